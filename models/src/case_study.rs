@@ -1,0 +1,146 @@
+//! A case study: the roles of a robot's loop, the channels between them, and how a finished run
+//! is scored. It says nothing about hosts, processes or networks; the topology file does.
+
+use core::fmt::Debug;
+
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+use crate::component::Role;
+use crate::message::{Message, MessageType};
+use crate::run_log::RunLog;
+
+/// A kind of experiment that a topology file can name in `[case]`.
+///
+/// To swap only the controller of a shipped case, wrap the case: forward every function and
+/// return your own [`Role`] for `"controller"`.
+pub trait CaseStudy: Sized + Debug + 'static {
+    /// What `[case] name = "…"` says.
+    const NAME: &'static str;
+    /// One line for `hil-runtime cases`.
+    const SUMMARY: &'static str;
+    /// The roles, in the order reports list them.
+    const ROLES: &'static [&'static str];
+    /// The channels between the roles; a role's ports follow the order of this list.
+    const CHANNELS: &'static [ChannelSpec];
+    /// `[case.parameters]`; use `#[serde(deny_unknown_fields, default)]`.
+    type Parameters: DeserializeOwned + Serialize + Default;
+
+    /// Checks the parameters and prepares what the roles share.
+    ///
+    /// # Errors
+    /// Names the parameter, its value and its allowed range.
+    fn new(parameters: Self::Parameters, seed: u64) -> Result<Self, ParameterError>;
+
+    /// A fresh instance of the role called `name`; `None` if the case has no such role.
+    fn role(&self, name: &str) -> Option<Box<dyn Role>>;
+
+    /// What the robot did, from the messages of a finished run.
+    fn score(&self, log: &RunLog) -> Score;
+}
+
+/// One channel of a case study: who publishes what to whom.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ChannelSpec {
+    /// Name, also of the shared-memory service, e.g. `arm/command`.
+    pub name: &'static str,
+    /// What it carries.
+    pub message: MessageType,
+    /// The role that publishes.
+    pub from: &'static str,
+    /// The role that subscribes.
+    pub to: &'static str,
+}
+
+impl ChannelSpec {
+    /// The channel `name` carrying `M` from one role to another.
+    pub const fn of<M: Message>(name: &'static str, from: &'static str, to: &'static str) -> Self {
+        Self {
+            name,
+            message: MessageType::of::<M>(),
+            from,
+            to,
+        }
+    }
+}
+
+/// The channels `role` reads, in port order.
+pub fn inputs_of<'a>(
+    channels: &'a [ChannelSpec],
+    role: &'a str,
+) -> impl Iterator<Item = &'a ChannelSpec> {
+    channels.iter().filter(move |channel| channel.to == role)
+}
+
+/// The channels `role` writes, in port order.
+pub fn outputs_of<'a>(
+    channels: &'a [ChannelSpec],
+    role: &'a str,
+) -> impl Iterator<Item = &'a ChannelSpec> {
+    channels.iter().filter(move |channel| channel.from == role)
+}
+
+/// A parameter outside its range.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error("{key} {value} is outside {allowed}")]
+pub struct ParameterError {
+    /// Key below `[case.parameters]`.
+    pub key: &'static str,
+    /// What it was.
+    pub value: String,
+    /// What it may be, e.g. `0..=20`.
+    pub allowed: &'static str,
+}
+
+impl ParameterError {
+    /// `Ok` when `value` lies in `allowed`; NaN never does.
+    ///
+    /// # Errors
+    /// Names the key, the value and the text `allowed_text`.
+    pub fn check(
+        key: &'static str,
+        value: f64,
+        allowed: core::ops::RangeInclusive<f64>,
+        allowed_text: &'static str,
+    ) -> Result<(), Self> {
+        if allowed.contains(&value) {
+            return Ok(());
+        }
+        Err(Self {
+            key,
+            value: value.to_string(),
+            allowed: allowed_text,
+        })
+    }
+}
+
+/// What the robot did, as named figures.
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
+pub struct Score {
+    /// The figures, in the order a report prints them.
+    pub metrics: Vec<Metric>,
+}
+
+/// One figure with its unit, interval and method.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Metric {
+    /// Snake-case name with unit suffix, e.g. `joint_error_rad_rms`.
+    pub name: &'static str,
+    /// The words a report prints.
+    pub label: &'static str,
+    /// The figure; `None` when the run did not allow it, with the reason in `method`.
+    pub value: Option<f64>,
+    /// 95 % interval, when the figure is a statistic.
+    pub interval: Option<(f64, f64)>,
+    /// SI unit, or `1` for a pure number.
+    pub unit: &'static str,
+    /// How it was obtained, or why it was not.
+    pub method: String,
+}
+
+impl Score {
+    /// The metric called `name`.
+    pub fn get(&self, name: &str) -> Option<&Metric> {
+        self.metrics.iter().find(|metric| metric.name == name)
+    }
+}

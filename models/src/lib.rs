@@ -1,0 +1,25 @@
+//! Pure models of robots, links and measures, and the virtual-time driver.
+//!
+//! Nothing here reads a clock, blocks, or touches a file, a socket or a thread: time enters as
+//! `now`, randomness as a seeded [`random::RandomStream`]. Read in this order:
+//!
+//! 1. [`time`] and [`message`]: instants, periodic timers, fixed-size messages.
+//! 2. [`component`] and [`case_study`]: what a user writes.
+//! 3. [`endpoint`] and [`simulation`]: what drives it, in real and in virtual time.
+//! 4. [`shuttle`]: a whole case study in one short file.
+//! 5. [`link`]: what a network does to a message; [`measure`]: how that is accounted.
+//! 6. [`teleoperation`]: the dual-arm `YuMi` of the seed paper.
+#![forbid(unsafe_code)]
+
+pub mod case_study;
+pub mod component;
+pub mod endpoint;
+pub mod link;
+pub mod measure;
+pub mod message;
+pub mod random;
+pub mod run_log;
+pub mod shuttle;
+pub mod simulation;
+pub mod teleoperation;
+pub mod time;

@@ -1,0 +1,34 @@
+//! Link models: what a network does to a message, as a pure function of time and a seeded
+//! stream. They carry no bytes; virtual time and `via = "emulated"` ask them for each message.
+
+pub mod bernoulli;
+
+use core::fmt::Debug;
+
+use crate::time::Instant;
+
+/// What happens to one offered message.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Fate {
+    /// It arrives at this instant, never before it was offered.
+    Delivered(Instant),
+    /// It does not arrive.
+    Lost,
+}
+
+/// A one-directional link.
+pub trait LinkModel: Debug + Send {
+    /// Offers a message of `length_bytes` at `now` and decides its fate. Calls come in
+    /// non-decreasing `now`.
+    fn offer(&mut self, now: Instant, length_bytes: usize) -> Fate;
+}
+
+/// The shared-memory channel of one host in virtual time: everything arrives at once.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct PerfectLink;
+
+impl LinkModel for PerfectLink {
+    fn offer(&mut self, now: Instant, _length_bytes: usize) -> Fate {
+        Fate::Delivered(now)
+    }
+}

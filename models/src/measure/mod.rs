@@ -1,0 +1,3 @@
+//! Measures: from raw stamps to segments, histograms and intervals. It opens no file.
+
+pub mod record;

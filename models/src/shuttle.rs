@@ -1,0 +1,241 @@
+//! The smallest case study: a cart on a rail follows a square wave. Tutorial, test and bench
+//! subject; not a model of any product.
+//!
+//! The controller ticks, reads the newest status, and commands a speed; the robot integrates the
+//! speed and reports where it is. Everything a larger case has, this one has in small.
+
+use core::time::Duration;
+
+use bytemuck::{Pod, Zeroable};
+use serde::{Deserialize, Serialize};
+
+use crate::case_study::{CaseStudy, ChannelSpec, Metric, ParameterError, Score};
+use crate::component::{Component, Outbox, Role, into_role};
+use crate::message::Message;
+use crate::run_log::RunLog;
+use crate::time::{Instant, PeriodicTimer};
+
+/// Controller to robot: the speed to drive.
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct ShuttleCommand {
+    /// Commanded speed along the rail.
+    pub speed_mps: f64,
+    /// Where the controller wants the cart, for the score.
+    pub target_m: f64,
+}
+
+impl Message for ShuttleCommand {
+    const NAME: &'static str = "hil.ShuttleCommand.v1";
+}
+
+/// Robot to controller: where the cart is.
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct ShuttleStatus {
+    /// Position along the rail.
+    pub position_m: f64,
+}
+
+impl Message for ShuttleStatus {
+    const NAME: &'static str = "hil.ShuttleStatus.v1";
+}
+
+/// `[case.parameters]` of the shuttle.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ShuttleParameters {
+    /// Control and reporting rate, 1..=10000 Hz.
+    pub rate_hz: f64,
+    /// Proportional gain, 0..=100 per second.
+    pub gain_per_s: f64,
+    /// Speed limit of the cart, 0..=10 m/s.
+    pub speed_max_mps: f64,
+}
+
+impl Default for ShuttleParameters {
+    fn default() -> Self {
+        Self {
+            rate_hz: 100.0,
+            gain_per_s: 5.0,
+            speed_max_mps: 1.0,
+        }
+    }
+}
+
+/// The case study.
+#[derive(Debug, Clone)]
+pub struct Shuttle {
+    parameters: ShuttleParameters,
+}
+
+impl CaseStudy for Shuttle {
+    const NAME: &'static str = "shuttle";
+    const SUMMARY: &'static str = "a cart on a rail follows a square wave (tutorial)";
+    const ROLES: &'static [&'static str] = &["controller", "robot"];
+    const CHANNELS: &'static [ChannelSpec] = &[
+        ChannelSpec::of::<ShuttleCommand>("shuttle/command", "controller", "robot"),
+        ChannelSpec::of::<ShuttleStatus>("shuttle/status", "robot", "controller"),
+    ];
+    type Parameters = ShuttleParameters;
+
+    fn new(parameters: Self::Parameters, _seed: u64) -> Result<Self, ParameterError> {
+        ParameterError::check("rate_hz", parameters.rate_hz, 1.0..=10_000.0, "1..=10000")?;
+        ParameterError::check("gain_per_s", parameters.gain_per_s, 0.0..=100.0, "0..=100")?;
+        ParameterError::check(
+            "speed_max_mps",
+            parameters.speed_max_mps,
+            0.0..=10.0,
+            "0..=10",
+        )?;
+        Ok(Self { parameters })
+    }
+
+    fn role(&self, name: &str) -> Option<Box<dyn Role>> {
+        let period = Duration::from_secs_f64(1.0 / self.parameters.rate_hz);
+        match name {
+            "controller" => Some(into_role(Controller {
+                parameters: self.parameters.clone(),
+                timer: PeriodicTimer::new(period),
+                started: Instant::ZERO,
+                position_m: 0.0,
+            })),
+            "robot" => Some(into_role(Robot {
+                timer: PeriodicTimer::new(period),
+                moved_until: Instant::ZERO,
+                speed_mps: 0.0,
+                position_m: 0.0,
+            })),
+            _ => None,
+        }
+    }
+
+    fn score(&self, log: &RunLog) -> Score {
+        let commands: Vec<_> = log.messages::<ShuttleCommand>("shuttle/command").collect();
+        let travelled = log
+            .messages::<ShuttleStatus>("shuttle/status")
+            .map(|(_, status)| status.position_m)
+            .fold((None, 0.0), |(last, sum): (Option<f64>, f64), x| {
+                (Some(x), sum + last.map_or(0.0, |last| (x - last).abs()))
+            });
+        let value = travelled.0.is_some().then_some(travelled.1);
+        Score {
+            metrics: vec![Metric {
+                name: "travelled_m",
+                label: "distance travelled",
+                value,
+                interval: None,
+                unit: "m",
+                method: format!("sum of status steps; {} commands sent", commands.len()),
+            }],
+        }
+    }
+}
+
+/// Half the period of the square wave the controller follows.
+const HALF_WAVE_S: f64 = 2.0;
+
+#[derive(Debug)]
+struct Controller {
+    parameters: ShuttleParameters,
+    timer: PeriodicTimer,
+    started: Instant,
+    position_m: f64,
+}
+
+impl Component for Controller {
+    type Input = ShuttleStatus;
+    type Output = ShuttleCommand;
+
+    fn on_start(&mut self, now: Instant) {
+        self.started = now;
+        self.timer.start(now);
+    }
+
+    fn on_message(
+        &mut self,
+        _now: Instant,
+        input: &ShuttleStatus,
+        _out: &mut Outbox<ShuttleCommand>,
+    ) {
+        self.position_m = input.position_m;
+    }
+
+    fn on_tick(&mut self, now: Instant, out: &mut Outbox<ShuttleCommand>) {
+        let Some(tick) = self.timer.poll(now) else {
+            return;
+        };
+        let phase = tick
+            .scheduled
+            .seconds_since(self.started)
+            .rem_euclid(2.0 * HALF_WAVE_S);
+        let target_m = if phase < HALF_WAVE_S { 1.0 } else { 0.0 };
+        let limit = self.parameters.speed_max_mps;
+        let speed = self.parameters.gain_per_s * (target_m - self.position_m);
+        out.send(ShuttleCommand {
+            speed_mps: speed.clamp(-limit, limit),
+            target_m,
+        });
+    }
+
+    fn next_tick(&self) -> Option<Instant> {
+        self.timer.next()
+    }
+
+    fn skipped_ticks(&self) -> u64 {
+        self.timer.skipped_total()
+    }
+}
+
+#[derive(Debug)]
+struct Robot {
+    timer: PeriodicTimer,
+    moved_until: Instant,
+    speed_mps: f64,
+    position_m: f64,
+}
+
+impl Robot {
+    /// Integrates with the time that really passed, not with the nominal period.
+    fn advance(&mut self, now: Instant) {
+        self.position_m += self.speed_mps * now.seconds_since(self.moved_until);
+        self.moved_until = now;
+    }
+}
+
+impl Component for Robot {
+    type Input = ShuttleCommand;
+    type Output = ShuttleStatus;
+
+    fn on_start(&mut self, now: Instant) {
+        self.moved_until = now;
+        self.timer.start(now);
+    }
+
+    fn on_message(
+        &mut self,
+        now: Instant,
+        input: &ShuttleCommand,
+        _out: &mut Outbox<ShuttleStatus>,
+    ) {
+        self.advance(now);
+        self.speed_mps = input.speed_mps;
+    }
+
+    fn on_tick(&mut self, now: Instant, out: &mut Outbox<ShuttleStatus>) {
+        if self.timer.poll(now).is_some() {
+            self.advance(now);
+            out.send(ShuttleStatus {
+                position_m: self.position_m,
+            });
+        }
+    }
+
+    fn next_tick(&self) -> Option<Instant> {
+        self.timer.next()
+    }
+
+    fn skipped_ticks(&self) -> u64 {
+        self.timer.skipped_total()
+    }
+}

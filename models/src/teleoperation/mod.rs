@@ -1,0 +1,1 @@
+//! Case study 2: human motion drives a dual-arm `YuMi`.

@@ -1,0 +1,3 @@
+//! The runtime: clock, shared memory, threads, processes, files.
+pub mod channel;
+pub mod topology;

@@ -1,0 +1,2 @@
+//! The `hil-runtime` binary with the shipped case studies.
+fn main() {}

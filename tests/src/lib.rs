@@ -1,0 +1,1 @@
+//! Shared by the tests that cross crate and process borders.
