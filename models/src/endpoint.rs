@@ -38,6 +38,9 @@ pub trait OutputPort: Debug {
     fn send(&mut self, now: Instant, payload: &[u8]) -> Result<(), Self::Error>;
 }
 
+/// Messages taken from one port before the role is ticked; the rest waits for the next poll.
+const MESSAGES_PER_POLL_MAX: usize = 1024;
+
 /// What one [`Endpoint::poll`] did.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Activity {
@@ -47,6 +50,8 @@ pub struct Activity {
     pub sent_count: u64,
     /// Payloads that were not a message of their port.
     pub malformed_count: u64,
+    /// Times the role was ticked.
+    pub tick_count: u64,
 }
 
 /// A role and its ports.
@@ -104,7 +109,7 @@ impl<E, I: InputPort<Error = E>, O: OutputPort<Error = E>> Endpoint<I, O> {
         self.role.start(now);
     }
 
-    /// Takes every waiting message, port by port, then ticks the role when due.
+    /// Takes the waiting messages, port by port, then ticks the role when due.
     ///
     /// # Errors
     /// The first port that fails.
@@ -124,11 +129,17 @@ impl<E, I: InputPort<Error = E>, O: OutputPort<Error = E>> Endpoint<I, O> {
                     activity.malformed_count += 1;
                 }
             };
-            while input.receive(now, &mut take)? {}
+            // Bounded, so that a flood on one port cannot keep the role from its tick.
+            for _ in 0..MESSAGES_PER_POLL_MAX {
+                if !input.receive(now, &mut take)? {
+                    break;
+                }
+            }
         }
         if role.next_tick().is_some_and(|due| due <= now) {
             let mut emit = emitter(outputs, now, &mut activity.sent_count, &mut failed);
             role.tick(now, &mut emit);
+            activity.tick_count += 1;
         }
         failed.map_or(Ok(activity), Err)
     }
