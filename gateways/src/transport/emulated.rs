@@ -1,0 +1,352 @@
+//! Any receiver behind a link model: it loses and delays real datagrams as the model says, so a
+//! run over an emulated link differs from one over the real link in one object. It reads no
+//! clock and wakes nobody; the caller waits until [`DatagramReceiver::next_due`].
+
+use core::cmp::Reverse;
+use core::fmt;
+use std::collections::BinaryHeap;
+use std::io;
+use std::net::SocketAddr;
+use std::os::fd::BorrowedFd;
+
+use hil_models::link::{Fate, LinkModel};
+use hil_models::time::Instant;
+
+use super::{DatagramReceiver, EmulatedDelay, Received, ReceiverCounters, SendRefusal};
+
+/// How much an emulated link may hold.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct EmulatedSettings {
+    /// Datagrams held at a time; further arrivals are dropped and counted.
+    pub capacity_count: usize,
+    /// Longest datagram; longer ones are cut and say so.
+    pub datagram_bytes_max: usize,
+}
+
+impl Default for EmulatedSettings {
+    /// One second of a 1 kHz channel, in datagrams of an Ethernet frame's content.
+    fn default() -> Self {
+        Self {
+            capacity_count: 1024,
+            datagram_bytes_max: 1472,
+        }
+    }
+}
+
+/// Position in the order of delivery: due first, then arrival, and the buffer that holds it.
+type Position = Reverse<(Instant, u64, usize)>;
+
+/// A receiver whose arrivals pass a link model first.
+pub struct EmulatedReceiver<R> {
+    inner: R,
+    link: Box<dyn LinkModel>,
+    is_exempt: fn(&[u8]) -> bool,
+    datagram_bytes_max: usize,
+    /// One buffer per place and a last one for arrivals that find no place.
+    storage: Box<[u8]>,
+    held: Box<[Option<Received>]>,
+    free: Vec<usize>,
+    order: BinaryHeap<Position>,
+    arrival_count: u64,
+    newest_arrival: Instant,
+    counters: ReceiverCounters,
+}
+
+impl<R: DatagramReceiver> EmulatedReceiver<R> {
+    /// Puts `inner` behind `link`. Datagrams that `is_exempt` accepts, such as handshakes, pass
+    /// undelayed and without being offered, so that they do not change the fate of the others.
+    ///
+    /// # Panics
+    /// When `settings` leaves no room for a datagram.
+    pub fn new(
+        inner: R,
+        link: Box<dyn LinkModel>,
+        is_exempt: fn(&[u8]) -> bool,
+        settings: EmulatedSettings,
+    ) -> Self {
+        let EmulatedSettings {
+            capacity_count,
+            datagram_bytes_max,
+        } = settings;
+        assert!(
+            capacity_count > 0 && datagram_bytes_max > 0,
+            "an emulated link needs room for one datagram"
+        );
+        let storage = vec![0; (capacity_count + 1) * datagram_bytes_max];
+        Self {
+            inner,
+            link,
+            is_exempt,
+            datagram_bytes_max,
+            storage: storage.into_boxed_slice(),
+            held: vec![None; capacity_count].into_boxed_slice(),
+            free: (0..capacity_count).rev().collect(),
+            order: BinaryHeap::with_capacity(capacity_count),
+            arrival_count: 0,
+            newest_arrival: Instant::from_ns(i64::MIN),
+            counters: ReceiverCounters::default(),
+        }
+    }
+
+    /// Datagrams held now.
+    pub fn held_count(&self) -> usize {
+        self.order.len()
+    }
+
+    /// The receiver below.
+    pub fn inner(&self) -> &R {
+        &self.inner
+    }
+
+    /// Takes everything that has arrived below, at most as many as may be held.
+    fn pull(&mut self, now: Instant) -> io::Result<()> {
+        self.newest_arrival = self.newest_arrival.max(now);
+        for _ in 0..self.held.len() {
+            let overflow = self.held.len();
+            let place = self.free.last().copied().unwrap_or(overflow);
+            let start = place * self.datagram_bytes_max;
+            let buffer = &mut self.storage[start..start + self.datagram_bytes_max];
+            let Some(received) = self.inner.receive(now, buffer)? else {
+                break;
+            };
+            self.admit(received, place);
+        }
+        Ok(())
+    }
+
+    /// Decides the fate of the datagram in `place`.
+    fn admit(&mut self, mut received: Received, place: usize) {
+        let arrived = self.newest_arrival;
+        let start = place * self.datagram_bytes_max;
+        let datagram = &self.storage[start..start + received.length_bytes];
+        let due = if (self.is_exempt)(datagram) {
+            arrived
+        } else {
+            // The model is asked even when there is no room, so that the fate of the n-th
+            // datagram does not depend on how full we were.
+            let Fate::Delivered(due) = self.link.offer(arrived, received.length_bytes) else {
+                self.counters.link_lost_count += 1;
+                return;
+            };
+            received.emulated = Some(EmulatedDelay { arrived, due });
+            due
+        };
+        let Some(slot) = self.held.get_mut(place) else {
+            self.counters.link_overflow_count += 1;
+            return;
+        };
+        *slot = Some(received);
+        self.free.pop();
+        self.order.push(Reverse((due, self.arrival_count, place)));
+        self.arrival_count += 1;
+    }
+}
+
+impl<R: DatagramReceiver> DatagramReceiver for EmulatedReceiver<R> {
+    fn receive(&mut self, now: Instant, buffer: &mut [u8]) -> io::Result<Option<Received>> {
+        self.pull(now)?;
+        let Some(&Reverse((due, _, place))) = self.order.peek() else {
+            return Ok(None);
+        };
+        if due > now {
+            return Ok(None);
+        }
+        self.order.pop();
+        self.free.push(place);
+        let held = self.held[place].take();
+        let mut received = held.expect("a place in the order holds a datagram");
+        let start = place * self.datagram_bytes_max;
+        let length_bytes = received.length_bytes.min(buffer.len());
+        buffer[..length_bytes].copy_from_slice(&self.storage[start..start + length_bytes]);
+        received.is_truncated |= length_bytes < received.length_bytes;
+        received.length_bytes = length_bytes;
+        self.counters.count_received(&received);
+        Ok(Some(received))
+    }
+
+    fn reply(&mut self, datagram: &[u8], to: SocketAddr) -> Result<(), SendRefusal> {
+        self.inner.reply(datagram, to)
+    }
+
+    fn next_due(&self) -> Option<Instant> {
+        let own = self.order.peek().map(|&Reverse((due, _, _))| due);
+        match (own, self.inner.next_due()) {
+            (Some(own), Some(inner)) => Some(own.min(inner)),
+            (own, inner) => own.or(inner),
+        }
+    }
+
+    fn poll_fd(&self) -> Option<BorrowedFd<'_>> {
+        self.inner.poll_fd()
+    }
+
+    /// Own counts of what was handed out, lost and dropped; the rest from below.
+    fn counters(&self) -> ReceiverCounters {
+        let inner = self.inner.counters();
+        let own = &self.counters;
+        ReceiverCounters {
+            received_count: own.received_count,
+            software_stamp_count: own.software_stamp_count,
+            hardware_stamp_count: own.hardware_stamp_count,
+            truncated_count: own.truncated_count,
+            link_lost_count: inner.link_lost_count + own.link_lost_count,
+            link_overflow_count: inner.link_overflow_count + own.link_overflow_count,
+            ..inner
+        }
+    }
+}
+
+impl<R: fmt::Debug> fmt::Debug for EmulatedReceiver<R> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        // Without the buffers, which are long and say nothing.
+        f.debug_struct("EmulatedReceiver")
+            .field("inner", &self.inner)
+            .field("link", &self.link)
+            .field("held_count", &self.order.len())
+            .field("counters", &self.counters)
+            .finish_non_exhaustive()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use core::time::Duration;
+
+    use hil_models::link::bernoulli::BernoulliLink;
+    use hil_models::random::RandomStream;
+
+    use super::*;
+    use crate::transport::DatagramSender;
+    use crate::transport::queue::{QueueReceiver, QueueSender, QueueSettings, queue_pair};
+
+    const MS: i64 = 1_000_000;
+
+    /// Delays the n-th datagram by the n-th of these milliseconds; a negative one loses it.
+    #[derive(Debug)]
+    struct Listed(Vec<i64>);
+
+    impl LinkModel for Listed {
+        fn offer(&mut self, now: Instant, _length_bytes: usize) -> Fate {
+            match self.0.remove(0) {
+                ms if ms < 0 => Fate::Lost,
+                ms => Fate::Delivered(now + Duration::from_millis(ms.unsigned_abs())),
+            }
+        }
+    }
+
+    fn emulated(
+        link: impl LinkModel + 'static,
+        capacity_count: usize,
+    ) -> (QueueSender, EmulatedReceiver<QueueReceiver>) {
+        let (sender, inner) = queue_pair(&QueueSettings::default());
+        let settings = EmulatedSettings {
+            capacity_count,
+            datagram_bytes_max: 16,
+        };
+        let is_handshake = |datagram: &[u8]| datagram.first() == Some(&b'h');
+        let receiver = EmulatedReceiver::new(inner, Box::new(link), is_handshake, settings);
+        (sender, receiver)
+    }
+
+    fn take(receiver: &mut impl DatagramReceiver, now: Instant) -> Option<(u8, Received)> {
+        let mut buffer = [0; 16];
+        let arrival = receiver.receive(now, &mut buffer).unwrap()?;
+        Some((buffer[0], arrival))
+    }
+
+    #[test]
+    fn datagrams_come_when_due_in_due_order_and_say_how_long_they_were_held() {
+        let (mut sender, mut receiver) = emulated(Listed(vec![30, -1, 10, 10]), 8);
+        for byte in 0..4 {
+            sender.send(&[byte]).unwrap();
+        }
+        let start = Instant::from_ns(5 * MS);
+        assert_eq!(take(&mut receiver, start), None);
+        assert_eq!(receiver.next_due(), Some(Instant::from_ns(15 * MS)));
+        assert_eq!(take(&mut receiver, Instant::from_ns(15 * MS - 1)), None);
+        let now = Instant::from_ns(40 * MS);
+        let order: Vec<_> = core::iter::from_fn(|| take(&mut receiver, now)).collect();
+        assert_eq!(
+            order.iter().map(|(byte, _)| *byte).collect::<Vec<_>>(),
+            [2, 3, 0]
+        );
+        let delay = order[2].1.emulated.unwrap();
+        assert_eq!(
+            (delay.arrived, delay.due),
+            (start, Instant::from_ns(35 * MS))
+        );
+        assert_eq!(receiver.counters().link_lost_count, 1);
+        assert_eq!((receiver.next_due(), receiver.held_count()), (None, 0));
+    }
+
+    #[test]
+    fn a_full_link_drops_and_counts_and_recovers() {
+        let (mut sender, mut receiver) = emulated(Listed(vec![10; 8]), 2);
+        for byte in 0..5 {
+            sender.send(&[byte]).unwrap();
+            assert_eq!(take(&mut receiver, Instant::ZERO), None);
+        }
+        assert_eq!(receiver.counters().link_overflow_count, 3);
+        let due = Instant::from_ns(10 * MS);
+        assert_eq!(take(&mut receiver, due).unwrap().0, 0);
+        assert_eq!(take(&mut receiver, due).unwrap().0, 1);
+        sender.send(&[9]).unwrap();
+        assert_eq!(take(&mut receiver, due), None);
+        assert_eq!(take(&mut receiver, Instant::from_ns(20 * MS)).unwrap().0, 9);
+    }
+
+    #[test]
+    fn exempt_datagrams_pass_at_once_and_change_no_fate() {
+        let (mut sender, mut receiver) = emulated(Listed(vec![10, -1]), 8);
+        sender.send(b"1").unwrap();
+        sender.send(b"hello").unwrap();
+        sender.send(b"2").unwrap();
+        let (byte, arrival) = take(&mut receiver, Instant::ZERO).unwrap();
+        assert_eq!((byte, arrival.emulated), (b'h', None));
+        assert_eq!(
+            take(&mut receiver, Instant::from_ns(10 * MS)).unwrap().0,
+            b'1'
+        );
+        assert_eq!(receiver.counters().link_lost_count, 1);
+    }
+
+    #[test]
+    fn equal_seeds_lose_the_same_datagrams() {
+        let survivors = |seed| {
+            let stream = RandomStream::new(seed, "link");
+            let link = BernoulliLink::new(Duration::from_millis(3), 0.3, stream).unwrap();
+            let (mut sender, mut receiver) = emulated(link, 8);
+            let mut seen = Vec::new();
+            for byte in 0..200 {
+                sender.send(&[byte]).unwrap();
+                let now = Instant::from_ns(i64::from(byte) * MS);
+                seen.extend(take(&mut receiver, now).map(|(byte, _)| byte));
+            }
+            seen
+        };
+        assert_eq!(survivors(4), survivors(4));
+        assert_ne!(survivors(4), survivors(5));
+        assert!((100..180).contains(&survivors(4).len()));
+    }
+
+    #[test]
+    fn a_clock_that_goes_back_does_not_reach_the_model() {
+        #[derive(Debug)]
+        struct Strict(Instant);
+        impl LinkModel for Strict {
+            fn offer(&mut self, now: Instant, _length_bytes: usize) -> Fate {
+                assert!(now >= self.0, "offers come in order");
+                self.0 = now;
+                Fate::Delivered(now)
+            }
+        }
+        let (mut sender, mut receiver) = emulated(Strict(Instant::ZERO), 8);
+        for now in [7, 3, 9] {
+            sender.send(&[now]).unwrap();
+            take(&mut receiver, Instant::from_ns(i64::from(now)));
+        }
+        // The second came in at 7, so at 3 it was not due yet.
+        assert_eq!(receiver.counters().received_count, 2);
+        assert_eq!(receiver.held_count(), 1);
+    }
+}

@@ -1,0 +1,471 @@
+//! The kernel side of time stamps: which to ask for, the receive call that brings them, and what
+//! an interface claims to offer. The control messages are decoded in a sibling file; whether a
+//! claim holds is found out by [`super::probe`].
+//!
+//! This is the only file of the crate with `unsafe`: `recvmsg`, two socket options and one
+//! `ioctl` have no safe form that does not allocate.
+#![allow(
+    unsafe_code,
+    reason = "recvmsg without allocation, and socket options and ioctls that no crate wraps"
+)]
+
+use core::ffi::{c_char, c_int, c_ulong};
+use core::mem;
+use std::io;
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, SocketAddrV4, SocketAddrV6};
+use std::os::fd::{AsFd, AsRawFd, BorrowedFd};
+
+use nix::sys::socket::{TimestampingFlag, setsockopt, sockopt};
+
+/// Which stamps to ask the kernel for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum TimestampMode {
+    /// None.
+    Off,
+    /// Software stamps when a datagram leaves for the driver and when it arrives.
+    #[default]
+    Software,
+    /// As `Software`, and before the queueing discipline: the only transmit stamp where the
+    /// driver gives none, as on Wi-Fi.
+    Scheduled,
+    /// Software and network card stamps. The card must be set up for it, see
+    /// [`HardwareStamping::request`].
+    Hardware,
+}
+
+impl TimestampMode {
+    /// What a receiver asks for. Never transmit stamps: unfetched ones would take the room of
+    /// arrivals.
+    fn receive_flags(self) -> TimestampingFlag {
+        let software = TimestampingFlag::SOF_TIMESTAMPING_SOFTWARE
+            | TimestampingFlag::SOF_TIMESTAMPING_RX_SOFTWARE;
+        match self {
+            Self::Off => TimestampingFlag::empty(),
+            Self::Software | Self::Scheduled => software,
+            Self::Hardware => {
+                software
+                    | TimestampingFlag::SOF_TIMESTAMPING_RAW_HARDWARE
+                    | TimestampingFlag::SOF_TIMESTAMPING_RX_HARDWARE
+            }
+        }
+    }
+
+    /// What a sender asks for: the above for replies, and transmit stamps that carry the number
+    /// of the send and no copy of the datagram.
+    fn transmit_flags(self) -> TimestampingFlag {
+        let bits = TimestampingFlag::from_bits_retain;
+        let software = TimestampingFlag::SOF_TIMESTAMPING_TX_SOFTWARE
+            | TimestampingFlag::SOF_TIMESTAMPING_OPT_ID
+            | TimestampingFlag::SOF_TIMESTAMPING_OPT_TSONLY;
+        let transmit = match self {
+            Self::Off => TimestampingFlag::empty(),
+            Self::Software => software,
+            Self::Scheduled => software | bits(libc::SOF_TIMESTAMPING_TX_SCHED),
+            // Without TX_SWHW a card's stamp suppresses the software stamp.
+            Self::Hardware => {
+                software
+                    | TimestampingFlag::SOF_TIMESTAMPING_TX_HARDWARE
+                    | bits(libc::SOF_TIMESTAMPING_OPT_TX_SWHW)
+            }
+        };
+        self.receive_flags() | transmit
+    }
+}
+
+/// Asks for the stamps of `mode` on a sending socket; its send counter starts at 0 here.
+pub(super) fn arm_transmit(socket: &impl AsFd, mode: TimestampMode) -> io::Result<()> {
+    Ok(setsockopt(
+        socket,
+        sockopt::Timestamping,
+        &mode.transmit_flags(),
+    )?)
+}
+
+/// Makes the kernel count the next send of an armed socket as 0 again.
+pub(super) fn restart_send_count(socket: &impl AsFd, mode: TimestampMode) -> io::Result<()> {
+    // The count restarts when the option is set anew. Everything else stays on, for the kernel
+    // switches receive stamps off and on with a delay.
+    let uncounted = mode.transmit_flags() - TimestampingFlag::SOF_TIMESTAMPING_OPT_ID;
+    setsockopt(socket, sockopt::Timestamping, &uncounted)?;
+    arm_transmit(socket, mode)
+}
+
+/// Asks for the stamps of `mode` on a receiving socket.
+pub(super) fn arm_receive(socket: &impl AsFd, mode: TimestampMode) -> io::Result<()> {
+    Ok(setsockopt(
+        socket,
+        sockopt::Timestamping,
+        &mode.receive_flags(),
+    )?)
+}
+
+/// Room for the control messages of one datagram: stamps, drop count, an error report and more
+/// take under 200 bytes.
+const CONTROL_BYTES: usize = 512;
+/// `sizeof(struct sockaddr_storage)`.
+const ADDRESS_BYTES: usize = 128;
+/// The same, as the kernel takes it.
+const ADDRESS_LENGTH: libc::socklen_t = 128;
+/// Bytes of an `int`, as the kernel takes it.
+const INT_LENGTH: libc::socklen_t = 4;
+const _: () = assert!(size_of::<c_int>() == 4);
+
+/// Preallocated buffers of the receive call, aligned as the kernel's structures are.
+#[derive(Debug)]
+#[repr(C, align(16))]
+pub(super) struct MessageReader {
+    control: [u8; CONTROL_BYTES],
+    address: [u8; ADDRESS_BYTES],
+    control_length: usize,
+}
+
+/// One datagram or entry of the error queue, as `recvmsg` returned it.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Message {
+    pub length_bytes: usize,
+    /// The sender; `None` when the kernel gave no IP address.
+    pub source: Option<SocketAddr>,
+    pub is_truncated: bool,
+    pub is_control_truncated: bool,
+}
+
+/// Which queue of a socket to read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Queue {
+    Arrivals,
+    Errors,
+}
+
+impl MessageReader {
+    pub(super) fn new() -> Self {
+        Self {
+            control: [0; CONTROL_BYTES],
+            address: [0; ADDRESS_BYTES],
+            control_length: 0,
+        }
+    }
+
+    /// Takes the next message of `queue`, or `None` when there is none. Never blocks.
+    pub(super) fn read(
+        &mut self,
+        socket: BorrowedFd<'_>,
+        buffer: &mut [u8],
+        queue: Queue,
+    ) -> io::Result<Option<Message>> {
+        let flags = match queue {
+            Queue::Arrivals => libc::MSG_DONTWAIT,
+            Queue::Errors => libc::MSG_DONTWAIT | libc::MSG_ERRQUEUE,
+        };
+        let mut vector = libc::iovec {
+            iov_base: buffer.as_mut_ptr().cast(),
+            iov_len: buffer.len(),
+        };
+        // SAFETY: msghdr is integers and pointers, for which all-zero bytes are valid; it may
+        // have private padding, so it cannot be written as a literal.
+        let mut header: libc::msghdr = unsafe { mem::zeroed() };
+        header.msg_iov = &raw mut vector;
+        header.msg_iovlen = 1;
+        header.msg_name = self.address.as_mut_ptr().cast();
+        header.msg_control = self.control.as_mut_ptr().cast();
+        let length_bytes = loop {
+            header.msg_namelen = ADDRESS_LENGTH;
+            header.msg_controllen = CONTROL_BYTES as _;
+            // SAFETY: every pointer in `header` is to a live buffer of the length beside it that
+            // nothing else uses during the call; the descriptor is open for the borrow.
+            let result = unsafe { libc::recvmsg(socket.as_raw_fd(), &raw mut header, flags) };
+            match usize::try_from(result) {
+                Ok(length_bytes) => break length_bytes,
+                Err(_) => match io::Error::last_os_error() {
+                    error if error.kind() == io::ErrorKind::Interrupted => {}
+                    error if error.kind() == io::ErrorKind::WouldBlock => return Ok(None),
+                    error => return Err(error),
+                },
+            }
+        };
+        self.control_length = header.msg_controllen.min(CONTROL_BYTES);
+        let address_length = (header.msg_namelen as usize).min(ADDRESS_BYTES);
+        Ok(Some(Message {
+            length_bytes: length_bytes.min(buffer.len()),
+            source: decode_address(&self.address[..address_length]),
+            is_truncated: header.msg_flags & libc::MSG_TRUNC != 0,
+            is_control_truncated: header.msg_flags & libc::MSG_CTRUNC != 0,
+        }))
+    }
+
+    /// The control messages of the message read last.
+    pub(super) fn control(&self) -> &[u8] {
+        &self.control[..self.control_length]
+    }
+}
+
+/// `struct sockaddr_in` or `sockaddr_in6` from its bytes.
+fn decode_address(bytes: &[u8]) -> Option<SocketAddr> {
+    let family = u16::from_ne_bytes(*bytes.first_chunk()?);
+    let port = u16::from_be_bytes(*bytes.get(2..)?.first_chunk()?);
+    match c_int::from(family) {
+        libc::AF_INET => {
+            let octets: [u8; 4] = *bytes.get(4..)?.first_chunk()?;
+            Some(SocketAddrV4::new(Ipv4Addr::from(octets), port).into())
+        }
+        libc::AF_INET6 => {
+            let flow = u32::from_be_bytes(*bytes.get(4..)?.first_chunk()?);
+            let octets: [u8; 16] = *bytes.get(8..)?.first_chunk()?;
+            let scope = u32::from_ne_bytes(*bytes.get(24..)?.first_chunk()?);
+            Some(SocketAddrV6::new(Ipv6Addr::from(octets), port, flow, scope).into())
+        }
+        _ => None,
+    }
+}
+
+/// Sets a socket option with an `int` value.
+pub(super) fn set_int_option(
+    socket: &impl AsFd,
+    level: c_int,
+    name: c_int,
+    value: c_int,
+) -> io::Result<()> {
+    let length = INT_LENGTH;
+    let pointer = (&raw const value).cast();
+    let descriptor = socket.as_fd().as_raw_fd();
+    // SAFETY: the kernel reads `length` bytes at `pointer`, which is a live int of that size.
+    let result = unsafe { libc::setsockopt(descriptor, level, name, pointer, length) };
+    if result == 0 {
+        Ok(())
+    } else {
+        Err(io::Error::last_os_error())
+    }
+}
+
+/// Reads a socket option with an `int` value.
+pub(super) fn int_option(socket: &impl AsFd, level: c_int, name: c_int) -> io::Result<c_int> {
+    let mut value: c_int = 0;
+    let mut length = INT_LENGTH;
+    let pointer = (&raw mut value).cast();
+    let descriptor = socket.as_fd().as_raw_fd();
+    // SAFETY: the kernel writes at most `length` bytes at `pointer`, a live int of that size.
+    let result = unsafe { libc::getsockopt(descriptor, level, name, pointer, &raw mut length) };
+    if result == 0 {
+        Ok(value)
+    } else {
+        Err(io::Error::last_os_error())
+    }
+}
+
+/// What an interface claims to stamp (`ETHTOOL_GET_TS_INFO`). Several drivers claim what they
+/// never do, so a claim is a reason to probe, not a result.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[expect(
+    clippy::struct_excessive_bools,
+    reason = "four independent claims of one driver"
+)]
+pub struct TimestampCapabilities {
+    /// Software transmit stamps.
+    pub tx_software: bool,
+    /// Software receive stamps.
+    pub rx_software: bool,
+    /// Hardware transmit stamps.
+    pub tx_hardware: bool,
+    /// Hardware receive stamps.
+    pub rx_hardware: bool,
+    /// Index of the card's clock (`/dev/ptpN`); `None` when it has none.
+    pub phc_index: Option<u32>,
+}
+
+/// `ETHTOOL_GET_TS_INFO` of `linux/ethtool.h`.
+const ETHTOOL_GET_TS_INFO: u32 = 0x41;
+
+/// `struct ethtool_ts_info` of `linux/ethtool.h`.
+#[derive(Debug, Default)]
+#[repr(C)]
+struct EthtoolTimestampInfo {
+    command: u32,
+    timestamping: u32,
+    phc_index: i32,
+    transmit_types: u32,
+    transmit_reserved: [u32; 3],
+    receive_filters: u32,
+    receive_reserved: [u32; 3],
+}
+
+impl TimestampCapabilities {
+    /// Asks the driver of `interface`.
+    ///
+    /// # Errors
+    /// When there is no such interface or its driver does not answer (`EOPNOTSUPP`).
+    pub fn query(interface: &str) -> io::Result<Self> {
+        let mut info = EthtoolTimestampInfo {
+            command: ETHTOOL_GET_TS_INFO,
+            ..Default::default()
+        };
+        let data = (&raw mut info).cast();
+        // SAFETY: SIOCETHTOOL with this command reads and writes one `ethtool_ts_info`, which
+        // `info` is.
+        unsafe { device_request(interface, libc::SIOCETHTOOL, data) }?;
+        Ok(Self::from_bits(info.timestamping, info.phc_index))
+    }
+
+    /// The claims in the kernel's bits.
+    fn from_bits(timestamping: u32, phc_index: i32) -> Self {
+        let claims = |bits: u32| timestamping & bits == bits;
+        let raw = libc::SOF_TIMESTAMPING_RAW_HARDWARE;
+        Self {
+            tx_software: claims(libc::SOF_TIMESTAMPING_TX_SOFTWARE),
+            rx_software: claims(libc::SOF_TIMESTAMPING_RX_SOFTWARE),
+            tx_hardware: claims(libc::SOF_TIMESTAMPING_TX_HARDWARE | raw),
+            rx_hardware: claims(libc::SOF_TIMESTAMPING_RX_HARDWARE | raw),
+            phc_index: u32::try_from(phc_index).ok(),
+        }
+    }
+}
+
+/// How a network card is set up to stamp (`struct hwtstamp_config` of `linux/net_tstamp.h`).
+/// This is a setting of the card, shared by all its users such as a PTP daemon.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct HardwareStamping {
+    /// The card stamps what leaves (`HWTSTAMP_TX_ON`).
+    pub is_transmit_on: bool,
+    /// Which arrivals it stamps: 0 none, 1 all, else one of `HWTSTAMP_FILTER_*`.
+    pub receive_filter: i32,
+}
+
+impl HardwareStamping {
+    /// How the card behind `interface` is set up now (`SIOCGHWTSTAMP`).
+    ///
+    /// # Errors
+    /// `EOPNOTSUPP` when it cannot stamp, as on loopback, veth and virtio.
+    pub fn query(interface: &str) -> io::Result<Self> {
+        Self::exchange(interface, libc::SIOCGHWTSTAMP, (0, 0))
+    }
+
+    /// Asks the card to stamp everything (`SIOCSHWTSTAMP`) and says what it settled for. Needs
+    /// `CAP_NET_ADMIN` and changes the card for all its users.
+    ///
+    /// # Errors
+    /// `EOPNOTSUPP` when it cannot stamp, `ERANGE` when it cannot stamp all arrivals, `EPERM`.
+    pub fn request(interface: &str) -> io::Result<Self> {
+        let wanted = (libc::HWTSTAMP_TX_ON, libc::HWTSTAMP_FILTER_ALL);
+        Self::exchange(interface, libc::SIOCSHWTSTAMP, wanted)
+    }
+
+    fn exchange(interface: &str, request: c_ulong, wanted: (u32, u32)) -> io::Result<Self> {
+        let mut config = libc::hwtstamp_config {
+            flags: 0,
+            tx_type: wanted.0.cast_signed(),
+            rx_filter: wanted.1.cast_signed(),
+        };
+        let data = (&raw mut config).cast();
+        // SAFETY: both requests read and write one `hwtstamp_config`, which `config` is.
+        unsafe { device_request(interface, request, data) }?;
+        Ok(Self {
+            is_transmit_on: config.tx_type != libc::HWTSTAMP_TX_OFF.cast_signed(),
+            receive_filter: config.rx_filter,
+        })
+    }
+}
+
+/// One `ioctl` to a network interface.
+///
+/// # Safety
+/// `data` points to the live structure that `request` reads and writes.
+unsafe fn device_request(interface: &str, request: c_ulong, data: *mut c_char) -> io::Result<()> {
+    let mut name: [c_char; libc::IFNAMSIZ] = [0; libc::IFNAMSIZ];
+    // One byte stays zero as the end of the name.
+    if interface.len() >= name.len() || interface.is_empty() {
+        return Err(io::ErrorKind::InvalidInput.into());
+    }
+    for (place, byte) in name.iter_mut().zip(interface.bytes()) {
+        *place = c_char::from_ne_bytes([byte]);
+    }
+    let mut message = libc::ifreq {
+        ifr_name: name,
+        ifr_ifru: libc::__c_anonymous_ifr_ifru { ifru_data: data },
+    };
+    let socket = socket2::Socket::new(socket2::Domain::IPV4, socket2::Type::DGRAM, None)?;
+    // SAFETY: `message` is a live ifreq whose data pointer fits the request, by the contract of
+    // this function.
+    let result = unsafe { libc::ioctl(socket.as_raw_fd(), request as _, &raw mut message) };
+    if result >= 0 {
+        Ok(())
+    } else {
+        Err(io::Error::last_os_error())
+    }
+}
+
+/// The interface that has `address`; `None` when this host has no such address.
+///
+/// # Errors
+/// When the kernel does not list the interfaces.
+pub fn interface_with_address(address: IpAddr) -> io::Result<Option<String>> {
+    let has_address = |entry: &nix::ifaddrs::InterfaceAddress| {
+        let Some(storage) = entry.address.as_ref() else {
+            return false;
+        };
+        let v4 = storage.as_sockaddr_in().map(|a| IpAddr::V4(a.ip()));
+        let v6 = storage.as_sockaddr_in6().map(|a| IpAddr::V6(a.ip()));
+        v4.or(v6) == Some(address)
+    };
+    let mut entries = nix::ifaddrs::getifaddrs()?;
+    Ok(entries.find(has_address).map(|entry| entry.interface_name))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn addresses_of_both_families_are_read_and_others_are_not() {
+        let mut bytes = u16::try_from(libc::AF_INET).unwrap().to_ne_bytes().to_vec();
+        bytes.extend([0x1f, 0x90, 127, 0, 0, 1, 0, 0]);
+        assert_eq!(decode_address(&bytes), "127.0.0.1:8080".parse().ok());
+        let mut bytes = u16::try_from(libc::AF_INET6)
+            .unwrap()
+            .to_ne_bytes()
+            .to_vec();
+        bytes.extend([0x1f, 0x90, 0, 0, 0, 0]);
+        bytes.extend(Ipv6Addr::LOCALHOST.octets());
+        bytes.extend(0_u32.to_ne_bytes());
+        assert_eq!(decode_address(&bytes), "[::1]:8080".parse().ok());
+        for length in 0..bytes.len() {
+            assert_eq!(decode_address(&bytes[..length]), None);
+        }
+        assert_eq!(decode_address(&[9; 28]), None);
+    }
+
+    #[test]
+    fn hardware_is_claimed_only_together_with_its_report() {
+        let bits = libc::SOF_TIMESTAMPING_TX_HARDWARE | libc::SOF_TIMESTAMPING_TX_SOFTWARE;
+        let claims = TimestampCapabilities::from_bits(bits, -1);
+        assert!(claims.tx_software && !claims.tx_hardware && !claims.rx_software);
+        assert_eq!(claims.phc_index, None);
+        let raw = libc::SOF_TIMESTAMPING_RAW_HARDWARE;
+        let claims = TimestampCapabilities::from_bits(bits | raw, 3);
+        assert!(claims.tx_hardware && !claims.rx_hardware);
+        assert_eq!(claims.phc_index, Some(3));
+    }
+
+    #[test]
+    fn loopback_claims_software_stamps_and_refuses_hardware() {
+        let claims = TimestampCapabilities::query("lo").unwrap();
+        assert!(claims.tx_software && claims.rx_software);
+        assert!(!claims.tx_hardware && !claims.rx_hardware);
+        let refusal = HardwareStamping::query("lo").unwrap_err();
+        assert_eq!(refusal.raw_os_error(), Some(libc::EOPNOTSUPP));
+        assert!(HardwareStamping::request("lo").is_err());
+    }
+
+    #[test]
+    fn an_impossible_interface_name_is_an_error() {
+        for name in ["", "no-such-device", "a-name-longer-than-the-kernel-allows"] {
+            assert!(TimestampCapabilities::query(name).is_err(), "{name}");
+        }
+    }
+
+    #[test]
+    fn the_interface_of_an_address_is_found() {
+        let loopback = IpAddr::V4(Ipv4Addr::LOCALHOST);
+        let found = interface_with_address(loopback).unwrap();
+        assert_eq!(found.as_deref(), Some("lo"));
+        let foreign = IpAddr::V4(Ipv4Addr::new(203, 0, 113, 77));
+        assert_eq!(interface_with_address(foreign).unwrap(), None);
+    }
+}
