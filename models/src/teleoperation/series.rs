@@ -1,0 +1,1 @@
+//! Peaks and lags of sampled signals.

@@ -1,0 +1,1 @@
+//! The whole case: hours of motion in virtual time.
