@@ -11,6 +11,7 @@
 //! 6. [`teleoperation`]: the dual-arm `YuMi` of the seed paper.
 #![forbid(unsafe_code)]
 
+pub mod arrival;
 pub mod case_study;
 pub mod component;
 pub mod endpoint;

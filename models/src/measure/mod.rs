@@ -1,3 +1,10 @@
 //! Measures: from raw stamps to segments, histograms and intervals. It opens no file.
+//!
+//! [`record`] is what processes write, [`account`] joins it into one latency account per channel,
+//! [`histogram`] and [`statistics`] turn samples into figures with intervals.
 
+pub mod account;
+pub mod histogram;
 pub mod record;
+pub(crate) mod special;
+pub mod statistics;

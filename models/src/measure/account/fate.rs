@@ -1,0 +1,257 @@
+//! Decides what became of each message. It concludes from records only: the absence of a record
+//! means something only in a file that is at hand.
+
+use super::figures::{Gap, InterruptionFigures};
+use super::join::{Join, Joined, Key, stamp};
+use super::stage::{MessageFate, Side};
+use super::{AccountContext, ChannelRecords, Interruption, PathProcess, RunSpan};
+use crate::measure::record::{EgressRecord, IngressRecord};
+use crate::time::{Alignment, Instant, RemoteInstant, duration_ns};
+
+/// Judges messages in key order.
+#[derive(Debug)]
+pub(super) struct Judge<'a> {
+    files: ChannelRecords<'a>,
+    is_gateway: bool,
+    alignment: Option<Alignment>,
+    last_egress: Option<Key>,
+    last_taken: Option<Key>,
+    producer_end_ns: Option<i64>,
+    consumer_end_ns: Option<i64>,
+    flight_ns: i64,
+    interruptions: &'a [Interruption],
+    lost_counts: Vec<u64>,
+    /// Where the previous message of known place was, for those without any.
+    previous_producer_ns: Option<i64>,
+    previous_consumer_ns: Option<i64>,
+}
+
+impl<'a> Judge<'a> {
+    pub(super) fn new(
+        records: &ChannelRecords<'a>,
+        context: &AccountContext<'a>,
+        join: &Join<'_>,
+    ) -> Self {
+        let alignment = context.path.alignment();
+        let end = |run: Option<RunSpan>| run.map(|run| run.end.as_ns());
+        let (producer_end, consumer_end) = (end(context.producer_run), end(context.consumer_run));
+        let to_producer = |ns: i64| Some(ns.saturating_sub(alignment?.offset_ns));
+        Self {
+            files: *records,
+            is_gateway: context.path.is_gateway(),
+            alignment,
+            last_egress: join.last_egress(),
+            last_taken: join.last_taken(),
+            producer_end_ns: producer_end.or_else(|| to_producer(consumer_end?)),
+            consumer_end_ns: consumer_end.or_else(|| localise(alignment, producer_end?)),
+            flight_ns: duration_ns(context.flight_time_max),
+            interruptions: context.interruptions,
+            lost_counts: vec![0; context.interruptions.len()],
+            previous_producer_ns: None,
+            previous_consumer_ns: None,
+        }
+    }
+
+    /// The fate of one message; remembers what its interruption cost.
+    pub(super) fn judge(&mut self, joined: &Joined<'_>) -> MessageFate {
+        let place = Place::of(joined);
+        let fate = self.fate(joined, place);
+        self.previous_producer_ns = place.producer_ns.or(self.previous_producer_ns);
+        self.previous_consumer_ns = place.consumer_ns.or(self.previous_consumer_ns);
+        fate
+    }
+
+    /// What each interruption cost, with the silence it caused.
+    pub(super) fn interruptions(&self, gaps: &[Option<Gap>]) -> Vec<InterruptionFigures> {
+        let costs = self.lost_counts.iter().zip(gaps);
+        self.interruptions
+            .iter()
+            .zip(costs)
+            .map(|(interruption, (lost_count, gap))| InterruptionFigures {
+                process: interruption.process.clone(),
+                cause: interruption.cause.clone(),
+                length_ns: interruption.until.ns_since(interruption.from),
+                lost_count: *lost_count,
+                gap: *gap,
+            })
+            .collect()
+    }
+
+    fn fate(&mut self, joined: &Joined<'_>, place: Place) -> MessageFate {
+        if joined.taken.is_some() {
+            return MessageFate::Taken;
+        }
+        let fate = if self.is_gateway {
+            self.fate_over_gateway(joined, place)
+        } else {
+            self.fate_at_consumer(joined, place.producer_ns, self.producer_end_ns)
+        };
+        let hit = (0..self.interruptions.len()).find(|index| {
+            let interruption = &self.interruptions[*index];
+            self.is_within_reach(joined, interruption) && self.is_hit(fate, place, interruption)
+        });
+        match hit {
+            Some(index) => {
+                self.lost_counts[index] = self.lost_counts[index].saturating_add(joined.count);
+                MessageFate::LostInInterruption
+            }
+            None => fate,
+        }
+    }
+
+    fn fate_over_gateway(&self, joined: &Joined<'_>, place: Place) -> MessageFate {
+        if let Some(ingress) = joined.ingress {
+            return self.fate_after_reception(joined, ingress);
+        }
+        if let Some(egress) = joined.egress {
+            if egress.flags & EgressRecord::REFUSED_BY_KERNEL != 0 {
+                return MessageFate::RefusedByKernel;
+            }
+            if self.files.ingress.is_none() {
+                return MessageFate::UnknownPeerRecordsUnavailable;
+            }
+            if self.is_near(place.producer_ns, self.producer_end_ns) {
+                return MessageFate::InFlight;
+            }
+            return match stamp(egress.handed_ns) {
+                Some(_) => MessageFate::LostOnWire,
+                None => MessageFate::Unexplained,
+            };
+        }
+        if self.files.egress.is_none() {
+            return MessageFate::UnknownPeerRecordsUnavailable;
+        }
+        if self.last_egress.is_some_and(|last| joined.key < last) {
+            return MessageFate::SupersededAtInput;
+        }
+        self.in_flight_or_unexplained(place.producer_ns, self.producer_end_ns)
+    }
+
+    fn fate_after_reception(&self, joined: &Joined<'_>, ingress: &IngressRecord) -> MessageFate {
+        if let Some(forwarded_ns) = stamp(ingress.forwarded_ns) {
+            return self.fate_at_consumer(joined, Some(forwarded_ns), self.consumer_end_ns);
+        }
+        if ingress.flags & IngressRecord::LATE != 0 {
+            MessageFate::Late
+        } else if ingress.flags & IngressRecord::DUPLICATE != 0 {
+            MessageFate::Duplicate
+        } else {
+            MessageFate::RefusedAtIngress
+        }
+    }
+
+    fn fate_at_consumer(
+        &self,
+        joined: &Joined<'_>,
+        arrived_ns: Option<i64>,
+        end_ns: Option<i64>,
+    ) -> MessageFate {
+        if self.files.taken.is_none() {
+            return MessageFate::UnknownPeerRecordsUnavailable;
+        }
+        if self.last_taken.is_some_and(|last| joined.key < last) {
+            return MessageFate::SupersededAtConsumer;
+        }
+        self.in_flight_or_unexplained(arrived_ns, end_ns)
+    }
+
+    fn in_flight_or_unexplained(&self, at_ns: Option<i64>, end_ns: Option<i64>) -> MessageFate {
+        if self.is_near(at_ns, end_ns) {
+            MessageFate::InFlight
+        } else {
+            MessageFate::Unexplained
+        }
+    }
+
+    fn is_near(&self, at_ns: Option<i64>, end_ns: Option<i64>) -> bool {
+        let Some((at_ns, end_ns)) = at_ns.zip(end_ns) else {
+            return false;
+        };
+        at_ns >= end_ns.saturating_sub(self.flight_ns)
+    }
+
+    /// True when the message could have been in or before the interrupted process.
+    fn is_within_reach(&self, joined: &Joined<'_>, interruption: &Interruption) -> bool {
+        if !self.is_gateway {
+            return true;
+        }
+        let never_left =
+            self.files.egress.is_some() && joined.egress.is_none() && joined.ingress.is_none();
+        let is_forwarded = joined
+            .ingress
+            .is_some_and(|ingress| stamp(ingress.forwarded_ns).is_some());
+        match interruption.place {
+            PathProcess::Producer => joined.egress.is_none() && joined.ingress.is_none(),
+            PathProcess::SendingGateway => joined.ingress.is_none(),
+            PathProcess::ReceivingGateway => !never_left,
+            PathProcess::Consumer => is_forwarded || (self.files.ingress.is_none() && !never_left),
+        }
+    }
+
+    /// True when the message was last seen while the process was down, or shortly before and
+    /// nothing recorded says that it got lost otherwise.
+    fn is_hit(&self, fate: MessageFate, place: Place, interruption: &Interruption) -> bool {
+        let Some(at_ns) = self.position(place, interruption.place.side()) else {
+            return false;
+        };
+        let (from_ns, until_ns) = (interruption.from.as_ns(), interruption.until.as_ns());
+        if (from_ns..=until_ns).contains(&at_ns) {
+            return true;
+        }
+        let may_have_been_inside = match fate {
+            MessageFate::LostOnWire | MessageFate::Unexplained | MessageFate::InFlight => true,
+            MessageFate::SupersededAtInput => interruption.place == PathProcess::SendingGateway,
+            MessageFate::SupersededAtConsumer => interruption.place == PathProcess::Consumer,
+            _ => false,
+        };
+        may_have_been_inside && (from_ns.saturating_sub(self.flight_ns)..from_ns).contains(&at_ns)
+    }
+
+    /// When the message was last seen, on the clock of one host.
+    fn position(&self, place: Place, side: Side) -> Option<i64> {
+        match side {
+            Side::Producer => place.producer_ns.or(self.previous_producer_ns),
+            Side::Consumer => place
+                .consumer_ns
+                .or_else(|| localise(self.alignment, place.producer_ns?))
+                .or(self.previous_consumer_ns),
+        }
+    }
+}
+
+fn localise(alignment: Option<Alignment>, producer_ns: i64) -> Option<i64> {
+    let here: Instant = alignment?.localise(RemoteInstant::from_ns(producer_ns));
+    Some(here.as_ns())
+}
+
+/// The last instants at which a message was seen on each host.
+#[derive(Debug, Clone, Copy)]
+struct Place {
+    producer_ns: Option<i64>,
+    consumer_ns: Option<i64>,
+}
+
+impl Place {
+    fn of(joined: &Joined<'_>) -> Self {
+        let published = joined
+            .published
+            .and_then(|record| stamp(record.published_ns));
+        let egress = joined.egress.and_then(|record| {
+            stamp(record.handed_ns)
+                .or(stamp(record.taken_ns))
+                .or(stamp(record.published_ns))
+        });
+        let sender = joined
+            .ingress
+            .and_then(|record| stamp(record.handed_ns).or(stamp(record.published_ns)));
+        let arrived = joined
+            .ingress
+            .and_then(|record| stamp(record.forwarded_ns).or(stamp(record.received_ns)));
+        let origin = joined.taken.and_then(|record| stamp(record.published_ns));
+        let taken = joined.taken.and_then(|record| stamp(record.taken_ns));
+        Self {
+            producer_ns: egress.or(sender).or(published).or(origin),
+            consumer_ns: taken.or(arrived),
+        }
+    }
+}

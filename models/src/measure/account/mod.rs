@@ -1,0 +1,257 @@
+//! The latency account of one channel: what became of every message, where its time went, and
+//! whether the parts add up to the whole. It reads records, not files, and it knows nothing of
+//! sockets or shared memory.
+//!
+//! Each message goes *published → taken by gateway → handed to kernel → TX stamp → RX stamp →
+//! received by gateway → forwarded → taken by consumer*. On one clock the wire segment is the
+//! difference of the two raw kernel stamps, while the segments beside it are converted to the
+//! monotonic clock with the offset each gateway read at its own time. So the sum of segments
+//! equals end-to-end only when records, stamps and both offsets agree: the closing check can
+//! fail, which is what makes it worth printing.
+
+mod fate;
+mod figures;
+mod gaps;
+mod join;
+mod segments;
+mod stage;
+#[cfg(test)]
+mod synthetic;
+#[cfg(test)]
+mod tests;
+
+use core::time::Duration;
+
+pub use figures::{
+    BurstCount, ChannelAccount, Closing, ClosingFigures, Coverage, EndToEnd, FateCounts, Gap, Gaps,
+    InterruptionFigures, SegmentFigures, StampCoverage,
+};
+pub use stage::{MessageFate, Side, Stage};
+
+use crate::measure::histogram::LatencyHistogram;
+use crate::measure::record::{
+    EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, TakenRecord,
+};
+use crate::random::RandomStream;
+use crate::time::{Alignment, Instant};
+
+/// Largest difference between end-to-end and the sum of segments for a message that closes.
+pub const RESIDUAL_LIMIT_NS: i64 = 1_000;
+
+/// How far a stage may lie before its predecessor: two clocks of one host are read as a pair
+/// with an error below this.
+pub const ORDER_TOLERANCE_NS: i64 = 1_000;
+
+/// How long a message may travel before it counts as lost instead of in flight, unless the
+/// caller knows better.
+pub const FLIGHT_TIME_MAX: Duration = Duration::from_millis(50);
+
+/// The record files of one channel. `None` means the file is not at hand, which differs from an
+/// empty one: nothing is concluded from the absence of a record in an absent file.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct ChannelRecords<'a> {
+    /// The producer's.
+    pub published: Option<&'a [PublishedRecord]>,
+    /// The sending gateway's.
+    pub egress: Option<&'a [EgressRecord]>,
+    /// The receiving gateway's.
+    pub ingress: Option<&'a [IngressRecord]>,
+    /// Transmit stamps the sender reported to the receiver.
+    pub follow_up: Option<&'a [FollowUpRecord]>,
+    /// The consumer's.
+    pub taken: Option<&'a [TakenRecord]>,
+}
+
+/// How a channel gets from its producer to its consumer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ChannelPath {
+    /// Shared memory of one host.
+    SharedMemory,
+    /// A gateway pair.
+    Gateway {
+        /// From the producer's host clock to the consumer's; [`Alignment::SAME_CLOCK`] on one
+        /// machine, `None` when the clocks are not aligned.
+        alignment: Option<Alignment>,
+    },
+}
+
+impl ChannelPath {
+    const fn alignment(self) -> Option<Alignment> {
+        match self {
+            Self::SharedMemory => Some(Alignment::SAME_CLOCK),
+            Self::Gateway { alignment } => alignment,
+        }
+    }
+
+    const fn is_gateway(self) -> bool {
+        matches!(self, Self::Gateway { .. })
+    }
+}
+
+/// A process on a channel's way.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum PathProcess {
+    /// Publishes the messages.
+    Producer,
+    /// Takes them to the network, on the producer's host.
+    SendingGateway,
+    /// Takes them from the network, on the consumer's host.
+    ReceivingGateway,
+    /// Takes the messages.
+    Consumer,
+}
+
+impl PathProcess {
+    /// The host it runs on.
+    pub const fn side(self) -> Side {
+        match self {
+            Self::Producer | Self::SendingGateway => Side::Producer,
+            Self::ReceivingGateway | Self::Consumer => Side::Consumer,
+        }
+    }
+}
+
+/// A time during which a process on the way was down.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Interruption {
+    /// Its name in the topology.
+    pub process: String,
+    /// Its place on this channel's way.
+    pub place: PathProcess,
+    /// When it went down, on the clock of its own host.
+    pub from: Instant,
+    /// When it worked again, or the end of the run, on the clock of its own host.
+    pub until: Instant,
+    /// Why, e.g. `killed by signal 9`.
+    pub cause: String,
+}
+
+/// The run on one host's clock.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct RunSpan {
+    /// First instant of the run.
+    pub start: Instant,
+    /// Last instant of the run.
+    pub end: Instant,
+}
+
+/// What the records alone do not say.
+#[derive(Debug, Clone, Copy)]
+pub struct AccountContext<'a> {
+    /// How the channel is carried.
+    pub path: ChannelPath,
+    /// Interruptions of processes on this channel's way.
+    pub interruptions: &'a [Interruption],
+    /// The run on the producer's host clock, if known.
+    pub producer_run: Option<RunSpan>,
+    /// The run on the consumer's host clock, if known.
+    pub consumer_run: Option<RunSpan>,
+    /// Longest time a message may travel; see [`FLIGHT_TIME_MAX`]. Messages seen last within
+    /// this time of the end of the run count as in flight, and those seen last within this time
+    /// before an interruption count as lost in it.
+    pub flight_time_max: Duration,
+    /// True when both network cards take their stamps from one hardware clock.
+    pub cards_share_clock: bool,
+    /// Round trips of the gateways' clock exchange, nanoseconds.
+    pub round_trips_ns: &'a [i64],
+    /// Seed of the run, for the bootstrap intervals.
+    pub seed: u64,
+}
+
+impl<'a> AccountContext<'a> {
+    /// The context of a channel about whose run nothing else is known.
+    pub const fn new(path: ChannelPath) -> Self {
+        Self {
+            path,
+            interruptions: &[],
+            producer_run: None,
+            consumer_run: None,
+            flight_time_max: FLIGHT_TIME_MAX,
+            cards_share_clock: false,
+            round_trips_ns: &[],
+            seed: 0,
+        }
+    }
+
+    /// The same with these interruptions.
+    #[must_use]
+    pub const fn with_interruptions(mut self, interruptions: &'a [Interruption]) -> Self {
+        self.interruptions = interruptions;
+        self
+    }
+}
+
+/// Draws up the account of one channel. Time and memory grow with the number of records.
+///
+/// # Panics
+/// Never for any records; it asserts its own invariant, that the fates sum to the published
+/// count.
+pub fn account(records: &ChannelRecords<'_>, context: &AccountContext<'_>) -> ChannelAccount {
+    let records = if context.path.is_gateway() {
+        *records
+    } else {
+        ChannelRecords {
+            egress: None,
+            ingress: None,
+            follow_up: None,
+            ..*records
+        }
+    };
+    let join = join::Join::new(&records);
+    let producer_restart_count = join.epoch_count().saturating_sub(1);
+    let mut judge = fate::Judge::new(&records, context, &join);
+    let mut book = segments::SegmentBook::new(&records, context);
+    let mut bursts = gaps::Bursts::default();
+    let mut fates = FateCounts::default();
+    let mut published_count = 0_u64;
+    for joined in join {
+        let fate = judge.judge(&joined);
+        fates.add(fate, joined.count);
+        bursts.count(joined.key, fate, joined.count);
+        book.count(&joined);
+        published_count = published_count.saturating_add(joined.count);
+    }
+    assert_eq!(
+        fates.total(),
+        published_count,
+        "every published message has exactly one fate"
+    );
+    let (gaps, gap_of_interruption) = gaps::gaps(&records, context);
+    let mut random = RandomStream::new(context.seed, "measure.account.bootstrap");
+    ChannelAccount {
+        published_count,
+        published_unrecorded_count: records
+            .published
+            .map(|published| published_count.saturating_sub(published.len() as u64)),
+        producer_restart_count,
+        fates,
+        reordered_count: flag_count(&records, IngressRecord::REORDERED),
+        duplicated_count: flag_count(&records, IngressRecord::DUPLICATE),
+        late_count: flag_count(&records, IngressRecord::LATE),
+        segments: book.segments(),
+        hardware_wire: book.hardware_wire(),
+        end_to_end: book.end_to_end(&mut random),
+        closing: book.closing(),
+        coverage: book.coverage(),
+        round_trip: round_trip(context),
+        loss_bursts: bursts.finish(),
+        gaps,
+        interruptions: judge.interruptions(&gap_of_interruption),
+    }
+}
+
+fn flag_count(records: &ChannelRecords<'_>, flag: u32) -> Option<u64> {
+    let flagged = records
+        .ingress?
+        .iter()
+        .filter(|record| record.flags & flag != 0);
+    Some(flagged.count() as u64)
+}
+
+fn round_trip(context: &AccountContext<'_>) -> crate::measure::histogram::Distribution {
+    let mut histogram = LatencyHistogram::default();
+    for round_trip_ns in context.round_trips_ns {
+        histogram.record(*round_trip_ns);
+    }
+    histogram.distribution("no clock exchange took place")
+}

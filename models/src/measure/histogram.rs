@@ -1,0 +1,262 @@
+//! A histogram of nanoseconds with three significant digits. Negative values, which only wrong
+//! or unaligned clocks produce, are kept and counted apart, never clipped to zero.
+
+use hdrhistogram::Histogram;
+use serde::{Deserialize, Serialize};
+
+use crate::measure::special::ceil_count;
+
+/// Digits a recorded value keeps: a quantile is right within 0.1 %.
+const SIGNIFICANT_DIGITS: u8 = 3;
+
+/// Counts of durations. Recording may allocate when a value is larger than any before, so it
+/// belongs beside the measured path, not on it.
+#[derive(Debug, Clone)]
+pub struct LatencyHistogram {
+    positive: Histogram<u64>,
+    /// Magnitudes below zero; most histograms never need it.
+    negative: Option<Histogram<u64>>,
+    min_ns: i64,
+    max_ns: i64,
+    sum_ns: i128,
+}
+
+impl Default for LatencyHistogram {
+    fn default() -> Self {
+        Self {
+            positive: empty(),
+            negative: None,
+            min_ns: i64::MAX,
+            max_ns: i64::MIN,
+            sum_ns: 0,
+        }
+    }
+}
+
+fn empty() -> Histogram<u64> {
+    Histogram::new(SIGNIFICANT_DIGITS).expect("three digits are within 0..=5")
+}
+
+impl LatencyHistogram {
+    /// Counts one value.
+    #[allow(
+        clippy::missing_panics_doc,
+        reason = "an auto-resizing histogram holds every 64-bit value"
+    )]
+    pub fn record(&mut self, value_ns: i64) {
+        let histogram = if value_ns < 0 {
+            self.negative.get_or_insert_with(empty)
+        } else {
+            &mut self.positive
+        };
+        histogram
+            .record(value_ns.unsigned_abs())
+            .expect("an auto-resizing histogram holds every 64-bit value");
+        self.min_ns = self.min_ns.min(value_ns);
+        self.max_ns = self.max_ns.max(value_ns);
+        self.sum_ns += i128::from(value_ns);
+    }
+
+    /// Adds every value of `other`.
+    #[allow(
+        clippy::missing_panics_doc,
+        reason = "an auto-resizing histogram holds every 64-bit value"
+    )]
+    pub fn merge(&mut self, other: &Self) {
+        const RESIZES: &str = "an auto-resizing histogram holds every 64-bit value";
+        self.positive.add(&other.positive).expect(RESIZES);
+        if let Some(negative) = &other.negative {
+            let own = self.negative.get_or_insert_with(empty);
+            own.add(negative).expect(RESIZES);
+        }
+        self.min_ns = self.min_ns.min(other.min_ns);
+        self.max_ns = self.max_ns.max(other.max_ns);
+        self.sum_ns += other.sum_ns;
+    }
+
+    /// How many values were recorded.
+    pub fn count(&self) -> u64 {
+        self.positive.len() + self.negative_count()
+    }
+
+    /// How many of them were below zero.
+    pub fn negative_count(&self) -> u64 {
+        self.negative.as_ref().map_or(0, Histogram::len)
+    }
+
+    /// The smallest value that at least `quantile` (0..=1) of all values do not exceed, within
+    /// 0.1 %; `None` when empty.
+    pub fn quantile(&self, quantile: f64) -> Option<i64> {
+        let count = self.count();
+        if count == 0 {
+            return None;
+        }
+        let rank = (ceil_count(quantile * count as f64) as u64).clamp(1, count);
+        let negative_count = self.negative_count();
+        let value = match &self.negative {
+            // Ranks count from the most negative, magnitudes from the least.
+            Some(negative) if rank <= negative_count => {
+                -signed(at_rank(negative, negative_count - rank + 1))
+            }
+            _ => signed(at_rank(&self.positive, rank - negative_count)),
+        };
+        Some(value.clamp(self.min_ns, self.max_ns))
+    }
+
+    /// The figures a report prints; `None` when empty.
+    pub fn summary(&self) -> Option<LatencySummary> {
+        Some(LatencySummary {
+            count: self.count(),
+            negative_count: self.negative_count(),
+            min_ns: self.quantile(0.0).map(|_| self.min_ns)?,
+            p50_ns: self.quantile(0.5)?,
+            p90_ns: self.quantile(0.9)?,
+            p99_ns: self.quantile(0.99)?,
+            p999_ns: self.quantile(0.999)?,
+            max_ns: self.max_ns,
+            mean_ns: self.sum_ns as f64 / self.count() as f64,
+        })
+    }
+
+    /// The figures, or `reason` when there is nothing to summarise.
+    pub fn distribution(&self, reason: &str) -> Distribution {
+        self.summary()
+            .map_or_else(|| Distribution::unavailable(reason), Distribution::Measured)
+    }
+}
+
+fn signed(magnitude: u64) -> i64 {
+    i64::try_from(magnitude).unwrap_or(i64::MAX)
+}
+
+fn at_rank(histogram: &Histogram<u64>, rank: u64) -> u64 {
+    // Half a rank below, so that rounding cannot reach the next one.
+    histogram.value_at_quantile((rank as f64 - 0.5) / histogram.len() as f64)
+}
+
+/// The figures of one histogram. Minimum and maximum are exact, quantiles within 0.1 %.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct LatencySummary {
+    /// Values recorded.
+    pub count: u64,
+    /// Values below zero among them: a sign of wrong clocks.
+    pub negative_count: u64,
+    /// Smallest.
+    pub min_ns: i64,
+    /// Median.
+    pub p50_ns: i64,
+    /// 90th percentile.
+    pub p90_ns: i64,
+    /// 99th percentile.
+    pub p99_ns: i64,
+    /// 99.9th percentile.
+    pub p999_ns: i64,
+    /// Largest.
+    pub max_ns: i64,
+    /// Arithmetic mean.
+    pub mean_ns: f64,
+}
+
+/// Figures, or why there are none.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "state", rename_all = "snake_case")]
+pub enum Distribution {
+    /// At least one value was measured.
+    Measured(LatencySummary),
+    /// Nothing could be measured.
+    Unavailable {
+        /// Why, in words for a report.
+        reason: String,
+    },
+}
+
+impl Distribution {
+    /// No figures because of `reason`.
+    pub fn unavailable(reason: &str) -> Self {
+        Self::Unavailable {
+            reason: reason.to_owned(),
+        }
+    }
+
+    /// The figures, if any.
+    pub const fn measured(&self) -> Option<&LatencySummary> {
+        match self {
+            Self::Measured(summary) => Some(summary),
+            Self::Unavailable { .. } => None,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::random::RandomStream;
+
+    #[test]
+    fn quantiles_agree_with_sorting_within_a_thousandth() {
+        let mut stream = RandomStream::new(2, "histogram");
+        let mut values: Vec<i64> = (0..5_001)
+            .map(|_| (stream.next_u64() >> (24 + stream.next_u64() % 30)).cast_signed() - 5_000)
+            .collect();
+        let mut histogram = LatencyHistogram::default();
+        for value in &values {
+            histogram.record(*value);
+        }
+        values.sort_unstable();
+        for quantile in [0.001, 0.1, 0.25, 0.5, 0.9, 0.99, 0.999, 1.0] {
+            let index = ceil_count(quantile * 5_001.0) - 1;
+            let (expected, actual) = (values[index], histogram.quantile(quantile).unwrap());
+            let error = (actual - expected).abs() as f64;
+            assert!(
+                error <= 1e-3 * expected.abs() as f64 + 1.0,
+                "{actual} is not {expected}"
+            );
+        }
+        let summary = histogram.summary().unwrap();
+        assert_eq!((summary.min_ns, summary.max_ns), (values[0], values[5_000]));
+    }
+
+    #[test]
+    fn negative_values_are_kept_and_counted_apart() {
+        let mut histogram = LatencyHistogram::default();
+        for value in [-30, -20, -10, 5, 7] {
+            histogram.record(value);
+        }
+        let summary = histogram.summary().unwrap();
+        assert_eq!((summary.count, summary.negative_count), (5, 3));
+        assert_eq!(
+            (summary.min_ns, summary.p50_ns, summary.max_ns),
+            (-30, -10, 7)
+        );
+        assert!((summary.mean_ns + 9.6).abs() < 1e-9);
+    }
+
+    #[test]
+    fn an_empty_histogram_is_unavailable_not_zero() {
+        let histogram = LatencyHistogram::default();
+        assert_eq!(histogram.summary(), None);
+        let none = histogram.distribution("no message arrived");
+        assert_eq!(none, Distribution::unavailable("no message arrived"));
+        assert_eq!(none.measured(), None);
+    }
+
+    #[test]
+    fn merging_equals_recording_everything_in_one() {
+        let (mut left, mut right, mut both) = Default::default();
+        let all = [&mut left, &mut right, &mut both];
+        let [left, right, both]: [&mut LatencyHistogram; 3] = all;
+        for value in -500_i64..40_000 {
+            if value % 3 == 0 {
+                &mut *left
+            } else {
+                &mut *right
+            }
+            .record(value * 97);
+            both.record(value * 97);
+        }
+        left.merge(right);
+        assert_eq!(left.summary(), both.summary());
+        left.merge(&LatencyHistogram::default());
+        assert_eq!(left.summary(), both.summary());
+    }
+}
