@@ -1,0 +1,166 @@
+//! The clocks of this host: which counter, what a read costs, and who steers the time of day. It
+//! does not compare the host with another; that is the gateways' alignment.
+
+use std::hint::black_box;
+
+use super::{Finding, State};
+use crate::clock::MonotonicClock;
+use crate::host_facts::{Fact, HostFiles};
+use crate::realtime::{ClockDiscipline, clock_discipline};
+
+/// A vDSO read stays below this on any PC of the last ten years.
+const READ_COST_NS_GOOD: f64 = 100.0;
+/// Above this the read is a system call, as long as a shared-memory hop.
+const READ_COST_NS_BAD: f64 = 1000.0;
+
+pub(crate) fn examine(files: &HostFiles) -> Vec<Finding> {
+    vec![
+        clocksource(files),
+        read_cost(cheapest_read_ns()),
+        synchronisation(),
+    ]
+}
+
+fn clocksource(files: &HostFiles) -> Finding {
+    let (id, title) = ("clocksource", "Clock source");
+    let path = "/sys/devices/system/clocksource/clocksource0/current_clocksource";
+    match files.read(path) {
+        Fact::Available(name) => {
+            // These are read in user space through the vDSO; any other is a system call.
+            let is_fast = [
+                "tsc",
+                "arch_sys_counter",
+                "kvm-clock",
+                "hyperv_clocksource_tsc_page",
+            ]
+            .contains(&name.as_str());
+            Finding::note_unless(is_fast, id, title, name)
+                .because("reads are system calls, and the kernel may have found the TSC unstable")
+                .fixed_by("look for `clocksource` in dmesg; boot with tsc=reliable if it is")
+                .quiet_when_good()
+        }
+        Fact::Unavailable(reason) => Finding::unknown(id, title, &reason),
+    }
+}
+
+/// The cheapest of 20 batches: the cost itself, with the scheduler's interruptions left out.
+fn cheapest_read_ns() -> f64 {
+    const READ_COUNT: u32 = 5000;
+    (0..20)
+        .map(|_| {
+            let start = MonotonicClock::now();
+            for _ in 0..READ_COUNT {
+                black_box(MonotonicClock::now());
+            }
+            MonotonicClock::now().ns_since(start) as f64 / f64::from(READ_COUNT)
+        })
+        .fold(f64::INFINITY, f64::min)
+}
+
+fn read_cost(cost_ns: f64) -> Finding {
+    let state = if cost_ns < READ_COST_NS_GOOD {
+        State::Good
+    } else if cost_ns < READ_COST_NS_BAD {
+        State::Note
+    } else {
+        State::Problem
+    };
+    Finding::new(
+        "clock_read_cost",
+        "Cost of a clock read",
+        state,
+        format!("{cost_ns:.0} ns"),
+    )
+    .because("every stamp of a message pays it, several times per hop")
+    .fixed_by("use the tsc clocksource; build with optimisation")
+    .quiet_when_good()
+}
+
+fn synchronisation() -> Finding {
+    match clock_discipline() {
+        Ok(discipline) => judge_discipline(&discipline),
+        Err(errno) => Finding::unknown(
+            "clock_synchronisation",
+            "Time of day against a reference",
+            &format!("adjtimex: {errno}"),
+        ),
+    }
+}
+
+fn judge_discipline(discipline: &ClockDiscipline) -> Finding {
+    let (id, title) = ("clock_synchronisation", "Time of day against a reference");
+    let value = format!(
+        "{}, claimed error {} us, estimate {} us, rate {:+} ppb",
+        if discipline.is_synchronised {
+            "synchronised"
+        } else {
+            "not synchronised"
+        },
+        discipline.max_error_us,
+        discipline.estimated_error_us,
+        discipline.frequency_ppb
+    );
+    if discipline.is_synchronised {
+        // ptp4l and phc2sys leave maxerror alone or write a constant into it.
+        let why = "the claimed error is the daemon's word: chronyd and ntpd keep it, ptp4l and \
+                   phc2sys do not, so it is no bound under PTP";
+        return Finding::good(id, title, value).because(why);
+    }
+    Finding::note(id, title, value)
+        .because(
+            "one-way delays to another host then rest on the runtime's own probe exchange alone, \
+             and kernel receive stamps jump if a daemon steps the clock during a run",
+        )
+        .fixed_by(
+            "run chronyd, or ptp4l with phc2sys, on both hosts, and wait until it has settled",
+        )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::host_facts::FakeHost;
+
+    #[test]
+    fn a_slow_counter_is_noted() {
+        let path = "/sys/devices/system/clocksource/clocksource0/current_clocksource";
+        for (name, expected) in [("tsc", State::Good), ("hpet", State::Note)] {
+            let host = FakeHost::with(&[(path, name)]);
+            assert_eq!(clocksource(&host.files()).state, expected, "{name}");
+        }
+    }
+
+    #[test]
+    fn the_read_cost_is_judged_by_its_class() {
+        for (cost_ns, expected) in [
+            (25.0, State::Good),
+            (400.0, State::Note),
+            (15_000.0, State::Problem),
+        ] {
+            assert_eq!(read_cost(cost_ns).state, expected);
+        }
+        assert!(cheapest_read_ns() > 0.0);
+    }
+
+    #[test]
+    fn a_claimed_error_is_never_called_a_bound() {
+        let discipline = ClockDiscipline {
+            is_synchronised: true,
+            max_error_us: 16,
+            estimated_error_us: 3,
+            frequency_ppb: -1200,
+        };
+        let finding = judge_discipline(&discipline);
+        assert_eq!(finding.state, State::Good);
+        assert_eq!(
+            finding.value,
+            "synchronised, claimed error 16 us, estimate 3 us, rate -1200 ppb"
+        );
+        assert!(finding.why.contains("no bound under PTP"));
+        let loose = ClockDiscipline {
+            is_synchronised: false,
+            ..discipline
+        };
+        assert_eq!(judge_discipline(&loose).state, State::Note);
+    }
+}
