@@ -1,9 +1,122 @@
-//! The topology file: hosts, processes, channels and links in TOML.
+//! The topology file: hosts, processes, channels and links in TOML, read, checked, and written
+//! back. It starts nothing and opens no socket.
+//!
+//! Reading goes in steps, each in its own file: [`load`] joins the `extends` chain and the
+//! overrides into one tree whose every key remembers its place (`layers`, `tree`); each table is
+//! read by itself (`reader`, `file`); then the tables are checked against each other (`check`)
+//! and become a [`Topology`]. Bounds of numbers are in `limits` alone. Whatever is wrong is
+//! collected with file, line and column into [`TopologyErrors`].
+//!
+//! A program registers its case studies in [`KnownCases`]; [`which_host`] says which host of the
+//! topology this machine is; [`ProcessCard`] is all that a process is told.
 
+mod card;
+mod check;
+mod check_channels;
+mod errors;
+mod file;
+mod file_links;
+mod host;
+mod known;
+mod layers;
+mod limits;
 mod model;
+mod reader;
+mod resolved;
+mod suggest;
+mod tree;
+mod units;
 
+use std::path::Path;
+
+pub use card::{CardChannel, ProcessCard};
+pub use errors::{Fault, Location, TopologyError, TopologyErrors};
+pub use host::{HOST_VARIABLE, HostChoice, HostError, MachineIdentity, which_host};
+pub use known::{KnownCase, KnownCases, ParameterCheck, ParameterFault, parameters_of};
 pub use model::{
     Case, Channel, ChannelPorts, Crossing, Direction, Emulation, Execution, Gateway, Hop, Host,
     Impairment, Link, MessageLayout, OnExit, Process, Program, Run, Scheduling, Timestamps,
     Topology, Via, Wait,
 };
+
+use errors::Place;
+use layers::Layers;
+
+/// Reads the topology file at `path` and all it extends, lays the `overrides` (each
+/// `key.path=value`) over it, and checks the result against the cases the program knows.
+///
+/// # Errors
+/// Everything that is wrong, each with file, line, column and key.
+pub fn load(
+    path: &Path,
+    overrides: &[String],
+    known: &KnownCases,
+) -> Result<Topology, TopologyErrors> {
+    read_and_check(path, None, overrides, known)
+}
+
+/// Like [`load`], but from a text; `name` stands in error messages, and what the text extends is
+/// looked for beside it.
+///
+/// # Errors
+/// As [`load`].
+///
+/// ```
+/// use hil_models::shuttle::Shuttle;
+/// use hil_runtime::topology::{KnownCases, parse};
+///
+/// let text = r#"
+/// version = 1
+/// name = "shuttle"
+/// case.name = "shuttle"
+/// processes.controller.role = "controller"
+/// processes.robot.role = "robot"
+/// "#;
+/// let known = KnownCases::new().with::<Shuttle>();
+/// let topology = parse("shuttle.toml", text, &[], &known).unwrap();
+/// assert_eq!(topology.channels().len(), 2);
+///
+/// let wrong = parse("shuttle.toml", text, &["run.duratoin=4 s".to_owned()], &known);
+/// assert!(wrong.unwrap_err().to_string().contains("did you mean `duration`?"));
+/// ```
+pub fn parse(
+    name: &str,
+    text: &str,
+    overrides: &[String],
+    known: &KnownCases,
+) -> Result<Topology, TopologyErrors> {
+    read_and_check(Path::new(name), Some(text.to_owned()), overrides, known)
+}
+
+fn read_and_check(
+    path: &Path,
+    text: Option<String>,
+    overrides: &[String],
+    known: &KnownCases,
+) -> Result<Topology, TopologyErrors> {
+    let mut layers = Layers::default();
+    let Some(mut table) = layers.read(path, text) else {
+        return Err(layers.faults.into_errors(layers.sources));
+    };
+    for text in overrides {
+        layers.lay_override(&mut table, text);
+    }
+    // The first source is the file that was asked for; what is missing is missing there.
+    let top = Place {
+        source_index: 0,
+        start: 0,
+        end: 0,
+    };
+    let topology = {
+        let file = file::read(&table, top, &layers.faults);
+        check::check(file, known, &layers.faults)
+    };
+    if layers.faults.is_empty() {
+        Ok(topology)
+    } else {
+        Err(layers.faults.into_errors(layers.sources))
+    }
+}
+
+#[cfg(test)]
+mod tests;

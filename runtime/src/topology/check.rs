@@ -1,0 +1,287 @@
+//! What the tables say about each other: hosts and processes. Channels and links follow in
+//! `check_channels`. Nothing is read here; the result is the checked topology.
+
+use super::check_channels;
+use super::errors::{Fault, Faults, Place};
+use super::file::{CaseEntry, File, HostEntry, ProcessEntry};
+use super::known::{KnownCase, KnownCases, ParameterFault};
+use super::limits;
+use super::model::{Case, Host, Process, Program, Topology};
+use super::reader::At;
+use super::tree::{Node, Table, Value, join, to_plain_table};
+
+/// Name of the host of a file without `[hosts]`.
+const IMPLICIT_HOST: &str = "local";
+
+/// Checks `file`; the result is meaningless if `faults` is not empty afterwards.
+pub(super) fn check(file: File<'_>, known: &KnownCases, faults: &Faults) -> Topology {
+    let case_entry = file.case.as_ref();
+    let known_case = case_entry.and_then(|entry| find_case(entry, known, faults));
+    let case = match (case_entry, known_case) {
+        (Some(entry), Some(known)) => check_case(entry, known, file.run.seed, faults),
+        _ => None,
+    };
+    let hosts = check_hosts(file.hosts, faults);
+    let roles = Roles {
+        known: known_case,
+        has_case: case_entry.is_some(),
+    };
+    if file.processes.is_empty() {
+        let hint = "a topology has at least one [processes.<name>]";
+        faults.add(
+            "processes",
+            Some(file.place),
+            Fault::Missing(hint.to_owned()),
+        );
+    }
+    let processes = check_processes(&file.processes, &hosts, &roles, faults);
+    if let (Some(entry), Some(known)) = (case_entry, known_case) {
+        check_every_role_is_played(known, &processes, entry.place, faults);
+    }
+    let mut topology = Topology {
+        name: file.name,
+        run: file.run,
+        case,
+        hosts,
+        processes,
+        channels: Vec::new(),
+        links: Vec::new(),
+    };
+    // Without the case, its channels would look like foreign ones.
+    if known_case.is_some() || case_entry.is_none() {
+        let tables = check_channels::Tables {
+            channels: &file.channels,
+            processes: &file.processes,
+        };
+        check_channels::check(&mut topology, known_case, tables, file.links, faults);
+    }
+    topology
+}
+
+fn find_case<'k>(
+    entry: &CaseEntry<'_>,
+    known: &'k KnownCases,
+    faults: &Faults,
+) -> Option<&'k KnownCase> {
+    let allowed = || known.names().map(str::to_owned).collect::<Vec<_>>();
+    let Some(name) = &entry.name else {
+        let fault = Fault::Missing(format!("one of {}", super::suggest::listed(&allowed())));
+        faults.add("case.name", Some(entry.place), fault);
+        return None;
+    };
+    let case = known.get(&name.value);
+    if case.is_none() {
+        let fault = Fault::UnknownWord {
+            value: name.value.clone(),
+            expected: "a case study of this program",
+            allowed: allowed(),
+        };
+        faults.add("case.name", Some(name.place), fault);
+    }
+    case
+}
+
+fn check_case(
+    entry: &CaseEntry<'_>,
+    known: &KnownCase,
+    seed: u64,
+    faults: &Faults,
+) -> Option<Case> {
+    let empty = Table::new();
+    let table = entry.parameters.unwrap_or(&empty);
+    match (known.check_parameters)(&to_plain_table(table), seed) {
+        Ok(parameters) => Some(Case {
+            name: known.name.to_owned(),
+            parameters,
+        }),
+        Err(found) => {
+            for fault in found {
+                add_parameter_fault(fault, table, entry.place, faults);
+            }
+            None
+        }
+    }
+}
+
+/// Finds the line of a parameter; a parameter left at its default has none, then the case's.
+fn add_parameter_fault(fault: ParameterFault, table: &Table, place: Place, faults: &Faults) {
+    let mut path = "case.parameters".to_owned();
+    let mut below = Some(table);
+    let mut deepest: Option<&Node> = None;
+    for key in &fault.key {
+        path = join(&path, key);
+        let Some(node) = below.and_then(|table| table.get(key)) else {
+            break;
+        };
+        deepest = Some(node);
+        below = match &node.value {
+            Value::Table(table) => Some(table),
+            _ => None,
+        };
+    }
+    let place = deepest.map_or(place, |node| {
+        if fault.is_unknown_key {
+            node.key_place
+        } else {
+            node.place
+        }
+    });
+    let fault = if fault.is_unknown_key {
+        Fault::UnknownKey {
+            allowed: fault.valid_keys,
+        }
+    } else {
+        Fault::Parameter(fault.message)
+    };
+    faults.add(path, Some(place), fault);
+}
+
+fn check_hosts(entries: Vec<HostEntry>, faults: &Faults) -> Vec<Host> {
+    if entries.is_empty() {
+        return vec![Host {
+            name: IMPLICIT_HOST.to_owned(),
+            address: None,
+            interface: None,
+            control_port: u16::try_from(limits::HOST_CONTROL_PORT.default)
+                .expect("a default port is within 1..=65535"),
+        }];
+    }
+    let with_address = entries.iter().find(|entry| entry.host.address.is_some());
+    let with_address = with_address.map(|entry| entry.host.name.clone());
+    for (index, entry) in entries.iter().enumerate() {
+        let host = &entry.host;
+        let key = join(&entry.path, "address");
+        if let (None, Some(other)) = (host.address, &with_address) {
+            let hint = format!("host `{other}` has one, so every host needs one");
+            faults.add(key, Some(entry.place), Fault::Missing(hint));
+            continue;
+        }
+        let same = |earlier: &&HostEntry| {
+            host.control_address().is_some()
+                && earlier.host.control_address() == host.control_address()
+        };
+        if let Some(earlier) = entries[..index].iter().find(same) {
+            let other = &earlier.host.name;
+            let fault = format!("and control_port are those of host `{other}` already");
+            faults.add(key, Some(entry.place), Fault::Inconsistent(fault));
+        }
+    }
+    entries.into_iter().map(|entry| entry.host).collect()
+}
+
+/// What a process may say as its role.
+struct Roles<'k> {
+    known: Option<&'k KnownCase>,
+    has_case: bool,
+}
+
+fn check_processes(
+    entries: &[ProcessEntry],
+    hosts: &[Host],
+    roles: &Roles<'_>,
+    faults: &Faults,
+) -> Vec<Process> {
+    let mut processes: Vec<Process> = Vec::new();
+    for entry in entries {
+        let role = entry
+            .role
+            .as_ref()
+            .and_then(|role| check_role(entry, role, roles, &processes, faults));
+        let program = match (&entry.command, role) {
+            (Some(command), role) => Program::Command {
+                role,
+                command: command.clone(),
+                environment: entry.environment.clone(),
+            },
+            (None, role) => Program::BuiltIn {
+                role: role.unwrap_or_default(),
+            },
+        };
+        processes.push(Process {
+            name: entry.name.clone(),
+            host: check_host(entry, hosts, faults),
+            program,
+            execution: entry.execution.clone(),
+            on_exit: entry.on_exit,
+        });
+    }
+    processes
+}
+
+fn check_role(
+    entry: &ProcessEntry,
+    role: &At<String>,
+    roles: &Roles<'_>,
+    earlier: &[Process],
+    faults: &Faults,
+) -> Option<String> {
+    let add = |fault| faults.add(join(&entry.path, "role"), Some(role.place), fault);
+    let Some(case) = roles.known else {
+        if !roles.has_case {
+            add(Fault::Inconsistent(format!(
+                "`{}` needs a [case] that has this role",
+                role.value
+            )));
+        }
+        return None;
+    };
+    if !case.roles.contains(&role.value.as_str()) {
+        add(Fault::UnknownWord {
+            value: role.value.clone(),
+            expected: "a role of the case",
+            allowed: case.roles.iter().map(|&role| role.to_owned()).collect(),
+        });
+        return None;
+    }
+    let same = |process: &&Process| process.role() == Some(&role.value);
+    if let Some(other) = earlier.iter().find(same) {
+        let (role, other) = (&role.value, &other.name);
+        add(Fault::Inconsistent(format!(
+            "`{role}` is played by process `{other}` already"
+        )));
+    }
+    Some(role.value.clone())
+}
+
+fn check_host(entry: &ProcessEntry, hosts: &[Host], faults: &Faults) -> String {
+    let names = || {
+        hosts
+            .iter()
+            .map(|host| host.name.clone())
+            .collect::<Vec<_>>()
+    };
+    let key = join(&entry.path, "host");
+    let Some(host) = &entry.host else {
+        if let [only] = hosts {
+            return only.name.clone();
+        }
+        let hint = format!("one of {}", super::suggest::listed(&names()));
+        faults.add(key, Some(entry.place), Fault::Missing(hint));
+        return String::new();
+    };
+    if !hosts.iter().any(|known| known.name == host.value) {
+        let fault = Fault::UnknownWord {
+            value: host.value.clone(),
+            expected: "a host of this file",
+            allowed: names(),
+        };
+        faults.add(key, Some(host.place), fault);
+    }
+    host.value.clone()
+}
+
+fn check_every_role_is_played(
+    case: &KnownCase,
+    processes: &[Process],
+    place: Place,
+    faults: &Faults,
+) {
+    for role in case.roles {
+        let is_played = |process: &Process| process.role() == Some(role);
+        // A role that a faulty process meant to play is not missing.
+        if !processes.iter().any(is_played) && faults.is_empty() {
+            let hint = format!("no process plays role `{role}` of case `{}`", case.name);
+            faults.add("processes", Some(place), Fault::Missing(hint));
+        }
+    }
+}
