@@ -1,6 +1,7 @@
 //! Any receiver behind a link model: it loses and delays real datagrams as the model says, so a
 //! run over an emulated link differs from one over the real link in one object. It reads no
-//! clock and wakes nobody; the caller waits until [`DatagramReceiver::next_due`].
+//! clock, delays no replies (they go the other way) and wakes nobody; the caller waits until
+//! [`DatagramReceiver::next_due`].
 
 use core::cmp::Reverse;
 use core::fmt;

@@ -22,6 +22,8 @@ mod udp_socket;
 #[cfg(test)]
 mod conformance_tests;
 #[cfg(test)]
+mod host_tests;
+#[cfg(test)]
 mod trap_tests;
 
 use core::fmt::Debug;

@@ -2,14 +2,9 @@
 
 use std::net::UdpSocket;
 use std::os::fd::AsFd;
-use std::process::Command;
-use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
-use std::thread;
 use std::time::Duration;
 
 use hil_models::time::Instant;
-use nix::sched::{CpuSet, sched_getaffinity, sched_setaffinity};
-use nix::unistd::{Pid, gettid};
 
 use super::clock_pair::{ClockPair, monotonic_now};
 use super::conformance_tests::{udp_pair, within_bound};
@@ -21,25 +16,42 @@ use super::{DatagramReceiver, DatagramSender, SendRefusal, TxToken};
 const UNDRAINED_SEND_COUNT: u32 = 2000;
 const ARRIVAL_COUNT: u32 = 50;
 
-fn loopback_settings() -> UdpSettings {
+pub(super) fn loopback_settings() -> UdpSettings {
     let address = "127.0.0.1:0".parse().unwrap();
     UdpSettings::new(address, address)
 }
 
-fn sentinel() -> Sentinel {
+pub(super) fn sentinel() -> Sentinel {
     let (report, sentinel) =
         arm_and_probe(&ProbeSettings::loopback(TimestampMode::Software)).unwrap();
     assert_eq!(report.rx_software, Availability::Seen, "{report:?}");
     sentinel
 }
 
-/// Counts what is waiting now; loopback delivers within the send call.
-fn count_arrivals(receiver: &mut dyn DatagramReceiver) -> u32 {
+/// Counts what is waiting now. Loopback mostly delivers within the send call, but a loaded
+/// kernel may do it later.
+pub(super) fn count_waiting(receiver: &mut dyn DatagramReceiver) -> u32 {
     let mut count = 0;
     while let Some(_arrival) = receiver.receive(Instant::ZERO, &mut [0; 64]).unwrap() {
         count += 1;
     }
     count
+}
+
+/// Waits until `expected` have come.
+fn expect_arrivals(receiver: &mut dyn DatagramReceiver, expected: u32) {
+    let mut count = 0;
+    within_bound("arrivals", || {
+        count += count_waiting(receiver);
+        (count >= expected).then_some(())
+    });
+    assert_eq!(count, expected);
+}
+
+pub(super) fn take_stamps(sender: &mut UdpSender) -> Vec<u32> {
+    core::iter::from_fn(|| sender.next_stamp())
+        .map(|stamp| stamp.token.0)
+        .collect()
 }
 
 #[test]
@@ -53,10 +65,9 @@ fn an_undrained_sender_does_not_deafen_its_receiver() {
     for _ in 0..ARRIVAL_COUNT {
         other_sender.send(&[1; 64]).unwrap();
     }
-    assert_eq!(count_arrivals(&mut own_receiver), ARRIVAL_COUNT);
+    expect_arrivals(&mut own_receiver, ARRIVAL_COUNT);
     // The flood was real: stamps had piled up, and draining ends.
-    let stamp_count = core::iter::from_fn(|| own_sender.next_stamp()).count();
-    assert!(stamp_count > 0);
+    assert!(!take_stamps(&mut own_sender).is_empty());
 }
 
 /// The control: with one socket for both, the same flood does deafen it. This is why sending
@@ -94,9 +105,11 @@ fn a_sender_that_is_drained_gets_every_stamp_and_every_reply() {
         let stamp = within_bound("stamp", || sender.next_stamp());
         assert_eq!(stamp.token, TxToken(index));
         assert!(stamp.stamps.software_ns.is_some() && stamp.stamps.hardware_ns.is_none());
-        let arrival = receiver.receive(Instant::ZERO, &mut [0; 64]).unwrap();
-        receiver.reply(b"heard", arrival.unwrap().source).unwrap();
-        assert!(sender.receive(&mut [0; 64]).unwrap().is_some());
+        let arrival = within_bound("arrival", || {
+            receiver.receive(Instant::ZERO, &mut [0; 64]).unwrap()
+        });
+        receiver.reply(b"heard", arrival.source).unwrap();
+        within_bound("reply", || sender.receive(&mut [0; 64]).unwrap());
     }
     assert_eq!(sender.counters().unmatched_stamp_count, 0);
 }
@@ -109,20 +122,21 @@ fn a_failed_send_takes_no_token_and_shifts_no_stamp() {
     assert!(sender.send(&too_long).is_err());
     assert_eq!(sender.send(&[0; 8]), Ok(TxToken(1)));
     drop(receiver);
-    // The first send after that provokes a report, which refuses the second.
-    assert_eq!(sender.send(&[0; 8]), Ok(TxToken(2)));
-    assert_eq!(sender.send(&[0; 8]), Err(SendRefusal::PeerRefused));
-    assert_eq!(sender.send(&[0; 8]), Ok(TxToken(3)));
-    let tokens: Vec<u32> = core::iter::from_fn(|| sender.next_stamp())
-        .map(|stamp| stamp.token.0)
-        .collect();
-    assert_eq!(tokens, [0, 1, 2, 3]);
+    // A send after that provokes a report, which refuses a later one.
+    within_bound("refusal", || sender.send(&[0; 8]).err());
+    sender.send(&[0; 8]).ok();
+    let sent_count = u32::try_from(sender.counters().sent_count).unwrap();
+    let expected: Vec<u32> = (0..sent_count).collect();
+    let mut tokens = Vec::new();
+    within_bound("stamp of each send", || {
+        tokens.extend(take_stamps(&mut sender));
+        (tokens.len() >= expected.len()).then_some(())
+    });
+    assert_eq!(tokens, expected);
     let counters = sender.counters();
     assert_eq!(counters.unmatched_stamp_count, 0);
-    assert_eq!(
-        (counters.too_long_count, counters.peer_refused_count),
-        (1, 1)
-    );
+    assert_eq!(counters.too_long_count, 1);
+    assert!(counters.peer_refused_count >= 1);
 }
 
 #[test]
@@ -131,24 +145,29 @@ fn a_dead_peer_is_a_state_that_ends_when_it_comes_back() {
     let address = receiver.local_address().unwrap();
     drop(receiver);
     // Drained after every send, each report is swallowed before it can refuse a datagram.
-    for _ in 0..10 {
+    let expect_report = |sender: &mut UdpSender, report_count| {
+        within_bound("report", || {
+            take_stamps(sender);
+            (sender.counters().network_report_count == report_count).then_some(())
+        });
+    };
+    for report_count in 1..=10 {
         sender.send(b"anyone?").unwrap();
-        while sender.next_stamp().is_some() {}
+        expect_report(&mut sender, report_count);
     }
     let counters = sender.counters();
-    assert_eq!(counters.network_report_count, 10);
     assert_eq!(counters.newest_report, Some(SendRefusal::PeerRefused));
     assert_eq!(counters.refused_count(), 0);
     // A pending report does not break the reading of replies either.
     sender.send(b"anyone?").unwrap();
     assert_eq!(sender.receive(&mut [0; 8]).unwrap(), None);
+    expect_report(&mut sender, 11);
 
     let mut settings = loopback_settings();
     settings.local = address;
     let mut receiver = UdpReceiver::open(&settings).unwrap();
-    while sender.next_stamp().is_some() {}
     sender.send(b"welcome").unwrap();
-    assert_eq!(count_arrivals(&mut receiver), 1);
+    expect_arrivals(&mut receiver, 1);
 }
 
 #[test]
@@ -161,16 +180,6 @@ fn a_datagram_longer_than_the_path_is_refused_not_fragmented() {
     let length_bytes = longest + 1;
     let refusal = sender.send(&vec![0; length_bytes]).unwrap_err();
     assert_eq!(refusal, SendRefusal::TooLong { length_bytes });
-}
-
-#[test]
-fn an_unreachable_network_is_a_state() {
-    let (_sender, mut receiver) = udp_pair("127.0.0.1:0", TimestampMode::Software);
-    // A socket of the loopback network cannot send beyond it.
-    let refusal = receiver.reply(b"x", "203.0.113.9:9".parse().unwrap());
-    println!("reply beyond loopback: {refusal:?}");
-    assert!(refusal.is_err());
-    assert_eq!(receiver.counters().reply_refused_count, 1);
 }
 
 #[test]
@@ -190,6 +199,12 @@ fn code_point_and_priority_are_both_kept() {
     settings.priority = None;
     let alone = UdpReceiver::open(&settings).unwrap().granted();
     assert_eq!((alone.dscp, alone.priority), (46, 4));
+    if UdpSocket::bind("[::1]:0").is_ok() {
+        settings.local = "[::1]:0".parse().unwrap();
+        settings.priority = Some(5);
+        let granted = UdpReceiver::open(&settings).unwrap().granted();
+        assert_eq!((granted.dscp, granted.priority), (46, 5));
+    }
 }
 
 #[test]
@@ -199,6 +214,10 @@ fn settings_that_cannot_be_are_refused_by_name_value_and_bound() {
     let error = UdpReceiver::open(&settings).unwrap_err().to_string();
     assert_eq!(error, "dscp 64 is outside 0..=63");
     settings.dscp = None;
+    settings.receive_buffer_bytes = Some(usize::MAX);
+    let error = UdpReceiver::open(&settings).unwrap_err().to_string();
+    assert!(error.starts_with("SO_RCVBUF of 18446744073709551615 bytes is above 1073741823"));
+    settings.receive_buffer_bytes = None;
     settings.interface = Some("no-such-device".into());
     let error = UdpReceiver::open(&settings).unwrap_err().to_string();
     assert!(error.contains("SO_BINDTODEVICE = no-such-device was refused: No such device"));
@@ -216,14 +235,18 @@ fn a_full_receive_buffer_is_counted_by_the_kernel() {
     let mut sender = UdpSender::open(&settings).unwrap();
     for _ in 0..200 {
         sender.send(&[0; 64]).unwrap();
-        while sender.next_stamp().is_some() {}
+        take_stamps(&mut sender);
     }
-    let taken_count = u64::from(count_arrivals(&mut receiver));
-    // The count comes with the next datagram.
-    sender.send(&[0; 64]).unwrap();
-    assert_eq!(count_arrivals(&mut receiver), 1);
-    assert_eq!(taken_count + receiver.counters().kernel_drop_count, 200);
-    assert!(taken_count < 200);
+    // The count comes with the next datagram, so ask until both add up.
+    within_bound("sum of arrivals and drops", || {
+        count_waiting(&mut receiver);
+        sender.send(&[0; 64]).unwrap();
+        expect_arrivals(&mut receiver, 1);
+        let counters = receiver.counters();
+        let known_count = counters.received_count + counters.kernel_drop_count;
+        (known_count == sender.counters().sent_count).then_some(())
+    });
+    assert!(receiver.counters().kernel_drop_count > 100);
 }
 
 #[test]
@@ -243,7 +266,7 @@ fn after_the_probe_stamps_cover_the_arrivals_and_lie_between_our_clock_reads() {
             let stamp = pair.to_monotonic(stamp_ns);
             assert!(stamp + slack >= before && stamp <= after + slack);
         }
-        while sender.next_stamp().is_some() {}
+        take_stamps(&mut sender);
     }
     let counters = receiver.counters();
     assert_eq!(counters.received_count, 1000);
@@ -265,7 +288,7 @@ fn a_pending_stamp_wakes_a_wait_for_replies_until_it_is_fetched() {
         Some(wakes(&sender)).filter(|events| !events.is_empty())
     });
     assert_eq!(events, PollFlags::POLLERR);
-    while sender.next_stamp().is_some() {}
+    take_stamps(&mut sender);
     assert_eq!(wakes(&sender), PollFlags::empty());
     assert!(
         sender
@@ -275,76 +298,4 @@ fn a_pending_stamp_wakes_a_wait_for_replies_until_it_is_fetched() {
             .try_clone_to_owned()
             .is_ok()
     );
-}
-
-/// Gives `thread` the policy `SCHED_FIFO`; false when the host refuses or lacks `chrt`.
-fn make_realtime(thread: Pid) -> bool {
-    let arguments = ["-f", "-p", "10", &thread.to_string()];
-    let output = Command::new("chrt").args(arguments).output();
-    output.is_ok_and(|output| output.status.success())
-}
-
-/// Spins on the CPU of this thread, as real-time, while `body` runs beside it; `None` when the
-/// host refuses real-time.
-fn beside_a_spinning_realtime_thread<T>(body: impl FnOnce() -> T) -> Option<T> {
-    let allowed = sched_getaffinity(Pid::from_raw(0)).unwrap();
-    let cpu = (0..CpuSet::count()).find(|cpu| allowed.is_set(*cpu).unwrap())?;
-    let mut one = CpuSet::new();
-    one.set(cpu).unwrap();
-    let (is_over, spinner_id) = (AtomicBool::new(false), AtomicU32::new(0));
-    thread::scope(|scope| {
-        scope.spawn(|| {
-            sched_setaffinity(Pid::from_raw(0), &one).unwrap();
-            spinner_id.store(gettid().as_raw().cast_unsigned(), Ordering::Release);
-            // Half a second at most: the rest of the machine wants to live.
-            let end = monotonic_now().unwrap() + Duration::from_millis(500);
-            while !is_over.load(Ordering::Acquire) && monotonic_now().unwrap() < end {
-                core::hint::spin_loop();
-            }
-        });
-        let id = within_bound("spinner", || {
-            Some(spinner_id.load(Ordering::Acquire)).filter(|id| *id != 0)
-        });
-        let is_realtime = make_realtime(Pid::from_raw(id.cast_signed()));
-        let result = is_realtime.then(body);
-        is_over.store(true, Ordering::Release);
-        result
-    })
-}
-
-#[test]
-fn a_sentinel_keeps_the_stamps_when_a_realtime_thread_starves_the_kernel() {
-    let _sentinel = sentinel();
-    let counters = beside_a_spinning_realtime_thread(|| {
-        // A receiver armed under the spinning thread, as a role's would be.
-        let (mut sender, mut receiver) = udp_pair("127.0.0.1:0", TimestampMode::Software);
-        for _ in 0..500 {
-            sender.send(&[0; 64]).unwrap();
-            while sender.next_stamp().is_some() {}
-            count_arrivals(&mut receiver);
-        }
-        receiver.counters()
-    });
-    let Some(counters) = counters else {
-        println!("skipped: this host refuses SCHED_FIFO");
-        return;
-    };
-    assert_eq!(counters.received_count, 500);
-    assert!(counters.software_stamp_count >= 495, "{counters:?}");
-}
-
-#[test]
-fn a_probe_under_a_spinning_realtime_thread_ends_and_says_what_it_saw() {
-    let mut settings = ProbeSettings::loopback(TimestampMode::Software);
-    settings.bound = Duration::from_millis(300);
-    let Some(result) = beside_a_spinning_realtime_thread(|| arm_and_probe(&settings)) else {
-        println!("skipped: this host refuses SCHED_FIFO");
-        return;
-    };
-    let (report, _sentinel) = result.unwrap();
-    println!("{report:?}");
-    assert_ne!(report.rx_software, Availability::NotOffered);
-    if report.rx_software == Availability::Seen {
-        assert!(report.attempts >= settings.proof_count);
-    }
 }

@@ -13,6 +13,8 @@ use super::timestamping::{TimestampMode, set_int_option};
 
 /// `IPV6_MTU_DISCOVER` of `linux/in6.h`.
 const IPV6_MTU_DISCOVER: i32 = 23;
+/// Largest buffer to ask for: the kernel doubles the value in an `int`.
+const BUFFER_BYTES_MAX: usize = 0x3fff_ffff;
 
 /// How to set up both sockets. Everything optional stays at the kernel's default when `None`.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -61,6 +63,14 @@ pub enum UdpError {
     Dscp {
         /// The value.
         dscp: u8,
+    },
+    /// A buffer larger than the kernel can account.
+    #[error("{option} of {bytes} bytes is above {BUFFER_BYTES_MAX}")]
+    Buffer {
+        /// The socket option.
+        option: &'static str,
+        /// The value.
+        bytes: usize,
     },
     /// One address is IPv4 and the other IPv6.
     #[error("local address {local} and peer address {peer} are of different IP versions")]
@@ -142,26 +152,7 @@ pub(super) fn open_socket(settings: &UdpSettings) -> Result<Socket, UdpError> {
         let bound = socket.bind_device(Some(interface.as_bytes()));
         refuse("SO_BINDTODEVICE", interface, bound)?;
     }
-    if let Some(bytes) = settings.send_buffer_bytes {
-        refuse("SO_SNDBUF", bytes, socket.set_send_buffer_size(bytes))?;
-        if socket
-            .send_buffer_size()
-            .is_ok_and(|granted| granted < 2 * bytes)
-        {
-            // Beyond net.core.wmem_max with CAP_NET_ADMIN only; what remains short is reported
-            // by GrantedOptions.
-            setsockopt(&socket, sockopt::SndBufForce, &bytes).ok();
-        }
-    }
-    if let Some(bytes) = settings.receive_buffer_bytes {
-        refuse("SO_RCVBUF", bytes, socket.set_recv_buffer_size(bytes))?;
-        if socket
-            .recv_buffer_size()
-            .is_ok_and(|granted| granted < 2 * bytes)
-        {
-            setsockopt(&socket, sockopt::RcvBufForce, &bytes).ok();
-        }
-    }
+    set_buffers(&socket, settings)?;
     mark(&socket, settings)?;
     // A datagram too long for the path is refused instead of sent in pieces, of which the loss
     // of one would look like the loss of all.
@@ -181,6 +172,34 @@ pub(super) fn open_socket(settings: &UdpSettings) -> Result<Socket, UdpError> {
     let set = set_int_option(&socket, level, name, discover);
     refuse(option, discover, set)?;
     Ok(socket)
+}
+
+/// Sizes the buffers. Beyond `net.core.wmem_max` and `rmem_max` that takes `CAP_NET_ADMIN`; what
+/// remains short without it is reported by [`GrantedOptions`].
+fn set_buffers(socket: &Socket, settings: &UdpSettings) -> Result<(), UdpError> {
+    if let Some(bytes) = settings.send_buffer_bytes {
+        let doubled = doubled_buffer("SO_SNDBUF", bytes)?;
+        refuse("SO_SNDBUF", bytes, socket.set_send_buffer_size(bytes))?;
+        if refuse("SO_SNDBUF", "read", socket.send_buffer_size())? < doubled {
+            setsockopt(socket, sockopt::SndBufForce, &bytes).ok();
+        }
+    }
+    if let Some(bytes) = settings.receive_buffer_bytes {
+        let doubled = doubled_buffer("SO_RCVBUF", bytes)?;
+        refuse("SO_RCVBUF", bytes, socket.set_recv_buffer_size(bytes))?;
+        if refuse("SO_RCVBUF", "read", socket.recv_buffer_size())? < doubled {
+            setsockopt(socket, sockopt::RcvBufForce, &bytes).ok();
+        }
+    }
+    Ok(())
+}
+
+/// What the kernel accounts for a buffer of `bytes` when it grants all of it.
+fn doubled_buffer(option: &'static str, bytes: usize) -> Result<usize, UdpError> {
+    if bytes > BUFFER_BYTES_MAX {
+        return Err(UdpError::Buffer { option, bytes });
+    }
+    Ok(2 * bytes)
 }
 
 /// Code point first: `IP_TOS` resets `SO_PRIORITY`.
