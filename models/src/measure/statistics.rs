@@ -332,8 +332,8 @@ mod tests {
     fn correlated_samples_widen_the_bootstrap_but_fool_the_order_statistics() {
         let mut stream = RandomStream::new(5, "series");
         let (mut naive_hits, mut block_hits) = (0, 0);
-        for _ in 0..100 {
-            let samples = series(2_500, 0.9, &mut stream);
+        for _ in 0..50 {
+            let samples = series(1_600, 0.9, &mut stream);
             let block = block_bootstrap_quantile(&samples, 0.5, 0.95, &mut stream).unwrap();
             let mut ascending = samples;
             ascending.sort_unstable();
@@ -342,8 +342,8 @@ mod tests {
             naive_hits += u32::from(holds(naive));
             block_hits += u32::from(holds(block));
         }
-        assert!(naive_hits < 65, "naive covered {naive_hits} of 100");
-        assert!(block_hits > 80, "blocks covered {block_hits} of 100");
+        assert!(naive_hits < 33, "naive covered {naive_hits} of 50");
+        assert!(block_hits > 39, "blocks covered {block_hits} of 50");
     }
 
     #[test]

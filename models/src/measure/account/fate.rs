@@ -199,7 +199,10 @@ impl<'a> Judge<'a> {
             return true;
         }
         let may_have_been_inside = match fate {
-            MessageFate::LostOnWire | MessageFate::Unexplained | MessageFate::InFlight => true,
+            MessageFate::LostOnWire
+            | MessageFate::Unexplained
+            | MessageFate::InFlight
+            | MessageFate::UnknownPeerRecordsUnavailable => true,
             MessageFate::SupersededAtInput => interruption.place == PathProcess::SendingGateway,
             MessageFate::SupersededAtConsumer => interruption.place == PathProcess::Consumer,
             _ => false,

@@ -13,6 +13,8 @@ mod fate;
 mod figures;
 mod gaps;
 mod join;
+#[cfg(test)]
+mod random_fates;
 mod segments;
 mod stage;
 #[cfg(test)]
