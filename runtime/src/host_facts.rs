@@ -362,6 +362,10 @@ mod tests {
                 "/sys/kernel/debug/sched/preempt",
                 "none voluntary (full) lazy",
             ),
+            (
+                "/proc/cmdline",
+                "root=/dev/sda1 isolcpus=2-3 token=secret nosmt",
+            ),
         ]);
         let facts = HostFacts::gather_from(&host.files());
         for (label, expected) in [
