@@ -83,7 +83,7 @@ impl HostFacts {
         list.add("hostname", hostname());
         list.add("kernel", kernel_name());
         list.add("preemption", preemption(files));
-        list.add("kernel_command_line", files.read("/proc/cmdline"));
+        list.add("boot_parameters", boot_parameters(files));
         list.add("cpu_model", files.read_field("/proc/cpuinfo", "model name"));
         list.add("cores", cores(files));
         list.add(
@@ -202,6 +202,40 @@ fn dynamic_mode(files: &HostFiles) -> String {
         || "mode unavailable (debugfs is not readable)".to_owned(),
         |mode| format!("mode {mode}"),
     )
+}
+
+/// Parameters of the kernel's command line that change how it schedules, ticks or idles. The others
+/// are left out: they say nothing about a measurement, and a manifest is meant to be shown around.
+const TIMING_PARAMETERS: [&str; 15] = [
+    "clocksource",
+    "cpuidle.off",
+    "idle",
+    "intel_idle.max_cstate",
+    "intel_pstate",
+    "irqaffinity",
+    "isolcpus",
+    "mitigations",
+    "nohz",
+    "nohz_full",
+    "nosmt",
+    "preempt",
+    "processor.max_cstate",
+    "rcu_nocbs",
+    "tsc",
+];
+
+fn boot_parameters(files: &HostFiles) -> Fact<String> {
+    files.read("/proc/cmdline").map(|line| {
+        let chosen: Vec<&str> = line
+            .split_whitespace()
+            .filter(|word| TIMING_PARAMETERS.contains(&word.split('=').next().unwrap_or(word)))
+            .collect();
+        if chosen.is_empty() {
+            "none that affect timing".to_owned()
+        } else {
+            chosen.join(" ")
+        }
+    })
 }
 
 fn cores(files: &HostFiles) -> Fact<String> {
@@ -328,6 +362,10 @@ mod tests {
                 "/sys/kernel/debug/sched/preempt",
                 "none voluntary (full) lazy",
             ),
+            (
+                "/proc/cmdline",
+                "root=/dev/sda1 isolcpus=2-3 token=secret nosmt",
+            ),
         ]);
         let facts = HostFacts::gather_from(&host.files());
         for (label, expected) in [
@@ -337,6 +375,7 @@ mod tests {
             ("memory", "16 kB in all, 9 kB available"),
             ("virtual_machine", "yes"),
             ("preemption", "PREEMPT_DYNAMIC, mode full"),
+            ("boot_parameters", "isolcpus=2-3 nosmt"),
         ] {
             assert_eq!(facts.find(label).unwrap().to_text(), expected);
         }

@@ -1,1 +1,9 @@
-//! Shared by the tests that cross crate and process borders.
+//! Shared by the tests that cross crate and process borders: two hosts on one machine, the built
+//! binary, children that do not outlive their test, folders that clean up after themselves. It
+//! holds no test of the product.
+
+pub mod binary;
+pub mod child;
+pub mod lab;
+pub mod run_folder;
+pub mod source_tree;

@@ -117,9 +117,9 @@ pub(crate) fn judge(measured: Option<&WakeupMeasurement>, files: &HostFiles) -> 
     };
     // A second holds a thousand wake-ups: one per mille of them is a single event.
     let why = format!(
-        "medians and p99 of blocking operations above about {p99:.0} us can be claimed here; \
-         single delays up to {max:.0} us may be the host's own, and p99.9 needs a longer \
-         measurement{below}"
+        "of blocking operations, medians above about {p50:.0} us and p99 above about {p99:.0} us \
+         can be claimed here; single delays up to {max:.0} us may be the host's own, and p99.9 \
+         needs a longer measurement{below}"
     );
     Finding::new(id, title, state, value)
         .because(why)
@@ -176,7 +176,7 @@ mod tests {
         let host = FakeHost::with(&[("/proc/cpuinfo", "flags : fpu hypervisor")]);
         let good = judge(measured(65_000).as_ref(), &host.files());
         assert_eq!(good.state, State::Good);
-        assert!(good.why.contains("above about 65 us"), "{}", good.why);
+        assert!(good.why.contains("p99 above about 65 us"), "{}", good.why);
         assert!(
             good.why.contains("single delays up to 7000 us"),
             "{}",

@@ -1,0 +1,265 @@
+//! Two hosts on one machine: network namespaces joined by a veth pair, each with shared memory and
+//! runtime folders of its own. They share the kernel, its clock and its processors, so a delay
+//! between them is the software's alone and its true clock offset is zero.
+//!
+//! Each host is held open by a process that waits for the end of its input. When the test ends,
+//! even by `SIGKILL`, that input closes and the mounts go; [`Lab`]'s drop, or the next lab's start,
+//! removes the named namespaces.
+
+mod namespace;
+mod privilege;
+#[cfg(test)]
+mod self_tests;
+
+use std::ffi::OsStr;
+use std::fs::{self, File};
+use std::io::{BufRead, BufReader, Read};
+use std::net::Ipv4Addr;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::mpsc;
+use std::thread;
+use std::time::Duration;
+
+use nix::sched::{CloneFlags, setns};
+
+pub use self::privilege::require_privileges;
+
+/// The interface that joins the two hosts, in each of them.
+pub const INTERFACE: &str = "eth0";
+/// The addresses of host 0 and host 1.
+pub const ADDRESSES: [Ipv4Addr; 2] = [Ipv4Addr::new(10, 77, 0, 1), Ipv4Addr::new(10, 77, 0, 2)];
+
+/// No set-up command takes a tenth of this on an overloaded machine.
+const SETUP_LIMIT: Duration = Duration::from_secs(20);
+
+/// Private folders, then a word, then waiting for the test to end. `/run` is private because the
+/// runtime keeps its sockets below it; `TMPDIR` points there too, see [`LabHost::command`].
+const HOLDER_SCRIPT: &str = "mount -t tmpfs -o mode=1777 tmpfs /dev/shm \
+    && mount -t tmpfs -o mode=0755 tmpfs /run \
+    && mkdir -m 1777 /run/tmp && mkdir -m 0755 /run/hil \
+    && echo ready && exec cat";
+
+/// Two hosts joined by a cable. Dropping it removes everything, the processes inside included.
+#[derive(Debug)]
+pub struct Lab {
+    hosts: [LabHost; 2],
+}
+
+impl Lab {
+    /// Builds two hosts, after removing labs whose owner has died.
+    ///
+    /// # Errors
+    /// The first set-up command that failed, with its words.
+    pub fn two_hosts() -> Result<Self, String> {
+        namespace::sweep_stale();
+        let names = namespace::fresh_names();
+        let hosts = [LabHost::start(&names[0], 0)?, LabHost::start(&names[1], 1)?];
+        namespace::join(&names, INTERFACE)?;
+        for host in &hosts {
+            host.bring_up()?;
+        }
+        Ok(Self { hosts })
+    }
+
+    /// Builds two hosts; `None`, with the reason printed, where the rights for it are missing.
+    ///
+    /// # Panics
+    /// When building fails in spite of the rights, and in CI (`CI` is set) when they are missing:
+    /// a gate that skips its main test is no gate.
+    #[allow(clippy::print_stderr, reason = "a test that is skipped must say so")]
+    pub fn two_hosts_or_skip() -> Option<Self> {
+        if let Err(reason) = require_privileges() {
+            eprintln!("skipped: {reason}");
+            return None;
+        }
+        Some(Self::two_hosts().unwrap_or_else(|reason| panic!("no lab: {reason}")))
+    }
+
+    /// Host 0 (the controller's, by convention) or host 1 (the robot's).
+    ///
+    /// # Panics
+    /// When `index` is above 1.
+    pub fn host(&self, index: usize) -> &LabHost {
+        &self.hosts[index]
+    }
+}
+
+/// One host of a [`Lab`].
+#[derive(Debug)]
+pub struct LabHost {
+    namespace: String,
+    address: Ipv4Addr,
+    holder: Child,
+}
+
+impl LabHost {
+    /// Its address on the cable.
+    pub fn address(&self) -> Ipv4Addr {
+        self.address
+    }
+
+    /// The name of its network namespace, for `ip netns exec` by hand.
+    pub fn namespace(&self) -> &str {
+        &self.namespace
+    }
+
+    /// A command that will run on this host.
+    ///
+    /// All commands of one host share its `/dev/shm` and `/run`; the rest of the file system is
+    /// this machine's. `TMPDIR` and `XDG_RUNTIME_DIR` point below the private `/run`, the working
+    /// folder is the caller's, and the process identifier is the program's own, so a signal to
+    /// the child reaches it.
+    pub fn command(&self, program: impl AsRef<OsStr>) -> Command {
+        let mut command = Command::new("nsenter");
+        command
+            .arg("--target")
+            .arg(self.holder.id().to_string())
+            .args([
+                "--mount",
+                "--net",
+                "--",
+                "/bin/sh",
+                "-c",
+                r#"cd "$0" && exec "$@""#,
+            ])
+            .arg(std::env::current_dir().unwrap_or_else(|_| PathBuf::from("/")))
+            .arg(program)
+            .env("TMPDIR", "/run/tmp")
+            .env("XDG_RUNTIME_DIR", "/run/tmp");
+        command
+    }
+
+    /// Runs `work` in a thread whose new sockets belong to this host's network. The sockets stay
+    /// there when they are handed out; the file system is this machine's.
+    ///
+    /// # Panics
+    /// When the namespace cannot be entered, or `work` panics.
+    pub fn on_network<T: Send>(&self, work: impl FnOnce() -> T + Send) -> T {
+        let network = format!("/proc/{}/ns/net", self.holder.id());
+        let result = thread::scope(|scope| {
+            let entered = scope.spawn(|| {
+                let file = File::open(&network).map_err(|error| format!("{network}: {error}"))?;
+                setns(file, CloneFlags::CLONE_NEWNET)
+                    .map_err(|errno| format!("setns {network}: {errno}"))?;
+                Ok::<T, String>(work())
+            });
+            entered.join()
+        });
+        match result {
+            Ok(Ok(value)) => value,
+            Ok(Err(reason)) => panic!("host {} cannot be entered: {reason}", self.namespace),
+            Err(cause) => std::panic::resume_unwind(cause),
+        }
+    }
+
+    /// Where `path` of this host can be read from outside.
+    pub fn locate(&self, path: impl AsRef<Path>) -> PathBuf {
+        let path = path.as_ref();
+        let inside = path.strip_prefix("/").unwrap_or(path);
+        Path::new("/proc")
+            .join(self.holder.id().to_string())
+            .join("root")
+            .join(inside)
+    }
+
+    /// The names in this host's `/dev/shm`, sorted.
+    ///
+    /// # Panics
+    /// When it cannot be listed: an unread folder must not pass for an empty one.
+    pub fn shared_memory_files(&self) -> Vec<String> {
+        let folder = self.locate("/dev/shm");
+        let entries = fs::read_dir(&folder)
+            .unwrap_or_else(|error| panic!("cannot list {}: {error}", folder.display()));
+        let mut names: Vec<String> = entries
+            .flatten()
+            .map(|e| e.file_name().to_string_lossy().into_owned())
+            .collect();
+        names.sort();
+        names
+    }
+
+    /// The segments runs left in this host's `/dev/shm`: names of the form `h????????_*`.
+    pub fn shared_memory_leftovers(&self) -> Vec<String> {
+        let mut names = self.shared_memory_files();
+        names.retain(|name| name.len() > 10 && name.starts_with('h') && name[9..].starts_with('_'));
+        names
+    }
+
+    fn start(name: &str, index: usize) -> Result<Self, String> {
+        namespace::add(name)?;
+        let spawned = Command::new("ip")
+            .args(["netns", "exec", name])
+            .args(["unshare", "--mount", "--propagation", "private"])
+            .args(["sh", "-c", HOLDER_SCRIPT])
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn();
+        let holder = match spawned {
+            Ok(holder) => holder,
+            Err(error) => {
+                namespace::remove(name);
+                return Err(format!("ip netns exec {name}: {error}"));
+            }
+        };
+        // From here on dropping the host cleans up.
+        let mut host = Self {
+            namespace: name.to_owned(),
+            address: ADDRESSES[index],
+            holder,
+        };
+        host.wait_until_ready()?;
+        Ok(host)
+    }
+
+    fn wait_until_ready(&mut self) -> Result<(), String> {
+        let Some(stdout) = self.holder.stdout.take() else {
+            return Err("the holder has no output".to_owned());
+        };
+        let (sender, receiver) = mpsc::channel();
+        thread::spawn(move || {
+            let mut line = String::new();
+            let read = BufReader::new(stdout).read_line(&mut line);
+            // The receiver is gone when the limit has passed.
+            drop(sender.send(read.map(|_length| line)));
+        });
+        match receiver.recv_timeout(SETUP_LIMIT) {
+            Ok(Ok(line)) if line == "ready\n" => Ok(()),
+            Ok(Ok(_)) => {
+                let mut words = String::new();
+                if let Some(stderr) = self.holder.stderr.as_mut() {
+                    drop(stderr.read_to_string(&mut words));
+                }
+                Err(format!(
+                    "host {} was not set up: {}",
+                    self.namespace,
+                    words.trim()
+                ))
+            }
+            Ok(Err(error)) => Err(format!("host {}: {error}", self.namespace)),
+            Err(error) => Err(format!(
+                "host {} within {SETUP_LIMIT:?}: {error}",
+                self.namespace
+            )),
+        }
+    }
+
+    fn bring_up(&self) -> Result<(), String> {
+        let name = self.namespace.as_str();
+        let address = format!("{}/24", self.address);
+        namespace::ip(&["-n", name, "link", "set", "lo", "up"])?;
+        namespace::ip(&["-n", name, "address", "add", &address, "dev", INTERFACE])?;
+        namespace::ip(&["-n", name, "link", "set", INTERFACE, "up"])
+    }
+}
+
+impl Drop for LabHost {
+    fn drop(&mut self) {
+        namespace::remove(&self.namespace);
+        // The holder was among the processes just killed; this reaps it. Both calls fail only if
+        // it is gone already.
+        drop(self.holder.kill());
+        drop(self.holder.wait());
+    }
+}
