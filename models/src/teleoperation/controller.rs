@@ -21,8 +21,8 @@ crate::message_set! {
 /// get the whole gap's worth of speed at once.
 const ELAPSED_MAX_S: f64 = 0.1;
 
-/// The role. It engages on the first human frame after the first robot status, from the posture
-/// that status reports; before that it says nothing.
+/// The role. It engages on the first sound human frame after the first robot status, from the
+/// posture that status reports; before that it says nothing.
 #[derive(Debug)]
 pub(crate) struct Controller {
     parameters: TeleoperationParameters,
@@ -108,6 +108,11 @@ impl Controller {
 
     fn engage(&self, frame: &HumanFrame) -> Option<Engaged> {
         let status = self.newest_status.as_ref()?;
+        let joints = status.right.measured_rad.iter();
+        let mut joints = joints.chain(&status.left.measured_rad);
+        if !frame.right_hand.is_finite() || !joints.all(|q| q.is_finite()) {
+            return None;
+        }
         let follow = |arm, q_rad, is_mirrored| {
             let settings = self.parameters.mapping(is_mirrored);
             Follower::engage(arm, q_rad, settings, &frame.right_hand)

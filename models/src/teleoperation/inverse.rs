@@ -67,28 +67,30 @@ impl Tracker {
     /// allow in `elapsed_s`.
     pub fn track(&mut self, target: &Pose, elapsed_s: f64) -> Reach {
         let start = self.q_rad;
-        let start_cost = cost(&task_error(&self.chain.at(&start), target));
-        let mut q = start;
+        let (mut q, mut state) = (start, self.chain.at(&start));
+        let mut error = task_error(&state, target);
+        let start_cost = cost(&error);
         for iteration in 0..TRACKING_ITERATIONS_MAX {
-            let state = self.chain.at(&q);
-            let error = task_error(&state, target);
-            if iteration > 0 && is_within(&error, 0.01) {
-                break;
-            }
             // Only the first step is pulled: the later ones correct what the pull disturbed.
             let gain = if iteration == 0 { POSTURE_GAIN } else { 0.0 };
             let pull = combine(&self.posture_rad, &q, |posture, q| gain * (posture - q));
             q = within_limits(&damped_step(&state.jacobian(), &error, &q, &pull)).0;
+            state = self.chain.at(&q);
+            error = task_error(&state, target);
+            if is_within(&error, 0.01) {
+                break;
+            }
         }
         let share = share_within_speed(&start, &q, elapsed_s);
         if share < 1.0 {
             q = combine(&start, &q, |from, to| from + share * (to - from));
+            error = task_error(&self.chain.at(&q), target);
         }
-        let error = task_error(&self.chain.at(&q), target);
-        let cost = cost(&error);
+        // A speed limit may leave little of a step; an unlimited one that gains little is stuck.
+        let remaining_max = if share < 1.0 { 1.0 } else { 0.25 };
         let reach = if is_within(&error, 1.0) {
             Reach::Reached
-        } else if cost < 0.25 * start_cost || (share < 1.0 && cost < start_cost) {
+        } else if cost(&error) < remaining_max * start_cost {
             Reach::Approaching
         } else {
             // Also where the comparison fails because the target is not a number.
@@ -113,7 +115,8 @@ pub struct Solution {
 /// Joint positions that put the tool at `target` (arm base frame) from anywhere: starts at
 /// `seed_rad`, then at up to `restarts_max` random postures.
 ///
-/// `None` means not found; with 50 restarts that happens to about one reachable pose in 500.
+/// `None` means not found; with 50 restarts that happened to 10 of 20 000
+/// random reachable poses.
 pub fn search(
     chain: Chain,
     target: &Pose,

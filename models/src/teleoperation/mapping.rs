@@ -21,7 +21,7 @@ pub const CAPTURE_TO_BODY: Orientation = Orientation {
 pub struct MappingSettings {
     /// Tool path length per hand path length.
     pub scale_ratio: f64,
-    /// Reflect the motion at the body's plane of symmetry, for the arm on the other side.
+    /// Reflects the motion at the body's plane of symmetry, for the arm on the other side.
     pub is_mirrored: bool,
     /// Farthest the target may move from one frame to the next, metres.
     pub jump_max_m: f64,
@@ -39,11 +39,12 @@ pub struct Clutch {
 }
 
 impl Clutch {
-    /// Engages with the hand (capture frame) and the tool (body frame) where they are now.
+    /// Engages with the hand (capture frame) and the tool (body frame) where they are now. Both
+    /// must be poses of finite numbers.
     pub fn engage(settings: MappingSettings, hand: &Pose, tool: &Pose) -> Self {
         Self {
             settings,
-            hand_origin: *hand,
+            hand_origin: normalised(hand),
             tool_origin: *tool,
             target: *tool,
         }
@@ -52,12 +53,12 @@ impl Clutch {
     /// Where the tool shall be now that the hand is at `hand`, and whether the jump limit held
     /// it back. A hand that is not a pose of finite numbers leaves the target where it is.
     pub fn follow(&mut self, hand: &Pose) -> (Pose, bool) {
-        let wanted = self.wanted(hand);
-        let step_m = length(subtract(wanted.position_m, self.target.position_m));
-        let step_rad = self.target.orientation.angle_to(wanted.orientation);
-        if !(step_m.is_finite() && step_rad.is_finite()) {
+        if !hand.is_finite() {
             return (self.target, true);
         }
+        let wanted = self.wanted(&normalised(hand));
+        let step_m = length(subtract(wanted.position_m, self.target.position_m));
+        let step_rad = self.target.orientation.angle_to(wanted.orientation);
         let share = (self.settings.jump_max_m / step_m)
             .min(self.settings.jump_max_rad / step_rad)
             .min(1.0);
@@ -89,6 +90,14 @@ impl Clutch {
             position_m: add(self.tool_origin.position_m, moved),
             orientation: turned.after(self.tool_origin.orientation).normalised(),
         }
+    }
+}
+
+/// Another producer's quaternion may be of any length; the mapping needs a rotation.
+fn normalised(hand: &Pose) -> Pose {
+    Pose {
+        orientation: hand.orientation.normalised(),
+        ..*hand
     }
 }
 

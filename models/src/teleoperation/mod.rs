@@ -15,6 +15,23 @@
 //! 4. [`servo`]: from the command to the motion.
 //! 5. `score`: what the robot made of it.
 //!
+//! ```
+//! use std::collections::BTreeMap;
+//! use std::time::Duration;
+//!
+//! use hil_models::case_study::CaseStudy;
+//! use hil_models::simulation::Simulation;
+//! use hil_models::teleoperation::{Teleoperation, TeleoperationParameters};
+//!
+//! let parameters = TeleoperationParameters { servo_gain_per_s: 20.0, ..Default::default() };
+//! let case = Teleoperation::new(parameters, 1)?;
+//! let result = Simulation::new(&case, BTreeMap::new())?.run(Duration::from_secs(10))?;
+//! let score = case.score(&result.log);
+//! let lag_ms = score.get("tracking_lag_ms").and_then(|metric| metric.value);
+//! assert!(lag_ms.is_some_and(|lag_ms| (lag_ms - 50.0).abs() < 8.0));
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+//!
 //! This first form has no guided-motion session: no time-out, no re-activation, no message queue
 //! on the robot's side. A silent network makes the robot hold; it never stops the motion for good.
 

@@ -1,5 +1,5 @@
 //! Human motion as a function of time: one loop, synthetic or recorded, and a player that repeats
-//! it. It publishes nothing: see [`super::human`].
+//! it. It publishes nothing: the role "human" does.
 
 use crate::random::RandomStream;
 use crate::teleoperation::bvh::Bvh;

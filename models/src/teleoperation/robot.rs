@@ -80,14 +80,18 @@ fn arm_status((arm, servo): &(Arm, Servo)) -> ArmStatus {
     }
 }
 
-/// A command of infinities or non-numbers would poison the arm's state for ever.
-fn is_finite(command: &ArmCommand) -> bool {
+/// Far beyond any joint, far below where the control law overflows.
+const MAGNITUDE_MAX: f64 = 1e6;
+
+/// A command of non-numbers, or so large that the law overflows, would poison the arm's state for
+/// ever; the robot does not take it.
+fn is_usable(command: &ArmCommand) -> bool {
     let speeds = command.speed_rad_per_s.iter();
     command
         .position_rad
         .iter()
         .chain(speeds)
-        .all(|value| value.is_finite())
+        .all(|value| value.abs() <= MAGNITUDE_MAX)
 }
 
 impl Component for Robot {
@@ -102,7 +106,7 @@ impl Component for Robot {
     }
 
     fn on_message(&mut self, now: Instant, input: &JointCommand, _out: &mut Outbox<JointStatus>) {
-        if is_finite(&input.right) && is_finite(&input.left) {
+        if is_usable(&input.right) && is_usable(&input.left) {
             self.newest_command = Some((now, *input));
         }
     }

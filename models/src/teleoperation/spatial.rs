@@ -192,6 +192,12 @@ impl Pose {
         orientation: Orientation::IDENTITY,
     };
 
+    /// True when every number is one.
+    pub fn is_finite(&self) -> bool {
+        let parts = self.position_m.iter().chain(&self.orientation.wxyz);
+        parts.copied().all(f64::is_finite)
+    }
+
     /// `inner`, given in this frame, seen from where this frame is given.
     #[must_use]
     pub fn compose(&self, inner: &Self) -> Self {
