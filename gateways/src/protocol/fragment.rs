@@ -11,6 +11,7 @@ use core::time::Duration;
 
 use hil_models::time::Instant;
 
+use super::counters::named_counts;
 use super::refusal::Refusal;
 use super::sequence::Stream;
 
@@ -124,6 +125,14 @@ pub struct ReassemblyCounts {
     /// Incomplete messages given up because their session was over.
     pub abandoned_count: u64,
 }
+
+named_counts!(ReassemblyCounts {
+    started_count,
+    completed_count,
+    evicted_count,
+    timed_out_count,
+    abandoned_count,
+});
 
 /// Puts messages together in a fixed number of slots.
 #[derive(Debug)]

@@ -3,10 +3,16 @@
 //!
 //! A message is *lost* once its number has slid out of the newest 1024 unseen, or is still unseen
 //! when its stream is finished. Until then a gap is *outstanding*: a reordered message can fill it.
+//! Numbers that never left the sending host count as well: what they cost is found by joining the
+//! records of both hosts.
+//!
 //! A stream is one start of the producer within one session of the sending gateway; a new stream
-//! is a restart, and never a loss.
+//! is a restart, and never a loss. Which of two streams of a session is the newer one is told by
+//! the sending gateway's own clock, so that neither a datagram that was long under way nor a single
+//! corrupted one can make the window follow a stream that is over.
 
 use super::body::ReceivedWindow;
+use super::counters::named_counts;
 
 /// Sequence numbers the window remembers.
 pub const WINDOW_LENGTH: u64 = 1024;
@@ -14,7 +20,6 @@ pub const WINDOW_LENGTH: u64 = 1024;
 pub const BURST_LENGTH_MAX: usize = 32;
 
 const WORDS: usize = 16;
-const RETIRED_LENGTH: usize = 4;
 const _: () = assert!(WORDS as u64 * 64 == WINDOW_LENGTH);
 
 /// One start of the producer within one session of the sending gateway.
@@ -64,12 +69,24 @@ pub struct SequenceCounts {
     pub loss_burst_length_max: u64,
 }
 
+named_counts!(SequenceCounts {
+    received_count,
+    lost_count,
+    reordered_count,
+    duplicate_count,
+    late_count,
+    restart_count,
+    loss_burst_length_max,
+} beside { loss_bursts });
+
 /// The window and its counts.
 #[derive(Debug, Clone)]
 pub struct SequenceWindow {
     stream: Option<Stream>,
-    retired: [Option<Stream>; RETIRED_LENGTH],
-    retired_next: usize,
+    /// The stream that was finished last.
+    ended: Option<Stream>,
+    /// Latest hand-over seen, by the sending gateway's clock.
+    handed_ns_max: i64,
     /// Lowest number that counts; messages before it were never expected here.
     base: u64,
     highest: u64,
@@ -92,8 +109,8 @@ impl SequenceWindow {
     pub const fn new() -> Self {
         Self {
             stream: None,
-            retired: [None; RETIRED_LENGTH],
-            retired_next: 0,
+            ended: None,
+            handed_ns_max: i64::MIN,
             base: 0,
             highest: 0,
             announced_end: 0,
@@ -112,13 +129,14 @@ impl SequenceWindow {
         }
     }
 
-    /// Where a message would stand, without counting it.
-    pub fn peek(&self, stream: Stream, sequence: u64) -> Order {
+    /// Where a message would stand, without counting it; `handed_ns` is when the sending gateway
+    /// handed it over, by its own clock.
+    pub fn peek(&self, stream: Stream, sequence: u64, handed_ns: i64) -> Order {
         if self.stream != Some(stream) {
-            return if self.retired.contains(&Some(stream)) {
+            let base = self.base_of_new(stream, sequence);
+            return if self.is_over(stream, handed_ns) {
                 Order::Late
             } else {
-                let base = self.base_of_new(stream, sequence);
                 Order::InOrder {
                     gap: sequence - base,
                 }
@@ -137,9 +155,9 @@ impl SequenceWindow {
         }
     }
 
-    /// Counts a message and says where it stands.
-    pub fn record(&mut self, stream: Stream, sequence: u64) -> Order {
-        let order = self.peek(stream, sequence);
+    /// Counts a message and says where it stands; see [`SequenceWindow::peek`].
+    pub fn record(&mut self, stream: Stream, sequence: u64, handed_ns: i64) -> Order {
+        let order = self.peek(stream, sequence, handed_ns);
         match order {
             Order::InOrder { .. } => {
                 if self.stream == Some(stream) {
@@ -159,6 +177,9 @@ impl SequenceWindow {
             Order::Duplicate => self.counts.duplicate_count += 1,
             Order::Late => self.counts.late_count += 1,
         }
+        if self.stream == Some(stream) {
+            self.handed_ns_max = self.handed_ns_max.max(handed_ns);
+        }
         order
     }
 
@@ -170,8 +191,8 @@ impl SequenceWindow {
         }
     }
 
-    /// Ends the current stream: every outstanding gap becomes a loss. A message of it that still
-    /// comes is late.
+    /// Ends the current stream: every outstanding gap becomes a loss. A message of it that was
+    /// under way is late; one sent after those already seen opens the stream again.
     pub fn finish(&mut self) {
         let Some(stream) = self.stream.take() else {
             return;
@@ -185,8 +206,7 @@ impl SequenceWindow {
                 .saturating_sub(self.highest.saturating_add(1)),
         );
         self.close_burst();
-        self.retired[self.retired_next] = Some(stream);
-        self.retired_next = (self.retired_next + 1) % RETIRED_LENGTH;
+        self.ended = Some(stream);
     }
 
     /// The counts so far; outstanding gaps are not in them.
@@ -241,12 +261,19 @@ impl SequenceWindow {
         }
     }
 
+    /// Whether `stream`, which is not the current one, is an older one.
+    fn is_over(&self, stream: Stream, handed_ns: i64) -> bool {
+        match self.stream {
+            Some(current) => current.session == stream.session && handed_ns <= self.handed_ns_max,
+            None => self.ended == Some(stream) && handed_ns <= self.handed_ns_max,
+        }
+    }
+
     fn begin(&mut self, stream: Stream, sequence: u64) {
         let base = self.base_of_new(stream, sequence);
         self.finish();
-        if self.retired.iter().any(Option::is_some) {
-            self.counts.restart_count += 1;
-        }
+        self.counts.restart_count += u64::from(self.ended.is_some());
+        self.handed_ns_max = i64::MIN;
         self.stream = Some(stream);
         self.base = base;
         self.highest = sequence;

@@ -12,7 +12,7 @@
 //! | 8 | 4 | session | start of the *sending-side* gateway; replies repeat the request's |
 //! | 12 | 2 | channel | number of the channel between the two hosts |
 //! | 14 | 2 | `header_len` | 72 |
-//! | 16 | 8 | sequence | DATA: the producer's; `SYNC_REQ`, HELLO: own count; replies repeat the request's; BYE: one past the last message sent |
+//! | 16 | 8 | sequence | DATA: the producer's; `SYNC_REQ`, HELLO: own count; replies repeat the request's; BYE: one past the last message taken for sending |
 //! | 24 | 8 | `type_hash` | hash over message type name, size and alignment |
 //! | 32 | 8 | `published_ns` | DATA: producer's stamp, sender's monotonic clock, `i64::MIN` when it has none; otherwise 0 |
 //! | 40 | 8 | `handed_ns` | just before the send call, sender's monotonic clock |

@@ -1,5 +1,7 @@
 //! What became of the messages offered to an egress bridge. It decides nothing.
 
+use crate::protocol::counters::named_counts;
+
 /// Why a message of the local channel was not taken.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum LocalRefusal {
@@ -79,6 +81,30 @@ pub struct EgressCounts {
     pub reply_accepted_count: u64,
 }
 
+named_counts!(EgressCounts {
+    offered_count,
+    sent_count,
+    message_failed_count,
+    refused_not_greeted_count,
+    refused_peer_down_count,
+    refused_channel_count,
+    refused_forwarded_count,
+    refused_too_big_count,
+    refused_pending_count,
+    refused_closed_count,
+    datagram_count,
+    transmit_failed_count,
+    transmit_stamp_implausible_count,
+    hello_sent_count,
+    sync_sent_count,
+    round_trip_count,
+    peer_down_count,
+    peer_restart_count,
+    greet_again_count,
+    reply_count,
+    reply_accepted_count,
+});
+
 impl EgressCounts {
     /// Messages of the local channel refused for any reason.
     pub const fn refused_count(&self) -> u64 {
@@ -89,37 +115,6 @@ impl EgressCounts {
             + self.refused_too_big_count
             + self.refused_pending_count
             + self.refused_closed_count
-    }
-
-    /// Every counter with its name, in the order above.
-    pub fn iter(&self) -> impl Iterator<Item = (&'static str, u64)> + use<> {
-        [
-            ("offered_count", self.offered_count),
-            ("sent_count", self.sent_count),
-            ("message_failed_count", self.message_failed_count),
-            ("refused_not_greeted_count", self.refused_not_greeted_count),
-            ("refused_peer_down_count", self.refused_peer_down_count),
-            ("refused_channel_count", self.refused_channel_count),
-            ("refused_forwarded_count", self.refused_forwarded_count),
-            ("refused_too_big_count", self.refused_too_big_count),
-            ("refused_pending_count", self.refused_pending_count),
-            ("refused_closed_count", self.refused_closed_count),
-            ("datagram_count", self.datagram_count),
-            ("transmit_failed_count", self.transmit_failed_count),
-            (
-                "transmit_stamp_implausible_count",
-                self.transmit_stamp_implausible_count,
-            ),
-            ("hello_sent_count", self.hello_sent_count),
-            ("sync_sent_count", self.sync_sent_count),
-            ("round_trip_count", self.round_trip_count),
-            ("peer_down_count", self.peer_down_count),
-            ("peer_restart_count", self.peer_restart_count),
-            ("greet_again_count", self.greet_again_count),
-            ("reply_count", self.reply_count),
-            ("reply_accepted_count", self.reply_accepted_count),
-        ]
-        .into_iter()
     }
 
     pub(super) fn refuse(&mut self, refusal: LocalRefusal) {

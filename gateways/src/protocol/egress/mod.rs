@@ -288,7 +288,9 @@ impl EgressBridge {
             return;
         }
         match kind {
-            Kind::Data => self.staging.set_follow_up(sequence, delta),
+            Kind::Data if self.last_message.is_some_and(|(_, last)| sequence <= last) => {
+                self.staging.set_follow_up(sequence, delta);
+            }
             Kind::SyncRequest => self.exchanges.set_transmit_stamp(sequence, handed_to_tx_ns),
             _ => {}
         }

@@ -1,7 +1,9 @@
 //! What an ingress bridge says about a datagram and a message. It keeps no state of its own.
 
-use hil_models::time::RemoteInstant;
+use hil_models::message::Envelope;
+use hil_models::time::{Instant, RemoteInstant};
 
+use crate::protocol::counters::named_counts;
 use crate::protocol::sequence::{Order, Stream};
 use crate::protocol::wire::{FollowUpField, Header};
 
@@ -20,6 +22,20 @@ pub struct MessageInfo {
     pub handed: RemoteInstant,
     /// Datagrams it took.
     pub fragment_count: u16,
+}
+
+impl MessageInfo {
+    /// The envelope under which a gateway publishes the message on this host at `forwarded`.
+    pub fn envelope(&self, forwarded: Instant) -> Envelope {
+        Envelope {
+            sequence: self.sequence,
+            published_ns: self.published.as_ns(),
+            forwarded_ns: forwarded.as_ns(),
+            epoch: self.epoch,
+            flags: Envelope::FORWARDED,
+            ..Envelope::default()
+        }
+    }
 }
 
 /// A sender's kernel transmit stamp of an earlier message.
@@ -92,6 +108,19 @@ pub struct IngressCounts {
     /// Sessions that replaced an earlier one; not a disposition of its own.
     pub session_restart_count: u64,
 }
+
+named_counts!(IngressCounts {
+    datagram_count,
+    delivered_count,
+    superseded_count,
+    duplicate_count,
+    late_count,
+    fragment_count,
+    hello_count,
+    sync_count,
+    bye_count,
+    session_restart_count,
+});
 
 impl IngressCounts {
     /// Datagrams accepted.

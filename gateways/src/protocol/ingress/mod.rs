@@ -237,8 +237,9 @@ impl IngressBridge {
             Body::Bye => self.on_bye(request.header),
             _ => self.on_sync_request(request),
         };
+        let handed_ns = datagram.header.handed_ns;
         let has_left = disposition == Disposition::Farewell;
-        self.sessions.heard(now, has_left);
+        self.sessions.heard(now, handed_ns, has_left);
         Ok(disposition)
     }
 
@@ -357,7 +358,7 @@ impl IngressBridge {
         }
         self.sessions.check_stamps(request.arrival, header)?;
         let stream = stream_of(header);
-        let order = self.window.peek(stream, header.sequence);
+        let order = self.window.peek(stream, header.sequence, header.handed_ns);
         if let Order::InOrder { gap } = order
             && gap > SEQUENCE_JUMP_MAX
             && !self.is_jump_allowed
@@ -369,7 +370,7 @@ impl IngressBridge {
             let window = &mut self.window;
             self.is_jump_allowed = false;
             let message = message_of(header, header.handed_ns);
-            let order = window.record(stream, header.sequence);
+            let order = window.record(stream, header.sequence, header.handed_ns);
             let delivery = delivery_of(header, message, payload, order);
             return Ok(delivery.dispose(self.settings.deliver_reordered, deliver));
         }
@@ -392,7 +393,9 @@ impl IngressBridge {
         };
         self.is_jump_allowed = false;
         let message = message_of(header, assembled.handed_ns);
-        let order = self.window.record(stream, header.sequence);
+        let order = self
+            .window
+            .record(stream, header.sequence, header.handed_ns);
         let delivery = delivery_of(header, message, assembled.payload, order);
         Ok(delivery.dispose(self.settings.deliver_reordered, deliver))
     }
@@ -419,7 +422,7 @@ impl IngressBridge {
         let Some(last) = header.sequence.checked_sub(1) else {
             return Disposition::Farewell;
         };
-        let order = self.window.peek(stream, last);
+        let order = self.window.peek(stream, last, header.handed_ns);
         if !matches!(order, Order::InOrder { gap } if gap > SEQUENCE_JUMP_MAX) {
             self.window.announce_end(stream, header.sequence);
         }

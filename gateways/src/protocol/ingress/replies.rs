@@ -9,6 +9,7 @@ use super::{IngressSettings, REFUSAL_REPLY_PERIOD, Reply};
 use crate::protocol::body::{
     HELLO_ACK_BODY_BYTES, HelloAck, HelloStatus, ReceivedWindow, SYNC_BODY_BYTES, SyncResponse,
 };
+use crate::protocol::counters::named_counts;
 use crate::protocol::stamps::StampSource;
 use crate::protocol::wire::{FollowUpField, HEADER_BYTES, Header, Kind};
 
@@ -27,6 +28,13 @@ pub struct ReplyCounts {
     /// Replies withheld because they would have been longer than their request.
     pub amplifying_count: u64,
 }
+
+named_counts!(ReplyCounts {
+    sent_count,
+    replaced_count,
+    rate_limited_count,
+    amplifying_count,
+});
 
 #[derive(Debug, Clone, Copy)]
 pub(super) struct AckRequest {

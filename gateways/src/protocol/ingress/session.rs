@@ -25,6 +25,8 @@ pub(super) struct Session {
     pub(super) clock_id: u64,
     pub(super) last_heard: Instant,
     pub(super) has_left: bool,
+    /// Latest hand-over accepted, by the sender's clock.
+    handed_ns_max: i64,
     peer: Option<SocketAddr>,
     /// The sender's clock minus this host's at the last greeting or exchange, delay included.
     offset_ns: i64,
@@ -41,7 +43,8 @@ pub(super) struct Greeting {
 #[derive(Debug)]
 pub(super) struct Sessions {
     current: Option<Session>,
-    retired: [Option<u32>; RETIRED_LENGTH],
+    /// Sessions that are over, and their latest hand-over.
+    retired: [Option<(u32, i64)>; RETIRED_LENGTH],
     retired_next: usize,
 }
 
@@ -66,7 +69,7 @@ impl Sessions {
         header: &Header,
         clock_id: u64,
     ) -> Result<Greeting, Refusal> {
-        if self.retired.contains(&Some(header.session)) {
+        if self.is_over(header) {
             return Err(Refusal::Stale);
         }
         if self
@@ -75,22 +78,26 @@ impl Sessions {
         {
             return Err(Refusal::ForeignSource);
         }
-        let previous = self.current.map(|session| session.id);
-        let is_new = previous != Some(header.session);
-        let is_restart = is_new && previous.is_some();
-        if is_restart {
-            self.retired[self.retired_next] = previous;
-            self.retired_next = (self.retired_next + 1) % RETIRED_LENGTH;
+        let replaced = self.current.filter(|current| current.id != header.session);
+        let confirmed = self.current.filter(|current| current.id == header.session);
+        if let Some(session) = replaced {
+            self.retire(session);
         }
         self.current = Some(Session {
             id: header.session,
             clock_id,
             last_heard: now,
             has_left: false,
+            handed_ns_max: confirmed.map_or(header.handed_ns, |current| {
+                current.handed_ns_max.max(header.handed_ns)
+            }),
             peer: arrival.peer,
             offset_ns: offset_ns(arrival, header),
         });
-        Ok(Greeting { is_new, is_restart })
+        Ok(Greeting {
+            is_new: confirmed.is_none(),
+            is_restart: replaced.is_some(),
+        })
     }
 
     /// Whether a datagram of the session may be looked at.
@@ -99,7 +106,7 @@ impl Sessions {
             return Err(Refusal::UnknownSession);
         };
         if current.id != header.session {
-            return Err(if self.retired.contains(&Some(header.session)) {
+            return Err(if self.is_over(header) {
                 Refusal::Stale
             } else {
                 Refusal::UnknownSession
@@ -140,11 +147,30 @@ impl Sessions {
         }
     }
 
-    pub(super) fn heard(&mut self, now: Instant, has_left: bool) {
+    pub(super) fn heard(&mut self, now: Instant, handed_ns: i64, has_left: bool) {
         if let Some(current) = &mut self.current {
             current.last_heard = now;
-            current.has_left = has_left;
+            // A message that the farewell overtook does not mean that the sender is back.
+            current.has_left = has_left || (current.has_left && handed_ns <= current.handed_ns_max);
+            current.handed_ns_max = current.handed_ns_max.max(handed_ns);
         }
+    }
+
+    /// True for a datagram sent before its session was replaced. One sent afterwards shows that
+    /// the session lives, and that replacing it was a mistake.
+    fn is_over(&self, header: &Header) -> bool {
+        let mut retired = self.retired.iter().flatten();
+        retired.any(|&(id, handed_ns)| id == header.session && header.handed_ns <= handed_ns)
+    }
+
+    fn retire(&mut self, session: Session) {
+        let known = |entry: &Option<(u32, i64)>| entry.is_some_and(|(id, _)| id == session.id);
+        let index = self.retired.iter().position(known).unwrap_or_else(|| {
+            let next = self.retired_next;
+            self.retired_next = (next + 1) % RETIRED_LENGTH;
+            next
+        });
+        self.retired[index] = Some((session.id, session.handed_ns_max));
     }
 }
 

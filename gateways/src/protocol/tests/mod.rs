@@ -1,1 +1,9 @@
-//! Tests of the two bridges together.
+//! Tests of the protocol's parts together; nothing here ships.
+
+mod bridges;
+mod fragments;
+mod golden;
+mod mutation;
+mod network;
+mod recovery;
+mod sequences;
