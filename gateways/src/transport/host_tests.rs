@@ -10,7 +10,7 @@ use nix::unistd::{Pid, gettid};
 
 use super::clock_pair::{ClockPair, monotonic_now};
 use super::conformance_tests::{udp_pair, within_bound};
-use super::probe::{Availability, ProbeSettings, arm_and_probe};
+use super::probe::{Availability, DISCARD_PORT, ProbeSettings, arm_and_probe};
 use super::timestamping::TimestampMode;
 use super::trap_tests::{count_waiting, loopback_settings, sentinel, take_stamps};
 use super::udp::{UdpReceiver, UdpSender};
@@ -155,5 +155,44 @@ fn a_full_queue_on_the_way_out_is_a_state_and_shifts_no_stamp() {
             (counters.queue_full_count, counters.unmatched_stamp_count),
             (5, 0)
         );
+    });
+}
+
+#[test]
+fn an_interface_is_probed_by_what_leaves_through_it() {
+    in_an_own_network(|| {
+        if !run("ip link add near type veth peer name far") {
+            println!("skipped: this host has no veth");
+            return;
+        }
+        let is_ready = run("ip addr add 198.51.100.1/24 dev near")
+            && run("ip link set near up")
+            && run("ip link set far up")
+            && run("ip neigh add 198.51.100.2 lladdr 02:00:00:00:00:02 dev near nud permanent");
+        assert!(is_ready, "a veth pair can be configured");
+        let mut settings = ProbeSettings::loopback(TimestampMode::Scheduled);
+        settings.interface = Some("near".into());
+        settings.transmit_target = Some(([198, 51, 100, 2], DISCARD_PORT).into());
+        let (report, _sentinel) = arm_and_probe(&settings).unwrap();
+        assert_eq!(report.tx_software, Availability::Seen, "{report:?}");
+        assert_eq!(report.tx_scheduled, Availability::Seen, "{report:?}");
+        // Unbound, the route leads to the same interface.
+        settings.interface = None;
+        let (report, _sentinel) = arm_and_probe(&settings).unwrap();
+        assert!(report.capabilities.is_some_and(|claims| claims.tx_software));
+
+        // Nobody answers for this address, so nothing leaves and no stamp comes.
+        settings.transmit_target = Some(([198, 51, 100, 3], DISCARD_PORT).into());
+        settings.bound = Duration::from_millis(100);
+        let (report, _sentinel) = arm_and_probe(&settings).unwrap();
+        assert_eq!(report.tx_software, Availability::ClaimedButNotSeen);
+
+        // And no way leads there.
+        settings.transmit_target = Some(([203, 0, 113, 1], DISCARD_PORT).into());
+        settings.interface = Some("far".into());
+        match arm_and_probe(&settings) {
+            Ok((report, _sentinel)) => assert_ne!(report.tx_software, Availability::Seen),
+            Err(error) => println!("{error}"),
+        }
     });
 }

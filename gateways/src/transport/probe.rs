@@ -14,9 +14,9 @@ use nix::poll::{PollFd, PollFlags, ppoll};
 use thiserror::Error;
 
 use super::clock_pair::monotonic_now;
-use super::timestamping::{TimestampCapabilities, TimestampMode};
+use super::timestamping::{TimestampCapabilities, TimestampMode, interface_with_address};
 use super::udp::{UdpError, UdpReceiver, UdpSender, UdpSettings};
-use super::{DatagramReceiver, DatagramSender, SendRefusal, TransmitStage};
+use super::{DatagramReceiver, DatagramSender, SendRefusal, TransmitStage, TxToken};
 
 /// How long one probe datagram may take to come back with its stamps.
 const STAMP_WAIT: Duration = Duration::from_millis(20);
@@ -32,11 +32,11 @@ pub const DISCARD_PORT: u16 = 9;
 pub struct ProbeSettings {
     /// Which stamps the run will ask for.
     pub timestamps: TimestampMode,
-    /// Interface the run sends on; its driver is asked what it claims. `None` probes loopback.
-    pub interface: Option<String>,
-    /// Where to send the transmit probes, so that they leave by that interface: the peer's
-    /// address with [`DISCARD_PORT`] is polite. `None` probes loopback.
+    /// Where to send the transmit probes, so that they leave as the run's datagrams will: the
+    /// peer's address with [`DISCARD_PORT`] is polite. `None` probes loopback.
     pub transmit_target: Option<SocketAddr>,
+    /// Interface the run is bound to; needs a target. `None` leaves the way to the routes.
+    pub interface: Option<String>,
     /// Stamps in a row that count as proof.
     pub proof_count: u32,
     /// Longest time the receive and the transmit half may each take.
@@ -48,8 +48,8 @@ impl ProbeSettings {
     pub const fn loopback(timestamps: TimestampMode) -> Self {
         Self {
             timestamps,
-            interface: None,
             transmit_target: None,
+            interface: None,
             proof_count: 20,
             bound: Duration::from_secs(2),
         }
@@ -81,8 +81,9 @@ pub struct ProbeReport {
     pub tx_scheduled: Availability,
     /// Transmit stamps of the network card; asked for in [`TimestampMode::Hardware`] only.
     pub tx_hardware: Availability,
-    /// What the driver of the interface claims; `None` when it does not answer. Hardware receive
-    /// stamps are known from here only: they need a peer that sends.
+    /// What the driver of the interface that the transmit probes left by claims; `None` when it
+    /// does not answer or the interface is unknown. Hardware receive stamps are known from here
+    /// only: they need a peer that sends.
     pub capabilities: Option<TimestampCapabilities>,
     /// Datagrams sent to find the receive stamps.
     pub attempts: u32,
@@ -107,6 +108,12 @@ pub struct Sentinel {
 /// Why nothing could be probed.
 #[derive(Debug, Error)]
 pub enum ProbeError {
+    /// An interface cannot be probed without sending through it.
+    #[error("interface {interface} is to be probed but no transmit target is given")]
+    NoTarget {
+        /// Its name.
+        interface: String,
+    },
     /// A probe socket could not be set up.
     #[error("probe socket: {0}")]
     Socket(#[from] UdpError),
@@ -122,16 +129,19 @@ pub enum ProbeError {
 /// # Errors
 /// When the probe itself failed. Missing stamps are a finding, not an error.
 pub fn arm_and_probe(settings: &ProbeSettings) -> Result<(ProbeReport, Sentinel), ProbeError> {
+    if let (Some(interface), None) = (&settings.interface, settings.transmit_target) {
+        let interface = interface.clone();
+        return Err(ProbeError::NoTarget { interface });
+    }
     let start = monotonic_now()?;
     let (mut receiver, mut sender) = open_loopback(settings.timestamps)?;
     let (is_rx_seen, attempts) = probe_receive(settings, &mut sender, &mut receiver)?;
 
-    let interface = settings.interface.as_deref().unwrap_or("lo");
-    let capabilities = TimestampCapabilities::query(interface).ok();
-    let seen = match settings.transmit_target {
-        None => probe_transmit(settings, &mut sender)?,
-        Some(target) => probe_transmit(settings, &mut open_towards(settings, target)?)?,
-    };
+    if let Some(target) = settings.transmit_target {
+        sender = open_towards(settings, target)?;
+    }
+    let seen = probe_transmit(settings, &mut sender)?;
+    let capabilities = capabilities_of(settings, &sender);
 
     let mode = settings.timestamps;
     let is_armed = mode != TimestampMode::Off;
@@ -192,6 +202,16 @@ fn open_towards(settings: &ProbeSettings, target: SocketAddr) -> Result<UdpSende
     Ok(UdpSender::open(&udp)?)
 }
 
+/// The claims of the interface that `sender` leaves by.
+fn capabilities_of(settings: &ProbeSettings, sender: &UdpSender) -> Option<TimestampCapabilities> {
+    if let Some(interface) = &settings.interface {
+        return TimestampCapabilities::query(interface).ok();
+    }
+    let own_address = sender.local_address().ok()?.ip();
+    let interface = interface_with_address(own_address).ok()??;
+    TimestampCapabilities::query(&interface).ok()
+}
+
 /// Sends to ourselves until enough datagrams in a row came with a stamp.
 fn probe_receive(
     settings: &ProbeSettings,
@@ -248,7 +268,7 @@ fn probe_transmit(
     loop {
         finding.attempts += 1;
         let seen = match sender.send(PROBE_DATAGRAM) {
-            Ok(_) => collect_stamps(sender, mode)?,
+            Ok(token) => collect_stamps(sender, token, mode)?,
             Err(refusal) => {
                 finding.newest_refusal = Some(refusal);
                 thread::sleep(RETRY_PAUSE);
@@ -271,8 +291,12 @@ fn probe_transmit(
     }
 }
 
-/// Which kinds of stamp (software, scheduled, hardware) the datagram sent last got in time.
-fn collect_stamps(sender: &mut UdpSender, mode: TimestampMode) -> Result<[bool; 3], ProbeError> {
+/// Which kinds of stamp (software, scheduled, hardware) the send `token` got in time.
+fn collect_stamps(
+    sender: &mut UdpSender,
+    token: TxToken,
+    mode: TimestampMode,
+) -> Result<[bool; 3], ProbeError> {
     let wanted = [
         true,
         mode == TimestampMode::Scheduled,
@@ -282,6 +306,9 @@ fn collect_stamps(sender: &mut UdpSender, mode: TimestampMode) -> Result<[bool; 
     let end = monotonic_now()? + STAMP_WAIT;
     loop {
         while let Some(stamp) = sender.next_stamp() {
+            if stamp.token != token {
+                continue;
+            }
             let has_software = stamp.stamps.software_ns.is_some();
             seen[0] |= has_software && stamp.stage == TransmitStage::Sent;
             seen[1] |= has_software && stamp.stage == TransmitStage::Scheduled;
@@ -371,7 +398,15 @@ mod tests {
     }
 
     #[test]
-    fn a_test_thread_has_no_realtime_policy() {
-        assert_eq!(is_this_thread_realtime(), Some(false));
+    fn an_interface_without_a_target_is_an_error_not_a_probe_of_loopback() {
+        let mut settings = ProbeSettings::loopback(TimestampMode::Software);
+        settings.interface = Some("lo".into());
+        let error = arm_and_probe(&settings).unwrap_err();
+        assert!(matches!(error, ProbeError::NoTarget { .. }), "{error}");
+    }
+
+    #[test]
+    fn the_policy_of_a_thread_can_be_read() {
+        assert!(is_this_thread_realtime().is_some());
     }
 }

@@ -4,10 +4,6 @@
 //!
 //! This is the only file of the crate with `unsafe`: `recvmsg`, two socket options and one
 //! `ioctl` have no safe form that does not allocate.
-#![allow(
-    unsafe_code,
-    reason = "recvmsg without allocation, and socket options and ioctls that no crate wraps"
-)]
 
 use core::ffi::{c_char, c_int, c_ulong};
 use core::mem;
@@ -146,6 +142,10 @@ impl MessageReader {
     }
 
     /// Takes the next message of `queue`, or `None` when there is none. Never blocks.
+    #[allow(
+        unsafe_code,
+        reason = "no safe receive call takes preallocated control memory"
+    )]
     pub(super) fn read(
         &mut self,
         socket: BorrowedFd<'_>,
@@ -218,6 +218,7 @@ fn decode_address(bytes: &[u8]) -> Option<SocketAddr> {
 }
 
 /// Sets a socket option with an `int` value.
+#[allow(unsafe_code, reason = "no crate wraps IP_MTU_DISCOVER")]
 pub(super) fn set_int_option(
     socket: &impl AsFd,
     level: c_int,
@@ -237,6 +238,7 @@ pub(super) fn set_int_option(
 }
 
 /// Reads a socket option with an `int` value.
+#[allow(unsafe_code, reason = "no crate wraps IPV6_MTU")]
 pub(super) fn int_option(socket: &impl AsFd, level: c_int, name: c_int) -> io::Result<c_int> {
     let mut value: c_int = 0;
     let mut length = INT_LENGTH;
@@ -292,6 +294,7 @@ impl TimestampCapabilities {
     ///
     /// # Errors
     /// When there is no such interface or its driver does not answer (`EOPNOTSUPP`).
+    #[allow(unsafe_code, reason = "no crate wraps ETHTOOL_GET_TS_INFO")]
     pub fn query(interface: &str) -> io::Result<Self> {
         let mut info = EthtoolTimestampInfo {
             command: ETHTOOL_GET_TS_INFO,
@@ -347,6 +350,7 @@ impl HardwareStamping {
         Self::exchange(interface, libc::SIOCSHWTSTAMP, wanted)
     }
 
+    #[allow(unsafe_code, reason = "no crate wraps SIOCGHWTSTAMP and SIOCSHWTSTAMP")]
     fn exchange(interface: &str, request: c_ulong, wanted: (u32, u32)) -> io::Result<Self> {
         let mut config = libc::hwtstamp_config {
             flags: 0,
@@ -367,6 +371,7 @@ impl HardwareStamping {
 ///
 /// # Safety
 /// `data` points to the live structure that `request` reads and writes.
+#[allow(unsafe_code, reason = "the kernel follows the pointer it is given")]
 unsafe fn device_request(interface: &str, request: c_ulong, data: *mut c_char) -> io::Result<()> {
     let mut name: [c_char; libc::IFNAMSIZ] = [0; libc::IFNAMSIZ];
     // One byte stays zero as the end of the name.
