@@ -39,6 +39,7 @@ pub(super) struct CaseEntry<'t> {
 pub(super) struct HostEntry {
     pub host: Host,
     pub path: String,
+    /// Of its address or, without one, of its key.
     pub place: Place,
 }
 
@@ -170,7 +171,11 @@ fn read_case(mut reader: Reader<'_>) -> CaseEntry<'_> {
 }
 
 fn read_host(name: String, mut reader: Reader<'_>) -> HostEntry {
-    let address = reader.text("address").and_then(|text| {
+    let address_text = reader.text("address");
+    let place = address_text
+        .as_ref()
+        .map_or(reader.place, |text| text.place);
+    let address = address_text.and_then(|text| {
         let parsed: Option<IpAddr> = text.value.parse().ok();
         if parsed.is_none_or(|address| address.is_unspecified() || address.is_multicast()) {
             let text = text.value;
@@ -194,7 +199,7 @@ fn read_host(name: String, mut reader: Reader<'_>) -> HostEntry {
         reader.refuse_present(&["control_port", "interface"], why);
     }
     let control_port = control_port.unwrap_or_else(|| default_port(&limits::HOST_CONTROL_PORT));
-    let (path, place) = (reader.path.clone(), reader.place);
+    let path = reader.path.clone();
     reader.finish();
     HostEntry {
         host: Host {

@@ -3,7 +3,7 @@
 
 use std::collections::BTreeMap;
 
-use hil_models::case_study::{CaseStudy, ChannelSpec};
+use hil_models::case_study::{CaseStudy, ChannelSpec, ParameterError};
 use serde::Deserialize;
 
 /// The case studies that `[case] name` may say.
@@ -83,22 +83,40 @@ impl KnownCase {
     }
 }
 
-/// Deserialises, lets the case check, and serialises again so that defaults become visible.
 fn check_parameters<C: CaseStudy>(
     table: &toml::Table,
     seed: u64,
 ) -> Result<toml::Table, Vec<ParameterFault>> {
-    let parameters = match C::Parameters::deserialize(table.clone()) {
+    check_parameters_with::<C>(table, seed, &mut |_| Ok(()))
+}
+
+/// The [`ParameterCheck`] of `C` with a step between reading and checking the parameters, for a
+/// case whose parameters name files that someone must open for it.
+///
+/// Deserialises, lets the case check, and serialises again so that defaults become visible.
+///
+/// # Errors
+/// Every parameter the case cannot read; else what `prepare` says, else what the case says.
+pub fn check_parameters_with<C: CaseStudy>(
+    table: &toml::Table,
+    seed: u64,
+    prepare: &mut dyn FnMut(&mut C::Parameters) -> Result<(), ParameterError>,
+) -> Result<toml::Table, Vec<ParameterFault>> {
+    let mut parameters = match C::Parameters::deserialize(table.clone()) {
         Ok(parameters) => parameters,
         Err(error) => return Err(faults_of_each_key::<C>(table, &error)),
     };
     let complete = toml::Table::try_from(&parameters).map_err(|error| {
-        vec![ParameterFault::whole(format!(
-            "parameters cannot be written as TOML: {error}"
-        ))]
+        vec![ParameterFault {
+            key: Vec::new(),
+            message: format!("cannot be written as TOML: {error}"),
+            is_unknown_key: false,
+            valid_keys: Vec::new(),
+        }]
     })?;
-    match C::new(parameters, seed) {
-        Ok(_) => Ok(complete),
+    let checked = prepare(&mut parameters).and_then(|()| C::new(parameters, seed).map(drop));
+    match checked {
+        Ok(()) => Ok(complete),
         Err(error) => Err(vec![ParameterFault {
             key: error.key.split('.').map(str::to_owned).collect(),
             message: format!("{} is outside {}", error.value, error.allowed),
@@ -143,7 +161,7 @@ fn fault_of(error: &toml::de::Error, key: Option<&String>) -> ParameterFault {
     let Some((name, expected)) = unknown.and_then(|rest| rest.split_once('`')) else {
         return ParameterFault {
             key: path,
-            message: error.message().to_owned(),
+            message: format!("cannot be read: {}", error.message()),
             is_unknown_key: false,
             valid_keys: Vec::new(),
         };
@@ -162,17 +180,6 @@ fn fault_of(error: &toml::de::Error, key: Option<&String>) -> ParameterFault {
             .step_by(2)
             .map(str::to_owned)
             .collect(),
-    }
-}
-
-impl ParameterFault {
-    fn whole(message: String) -> Self {
-        Self {
-            key: Vec::new(),
-            message,
-            is_unknown_key: false,
-            valid_keys: Vec::new(),
-        }
     }
 }
 

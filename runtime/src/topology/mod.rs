@@ -32,7 +32,9 @@ use std::path::Path;
 pub use card::{CardChannel, ProcessCard};
 pub use errors::{Fault, Location, TopologyError, TopologyErrors};
 pub use host::{HOST_VARIABLE, HostChoice, HostError, MachineIdentity, which_host};
-pub use known::{KnownCase, KnownCases, ParameterCheck, ParameterFault, parameters_of};
+pub use known::{
+    KnownCase, KnownCases, ParameterCheck, ParameterFault, check_parameters_with, parameters_of,
+};
 pub use model::{
     Case, Channel, ChannelPorts, Crossing, Direction, Emulation, Execution, Gateway, Hop, Host,
     Impairment, Link, MessageLayout, OnExit, Process, Program, Run, Scheduling, Timestamps,

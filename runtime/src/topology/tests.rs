@@ -211,7 +211,7 @@ fn what_a_file_leaves_out_has_the_documented_default() {
 }
 
 #[test]
-fn every_key_reaches_the_checked_topology() {
+fn every_key_of_a_process_reaches_the_checked_topology() {
     let topology = parse_good(EVERYTHING);
     let human = topology.process("human").unwrap();
     assert_eq!(human.execution.cpus, [2]);
@@ -233,7 +233,11 @@ fn every_key_reaches_the_checked_topology() {
     assert_eq!(role.as_deref(), Some("controller"));
     assert_eq!(command, &["./my-controller", "--fast"]);
     assert_eq!(environment["RUST_LOG"], "debug");
+}
 
+#[test]
+fn every_key_of_a_channel_and_its_link_reaches_the_checked_topology() {
+    let topology = parse_good(EVERYTHING);
     let ids: Vec<_> = topology
         .channels()
         .iter()

@@ -161,3 +161,23 @@ fn one_link_joins_one_pair_of_hosts() {
     );
     assert!(text.contains("between `control-pc` and `third`"), "{text}");
 }
+
+fn check_with_refusal(table: &toml::Table, seed: u64) -> Result<toml::Table, Vec<ParameterFault>> {
+    let mut refuse =
+        |_: &mut ShuttleParameters| ParameterError::check("gain_per_s", 1.0, 2.0..=3.0, "2..=3");
+    check_parameters_with::<Shuttle>(table, seed, &mut refuse)
+}
+
+#[test]
+fn a_callers_own_parameter_check_points_at_the_line_too() {
+    let case = KnownCase {
+        check_parameters: check_with_refusal,
+        ..KnownCase::of::<Shuttle>()
+    };
+    let text = "version = 1\nname = 'x'\n[processes]\ncontroller.role = 'controller'\n\
+                robot.role = 'robot'\n[case]\nname = 'shuttle'\nparameters.gain_per_s = 1.0\n";
+    let known = KnownCases::new().with_case(case);
+    let errors = parse("own.toml", text, &[], &known).unwrap_err();
+    let says = "own.toml:8:25: case.parameters.gain_per_s 1 is outside 2..=3";
+    assert_eq!(errors.to_string(), says);
+}
