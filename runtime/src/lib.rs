@@ -4,4 +4,5 @@ pub mod clock;
 pub mod doctor;
 pub mod host_facts;
 pub mod realtime;
+pub mod report;
 pub mod topology;

@@ -191,11 +191,13 @@ impl<'a> Judge<'a> {
     /// True when the message was last seen while the process was down, or shortly before and
     /// nothing recorded says that it got lost otherwise.
     fn is_hit(&self, fate: MessageFate, place: Place, interruption: &Interruption) -> bool {
-        let Some(at_ns) = self.position(place, interruption.place.side()) else {
-            return false;
+        let (seen_ns, is_exact) = match self.position(place, interruption.place.side()) {
+            Position::Exact(seen_ns) => (seen_ns, true),
+            Position::After(seen_ns) => (seen_ns, false),
+            Position::Unknown => return false,
         };
         let (from_ns, until_ns) = (interruption.from.as_ns(), interruption.until.as_ns());
-        if (from_ns..=until_ns).contains(&at_ns) {
+        if (from_ns..=until_ns).contains(&seen_ns) {
             return true;
         }
         let may_have_been_inside = match fate {
@@ -205,21 +207,39 @@ impl<'a> Judge<'a> {
             | MessageFate::UnknownPeerRecordsUnavailable => true,
             MessageFate::SupersededAtInput => interruption.place == PathProcess::SendingGateway,
             MessageFate::SupersededAtConsumer => interruption.place == PathProcess::Consumer,
-            _ => false,
+            // Its record says otherwise, but if it was somewhat later, its cause is the same.
+            _ => !is_exact,
         };
-        may_have_been_inside && (from_ns.saturating_sub(self.flight_ns)..from_ns).contains(&at_ns)
+        may_have_been_inside && (from_ns.saturating_sub(self.flight_ns)..from_ns).contains(&seen_ns)
     }
 
     /// When the message was last seen, on the clock of one host.
-    fn position(&self, place: Place, side: Side) -> Option<i64> {
-        match side {
-            Side::Producer => place.producer_ns.or(self.previous_producer_ns),
-            Side::Consumer => place
-                .consumer_ns
-                .or_else(|| localise(self.alignment, place.producer_ns?))
-                .or(self.previous_consumer_ns),
+    fn position(&self, place: Place, side: Side) -> Position {
+        let (exact_ns, previous_ns) = match side {
+            Side::Producer => (place.producer_ns, self.previous_producer_ns),
+            Side::Consumer => {
+                let localised = || localise(self.alignment, place.producer_ns?);
+                (
+                    place.consumer_ns.or_else(localised),
+                    self.previous_consumer_ns,
+                )
+            }
+        };
+        match (exact_ns, previous_ns) {
+            (Some(exact_ns), _) => Position::Exact(exact_ns),
+            (None, Some(previous_ns)) => Position::After(previous_ns),
+            (None, None) => Position::Unknown,
         }
     }
+}
+
+/// What is known about when a message was last seen.
+#[derive(Debug, Clone, Copy)]
+enum Position {
+    Exact(i64),
+    /// Only that it followed a message seen then.
+    After(i64),
+    Unknown,
 }
 
 fn localise(alignment: Option<Alignment>, producer_ns: i64) -> Option<i64> {

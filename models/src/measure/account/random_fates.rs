@@ -332,7 +332,7 @@ fn a_wild_sequence_number_neither_hangs_nor_breaks_the_sum() {
 }
 
 #[test]
-#[ignore = "prints a figure; run in release"]
+#[ignore = "a million messages: run it with --release"]
 fn a_million_messages_are_accounted_for_in_linear_time() {
     let files = Files::delivered(1_000_000);
     let account = account(&files.records(), &same_clock(1_000_000 * PERIOD_NS));

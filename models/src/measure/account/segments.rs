@@ -30,7 +30,8 @@ struct Timeline {
 }
 
 impl Timeline {
-    fn of(joined: &Joined<'_>) -> Self {
+    /// A direct channel has no stages between its ends, whatever a record claims.
+    fn of(joined: &Joined<'_>, is_gateway: bool) -> Self {
         let (egress, ingress, taken) = (joined.egress, joined.ingress, joined.taken);
         let published_ns = joined
             .published
@@ -44,7 +45,8 @@ impl Timeline {
             .or(sender_handed_ns);
         let forwarded_ns = ingress
             .and_then(|record| stamp(record.forwarded_ns))
-            .or_else(|| stamp(taken?.forwarded_ns));
+            .or_else(|| stamp(taken?.forwarded_ns))
+            .filter(|_| is_gateway);
         let plain = |stage, ns: Option<i64>| {
             ns.map(|host_ns| Mark {
                 stage,
@@ -153,7 +155,7 @@ impl<'a> SegmentBook<'a> {
         if self.files.taken.is_some() && joined.taken.is_none() {
             return;
         }
-        let timeline = Timeline::of(joined);
+        let timeline = Timeline::of(joined, self.is_gateway);
         let (mut sum_ns, mut is_ordered) = (0_i64, true);
         for mark in timeline.marks.iter().flatten() {
             self.mark_counts[mark.stage.index()] += 1;

@@ -357,7 +357,8 @@ fn hardware_stamps_give_a_segment_only_on_one_card_clock() {
 #[test]
 fn a_direct_channel_has_one_segment() {
     let mut files = Files::delivered(100);
-    for record in &mut files.taken {
+    // A stray gateway stamp on half of them must not cut the only segment.
+    for record in &mut files.taken[..50] {
         record.forwarded_ns = UNAVAILABLE;
     }
     files.taken.retain(|record| record.sequence % 10 != 4);

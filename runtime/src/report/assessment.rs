@@ -1,0 +1,171 @@
+//! What follows from a summary's figures: whether the run may be called a network result at all,
+//! and what a reader must be warned of. It draws conclusions, it does not measure.
+
+use hil_models::measure::account::{ChannelAccount, ClosingFigures, Coverage, MessageFate};
+use serde::{Deserialize, Serialize};
+
+use super::summary::{ChannelSummary, LinkKind, ProcessSummary, RunSummary};
+use super::terminal::{JOINT, grouped, percent};
+
+/// Share of skipped ticks above which the host, not the network, shaped the run.
+pub const SKIPPED_TICK_RATIO_MAX: f64 = 0.001;
+
+/// Share of messages whose account must close.
+const CLOSED_RATIO_MIN: f64 = 0.999;
+
+/// Share of messages that must carry a software stamp.
+const STAMPED_RATIO_MIN: f64 = 0.99;
+
+/// Whether delays and losses of a run may be put down to the network.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "state", rename_all = "snake_case")]
+pub enum NetworkVerdict {
+    /// No channel went over a network.
+    NoNetwork,
+    /// The host kept its ticks: what remains is the network's.
+    NetworkResult,
+    /// A process skipped too many ticks: the run says nothing about the network.
+    HostOverran {
+        /// The processes that did.
+        processes: Vec<Overrun>,
+    },
+    /// No process reported its ticks, so nobody can tell.
+    TicksUnknown,
+}
+
+/// A process that skipped more than [`SKIPPED_TICK_RATIO_MAX`] of its ticks.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Overrun {
+    /// Its name.
+    pub process: String,
+    /// Its host.
+    pub host: String,
+    /// Ticks it passed over.
+    pub skipped_tick_count: u64,
+    /// Ticks it should have run.
+    pub due_tick_count: u64,
+}
+
+/// What follows from a summary's figures.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Assessment {
+    /// Whether this is a network result.
+    pub network: NetworkVerdict,
+    /// What a reader must be warned of, most important first.
+    pub warnings: Vec<String>,
+}
+
+impl Assessment {
+    /// Draws the conclusions.
+    pub fn of(summary: &RunSummary) -> Self {
+        let overruns: Vec<Overrun> = summary.processes.iter().filter_map(overrun).collect();
+        let mut warnings: Vec<String> = overruns.iter().map(overrun_warning).collect();
+        warnings.extend(summary.warnings.iter().cloned());
+        warnings.extend(summary.processes.iter().flat_map(process_warnings));
+        warnings.extend(summary.channels.iter().flat_map(channel_warnings));
+        let is_networked = |channel: &ChannelSummary| channel.link != LinkKind::SharedMemory;
+        let has_ticks = |process: &ProcessSummary| process.tick_count.is_some();
+        let network = if !overruns.is_empty() {
+            NetworkVerdict::HostOverran {
+                processes: overruns,
+            }
+        } else if !summary.channels.iter().any(is_networked) {
+            NetworkVerdict::NoNetwork
+        } else if summary.processes.iter().any(has_ticks) {
+            NetworkVerdict::NetworkResult
+        } else {
+            NetworkVerdict::TicksUnknown
+        };
+        // The joint is for pages; in JSON it would only surprise.
+        for warning in &mut warnings {
+            *warning = warning.replace(JOINT, " ");
+        }
+        Self { network, warnings }
+    }
+}
+
+fn overrun(process: &ProcessSummary) -> Option<Overrun> {
+    let skipped_tick_count = process.skipped_tick_count?;
+    let due_tick_count = process.tick_count?.saturating_add(skipped_tick_count);
+    let limit = SKIPPED_TICK_RATIO_MAX * due_tick_count as f64;
+    (skipped_tick_count as f64 > limit).then(|| Overrun {
+        process: process.name.clone(),
+        host: process.host.clone(),
+        skipped_tick_count,
+        due_tick_count,
+    })
+}
+
+fn overrun_warning(overrun: &Overrun) -> String {
+    format!(
+        "host overran: {} skipped {} of {} ticks ({}) on {}; the network is not to blame for \
+         what these ticks missed",
+        overrun.process,
+        grouped(overrun.skipped_tick_count),
+        grouped(overrun.due_tick_count),
+        percent(overrun.skipped_tick_count as f64 / overrun.due_tick_count as f64),
+        overrun.host,
+    )
+}
+
+fn process_warnings(process: &ProcessSummary) -> Vec<String> {
+    let name = &process.name;
+    let some = |count: Option<u64>| count.filter(|count| *count > 0).map(grouped);
+    let mut warnings = Vec::new();
+    if let Some(count) = some(process.recorder_drop_count) {
+        warnings.push(format!(
+            "{name} could not write {count} records; their messages show as missing stages"
+        ));
+    }
+    if let Some(count) = some(process.outbox_drop_count) {
+        warnings.push(format!(
+            "{name} dropped {count} messages into a full outbox"
+        ));
+    }
+    if let Some(count) = some(process.malformed_count) {
+        warnings.push(format!("{name} refused {count} malformed messages"));
+    }
+    warnings
+}
+
+fn channel_warnings(channel: &ChannelSummary) -> Vec<String> {
+    let name = &channel.name;
+    let Some(account) = &channel.account else {
+        return vec![format!("{name} left no records: it has no account")];
+    };
+    let mut warnings = Vec::new();
+    let unexplained = account.fates.of(MessageFate::Unexplained);
+    if unexplained > 0 {
+        let count = grouped(unexplained);
+        warnings.push(format!(
+            "{name}: {count} messages vanished without explanation"
+        ));
+    }
+    if let Some((ratio, _)) = account
+        .closing
+        .checked()
+        .and_then(ClosingFigures::closed_ratio)
+        && ratio < CLOSED_RATIO_MIN
+    {
+        let (ratio, least) = (percent(ratio), percent(CLOSED_RATIO_MIN));
+        warnings.push(format!(
+            "{name}: the account closes for {ratio} of messages, less than {least}"
+        ));
+    }
+    warnings.extend(stamp_warnings(name, account));
+    warnings
+}
+
+fn stamp_warnings(name: &str, account: &ChannelAccount) -> Vec<String> {
+    let coverage = &account.coverage;
+    [("TX", coverage.tx_software), ("RX", coverage.rx_software)]
+        .into_iter()
+        .filter_map(|(kind, coverage)| {
+            let ratio = coverage.as_ref().and_then(Coverage::ratio)?;
+            (ratio < STAMPED_RATIO_MIN).then(|| {
+                let ratio = percent(ratio);
+                format!("{name}: only {ratio} of messages carry a kernel {kind} stamp")
+            })
+        })
+        .collect()
+}

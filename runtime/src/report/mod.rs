@@ -1,0 +1,9 @@
+//! What a run leaves behind for people: the summary that goes into `summary.json` and its
+//! rendering for a terminal. It measures nothing and prints nothing; the caller writes the text.
+
+pub mod assessment;
+pub mod summary;
+pub mod terminal;
+
+#[cfg(test)]
+mod sample;

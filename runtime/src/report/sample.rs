@@ -1,0 +1,485 @@
+//! A summary of a run that never was, and the rendered reports that are checked in. To renew
+//! them after a deliberate change: `HIL_BLESS=1 cargo test -p hil-runtime report`, then read the
+//! difference.
+
+use hil_models::measure::account::{
+    AccountContext, ChannelAccount, ChannelPath, ChannelRecords, Interruption, PathProcess,
+    RunSpan, account,
+};
+use hil_models::measure::record::{
+    EgressRecord, IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE,
+};
+use hil_models::random::RandomStream;
+use hil_models::time::{Alignment, Instant};
+
+use super::assessment::{Assessment, NetworkVerdict};
+use super::summary::{
+    ChannelSummary, CountByName, Fact, LinkKind, Outcome, PeerState, ProcessSummary, RealtimeFacts,
+    RunEvent, RunFacts, RunSummary, ScoreMetric, SummaryError,
+};
+use super::terminal::{Style, render};
+
+const PERIOD_NS: i64 = 4_000_000;
+const REALTIME_NS: i64 = 1_790_000_000_000_000_000;
+
+/// The records of 5000 messages with losses, missing stamps and a killed gateway.
+#[derive(Default)]
+struct Files {
+    published: Vec<PublishedRecord>,
+    egress: Vec<EgressRecord>,
+    ingress: Vec<IngressRecord>,
+    taken: Vec<TakenRecord>,
+}
+
+impl Files {
+    fn sample() -> Self {
+        let mut files = Self::default();
+        let mut stream = RandomStream::new(1, "report sample");
+        for sequence in 0..5_000_u64 {
+            files.write(sequence, &mut stream);
+        }
+        files
+    }
+
+    fn write(&mut self, sequence: u64, stream: &mut RandomStream) {
+        let published_ns = i64::try_from(sequence).unwrap() * PERIOD_NS;
+        let mut now_ns = published_ns;
+        let mut next = |scale: f64| {
+            // A skewed delay: mostly near its scale, sometimes far above.
+            let exponent = 0.3 * stream.normal() + if stream.chance(0.01) { 1.5 } else { 0.0 };
+            #[allow(clippy::cast_possible_truncation, reason = "far below 10^18")]
+            let delay_ns = (scale * exponent.exp()) as i64;
+            now_ns += delay_ns;
+            now_ns
+        };
+        self.published.push(PublishedRecord {
+            sequence,
+            published_ns,
+            epoch: 1,
+            reserved: 0,
+        });
+        let is_down = (2_000..2_190).contains(&sequence);
+        if sequence % 700 == 13 {
+            return;
+        }
+        let (taken_ns, handed_ns) = (next(14_000.0), next(900.0));
+        let has_tx = !sequence.is_multiple_of(97) && !is_down;
+        let tx_ns = REALTIME_NS + next(2_300.0);
+        self.egress.push(EgressRecord {
+            sequence,
+            published_ns,
+            taken_ns,
+            handed_ns,
+            tx_software_ns: if has_tx { tx_ns } else { UNAVAILABLE },
+            tx_hardware_ns: UNAVAILABLE,
+            realtime_offset_ns: REALTIME_NS,
+            epoch: 1,
+            session: 9,
+            flags: u32::from(is_down && sequence.is_multiple_of(2)),
+            fragment_count: 1,
+        });
+        if is_down || matches!(sequence, 900 | 3_000..3_003) {
+            return;
+        }
+        let rx_ns = REALTIME_NS + next(700.0);
+        let (received_ns, forwarded_ns) = (next(13_000.0), next(1_100.0));
+        self.ingress.push(IngressRecord {
+            sequence,
+            published_ns,
+            handed_ns,
+            rx_hardware_ns: UNAVAILABLE,
+            rx_software_ns: rx_ns,
+            received_ns,
+            forwarded_ns,
+            // Two reads of one clock pair differ by a little; one pair was read across a step.
+            realtime_offset_ns: REALTIME_NS + if sequence == 4_000 { 7_000 } else { 40 },
+            epoch: 1,
+            session: 9,
+            flags: 0,
+            fragment_count: 1,
+        });
+        self.taken.push(TakenRecord {
+            sequence,
+            published_ns,
+            forwarded_ns,
+            taken_ns: next(16_000.0),
+            epoch: 1,
+            reserved: 0,
+        });
+    }
+
+    fn account(&self, alignment: Option<Alignment>) -> ChannelAccount {
+        let run = RunSpan {
+            start: Instant::ZERO,
+            end: Instant::from_ns(5_000 * PERIOD_NS),
+        };
+        let interruptions = [Interruption {
+            process: "robot gateway".to_owned(),
+            place: PathProcess::ReceivingGateway,
+            from: Instant::from_ns(2_000 * PERIOD_NS - 1_000_000),
+            until: Instant::from_ns(2_190 * PERIOD_NS - 1_000_000),
+            cause: "killed by signal 9".to_owned(),
+        }];
+        let records = ChannelRecords {
+            published: Some(&self.published),
+            egress: Some(&self.egress),
+            ingress: Some(&self.ingress),
+            follow_up: None,
+            taken: Some(&self.taken),
+        };
+        let context = AccountContext {
+            producer_run: Some(run),
+            consumer_run: Some(run),
+            round_trips_ns: &[41_000, 44_000, 47_500, 90_000],
+            ..AccountContext::new(ChannelPath::Gateway { alignment })
+        };
+        account(&records, &context.with_interruptions(&interruptions))
+    }
+
+    fn direct(&self) -> ChannelAccount {
+        let records = ChannelRecords {
+            published: Some(&self.published),
+            taken: Some(&self.taken),
+            ..ChannelRecords::default()
+        };
+        account(&records, &AccountContext::new(ChannelPath::SharedMemory))
+    }
+}
+
+fn run_facts() -> RunFacts {
+    RunFacts {
+        name: "swing-split".to_owned(),
+        case: "teleoperation".to_owned(),
+        topology_file: "deploy/topologies/split.toml".to_owned(),
+        topology_hash: "5d1c9a70e2b34f18".to_owned(),
+        seed: 42,
+        host: "operator".to_owned(),
+        started: "2026-03-14 09:26:53 +01:00".to_owned(),
+        duration_s: 20.0,
+        outcome: Outcome::Completed,
+        exit_reason: "ran its 20 s".to_owned(),
+        folder: "runs/2026-03-14T092653-swing-split".to_owned(),
+        files: vec![
+            Fact::new("summary.json", "everything in this report, for programs"),
+            Fact::new("records/", "one fixed-size record per message and stage"),
+        ],
+        repeat_command: "hil-runtime --topology deploy/topologies/split.toml --seed 42".to_owned(),
+    }
+}
+
+fn process(name: &str, role: &str, skipped_tick_count: Option<u64>) -> ProcessSummary {
+    ProcessSummary {
+        name: name.to_owned(),
+        host: "operator".to_owned(),
+        role: role.to_owned(),
+        exit: "ended by itself, code 0".to_owned(),
+        restart_count: 0,
+        tick_count: skipped_tick_count.map(|_| 5_000),
+        skipped_tick_count,
+        cpu_time_s: Some(1.234),
+        voluntary_switch_count: Some(10_021),
+        involuntary_switch_count: Some(17),
+        malformed_count: Some(0),
+        outbox_drop_count: Some(0),
+        recorder_drop_count: Some(0),
+    }
+}
+
+fn metric(label: &str, value: Option<f64>, unit: &str, method: &str) -> ScoreMetric {
+    ScoreMetric {
+        name: label.replace(' ', "_"),
+        label: label.to_owned(),
+        value,
+        interval: value.map(|value| (0.9 * value, 1.1 * value)),
+        unit: unit.to_owned(),
+        method: method.to_owned(),
+    }
+}
+
+fn channel(
+    name: &str,
+    roles: [&str; 2],
+    link: LinkKind,
+    account: ChannelAccount,
+) -> ChannelSummary {
+    ChannelSummary {
+        name: name.to_owned(),
+        from: roles[0].to_owned(),
+        to: roles[1].to_owned(),
+        link,
+        account: Some(account),
+        refusals: Vec::new(),
+        peer_states: Vec::new(),
+    }
+}
+
+/// One channel over the network on one clock, one between unaligned hosts, one direct.
+fn channels() -> Vec<ChannelSummary> {
+    let files = Files::sample();
+    let (there, back) = (["controller", "robot"], ["robot", "controller"]);
+    let exact = files.account(Some(Alignment::SAME_CLOCK));
+    let mut command = channel("arm/command", there, LinkKind::Udp, exact);
+    command.refusals.push(CountByName {
+        name: "type hash differs".to_owned(),
+        count: 3,
+    });
+    for (at_s, state) in [(0.0, "up"), (8.0, "absent"), (8.761, "up")] {
+        command.peer_states.push(PeerState {
+            at_s,
+            state: state.to_owned(),
+        });
+    }
+    let status = channel("arm/status", back, LinkKind::Udp, files.account(None));
+    let human = ["operator", "controller"];
+    let motion = channel(
+        "human/motion",
+        human,
+        LinkKind::SharedMemory,
+        files.direct(),
+    );
+    vec![command, status, motion]
+}
+
+/// A whole report.
+fn full() -> RunSummary {
+    let mut killed = process("robot gateway", "gateway", None);
+    killed.restart_count = 1;
+    killed.cpu_time_s = None;
+    killed.exit = "first killed by signal 9, then ended by itself, code 0".to_owned();
+    RunSummary {
+        host_facts: vec![
+            Fact::new("processor", "2 × a virtual core"),
+            Fact::new("kernel", "6.18, PREEMPT_DYNAMIC"),
+        ],
+        realtime: RealtimeFacts {
+            granted: vec![Fact::new("controller", "SCHED_FIFO 50 on core 0")],
+            refused: vec![Fact::new("robot gateway", "spin: core 1 is not isolated")],
+        },
+        processes: vec![
+            process("controller", "controller", Some(2)),
+            process("robot", "robot", Some(0)),
+            killed,
+        ],
+        events: vec![RunEvent {
+            at_s: 8.0,
+            what: "robot gateway ended and was restarted after 0.757 s".to_owned(),
+            cause: "killed by signal 9".to_owned(),
+        }],
+        channels: channels(),
+        score: vec![
+            metric(
+                "joint error, root mean square",
+                Some(0.002_134),
+                "rad",
+                "commanded against reached joint angles at each status, both arms",
+            ),
+            metric(
+                "motion loops",
+                Some(4.0),
+                "1",
+                "whole swings of the recorded arm",
+            ),
+            metric("tracking lag", None, "s", "no swing was complete"),
+        ],
+        ..RunSummary::new(run_facts())
+    }
+}
+
+/// Names longer than any column, hostile characters, an overrun host, processes without figures.
+fn awkward() -> RunSummary {
+    let long = "an-exceedingly-long-name-that-someone-will-surely-choose-one-day".repeat(2);
+    let mut summary = full();
+    summary.run.name.clone_from(&long);
+    summary.run.folder.clone_from(&long);
+    summary.run.outcome = Outcome::Failed;
+    summary.run.exit_reason = format!("process {long} ended with code 1\u{1b}[2J");
+    summary.processes = vec![
+        ProcessSummary {
+            name: long.clone(),
+            role: long.clone(),
+            host: long.clone(),
+            recorder_drop_count: Some(12_345),
+            ..process("", "", Some(308))
+        },
+        process("robot", "robot", None),
+    ];
+    summary.channels.truncate(1);
+    summary.channels[0].name.clone_from(&long);
+    summary.channels[0].from.clone_from(&long);
+    summary.score[0].label.clone_from(&long);
+    summary.score[0].value = Some(-123_456_789.123);
+    summary.events[0].what.clone_from(&long);
+    summary
+}
+
+/// Nothing ran, nothing is known.
+fn empty() -> RunSummary {
+    let mut run = run_facts();
+    run.outcome = Outcome::Stopped;
+    run.exit_reason = "stopped by a person while waiting for host robot".to_owned();
+    run.duration_s = 0.0;
+    run.files.clear();
+    let mut summary = RunSummary::new(run);
+    let nothing = account(
+        &ChannelRecords::default(),
+        &AccountContext::new(ChannelPath::Gateway { alignment: None }),
+    );
+    for (name, account) in [("arm/command", Some(nothing)), ("arm/status", None)] {
+        summary.channels.push(ChannelSummary {
+            name: name.to_owned(),
+            from: "controller".to_owned(),
+            to: "robot".to_owned(),
+            link: LinkKind::Udp,
+            account,
+            refusals: Vec::new(),
+            peer_states: Vec::new(),
+        });
+    }
+    summary
+}
+
+fn check_golden(actual: &str, file: &str, expected: &str) {
+    if std::env::var_os("HIL_BLESS").is_some() {
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/src/report/testdata");
+        std::fs::write(format!("{folder}/{file}"), actual).unwrap();
+        return;
+    }
+    for (index, (actual, expected)) in actual.lines().zip(expected.lines()).enumerate() {
+        assert_eq!(actual, expected, "line {} of {file}", index + 1);
+    }
+    assert_eq!(
+        actual.lines().count(),
+        expected.lines().count(),
+        "length of {file}"
+    );
+}
+
+#[test]
+fn a_full_report_reads_as_checked_in() {
+    let text = render(&full(), 100, Style::Plain);
+    check_golden(&text, "full_100.txt", include_str!("testdata/full_100.txt"));
+}
+
+#[test]
+fn a_report_of_awkward_names_keeps_its_columns() {
+    let text = render(&awkward(), 80, Style::Plain);
+    check_golden(
+        &text,
+        "awkward_80.txt",
+        include_str!("testdata/awkward_80.txt"),
+    );
+}
+
+#[test]
+fn a_report_of_nothing_says_so() {
+    let text = render(&empty(), 80, Style::Plain);
+    check_golden(&text, "empty_80.txt", include_str!("testdata/empty_80.txt"));
+}
+
+#[test]
+fn no_line_exceeds_the_page_and_no_control_character_gets_through() {
+    for summary in [full(), awkward(), empty()] {
+        for width in [0, 80, 97, 120, 500] {
+            let text = render(&summary, width, Style::Plain);
+            let limit = width.clamp(80, 120);
+            for line in text.lines() {
+                assert!(line.chars().count() <= limit, "beyond {limit}: {line}");
+            }
+            assert!(text.chars().all(|c| c == '\n' || !c.is_control()));
+        }
+    }
+}
+
+#[test]
+fn colours_change_nothing_but_colours() {
+    let coloured = render(&full(), 100, Style::Coloured);
+    let mut plain = String::new();
+    let mut rest = coloured.as_str();
+    while let Some((before, after)) = rest.split_once('\u{1b}') {
+        plain.push_str(before);
+        rest = after.split_once('m').unwrap().1;
+    }
+    plain.push_str(rest);
+    let expected = render(&full(), 100, Style::Plain);
+    // Padding before a sequence cannot be trimmed, so ends of lines are compared without it.
+    for (plain, expected) in plain.lines().zip(expected.lines()) {
+        assert_eq!(plain.trim_end(), expected);
+    }
+}
+
+#[test]
+fn a_summary_survives_its_json() {
+    for summary in [full(), awkward(), empty()] {
+        let text = summary.to_json().unwrap();
+        // The JSON reader may differ by one unit in the last place of a float, so the texts
+        // people read are compared, and every count.
+        let read = RunSummary::from_json(&text).unwrap();
+        assert_eq!(
+            render(&read, 120, Style::Plain),
+            render(&summary, 120, Style::Plain)
+        );
+        for (read, written) in read.channels.iter().zip(&summary.channels) {
+            let counts = |channel: &ChannelSummary| {
+                let account = channel.account.clone();
+                account.map(|a| (a.fates, a.gaps.longest, a.coverage, a.loss_bursts))
+            };
+            assert_eq!(counts(read), counts(written));
+        }
+        assert!(text.contains("\"assessment\""));
+    }
+}
+
+#[test]
+fn a_newer_schema_is_refused_by_its_number() {
+    let error = RunSummary::from_json("{\"schema_version\": 7, \"runs\": []}").unwrap_err();
+    assert!(matches!(error, SummaryError::NewerSchema { found: 7 }));
+    assert_eq!(error.to_string(), "schema version 7 is newer than 1");
+    assert!(matches!(
+        RunSummary::from_json("{}"),
+        Err(SummaryError::Decode(_))
+    ));
+}
+
+#[test]
+fn a_host_that_overran_is_not_a_network_result() {
+    let mut summary = full();
+    // 0.1 % of 5 000 due ticks is 5: at the limit it still counts.
+    for (skipped, ran, is_result) in [(5, 4_995, true), (6, 4_994, false), (308, 692, false)] {
+        summary.processes[1].tick_count = Some(ran);
+        summary.processes[1].skipped_tick_count = Some(skipped);
+        let assessment = Assessment::of(&summary);
+        assert_eq!(
+            assessment.network == NetworkVerdict::NetworkResult,
+            is_result,
+            "{skipped}"
+        );
+        let text = render(&summary, 120, Style::Plain);
+        assert_eq!(text.contains("NOT a network result"), !is_result);
+        assert_eq!(text.contains("the network is not to blame"), !is_result);
+    }
+    for process in &mut summary.processes {
+        process.tick_count = None;
+        process.skipped_tick_count = None;
+    }
+    assert_eq!(
+        Assessment::of(&summary).network,
+        NetworkVerdict::TicksUnknown
+    );
+    summary.channels.truncate(0);
+    assert_eq!(Assessment::of(&summary).network, NetworkVerdict::NoNetwork);
+}
+
+#[test]
+fn writing_replaces_the_file_whole_and_names_it_when_it_cannot() {
+    let folder = std::env::temp_dir().join(format!("hil-report-{}", std::process::id()));
+    std::fs::create_dir_all(&folder).unwrap();
+    let path = folder.join("summary.json");
+    full().write(&path).unwrap();
+    empty().write(&path).unwrap();
+    let text = std::fs::read_to_string(&path).unwrap();
+    assert_eq!(RunSummary::from_json(&text).unwrap().run, empty().run);
+    assert_eq!(std::fs::read_dir(&folder).unwrap().count(), 1);
+    std::fs::remove_dir_all(&folder).unwrap();
+    let error = full().write(&path).unwrap_err();
+    assert!(error.to_string().contains("summary.json"), "{error}");
+}

@@ -1,0 +1,350 @@
+//! The serialisable summary of a run, schema version 1. It holds figures, not judgements: those
+//! are drawn from them in [`super::assessment`] whenever a summary is written.
+//!
+//! `summary.json` is one object with the fields of [`RunSummary`] under their own names plus
+//! `assessment`. Within a schema version fields are only added; a reader ignores what it does
+//! not know. Units are part of the names.
+
+use std::io;
+use std::path::{Path, PathBuf};
+
+use hil_models::case_study::{Metric, Score};
+use hil_models::measure::account::ChannelAccount;
+use serde::{Deserialize, Serialize};
+
+use super::assessment::Assessment;
+
+/// Version of the `summary.json` layout.
+pub const SCHEMA_VERSION: u32 = 1;
+
+/// Everything a finished run has to say.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RunSummary {
+    /// [`SCHEMA_VERSION`] of the writer.
+    pub schema_version: u32,
+    /// What was run, when, and how it ended.
+    pub run: RunFacts,
+    /// What the host is, as label and value.
+    pub host_facts: Vec<Fact>,
+    /// What real-time settings the kernel granted and refused.
+    pub realtime: RealtimeFacts,
+    /// The processes of the run.
+    pub processes: Vec<ProcessSummary>,
+    /// What happened, in order of time.
+    pub events: Vec<RunEvent>,
+    /// The channels, in the order of the case study.
+    pub channels: Vec<ChannelSummary>,
+    /// What the robot did.
+    pub score: Vec<ScoreMetric>,
+    /// Anything else a reader must know; [`Assessment::warnings`] come on top.
+    pub warnings: Vec<String>,
+}
+
+impl RunSummary {
+    /// A summary with nothing but its run facts.
+    pub fn new(run: RunFacts) -> Self {
+        Self {
+            schema_version: SCHEMA_VERSION,
+            run,
+            host_facts: Vec::new(),
+            realtime: RealtimeFacts::default(),
+            processes: Vec::new(),
+            events: Vec::new(),
+            channels: Vec::new(),
+            score: Vec::new(),
+            warnings: Vec::new(),
+        }
+    }
+
+    /// The text of `summary.json`, with the assessment drawn from the figures.
+    ///
+    /// # Errors
+    /// When a figure cannot be represented.
+    pub fn to_json(&self) -> Result<String, SummaryError> {
+        #[derive(Serialize)]
+        struct Document<'a> {
+            #[serde(flatten)]
+            summary: &'a RunSummary,
+            assessment: Assessment,
+        }
+        let document = Document {
+            summary: self,
+            assessment: Assessment::of(self),
+        };
+        serde_json::to_string_pretty(&document).map_err(SummaryError::Encode)
+    }
+
+    /// Reads the text of `summary.json`.
+    ///
+    /// # Errors
+    /// When it is not JSON of this layout, or of a newer schema version.
+    pub fn from_json(text: &str) -> Result<Self, SummaryError> {
+        /// Read first, so that a newer layout is named as such instead of as a missing field.
+        #[derive(Deserialize)]
+        struct Version {
+            schema_version: u32,
+        }
+        let version: Version = serde_json::from_str(text).map_err(SummaryError::Decode)?;
+        if version.schema_version > SCHEMA_VERSION {
+            return Err(SummaryError::NewerSchema {
+                found: version.schema_version,
+            });
+        }
+        serde_json::from_str(text).map_err(SummaryError::Decode)
+    }
+
+    /// Writes `summary.json` at `path`, whole or not at all: a reader never sees half a file.
+    ///
+    /// # Errors
+    /// When the file cannot be written; names the path.
+    pub fn write(&self, path: &Path) -> Result<(), SummaryError> {
+        let text = self.to_json()?;
+        let partial = path.with_extension("json.partial");
+        std::fs::write(&partial, text)
+            .and_then(|()| std::fs::rename(&partial, path))
+            .map_err(|source| SummaryError::Write {
+                path: path.to_owned(),
+                source,
+            })
+    }
+}
+
+/// Why a summary could not be written or read.
+#[derive(Debug, thiserror::Error)]
+pub enum SummaryError {
+    /// A figure cannot be represented.
+    #[error("the summary cannot be encoded")]
+    Encode(#[source] serde_json::Error),
+    /// Not JSON, or not this layout.
+    #[error("not a run summary of schema version {SCHEMA_VERSION} or below")]
+    Decode(#[source] serde_json::Error),
+    /// Written by a newer version.
+    #[error("schema version {found} is newer than {SCHEMA_VERSION}")]
+    NewerSchema {
+        /// Version of the file.
+        found: u32,
+    },
+    /// The file cannot be written.
+    #[error("cannot write {}", path.display())]
+    Write {
+        /// Which file.
+        path: PathBuf,
+        /// Why.
+        source: io::Error,
+    },
+}
+
+/// What was run, when, and how it ended.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RunFacts {
+    /// Name of the run.
+    pub name: String,
+    /// Name of the case study.
+    pub case: String,
+    /// The topology file, as given.
+    pub topology_file: String,
+    /// Hash of the topology's text.
+    pub topology_hash: String,
+    /// Seed of every random stream.
+    pub seed: u64,
+    /// The host that wrote this summary.
+    pub host: String,
+    /// Wall-clock time of the start, with its zone.
+    pub started: String,
+    /// Length of the run, seconds.
+    pub duration_s: f64,
+    /// How it ended.
+    pub outcome: Outcome,
+    /// Why it ended, in words.
+    pub exit_reason: String,
+    /// Folder with the records.
+    pub folder: String,
+    /// Files in the folder and what they hold.
+    pub files: Vec<Fact>,
+    /// The command that repeats the run.
+    pub repeat_command: String,
+}
+
+/// How a run ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Outcome {
+    /// Ran its full length.
+    Completed,
+    /// Ran, but a result failed its criterion.
+    CriterionFailed,
+    /// Stopped before its end by a person, a signal or the peer.
+    Stopped,
+    /// Could not go on.
+    Failed,
+}
+
+/// A label and its value.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Fact {
+    /// What.
+    pub label: String,
+    /// Its value.
+    pub value: String,
+}
+
+impl Fact {
+    /// `label` is `value`.
+    pub fn new(label: impl Into<String>, value: impl Into<String>) -> Self {
+        Self {
+            label: label.into(),
+            value: value.into(),
+        }
+    }
+}
+
+/// What real-time settings the kernel granted and refused.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RealtimeFacts {
+    /// Granted: who, and what.
+    pub granted: Vec<Fact>,
+    /// Refused: who, and what with the reason.
+    pub refused: Vec<Fact>,
+}
+
+/// One process. `None` where it left no figure, e.g. because it was killed.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ProcessSummary {
+    /// Its name in the topology.
+    pub name: String,
+    /// The host it ran on.
+    pub host: String,
+    /// Its role in the case study, or `gateway`.
+    pub role: String,
+    /// How it ended, in words.
+    pub exit: String,
+    /// Starts after the first.
+    pub restart_count: u64,
+    /// Periodic ticks it ran; `None` for a process without a period.
+    pub tick_count: Option<u64>,
+    /// Ticks it could not run in time and passed over.
+    pub skipped_tick_count: Option<u64>,
+    /// Processor time, seconds.
+    pub cpu_time_s: Option<f64>,
+    /// Context switches it asked for.
+    pub voluntary_switch_count: Option<u64>,
+    /// Context switches forced on it.
+    pub involuntary_switch_count: Option<u64>,
+    /// Messages of a wrong size or port it refused.
+    pub malformed_count: Option<u64>,
+    /// Messages its component could not put into a full outbox.
+    pub outbox_drop_count: Option<u64>,
+    /// Records it could not write because the recorder was full.
+    pub recorder_drop_count: Option<u64>,
+}
+
+/// Something that happened during the run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RunEvent {
+    /// When, seconds after the start.
+    pub at_s: f64,
+    /// What, in words.
+    pub what: String,
+    /// Why, in words; empty when unknown.
+    pub cause: String,
+}
+
+/// How a channel is carried.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum LinkKind {
+    /// Shared memory of one host.
+    SharedMemory,
+    /// A gateway pair over UDP.
+    Udp,
+    /// A gateway pair over an emulated link.
+    Emulated,
+}
+
+impl LinkKind {
+    /// The words a report prints.
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::SharedMemory => "shared memory",
+            Self::Udp => "UDP",
+            Self::Emulated => "emulated link",
+        }
+    }
+}
+
+/// One channel.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ChannelSummary {
+    /// Its name.
+    pub name: String,
+    /// The role that publishes.
+    pub from: String,
+    /// The role that subscribes.
+    pub to: String,
+    /// How it is carried.
+    pub link: LinkKind,
+    /// Its latency account; `None` when no records were found.
+    pub account: Option<ChannelAccount>,
+    /// Datagrams the gateways refused, by reason; only reasons that occurred.
+    pub refusals: Vec<CountByName>,
+    /// States of the peer, in order of time.
+    pub peer_states: Vec<PeerState>,
+}
+
+/// A named count.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct CountByName {
+    /// What was counted.
+    pub name: String,
+    /// How often.
+    pub count: u64,
+}
+
+/// A change of a peer's state.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PeerState {
+    /// When, seconds after the start.
+    pub at_s: f64,
+    /// The state from then on, in words.
+    pub state: String,
+}
+
+/// One figure of the score.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ScoreMetric {
+    /// Snake-case name with unit suffix.
+    pub name: String,
+    /// The words a report prints.
+    pub label: String,
+    /// The figure; `None` when the run did not allow it.
+    pub value: Option<f64>,
+    /// 95 % interval, when the figure is a statistic.
+    pub interval: Option<(f64, f64)>,
+    /// SI unit, or `1` for a pure number.
+    pub unit: String,
+    /// How it was obtained, or why it was not.
+    pub method: String,
+}
+
+impl ScoreMetric {
+    /// The figures of a score, in its order.
+    pub fn all_of(score: &Score) -> Vec<Self> {
+        score.metrics.iter().map(Self::from).collect()
+    }
+}
+
+impl From<&Metric> for ScoreMetric {
+    fn from(metric: &Metric) -> Self {
+        Self {
+            name: metric.name.to_owned(),
+            label: metric.label.to_owned(),
+            // JSON has no word for infinity and NaN: both mean that there is no figure.
+            value: metric.value.filter(|value| value.is_finite()),
+            interval: metric
+                .interval
+                .filter(|(low, high)| low.is_finite() && high.is_finite()),
+            unit: metric.unit.to_owned(),
+            method: metric.method.clone(),
+        }
+    }
+}

@@ -1,0 +1,394 @@
+//! One channel of a report: fates, the way of a message as a waterfall, closing, stamps and
+//! silences.
+
+use hil_models::measure::account::{
+    BurstCount, ChannelAccount, Closing, ClosingFigures, Coverage, Gap, MessageFate, SegmentFigures,
+};
+use hil_models::measure::histogram::{Distribution, LatencySummary};
+use hil_models::measure::statistics::IntervalNs;
+
+use super::canvas::{Canvas, INDENT, Tone, bar, left, right};
+use super::units::{duration, grouped, percent};
+use crate::report::summary::{ChannelSummary, CountByName};
+
+/// Columns of a stage's name, of each of the four figures, and between figures and bar.
+const NAME_WIDTH: usize = 22;
+const FIGURE_WIDTH: usize = 9;
+const BAR_GAP: usize = 2;
+
+pub(super) fn channel(canvas: &mut Canvas, channel: &ChannelSummary) {
+    let link = channel.link.label();
+    let aside = format!("{} → {} · {link}", channel.from, channel.to);
+    canvas.heading(&format!("Channel {}", channel.name), &aside);
+    let Some(account) = &channel.account else {
+        canvas.paragraph(
+            INDENT,
+            Tone::Faint,
+            "unavailable: no records of this channel",
+        );
+        return;
+    };
+    fates(canvas, account);
+    if account.published_count > 0 {
+        waterfall(canvas, account);
+        closing(canvas, &account.closing);
+        stamps(canvas, account);
+        round_trip(canvas, &account.round_trip);
+        losses(canvas, account);
+    }
+    let list = |counts: &[CountByName]| {
+        let words = counts
+            .iter()
+            .map(|c| format!("{} {}", c.name, grouped(c.count)));
+        words.collect::<Vec<_>>().join(" · ")
+    };
+    if !channel.refusals.is_empty() {
+        canvas.field(
+            "refused",
+            Tone::Caution,
+            &format!("datagrams: {}", list(&channel.refusals)),
+        );
+    }
+    if !channel.peer_states.is_empty() {
+        let states = channel.peer_states.iter();
+        let words: Vec<_> = states
+            .map(|s| format!("{} at {:.3} s", s.state, s.at_s))
+            .collect();
+        canvas.field("peer", Tone::Plain, &words.join(" · "));
+    }
+}
+
+fn fates(canvas: &mut Canvas, account: &ChannelAccount) {
+    let total = account.published_count;
+    if total == 0 {
+        canvas.paragraph(INDENT, Tone::Caution, "no message was published");
+        return;
+    }
+    let title = format!(
+        "{} messages published, and what became of them",
+        grouped(total)
+    );
+    canvas.paragraph(INDENT, Tone::Faint, &title);
+    let bar_width = canvas.width() - INDENT - 38 - 12 - 10 - BAR_GAP;
+    for (fate, count) in account.fates.iter() {
+        let ratio = count as f64 / total as f64;
+        let tone = match fate {
+            MessageFate::Taken => Tone::Good,
+            MessageFate::Unexplained => Tone::Bad,
+            fate if fate.is_loss() => Tone::Caution,
+            _ => Tone::Plain,
+        };
+        let line = format!(
+            "{:INDENT$}{}{}{}{:BAR_GAP$}{}",
+            "",
+            canvas.paint(tone, &left(fate.label(), 38)),
+            right(&grouped(count), 12),
+            right(&percent(ratio), 10),
+            "",
+            canvas.paint(Tone::Bar, &bar(0.0, ratio, bar_width))
+        );
+        canvas.line(&line);
+    }
+}
+
+fn waterfall(canvas: &mut Canvas, account: &ChannelAccount) {
+    canvas.blank();
+    let header = format!(
+        "{:INDENT$}{}{:>9}{:>9}{:>9}{:>9}",
+        "",
+        left("from published", NAME_WIDTH),
+        "p50",
+        "p99",
+        "p99.9",
+        "max"
+    );
+    let header = canvas.paint(Tone::Faint, &header);
+    canvas.line(&header);
+    let (chain, combined): (Vec<_>, Vec<_>) = account
+        .segments
+        .iter()
+        .partition(|segment| !segment.is_combined);
+    let median = |segment: &&SegmentFigures| {
+        let summary = segment.distribution.measured();
+        summary.map_or(0.0, |summary| summary.p50_ns.max(0) as f64)
+    };
+    let scale: f64 = chain.iter().map(median).sum();
+    let mut start = 0.0;
+    for segment in &chain {
+        let end = start + median(segment);
+        let name = format!("→ {}", segment.to);
+        row(
+            canvas,
+            (Tone::Plain, &name),
+            &segment.distribution,
+            (start / scale, end / scale),
+        );
+        start = end;
+    }
+    if let Some(hardware) = &account.hardware_wire
+        && hardware.measured().is_some()
+    {
+        row(canvas, (Tone::Plain, "card to card"), hardware, (0.0, 0.0));
+    }
+    row(
+        canvas,
+        (Tone::Strong, "published → taken"),
+        &account.end_to_end.distribution,
+        (0.0, 0.0),
+    );
+    intervals(canvas, account);
+    for segment in combined {
+        let count = segment
+            .distribution
+            .measured()
+            .map_or(0, |summary| summary.count);
+        let name = format!(
+            "{} ({} messages without a stamp between)",
+            segment.name(),
+            grouped(count)
+        );
+        canvas.paragraph(INDENT, Tone::Faint, &name);
+        row(
+            canvas,
+            (Tone::Plain, "  combined"),
+            &segment.distribution,
+            (0.0, 0.0),
+        );
+    }
+}
+
+fn row(canvas: &mut Canvas, (tone, name): (Tone, &str), figures: &Distribution, span: (f64, f64)) {
+    let name = canvas.paint(tone, &left(name, NAME_WIDTH));
+    let line = match figures {
+        Distribution::Measured(summary) => {
+            let bar_width = canvas.width() - INDENT - NAME_WIDTH - 4 * FIGURE_WIDTH - BAR_GAP;
+            let figures = canvas.paint(tone, &quantiles(summary));
+            let bar = canvas.paint(Tone::Bar, &bar(span.0, span.1, bar_width));
+            format!("{:INDENT$}{name}{figures}{:BAR_GAP$}{bar}", "", "")
+        }
+        Distribution::Unavailable { reason } => {
+            let room = canvas.width() - INDENT - NAME_WIDTH - 1;
+            let text = left(&format!("unavailable: {reason}"), room);
+            format!("{:INDENT$}{name} {}", "", canvas.paint(Tone::Faint, &text))
+        }
+    };
+    canvas.line(&line);
+}
+
+fn quantiles(summary: &LatencySummary) -> String {
+    [
+        summary.p50_ns,
+        summary.p99_ns,
+        summary.p999_ns,
+        summary.max_ns,
+    ]
+    .map(|ns| right(&duration(ns), FIGURE_WIDTH))
+    .concat()
+}
+
+fn intervals(canvas: &mut Canvas, account: &ChannelAccount) {
+    let end_to_end = &account.end_to_end;
+    let interval = |name: &str, interval: Option<IntervalNs>| {
+        let interval = interval?;
+        let (low, high) = (duration(interval.low_ns), duration(interval.high_ns));
+        Some(format!("{name} {low} to {high}"))
+    };
+    let mut words: Vec<String> = [
+        interval("p50", end_to_end.p50_interval),
+        interval("p99", end_to_end.p99_interval),
+    ]
+    .into_iter()
+    .flatten()
+    .collect();
+    if let Some(bound_ns) = end_to_end
+        .alignment_bound_ns
+        .filter(|bound_ns| *bound_ns > 0)
+    {
+        let bound = duration(i64::try_from(bound_ns).unwrap_or(i64::MAX));
+        words.push(format!("clock alignment within ±{bound}"));
+    }
+    if !words.is_empty() {
+        canvas.field("95 %", Tone::Faint, &words.join(" · "));
+    }
+}
+
+fn closing(canvas: &mut Canvas, closing: &Closing) {
+    match closing {
+        Closing::Checked(figures) => {
+            if let Some((tone, text)) = closing_words(figures) {
+                canvas.field("account", tone, &text);
+            }
+        }
+        Closing::Unavailable { reason } => {
+            canvas.field(
+                "account",
+                Tone::Faint,
+                &format!("closing unavailable: {reason}"),
+            );
+        }
+    }
+}
+
+fn closing_words(figures: &ClosingFigures) -> Option<(Tone, String)> {
+    let (ratio, interval) = figures.closed_ratio()?;
+    let mut text = format!(
+        "closes for {} of {} messages: {} [{}, {}]",
+        grouped(figures.closed_count),
+        grouped(figures.checked_count),
+        percent(ratio),
+        percent(interval.low),
+        percent(interval.high),
+    );
+    if let Some(residual) = figures.residual.measured() {
+        let words = format!(
+            "; residual p50 {}, p99.9 {}, max {} (limit {})",
+            duration(residual.p50_ns),
+            duration(residual.p999_ns),
+            duration(residual.max_ns),
+            duration(figures.residual_limit_ns),
+        );
+        text.push_str(&words);
+    }
+    for (count, words) in [
+        (
+            figures.missing_stage_count,
+            "not closed for a missing stage",
+        ),
+        (
+            figures.negative_segment_count,
+            "for a stage before its predecessor",
+        ),
+        (figures.residual_count, "for the residual"),
+        (
+            figures.closed_combined_count,
+            "closed with a combined segment",
+        ),
+    ] {
+        if count > 0 {
+            text.push_str(&["; ", &grouped(count), " ", words].concat());
+        }
+    }
+    let is_whole = figures.closed_count == figures.checked_count;
+    Some((if is_whole { Tone::Good } else { Tone::Plain }, text))
+}
+
+fn stamps(canvas: &mut Canvas, account: &ChannelAccount) {
+    let coverage = &account.coverage;
+    let kinds = [
+        ("TX", coverage.tx_software),
+        ("RX", coverage.rx_software),
+        ("hardware TX", coverage.tx_hardware),
+        ("hardware RX", coverage.rx_hardware),
+    ];
+    if kinds.iter().all(|(_, coverage)| coverage.is_none()) {
+        return;
+    }
+    let words = kinds.map(|(kind, coverage)| {
+        let ratio = coverage.as_ref().and_then(Coverage::ratio);
+        let share = match ratio {
+            Some(ratio) if ratio > 0.0 => percent(ratio),
+            Some(_) => "none".to_owned(),
+            None => "unavailable".to_owned(),
+        };
+        format!("{kind} {share}")
+    });
+    canvas.field("kernel stamps", Tone::Plain, &words.join(" · "));
+    if let Some(Distribution::Unavailable { reason }) = &account.hardware_wire {
+        canvas.field(
+            "card to card",
+            Tone::Faint,
+            &format!("unavailable: {reason}"),
+        );
+    }
+}
+
+fn round_trip(canvas: &mut Canvas, round_trip: &Distribution) {
+    if let Some(summary) = round_trip.measured() {
+        let text = format!(
+            "p50 {}, p99 {}, p99.9 {}, max {} over {} clock exchanges",
+            duration(summary.p50_ns),
+            duration(summary.p99_ns),
+            duration(summary.p999_ns),
+            duration(summary.max_ns),
+            grouped(summary.count)
+        );
+        canvas.field("round trip", Tone::Plain, &text);
+    }
+}
+
+fn losses(canvas: &mut Canvas, account: &ChannelAccount) {
+    let counted = [
+        ("reordered", account.reordered_count),
+        ("duplicated", account.duplicated_count),
+        ("late", account.late_count),
+        ("producer restarts", Some(account.producer_restart_count)),
+        (
+            "unrecorded by the producer",
+            account.published_unrecorded_count.filter(|c| *c > 0),
+        ),
+    ];
+    let words: Vec<String> = counted
+        .into_iter()
+        .filter_map(|(name, count)| Some(format!("{name} {}", grouped(count?))))
+        .collect();
+    canvas.field("counted", Tone::Plain, &words.join(" · "));
+    if let Some(text) = burst_words(account) {
+        canvas.field("lost in a row", Tone::Plain, &text);
+    }
+    let gaps = &account.gaps;
+    if let Some(longest) = gaps.longest {
+        canvas.field("silence", Tone::Plain, &gap_words(account, longest));
+    }
+    if let Some(other) = gaps.longest_unattributed
+        && Some(other) != gaps.longest
+    {
+        let text = format!("otherwise {}", gap_words(account, other));
+        canvas.field("", Tone::Plain, &text);
+    }
+    for interruption in &account.interruptions {
+        let text = format!(
+            "{} down for {} ({}): {} messages lost",
+            interruption.process,
+            duration(interruption.length_ns),
+            interruption.cause,
+            grouped(interruption.lost_count)
+        );
+        canvas.field("interruption", Tone::Caution, &text);
+    }
+}
+
+/// Lengths of loss runs with how often each occurred; of many, the shortest and the longest.
+fn burst_words(account: &ChannelAccount) -> Option<String> {
+    const SHOWN_COUNT: usize = 8;
+    let bursts = &account.loss_bursts;
+    let longest = bursts.last()?;
+    let word = |burst: &BurstCount| {
+        let times = match burst.count {
+            1 => "once".to_owned(),
+            count => format!("{} times", grouped(count)),
+        };
+        format!("{} {times}", grouped(burst.length_messages))
+    };
+    let shown = bursts.iter().take(SHOWN_COUNT).map(word);
+    let mut text = shown.collect::<Vec<_>>().join(", ");
+    if bursts.len() > SHOWN_COUNT {
+        text.push_str(" … ");
+        text.push_str(&word(longest));
+    }
+    Some(text)
+}
+
+fn gap_words(account: &ChannelAccount, gap: Gap) -> String {
+    let cause = gap
+        .interruption_index
+        .and_then(|index| account.interruptions.get(index))
+        .map_or_else(String::new, |interruption| {
+            format!(", while {} was down", interruption.process)
+        });
+    format!(
+        "longest {} at {} into the run, after message {}{cause}",
+        duration(gap.length_ns),
+        duration(gap.start_ns),
+        grouped(gap.after_sequence)
+    )
+}

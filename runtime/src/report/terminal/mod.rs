@@ -1,0 +1,131 @@
+//! Renders a summary for a terminal of 80 to 120 columns. It returns text; the caller prints it.
+
+mod canvas;
+mod channel;
+mod tables;
+mod units;
+
+pub use canvas::Style;
+pub(crate) use units::{JOINT, grouped, percent};
+
+use canvas::{Canvas, INDENT, Tone};
+
+use super::assessment::{Assessment, NetworkVerdict, SKIPPED_TICK_RATIO_MAX};
+use super::summary::{Outcome, RunSummary};
+
+/// The report of a run as text of at most `width_columns` columns (clamped to 80..=120).
+pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> String {
+    let assessment = Assessment::of(summary);
+    let mut canvas = Canvas::new(width_columns, style);
+    title(&mut canvas, summary);
+    verdict(&mut canvas, summary, &assessment);
+    tables::score(&mut canvas, &summary.score);
+    for channel in &summary.channels {
+        channel::channel(&mut canvas, channel);
+    }
+    tables::processes(&mut canvas, &summary.processes);
+    tables::events(&mut canvas, &summary.events);
+    tables::realtime(&mut canvas, &summary.realtime);
+    tables::host(&mut canvas, &summary.host_facts);
+    method(&mut canvas, summary);
+    files(&mut canvas, summary);
+    canvas.rule(Tone::Faint);
+    canvas.finish()
+}
+
+fn title(canvas: &mut Canvas, summary: &RunSummary) {
+    let run = &summary.run;
+    canvas.rule(Tone::Faint);
+    let title = canvas::shortened(&format!("{} · {}", run.case, run.name), canvas.width());
+    let line = canvas.paint(Tone::Strong, &title);
+    canvas.line(&line);
+    let facts = format!(
+        "{} · {} long · seed {} · host {} · topology {} ({})",
+        run.started,
+        units::seconds(run.duration_s),
+        run.seed,
+        run.host,
+        run.topology_file,
+        run.topology_hash,
+    );
+    canvas.paragraph(0, Tone::Faint, &facts);
+    canvas.rule(Tone::Faint);
+}
+
+fn verdict(canvas: &mut Canvas, summary: &RunSummary, assessment: &Assessment) {
+    let (tone, word) = match summary.run.outcome {
+        Outcome::Completed => (Tone::Good, "completed"),
+        Outcome::CriterionFailed => (Tone::Bad, "criterion failed"),
+        Outcome::Stopped => (Tone::Caution, "stopped early"),
+        Outcome::Failed => (Tone::Bad, "failed"),
+    };
+    canvas.field(
+        "Outcome",
+        tone,
+        &format!("{word}: {}", summary.run.exit_reason),
+    );
+    let (tone, text) = network_words(&assessment.network);
+    canvas.field("Network", tone, &text);
+    for (index, warning) in assessment.warnings.iter().enumerate() {
+        let label = if index == 0 { "Warnings" } else { "" };
+        canvas.field(label, Tone::Caution, warning);
+    }
+}
+
+fn network_words(verdict: &NetworkVerdict) -> (Tone, String) {
+    let limit = percent(SKIPPED_TICK_RATIO_MAX);
+    match verdict {
+        NetworkVerdict::NoNetwork => {
+            let text = "no channel went over a network; nothing here says anything about one";
+            (Tone::Plain, text.to_owned())
+        }
+        NetworkVerdict::NetworkResult => {
+            let text =
+                format!("a network result: no process skipped more than {limit} of its ticks");
+            (Tone::Good, text)
+        }
+        NetworkVerdict::HostOverran { processes } => {
+            let skipped = processes
+                .iter()
+                .map(|overrun| overrun.skipped_tick_count)
+                .sum();
+            let text = format!(
+                "NOT a network result: the host overran ({} skipped ticks, more than {limit}); \
+                 repeat on an idle host or at a lower rate",
+                grouped(skipped)
+            );
+            (Tone::Bad, text)
+        }
+        NetworkVerdict::TicksUnknown => {
+            let text = "cannot be called a network result: no process reported its ticks";
+            (Tone::Caution, text.to_owned())
+        }
+    }
+}
+
+fn method(canvas: &mut Canvas, summary: &RunSummary) {
+    if summary.channels.is_empty() {
+        return;
+    }
+    canvas.heading("How to read this", "");
+    for text in [
+        "Each message is joined across records by the producer's start and its sequence number. \
+         It closes when every stage is recorded, in order, and the segments add up to published → \
+         taken within 1 µs; on one clock the wire is the difference of raw kernel stamps.",
+        "Quantiles are from histograms with three digits, of taken messages. Bars show medians \
+         end to end. Intervals are 95 %: Wilson for shares, block bootstrap for quantiles, because \
+         successive delays are correlated.",
+    ] {
+        canvas.paragraph(INDENT, Tone::Faint, text);
+    }
+}
+
+fn files(canvas: &mut Canvas, summary: &RunSummary) {
+    let run = &summary.run;
+    canvas.heading("Files", "");
+    canvas.field("folder", Tone::Plain, &run.folder);
+    for file in &run.files {
+        canvas.field(&file.label, Tone::Plain, &file.value);
+    }
+    canvas.field("repeat with", Tone::Strong, &run.repeat_command);
+}

@@ -1,0 +1,147 @@
+//! The parts of a report that are not about one channel: score, processes, events, host.
+
+use super::canvas::{Canvas, INDENT, Tone, columns, left, right};
+use super::units::{figure, grouped, seconds};
+use crate::report::summary::{Fact, ProcessSummary, RealtimeFacts, RunEvent, ScoreMetric};
+
+/// Columns of margins, value and interval beside a label of the score.
+const FIGURES_WIDTH: usize = 46;
+
+pub(super) fn score(canvas: &mut Canvas, metrics: &[ScoreMetric]) {
+    canvas.heading("Score", "what the robot did");
+    if metrics.is_empty() {
+        canvas.paragraph(INDENT, Tone::Faint, "unavailable: the case gave no score");
+        return;
+    }
+    let widest = metrics.iter().map(|metric| columns(&metric.label)).max();
+    let label_width = widest
+        .unwrap_or(0)
+        .clamp(20, canvas.width() - FIGURES_WIDTH);
+    for metric in metrics {
+        let unit = if metric.unit == "1" {
+            ""
+        } else {
+            metric.unit.as_str()
+        };
+        let (tone, value) = match metric.value {
+            Some(value) => (Tone::Strong, format!("{} {unit}", figure(value))),
+            None => (Tone::Faint, "unavailable".to_owned()),
+        };
+        let interval = metric.interval.map_or_else(String::new, |(low, high)| {
+            format!("  [{}, {}]", figure(low), figure(high))
+        });
+        let line = format!(
+            "{:INDENT$}{}  {}{}",
+            "",
+            left(&metric.label, label_width),
+            canvas.paint(tone, &left(value.trim_end(), 16)),
+            interval
+        );
+        canvas.line(&line);
+        canvas.paragraph(INDENT + 2, Tone::Faint, &metric.method);
+    }
+}
+
+pub(super) fn processes(canvas: &mut Canvas, processes: &[ProcessSummary]) {
+    canvas.heading("Processes", "");
+    if processes.is_empty() {
+        canvas.paragraph(INDENT, Tone::Faint, "none were started");
+        return;
+    }
+    // The two name columns share what the figures leave.
+    let name_width = (canvas.width() - INDENT - 54) / 2;
+    let header = format!(
+        "{:INDENT$}{}{}{:>9}{:>9}{:>9}{:>10}{:>17}",
+        "",
+        left("name", name_width),
+        left("role on host", name_width),
+        "restarts",
+        "ticks",
+        "skipped",
+        "CPU time",
+        "sw. own/forced"
+    );
+    let header = canvas.paint(Tone::Faint, &header);
+    canvas.line(&header);
+    for process in processes {
+        let count = |count: Option<u64>| count.map_or_else(|| "–".to_owned(), grouped);
+        let restarts = right(&grouped(process.restart_count), 9);
+        let skipped = right(&count(process.skipped_tick_count), 9);
+        let caution = |is_raised: bool| {
+            if is_raised {
+                Tone::Caution
+            } else {
+                Tone::Plain
+            }
+        };
+        let switches = format!(
+            "{}/{}",
+            count(process.voluntary_switch_count),
+            count(process.involuntary_switch_count)
+        );
+        let cpu_time = process
+            .cpu_time_s
+            .map_or_else(|| "–".to_owned(), |s| format!("{s:.2} s"));
+        let line = format!(
+            "{:INDENT$}{}{}{}{}{}{}{}",
+            "",
+            column(&process.name, name_width),
+            left(&format!("{} on {}", process.role, process.host), name_width),
+            canvas.paint(caution(process.restart_count > 0), &restarts),
+            right(&count(process.tick_count), 9),
+            canvas.paint(
+                caution(process.skipped_tick_count.unwrap_or(0) > 0),
+                &skipped
+            ),
+            right(&cpu_time, 10),
+            right(&switches, 17),
+        );
+        canvas.line(&line);
+        canvas.paragraph(INDENT + 2, Tone::Faint, &process.exit);
+    }
+}
+
+/// Text at the left of a column, with a blank before the next one.
+fn column(text: &str, width: usize) -> String {
+    format!("{} ", left(text, width.saturating_sub(1)))
+}
+
+pub(super) fn events(canvas: &mut Canvas, events: &[RunEvent]) {
+    if events.is_empty() {
+        return;
+    }
+    canvas.heading("Events", "");
+    for event in events {
+        let text = if event.cause.is_empty() {
+            event.what.clone()
+        } else {
+            format!("{} ({})", event.what, event.cause)
+        };
+        canvas.field(&seconds(event.at_s), Tone::Plain, &text);
+    }
+}
+
+pub(super) fn realtime(canvas: &mut Canvas, realtime: &RealtimeFacts) {
+    if realtime.granted.is_empty() && realtime.refused.is_empty() {
+        return;
+    }
+    canvas.heading("Real time", "");
+    for fact in &realtime.refused {
+        let text = format!("{}: {}", fact.label, fact.value);
+        canvas.field("refused", Tone::Caution, &text);
+    }
+    for fact in &realtime.granted {
+        let text = format!("{}: {}", fact.label, fact.value);
+        canvas.field("granted", Tone::Plain, &text);
+    }
+}
+
+pub(super) fn host(canvas: &mut Canvas, facts: &[Fact]) {
+    if facts.is_empty() {
+        return;
+    }
+    canvas.heading("Host", "");
+    for fact in facts {
+        canvas.field(&fact.label, Tone::Plain, &fact.value);
+    }
+}

@@ -1,0 +1,128 @@
+//! Numbers as people read them: a unit per value, three significant digits, grouped thousands.
+//! Number and unit are joined by [`JOINT`], so that no line breaks between them.
+
+/// Stands for a blank at which a line must not break; a page turns it into one.
+pub(crate) const JOINT: char = '\u{a0}';
+
+/// A duration in the unit that leaves one to three digits before the point.
+pub(crate) fn duration(ns: i64) -> String {
+    let magnitude = ns.unsigned_abs();
+    let sign = if ns < 0 { "-" } else { "" };
+    let (scale, unit) = match magnitude {
+        0..1_000 => return format!("{sign}{magnitude}{JOINT}ns"),
+        1_000..999_500 => (1e3, "µs"),
+        999_500..999_500_000 => (1e6, "ms"),
+        _ => (1e9, "s"),
+    };
+    format!(
+        "{sign}{}{JOINT}{unit}",
+        three_digits(magnitude as f64 / scale)
+    )
+}
+
+/// Seconds after the start of a run.
+pub(crate) fn seconds(value: f64) -> String {
+    format!("{value:.3}{JOINT}s")
+}
+
+fn three_digits(value: f64) -> String {
+    // Compared after rounding: 9.996 is 10.0, not 10.00.
+    if value < 9.995 {
+        format!("{value:.2}")
+    } else if value < 99.95 {
+        format!("{value:.1}")
+    } else {
+        format!("{value:.0}")
+    }
+}
+
+/// A count with its thousands grouped.
+pub(crate) fn grouped(count: u64) -> String {
+    let digits = count.to_string();
+    let mut text = String::with_capacity(digits.len() * 4 / 3);
+    for (index, digit) in digits.chars().enumerate() {
+        if index > 0 && (digits.len() - index).is_multiple_of(3) {
+            text.push(',');
+        }
+        text.push(digit);
+    }
+    text
+}
+
+/// A ratio as per cent. Nothing but all rounds to 100 %, nothing but none to 0 %.
+pub(crate) fn percent(ratio: f64) -> String {
+    let value = 100.0 * ratio;
+    if ratio > 0.0 && value < 0.01 {
+        return format!("<0.01{JOINT}%");
+    }
+    if ratio < 1.0 && value > 99.99 {
+        return format!(">99.99{JOINT}%");
+    }
+    format!("{value:.2}{JOINT}%")
+}
+
+/// A figure of a score: enough digits for its size, never more than it holds.
+pub(crate) fn figure(value: f64) -> String {
+    let magnitude = value.abs();
+    if value.fract().abs() < f64::EPSILON && magnitude < 1e9 {
+        format!("{value:.0}")
+    } else if (1e-3..1e6).contains(&magnitude) {
+        let digits = 3.0 - magnitude.log10().floor().clamp(-3.0, 3.0);
+        format!("{value:.*}", digit_count(digits))
+    } else {
+        format!("{value:.3e}")
+    }
+}
+
+#[allow(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "the caller clamps to 0..=6"
+)]
+const fn digit_count(digits: f64) -> usize {
+    digits as usize
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_duration_has_the_unit_of_its_size() {
+        for (ns, expected) in [
+            (0, "0 ns"),
+            (999, "999 ns"),
+            (1_000, "1.00 µs"),
+            (12_345, "12.3 µs"),
+            (-12_345, "-12.3 µs"),
+            (999_499, "999 µs"),
+            (999_500, "1.00 ms"),
+            (9_996_000, "10.0 ms"),
+            (4_033_000_000, "4.03 s"),
+            (i64::MIN, "-9223372037 s"),
+        ] {
+            assert_eq!(duration(ns).replace(JOINT, " "), expected);
+        }
+    }
+
+    #[test]
+    fn shares_never_round_into_all_or_nothing() {
+        assert_eq!(percent(1.0).replace(JOINT, " "), "100.00 %");
+        assert_eq!(percent(0.999_999).replace(JOINT, " "), ">99.99 %");
+        assert_eq!(percent(0.5).replace(JOINT, " "), "50.00 %");
+        assert_eq!(percent(0.000_001).replace(JOINT, " "), "<0.01 %");
+        assert_eq!(percent(0.0).replace(JOINT, " "), "0.00 %");
+    }
+
+    #[test]
+    fn counts_are_grouped_and_figures_keep_four_digits() {
+        assert_eq!(grouped(0), "0");
+        assert_eq!(grouped(999), "999");
+        assert_eq!(grouped(1_234_567), "1,234,567");
+        assert_eq!(figure(890.0), "890");
+        assert_eq!(figure(195.324_5), "195.3");
+        assert_eq!(figure(0.001_234_56), "0.001235");
+        assert_eq!(figure(1.234_56e-6), "1.235e-6");
+        assert_eq!(figure(-0.5), "-0.5000");
+    }
+}
