@@ -26,6 +26,7 @@ use iceoryx2::service::marker::{CustomHeaderMarker, CustomPayloadMarker};
 use iceoryx2::service::port_factory::publish_subscribe;
 use iceoryx2::service::static_config::message_type_details::{TypeDetail, TypeVariant};
 
+use super::degradation::ConnectionFailures;
 use super::domain::Domain;
 use super::error::{ChannelError, retry};
 use super::holder::ChannelSettings;
@@ -260,6 +261,7 @@ pub struct RawOutput {
     message: TypeInfo,
     publisher: Publisher<ipc::Service, [CustomPayloadMarker], CustomHeaderMarker>,
     notifier: Option<Notifier<ipc::Service>>,
+    failures: ConnectionFailures,
 }
 
 impl RawOutput {
@@ -286,9 +288,14 @@ impl RawOutput {
     ) -> Result<Self, ChannelError> {
         let within = domain.open_within();
         let service = retry(within, || open_for_writing(domain, channel, &message))?;
+        let failures = ConnectionFailures::default();
         let publisher = retry(within, || {
-            let publisher = service.publisher_builder().max_loaned_samples(1).create();
-            publisher.map_err(|error| ChannelError::refused(channel, "become a writer", &error))
+            service
+                .publisher_builder()
+                .max_loaned_samples(1)
+                .set_degradation_handler(failures.handler())
+                .create()
+                .map_err(|error| ChannelError::refused(channel, "become a writer", &error))
         })?;
         let notifier = notifies_readers
             .then(|| retry(within, || open_notifier(domain, channel)))
@@ -298,7 +305,13 @@ impl RawOutput {
             message,
             publisher,
             notifier,
+            failures,
         })
+    }
+
+    /// Attempts to connect to a reader that failed. While it grows, a reader hears nothing.
+    pub fn connection_failure_count(&self) -> u64 {
+        self.failures.count()
     }
 
     /// What the channel carries.
@@ -369,6 +382,7 @@ impl RawOutput {
 pub(crate) struct ByteReader {
     channel: String,
     subscriber: Subscriber<ipc::Service, [CustomPayloadMarker], SharedEnvelope>,
+    failures: ConnectionFailures,
 }
 
 impl ByteReader {
@@ -380,9 +394,14 @@ impl ByteReader {
     ) -> Result<Self, ChannelError> {
         let within = domain.open_within();
         let service = retry(within, || open_for_reading(domain, channel, message))?;
+        let failures = ConnectionFailures::default();
         let subscriber = retry(within, || {
-            let subscriber = service.subscriber_builder().buffer_size(depth).create();
-            subscriber.map_err(|error| ChannelError::refused(channel, "become a reader", &error))
+            service
+                .subscriber_builder()
+                .buffer_size(depth)
+                .set_degradation_handler(failures.handler())
+                .create()
+                .map_err(|error| ChannelError::refused(channel, "become a reader", &error))
         })?;
         subscriber
             .update_connections()
@@ -390,7 +409,12 @@ impl ByteReader {
         Ok(Self {
             channel: channel.to_owned(),
             subscriber,
+            failures,
         })
+    }
+
+    pub(crate) fn connection_failure_count(&self) -> u64 {
+        self.failures.count()
     }
 
     /// Hands the oldest waiting sample to `take`; `None` when none waits.
@@ -438,6 +462,11 @@ impl RawInput {
     /// What the channel carries.
     pub const fn message(&self) -> &TypeInfo {
         &self.message
+    }
+
+    /// Attempts to connect to a writer that failed. While it grows, a writer is not heard.
+    pub fn connection_failure_count(&self) -> u64 {
+        self.reader.connection_failure_count()
     }
 
     /// Hands the oldest waiting sample to `take`; false when none waits. Never blocks.

@@ -90,6 +90,9 @@ pub struct InputCounters {
     pub outdated_count: u64,
     /// New starts of the writer.
     pub restart_count: u64,
+    /// Attempts to connect to a writer that failed. While it grows, a writer is not heard: it
+    /// runs as another Unix user, or died while starting.
+    pub connection_failure_count: u64,
 }
 
 /// Follows one writer through its restarts.

@@ -3,7 +3,6 @@
 //! [`raw`](super::raw).
 
 use core::fmt::Debug;
-use core::marker::PhantomData;
 
 use hil_models::endpoint::{InputPort, OutputPort};
 use hil_models::message::{Envelope, Message, MessageType};
@@ -15,6 +14,7 @@ use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::{ZeroCopySend, ipc};
 use iceoryx2::service::port_factory::publish_subscribe;
 
+use super::degradation::ConnectionFailures;
 use super::domain::Domain;
 use super::error::{ChannelError, retry};
 use super::raw::{self, ByteReader, RawOutput, SharedEnvelope, TypeInfo};
@@ -49,6 +49,11 @@ impl ShmOutput {
     /// Messages sent since the start; also the next sequence number.
     pub const fn sent_count(&self) -> u64 {
         self.sequencer.sent_count()
+    }
+
+    /// Attempts to connect to a reader that failed. While it grows, a reader hears nothing.
+    pub fn connection_failure_count(&self) -> u64 {
+        self.output.connection_failure_count()
     }
 }
 
@@ -89,8 +94,11 @@ impl ShmInput {
     }
 
     /// What came and what did not.
-    pub const fn counters(&self) -> InputCounters {
-        self.tracker.counters()
+    pub fn counters(&self) -> InputCounters {
+        InputCounters {
+            connection_failure_count: self.reader.connection_failure_count(),
+            ..self.tracker.counters()
+        }
     }
 }
 
@@ -161,6 +169,7 @@ pub struct TypedOutput<M: Message> {
     publisher: Publisher<ipc::Service, Shared<M>, SharedEnvelope>,
     notifier: Option<Notifier<ipc::Service>>,
     sequencer: Sequencer,
+    failures: ConnectionFailures,
 }
 
 impl<M: Message> TypedOutput<M> {
@@ -175,9 +184,14 @@ impl<M: Message> TypedOutput<M> {
     ) -> Result<Self, ChannelError> {
         let service = open_typed::<M>(domain, channel)?;
         let within = domain.open_within();
+        let failures = ConnectionFailures::default();
         let publisher = retry(within, || {
-            let publisher = service.publisher_builder().max_loaned_samples(1).create();
-            publisher.map_err(|error| ChannelError::refused(channel, "become a writer", &error))
+            service
+                .publisher_builder()
+                .max_loaned_samples(1)
+                .set_degradation_handler(failures.handler())
+                .create()
+                .map_err(|error| ChannelError::refused(channel, "become a writer", &error))
         })?;
         let notifier = settings
             .notifies_readers
@@ -188,7 +202,13 @@ impl<M: Message> TypedOutput<M> {
             publisher,
             notifier,
             sequencer: Sequencer::new(settings),
+            failures,
         })
+    }
+
+    /// Attempts to connect to a reader that failed. While it grows, a reader hears nothing.
+    pub fn connection_failure_count(&self) -> u64 {
+        self.failures.count()
     }
 
     /// Publishes `message` with the next sequence number. Never blocks.
@@ -221,7 +241,7 @@ pub struct TypedInput<M: Message> {
     channel: String,
     subscriber: Subscriber<ipc::Service, Shared<M>, SharedEnvelope>,
     tracker: SequenceTracker,
-    message: PhantomData<M>,
+    failures: ConnectionFailures,
 }
 
 impl<M: Message> TypedInput<M> {
@@ -231,9 +251,14 @@ impl<M: Message> TypedInput<M> {
     /// As [`ShmInput::open`].
     pub fn open(domain: &Domain, channel: &str, depth: usize) -> Result<Self, ChannelError> {
         let service = open_typed::<M>(domain, channel)?;
+        let failures = ConnectionFailures::default();
         let subscriber = retry(domain.open_within(), || {
-            let subscriber = service.subscriber_builder().buffer_size(depth).create();
-            subscriber.map_err(|error| ChannelError::refused(channel, "become a reader", &error))
+            service
+                .subscriber_builder()
+                .buffer_size(depth)
+                .set_degradation_handler(failures.handler())
+                .create()
+                .map_err(|error| ChannelError::refused(channel, "become a reader", &error))
         })?;
         subscriber
             .update_connections()
@@ -242,7 +267,7 @@ impl<M: Message> TypedInput<M> {
             channel: channel.to_owned(),
             subscriber,
             tracker: SequenceTracker::default(),
-            message: PhantomData,
+            failures,
         })
     }
 
@@ -267,7 +292,10 @@ impl<M: Message> TypedInput<M> {
     }
 
     /// What came and what did not.
-    pub const fn counters(&self) -> InputCounters {
-        self.tracker.counters()
+    pub fn counters(&self) -> InputCounters {
+        InputCounters {
+            connection_failure_count: self.failures.count(),
+            ..self.tracker.counters()
+        }
     }
 }

@@ -375,3 +375,22 @@ fn a_waiter_takes_a_bounded_number_of_channels() {
     drop(holder);
     assert_nothing_left(domain);
 }
+
+#[test]
+fn a_writer_whose_memory_cannot_be_mapped_is_counted() {
+    let (domain, holder) = launch("unmapped", 1);
+    let mut output = output(&domain, 1);
+    let prefix = domain.address().prefix();
+    for file in std::fs::read_dir("/dev/shm").unwrap().flatten() {
+        let name = file.file_name().into_string().unwrap();
+        if name.starts_with(prefix) && name.trim_end_matches(".data") != name {
+            std::fs::remove_file(file.path()).unwrap();
+        }
+    }
+    let mut input = ShmInput::open(&domain, "arm/pose", &POSE, 1).unwrap();
+    send(&mut output, 0..1);
+    assert!(drain(&mut input).is_empty());
+    assert!(input.counters().connection_failure_count > 0);
+    drop((input, output, holder));
+    assert_nothing_left(domain);
+}
