@@ -26,6 +26,18 @@ pub trait CaseStudy: Sized + Debug + 'static {
     /// `[case.parameters]`; use `#[serde(deny_unknown_fields, default)]`.
     type Parameters: DeserializeOwned + Serialize + Default;
 
+    /// Fills in what the parameters name by file; `read` gives a file's text or says why not.
+    /// Models open no file themselves.
+    ///
+    /// # Errors
+    /// Names the parameter and what `read` said.
+    fn read_files(
+        _parameters: &mut Self::Parameters,
+        _read: &mut dyn FnMut(&str) -> Result<String, String>,
+    ) -> Result<(), ParameterError> {
+        Ok(())
+    }
+
     /// Checks the parameters and prepares what the roles share.
     ///
     /// # Errors

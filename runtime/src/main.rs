@@ -1,2 +1,14 @@
 //! The `hil-runtime` binary with the shipped case studies.
-fn main() {}
+
+use std::process::ExitCode;
+
+use hil_models::shuttle::Shuttle;
+use hil_models::teleoperation::Teleoperation;
+use hil_runtime::Runtime;
+
+fn main() -> ExitCode {
+    Runtime::new()
+        .case::<Teleoperation>()
+        .case::<Shuttle>()
+        .run()
+}

@@ -235,7 +235,7 @@ fn probe_receive(
             return Ok((true, attempts));
         }
         if !is_stamped {
-            thread::sleep(RETRY_PAUSE);
+            pause();
         }
     }
     Ok((false, attempts))
@@ -271,7 +271,7 @@ fn probe_transmit(
             Ok(token) => collect_stamps(sender, token, mode)?,
             Err(refusal) => {
                 finding.newest_refusal = Some(refusal);
-                thread::sleep(RETRY_PAUSE);
+                pause();
                 [false; 3]
             }
         };
@@ -321,6 +321,15 @@ fn collect_stamps(
         // Pending entries show as POLLERR, which is always waited for.
         wait(sender.poll_fd(), PollFlags::empty(), left)?;
     }
+}
+
+/// Gives the kernel's worker time to run.
+#[allow(
+    clippy::disallowed_methods,
+    reason = "a probe runs before any loop, in a normal thread that is meant to step aside"
+)]
+fn pause() {
+    thread::sleep(RETRY_PAUSE);
 }
 
 /// Waits until the descriptor is ready or the time has passed.

@@ -67,9 +67,7 @@ impl UdpSender {
             });
         }
         let socket = open_socket(settings)?;
-        let mut local = settings.local;
-        local.set_port(0);
-        bind(&socket, local)?;
+        bind(&socket, settings.local)?;
         // Reports of the network go to the error queue, with their reason.
         let reports = if settings.peer.is_ipv4() {
             setsockopt(&socket, sockopt::Ipv4RecvErr, &true)

@@ -19,8 +19,8 @@ const BUFFER_BYTES_MAX: usize = 0x3fff_ffff;
 /// How to set up both sockets. Everything optional stays at the kernel's default when `None`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct UdpSettings {
-    /// Where the receiver listens; port 0 lets the kernel choose. The sender uses the same IP
-    /// address with a port of the kernel's choice.
+    /// Where this socket is: where a receiver listens, what a sender's datagrams come from. Port
+    /// 0 lets the kernel choose. Sender and receiver of one channel need a port each.
     pub local: SocketAddr,
     /// Where the peer's receiver listens: the sender is connected to it and hears replies of it
     /// alone. The receiver does not use it.

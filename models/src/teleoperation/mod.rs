@@ -113,6 +113,13 @@ impl CaseStudy for Teleoperation {
     ];
     type Parameters = TeleoperationParameters;
 
+    fn read_files(
+        parameters: &mut Self::Parameters,
+        read: &mut dyn FnMut(&str) -> Result<String, String>,
+    ) -> Result<(), ParameterError> {
+        parameters.read_files(read)
+    }
+
     fn new(parameters: Self::Parameters, seed: u64) -> Result<Self, ParameterError> {
         parameters.check()?;
         let motion = parameters.motion()?;

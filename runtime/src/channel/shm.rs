@@ -55,16 +55,28 @@ impl ShmOutput {
     pub fn connection_failure_count(&self) -> u64 {
         self.output.connection_failure_count()
     }
+
+    /// Publishes `payload` with the next sequence number and gives the envelope it got.
+    ///
+    /// # Errors
+    /// When the payload is not one message long, or the channel is broken.
+    pub fn publish(&mut self, now: Instant, payload: &[u8]) -> Result<Envelope, ChannelError> {
+        let Self { output, sequencer } = self;
+        let mut published = Envelope::default();
+        output.publish_with(payload, || {
+            published = sequencer.envelope(now);
+            published
+        })?;
+        sequencer.advance();
+        Ok(published)
+    }
 }
 
 impl OutputPort for ShmOutput {
     type Error = ChannelError;
 
     fn send(&mut self, now: Instant, payload: &[u8]) -> Result<(), ChannelError> {
-        let Self { output, sequencer } = self;
-        output.publish_with(payload, || sequencer.envelope(now))?;
-        sequencer.advance();
-        Ok(())
+        self.publish(now, payload).map(|_envelope| ())
     }
 }
 

@@ -14,8 +14,8 @@ use hil_models::time::{Alignment, Instant};
 
 use super::assessment::{Assessment, NetworkVerdict};
 use super::summary::{
-    ChannelSummary, CountByName, Fact, LinkKind, Outcome, PeerState, ProcessSummary, RealtimeFacts,
-    RunEvent, RunFacts, RunSummary, ScoreMetric, SummaryError,
+    ChannelSummary, CountByName, DirectionSummary, Fact, LinkKind, Outcome, ProcessSummary,
+    RealtimeFacts, RunEvent, RunFacts, RunSummary, ScoreMetric, SummaryError,
 };
 use super::terminal::{Style, render};
 
@@ -209,7 +209,7 @@ fn channel(
         link,
         account: Some(account),
         refusals: Vec::new(),
-        peer_states: Vec::new(),
+        directions: Vec::new(),
     }
 }
 
@@ -223,12 +223,13 @@ fn channels() -> Vec<ChannelSummary> {
         name: "type hash differs".to_owned(),
         count: 3,
     });
-    for (at_s, state) in [(0.0, "up"), (8.0, "absent"), (8.761, "up")] {
-        command.peer_states.push(PeerState {
-            at_s,
-            state: state.to_owned(),
-        });
-    }
+    command.directions.push(DirectionSummary {
+        process: "robot gateway".to_owned(),
+        direction: "ingress".to_owned(),
+        peer_state: "said farewell".to_owned(),
+        counters: Vec::new(),
+        facts: vec![Fact::new("receive buffer granted", "425984 bytes")],
+    });
     let status = channel("arm/status", back, LinkKind::Udp, files.account(None));
     let human = ["operator", "controller"];
     let motion = channel(
@@ -332,7 +333,7 @@ fn empty() -> RunSummary {
             link: LinkKind::Udp,
             account,
             refusals: Vec::new(),
-            peer_states: Vec::new(),
+            directions: Vec::new(),
         });
     }
     summary

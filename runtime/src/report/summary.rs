@@ -287,8 +287,23 @@ pub struct ChannelSummary {
     pub account: Option<ChannelAccount>,
     /// Datagrams the gateways refused, by reason; only reasons that occurred.
     pub refusals: Vec<CountByName>,
-    /// States of the peer, in order of time.
-    pub peer_states: Vec<PeerState>,
+    /// The gateway threads that carried it; empty on a direct channel.
+    pub directions: Vec<DirectionSummary>,
+}
+
+/// One gateway thread of a channel.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct DirectionSummary {
+    /// The gateway process.
+    pub process: String,
+    /// `egress` or `ingress`.
+    pub direction: String,
+    /// The peer's state at the end, in words.
+    pub peer_state: String,
+    /// Everything it counted.
+    pub counters: Vec<CountByName>,
+    /// What was granted and found: buffers, stamp probe, path MTU.
+    pub facts: Vec<Fact>,
 }
 
 /// A named count.
@@ -298,15 +313,6 @@ pub struct CountByName {
     pub name: String,
     /// How often.
     pub count: u64,
-}
-
-/// A change of a peer's state.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct PeerState {
-    /// When, seconds after the start.
-    pub at_s: f64,
-    /// The state from then on, in words.
-    pub state: String,
 }
 
 /// One figure of the score.

@@ -49,12 +49,15 @@ pub(super) fn channel(canvas: &mut Canvas, channel: &ChannelSummary) {
             &format!("datagrams: {}", list(&channel.refusals)),
         );
     }
-    if !channel.peer_states.is_empty() {
-        let states = channel.peer_states.iter();
-        let words: Vec<_> = states
-            .map(|s| format!("{} at {:.3} s", s.state, s.at_s))
+    for direction in &channel.directions {
+        let facts = direction
+            .facts
+            .iter()
+            .map(|fact| format!("{}: {}", fact.label, fact.value));
+        let words: Vec<_> = core::iter::once(format!("peer {}", direction.peer_state))
+            .chain(facts)
             .collect();
-        canvas.field("peer", Tone::Plain, &words.join(" · "));
+        canvas.field(&direction.direction, Tone::Faint, &words.join(" · "));
     }
 }
 

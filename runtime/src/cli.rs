@@ -1,0 +1,148 @@
+//! The command line: definitions only. What a command does is elsewhere.
+
+use std::path::PathBuf;
+
+use clap::{Args, Parser, Subcommand};
+
+const EXAMPLES: &str = "\
+Examples:
+  hil-runtime --topology deploy/topologies/local.toml
+      the whole loop on this PC, over shared memory
+  hil-runtime --topology deploy/topologies/split.toml
+      this host's share of the loop; start the same command on the other host
+  hil-runtime --topology deploy/topologies/split.toml --check
+      say what is wrong with the file, start nothing
+  hil-runtime simulate --topology deploy/topologies/emulated.toml
+      the same loop and link in virtual time, in a moment
+  hil-runtime report runs/teleop-local-20261121-101500
+      print a finished run's report again
+
+Exit codes:
+  0  the run ended as planned        70  internal error
+  1  a process or the run failed     77  not permitted
+  2  wrong arguments or topology     78  doctor --strict: host not fit
+  69 a peer host was not reachable   130 interrupted; the report is complete";
+
+/// Runs a robot's controller and its model as separate processes, over shared memory or a real
+/// network, and accounts for every microsecond in between.
+#[derive(Debug, Parser)]
+#[command(
+    name = "hil-runtime",
+    version,
+    after_help = EXAMPLES,
+    args_conflicts_with_subcommands = true,
+    arg_required_else_help = true
+)]
+pub struct Cli {
+    /// What to do, if not to run a topology.
+    #[command(subcommand)]
+    pub command: Option<Command>,
+
+    /// Run this topology.
+    #[command(flatten)]
+    pub run: RunArgs,
+}
+
+/// Arguments of a run.
+#[derive(Debug, Args)]
+pub struct RunArgs {
+    /// The topology file (TOML).
+    #[arg(long, short, value_name = "FILE")]
+    pub topology: Option<PathBuf>,
+
+    /// Name of this host in the topology; otherwise `HIL_HOST`, or found from the machine's name and
+    /// addresses.
+    #[arg(long, value_name = "NAME")]
+    pub host: Option<String>,
+
+    /// Change one value of the file, e.g. --set run.duration='"5 s"'; may be repeated.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub overrides: Vec<String>,
+
+    /// Check the file, print what would run, start nothing.
+    #[arg(long)]
+    pub check: bool,
+
+    /// Print no progress, only the report.
+    #[arg(long, short)]
+    pub quiet: bool,
+
+    /// Folder for the shared-memory domain; otherwise below /run or the temporary folder. Both
+    /// hosts of a split run must have their own.
+    #[arg(long, value_name = "DIR", hide = true)]
+    pub domain_root: Option<PathBuf>,
+}
+
+/// Everything but a run.
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Run a topology in virtual time: same components, same link models, no processes.
+    #[command(
+        after_help = "Example:\n  hil-runtime simulate --topology deploy/topologies/emulated.toml --set run.duration='\"1 h\"'"
+    )]
+    Simulate {
+        /// The topology file (TOML).
+        #[arg(long, short, value_name = "FILE")]
+        topology: PathBuf,
+        /// Change one value of the file; may be repeated.
+        #[arg(long = "set", value_name = "KEY=VALUE")]
+        overrides: Vec<String>,
+        /// Print JSON instead of a table.
+        #[arg(long)]
+        json: bool,
+    },
+    /// Print the report of a finished run again.
+    #[command(after_help = "Example:\n  hil-runtime report runs/teleop-local-20261121-101500")]
+    Report {
+        /// The run's folder.
+        run: PathBuf,
+        /// Print summary.json instead of the table.
+        #[arg(long)]
+        json: bool,
+    },
+    /// Say what this host can measure and what to change.
+    #[command(
+        after_help = "Example:\n  hil-runtime doctor --strict   # exit code 78 when something must be fixed"
+    )]
+    Doctor {
+        /// Exit with 78 when a problem was found.
+        #[arg(long)]
+        strict: bool,
+        /// Print JSON instead of a table.
+        #[arg(long)]
+        json: bool,
+    },
+    /// List the case studies with their channels and parameters.
+    #[command(after_help = "Example:\n  hil-runtime cases")]
+    Cases,
+    /// Write the sample human motion as a BVH file.
+    #[command(after_help = "Example:\n  hil-runtime motion --output deploy/motions/swing.bvh")]
+    Motion {
+        /// Where to write it; standard output if left out.
+        #[arg(long, short, value_name = "FILE")]
+        output: Option<PathBuf>,
+        /// Time from one side to the other and back, seconds.
+        #[arg(long, default_value_t = 4.033)]
+        period: f64,
+        /// Half the way from side to side, metres.
+        #[arg(long, default_value_t = 0.1875)]
+        amplitude: f64,
+        /// Frames per second.
+        #[arg(long, default_value_t = 125.0)]
+        rate: f64,
+    },
+    /// Run one component; started by a run, not by hand.
+    #[command(hide = true)]
+    Component {
+        /// Launch file written by the supervisor.
+        #[arg(long)]
+        launch: PathBuf,
+    },
+    /// Run the gateway of one link; started by a run, not by hand.
+    #[command(hide = true)]
+    Gateway {
+        /// Launch file written by the supervisor.
+        #[arg(long)]
+        launch: PathBuf,
+    },
+}

@@ -1,0 +1,341 @@
+//! What each command of the command line does, and the exit code it ends with.
+
+use std::env;
+use std::fs;
+use std::io::IsTerminal;
+use std::path::Path;
+use std::process::ExitCode;
+
+use clap::Parser;
+use hil_gateways::transport::timestamping::TimestampCapabilities;
+use hil_models::case_study::ParameterError;
+use hil_models::teleoperation::swing::swing_bvh;
+
+use crate::analysis;
+use crate::cli::{Cli, Command, RunArgs};
+use crate::console::Console;
+use crate::doctor::{self, DoctorRequest, StampCapabilities};
+use crate::process::{component, gateway};
+use crate::registry::Registry;
+use crate::report::summary::RunSummary;
+use crate::report::terminal::{self, Style};
+use crate::run_folder::RunFolder;
+use crate::signals::{EXIT_INTERRUPTED, Signals};
+use crate::simulate;
+use crate::supervisor::{self, Outcome, PeerError, RunError, RunOptions};
+use crate::topology::{self, HOST_VARIABLE, HostChoice, MachineIdentity, Topology, which_host};
+
+/// Exit codes, as `--help` lists them (after `sysexits.h`, which systemd knows).
+mod exit {
+    pub(super) const RAN: u8 = 0;
+    pub(super) const FAILED: u8 = 1;
+    pub(super) const USAGE: u8 = 2;
+    pub(super) const PEER_ABSENT: u8 = 69;
+    pub(super) const INTERNAL: u8 = 70;
+    pub(super) const HOST_UNFIT: u8 = 78;
+}
+
+/// Does what the command line says.
+pub(crate) fn run(registry: &Registry) -> ExitCode {
+    let cli = Cli::parse();
+    let mut console = Console::new(cli.run.quiet);
+    let code = match cli.command {
+        None => run_topology(&cli.run, registry, &mut console),
+        Some(command) => run_command(command, registry, &mut console),
+    };
+    ExitCode::from(code)
+}
+
+fn run_command(command: Command, registry: &Registry, console: &mut Console) -> u8 {
+    match command {
+        Command::Component { launch } => code_of(component::run(&launch, registry), console),
+        Command::Gateway { launch } => code_of(gateway::run(&launch), console),
+        Command::Simulate {
+            topology,
+            overrides,
+            json,
+        } => simulate(&topology, &overrides, registry, (json, console)),
+        Command::Report { run, json } => show_report(&run, json, console),
+        Command::Doctor { strict, json } => {
+            let worst = examine(json, console);
+            if strict && worst == doctor::State::Problem {
+                exit::HOST_UNFIT
+            } else {
+                exit::RAN
+            }
+        }
+        Command::Cases => list_cases(registry, console),
+        Command::Motion {
+            output,
+            period,
+            amplitude,
+            rate,
+        } => write_motion(
+            output.as_deref(),
+            swing_bvh(period, amplitude, rate),
+            console,
+        ),
+    }
+}
+
+fn code_of<E: core::fmt::Display>(outcome: Result<(), E>, console: &mut Console) -> u8 {
+    match outcome {
+        Ok(()) => exit::RAN,
+        Err(error) => {
+            console.error(&error.to_string());
+            exit::FAILED
+        }
+    }
+}
+
+fn load(
+    path: &Path,
+    overrides: &[String],
+    registry: &Registry,
+    console: &mut Console,
+) -> Option<Topology> {
+    match topology::load(path, overrides, registry.known()) {
+        Ok(topology) => Some(topology),
+        Err(errors) => {
+            console.rendered(&errors.render(std::io::stderr().is_terminal()));
+            None
+        }
+    }
+}
+
+fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u8 {
+    let Some(path) = &args.topology else {
+        console.error("no topology given; try --topology deploy/topologies/local.toml or --help");
+        return exit::USAGE;
+    };
+    let Some(topology) = load(path, &args.overrides, registry, console) else {
+        return exit::USAGE;
+    };
+    if args.check {
+        console.result(&format!(
+            "{}: fit to run\n{}",
+            path.display(),
+            topology.to_toml()
+        ));
+        return exit::RAN;
+    }
+    let hosts = match hosts_here(&topology, args.host.as_deref()) {
+        Ok(hosts) => hosts,
+        Err(text) => {
+            console.error(&text);
+            return exit::USAGE;
+        }
+    };
+    let signals = match Signals::install() {
+        Ok(signals) => signals,
+        Err(error) => {
+            console.error(&format!("cannot handle signals: {error}"));
+            return exit::INTERNAL;
+        }
+    };
+    let options = RunOptions {
+        hosts,
+        domain_root: args.domain_root.clone(),
+        command_line: env::args().collect(),
+    };
+    match supervisor::run(&topology, &options, &signals, console) {
+        Ok(result) => {
+            let code = exit_code(&result.outcome);
+            let origin = (path.as_path(), options.command_line.as_slice());
+            match analysis::conclude(&topology, &result, registry, origin) {
+                Ok(summary) => {
+                    console.result(&terminal::render(&summary, columns(), Style::Coloured));
+                    code
+                }
+                Err(error) => {
+                    console.error(&format!("the run is over but its report failed: {error}"));
+                    exit::INTERNAL
+                }
+            }
+        }
+        Err(error) => {
+            console.error(&error.to_string());
+            match error {
+                RunError::Peer(PeerError::Absent { .. } | PeerError::Connection { .. }) => {
+                    exit::PEER_ABSENT
+                }
+                RunError::Peer(PeerError::Mismatch { .. } | PeerError::Listen { .. }) => {
+                    exit::USAGE
+                }
+                RunError::Peer(PeerError::Interrupted { .. }) => interrupted(),
+                RunError::Folder { .. }
+                | RunError::Domains(_)
+                | RunError::Identity(_)
+                | RunError::Start(_) => exit::INTERNAL,
+            }
+        }
+    }
+}
+
+fn interrupted() -> u8 {
+    u8::try_from(EXIT_INTERRUPTED).unwrap_or(exit::INTERNAL)
+}
+
+fn exit_code(outcome: &Outcome) -> u8 {
+    match outcome {
+        Outcome::Completed | Outcome::EndedEarly(_) => exit::RAN,
+        Outcome::Interrupted(_) => interrupted(),
+        Outcome::Failed(_) | Outcome::EndedByPeer(_) => exit::FAILED,
+        Outcome::PeerLost(_) => exit::PEER_ABSENT,
+    }
+}
+
+fn hosts_here(topology: &Topology, requested: Option<&str>) -> Result<Vec<String>, String> {
+    let machine = MachineIdentity::gather().map_err(|errno| {
+        format!(
+            "cannot read this machine's name and addresses: {}",
+            errno.desc()
+        )
+    })?;
+    let environment = env::var(HOST_VARIABLE).ok();
+    match which_host(topology, requested, environment.as_deref(), &machine) {
+        Ok(HostChoice::One(name)) => Ok(vec![name]),
+        Ok(HostChoice::All) => Ok(topology
+            .hosts()
+            .iter()
+            .map(|host| host.name.clone())
+            .collect()),
+        Err(error) => Err(error.to_string()),
+    }
+}
+
+fn simulate(
+    path: &Path,
+    overrides: &[String],
+    registry: &Registry,
+    (json, console): (bool, &mut Console),
+) -> u8 {
+    let Some(topology) = load(path, overrides, registry, console) else {
+        return exit::USAGE;
+    };
+    match simulate::simulate(&topology, registry, json) {
+        Ok(text) => {
+            console.result(&text);
+            exit::RAN
+        }
+        Err(text) => {
+            console.error(&text);
+            exit::USAGE
+        }
+    }
+}
+
+fn show_report(run: &Path, json: bool, console: &mut Console) -> u8 {
+    let folder = RunFolder::existing(run);
+    let text = match fs::read_to_string(folder.summary()) {
+        Ok(text) => text,
+        Err(error) => {
+            console.error(&format!("{}: {error}", folder.summary().display()));
+            return exit::USAGE;
+        }
+    };
+    if json {
+        console.result(&text);
+        return exit::RAN;
+    }
+    match RunSummary::from_json(&text) {
+        Ok(summary) => {
+            console.result(&terminal::render(&summary, columns(), Style::Coloured));
+            exit::RAN
+        }
+        Err(error) => {
+            console.error(&format!("{}: {error}", folder.summary().display()));
+            exit::USAGE
+        }
+    }
+}
+
+fn examine(json: bool, console: &mut Console) -> doctor::State {
+    let report = doctor::examine(&DoctorRequest::default(), &stamp_capabilities);
+    let text = if json {
+        report.to_json()
+    } else {
+        report.to_text(true)
+    };
+    console.result(&text);
+    report.worst_state()
+}
+
+/// What an interface claims, in the bits of the kernel's answer.
+fn stamp_capabilities(interface: &str) -> Result<StampCapabilities, String> {
+    let claims = TimestampCapabilities::query(interface).map_err(|error| error.to_string())?;
+    let flag = |is_claimed: bool, bit: u32| if is_claimed { bit } else { 0 };
+    Ok(StampCapabilities {
+        so_timestamping: flag(claims.tx_hardware, libc::SOF_TIMESTAMPING_TX_HARDWARE)
+            | flag(claims.tx_software, libc::SOF_TIMESTAMPING_TX_SOFTWARE)
+            | flag(claims.rx_hardware, libc::SOF_TIMESTAMPING_RX_HARDWARE)
+            | flag(claims.rx_software, libc::SOF_TIMESTAMPING_RX_SOFTWARE)
+            | flag(
+                claims.tx_software || claims.rx_software,
+                libc::SOF_TIMESTAMPING_SOFTWARE,
+            )
+            | flag(
+                claims.tx_hardware || claims.rx_hardware,
+                libc::SOF_TIMESTAMPING_RAW_HARDWARE,
+            ),
+        hardware_clock_index: claims.phc_index,
+    })
+}
+
+/// Columns of the terminal; where there is none, a page's.
+fn columns() -> usize {
+    env::var("COLUMNS")
+        .ok()
+        .and_then(|text| text.parse().ok())
+        .unwrap_or(100)
+}
+
+fn list_cases(registry: &Registry, console: &mut Console) -> u8 {
+    for entry in registry.entries() {
+        console.result(&format!("{}: {}\n", entry.name, entry.summary));
+        for channel in entry.channels {
+            console.result(&format!(
+                "  {:<16} {} -> {}  {} ({} bytes)\n",
+                channel.name,
+                channel.from,
+                channel.to,
+                channel.message.name,
+                channel.message.size_bytes
+            ));
+        }
+        if let serde_json::Value::Object(parameters) = entry.defaults() {
+            for (key, value) in parameters {
+                console.result(&format!("  {key} = {value}\n"));
+            }
+        }
+    }
+    exit::RAN
+}
+
+fn write_motion(
+    output: Option<&Path>,
+    text: Result<String, ParameterError>,
+    console: &mut Console,
+) -> u8 {
+    let text = match text {
+        Ok(text) => text,
+        Err(error) => {
+            console.error(&error.to_string());
+            return exit::USAGE;
+        }
+    };
+    let Some(path) = output else {
+        console.result(&text);
+        return exit::RAN;
+    };
+    match fs::write(path, text) {
+        Ok(()) => {
+            console.say(&format!("wrote {}", path.display()));
+            exit::RAN
+        }
+        Err(error) => {
+            console.error(&format!("{}: {error}", path.display()));
+            exit::FAILED
+        }
+    }
+}

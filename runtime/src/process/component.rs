@@ -1,0 +1,339 @@
+//! The process of one component: the same endpoint that virtual time drives, on shared-memory
+//! ports and a real clock.
+
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::thread;
+use std::time::Duration;
+
+use hil_models::component::Role;
+use hil_models::endpoint::{Activity, Endpoint, PortCountError};
+use hil_models::measure::record::{PublishedRecord, TakenRecord};
+use hil_models::message::{Envelope, MessageType};
+
+use super::launch::{ComponentLaunch, LaunchError, read};
+use super::pipe::{ChannelProgress, FromProcess, Orders, ProcessReport, say};
+use super::recording::{RecordedInput, RecordedOutput};
+use super::usage::add_usage;
+use crate::channel::{
+    ChannelError, Domain, DomainError, OutputSettings, ShmInput, ShmOutput, Waiter,
+};
+use crate::clock::{MonotonicClock, Wake};
+use crate::realtime::{self, SpinAdvice};
+use crate::record::{RecordFileError, RecordKind, RecordSink, Recorder};
+use crate::registry::{CaseError, Registry};
+use crate::topology::{CardChannel, ProcessCard};
+use crate::wait::{Pause, WaitMode, WaitStrategy};
+
+/// Records a ring holds: 4 s at 4 kHz, far more than the writer's period needs.
+const RING_RECORDS: usize = 16_384;
+const PROGRESS_PERIOD: Duration = Duration::from_millis(250);
+
+/// Why a component cannot run.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum ComponentError {
+    #[error(transparent)]
+    Launch(#[from] LaunchError),
+    #[error("this binary has no case {0}; it was built without the case the supervisor knows")]
+    UnknownCase(String),
+    #[error("case {case} has no role {role}")]
+    UnknownRole { case: String, role: String },
+    #[error(transparent)]
+    Case(#[from] CaseError),
+    #[error(transparent)]
+    Record(#[from] RecordFileError),
+    #[error(transparent)]
+    Domain(#[from] DomainError),
+    #[error(transparent)]
+    Channel(#[from] ChannelError),
+    #[error(transparent)]
+    Ports(#[from] PortCountError),
+    #[error("cannot start a thread: {0}")]
+    Thread(#[from] std::io::Error),
+}
+
+type ComponentEndpoint = Endpoint<RecordedInput, RecordedOutput>;
+
+/// Runs the component described by the launch file until told to stop.
+///
+/// # Errors
+/// When the component cannot be made or a channel breaks; the supervisor is told as well.
+pub(crate) fn run(launch: &Path, registry: &Registry) -> Result<(), ComponentError> {
+    let outcome = prepare_and_live(launch, registry);
+    if let Err(error) = &outcome {
+        say(&FromProcess::Failed(error.to_string()));
+    }
+    outcome
+}
+
+fn prepare_and_live(path: &Path, registry: &Registry) -> Result<(), ComponentError> {
+    let orders = Orders::listen()?;
+    let launch: ComponentLaunch = read(path)?;
+    let card: ProcessCard = read(&launch.card)?;
+    let role = make_role(&card, registry)?;
+    let counts = Counts::of(&card);
+    let mut recorder = Recorder::new(&launch.records, &launch.process, launch.instance);
+    let sinks = Sinks::open(&card, &mut recorder)?;
+    recorder.start()?;
+    let progress = counts.report_progress()?;
+
+    // Everything below runs on this thread, which from here on is the measured one.
+    let domain = Domain::open(&launch.domain.parse()?)?;
+    let mut waiter = open_waiter(&domain, &card, launch.wait)?;
+    let endpoint = connect(role, &domain, &card, launch.wait, (sinks, &counts))?;
+    warn_of_spinning(&launch);
+    let grant = realtime::apply(&launch.realtime);
+    say(&FromProcess::Ready);
+    let mut report = ProcessReport {
+        realtime: vec![("main".to_owned(), grant)],
+        ..ProcessReport::default()
+    };
+    if orders.wait_for_start() {
+        let lived = live(endpoint, waiter.as_mut(), &orders, launch.wait, &mut report);
+        progress.store(false, Ordering::Release);
+        lived?;
+    }
+    drop(waiter);
+    let outcome = recorder.finish();
+    report.recorder_dropped = outcome.dropped_count;
+    report.recorder_failures = outcome.failures;
+    add_usage(&mut report);
+    say(&FromProcess::Finished(Box::new(report)));
+    Ok(())
+}
+
+fn make_role(card: &ProcessCard, registry: &Registry) -> Result<Box<dyn Role>, ComponentError> {
+    let name = card.case.clone().unwrap_or_default();
+    let entry = registry
+        .find(&name)
+        .ok_or(ComponentError::UnknownCase(name))?;
+    let parameters = serde_json::to_value(&card.parameters).unwrap_or_default();
+    let case = entry.make(parameters, card.seed)?;
+    let role = card.role.clone().unwrap_or_default();
+    case.role(&role).ok_or(ComponentError::UnknownRole {
+        case: entry.name.to_owned(),
+        role,
+    })
+}
+
+/// Live counters of a component's ports, in port order.
+struct Counts {
+    taken: Vec<(String, Arc<AtomicU64>)>,
+    published: Vec<(String, Arc<AtomicU64>)>,
+}
+
+impl Counts {
+    fn of(card: &ProcessCard) -> Self {
+        let counters = |channels: &[CardChannel]| {
+            channels
+                .iter()
+                .map(|card| (card.name.clone(), Arc::default()))
+                .collect()
+        };
+        Self {
+            taken: counters(&card.inputs),
+            published: counters(&card.outputs),
+        }
+    }
+
+    /// Tells the supervisor the counts a few times a second, from a thread of its own.
+    fn report_progress(&self) -> Result<Arc<AtomicBool>, std::io::Error> {
+        let named = |what: &str, counters: &[(String, Arc<AtomicU64>)]| {
+            counters
+                .iter()
+                .map(|(channel, count)| (channel.clone(), what.to_owned(), Arc::clone(count)))
+                .collect::<Vec<_>>()
+        };
+        let mut all = named("taken", &self.taken);
+        all.extend(named("published", &self.published));
+        let is_running = Arc::new(AtomicBool::new(true));
+        let running = Arc::clone(&is_running);
+        thread::Builder::new()
+            .name("progress".to_owned())
+            .spawn(move || {
+                while running.load(Ordering::Acquire) {
+                    thread::sleep(PROGRESS_PERIOD);
+                    let counts = all.iter().map(|(channel, what, count)| ChannelProgress {
+                        channel: channel.clone(),
+                        what: what.clone(),
+                        count: count.load(Ordering::Relaxed),
+                    });
+                    say(&FromProcess::Progress(counts.collect()));
+                }
+            })?;
+        Ok(is_running)
+    }
+}
+
+/// The record rings of a component, in port order.
+struct Sinks {
+    taken: Vec<RecordSink>,
+    published: Vec<(RecordSink, RecordSink)>,
+}
+
+impl Sinks {
+    fn open(card: &ProcessCard, recorder: &mut Recorder) -> Result<Self, RecordFileError> {
+        let mut taken = Vec::new();
+        for channel in &card.inputs {
+            let size = size_of::<TakenRecord>();
+            taken.push(recorder.sink(RecordKind::Taken, &channel.name, size, RING_RECORDS)?);
+        }
+        let mut published = Vec::new();
+        for channel in &card.outputs {
+            let size = size_of::<PublishedRecord>();
+            let message = size_of::<Envelope>() + channel.message_size_bytes;
+            published.push((
+                recorder.sink(RecordKind::Published, &channel.name, size, RING_RECORDS)?,
+                recorder.sink(RecordKind::Message, &channel.name, message, RING_RECORDS)?,
+            ));
+        }
+        Ok(Self { taken, published })
+    }
+}
+
+fn connect(
+    role: Box<dyn Role>,
+    domain: &Domain,
+    card: &ProcessCard,
+    wait: WaitMode,
+    (sinks, counts): (Sinks, &Counts),
+) -> Result<ComponentEndpoint, ComponentError> {
+    // Producers of one channel never start twice within a microsecond on one host.
+    let epoch = u32::try_from(MonotonicClock::now().as_ns() / 1000 % i64::from(u32::MAX))
+        .expect("the remainder is below u32::MAX");
+    let settings = OutputSettings {
+        epoch,
+        ..OutputSettings::default()
+    };
+    let mut inputs = Vec::new();
+    let declared: Vec<MessageType> = role.inputs().to_vec();
+    for (((channel, message), sink), (_, taken)) in card
+        .inputs
+        .iter()
+        .zip(declared)
+        .zip(sinks.taken)
+        .zip(&counts.taken)
+    {
+        inputs.push(RecordedInput {
+            port: ShmInput::open(domain, &channel.name, &message, channel.depth)?,
+            sink,
+            taken: Arc::clone(taken),
+            wait: WaitStrategy::new(wait),
+        });
+    }
+    let mut outputs = Vec::new();
+    let declared: Vec<MessageType> = role.outputs().to_vec();
+    for (((channel, message), (sink, messages)), (_, published)) in card
+        .outputs
+        .iter()
+        .zip(declared)
+        .zip(sinks.published)
+        .zip(&counts.published)
+    {
+        outputs.push(RecordedOutput {
+            port: ShmOutput::open(domain, &channel.name, &message, settings)?,
+            sink,
+            messages,
+            published: Arc::clone(published),
+        });
+    }
+    Ok(Endpoint::new(role, inputs, outputs)?)
+}
+
+/// A component without inputs, or one that spins, listens for no wake-ups.
+fn open_waiter(
+    domain: &Domain,
+    card: &ProcessCard,
+    mode: WaitMode,
+) -> Result<Option<Waiter>, ChannelError> {
+    if card.inputs.is_empty() || mode == WaitMode::Spin {
+        return Ok(None);
+    }
+    let names: Vec<&str> = card
+        .inputs
+        .iter()
+        .map(|channel| channel.name.as_str())
+        .collect();
+    Waiter::open(domain, &names).map(Some)
+}
+
+fn warn_of_spinning(launch: &ComponentLaunch) {
+    if launch.wait != WaitMode::Spin {
+        return;
+    }
+    match launch.realtime.cpu.map(realtime::spin_advice) {
+        Some(SpinAdvice::Fine) => {}
+        Some(SpinAdvice::Warn(why)) => say(&FromProcess::Warning(format!("wait = spin: {why}"))),
+        None => say(&FromProcess::Warning(
+            "wait = spin without a cpu of its own".to_owned(),
+        )),
+    }
+}
+
+fn live(
+    mut endpoint: ComponentEndpoint,
+    mut waiter: Option<&mut Waiter>,
+    orders: &Orders,
+    mode: WaitMode,
+    report: &mut ProcessReport,
+) -> Result<(), ChannelError> {
+    let own_wait = WaitStrategy::new(mode);
+    let mut total = Activity::default();
+    endpoint.start(MonotonicClock::now());
+    while !orders.is_stopping() {
+        let activity = endpoint.poll(MonotonicClock::now())?;
+        total.malformed_count += activity.malformed_count;
+        total.tick_count += activity.tick_count;
+        let now = MonotonicClock::now();
+        let next_tick = endpoint.role().next_tick();
+        let mut pause = own_wait.pause(now, next_tick);
+        for input in endpoint.inputs_mut() {
+            pause = pause.sooner(input.wait.pause(now, None));
+        }
+        match (pause, &mut waiter) {
+            (Pause::Spin, _) => core::hint::spin_loop(),
+            (Pause::Sleep(until), Some(waiter)) => {
+                waiter.wait_until(Some(until))?;
+            }
+            (Pause::Sleep(until), None) => {
+                // An interrupted sleep only means looking again a little early.
+                let (Wake::Due | Wake::Interrupted) = MonotonicClock::sleep_until(until);
+            }
+        }
+    }
+    report.skipped_ticks = endpoint.role().skipped_ticks();
+    report.ticks = total.tick_count;
+    report.malformed_count = total.malformed_count;
+    report.outbox_dropped = endpoint.role().outbox_dropped();
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use hil_models::shuttle::Shuttle;
+
+    fn card(case: &str, role: &str) -> ProcessCard {
+        ProcessCard {
+            process: "test".to_owned(),
+            case: Some(case.to_owned()),
+            role: Some(role.to_owned()),
+            seed: 1,
+            inputs: Vec::new(),
+            outputs: Vec::new(),
+            parameters: toml::Table::new(),
+        }
+    }
+
+    #[test]
+    fn a_card_that_fits_no_case_or_role_is_refused_by_name() {
+        let mut registry = Registry::default();
+        registry.add::<Shuttle>();
+        let error = make_role(&card("fleet", "robot"), &registry).unwrap_err();
+        assert!(error.to_string().contains("no case fleet"), "{error}");
+        let error = make_role(&card("shuttle", "pilot"), &registry).unwrap_err();
+        assert_eq!(error.to_string(), "case shuttle has no role pilot");
+        assert!(make_role(&card("shuttle", "robot"), &registry).is_ok());
+    }
+}

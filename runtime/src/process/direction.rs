@@ -1,0 +1,442 @@
+//! One channel direction of a gateway from its launch description to its final counters: opens
+//! the socket in the normal thread, the shared-memory port in the pinned one.
+
+use std::net::{IpAddr, SocketAddr};
+use std::sync::Arc;
+use std::sync::atomic::AtomicU64;
+use std::time::Duration;
+
+use hil_gateways::protocol::ingress::IngressCounts;
+use hil_gateways::protocol::wire::{self, Kind};
+use hil_gateways::protocol::{
+    EgressBridge, EgressSettings, IngressBridge, IngressSettings, PeerState, RefusalCounts,
+};
+use hil_gateways::transport::clock_pair::ClockPair;
+use hil_gateways::transport::emulated::{EmulatedReceiver, EmulatedSettings};
+use hil_gateways::transport::timestamping::TimestampMode;
+use hil_gateways::transport::udp::{GrantedOptions, UdpReceiver, UdpSender, UdpSettings};
+use hil_gateways::transport::{DatagramReceiver, ReceiverCounters, SenderCounters};
+use hil_models::link::bernoulli::BernoulliLink;
+use hil_models::measure::record::{EgressRecord, FollowUpRecord, IngressRecord};
+use hil_models::random::RandomStream;
+
+use super::egress::{Armed, Egress, Line};
+use super::gateway::{GatewayError, PAIR_ATTEMPTS, Surroundings};
+use super::ingress::{Ingress, Notes};
+use super::launch::{DirectionLaunch, Side};
+use super::pipe::DirectionReport;
+use crate::channel::{RawInput, RawOutput, Waiter};
+use crate::record::{RecordKind, RecordSink, Recorder};
+use crate::wait::{WaitMode, WaitStrategy};
+
+/// Records a ring holds.
+const RING_RECORDS: usize = 16_384;
+/// Time between clock exchanges: frequent enough for a round-trip distribution, rare enough to
+/// be a fraction of any control channel's traffic.
+const SYNC_PERIOD: Duration = Duration::from_millis(100);
+/// IP and UDP headers of a datagram.
+const IPV4_HEADERS: usize = 20 + 8;
+const IPV6_HEADERS: usize = 40 + 8;
+
+type Sinks = (RecordSink, RecordSink);
+
+/// A direction whose socket and files are open and whose port is not.
+pub(crate) struct Opened {
+    socket: Socket,
+    sinks: Sinks,
+    count: Arc<AtomicU64>,
+    facts: Vec<(String, String)>,
+}
+
+enum Socket {
+    Sender(Box<UdpSender>),
+    Receiver(Box<dyn DatagramReceiver>),
+}
+
+/// A direction at work.
+pub(crate) struct Direction {
+    way: Way,
+    facts: Vec<(String, String)>,
+}
+
+enum Way {
+    Egress(Box<Egress>),
+    Ingress(Box<Ingress>),
+}
+
+/// Opens the socket and the record files of `launch`; call it from a thread of normal priority.
+pub(crate) fn open<'a>(
+    launch: &'a DirectionLaunch,
+    _surroundings: &Surroundings,
+    recorder: &mut Recorder,
+) -> Result<(&'a DirectionLaunch, Opened), GatewayError> {
+    let settings = socket_settings(launch);
+    let sinks = open_sinks(launch, recorder)?;
+    let (socket, granted) = match launch.side {
+        Side::Egress => {
+            let sender = UdpSender::open(&settings)?;
+            let granted = sender.granted();
+            (Socket::Sender(Box::new(sender)), granted)
+        }
+        Side::Ingress => {
+            let receiver = UdpReceiver::open(&settings)?;
+            let granted = receiver.granted();
+            (Socket::Receiver(emulate(receiver, launch)?), granted)
+        }
+    };
+    let facts = socket_facts(&settings, granted);
+    Ok((
+        launch,
+        Opened {
+            socket,
+            sinks,
+            count: Arc::default(),
+            facts,
+        },
+    ))
+}
+
+fn open_sinks(launch: &DirectionLaunch, recorder: &mut Recorder) -> Result<Sinks, GatewayError> {
+    let channel = &launch.channel;
+    let mut sink = |kind, size| recorder.sink(kind, channel, size, RING_RECORDS);
+    Ok(match launch.side {
+        Side::Egress => (
+            sink(RecordKind::Egress, size_of::<EgressRecord>())?,
+            sink(RecordKind::RoundTrip, 2 * size_of::<i64>())?,
+        ),
+        Side::Ingress => (
+            sink(RecordKind::Ingress, size_of::<IngressRecord>())?,
+            sink(RecordKind::FollowUp, size_of::<FollowUpRecord>())?,
+        ),
+    })
+}
+
+fn socket_settings(launch: &DirectionLaunch) -> UdpSettings {
+    let socket = &launch.socket;
+    UdpSettings {
+        local: launch.local,
+        peer: launch.peer,
+        interface: socket.interface.clone(),
+        // 0 is the kernel's default; setting it would only reset the priority.
+        dscp: (socket.dscp > 0).then_some(socket.dscp),
+        priority: socket.priority,
+        send_buffer_bytes: Some(socket.send_buffer_bytes),
+        receive_buffer_bytes: Some(socket.receive_buffer_bytes),
+        timestamps: timestamp_mode(&socket.timestamps),
+    }
+}
+
+pub(crate) fn timestamp_mode(word: &str) -> TimestampMode {
+    match word {
+        "off" => TimestampMode::Off,
+        "hardware" => TimestampMode::Hardware,
+        _ => TimestampMode::Software,
+    }
+}
+
+fn socket_facts(settings: &UdpSettings, granted: GrantedOptions) -> Vec<(String, String)> {
+    let mut facts = vec![
+        (
+            "socket".to_owned(),
+            format!("{} to or from {}", settings.local, settings.peer),
+        ),
+        (
+            "send buffer granted".to_owned(),
+            format!("{} bytes", granted.send_buffer_bytes),
+        ),
+        (
+            "receive buffer granted".to_owned(),
+            format!("{} bytes", granted.receive_buffer_bytes),
+        ),
+    ];
+    let shortfalls = granted.shortfalls(settings);
+    facts.extend(
+        shortfalls
+            .into_iter()
+            .map(|text| ("socket option".to_owned(), text)),
+    );
+    facts
+}
+
+/// Puts the receiver behind the launch's link model, if it has one. Greetings and clock exchanges
+/// pass freely: the model stands for what happens to the robot's messages.
+fn emulate(
+    receiver: UdpReceiver,
+    launch: &DirectionLaunch,
+) -> Result<Box<dyn DatagramReceiver>, GatewayError> {
+    let Some(emulation) = launch.emulation else {
+        return Ok(Box::new(receiver));
+    };
+    let stream = RandomStream::new(emulation.seed, &launch.channel);
+    let link = BernoulliLink::new(emulation.delay, emulation.loss_ratio, stream)?;
+    let settings = EmulatedSettings {
+        datagram_bytes_max: launch.socket.path_mtu_bytes,
+        ..EmulatedSettings::default()
+    };
+    let is_exempt =
+        |bytes: &[u8]| wire::decode(bytes).is_ok_and(|datagram| datagram.header.kind != Kind::Data);
+    Ok(Box::new(EmulatedReceiver::new(
+        receiver,
+        Box::new(link),
+        is_exempt,
+        settings,
+    )))
+}
+
+fn datagram_bytes_max(launch: &DirectionLaunch) -> usize {
+    let headers = match launch.peer.ip() {
+        IpAddr::V4(_) => IPV4_HEADERS,
+        IpAddr::V6(_) => IPV6_HEADERS,
+    };
+    launch.socket.path_mtu_bytes.saturating_sub(headers)
+}
+
+impl Opened {
+    /// Messages carried so far.
+    pub(crate) fn count(&self) -> Arc<AtomicU64> {
+        Arc::clone(&self.count)
+    }
+
+    /// Joins the local channel; call it in the thread that will carry the messages.
+    pub(crate) fn connect(
+        self,
+        launch: &DirectionLaunch,
+        surroundings: &Surroundings,
+    ) -> Result<Direction, GatewayError> {
+        let mut facts = self.facts;
+        let way = match self.socket {
+            Socket::Sender(sender) => {
+                let mtu = sender.path_mtu();
+                facts.push((
+                    "path MTU".to_owned(),
+                    format!(
+                        "{} bytes, {} configured",
+                        mtu.packet_bytes, launch.socket.path_mtu_bytes
+                    ),
+                ));
+                Way::Egress(Box::new(egress(
+                    sender,
+                    self.sinks,
+                    self.count,
+                    (launch, surroundings),
+                )?))
+            }
+            Socket::Receiver(receiver) => Way::Ingress(Box::new(ingress(
+                receiver,
+                self.sinks,
+                self.count,
+                (launch, surroundings),
+            )?)),
+        };
+        Ok(Direction { way, facts })
+    }
+}
+
+fn egress(
+    sender: Box<UdpSender>,
+    sinks: Sinks,
+    count: Arc<AtomicU64>,
+    (launch, around): (&DirectionLaunch, &Surroundings),
+) -> Result<Egress, GatewayError> {
+    let bridge = EgressBridge::new(EgressSettings {
+        channel: Surroundings::identity(launch),
+        session: around.session,
+        domain: around.fingerprint,
+        clock_id: around.clock_id,
+        datagram_max_bytes: datagram_bytes_max(launch),
+        sync_period: SYNC_PERIOD,
+    })?;
+    let mode = timestamp_mode(&launch.socket.timestamps);
+    let armed = Armed {
+        software: mode != TimestampMode::Off,
+        hardware: mode == TimestampMode::Hardware,
+    };
+    let waiter = (launch.wait != WaitMode::Spin)
+        .then(|| Waiter::open(&around.domain, &[launch.channel.as_str()]))
+        .transpose()?;
+    Ok(Egress {
+        input: RawInput::open(&around.domain, &launch.channel, launch.depth)?,
+        waiter,
+        bridge,
+        line: Line::new(sender, sinks, around.session, armed)?,
+        wait: WaitStrategy::new(launch.wait),
+        sent: count,
+        stop: Arc::clone(&around.stop),
+    })
+}
+
+fn ingress(
+    receiver: Box<dyn DatagramReceiver>,
+    sinks: Sinks,
+    count: Arc<AtomicU64>,
+    (launch, around): (&DirectionLaunch, &Surroundings),
+) -> Result<Ingress, GatewayError> {
+    let identity = Surroundings::identity(launch);
+    let settings = IngressSettings::new(
+        identity,
+        around.session,
+        around.fingerprint,
+        around.clock_id,
+    );
+    let (messages, follow_ups) = sinks;
+    Ok(Ingress {
+        receiver,
+        bridge: IngressBridge::new(settings)?,
+        output: RawOutput::open(&around.domain, &launch.channel, true)?,
+        wait: WaitStrategy::new(launch.wait),
+        peer: launch.peer,
+        notes: Notes {
+            messages,
+            follow_ups,
+        },
+        received: count,
+        stop: Arc::clone(&around.stop),
+        foreign_count: 0,
+        clock_steps: 0,
+        clock: ClockPair::read(PAIR_ATTEMPTS).map_err(GatewayError::Clock)?,
+    })
+}
+
+impl Direction {
+    /// Carries messages until told to stop.
+    pub(crate) fn run(&mut self) -> Result<(), GatewayError> {
+        match &mut self.way {
+            Way::Egress(egress) => egress.run(),
+            Way::Ingress(ingress) => ingress.run(),
+        }
+    }
+
+    /// Every counter of the direction.
+    pub(crate) fn report(&self, launch: &DirectionLaunch) -> DirectionReport {
+        let (direction, peer_state, counters) = match &self.way {
+            Way::Egress(egress) => ("egress", egress_state(egress), egress_counters(egress)),
+            Way::Ingress(ingress) => ("ingress", ingress_state(ingress), ingress_counters(ingress)),
+        };
+        DirectionReport {
+            channel: launch.channel.clone(),
+            direction: direction.to_owned(),
+            peer_state,
+            counters,
+            facts: self.facts.clone(),
+        }
+    }
+}
+
+fn egress_state(egress: &Egress) -> String {
+    match egress.bridge.peer_state() {
+        PeerState::Greeting => "never answered".to_owned(),
+        PeerState::Established => "established".to_owned(),
+        PeerState::Down => "unreachable".to_owned(),
+        PeerState::Refused(status) => format!("refused the channel: {status:?}"),
+    }
+}
+
+fn ingress_state(ingress: &Ingress) -> String {
+    match (ingress.bridge.session(), ingress.bridge.has_left()) {
+        (None, _) => "never greeted".to_owned(),
+        (Some(_), true) => "said farewell".to_owned(),
+        (Some(_), false) => "established".to_owned(),
+    }
+}
+
+fn named<'a>(prefix: &str, counts: impl IntoIterator<Item = (&'a str, u64)>) -> Vec<(String, u64)> {
+    counts
+        .into_iter()
+        .map(|(name, count)| (format!("{prefix}{name}"), count))
+        .collect()
+}
+
+fn refusals(counts: &RefusalCounts) -> Vec<(String, u64)> {
+    named("refused: ", counts.iter())
+}
+
+fn egress_counters(egress: &Egress) -> Vec<(String, u64)> {
+    let mut all = named("", egress.bridge.counts().iter());
+    all.extend(refusals(egress.bridge.refusals()));
+    let SenderCounters {
+        stamp_count,
+        unmatched_stamp_count,
+        network_report_count,
+        local_report_count,
+        peer_refused_count,
+        unreachable_count,
+        queue_full_count,
+        too_long_count,
+        other_refusal_count,
+        ..
+    } = egress.line.sender().counters();
+    all.extend(named(
+        "",
+        [
+            ("transmit_stamp_count", stamp_count),
+            ("transmit_stamp_unmatched_count", unmatched_stamp_count),
+            ("network_report_count", network_report_count),
+            ("local_report_count", local_report_count),
+            ("send_peer_refused_count", peer_refused_count),
+            ("send_unreachable_count", unreachable_count),
+            ("send_queue_full_count", queue_full_count),
+            ("send_too_long_count", too_long_count),
+            ("send_other_refusal_count", other_refusal_count),
+            ("clock_step_count", egress.line.clock_steps),
+        ],
+    ));
+    all
+}
+
+fn ingress_counters(ingress: &Ingress) -> Vec<(String, u64)> {
+    let IngressCounts {
+        datagram_count,
+        delivered_count,
+        duplicate_count,
+        late_count,
+        fragment_count,
+        hello_count,
+        sync_count,
+        bye_count,
+        session_restart_count,
+        ..
+    } = *ingress.bridge.counts();
+    let sequence = ingress.bridge.sequence_counts();
+    let ReceiverCounters {
+        software_stamp_count,
+        truncated_count,
+        kernel_drop_count,
+        link_lost_count,
+        link_overflow_count,
+        ..
+    } = ingress.receiver.counters();
+    let mut all = named(
+        "",
+        [
+            ("datagram_count", datagram_count),
+            ("delivered_count", delivered_count),
+            ("lost_count", sequence.lost_count),
+            ("reordered_count", sequence.reordered_count),
+            ("duplicate_count", duplicate_count),
+            ("late_count", late_count),
+            ("fragment_count", fragment_count),
+            ("hello_count", hello_count),
+            ("sync_count", sync_count),
+            ("bye_count", bye_count),
+            ("session_restart_count", session_restart_count),
+            ("stream_restart_count", sequence.restart_count),
+            ("receive_stamp_count", software_stamp_count),
+            ("truncated_count", truncated_count),
+            ("kernel_drop_count", kernel_drop_count),
+            ("emulated_loss_count", link_lost_count),
+            ("emulated_overflow_count", link_overflow_count),
+            ("clock_step_count", ingress.clock_steps),
+        ],
+    );
+    all.push(("refused: foreign source".to_owned(), ingress.foreign_count));
+    all.extend(refusals(ingress.bridge.refusals()));
+    all
+}
+
+/// Where a transmit probe of this direction may go: the peer's discard port.
+pub(crate) fn probe_target(launch: &DirectionLaunch) -> SocketAddr {
+    SocketAddr::new(
+        launch.peer.ip(),
+        hil_gateways::transport::probe::DISCARD_PORT,
+    )
+}

@@ -1,0 +1,394 @@
+//! The sending thread of a gateway: from one local channel to the network. It owns the clock, the
+//! port and the socket; what to send and what replies mean is the bridge's business.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+
+use hil_gateways::protocol::egress::{RoundTrip, TransmitFailure};
+use hil_gateways::protocol::wire::Kind;
+use hil_gateways::protocol::{
+    ArrivalStamps, EgressBridge, EgressEvent, LocalRefusal, PeerState, StampSource,
+};
+use hil_gateways::transport::clock_pair::ClockPair;
+use hil_gateways::transport::{
+    DatagramSender, Received, SendRefusal, TransmitStage, TransmitStamp, TxToken,
+};
+use hil_models::measure::record::{EgressRecord, UNAVAILABLE};
+use hil_models::message::Envelope;
+use hil_models::time::Instant;
+
+use super::gateway::{GatewayError, PAIR_ATTEMPTS, PAIR_PERIOD, best_stamp, poll_descriptors};
+use crate::channel::{RawInput, Waiter};
+use crate::clock::MonotonicClock;
+use crate::record::RecordSink;
+use crate::wait::{Pause, WaitStrategy};
+
+/// Datagrams whose transmit stamps may be outstanding; a power of two.
+const PENDING: usize = 256;
+/// A stamp that has not come by then does not come: drivers deliver within a millisecond or so,
+/// and a record must not wait for ever.
+const STAMP_PATIENCE_NS: i64 = 20_000_000;
+
+/// Everything the thread works with.
+pub(crate) struct Egress {
+    pub(crate) input: RawInput,
+    pub(crate) waiter: Option<Waiter>,
+    pub(crate) bridge: EgressBridge,
+    pub(crate) line: Line,
+    pub(crate) wait: WaitStrategy,
+    pub(crate) sent: Arc<AtomicU64>,
+    pub(crate) stop: Arc<AtomicBool>,
+}
+
+/// The socket, the stamps still to come from it, and the records they complete.
+pub(crate) struct Line {
+    sender: Box<dyn DatagramSender>,
+    pending: Box<[Option<Pending>]>,
+    pending_count: usize,
+    records: RecordSink,
+    round_trips: RecordSink,
+    session: u32,
+    clock: ClockPair,
+    wants_hardware: bool,
+    has_stamps: bool,
+    message: Option<EgressRecord>,
+    pub(crate) clock_steps: u64,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Pending {
+    token: TxToken,
+    kind: Kind,
+    sequence: u64,
+    handed: Instant,
+    record: Option<EgressRecord>,
+}
+
+/// Which stamps the socket was armed for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Armed {
+    pub(crate) software: bool,
+    pub(crate) hardware: bool,
+}
+
+impl Line {
+    pub(crate) fn new(
+        sender: Box<dyn DatagramSender>,
+        (records, round_trips): (RecordSink, RecordSink),
+        session: u32,
+        armed: Armed,
+    ) -> Result<Self, GatewayError> {
+        Ok(Self {
+            sender,
+            pending: vec![None; PENDING].into_boxed_slice(),
+            pending_count: 0,
+            records,
+            round_trips,
+            session,
+            clock: ClockPair::read(PAIR_ATTEMPTS).map_err(GatewayError::Clock)?,
+            wants_hardware: armed.hardware,
+            has_stamps: armed.software,
+            message: None,
+            clock_steps: 0,
+        })
+    }
+
+    pub(crate) fn sender(&self) -> &dyn DatagramSender {
+        self.sender.as_ref()
+    }
+
+    /// Sends everything the bridge has, then takes the stamps that came of it.
+    fn transmit(&mut self, bridge: &mut EgressBridge) {
+        loop {
+            let handed = MonotonicClock::now();
+            let Some(transmit) = bridge.poll_transmit(handed) else {
+                break;
+            };
+            let (kind, sequence) = (transmit.kind, transmit.sequence);
+            let is_last = transmit.is_last_fragment;
+            if kind == Kind::Data
+                && let Some(record) = &mut self.message
+            {
+                record.fragment_count += 1;
+                if record.handed_ns == UNAVAILABLE {
+                    record.handed_ns = handed.as_ns();
+                }
+            }
+            let sent = self.sender.send(transmit.datagram);
+            let is_message_end = kind == Kind::Data && (is_last || sent.is_err());
+            let record = if is_message_end {
+                self.message.take()
+            } else {
+                None
+            };
+            match sent {
+                Ok(token) => self.expect_stamp(token, (kind, sequence), handed, record),
+                Err(refusal) => {
+                    bridge.on_transmit_failed(handed, failure(refusal));
+                    if let Some(record) = record {
+                        self.finish(EgressRecord {
+                            flags: EgressRecord::REFUSED_BY_KERNEL,
+                            ..record
+                        });
+                    }
+                }
+            }
+        }
+        self.take_stamps(bridge);
+    }
+
+    fn expect_stamp(
+        &mut self,
+        token: TxToken,
+        (kind, sequence): (Kind, u64),
+        handed: Instant,
+        record: Option<EgressRecord>,
+    ) {
+        if !self.has_stamps {
+            if let Some(record) = record {
+                self.finish(record);
+            }
+            return;
+        }
+        let slot = slot_of(token);
+        if let Some(old) = self.pending[slot].take() {
+            self.retire(old);
+        }
+        self.pending[slot] = Some(Pending {
+            token,
+            kind,
+            sequence,
+            handed,
+            record,
+        });
+        self.pending_count += 1;
+    }
+
+    /// Takes stamps without blocking; a record is complete when all it waits for has come.
+    fn take_stamps(&mut self, bridge: &mut EgressBridge) {
+        while let Some(TransmitStamp {
+            token,
+            stage,
+            stamps,
+        }) = self.sender.next_stamp()
+        {
+            if stage != TransmitStage::Sent {
+                continue;
+            }
+            let slot = slot_of(token);
+            let offset = self.clock.offset_ns;
+            let Some(pending) = self.pending[slot].as_mut().filter(|one| one.token == token) else {
+                continue;
+            };
+            if let Some(software_ns) = stamps.software_ns {
+                let first_handed = pending
+                    .record
+                    .map_or(pending.handed.as_ns(), |record| record.handed_ns);
+                bridge.on_transmit_stamp(
+                    pending.kind,
+                    pending.sequence,
+                    software_ns - offset - first_handed,
+                );
+            }
+            let mut is_complete = !self.wants_hardware;
+            if let Some(record) = &mut pending.record {
+                record.tx_software_ns = stamps.software_ns.unwrap_or(record.tx_software_ns);
+                record.tx_hardware_ns = stamps.hardware_ns.unwrap_or(record.tx_hardware_ns);
+                is_complete = record.tx_software_ns != UNAVAILABLE
+                    && (record.tx_hardware_ns != UNAVAILABLE || !self.wants_hardware);
+            }
+            if is_complete && let Some(pending) = self.pending[slot].take() {
+                self.retire(pending);
+            }
+        }
+    }
+
+    fn retire(&mut self, pending: Pending) {
+        self.pending_count -= 1;
+        if let Some(record) = pending.record {
+            self.finish(record);
+        }
+    }
+
+    fn finish(&mut self, record: EgressRecord) {
+        self.records.push(&record);
+    }
+
+    /// Gives up on stamps that are overdue at `now`.
+    fn expire(&mut self, now: Instant) {
+        if self.pending_count == 0 {
+            return;
+        }
+        for slot in 0..PENDING {
+            let is_overdue =
+                self.pending[slot].is_some_and(|one| now.ns_since(one.handed) > STAMP_PATIENCE_NS);
+            if is_overdue && let Some(pending) = self.pending[slot].take() {
+                self.retire(pending);
+            }
+        }
+    }
+
+    fn refresh_clock(&mut self, now: Instant) {
+        if now.saturating_duration_since(self.clock.taken) < PAIR_PERIOD {
+            return;
+        }
+        if let Ok(pair) = ClockPair::read(PAIR_ATTEMPTS) {
+            self.clock_steps += u64::from(pair.step_since(&self.clock).is_some());
+            self.clock = pair;
+        }
+    }
+}
+
+fn slot_of(token: TxToken) -> usize {
+    token.0 as usize % PENDING
+}
+
+fn failure(refusal: SendRefusal) -> TransmitFailure {
+    match refusal {
+        SendRefusal::PeerRefused | SendRefusal::Unreachable { .. } => {
+            TransmitFailure::PeerUnreachable
+        }
+        SendRefusal::QueueFull { .. } | SendRefusal::TooLong { .. } | SendRefusal::Other { .. } => {
+            TransmitFailure::Local
+        }
+    }
+}
+
+impl Egress {
+    /// Carries the channel until told to stop, then says goodbye to the peer.
+    ///
+    /// # Errors
+    /// When the channel or the socket itself breaks, or the peer refuses the channel for good.
+    pub(crate) fn run(&mut self) -> Result<(), GatewayError> {
+        let mut buffer = [0; 2048];
+        while !self.stop.load(Ordering::Acquire) {
+            let moved = self.forward()?;
+            if !moved {
+                self.line.transmit(&mut self.bridge);
+                self.hear(&mut buffer)?;
+                let now = MonotonicClock::now();
+                self.line.expire(now);
+                self.line.refresh_clock(now);
+                self.rest()?;
+            }
+        }
+        self.bridge.bye();
+        self.line.transmit(&mut self.bridge);
+        self.line.expire(Instant::from_ns(i64::MAX));
+        Ok(())
+    }
+
+    /// Sends every waiting message; false when none waited.
+    fn forward(&mut self) -> Result<bool, GatewayError> {
+        let Self {
+            input,
+            bridge,
+            line,
+            wait,
+            sent,
+            ..
+        } = self;
+        let mut moved = false;
+        loop {
+            let mut take = |envelope: &Envelope, payload: &[u8]| {
+                let taken = MonotonicClock::now();
+                wait.on_arrival(taken);
+                let record = EgressRecord {
+                    sequence: envelope.sequence,
+                    published_ns: envelope.published_ns,
+                    taken_ns: taken.as_ns(),
+                    handed_ns: UNAVAILABLE,
+                    tx_software_ns: UNAVAILABLE,
+                    tx_hardware_ns: UNAVAILABLE,
+                    realtime_offset_ns: line.clock.offset_ns,
+                    epoch: envelope.epoch,
+                    session: line.session,
+                    flags: 0,
+                    fragment_count: 0,
+                };
+                match bridge.on_local(taken, envelope, payload) {
+                    Ok(()) => {
+                        line.message = Some(record);
+                        line.transmit(bridge);
+                        sent.fetch_add(1, Ordering::Relaxed);
+                    }
+                    // Another gateway's message: not this gateway's to account for.
+                    Err(LocalRefusal::Forwarded) => {}
+                    Err(_counted) => line.finish(EgressRecord {
+                        flags: EgressRecord::REFUSED_BY_KERNEL,
+                        ..record
+                    }),
+                }
+            };
+            if !input.receive(&mut take)? {
+                return Ok(moved);
+            }
+            moved = true;
+        }
+    }
+
+    /// Takes the peer's replies.
+    fn hear(&mut self, buffer: &mut [u8]) -> Result<(), GatewayError> {
+        while let Some(received) = self
+            .line
+            .sender
+            .receive(buffer)
+            .map_err(GatewayError::Socket)?
+        {
+            let now = MonotonicClock::now();
+            let arrival = self.arrival(&received, now);
+            let bytes = &buffer[..received.length_bytes];
+            match self.bridge.on_datagram(now, arrival, bytes) {
+                Ok(EgressEvent::RoundTrip { round_trip, .. }) => self.note_round_trip(&round_trip),
+                Ok(EgressEvent::Refused(status)) => {
+                    if self.bridge.peer_state() == PeerState::Refused(status) {
+                        return Err(GatewayError::Refused(status));
+                    }
+                }
+                Ok(EgressEvent::Accepted { .. } | EgressEvent::GreetAgain) | Err(_) => {}
+            }
+        }
+        self.line.transmit(&mut self.bridge);
+        Ok(())
+    }
+
+    fn arrival(&self, received: &Received, now: Instant) -> ArrivalStamps {
+        let (received_ns, received_source) = match best_stamp(received.stamps, &self.line.clock) {
+            Some(stamp) => (stamp.as_ns(), StampSource::KernelSoftware),
+            None => (now.as_ns(), StampSource::Application),
+        };
+        ArrivalStamps {
+            received_ns,
+            received_source,
+            peer: Some(received.source),
+        }
+    }
+
+    fn note_round_trip(&mut self, round_trip: &RoundTrip) {
+        self.line
+            .round_trips
+            .push(&[round_trip.rtt_ns(), round_trip.t4_ns]);
+    }
+
+    fn rest(&mut self) -> Result<(), GatewayError> {
+        let now = MonotonicClock::now();
+        let mut due = self.bridge.next_wakeup();
+        if self.line.pending_count > 0 {
+            // A stamp makes the socket readable, but an overdue one must be given up in time.
+            let patience = Instant::from_ns(now.as_ns() + STAMP_PATIENCE_NS);
+            due = Some(due.map_or(patience, |due| due.min(patience)));
+        }
+        match self.wait.pause(now, due) {
+            Pause::Spin => core::hint::spin_loop(),
+            Pause::Sleep(until) => {
+                let listeners = self.waiter.iter().flat_map(Waiter::descriptors);
+                let socket = self.line.sender.poll_fd();
+                poll_descriptors(listeners.chain(socket), until)?;
+                if let Some(waiter) = &mut self.waiter {
+                    waiter.drain()?;
+                }
+            }
+        }
+        Ok(())
+    }
+}

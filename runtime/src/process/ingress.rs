@@ -1,0 +1,247 @@
+//! The receiving thread of a gateway: from the network to one local channel. It owns the clock,
+//! the socket and the port; what a datagram means is the bridge's business.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+
+use hil_gateways::protocol::ingress::{FollowUp, MessageInfo};
+use hil_gateways::protocol::sequence::Order;
+use hil_gateways::protocol::{ArrivalStamps, Delivery, Disposition, IngressBridge, StampSource};
+use hil_gateways::transport::clock_pair::ClockPair;
+use hil_gateways::transport::{DatagramReceiver, Received};
+use hil_models::measure::record::{FollowUpRecord, IngressRecord, UNAVAILABLE};
+use hil_models::message::Envelope;
+use hil_models::time::Instant;
+
+use super::gateway::{GatewayError, PAIR_ATTEMPTS, PAIR_PERIOD, best_stamp, poll_descriptors};
+use crate::channel::{ChannelError, RawOutput};
+use crate::clock::MonotonicClock;
+use crate::record::RecordSink;
+use crate::wait::{Pause, WaitStrategy};
+
+/// Datagrams taken in one go before replies and orders get their turn.
+const BURST_MAX: usize = 64;
+
+/// Everything the thread works with.
+pub(crate) struct Ingress {
+    pub(crate) receiver: Box<dyn DatagramReceiver>,
+    pub(crate) bridge: IngressBridge,
+    pub(crate) output: RawOutput,
+    pub(crate) wait: WaitStrategy,
+    pub(crate) peer: SocketAddr,
+    pub(crate) notes: Notes,
+    pub(crate) received: Arc<AtomicU64>,
+    pub(crate) stop: Arc<AtomicBool>,
+    /// Datagrams from an address that is not the peer's, dropped unread.
+    pub(crate) foreign_count: u64,
+    pub(crate) clock_steps: u64,
+    pub(crate) clock: ClockPair,
+}
+
+/// Where the thread's records go.
+pub(crate) struct Notes {
+    pub(crate) messages: RecordSink,
+    pub(crate) follow_ups: RecordSink,
+}
+
+/// What is known of a datagram before the bridge reads it.
+#[derive(Clone, Copy)]
+struct Arrival {
+    received: Received,
+    at: Instant,
+    offset_ns: i64,
+}
+
+impl Arrival {
+    fn record(&self, message: &MessageInfo, forwarded_ns: i64, flags: u32) -> IngressRecord {
+        IngressRecord {
+            sequence: message.sequence,
+            published_ns: message.published.as_ns(),
+            handed_ns: message.handed.as_ns(),
+            rx_hardware_ns: self.received.stamps.hardware_ns.unwrap_or(UNAVAILABLE),
+            rx_software_ns: self.received.stamps.software_ns.unwrap_or(UNAVAILABLE),
+            received_ns: self.at.as_ns(),
+            forwarded_ns,
+            realtime_offset_ns: self.offset_ns,
+            epoch: message.epoch,
+            session: message.session,
+            flags,
+            fragment_count: u32::from(message.fragment_count),
+        }
+    }
+}
+
+impl Ingress {
+    /// Carries the channel until told to stop.
+    ///
+    /// # Errors
+    /// When the channel or the socket itself breaks.
+    pub(crate) fn run(&mut self) -> Result<(), GatewayError> {
+        let mut buffer = vec![0; usize::from(u16::MAX)];
+        while !self.stop.load(Ordering::Acquire) {
+            let mut moved = false;
+            for _ in 0..BURST_MAX {
+                if !self.take(&mut buffer)? {
+                    break;
+                }
+                moved = true;
+            }
+            self.answer();
+            if !moved {
+                let now = MonotonicClock::now();
+                self.bridge.on_wakeup(now);
+                self.refresh_clock(now);
+                self.rest()?;
+            }
+        }
+        self.bridge.finish();
+        Ok(())
+    }
+
+    /// Takes one datagram; false when none waits.
+    fn take(&mut self, buffer: &mut [u8]) -> Result<bool, GatewayError> {
+        let now = MonotonicClock::now();
+        let Some(received) = self
+            .receiver
+            .receive(now, buffer)
+            .map_err(GatewayError::Socket)?
+        else {
+            return Ok(false);
+        };
+        let at = MonotonicClock::now();
+        self.wait.on_arrival(at);
+        if received.source != self.peer {
+            self.foreign_count += 1;
+            return Ok(true);
+        }
+        let arrival = Arrival {
+            received,
+            at,
+            offset_ns: self.clock.offset_ns,
+        };
+        let stamps = self.stamps(&arrival);
+        let bytes = &buffer[..received.length_bytes];
+        let Self {
+            bridge,
+            output,
+            notes,
+            received: count,
+            ..
+        } = self;
+        let mut failed = None;
+        let mut deliver = |delivery: Delivery<'_>| {
+            count.fetch_add(1, Ordering::Relaxed);
+            if let Err(error) = publish(output, notes, &arrival, &delivery) {
+                failed = Some(error);
+            }
+        };
+        // A refused datagram is a counter of the bridge.
+        if let Ok(disposition) = bridge.on_datagram(at, stamps, bytes, &mut deliver) {
+            note_undelivered(notes, &arrival, disposition);
+        }
+        failed.map_or(Ok(true), |error| Err(error.into()))
+    }
+
+    fn stamps(&self, arrival: &Arrival) -> ArrivalStamps {
+        let peer = Some(arrival.received.source);
+        match best_stamp(arrival.received.stamps, &self.clock) {
+            Some(stamp) => ArrivalStamps {
+                received_ns: stamp.as_ns(),
+                received_source: StampSource::KernelSoftware,
+                peer,
+            },
+            None => ArrivalStamps {
+                peer,
+                ..ArrivalStamps::application(arrival.at.as_ns())
+            },
+        }
+    }
+
+    /// Sends the replies that are due; a reply that cannot leave is counted by the transport.
+    fn answer(&mut self) {
+        while let Some(reply) = self.bridge.poll_transmit(MonotonicClock::now()) {
+            let to = reply.destination.unwrap_or(self.peer);
+            let _counted = self.receiver.reply(reply.datagram, to).is_err();
+        }
+    }
+
+    fn refresh_clock(&mut self, now: Instant) {
+        if now.saturating_duration_since(self.clock.taken) < PAIR_PERIOD {
+            return;
+        }
+        if let Ok(pair) = ClockPair::read(PAIR_ATTEMPTS) {
+            self.clock_steps += u64::from(pair.step_since(&self.clock).is_some());
+            self.clock = pair;
+        }
+    }
+
+    fn rest(&mut self) -> Result<(), GatewayError> {
+        let dues = [self.bridge.next_wakeup(), self.receiver.next_due()];
+        let due = dues.into_iter().flatten().min();
+        match self.wait.pause(MonotonicClock::now(), due) {
+            Pause::Spin => core::hint::spin_loop(),
+            Pause::Sleep(until) => poll_descriptors(self.receiver.poll_fd().into_iter(), until)?,
+        }
+        Ok(())
+    }
+}
+
+fn publish(
+    output: &mut RawOutput,
+    notes: &mut Notes,
+    arrival: &Arrival,
+    delivery: &Delivery<'_>,
+) -> Result<(), ChannelError> {
+    let message = &delivery.message;
+    let mut forwarded_ns = UNAVAILABLE;
+    output.publish_with(delivery.payload, || {
+        forwarded_ns = MonotonicClock::now().as_ns();
+        Envelope {
+            sequence: message.sequence,
+            published_ns: message.published.as_ns(),
+            forwarded_ns,
+            epoch: message.epoch,
+            flags: Envelope::FORWARDED,
+            reserved: [0; 4],
+        }
+    })?;
+    let flags = if delivery.order == Order::Reordered {
+        IngressRecord::REORDERED
+    } else {
+        0
+    };
+    notes
+        .messages
+        .push(&arrival.record(message, forwarded_ns, flags));
+    if let Some(FollowUp {
+        sequence,
+        handed_to_tx_ns,
+    }) = delivery.follow_up
+    {
+        let session = message.session;
+        notes.follow_ups.push(&FollowUpRecord {
+            sequence,
+            handed_to_tx_ns,
+            session,
+            reserved: 0,
+        });
+    }
+    Ok(())
+}
+
+fn note_undelivered(notes: &mut Notes, arrival: &Arrival, disposition: Disposition) {
+    let (message, flags) = match disposition {
+        Disposition::Duplicate(message) => (message, IngressRecord::DUPLICATE),
+        Disposition::Late(message) => (message, IngressRecord::LATE),
+        Disposition::Superseded(message) => (message, IngressRecord::REORDERED),
+        Disposition::Delivered(_)
+        | Disposition::FragmentStored
+        | Disposition::Greeted { .. }
+        | Disposition::SyncRequested
+        | Disposition::Farewell => return,
+    };
+    notes
+        .messages
+        .push(&arrival.record(&message, UNAVAILABLE, flags));
+}

@@ -1,0 +1,175 @@
+//! What a supervisor tells a process it starts. A component learns its role and its channels and
+//! nothing of hosts, links or gateways: its card is byte-identical in a local and a split run.
+
+use std::fs;
+use std::io;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+
+use crate::realtime::RealtimeRequest;
+use crate::wait::WaitMode;
+
+/// How to start one component here.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ComponentLaunch {
+    /// Name of the process in the topology.
+    pub process: String,
+    /// How often it was restarted before.
+    pub instance: u32,
+    /// File with the [`ProcessCard`](crate::topology::ProcessCard).
+    pub card: PathBuf,
+    /// The shared memory to join, a [`DomainAddress`](crate::channel::DomainAddress).
+    pub domain: String,
+    /// What to ask of the kernel.
+    pub realtime: RealtimeRequest,
+    /// How to wait for messages and ticks.
+    pub wait: WaitMode,
+    /// Folder for record files.
+    pub records: PathBuf,
+}
+
+/// How to start the gateway of one link on one host.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct GatewayLaunch {
+    /// Name of the process, e.g. `gateway hop@robot-pc`.
+    pub process: String,
+    /// How often it was restarted before.
+    pub instance: u32,
+    /// The host's shared memory, a [`DomainAddress`](crate::channel::DomainAddress).
+    pub domain: String,
+    /// Folder for record files.
+    pub records: PathBuf,
+    /// One thread each.
+    pub directions: Vec<DirectionLaunch>,
+}
+
+/// One channel direction through a gateway.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DirectionLaunch {
+    /// Name of the channel.
+    pub channel: String,
+    /// Its number in datagrams.
+    pub channel_id: u16,
+    /// Name and version of its message type.
+    pub message: String,
+    /// Size of one message.
+    pub size_bytes: usize,
+    /// Alignment of one message.
+    pub alignment_bytes: usize,
+    /// Messages that wait at most in shared memory.
+    pub depth: usize,
+    /// Which way.
+    pub side: Side,
+    /// This end of the hop.
+    pub local: SocketAddr,
+    /// The other end of the hop.
+    pub peer: SocketAddr,
+    /// Socket options.
+    pub socket: SocketLaunch,
+    /// How to wait.
+    pub wait: WaitMode,
+    /// What to ask of the kernel.
+    pub realtime: RealtimeRequest,
+    /// A link model in front of this direction's receiver.
+    pub emulation: Option<EmulationLaunch>,
+}
+
+/// Which way a gateway thread carries its channel.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Side {
+    /// From shared memory to the network.
+    Egress,
+    /// From the network to shared memory.
+    Ingress,
+}
+
+/// Socket options of a hop.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SocketLaunch {
+    /// Interface to bind to.
+    pub interface: Option<String>,
+    /// Differentiated-services code point (RFC 2474), 0..=63.
+    pub dscp: u8,
+    /// `SO_PRIORITY`.
+    pub priority: Option<u32>,
+    /// Send buffer to ask for.
+    pub send_buffer_bytes: usize,
+    /// Receive buffer to ask for.
+    pub receive_buffer_bytes: usize,
+    /// Largest IP packet of the path.
+    pub path_mtu_bytes: usize,
+    /// `off`, `software` or `hardware`.
+    pub timestamps: String,
+}
+
+/// A static link model (seed paper, section II.B).
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EmulationLaunch {
+    /// Fixed one-way delay.
+    pub delay: Duration,
+    /// Probability of a loss, 0..=1.
+    pub loss_ratio: f64,
+    /// Seed of the run.
+    pub seed: u64,
+}
+
+/// A launch file or card cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum LaunchError {
+    /// It cannot be read or written.
+    #[error("launch file {path}: {source}")]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// It does not say what it should.
+    #[error("launch file {path}: {source}")]
+    Content {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        source: serde_json::Error,
+    },
+}
+
+/// Reads a launch file or card.
+///
+/// # Errors
+/// When it cannot be read or does not fit `T`.
+pub fn read<T: DeserializeOwned>(path: &Path) -> Result<T, LaunchError> {
+    let text = fs::read(path).map_err(|source| LaunchError::Io {
+        path: path.to_owned(),
+        source,
+    })?;
+    serde_json::from_slice(&text).map_err(|source| LaunchError::Content {
+        path: path.to_owned(),
+        source,
+    })
+}
+
+/// Writes a launch file or card.
+///
+/// # Errors
+/// When it cannot be written.
+pub fn write<T: Serialize>(path: &Path, content: &T) -> Result<(), LaunchError> {
+    let text = serde_json::to_vec_pretty(content).map_err(|source| LaunchError::Content {
+        path: path.to_owned(),
+        source,
+    })?;
+    fs::write(path, text).map_err(|source| LaunchError::Io {
+        path: path.to_owned(),
+        source,
+    })
+}

@@ -1,0 +1,182 @@
+//! What a supervisor and the process it started say to each other, one JSON line at a time over
+//! the child's standard input and output. Messages of channels never go this way.
+
+use std::io::{self, BufRead, Write};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU8, Ordering};
+use std::thread;
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+
+use crate::realtime::RealtimeGrant;
+
+/// From the supervisor to a process.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ToProcess {
+    /// Begin the run.
+    Start,
+    /// End, leaving everything in order.
+    Stop,
+}
+
+/// From a process to its supervisor.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum FromProcess {
+    /// Everything is open; waiting for the start.
+    Ready,
+    /// Counts so far, a few times a second.
+    Progress(Vec<ChannelProgress>),
+    /// A condition the user should hear about now.
+    Warning(String),
+    /// The last word of an orderly end.
+    Finished(Box<ProcessReport>),
+    /// The process cannot go on.
+    Failed(String),
+}
+
+/// Counts of one channel as one process sees it.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ChannelProgress {
+    /// The channel.
+    pub channel: String,
+    /// What is counted, e.g. `published`, `taken`, `sent`, `received`.
+    pub what: String,
+    /// How many.
+    pub count: u64,
+}
+
+/// What a process reports when it ends in order.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct ProcessReport {
+    /// What the kernel granted or refused, per thread.
+    pub realtime: Vec<(String, RealtimeGrant)>,
+    /// Grid points of the role's timer that passed without a tick.
+    pub skipped_ticks: u64,
+    /// Ticks that ran.
+    pub ticks: u64,
+    /// Payloads that were not a message of their port.
+    pub malformed_count: u64,
+    /// Messages refused by a full outbox.
+    pub outbox_dropped: u64,
+    /// Records dropped by a full ring.
+    pub recorder_dropped: u64,
+    /// Files that could not be written.
+    pub recorder_failures: Vec<String>,
+    /// Processor time of the whole process, seconds.
+    pub cpu_s: f64,
+    /// Context switches the process asked for (it waited).
+    pub voluntary_switches: u64,
+    /// Context switches forced on it.
+    pub involuntary_switches: u64,
+    /// Named counters of each channel direction a gateway carries.
+    pub directions: Vec<DirectionReport>,
+}
+
+/// One direction of one channel through a gateway.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct DirectionReport {
+    /// The channel.
+    pub channel: String,
+    /// `egress` or `ingress`.
+    pub direction: String,
+    /// The peer's state in words at the end.
+    pub peer_state: String,
+    /// Counters by name; zero ones are left out by whoever prints.
+    pub counters: Vec<(String, u64)>,
+    /// Facts in words: granted buffers, stamp probe, path MTU.
+    pub facts: Vec<(String, String)>,
+}
+
+const WAITING: u8 = 0;
+const STARTED: u8 = 1;
+const STOPPING: u8 = 2;
+
+/// The supervisor's latest word, readable without a system call.
+#[derive(Debug, Clone)]
+pub struct Orders {
+    state: Arc<AtomicU8>,
+}
+
+impl Orders {
+    /// Listens on standard input in a thread of its own. An end of input means that the
+    /// supervisor is gone, and counts as [`ToProcess::Stop`].
+    ///
+    /// # Errors
+    /// When the system gives no thread.
+    pub fn listen() -> io::Result<Self> {
+        let state = Arc::new(AtomicU8::new(WAITING));
+        let shared = Arc::clone(&state);
+        thread::Builder::new()
+            .name("orders".to_owned())
+            .spawn(move || {
+                for line in io::stdin().lock().lines() {
+                    match line.ok().and_then(|line| serde_json::from_str(&line).ok()) {
+                        Some(ToProcess::Start) => shared.store(STARTED, Ordering::Release),
+                        Some(ToProcess::Stop) | None => break,
+                    }
+                }
+                shared.store(STOPPING, Ordering::Release);
+            })?;
+        Ok(Self { state })
+    }
+
+    /// True once the process should end.
+    pub fn is_stopping(&self) -> bool {
+        self.state.load(Ordering::Acquire) == STOPPING
+    }
+
+    /// Waits for the start; false when told to stop instead.
+    pub fn wait_for_start(&self) -> bool {
+        loop {
+            match self.state.load(Ordering::Acquire) {
+                WAITING => thread::sleep(Duration::from_micros(200)),
+                state => return state == STARTED,
+            }
+        }
+    }
+}
+
+/// Says `message` to the supervisor. A supervisor that is gone is noticed by [`Orders`].
+///
+/// # Panics
+/// Never: these types always serialise.
+pub fn say(message: &FromProcess) {
+    let mut line = serde_json::to_string(message).expect("these types always serialise");
+    line.push('\n');
+    let mut out = io::stdout().lock();
+    // Nothing useful can be done about a closed pipe: the supervisor that would read the
+    // complaint is the one that left.
+    let _closed = out
+        .write_all(line.as_bytes())
+        .and_then(|()| out.flush())
+        .is_err();
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_message_survives_the_pipe() {
+        let report = ProcessReport {
+            skipped_ticks: 3,
+            ..ProcessReport::default()
+        };
+        for message in [
+            FromProcess::Ready,
+            FromProcess::Warning("spin on a shared CPU".to_owned()),
+            FromProcess::Finished(Box::new(report)),
+        ] {
+            let line = serde_json::to_string(&message).unwrap();
+            assert!(!line.contains('\n'));
+            assert_eq!(serde_json::from_str::<FromProcess>(&line).unwrap(), message);
+        }
+        assert_eq!(
+            serde_json::to_string(&ToProcess::Start).unwrap(),
+            "\"start\""
+        );
+    }
+}

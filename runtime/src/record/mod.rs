@@ -1,0 +1,8 @@
+//! Recording: fixed-size records go through a bounded ring to a file, off the measured path.
+//! What the records mean is in `hil_models::measure::record`; nothing here computes a figure.
+
+pub mod file;
+pub mod ring;
+
+pub use file::{RecordFile, RecordFileError, RecordKind};
+pub use ring::{RecordSink, Recorder};

@@ -1,0 +1,233 @@
+//! Bounded rings between the measured threads and one writer thread. Pushing never blocks,
+//! allocates or calls the system; a full ring drops the record and counts it.
+
+use std::fs::File;
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::thread::{self, JoinHandle};
+use std::time::Duration;
+
+use bytemuck::Pod;
+use hil_models::message::Envelope;
+
+use super::file::{RecordFileError, RecordHeader, RecordKind};
+
+/// How often the writer empties the rings: what a kill of the process can lose at most.
+const FLUSH_PERIOD: Duration = Duration::from_millis(20);
+
+/// The producing end of one ring: lives in a measured thread.
+#[derive(Debug)]
+pub struct RecordSink {
+    ring: rtrb::Producer<u8>,
+    dropped: Arc<AtomicU64>,
+}
+
+impl RecordSink {
+    /// Stores one record.
+    pub fn push<T: Pod>(&mut self, record: &T) {
+        self.push_parts(bytemuck::bytes_of(record), &[]);
+    }
+
+    /// Stores one message: envelope and payload.
+    pub fn push_message(&mut self, envelope: &Envelope, payload: &[u8]) {
+        self.push_parts(bytemuck::bytes_of(envelope), payload);
+    }
+
+    fn push_parts(&mut self, first: &[u8], second: &[u8]) {
+        // Only this end fills the ring, so free slots can only become more between the calls.
+        let fits = self.ring.slots() >= first.len() + second.len();
+        let stored = fits
+            && self.ring.push_entire_slice(first).is_ok()
+            && self.ring.push_entire_slice(second).is_ok();
+        if !stored {
+            self.dropped.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+}
+
+#[derive(Debug)]
+struct Drain {
+    ring: rtrb::Consumer<u8>,
+    file: File,
+    path: PathBuf,
+}
+
+/// What became of a recorder's files.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct RecorderOutcome {
+    /// Records dropped because a ring was full.
+    pub dropped_count: u64,
+    /// Files that could not be written, with the reason.
+    pub failures: Vec<String>,
+}
+
+/// Owns the files of one process and the thread that writes them.
+#[derive(Debug)]
+pub struct Recorder {
+    folder: PathBuf,
+    writer: String,
+    instance: u32,
+    dropped: Arc<AtomicU64>,
+    drains: Vec<Drain>,
+    stop: Arc<AtomicBool>,
+    thread: Option<JoinHandle<Vec<String>>>,
+}
+
+impl Recorder {
+    /// A recorder for process `writer` below `folder`; opens nothing yet.
+    pub fn new(folder: &Path, writer: &str, instance: u32) -> Self {
+        Self {
+            folder: folder.to_owned(),
+            writer: writer.to_owned(),
+            instance,
+            dropped: Arc::new(AtomicU64::new(0)),
+            drains: Vec::new(),
+            stop: Arc::new(AtomicBool::new(false)),
+            thread: None,
+        }
+    }
+
+    /// Opens the file for `kind` records of `channel` and a ring of `capacity_records`. Call
+    /// before [`Recorder::start`].
+    ///
+    /// # Errors
+    /// When the file cannot be created.
+    ///
+    /// # Panics
+    /// When a record is 4 GiB long.
+    pub fn sink(
+        &mut self,
+        kind: RecordKind,
+        channel: &str,
+        record_bytes: usize,
+        capacity_records: usize,
+    ) -> Result<RecordSink, RecordFileError> {
+        let record_bytes_header = u32::try_from(record_bytes).expect("records are small");
+        let header = RecordHeader {
+            kind,
+            channel: channel.to_owned(),
+            record_bytes: record_bytes_header,
+            instance: self.instance,
+        };
+        let path = self.folder.join(header.file_name(&self.writer));
+        let bytes = header.encode(&path)?;
+        let file = File::create(&path)
+            .and_then(|mut file| file.write_all(&bytes).map(|()| file))
+            .map_err(|source| RecordFileError::Io {
+                path: path.clone(),
+                source,
+            })?;
+        let (producer, ring) = rtrb::RingBuffer::new(record_bytes * capacity_records);
+        self.drains.push(Drain { ring, file, path });
+        Ok(RecordSink {
+            ring: producer,
+            dropped: Arc::clone(&self.dropped),
+        })
+    }
+
+    /// Starts the writer thread. Call from a thread of normal priority: the writer inherits it.
+    ///
+    /// # Errors
+    /// When the system gives no thread.
+    pub fn start(&mut self) -> io::Result<()> {
+        let mut drains = core::mem::take(&mut self.drains);
+        let stop = Arc::clone(&self.stop);
+        let builder = thread::Builder::new().name("recorder".to_owned());
+        self.thread = Some(builder.spawn(move || {
+            let mut failures = Vec::new();
+            loop {
+                let is_last = stop.load(Ordering::Acquire);
+                drains.retain_mut(|drain| match flush(drain) {
+                    Ok(()) => true,
+                    Err(error) => {
+                        failures.push(format!("{}: {error}", drain.path.display()));
+                        false
+                    }
+                });
+                if is_last {
+                    return failures;
+                }
+                thread::sleep(FLUSH_PERIOD);
+            }
+        })?);
+        Ok(())
+    }
+
+    /// Records dropped so far.
+    pub fn dropped_count(&self) -> u64 {
+        self.dropped.load(Ordering::Relaxed)
+    }
+
+    /// Writes what is left and ends the writer thread.
+    pub fn finish(mut self) -> RecorderOutcome {
+        self.stop.store(true, Ordering::Release);
+        let failures = match self.thread.take().map(JoinHandle::join) {
+            Some(Ok(failures)) => failures,
+            Some(Err(_)) => vec!["the recorder thread panicked".to_owned()],
+            None => Vec::new(),
+        };
+        RecorderOutcome {
+            dropped_count: self.dropped_count(),
+            failures,
+        }
+    }
+}
+
+fn flush(drain: &mut Drain) -> io::Result<()> {
+    let waiting = drain.ring.slots();
+    if let Ok(chunk) = drain.ring.read_chunk(waiting) {
+        let (first, second) = chunk.as_slices();
+        drain.file.write_all(first)?;
+        drain.file.write_all(second)?;
+        chunk.commit_all();
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::record::RecordFile;
+    use hil_models::measure::record::PublishedRecord;
+    use std::env;
+    use std::fs;
+    use std::process;
+
+    fn record(sequence: u64) -> PublishedRecord {
+        PublishedRecord {
+            sequence,
+            published_ns: 1,
+            epoch: 0,
+            reserved: 0,
+        }
+    }
+
+    #[test]
+    fn what_was_pushed_is_in_the_file_and_what_did_not_fit_is_counted() {
+        let folder = env::temp_dir().join(format!("hil-ring-{}", process::id()));
+        fs::create_dir_all(&folder).unwrap();
+        let mut recorder = Recorder::new(&folder, "robot", 0);
+        let size = size_of::<PublishedRecord>();
+        let mut sink = recorder
+            .sink(RecordKind::Published, "a/b", size, 100)
+            .unwrap();
+        for sequence in 0..130 {
+            sink.push(&record(sequence));
+        }
+        recorder.start().unwrap();
+        let outcome = recorder.finish();
+        assert_eq!(
+            outcome,
+            RecorderOutcome {
+                dropped_count: 30,
+                failures: Vec::new()
+            }
+        );
+        let file = RecordFile::read(&folder.join("a.b.published.robot.0.rec")).unwrap();
+        let read: Vec<PublishedRecord> = file.records().collect();
+        assert_eq!(read, (0..100).map(record).collect::<Vec<_>>());
+        fs::remove_dir_all(&folder).unwrap();
+    }
+}

@@ -1,0 +1,159 @@
+//! The case studies this binary knows, by name. It stores one monomorphised constructor per case;
+//! nothing is discovered or loaded at run time.
+
+use core::fmt::Debug;
+use std::fs;
+
+use hil_models::case_study::{CaseStudy, ChannelSpec, ParameterError, Score};
+use hil_models::component::Role;
+use hil_models::run_log::RunLog;
+use serde_json::Value;
+
+use crate::topology::KnownCases;
+
+/// A case whose type is no longer known: what `[case]` resolves to.
+pub trait Case: Debug {
+    /// A fresh instance of a role; `None` if the case has no such role.
+    fn role(&self, name: &str) -> Option<Box<dyn Role>>;
+
+    /// See [`CaseStudy::score`].
+    fn score(&self, log: &RunLog) -> Score;
+}
+
+#[derive(Debug)]
+struct Erased<C>(C);
+
+impl<C: CaseStudy> Case for Erased<C> {
+    fn role(&self, name: &str) -> Option<Box<dyn Role>> {
+        self.0.role(name)
+    }
+
+    fn score(&self, log: &RunLog) -> Score {
+        self.0.score(log)
+    }
+}
+
+/// Why a case cannot be made from its parameters.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{message}")]
+pub struct CaseError {
+    /// Key below `[case.parameters]`, where it is known.
+    pub key: Option<String>,
+    /// What is wrong with which value.
+    pub message: String,
+}
+
+/// One known case study.
+#[derive(Debug, Clone, Copy)]
+pub struct CaseEntry {
+    /// What `[case] name` says.
+    pub name: &'static str,
+    /// One line for a list.
+    pub summary: &'static str,
+    /// Its roles.
+    pub roles: &'static [&'static str],
+    /// Its channels.
+    pub channels: &'static [ChannelSpec],
+    make: fn(Value, u64) -> Result<Box<dyn Case>, CaseError>,
+    defaults: fn() -> Value,
+}
+
+impl CaseEntry {
+    /// The case with these parameters.
+    ///
+    /// # Errors
+    /// Names the parameter, its value and its allowed range.
+    pub fn make(&self, parameters: Value, seed: u64) -> Result<Box<dyn Case>, CaseError> {
+        (self.make)(parameters, seed)
+    }
+
+    /// Every parameter with its default.
+    pub fn defaults(&self) -> Value {
+        (self.defaults)()
+    }
+}
+
+/// The cases of a binary.
+#[derive(Debug, Clone, Default)]
+pub struct Registry {
+    entries: Vec<CaseEntry>,
+    known: KnownCases,
+}
+
+impl Registry {
+    /// Adds `C` under its name.
+    ///
+    /// # Panics
+    /// When two cases have one name: a mistake in `main`.
+    pub fn add<C: CaseStudy>(&mut self) {
+        assert!(
+            self.find(C::NAME).is_none(),
+            "case {} is registered twice",
+            C::NAME
+        );
+        self.entries.push(CaseEntry {
+            name: C::NAME,
+            summary: C::SUMMARY,
+            roles: C::ROLES,
+            channels: C::CHANNELS,
+            make: make::<C>,
+            defaults: || serde_json::to_value(C::Parameters::default()).unwrap_or(Value::Null),
+        });
+        self.known = core::mem::take(&mut self.known).with::<C>();
+    }
+
+    /// The case called `name`.
+    pub fn find(&self, name: &str) -> Option<&CaseEntry> {
+        self.entries.iter().find(|entry| entry.name == name)
+    }
+
+    /// The cases as the topology reader needs them.
+    pub fn known(&self) -> &KnownCases {
+        &self.known
+    }
+
+    /// All cases, in the order they were added.
+    pub fn entries(&self) -> &[CaseEntry] {
+        &self.entries
+    }
+}
+
+fn make<C: CaseStudy>(parameters: Value, seed: u64) -> Result<Box<dyn Case>, CaseError> {
+    let mut parameters: C::Parameters =
+        serde_json::from_value(parameters).map_err(|error| CaseError {
+            key: None,
+            message: error.to_string(),
+        })?;
+    let named = |error: ParameterError| CaseError {
+        key: Some(error.key.to_owned()),
+        message: error.to_string(),
+    };
+    C::read_files(&mut parameters, &mut read_text).map_err(named)?;
+    let case = C::new(parameters, seed).map_err(named)?;
+    Ok(Box::new(Erased(case)))
+}
+
+/// Reads a file that a parameter names, relative to the working directory.
+pub(crate) fn read_text(path: &str) -> Result<String, String> {
+    fs::read_to_string(path).map_err(|error| error.to_string())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use hil_models::shuttle::Shuttle;
+    use serde_json::json;
+
+    #[test]
+    fn a_wrong_parameter_is_named_with_its_range() {
+        let mut registry = Registry::default();
+        registry.add::<Shuttle>();
+        let entry = registry.find("shuttle").unwrap();
+        let error = entry.make(json!({ "gain_per_s": 101.0 }), 0).unwrap_err();
+        assert_eq!(error.key.as_deref(), Some("gain_per_s"));
+        assert_eq!(error.message, "gain_per_s 101 is outside 0..=100");
+        let error = entry.make(json!({ "gain": 1.0 }), 0).unwrap_err();
+        assert!(error.message.contains("unknown field `gain`"), "{error}");
+        assert!(entry.make(entry.defaults(), 0).is_ok());
+    }
+}

@@ -1,0 +1,218 @@
+//! One process the supervisor started: its pipes, its log, its death. When to start, restart or
+//! stop it is decided in `watch.rs`.
+
+use std::fs::File;
+use std::io::{self, BufRead, BufReader, Write};
+use std::os::unix::process::{CommandExt, ExitStatusExt};
+use std::path::Path;
+use std::process::{ChildStdin, Command, ExitStatus, Stdio};
+use std::sync::mpsc::SyncSender;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use nix::sys::signal::{Signal, killpg};
+use nix::sys::wait::{Id, WaitPidFlag, WaitStatus, waitid};
+use nix::unistd::Pid;
+
+use crate::process::pipe::{FromProcess, ToProcess};
+
+/// A word from a process: which one (index and instance), and what.
+pub(crate) type Word = (usize, u32, FromProcess);
+
+/// A running (or finished) child process.
+#[derive(Debug)]
+pub(crate) struct Child {
+    process: std::process::Child,
+    stdin: Option<ChildStdin>,
+    status: Option<ExitStatus>,
+    is_foreign: bool,
+}
+
+impl Child {
+    /// Starts a process that speaks the pipe protocol; its words arrive at `words` marked with
+    /// `index` and `instance`. Standard error goes to `log`.
+    ///
+    /// # Errors
+    /// When the program cannot be started or the log cannot be written.
+    pub(crate) fn spawn_speaking(
+        command: Command,
+        log: &Path,
+        (index, instance): (usize, u32),
+        words: SyncSender<Word>,
+    ) -> io::Result<Self> {
+        let mut command = prepared(command, log)?;
+        let mut process = command
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()?;
+        let output = process
+            .stdout
+            .take()
+            .expect("standard output was piped just above");
+        thread::Builder::new()
+            .name(format!("words {index}"))
+            .spawn(move || {
+                for line in BufReader::new(output).lines() {
+                    let Ok(line) = line else { return };
+                    let word = serde_json::from_str(&line)
+                        .unwrap_or_else(|_not_ours| FromProcess::Warning(format!("said: {line}")));
+                    if words.send((index, instance, word)).is_err() {
+                        return;
+                    }
+                }
+            })?;
+        let stdin = process.stdin.take();
+        Ok(Self {
+            process,
+            stdin,
+            status: None,
+            is_foreign: false,
+        })
+    }
+
+    /// Starts a user's own command; both its outputs go to `log`.
+    ///
+    /// # Errors
+    /// When the program cannot be started or the log cannot be written.
+    pub(crate) fn spawn_foreign(command: Command, log: &Path) -> io::Result<Self> {
+        let mut command = prepared(command, log)?;
+        command.stdout(File::options().append(true).open(log)?);
+        let process = command.stdin(Stdio::null()).spawn()?;
+        Ok(Self {
+            process,
+            stdin: None,
+            status: None,
+            is_foreign: true,
+        })
+    }
+
+    /// How it ended, once it has; does not wait.
+    pub(crate) fn poll_exit(&mut self) -> Option<ExitStatus> {
+        if self.status.is_none() && self.is_dead() {
+            // Children of its own must not outlive it. Its number still belongs to it, because
+            // it has not been reaped yet, so no stranger can be hit.
+            self.signal(Signal::SIGKILL);
+            self.status = self.process.try_wait().ok().flatten();
+        }
+        self.status
+    }
+
+    fn is_dead(&self) -> bool {
+        let look = WaitPidFlag::WEXITED | WaitPidFlag::WNOHANG | WaitPidFlag::WNOWAIT;
+        match i32::try_from(self.process.id()) {
+            Ok(id) => !matches!(
+                waitid(Id::Pid(Pid::from_raw(id)), look),
+                Ok(WaitStatus::StillAlive)
+            ),
+            Err(_out_of_range) => true,
+        }
+    }
+
+    /// Gives an order. A foreign command gets SIGTERM for [`ToProcess::Stop`] and nothing for
+    /// [`ToProcess::Start`].
+    pub(crate) fn order(&mut self, order: ToProcess) {
+        if self.is_foreign {
+            if order == ToProcess::Stop {
+                self.signal(Signal::SIGTERM);
+            }
+            return;
+        }
+        let line = serde_json::to_string(&order).expect("a unit variant always serialises");
+        if let Some(stdin) = &mut self.stdin {
+            // A process that is gone is noticed by poll_exit.
+            let _gone = writeln!(stdin, "{line}")
+                .and_then(|()| stdin.flush())
+                .is_err();
+        }
+    }
+
+    /// Waits until it ends or `deadline`; then kills it. True when it ended by itself.
+    pub(crate) fn end(&mut self, deadline: Instant) -> bool {
+        while self.poll_exit().is_none() {
+            if Instant::now() >= deadline {
+                self.signal(Signal::SIGKILL);
+                self.status = self.process.wait().ok();
+                return false;
+            }
+            thread::sleep(Duration::from_millis(2));
+        }
+        true
+    }
+
+    fn signal(&self, signal: Signal) {
+        if let Ok(id) = i32::try_from(self.process.id()) {
+            // The group may have ended already.
+            let _gone = killpg(Pid::from_raw(id), signal).is_err();
+        }
+    }
+}
+
+impl Drop for Child {
+    fn drop(&mut self) {
+        if self.status.is_none() {
+            self.end(Instant::now());
+        }
+    }
+}
+
+/// A group of its own keeps the terminal's Ctrl-C away from the child, so that the supervisor
+/// ends it in order.
+fn prepared(mut command: Command, log: &Path) -> io::Result<Command> {
+    let log = File::options().create(true).append(true).open(log)?;
+    command.stderr(log).process_group(0);
+    Ok(command)
+}
+
+/// How a process ended, in words.
+pub(crate) fn describe_exit(status: ExitStatus) -> String {
+    match (status.code(), status.signal()) {
+        (Some(0), _) => "ended".to_owned(),
+        (Some(code), _) => format!("ended with exit code {code}"),
+        (None, Some(number)) => {
+            let name = Signal::try_from(number).map_or("an unknown signal", Signal::as_str);
+            format!("was killed by {name}")
+        }
+        (None, None) => "ended for an unknown reason".to_owned(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::env;
+    use std::fs;
+    use std::sync::mpsc::sync_channel;
+
+    fn shell(script: &str) -> Command {
+        let mut command = Command::new("sh");
+        command.args(["-c", script]);
+        command
+    }
+
+    #[test]
+    fn words_arrive_marked_and_other_output_is_kept_as_a_warning() {
+        let log = env::temp_dir().join(format!("hil-child-{}.log", std::process::id()));
+        let (sender, words) = sync_channel(8);
+        let mut child =
+            Child::spawn_speaking(shell("echo '\"ready\"'; echo hello"), &log, (3, 1), sender)
+                .unwrap();
+        assert!(child.end(Instant::now() + Duration::from_secs(10)));
+        assert_eq!(words.recv().unwrap(), (3, 1, FromProcess::Ready));
+        let (_, _, word) = words.recv().unwrap();
+        assert_eq!(word, FromProcess::Warning("said: hello".to_owned()));
+        fs::remove_file(log).unwrap();
+    }
+
+    #[test]
+    fn a_child_that_does_not_stop_is_killed_and_its_end_is_told() {
+        let log = env::temp_dir().join(format!("hil-kill-{}.log", std::process::id()));
+        let mut child = Child::spawn_foreign(shell("trap '' TERM; sleep 60"), &log).unwrap();
+        child.order(ToProcess::Stop);
+        assert!(!child.end(Instant::now() + Duration::from_millis(50)));
+        assert_eq!(
+            describe_exit(child.poll_exit().unwrap()),
+            "was killed by SIGKILL"
+        );
+        fs::remove_file(log).unwrap();
+    }
+}

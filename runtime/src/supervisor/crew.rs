@@ -1,0 +1,378 @@
+//! The processes of this supervisor as a whole: started in order, watched, restarted or given up
+//! by policy, stopped in order. Each single one is a [`Child`].
+
+use std::collections::BTreeMap;
+use std::env;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::time::Duration;
+
+use hil_models::time::Instant;
+
+use super::child::{Child, Word, describe_exit};
+use super::event::{Event, Interruption};
+use super::plan::{ProcessKind, ProcessPlan};
+use crate::clock::MonotonicClock;
+use crate::process::launch::{ComponentLaunch, GatewayLaunch, LaunchError, write};
+use crate::process::pipe::{ChannelProgress, FromProcess, ProcessReport, ToProcess};
+use crate::run_folder::RunFolder;
+use crate::topology::OnExit;
+
+/// Words that may wait for the supervisor.
+const WORDS_MAX: usize = 4096;
+/// Messages a dead process may have held in its queues were published at most this long before
+/// it was last seen alive.
+const QUEUE_SPAN: Duration = Duration::from_millis(50);
+
+/// Why the processes could not be started.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum CrewError {
+    #[error(transparent)]
+    Launch(#[from] LaunchError),
+    #[error("process {process}: cannot start {program}: {source}")]
+    Spawn {
+        process: String,
+        program: String,
+        source: io::Error,
+    },
+    #[error("cannot find this program's own file: {0}")]
+    OwnPath(io::Error),
+}
+
+/// What ended the run, if a process did.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Verdict {
+    /// Everything goes on.
+    GoesOn,
+    /// A process ended by itself without a fault.
+    Finished(String),
+    /// A process failed.
+    Failed(String),
+}
+
+/// One process with its history.
+#[derive(Debug)]
+pub(crate) struct Member {
+    pub(crate) plan: ProcessPlan,
+    pub(crate) restart_count: u32,
+    pub(crate) report: Option<ProcessReport>,
+    pub(crate) end: Option<String>,
+    pub(crate) progress: Vec<ChannelProgress>,
+    child: Option<Child>,
+    is_ready: bool,
+    is_stopping: bool,
+    seen_alive: Instant,
+    complaint: Option<String>,
+}
+
+/// The processes of one supervisor.
+#[derive(Debug)]
+pub(crate) struct Crew {
+    members: Vec<Member>,
+    places: BTreeMap<String, String>,
+    folder: RunFolder,
+    own_program: PathBuf,
+    sender: SyncSender<Word>,
+    words: Receiver<Word>,
+    has_started: bool,
+    events: Vec<Event>,
+}
+
+impl Crew {
+    /// A crew for `plans`; `places` gives the address of each host's shared memory. Starts nothing.
+    pub(crate) fn new(
+        plans: Vec<ProcessPlan>,
+        places: BTreeMap<String, String>,
+        folder: &RunFolder,
+    ) -> Result<Self, CrewError> {
+        let (sender, words) = sync_channel(WORDS_MAX);
+        let members = plans.into_iter().map(|plan| Member {
+            plan,
+            restart_count: 0,
+            report: None,
+            end: None,
+            progress: Vec::new(),
+            child: None,
+            is_ready: false,
+            is_stopping: false,
+            seen_alive: Instant::ZERO,
+            complaint: None,
+        });
+        Ok(Self {
+            members: members.collect(),
+            places,
+            folder: folder.clone(),
+            own_program: env::current_exe().map_err(CrewError::OwnPath)?,
+            sender,
+            words,
+            has_started: false,
+            events: Vec::new(),
+        })
+    }
+
+    /// Starts every process; they wait for [`Crew::begin`].
+    pub(crate) fn start(&mut self) -> Result<(), CrewError> {
+        (0..self.members.len()).try_for_each(|index| self.spawn(index))
+    }
+
+    fn spawn(&mut self, index: usize) -> Result<(), CrewError> {
+        let member = &mut self.members[index];
+        let (name, instance) = (member.plan.name.clone(), member.restart_count);
+        let log = self.folder.log(&name);
+        let domain = self.places[&member.plan.host].clone();
+        let spawned = if let ProcessKind::Foreign {
+            card,
+            command,
+            environment,
+        } = &member.plan.kind
+        {
+            let card_path = self.folder.card(&name);
+            write(&card_path, card)?;
+            let mut program = Command::new(&command[0]);
+            program.args(&command[1..]).envs(environment);
+            program
+                .env("HIL_DOMAIN", &domain)
+                .env("HIL_CARD", &card_path);
+            member.is_ready = true;
+            Child::spawn_foreign(program, &log).map_err(|error| (command[0].clone(), error))
+        } else {
+            let launch = self.folder.launch(&name, instance);
+            let word = write_launch(member, &self.folder, &launch, domain)?;
+            let mut program = Command::new(&self.own_program);
+            program.arg(word).arg("--launch").arg(&launch);
+            member.is_ready = false;
+            Child::spawn_speaking(program, &log, (index, instance), self.sender.clone())
+                .map_err(|error| (self.own_program.display().to_string(), error))
+        };
+        let child = spawned.map_err(|(program, source)| CrewError::Spawn {
+            process: name,
+            program,
+            source,
+        })?;
+        member.child = Some(child);
+        member.seen_alive = MonotonicClock::now();
+        Ok(())
+    }
+
+    /// True once every process is ready.
+    pub(crate) fn is_ready(&self) -> bool {
+        self.members.iter().all(|member| member.is_ready)
+    }
+
+    /// Names of the processes that are not ready yet.
+    pub(crate) fn missing(&self) -> String {
+        let missing = self.members.iter().filter(|member| !member.is_ready);
+        missing
+            .map(|member| member.plan.name.as_str())
+            .collect::<Vec<_>>()
+            .join(", ")
+    }
+
+    /// Lets every process begin.
+    pub(crate) fn begin(&mut self) {
+        self.has_started = true;
+        for member in &mut self.members {
+            if let Some(child) = &mut member.child {
+                child.order(ToProcess::Start);
+            }
+        }
+    }
+
+    /// Hears what the processes said, sees who died, and applies the policies.
+    pub(crate) fn watch(&mut self) -> Result<Verdict, CrewError> {
+        self.listen();
+        let now = MonotonicClock::now();
+        let mut verdict = Verdict::GoesOn;
+        for index in 0..self.members.len() {
+            let member = &mut self.members[index];
+            let Some(child) = &mut member.child else {
+                continue;
+            };
+            let Some(status) = child.poll_exit() else {
+                member.seen_alive = now;
+                continue;
+            };
+            let died_after = member.seen_alive;
+            member.child = None;
+            let mut what = describe_exit(status);
+            // The words of a process may still be on their way when its end is seen.
+            self.listen();
+            let member = &mut self.members[index];
+            if let Some(complaint) = &member.complaint {
+                what = format!("{what}: {complaint}");
+            }
+            member.end = Some(what.clone());
+            if member.is_stopping {
+                continue;
+            }
+            let name = member.plan.name.clone();
+            let limit = match member.plan.on_exit {
+                OnExit::EndRun => 0,
+                OnExit::Restart { limit } => limit,
+            };
+            if self.has_started && member.restart_count < limit && member.complaint.is_none() {
+                member.restart_count += 1;
+                let count = member.restart_count;
+                let from = Instant::from_ns(
+                    died_after.as_ns() - hil_models::time::duration_ns(QUEUE_SPAN),
+                );
+                let interruption = Interruption { from, until: None };
+                let text = format!("{what}; restart {count} of at most {limit}");
+                self.note(now, index, text, Some(interruption));
+                self.spawn(index)?;
+            } else {
+                let is_orderly = status.success() && self.members[index].complaint.is_none();
+                self.note(now, index, format!("{what}; policy: end the run"), None);
+                let text = format!("process {name} {what}");
+                verdict = if is_orderly {
+                    Verdict::Finished(text)
+                } else {
+                    Verdict::Failed(text)
+                };
+            }
+        }
+        Ok(verdict)
+    }
+
+    fn listen(&mut self) {
+        while let Ok((index, instance, word)) = self.words.try_recv() {
+            let now = MonotonicClock::now();
+            if self.members[index].restart_count != instance {
+                continue;
+            }
+            let member = &mut self.members[index];
+            match word {
+                FromProcess::Ready => {
+                    member.is_ready = true;
+                    if self.has_started && instance > 0 {
+                        if let Some(child) = &mut member.child {
+                            child.order(ToProcess::Start);
+                        }
+                        self.close_interruption(index, now);
+                    }
+                }
+                FromProcess::Progress(progress) => member.progress = progress,
+                FromProcess::Warning(text) => self.note(now, index, text, None),
+                FromProcess::Finished(report) => member.report = Some(*report),
+                FromProcess::Failed(text) => member.complaint = Some(text),
+            }
+        }
+    }
+
+    fn close_interruption(&mut self, index: usize, now: Instant) {
+        let name = &self.members[index].plan.name;
+        let open = self.events.iter_mut().rev().find(|event| {
+            event.process == *name && event.interruption.is_some_and(|gap| gap.until.is_none())
+        });
+        if let Some(event) = open {
+            event.interruption = event.interruption.map(|gap| Interruption {
+                until: Some(now),
+                ..gap
+            });
+        }
+    }
+
+    fn note(
+        &mut self,
+        at: Instant,
+        index: usize,
+        what: String,
+        interruption: Option<Interruption>,
+    ) {
+        let plan = &self.members[index].plan;
+        self.events.push(Event {
+            at,
+            host: plan.host.clone(),
+            process: plan.name.clone(),
+            what,
+            interruption,
+        });
+    }
+
+    /// Stops the processes that `choose` picks and waits for them up to `patience`; who does not
+    /// end by then is killed, which is noted.
+    pub(crate) fn stop(&mut self, patience: Duration, choose: impl Fn(&ProcessPlan) -> bool) {
+        let chosen: Vec<usize> = (0..self.members.len())
+            .filter(|index| choose(&self.members[*index].plan))
+            .collect();
+        for index in &chosen {
+            let member = &mut self.members[*index];
+            member.is_stopping = true;
+            if let Some(child) = &mut member.child {
+                child.order(ToProcess::Stop);
+            }
+        }
+        let deadline = std::time::Instant::now() + patience;
+        for index in chosen {
+            let Some(mut child) = self.members[index].child.take() else {
+                continue;
+            };
+            let ended_by_itself = child.end(deadline);
+            let end = child
+                .poll_exit()
+                .map_or_else(|| "ended".to_owned(), describe_exit);
+            if !ended_by_itself {
+                let text = format!(
+                    "did not stop within {} s and was killed",
+                    patience.as_secs()
+                );
+                self.note(MonotonicClock::now(), index, text, None);
+            }
+            self.members[index].end = Some(end);
+        }
+        // The last words travel through a thread per process; they end with its output.
+        std::thread::sleep(Duration::from_millis(20));
+        self.listen();
+    }
+
+    /// The processes with their history.
+    pub(crate) fn members(&self) -> &[Member] {
+        &self.members
+    }
+
+    /// What happened, in order.
+    pub(crate) fn events(&self) -> &[Event] {
+        &self.events
+    }
+}
+
+fn write_launch(
+    member: &Member,
+    folder: &RunFolder,
+    path: &Path,
+    domain: String,
+) -> Result<&'static str, LaunchError> {
+    let plan = &member.plan;
+    let (process, instance) = (plan.name.clone(), member.restart_count);
+    match &plan.kind {
+        ProcessKind::Component(card) => {
+            let card_path = folder.card(&process);
+            write(&card_path, card)?;
+            let launch = ComponentLaunch {
+                process,
+                instance,
+                card: card_path,
+                domain,
+                realtime: plan.realtime.clone(),
+                wait: plan.wait,
+                records: folder.records(),
+            };
+            write(path, &launch)?;
+            Ok("component")
+        }
+        ProcessKind::Gateway(directions) => {
+            let launch = GatewayLaunch {
+                process,
+                instance,
+                domain,
+                records: folder.records(),
+                directions: directions.clone(),
+            };
+            write(path, &launch)?;
+            Ok("gateway")
+        }
+        ProcessKind::Foreign { .. } => Ok("foreign"),
+    }
+}

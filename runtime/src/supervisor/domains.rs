@@ -1,0 +1,154 @@
+//! The shared-memory domains a supervisor owns: one per host that runs here, with every channel
+//! created and held, so that the processes it starts only ever open.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+use super::plan::{HostPlan, domain_root};
+use crate::channel::{ChannelError, ChannelHolder, ChannelSettings, Domain, DomainError, TypeInfo};
+
+/// Writers at a time: one, and its successor while the dead one is not cleaned up yet.
+const WRITERS_MAX: usize = 2;
+/// Readers at a time: consumer or gateway, its successor, and room for four observers.
+const READERS_MAX: usize = 6;
+
+/// Why a domain could not be made.
+#[derive(Debug, thiserror::Error)]
+pub enum DomainsError {
+    /// The domain itself.
+    #[error("shared memory of host {host}: {source}")]
+    Domain {
+        /// The host.
+        host: String,
+        /// Why.
+        source: DomainError,
+    },
+    /// One of its channels.
+    #[error("shared memory of host {host}: {source}")]
+    Channel {
+        /// The host.
+        host: String,
+        /// Why.
+        source: ChannelError,
+    },
+}
+
+#[derive(Debug)]
+struct HostDomain {
+    host: String,
+    // Before the domain: channels go first.
+    holders: Vec<ChannelHolder>,
+    domain: Domain,
+}
+
+/// All domains of one supervisor.
+#[derive(Debug)]
+pub(crate) struct Domains {
+    hosts: Vec<HostDomain>,
+}
+
+impl Domains {
+    /// Creates a domain per host, below `base` or the default folder.
+    pub(crate) fn create(
+        plans: &[HostPlan],
+        base: Option<&PathBuf>,
+        run: &str,
+    ) -> Result<Self, DomainsError> {
+        let hosts = plans.iter().map(|plan| create_host(plan, base, run));
+        Ok(Self {
+            hosts: hosts.collect::<Result<_, _>>()?,
+        })
+    }
+
+    /// Address of each host's domain.
+    pub(crate) fn addresses(&self) -> BTreeMap<String, String> {
+        self.hosts
+            .iter()
+            .map(|host| (host.host.clone(), host.domain.address().to_string()))
+            .collect()
+    }
+
+    /// Fingerprint of the first host's domain: what peers compare with theirs.
+    pub(crate) fn fingerprint(&self) -> Result<[u8; 16], DomainsError> {
+        let host = self.hosts.first().expect("a plan has at least one host");
+        let named = |source| DomainsError::Domain {
+            host: host.host.clone(),
+            source,
+        };
+        host.domain.fingerprint().map_err(named)
+    }
+
+    /// Frees what processes that died had in use, so that their successors find room.
+    pub(crate) fn free_what_the_dead_held(&self) {
+        for host in &self.hosts {
+            host.domain.cleanup_dead_nodes();
+        }
+    }
+
+    /// Deletes everything; says what could not be deleted.
+    pub(crate) fn remove(self) -> Vec<String> {
+        let mut left = Vec::new();
+        for HostDomain {
+            host,
+            holders,
+            domain,
+        } in self.hosts
+        {
+            drop(holders);
+            // Members that were killed a moment ago must not count as alive.
+            domain.cleanup_dead_nodes();
+            let removal = domain.remove();
+            left.extend(
+                removal
+                    .remained
+                    .iter()
+                    .map(|path| path.display().to_string()),
+            );
+            if removal.live_member_count > 0 {
+                let count = removal.live_member_count;
+                left.push(format!(
+                    "{count} processes still used the shared memory of {host}"
+                ));
+            }
+        }
+        left
+    }
+}
+
+fn create_host(
+    plan: &HostPlan,
+    base: Option<&PathBuf>,
+    run: &str,
+) -> Result<HostDomain, DomainsError> {
+    let host = plan.name.clone();
+    let root = domain_root(base, run, &host);
+    let domain = Domain::create(&root).map_err(|source| DomainsError::Domain {
+        host: host.clone(),
+        source,
+    })?;
+    let mut holders = Vec::new();
+    for channel in &plan.channels {
+        let settings = ChannelSettings {
+            name: channel.name.clone(),
+            message: TypeInfo {
+                name: channel.message.name.clone(),
+                size_bytes: channel.message.size_bytes,
+                alignment_bytes: channel.message.alignment_bytes,
+            },
+            depth_max: channel.depth,
+            writers_max: WRITERS_MAX,
+            readers_max: READERS_MAX,
+        };
+        let holder =
+            ChannelHolder::create(&domain, &settings).map_err(|source| DomainsError::Channel {
+                host: host.clone(),
+                source,
+            })?;
+        holders.push(holder);
+    }
+    Ok(HostDomain {
+        host,
+        holders,
+        domain,
+    })
+}

@@ -1,0 +1,48 @@
+//! What happened during a run beside the messages: processes that died, restarted or complained,
+//! and what each said at its end. Plain data that hosts exchange.
+
+use hil_models::time::Instant;
+use serde::{Deserialize, Serialize};
+
+use crate::process::pipe::ProcessReport;
+
+/// One thing that happened.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Event {
+    /// When it was noticed, on that host's monotonic clock.
+    pub at: Instant,
+    /// The host it happened on.
+    pub host: String,
+    /// The process concerned; empty for the host as a whole.
+    pub process: String,
+    /// What happened, in words.
+    pub what: String,
+    /// Set when the process carried no messages for a while.
+    pub interruption: Option<Interruption>,
+}
+
+/// A time in which a process was not there.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Interruption {
+    /// Last moment it was known to live, less what its queues may have held.
+    pub from: Instant,
+    /// When its successor was ready; `None` if there was none.
+    pub until: Option<Instant>,
+}
+
+/// One process of the run, as its supervisor knows it at the end.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ProcessStory {
+    /// Name in the topology, or of a gateway.
+    pub name: String,
+    /// The host it ran on.
+    pub host: String,
+    /// The role it played.
+    pub role: String,
+    /// How it ended, in words.
+    pub end: String,
+    /// How often it was started again.
+    pub restart_count: u32,
+    /// What it said last; `None` when it did not end in order.
+    pub report: Option<ProcessReport>,
+}

@@ -1,0 +1,16 @@
+//! The supervisor: brings the hosts of a run together, starts the processes, watches them, ends
+//! everything in order and leaves a complete report, whatever happened. It carries no message.
+
+pub(crate) mod child;
+pub(crate) mod crew;
+pub(crate) mod domains;
+pub mod event;
+pub(crate) mod exchange;
+pub(crate) mod frame;
+pub(crate) mod peer;
+pub(crate) mod plan;
+mod session;
+
+pub use domains::DomainsError;
+pub use peer::PeerError;
+pub use session::{Outcome, RunError, RunOptions, RunResult, run};

@@ -1,0 +1,464 @@
+//! The other hosts of a run: a TCP connection between supervisors through which they start
+//! together, end together and exchange their records. The first host of the topology listens,
+//! the others connect to it.
+
+use std::io::{self, BufReader, BufWriter, Write};
+use std::net::{IpAddr, Shutdown, SocketAddr, TcpListener, TcpStream};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use super::frame::{Frame, PeerHello, PeerMessage, read_frame, write_message};
+
+/// How often a host that cannot connect yet tries again.
+const RETRY_PERIOD: Duration = Duration::from_millis(200);
+/// A connected peer that says nothing for this long counts as gone.
+pub(crate) const SILENCE_MAX: Duration = Duration::from_secs(3);
+const GREETING_TIMEOUT: Duration = Duration::from_secs(3);
+/// Frames that may wait between the reader thread and the supervisor.
+const INBOX_FRAMES: usize = 256;
+
+/// Why the hosts of a run did not come together.
+#[derive(Debug, thiserror::Error)]
+pub enum PeerError {
+    /// A peer did not appear in time.
+    #[error(
+        "{missing} did not appear within {waited_s} s; is the same topology started there, and is TCP {address} reachable?"
+    )]
+    Absent {
+        /// Host names.
+        missing: String,
+        /// How long was waited.
+        waited_s: u64,
+        /// Where the hosts meet.
+        address: SocketAddr,
+    },
+    /// The meeting address cannot be used.
+    #[error(
+        "cannot listen on {address}: {source}; is it this host's address, and is no other run using control_port?"
+    )]
+    Listen {
+        /// Where the hosts meet.
+        address: SocketAddr,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// The ends do not fit.
+    #[error("{host} does not fit this run: {reason}")]
+    Mismatch {
+        /// The other host.
+        host: String,
+        /// Which property differs.
+        reason: String,
+    },
+    /// The user ended the run while waiting.
+    #[error("interrupted while waiting for {missing}")]
+    Interrupted {
+        /// Host names.
+        missing: String,
+    },
+    /// The connection broke.
+    #[error("connection to {host}: {source}")]
+    Connection {
+        /// The other host.
+        host: String,
+        /// What the system said.
+        source: io::Error,
+    },
+}
+
+/// Where the hosts of a run meet.
+#[derive(Debug, Clone)]
+pub(crate) struct Meeting {
+    /// Address of the first host of the topology.
+    pub(crate) address: SocketAddr,
+    /// True on that first host.
+    pub(crate) is_here: bool,
+    /// Names and addresses of the other hosts this one connects with.
+    pub(crate) expected: Vec<(String, IpAddr)>,
+    /// How long to wait for all of them.
+    pub(crate) timeout: Duration,
+}
+
+/// Something a peer said, or that it left.
+#[derive(Debug)]
+pub(crate) enum PeerEvent {
+    /// A frame.
+    Frame(Frame),
+    /// The connection ended, and why.
+    Closed(String),
+}
+
+/// One connected peer.
+#[derive(Debug)]
+pub(crate) struct Peer {
+    /// What it said of itself.
+    pub(crate) hello: PeerHello,
+    writer: BufWriter<TcpStream>,
+    inbox: Receiver<PeerEvent>,
+    heard: Instant,
+    is_open: bool,
+    /// It said that its components have stopped; what it says next belongs to the exchange of
+    /// records and must not be read before.
+    pub(crate) is_quiet: bool,
+}
+
+impl Peer {
+    fn new(stream: TcpStream, hello: PeerHello) -> io::Result<Self> {
+        stream.set_read_timeout(None)?;
+        let input = stream.try_clone()?;
+        let (sender, inbox) = sync_channel(INBOX_FRAMES);
+        thread::Builder::new()
+            .name(format!("peer {}", hello.host))
+            .spawn(move || forward(input, &sender))?;
+        let writer = BufWriter::new(stream);
+        Ok(Self {
+            hello,
+            writer,
+            inbox,
+            heard: Instant::now(),
+            is_open: true,
+            is_quiet: false,
+        })
+    }
+
+    /// Says `message`; a peer that is gone is noticed by [`Peer::receive`].
+    pub(crate) fn say(&mut self, message: &PeerMessage) {
+        self.is_open = self.is_open && write_message(&mut self.writer, message).is_ok();
+    }
+
+    /// The next thing the peer said, waiting up to `timeout`.
+    pub(crate) fn receive(&mut self, timeout: Duration) -> Option<PeerEvent> {
+        match self.inbox.recv_timeout(timeout) {
+            Ok(event) => {
+                self.heard = Instant::now();
+                Some(event)
+            }
+            Err(RecvTimeoutError::Timeout) => None,
+            Err(RecvTimeoutError::Disconnected) => {
+                Some(PeerEvent::Closed("connection closed".to_owned()))
+            }
+        }
+    }
+
+    /// How long nothing has been heard.
+    pub(crate) fn silence(&self) -> Duration {
+        self.heard.elapsed()
+    }
+
+    /// The sending half by itself, so that a thread can send while another receives.
+    pub(crate) fn halves(&mut self) -> (&mut (impl Write + Send + use<>), &Receiver<PeerEvent>) {
+        (&mut self.writer, &self.inbox)
+    }
+}
+
+impl Drop for Peer {
+    /// Ends the connection both ways, so that the reader thread and the other end notice.
+    fn drop(&mut self) {
+        let _already_closed = self.writer.get_ref().shutdown(Shutdown::Both).is_err();
+    }
+}
+
+fn forward(input: TcpStream, out: &SyncSender<PeerEvent>) {
+    let mut input = BufReader::new(input);
+    loop {
+        let event = match read_frame(&mut input) {
+            Ok(frame) => PeerEvent::Frame(frame),
+            Err(error) => PeerEvent::Closed(error.to_string()),
+        };
+        let is_last = matches!(event, PeerEvent::Closed(_));
+        if out.send(event).is_err() || is_last {
+            return;
+        }
+    }
+}
+
+/// Brings the hosts of a run together. `waiting` is told whom it waits for, about once a second;
+/// it returns false to give up.
+///
+/// # Errors
+/// See [`PeerError`].
+pub(crate) fn meet(
+    meeting: &Meeting,
+    hello: &PeerHello,
+    waiting: &mut dyn FnMut(&str, Duration) -> bool,
+) -> Result<Vec<Peer>, PeerError> {
+    let mut patience = Patience {
+        meeting,
+        waiting,
+        began: Instant::now(),
+        told: None,
+    };
+    if meeting.is_here {
+        host(meeting, hello, &mut patience)
+    } else {
+        join(meeting, hello, &mut patience)
+    }
+}
+
+struct Patience<'a> {
+    meeting: &'a Meeting,
+    waiting: &'a mut dyn FnMut(&str, Duration) -> bool,
+    began: Instant,
+    told: Option<Instant>,
+}
+
+impl Patience<'_> {
+    /// Waits a moment for `missing`, or says why not.
+    fn wait(&mut self, missing: &str) -> Result<(), PeerError> {
+        let waited = self.began.elapsed();
+        if waited > self.meeting.timeout {
+            return Err(PeerError::Absent {
+                missing: missing.to_owned(),
+                waited_s: waited.as_secs(),
+                address: self.meeting.address,
+            });
+        }
+        if self
+            .told
+            .is_none_or(|told| told.elapsed() >= Duration::from_secs(1))
+        {
+            self.told = Some(Instant::now());
+            if !(self.waiting)(missing, waited) {
+                return Err(PeerError::Interrupted {
+                    missing: missing.to_owned(),
+                });
+            }
+        }
+        thread::sleep(RETRY_PERIOD.min(Duration::from_millis(50)));
+        Ok(())
+    }
+}
+
+fn host(
+    meeting: &Meeting,
+    hello: &PeerHello,
+    patience: &mut Patience<'_>,
+) -> Result<Vec<Peer>, PeerError> {
+    let address = meeting.address;
+    let listen = |source| PeerError::Listen { address, source };
+    let listener = TcpListener::bind(address).map_err(listen)?;
+    listener.set_nonblocking(true).map_err(listen)?;
+    let mut peers: Vec<Peer> = Vec::new();
+    while peers.len() < meeting.expected.len() {
+        let missing: Vec<&str> = meeting
+            .expected
+            .iter()
+            .map(|(name, _)| name.as_str())
+            .filter(|name| peers.iter().all(|peer| peer.hello.host != *name))
+            .collect();
+        let missing = missing.join(", ");
+        match listener.accept() {
+            // Strangers are turned away before a byte of theirs is read.
+            Ok((stream, from)) if meeting.expected.iter().any(|(_, ip)| *ip == from.ip()) => {
+                if let Some(peer) = welcome(stream, &missing, hello)? {
+                    peers.push(peer);
+                }
+            }
+            Ok(_stranger) => {}
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock => patience.wait(&missing)?,
+            Err(source) => return Err(listen(source)),
+        }
+    }
+    Ok(peers)
+}
+
+/// Greets one that connected; `None` when it left before it had said who it is.
+fn welcome(stream: TcpStream, missing: &str, hello: &PeerHello) -> Result<Option<Peer>, PeerError> {
+    let Ok((mut stream, theirs)) = read_hello(stream) else {
+        return Ok(None);
+    };
+    let PeerMessage::Hello(theirs) = theirs else {
+        return Ok(None);
+    };
+    let unexpected = !missing.split(", ").any(|name| name == theirs.host);
+    let reason = if unexpected {
+        Some(format!(
+            "host {} is not awaited; awaited: {missing}",
+            theirs.host
+        ))
+    } else {
+        misfit(hello, &theirs)
+    };
+    let connection = |source| PeerError::Connection {
+        host: theirs.host.clone(),
+        source,
+    };
+    if let Some(reason) = reason {
+        write_message(&mut stream, &PeerMessage::Refused(reason.clone())).map_err(connection)?;
+        return Err(PeerError::Mismatch {
+            host: theirs.host,
+            reason,
+        });
+    }
+    write_message(&mut stream, &PeerMessage::Hello(hello.clone())).map_err(connection)?;
+    Peer::new(stream, theirs.clone())
+        .map(Some)
+        .map_err(connection)
+}
+
+fn join(
+    meeting: &Meeting,
+    hello: &PeerHello,
+    patience: &mut Patience<'_>,
+) -> Result<Vec<Peer>, PeerError> {
+    let name = meeting
+        .expected
+        .first()
+        .map_or("the first host", |(name, _)| name)
+        .to_owned();
+    let connection = |source| PeerError::Connection {
+        host: name.clone(),
+        source,
+    };
+    loop {
+        let attempt = TcpStream::connect_timeout(&meeting.address, RETRY_PERIOD);
+        let Ok(mut stream) = attempt else {
+            patience.wait(&name)?;
+            continue;
+        };
+        let answer = write_message(&mut stream, &PeerMessage::Hello(hello.clone()))
+            .and_then(|()| read_hello(stream));
+        match answer {
+            Ok((stream, PeerMessage::Hello(theirs))) => {
+                if let Some(reason) = misfit(hello, &theirs) {
+                    return Err(PeerError::Mismatch {
+                        host: theirs.host,
+                        reason,
+                    });
+                }
+                return Ok(vec![Peer::new(stream, theirs).map_err(connection)?]);
+            }
+            Ok((_, PeerMessage::Refused(reason))) => {
+                return Err(PeerError::Mismatch { host: name, reason });
+            }
+            // Somebody else's service, or a peer that is just going away.
+            Ok(_) | Err(_) => patience.wait(&name)?,
+        }
+    }
+}
+
+fn read_hello(stream: TcpStream) -> io::Result<(TcpStream, PeerMessage)> {
+    stream.set_nonblocking(false)?;
+    stream.set_nodelay(true)?;
+    stream.set_read_timeout(Some(GREETING_TIMEOUT))?;
+    stream.set_write_timeout(Some(SILENCE_MAX))?;
+    let mut input = &stream;
+    match read_frame(&mut input)? {
+        Frame::Message(message) => Ok((stream, message)),
+        Frame::Chunk(_) => Err(io::Error::new(
+            io::ErrorKind::InvalidData,
+            "a chunk, not a hello",
+        )),
+    }
+}
+
+/// Why two hosts cannot share a run.
+fn misfit(ours: &PeerHello, theirs: &PeerHello) -> Option<String> {
+    if ours.version != theirs.version {
+        return Some(format!(
+            "version {} here, {} on {}; install the same on both",
+            ours.version, theirs.version, theirs.host
+        ));
+    }
+    if ours.topology_hash != theirs.topology_hash {
+        return Some(format!(
+            "topology {:016x} here, {:016x} on {}; use the same file and the same --set on both",
+            ours.topology_hash, theirs.topology_hash, theirs.host
+        ));
+    }
+    (ours.domain == theirs.domain).then(|| {
+        format!(
+            "{} and {} share one shared-memory domain, so messages would bypass the network; \
+             give each host its own /dev/shm and run folder",
+            ours.host, theirs.host
+        )
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::net::Ipv4Addr;
+
+    fn hello(host: &str, hash: u64, domain: u8) -> PeerHello {
+        PeerHello {
+            version: "1".to_owned(),
+            topology_hash: hash,
+            host: host.to_owned(),
+            clock_id: 1,
+            domain: [domain; 16],
+            run_id: "run".to_owned(),
+        }
+    }
+
+    fn pair(left: &PeerHello, right: &PeerHello) -> [Result<Vec<Peer>, PeerError>; 2] {
+        let probe = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
+        let address = probe.local_addr().unwrap();
+        drop(probe);
+        let meeting = |is_here, other: &PeerHello| Meeting {
+            address,
+            is_here,
+            expected: vec![(other.host.clone(), address.ip())],
+            timeout: Duration::from_secs(10),
+        };
+        let (there, here) = (meeting(false, left), meeting(true, right));
+        let right = right.clone();
+        let joining = thread::spawn(move || meet(&there, &right, &mut |_, _| true));
+        let hosting = meet(&here, left, &mut |_, _| true);
+        [hosting, joining.join().unwrap()]
+    }
+
+    #[test]
+    fn two_hosts_meet_and_talk() {
+        let [left, right] = pair(&hello("a", 1, 1), &hello("b", 1, 2));
+        let (mut left, mut right) = (left.unwrap(), right.unwrap());
+        assert_eq!(left[0].hello.host, "b");
+        left[0].say(&PeerMessage::Start);
+        let event = right[0].receive(Duration::from_secs(5));
+        assert!(matches!(
+            event,
+            Some(PeerEvent::Frame(Frame::Message(PeerMessage::Start)))
+        ));
+        drop(left);
+        let event = right[0].receive(Duration::from_secs(5));
+        assert!(matches!(event, Some(PeerEvent::Closed(_))));
+    }
+
+    #[test]
+    fn another_topology_is_refused_on_both_hosts() {
+        let [left, right] = pair(&hello("a", 1, 1), &hello("b", 2, 2));
+        for outcome in [left, right] {
+            let error = outcome.map(|_| ()).unwrap_err().to_string();
+            assert!(error.contains("topology"), "{error}");
+        }
+    }
+
+    #[test]
+    fn one_domain_at_both_ends_is_refused() {
+        let [left, _] = pair(&hello("a", 1, 7), &hello("b", 1, 7));
+        assert!(
+            left.map(|_| ())
+                .unwrap_err()
+                .to_string()
+                .contains("bypass the network")
+        );
+    }
+
+    #[test]
+    fn nobody_there_is_said_with_the_name_and_the_address() {
+        let meeting = Meeting {
+            address: SocketAddr::from((Ipv4Addr::LOCALHOST, 1)),
+            is_here: false,
+            expected: vec![("robot-pc".to_owned(), Ipv4Addr::LOCALHOST.into())],
+            timeout: Duration::from_millis(1),
+        };
+        let error = meet(&meeting, &hello("a", 1, 1), &mut |_, _| true)
+            .map(|_| ())
+            .unwrap_err();
+        assert!(
+            error.to_string().starts_with("robot-pc did not appear"),
+            "{error}"
+        );
+    }
+}

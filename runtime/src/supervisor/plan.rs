@@ -1,0 +1,248 @@
+//! From a checked topology to what this supervisor starts: domains, channels, processes. It
+//! starts nothing itself.
+
+use std::collections::BTreeMap;
+use std::net::SocketAddr;
+use std::path::PathBuf;
+
+use crate::process::launch::{DirectionLaunch, EmulationLaunch, Side, SocketLaunch};
+use crate::realtime::{RealtimeRequest, SchedulingPolicy};
+use crate::topology::{
+    Channel, Crossing, Execution, Host, OnExit, Process, ProcessCard, Program, Scheduling,
+    Topology, Wait,
+};
+use crate::wait::WaitMode;
+
+/// Everything one supervisor is responsible for.
+#[derive(Debug)]
+pub(crate) struct Plan {
+    /// One per host that runs here.
+    pub(crate) hosts: Vec<HostPlan>,
+    /// Gateways first: they must be ready before components publish.
+    pub(crate) processes: Vec<ProcessPlan>,
+}
+
+/// A host that runs here.
+#[derive(Debug)]
+pub(crate) struct HostPlan {
+    pub(crate) name: String,
+    /// Channels with an end on this host.
+    pub(crate) channels: Vec<Channel>,
+}
+
+/// A process to start here.
+#[derive(Debug)]
+pub(crate) struct ProcessPlan {
+    pub(crate) name: String,
+    pub(crate) host: String,
+    pub(crate) kind: ProcessKind,
+    pub(crate) realtime: RealtimeRequest,
+    pub(crate) wait: WaitMode,
+    pub(crate) on_exit: OnExit,
+}
+
+/// What it executes.
+#[derive(Debug)]
+pub(crate) enum ProcessKind {
+    /// A role of the case, in this binary.
+    Component(ProcessCard),
+    /// The gateway of one link, in this binary.
+    Gateway(Vec<DirectionLaunch>),
+    /// The user's own program.
+    Foreign {
+        card: ProcessCard,
+        command: Vec<String>,
+        environment: BTreeMap<String, String>,
+    },
+}
+
+impl ProcessPlan {
+    pub(crate) fn is_gateway(&self) -> bool {
+        matches!(self.kind, ProcessKind::Gateway(_))
+    }
+
+    /// The role's name, or what else it is.
+    pub(crate) fn role(&self) -> String {
+        match &self.kind {
+            ProcessKind::Component(card) => card.role.clone().unwrap_or_default(),
+            ProcessKind::Gateway(_) => "gateway".to_owned(),
+            ProcessKind::Foreign { .. } => "own program".to_owned(),
+        }
+    }
+}
+
+/// What to run on `hosts`, all of them on this PC.
+pub(crate) fn plan(topology: &Topology, hosts: &[&Host]) -> Plan {
+    let is_here = |name: &str| hosts.iter().any(|host| host.name == name);
+    let host_plans = hosts.iter().map(|host| {
+        let channels = topology.channels().iter().filter(|channel| {
+            [&channel.from, &channel.to]
+                .into_iter()
+                .filter_map(|name| topology.process(name))
+                .any(|process| process.host == host.name)
+        });
+        HostPlan {
+            name: host.name.clone(),
+            channels: channels.cloned().collect(),
+        }
+    });
+    let gateways = hosts.iter().flat_map(|host| gateways_on(topology, host));
+    let processes = topology
+        .processes()
+        .iter()
+        .filter(|process| is_here(&process.host))
+        .map(|process| component(topology, process));
+    Plan {
+        hosts: host_plans.collect(),
+        processes: gateways.chain(processes).collect(),
+    }
+}
+
+fn component(topology: &Topology, process: &Process) -> ProcessPlan {
+    let card = topology
+        .process_card(&process.name)
+        .expect("the process is of this topology");
+    let kind = match &process.program {
+        Program::BuiltIn { .. } => ProcessKind::Component(card),
+        Program::Command {
+            command,
+            environment,
+            ..
+        } => ProcessKind::Foreign {
+            card,
+            command: command.clone(),
+            environment: environment.clone(),
+        },
+    };
+    ProcessPlan {
+        name: process.name.clone(),
+        host: process.host.clone(),
+        kind,
+        realtime: realtime(&process.execution, 0),
+        wait: wait_mode(process.execution.wait),
+        on_exit: process.on_exit,
+    }
+}
+
+fn gateways_on(topology: &Topology, host: &Host) -> Vec<ProcessPlan> {
+    let mut plans = Vec::new();
+    for link in topology.links() {
+        let Some(hop) = link.hop() else { continue };
+        let mut directions = Vec::new();
+        for crossing in topology
+            .crossings()
+            .filter(|crossing| crossing.link.name == link.name)
+        {
+            for side in [Side::Egress, Side::Ingress] {
+                let here = match side {
+                    Side::Egress => crossing.from_host,
+                    Side::Ingress => crossing.to_host,
+                };
+                if here.name == host.name {
+                    let index = directions.len();
+                    directions.push(direction(&crossing, side, index, topology.run().seed));
+                }
+            }
+        }
+        if !directions.is_empty() {
+            plans.push(ProcessPlan {
+                name: format!("gateway-{}-{}", link.name, host.name),
+                host: host.name.clone(),
+                kind: ProcessKind::Gateway(directions),
+                realtime: RealtimeRequest::default(),
+                wait: wait_mode(hop.gateway.execution.wait),
+                on_exit: hop.gateway.on_exit,
+            });
+        }
+    }
+    plans
+}
+
+fn direction(crossing: &Crossing<'_>, side: Side, index: usize, seed: u64) -> DirectionLaunch {
+    let Crossing {
+        channel,
+        hop,
+        ports,
+        ..
+    } = crossing;
+    let sender = SocketAddr::new(crossing.from_host.gateway_address(), ports.sender);
+    let receiver = SocketAddr::new(crossing.to_host.gateway_address(), ports.receiver);
+    let (local, peer, here) = match side {
+        Side::Egress => (sender, receiver, crossing.from_host),
+        Side::Ingress => (receiver, sender, crossing.to_host),
+    };
+    let emulation = crossing.impairment.filter(|_| side == Side::Ingress);
+    DirectionLaunch {
+        channel: channel.name.clone(),
+        channel_id: channel.channel_id,
+        message: channel.message.name.clone(),
+        size_bytes: channel.message.size_bytes,
+        alignment_bytes: channel.message.alignment_bytes,
+        depth: channel.depth,
+        side,
+        local,
+        peer,
+        socket: SocketLaunch {
+            interface: here.interface.clone(),
+            dscp: hop.dscp,
+            priority: hop.socket_priority,
+            send_buffer_bytes: hop.send_buffer_bytes,
+            receive_buffer_bytes: hop.receive_buffer_bytes,
+            path_mtu_bytes: hop.path_mtu_bytes,
+            timestamps: hop.timestamps.word().to_owned(),
+        },
+        wait: wait_mode(hop.gateway.execution.wait),
+        realtime: realtime(&hop.gateway.execution, index),
+        emulation: emulation.map(|impairment| EmulationLaunch {
+            delay: impairment.delay,
+            loss_ratio: impairment.loss_ratio,
+            seed,
+        }),
+    }
+}
+
+/// The request for thread number `index` of something that runs as `execution` says: its CPUs
+/// are dealt out in turn.
+fn realtime(execution: &Execution, index: usize) -> RealtimeRequest {
+    let cpu = (!execution.cpus.is_empty())
+        .then(|| usize::from(execution.cpus[index % execution.cpus.len()]));
+    RealtimeRequest {
+        cpu,
+        policy: match execution.scheduling {
+            Scheduling::Other => SchedulingPolicy::Other,
+            Scheduling::Fifo { priority } => SchedulingPolicy::Fifo { priority },
+        },
+        lock_memory: execution.locks_memory,
+        timer_slack: Some(execution.timer_slack),
+    }
+}
+
+fn wait_mode(wait: Wait) -> WaitMode {
+    match wait {
+        Wait::Block => WaitMode::Block,
+        Wait::Hybrid => WaitMode::Hybrid,
+        Wait::Spin => WaitMode::Spin,
+    }
+}
+
+/// Where the shared-memory domain of `host` lies: short, because a socket path below it must
+/// stay under 108 bytes.
+pub(crate) fn domain_root(base: Option<&PathBuf>, run: &str, host: &str) -> PathBuf {
+    let base = base.cloned().unwrap_or_else(default_domain_base);
+    let mut hash: u64 = 0xcbf2_9ce4_8422_2325;
+    for byte in run.bytes().chain([0]).chain(host.bytes()) {
+        hash = (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3);
+    }
+    base.join(format!("{:012x}", hash & 0xffff_ffff_ffff))
+}
+
+fn default_domain_base() -> PathBuf {
+    let run = PathBuf::from("/run/hil");
+    let is_usable = std::fs::create_dir_all(&run).is_ok()
+        && nix::unistd::access(&run, nix::unistd::AccessFlags::W_OK).is_ok();
+    if is_usable {
+        run
+    } else {
+        std::env::temp_dir().join("hil")
+    }
+}

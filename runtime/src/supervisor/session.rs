@@ -1,0 +1,608 @@
+//! One run from beginning to end. Each step is short; what a step does is in its own file.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::io;
+use std::path::PathBuf;
+use std::thread;
+use std::time::{Duration, Instant as WallInstant, SystemTime};
+
+use hil_models::time::Instant;
+use serde_json::json;
+
+use super::crew::{Crew, CrewError, Verdict};
+use super::domains::{Domains, DomainsError};
+use super::event::{Event, ProcessStory};
+use super::exchange::{HostStory, exchange};
+use super::frame::{Frame, PeerHello, PeerMessage};
+use super::peer::{Meeting, Peer, PeerError, PeerEvent, SILENCE_MAX, meet};
+use super::plan::plan;
+use crate::channel::{DomainError, clock_id};
+use crate::clock::MonotonicClock;
+use crate::console::Console;
+use crate::host_facts::HostFacts;
+use crate::run_folder::{RunFolder, utc_text};
+use crate::signals::Signals;
+use crate::topology::{Host, Topology};
+
+/// How often the supervisor looks after everything.
+const WATCH_PERIOD: Duration = Duration::from_millis(5);
+/// How often the memory of dead processes is freed: short against the second in which a
+/// restarted process is to be back.
+const CLEANUP_PERIOD: Duration = Duration::from_millis(100);
+const ALIVE_PERIOD: Duration = Duration::from_millis(500);
+const PROGRESS_PERIOD: Duration = Duration::from_millis(500);
+/// How long components and gateways may take to end in order.
+const STOP_PATIENCE: Duration = Duration::from_secs(3);
+/// Time for what is still under way when the components have stopped.
+const DRAIN: Duration = Duration::from_millis(200);
+
+/// What the command line asks of a run beyond the topology.
+#[derive(Debug, Clone, Default)]
+pub struct RunOptions {
+    /// Names of the hosts that run here; at least one.
+    pub hosts: Vec<String>,
+    /// Folder for shared-memory domains, if not the default.
+    pub domain_root: Option<PathBuf>,
+    /// The command line, for the manifest.
+    pub command_line: Vec<String>,
+}
+
+/// Why a run did not come about.
+#[derive(Debug, thiserror::Error)]
+pub enum RunError {
+    /// The run folder cannot be written.
+    #[error("run folder below {folder}: {source}")]
+    Folder {
+        /// Parent folder.
+        folder: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// Shared memory cannot be set up.
+    #[error(transparent)]
+    Domains(#[from] DomainsError),
+    /// The host's identity cannot be read.
+    #[error(transparent)]
+    Identity(#[from] DomainError),
+    /// The other hosts did not come.
+    #[error(transparent)]
+    Peer(#[from] PeerError),
+    /// A process cannot be started.
+    #[error("{0}")]
+    Start(String),
+}
+
+impl From<CrewError> for RunError {
+    fn from(error: CrewError) -> Self {
+        Self::Start(error.to_string())
+    }
+}
+
+/// How a run ended.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Outcome {
+    /// The planned time passed.
+    Completed,
+    /// A process ended by itself without a fault.
+    EndedEarly(String),
+    /// The user ended it.
+    Interrupted(String),
+    /// A process failed and its policy ended the run.
+    Failed(String),
+    /// Another host ended it.
+    EndedByPeer(String),
+    /// Another host vanished.
+    PeerLost(String),
+}
+
+impl Outcome {
+    /// In words.
+    pub fn text(&self) -> String {
+        match self {
+            Self::Completed => "completed as planned".to_owned(),
+            Self::EndedEarly(text) => format!("ended early: {text}"),
+            Self::Interrupted(by) => format!("interrupted by {by}"),
+            Self::Failed(text) => format!("failed: {text}"),
+            Self::EndedByPeer(text) => format!("ended by another host: {text}"),
+            Self::PeerLost(text) => format!("another host vanished: {text}"),
+        }
+    }
+
+    /// The other hosts need not worry about an end for this reason.
+    fn is_planned(&self) -> bool {
+        matches!(self, Self::Completed | Self::EndedEarly(_))
+    }
+}
+
+/// Everything a finished run knows, before any figure is computed.
+#[derive(Debug)]
+pub struct RunResult {
+    /// Where its files are.
+    pub folder: RunFolder,
+    /// How it ended.
+    pub outcome: Outcome,
+    /// Start and end on this host's monotonic clock.
+    pub span: (Instant, Instant),
+    /// When it started, as people write it.
+    pub started: String,
+    /// What happened, on all hosts.
+    pub events: Vec<Event>,
+    /// How the processes of all hosts fared.
+    pub processes: Vec<ProcessStory>,
+    /// True when all hosts read one clock.
+    pub has_one_clock: bool,
+    /// Hosts whose records are here.
+    pub hosts: Vec<String>,
+    /// Hosts that ran here.
+    pub own_hosts: Vec<String>,
+    /// What spoils the completeness of the report.
+    pub problems: Vec<String>,
+    /// Facts of this host.
+    pub facts: HostFacts,
+}
+
+/// Runs `topology` here.
+///
+/// # Errors
+/// When the run did not come about. Once it has begun, every end is an [`Outcome`].
+pub fn run(
+    topology: &Topology,
+    options: &RunOptions,
+    signals: &Signals,
+    console: &mut Console,
+) -> Result<RunResult, RunError> {
+    let hosts: Vec<&Host> = topology
+        .hosts()
+        .iter()
+        .filter(|host| options.hosts.contains(&host.name))
+        .collect();
+    let folder = make_folder(topology, &hosts)?;
+    let facts = HostFacts::gather();
+    write_manifest(topology, options, &folder, &facts)?;
+    let plan = plan(topology, &hosts);
+    let domains = Domains::create(&plan.hosts, options.domain_root.as_ref(), &folder.name())?;
+    console.say(&format!("run folder {}", folder.root().display()));
+    let peers = gather_peers(topology, &hosts, (&domains, &folder), (signals, console))?;
+    let has_one_clock = {
+        let here = clock_id()?;
+        peers.iter().all(|peer| peer.hello.clock_id == here)
+    };
+    let crew = Crew::new(plan.processes, domains.addresses(), &folder)?;
+    let mut session = Session {
+        topology,
+        is_first_host: topology
+            .hosts()
+            .first()
+            .is_some_and(|host| is_here(host, &hosts)),
+        domains,
+        peers,
+        crew,
+        signals,
+        console,
+        cleaned: WallInstant::now(),
+        greeted: WallInstant::now(),
+        told: WallInstant::now(),
+    };
+    let begun = session.begin(topology.run().start_timeout)?;
+    let start = MonotonicClock::now();
+    let started = utc_text(SystemTime::now());
+    let outcome = match begun {
+        Some(outcome) => outcome,
+        None => session.watch(start, topology.run().duration)?,
+    };
+    let end = MonotonicClock::now();
+    session.stop(&outcome);
+    Ok(session.conclude(
+        folder,
+        outcome,
+        (start, end),
+        (started, has_one_clock, facts),
+    ))
+}
+
+fn is_here(host: &Host, hosts: &[&Host]) -> bool {
+    hosts.iter().any(|here| here.name == host.name)
+}
+
+fn make_folder(topology: &Topology, hosts: &[&Host]) -> Result<RunFolder, RunError> {
+    let parent = PathBuf::from(&topology.run().record_folder);
+    let suffix = (hosts.len() < topology.hosts().len()).then(|| hosts[0].name.as_str());
+    RunFolder::create(&parent, topology.name(), suffix).map_err(|source| RunError::Folder {
+        folder: parent,
+        source,
+    })
+}
+
+fn write_manifest(
+    topology: &Topology,
+    options: &RunOptions,
+    folder: &RunFolder,
+    facts: &HostFacts,
+) -> Result<(), RunError> {
+    let manifest = json!({
+        "schema_version": 1,
+        "program": { "name": env!("CARGO_PKG_NAME"), "version": env!("CARGO_PKG_VERSION") },
+        "command_line": options.command_line,
+        "created": utc_text(SystemTime::now()),
+        "hosts_here": options.hosts,
+        "topology_hash": format!("{:016x}", topology.hash()),
+        "topology": topology.resolved(),
+        "seed": topology.run().seed,
+        "host_facts": facts,
+    });
+    let text = serde_json::to_string_pretty(&manifest).unwrap_or_default();
+    fs::write(folder.manifest(), text).map_err(|source| RunError::Folder {
+        folder: folder.root().to_owned(),
+        source,
+    })
+}
+
+fn gather_peers(
+    topology: &Topology,
+    hosts: &[&Host],
+    (domains, folder): (&Domains, &RunFolder),
+    (signals, console): (&Signals, &mut Console),
+) -> Result<Vec<Peer>, RunError> {
+    let first = &topology.hosts()[0];
+    let Some(address) = first.control_address() else {
+        return Ok(Vec::new());
+    };
+    if hosts.len() == topology.hosts().len() {
+        return Ok(Vec::new());
+    }
+    let is_first = is_here(first, hosts);
+    let others = topology.hosts().iter().filter(|host| !is_here(host, hosts));
+    let expected = others
+        .filter(|host| is_first || host.name == first.name)
+        .map(|host| (host.name.clone(), host.gateway_address()))
+        .collect();
+    let meeting = Meeting {
+        address,
+        is_here: is_first,
+        expected,
+        timeout: topology.run().start_timeout,
+    };
+    let hello = PeerHello {
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+        topology_hash: topology.hash(),
+        host: hosts[0].name.clone(),
+        clock_id: clock_id()?,
+        domain: domains.fingerprint()?,
+        run_id: folder.name(),
+    };
+    let peers = meet(&meeting, &hello, &mut |missing, waited| {
+        let waited_s = waited.as_secs();
+        let role = if is_first { "at" } else { "to answer at" };
+        console.progress(&format!(
+            "waiting for {missing} {role} {address} ({waited_s} s)"
+        ));
+        signals.received().is_none()
+    })?;
+    let names: Vec<&str> = peers.iter().map(|peer| peer.hello.host.as_str()).collect();
+    console.say(&format!("connected with {}", names.join(", ")));
+    Ok(peers)
+}
+
+struct Session<'a> {
+    topology: &'a Topology,
+    is_first_host: bool,
+    domains: Domains,
+    peers: Vec<Peer>,
+    crew: Crew,
+    signals: &'a Signals,
+    console: &'a mut Console,
+    cleaned: WallInstant,
+    greeted: WallInstant,
+    told: WallInstant,
+}
+
+impl Session<'_> {
+    /// Starts the processes and waits until those of all hosts are ready, then begins
+    /// everywhere. `Some` when the run ended before it began.
+    fn begin(&mut self, timeout: Duration) -> Result<Option<Outcome>, RunError> {
+        self.crew.start()?;
+        let deadline = WallInstant::now() + timeout;
+        let mut ready_peers = 0;
+        let mut has_told = false;
+        loop {
+            if let Some(outcome) = self.look_after()? {
+                return Ok(Some(outcome));
+            }
+            let is_ready = self.crew.is_ready();
+            if is_ready && !has_told && !self.is_first_host {
+                self.say_to_all(&PeerMessage::Ready);
+                has_told = true;
+            }
+            let mut may_begin = self.peers.is_empty();
+            for event in self.hear() {
+                match event {
+                    Heard::Said(PeerMessage::Ready) => ready_peers += 1,
+                    Heard::Said(PeerMessage::Start) => may_begin = true,
+                    other => {
+                        if let Some(outcome) = other.outcome() {
+                            return Ok(Some(outcome));
+                        }
+                    }
+                }
+            }
+            if self.is_first_host && ready_peers == self.peers.len() {
+                may_begin = true;
+            }
+            if is_ready && may_begin {
+                self.say_to_all(&PeerMessage::Start);
+                self.crew.begin();
+                return Ok(None);
+            }
+            if WallInstant::now() > deadline {
+                let missing = self.crew.missing();
+                let text = if missing.is_empty() {
+                    "the other host".to_owned()
+                } else {
+                    missing
+                };
+                return Ok(Some(Outcome::Failed(format!(
+                    "{text} was not ready within {} s",
+                    timeout.as_secs()
+                ))));
+            }
+            thread::sleep(WATCH_PERIOD);
+        }
+    }
+
+    /// Watches until the time is up or something ends the run.
+    fn watch(&mut self, start: Instant, duration: Duration) -> Result<Outcome, RunError> {
+        loop {
+            if let Some(outcome) = self.look_after()? {
+                return Ok(outcome);
+            }
+            if let Some(outcome) = self.hear().into_iter().find_map(Heard::outcome) {
+                return Ok(outcome);
+            }
+            let elapsed = MonotonicClock::now().saturating_duration_since(start);
+            // The others end when the first host says so; on their own only if it does not.
+            let grace = if self.is_first_host {
+                Duration::ZERO
+            } else {
+                SILENCE_MAX
+            };
+            if elapsed >= duration + grace {
+                return Ok(Outcome::Completed);
+            }
+            self.show_progress(elapsed, duration);
+            thread::sleep(WATCH_PERIOD);
+        }
+    }
+
+    /// What must be done all the time, and the first reason to end.
+    fn look_after(&mut self) -> Result<Option<Outcome>, RunError> {
+        if self.cleaned.elapsed() >= CLEANUP_PERIOD {
+            self.domains.free_what_the_dead_held();
+            self.cleaned = WallInstant::now();
+        }
+        if self.greeted.elapsed() >= ALIVE_PERIOD {
+            self.say_to_all(&PeerMessage::Alive);
+            self.greeted = WallInstant::now();
+        }
+        if let Some(signal) = self.signals.received() {
+            return Ok(Some(Outcome::Interrupted(signal.to_owned())));
+        }
+        let known = self.crew.events().len();
+        let verdict = self.crew.watch()?;
+        for event in &self.crew.events()[known..] {
+            self.console
+                .warn(&format!("{}: {}", event.process, event.what));
+        }
+        Ok(match verdict {
+            Verdict::GoesOn => None,
+            Verdict::Finished(text) => Some(Outcome::EndedEarly(text)),
+            Verdict::Failed(text) => Some(Outcome::Failed(text)),
+        })
+    }
+
+    fn say_to_all(&mut self, message: &PeerMessage) {
+        for peer in &mut self.peers {
+            peer.say(message);
+        }
+    }
+
+    fn hear(&mut self) -> Vec<Heard> {
+        let mut heard = Vec::new();
+        for peer in &mut self.peers {
+            let host = peer.hello.host.clone();
+            while !peer.is_quiet
+                && let Some(event) = peer.receive(Duration::ZERO)
+            {
+                match event {
+                    PeerEvent::Frame(Frame::Message(PeerMessage::Quiet)) => peer.is_quiet = true,
+                    PeerEvent::Frame(Frame::Message(message)) => {
+                        heard.push(Heard::Said(message).named(&host));
+                    }
+                    PeerEvent::Frame(Frame::Chunk(_)) => {}
+                    PeerEvent::Closed(reason) => {
+                        heard.push(Heard::Lost(format!("{host}: {reason}")));
+                        break;
+                    }
+                }
+            }
+            if !peer.is_quiet && peer.silence() > SILENCE_MAX {
+                let silence_s = SILENCE_MAX.as_secs();
+                heard.push(Heard::Lost(format!(
+                    "{host} has been silent for {silence_s} s"
+                )));
+            }
+        }
+        heard
+    }
+
+    fn show_progress(&mut self, elapsed: Duration, duration: Duration) {
+        if self.told.elapsed() < PROGRESS_PERIOD {
+            return;
+        }
+        self.told = WallInstant::now();
+        let mut counts: BTreeMap<(&str, &str), u64> = BTreeMap::new();
+        for progress in self
+            .crew
+            .members()
+            .iter()
+            .flat_map(|member| &member.progress)
+        {
+            counts.insert((&progress.channel, &progress.what), progress.count);
+        }
+        let channels = self.topology.channels().iter().map(|channel| {
+            let told = ["published", "sent", "received", "taken"]
+                .iter()
+                .filter_map(|what| {
+                    counts
+                        .get(&(channel.name.as_str(), *what))
+                        .map(|count| format!("{what} {count}"))
+                });
+            format!("{}: {}", channel.name, told.collect::<Vec<_>>().join(", "))
+        });
+        let channels = channels.collect::<Vec<_>>().join(" | ");
+        let (elapsed_s, total_s) = (elapsed.as_secs_f64(), duration.as_secs_f64());
+        self.console
+            .progress(&format!("{elapsed_s:6.1} / {total_s:.0} s  {channels}"));
+    }
+
+    /// Ends components everywhere first, then gateways, so that what is under way arrives.
+    fn stop(&mut self, outcome: &Outcome) {
+        let reason = outcome.text();
+        self.say_to_all(&PeerMessage::Stop {
+            reason,
+            is_planned: outcome.is_planned(),
+        });
+        self.crew.stop(STOP_PATIENCE, |plan| !plan.is_gateway());
+        self.say_to_all(&PeerMessage::Quiet);
+        if !matches!(outcome, Outcome::PeerLost(_)) {
+            self.wait_for_quiet();
+        }
+        thread::sleep(DRAIN);
+        self.crew
+            .stop(STOP_PATIENCE, super::plan::ProcessPlan::is_gateway);
+    }
+
+    fn wait_for_quiet(&mut self) {
+        let deadline = WallInstant::now() + STOP_PATIENCE + DRAIN;
+        while self.peers.iter().any(|peer| !peer.is_quiet) && WallInstant::now() < deadline {
+            if self
+                .hear()
+                .iter()
+                .any(|heard| matches!(heard, Heard::Lost(_)))
+            {
+                return;
+            }
+            thread::sleep(WATCH_PERIOD);
+        }
+    }
+
+    /// Exchanges records with the other hosts and takes everything down.
+    fn conclude(
+        mut self,
+        folder: RunFolder,
+        outcome: Outcome,
+        span: (Instant, Instant),
+        (started, has_one_clock, facts): (String, bool, HostFacts),
+    ) -> RunResult {
+        let mut problems = Vec::new();
+        let story = HostStory {
+            events: self.crew.events().to_vec(),
+            processes: self.stories(),
+        };
+        let own_hosts: Vec<String> = self.domains.addresses().into_keys().collect();
+        let mut hosts = own_hosts.clone();
+        let mut stories = vec![story.clone()];
+        if !self.peers.is_empty() {
+            self.console
+                .progress("exchanging records with the other host");
+            let first = self.is_first_host;
+            let received = exchange(&mut self.peers, first, &folder.records(), &story);
+            problems.extend(received.problems);
+            hosts.extend(
+                received
+                    .stories
+                    .iter()
+                    .flat_map(|story| story.processes.iter().map(|process| process.host.clone())),
+            );
+            stories.extend(received.stories);
+        }
+        drop(self.crew);
+        let left = self.domains.remove();
+        problems.extend(
+            left.into_iter()
+                .map(|what| format!("left in shared memory: {what}")),
+        );
+        hosts.sort();
+        hosts.dedup();
+        let mut events: Vec<Event> = stories.iter().flat_map(|one| one.events.clone()).collect();
+        events.sort_by_key(|event| event.at);
+        let processes = stories.into_iter().flat_map(|one| one.processes).collect();
+        RunResult {
+            folder,
+            outcome,
+            span,
+            started,
+            events,
+            processes,
+            has_one_clock,
+            hosts,
+            own_hosts,
+            problems,
+            facts,
+        }
+    }
+
+    fn stories(&self) -> Vec<ProcessStory> {
+        let members = self.crew.members().iter();
+        members
+            .map(|member| ProcessStory {
+                name: member.plan.name.clone(),
+                host: member.plan.host.clone(),
+                role: member.plan.role(),
+                end: member
+                    .end
+                    .clone()
+                    .unwrap_or_else(|| "never started".to_owned()),
+                restart_count: member.restart_count,
+                report: member.report.clone(),
+            })
+            .collect()
+    }
+}
+
+/// What came from a peer during the run.
+enum Heard {
+    Said(PeerMessage),
+    Stopped {
+        host: String,
+        reason: String,
+        is_planned: bool,
+    },
+    Lost(String),
+}
+
+impl Heard {
+    fn named(self, host: &str) -> Self {
+        match self {
+            Self::Said(PeerMessage::Stop { reason, is_planned }) => Self::Stopped {
+                host: host.to_owned(),
+                reason,
+                is_planned,
+            },
+            other => other,
+        }
+    }
+
+    fn outcome(self) -> Option<Outcome> {
+        match self {
+            Self::Said(_) => None,
+            Self::Stopped {
+                is_planned: true, ..
+            } => Some(Outcome::Completed),
+            Self::Stopped { host, reason, .. } => {
+                Some(Outcome::EndedByPeer(format!("{host} {reason}")))
+            }
+            Self::Lost(text) => Some(Outcome::PeerLost(text)),
+        }
+    }
+}
