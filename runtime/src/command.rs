@@ -15,7 +15,8 @@ use crate::analysis;
 use crate::cli::{Cli, Command, RunArgs};
 use crate::console::Console;
 use crate::doctor::{self, DoctorRequest, StampCapabilities};
-use crate::process::{component, gateway};
+use crate::gateway;
+use crate::process::component;
 use crate::registry::Registry;
 use crate::report::summary::RunSummary;
 use crate::report::terminal::{self, Style};
@@ -49,7 +50,7 @@ pub(crate) fn run(registry: &Registry) -> ExitCode {
 fn run_command(command: Command, registry: &Registry, console: &mut Console) -> u8 {
     match command {
         Command::Component { launch } => code_of(component::run(&launch, registry), console),
-        Command::Gateway { launch } => code_of(gateway::run(&launch), console),
+        Command::Gateway { launch } => code_of(gateway::process::run(&launch), console),
         Command::Simulate {
             topology,
             overrides,

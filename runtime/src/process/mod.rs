@@ -1,11 +1,7 @@
-//! The processes a run is made of: components and gateways, and how they talk with the
-//! supervisor that started them.
+//! The processes a supervisor starts: what it tells them, what they say, and the component
+//! process itself. The gateway process is in [`crate::gateway`].
 
 pub(crate) mod component;
-pub(crate) mod direction;
-pub(crate) mod egress;
-pub(crate) mod gateway;
-pub(crate) mod ingress;
 pub mod launch;
 pub mod pipe;
 pub(crate) mod recording;

@@ -2,104 +2,34 @@
 //! opens and arms the sockets, because kernel stamps are switched on by a worker that a spinning
 //! real-time thread would starve; then it only reports.
 
-use std::fs::File;
-use std::io::{self, Read};
-use std::os::fd::BorrowedFd;
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Sender, channel};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use hil_gateways::protocol::body::HelloStatus;
-use hil_gateways::protocol::{ChannelIdentity, SettingsError};
-use hil_gateways::transport::KernelStamps;
-use hil_gateways::transport::clock_pair::ClockPair;
 use hil_gateways::transport::probe::{
     Availability, ProbeReport, ProbeSettings, Sentinel, arm_and_probe,
 };
-use hil_gateways::transport::udp::UdpError;
-use hil_models::case_study::ParameterError;
 use hil_models::time::Instant;
-use nix::errno::Errno;
-use nix::poll::{PollFd, PollFlags, ppoll};
-use nix::sys::time::TimeSpec;
 
 use super::direction::{self, Opened};
-use super::launch::{DirectionLaunch, GatewayLaunch, LaunchError, Side, read};
-use super::pipe::{ChannelProgress, DirectionReport, FromProcess, Orders, ProcessReport, say};
-use super::usage::add_usage;
-use crate::channel::{ChannelError, Domain, DomainError, clock_id};
+use super::{GatewayError, Surroundings};
+use crate::channel::Domain;
 use crate::clock::MonotonicClock;
+use crate::process::launch::{DirectionLaunch, GatewayLaunch, Side, read};
+use crate::process::pipe::{
+    ChannelProgress, DirectionReport, FromProcess, Orders, ProcessReport, say,
+};
+use crate::process::usage::add_usage;
 use crate::realtime::{self, RealtimeGrant, SpinAdvice};
-use crate::record::{RecordFileError, Recorder};
+use crate::record::Recorder;
 use crate::wait::WaitMode;
 
-/// Reads of a clock pair of which the narrowest counts.
-pub(crate) const PAIR_ATTEMPTS: u32 = 5;
-/// How often the relation of real-time and monotonic clock is read anew: it changes by steps
-/// only, so this bounds how many messages a step can spoil.
-pub(crate) const PAIR_PERIOD: Duration = Duration::from_millis(100);
 const PROGRESS_PERIOD: Duration = Duration::from_millis(250);
 /// How long each half of the stamp probe may take; a restart must not wait long for it.
 const PROBE_BOUND: Duration = Duration::from_millis(300);
-/// Descriptors one thread waits for: its listener and its socket.
-const DESCRIPTORS_MAX: usize = 4;
-
-/// Why a gateway cannot go on.
-#[derive(Debug, thiserror::Error)]
-pub(crate) enum GatewayError {
-    #[error(transparent)]
-    Launch(#[from] LaunchError),
-    #[error(transparent)]
-    Domain(#[from] DomainError),
-    #[error(transparent)]
-    Channel(#[from] ChannelError),
-    #[error(transparent)]
-    Record(#[from] RecordFileError),
-    #[error(transparent)]
-    Udp(#[from] UdpError),
-    #[error(transparent)]
-    Settings(#[from] SettingsError),
-    #[error("emulated link: {0}")]
-    Emulation(#[from] ParameterError),
-    #[error("cannot read the clocks: {0}")]
-    Clock(io::Error),
-    #[error("the socket is broken: {0}")]
-    Socket(io::Error),
-    #[error("cannot wait: {0}")]
-    Wait(io::Error),
-    #[error("cannot start a thread: {0}")]
-    Thread(io::Error),
-    #[error("cannot choose a session number: {0}")]
-    Session(io::Error),
-    #[error("the gateway at the other end refused the channel: {0:?}")]
-    Refused(HelloStatus),
-    #[error("a gateway thread panicked")]
-    Panicked,
-}
-
-/// What a direction's thread needs from the process around it.
-pub(crate) struct Surroundings {
-    pub(crate) domain: Domain,
-    pub(crate) session: u32,
-    pub(crate) fingerprint: [u8; 16],
-    pub(crate) clock_id: u64,
-    pub(crate) stop: Arc<AtomicBool>,
-}
-
-impl Surroundings {
-    pub(crate) fn identity(launch: &DirectionLaunch) -> ChannelIdentity {
-        ChannelIdentity::new(
-            launch.channel_id,
-            &launch.channel,
-            &launch.message,
-            u32::try_from(launch.size_bytes).unwrap_or(u32::MAX),
-            u32::try_from(launch.alignment_bytes).unwrap_or(u32::MAX),
-        )
-    }
-}
 
 /// Runs the gateway described by the launch file until told to stop.
 ///
@@ -117,19 +47,13 @@ fn prepare_and_live(path: &Path) -> Result<(), GatewayError> {
     let orders = Orders::listen().map_err(GatewayError::Thread)?;
     let launch: GatewayLaunch = read(path)?;
     let domain = Domain::open(&launch.domain.parse()?)?;
-    let surroundings = Arc::new(Surroundings {
-        session: random_session().map_err(GatewayError::Session)?,
-        fingerprint: domain.fingerprint()?,
-        clock_id: clock_id()?,
-        stop: Arc::new(AtomicBool::new(false)),
-        domain,
-    });
+    let surroundings = Arc::new(Surroundings::new(domain)?);
     // Held until the end, so that the kernel never switches receive stamps off in between.
     let (_sentinel, stamp_facts) = arm_stamps(&launch);
     let mut recorder = Recorder::new(&launch.records, &launch.process, launch.instance);
     let mut opened = Vec::new();
     for direction in &launch.directions {
-        opened.push(direction::open(direction, &surroundings, &mut recorder)?);
+        opened.push(direction::open(direction, &mut recorder)?);
     }
     recorder.start().map_err(GatewayError::Thread)?;
     let counters: Vec<Counter> = opened
@@ -324,42 +248,4 @@ fn describe_probe(report: &ProbeReport) -> String {
         word(report.tx_software),
         word(report.tx_hardware)
     )
-}
-
-/// Sessions must differ between starts, and not be guessable from the last one.
-fn random_session() -> io::Result<u32> {
-    let mut bytes = [0; 4];
-    File::open("/dev/urandom")?.read_exact(&mut bytes)?;
-    Ok(u32::from_le_bytes(bytes).max(1))
-}
-
-/// The kernel's software stamp on the monotonic clock, if there is one.
-pub(crate) fn best_stamp(stamps: KernelStamps, clock: &ClockPair) -> Option<Instant> {
-    stamps
-        .software_ns
-        .map(|realtime_ns| clock.to_monotonic(realtime_ns))
-}
-
-/// Sleeps until a descriptor has something or `until`.
-pub(crate) fn poll_descriptors<'a>(
-    descriptors: impl Iterator<Item = BorrowedFd<'a>>,
-    until: Instant,
-) -> Result<(), GatewayError> {
-    let left = until.saturating_duration_since(MonotonicClock::now());
-    let mut polled: [Option<PollFd<'a>>; DESCRIPTORS_MAX] = [const { None }; DESCRIPTORS_MAX];
-    let mut count = 0;
-    for (place, descriptor) in polled.iter_mut().zip(descriptors) {
-        *place = Some(PollFd::new(descriptor, PollFlags::POLLIN));
-        count += 1;
-    }
-    let timeout = Some(TimeSpec::from_duration(left));
-    let outcome = match polled {
-        [Some(a), None, ..] if count == 1 => ppoll(&mut [a], timeout, None),
-        [Some(a), Some(b), None, ..] if count == 2 => ppoll(&mut [a, b], timeout, None),
-        _ => ppoll(&mut [], timeout, None),
-    };
-    match outcome {
-        Ok(_) | Err(Errno::EINTR) => Ok(()),
-        Err(errno) => Err(GatewayError::Wait(errno.into())),
-    }
 }

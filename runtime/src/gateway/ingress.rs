@@ -14,7 +14,7 @@ use hil_models::measure::record::{FollowUpRecord, IngressRecord, UNAVAILABLE};
 use hil_models::message::Envelope;
 use hil_models::time::Instant;
 
-use super::gateway::{GatewayError, PAIR_ATTEMPTS, PAIR_PERIOD, best_stamp, poll_descriptors};
+use super::{GatewayError, PAIR_ATTEMPTS, PAIR_PERIOD, best_stamp, poll_descriptors};
 use crate::channel::{ChannelError, RawOutput};
 use crate::clock::MonotonicClock;
 use crate::record::RecordSink;
@@ -24,6 +24,7 @@ use crate::wait::{Pause, WaitStrategy};
 const BURST_MAX: usize = 64;
 
 /// Everything the thread works with.
+#[derive(Debug)]
 pub(crate) struct Ingress {
     pub(crate) receiver: Box<dyn DatagramReceiver>,
     pub(crate) bridge: IngressBridge,
@@ -37,9 +38,11 @@ pub(crate) struct Ingress {
     pub(crate) foreign_count: u64,
     pub(crate) clock_steps: u64,
     pub(crate) clock: ClockPair,
+    pub(crate) buffer: Box<[u8]>,
 }
 
 /// Where the thread's records go.
+#[derive(Debug)]
 pub(crate) struct Notes {
     pub(crate) messages: RecordSink,
     pub(crate) follow_ups: RecordSink,
@@ -78,20 +81,8 @@ impl Ingress {
     /// # Errors
     /// When the channel or the socket itself breaks.
     pub(crate) fn run(&mut self) -> Result<(), GatewayError> {
-        let mut buffer = vec![0; usize::from(u16::MAX)];
         while !self.stop.load(Ordering::Acquire) {
-            let mut moved = false;
-            for _ in 0..BURST_MAX {
-                if !self.take(&mut buffer)? {
-                    break;
-                }
-                moved = true;
-            }
-            self.answer();
-            if !moved {
-                let now = MonotonicClock::now();
-                self.bridge.on_wakeup(now);
-                self.refresh_clock(now);
+            if !self.step()? {
                 self.rest()?;
             }
         }
@@ -99,12 +90,31 @@ impl Ingress {
         Ok(())
     }
 
+    /// Delivers what waits and answers what asks; false when nothing waited.
+    pub(crate) fn step(&mut self) -> Result<bool, GatewayError> {
+        let mut moved = false;
+        for _ in 0..BURST_MAX {
+            if !self.take()? {
+                break;
+            }
+            moved = true;
+        }
+        if moved {
+            self.answer();
+        } else {
+            let now = MonotonicClock::now();
+            self.bridge.on_wakeup(now);
+            self.refresh_clock(now);
+        }
+        Ok(moved)
+    }
+
     /// Takes one datagram; false when none waits.
-    fn take(&mut self, buffer: &mut [u8]) -> Result<bool, GatewayError> {
+    fn take(&mut self) -> Result<bool, GatewayError> {
         let now = MonotonicClock::now();
         let Some(received) = self
             .receiver
-            .receive(now, buffer)
+            .receive(now, &mut self.buffer)
             .map_err(GatewayError::Socket)?
         else {
             return Ok(false);
@@ -121,14 +131,15 @@ impl Ingress {
             offset_ns: self.clock.offset_ns,
         };
         let stamps = self.stamps(&arrival);
-        let bytes = &buffer[..received.length_bytes];
         let Self {
             bridge,
             output,
             notes,
             received: count,
+            buffer,
             ..
         } = self;
+        let bytes = &buffer[..received.length_bytes];
         let mut failed = None;
         let mut deliver = |delivery: Delivery<'_>| {
             count.fetch_add(1, Ordering::Relaxed);
@@ -176,12 +187,15 @@ impl Ingress {
         }
     }
 
-    fn rest(&mut self) -> Result<(), GatewayError> {
+    /// Waits for a datagram or an appointment.
+    pub(crate) fn rest(&mut self) -> Result<(), GatewayError> {
         let dues = [self.bridge.next_wakeup(), self.receiver.next_due()];
         let due = dues.into_iter().flatten().min();
         match self.wait.pause(MonotonicClock::now(), due) {
             Pause::Spin => core::hint::spin_loop(),
-            Pause::Sleep(until) => poll_descriptors(self.receiver.poll_fd().into_iter(), until)?,
+            Pause::Sleep(until) => {
+                poll_descriptors(self.receiver.poll_fd().into_iter(), until)?;
+            }
         }
         Ok(())
     }

@@ -20,12 +20,12 @@ use hil_models::link::bernoulli::BernoulliLink;
 use hil_models::measure::record::{EgressRecord, FollowUpRecord, IngressRecord};
 use hil_models::random::RandomStream;
 
-use super::egress::{Armed, Egress, Line};
-use super::gateway::{GatewayError, PAIR_ATTEMPTS, Surroundings};
+use super::egress::{Armed, Attention, Egress, Line};
 use super::ingress::{Ingress, Notes};
-use super::launch::{DirectionLaunch, Side};
-use super::pipe::DirectionReport;
+use super::{GatewayError, PAIR_ATTEMPTS, Surroundings};
 use crate::channel::{RawInput, RawOutput, Waiter};
+use crate::process::launch::{DirectionLaunch, Side};
+use crate::process::pipe::DirectionReport;
 use crate::record::{RecordKind, RecordSink, Recorder};
 use crate::wait::{WaitMode, WaitStrategy};
 
@@ -41,33 +41,39 @@ const IPV6_HEADERS: usize = 40 + 8;
 type Sinks = (RecordSink, RecordSink);
 
 /// A direction whose socket and files are open and whose port is not.
-pub(crate) struct Opened {
+#[derive(Debug)]
+pub struct Opened {
     socket: Socket,
     sinks: Sinks,
     count: Arc<AtomicU64>,
     facts: Vec<(String, String)>,
 }
 
+#[derive(Debug)]
 enum Socket {
     Sender(Box<UdpSender>),
     Receiver(Box<dyn DatagramReceiver>),
 }
 
 /// A direction at work.
-pub(crate) struct Direction {
+#[derive(Debug)]
+pub struct Direction {
     way: Way,
     facts: Vec<(String, String)>,
 }
 
+#[derive(Debug)]
 enum Way {
     Egress(Box<Egress>),
     Ingress(Box<Ingress>),
 }
 
 /// Opens the socket and the record files of `launch`; call it from a thread of normal priority.
-pub(crate) fn open<'a>(
+///
+/// # Errors
+/// When the kernel refuses a socket option or a file cannot be made.
+pub fn open<'a>(
     launch: &'a DirectionLaunch,
-    _surroundings: &Surroundings,
     recorder: &mut Recorder,
 ) -> Result<(&'a DirectionLaunch, Opened), GatewayError> {
     let settings = socket_settings(launch);
@@ -193,12 +199,15 @@ fn datagram_bytes_max(launch: &DirectionLaunch) -> usize {
 
 impl Opened {
     /// Messages carried so far.
-    pub(crate) fn count(&self) -> Arc<AtomicU64> {
+    pub fn count(&self) -> Arc<AtomicU64> {
         Arc::clone(&self.count)
     }
 
     /// Joins the local channel; call it in the thread that will carry the messages.
-    pub(crate) fn connect(
+    ///
+    /// # Errors
+    /// When the channel does not appear or is of another type.
+    pub fn connect(
         self,
         launch: &DirectionLaunch,
         surroundings: &Surroundings,
@@ -262,6 +271,7 @@ fn egress(
         wait: WaitStrategy::new(launch.wait),
         sent: count,
         stop: Arc::clone(&around.stop),
+        attention: Attention::default(),
     })
 }
 
@@ -294,20 +304,46 @@ fn ingress(
         foreign_count: 0,
         clock_steps: 0,
         clock: ClockPair::read(PAIR_ATTEMPTS).map_err(GatewayError::Clock)?,
+        buffer: vec![0; usize::from(u16::MAX)].into_boxed_slice(),
     })
 }
 
 impl Direction {
     /// Carries messages until told to stop.
-    pub(crate) fn run(&mut self) -> Result<(), GatewayError> {
+    ///
+    /// # Errors
+    /// When the channel or the socket itself breaks, or the peer refuses the channel for good.
+    pub fn run(&mut self) -> Result<(), GatewayError> {
         match &mut self.way {
             Way::Egress(egress) => egress.run(),
             Way::Ingress(ingress) => ingress.run(),
         }
     }
 
+    /// Does what there is to do now, without waiting; false when there was nothing.
+    ///
+    /// # Errors
+    /// As [`Direction::run`].
+    pub fn step(&mut self) -> Result<bool, GatewayError> {
+        match &mut self.way {
+            Way::Egress(egress) => egress.step(),
+            Way::Ingress(ingress) => ingress.step(),
+        }
+    }
+
+    /// Waits for the next thing to do, as its waiting strategy says.
+    ///
+    /// # Errors
+    /// When waiting itself fails.
+    pub fn rest(&mut self) -> Result<(), GatewayError> {
+        match &mut self.way {
+            Way::Egress(egress) => egress.rest(),
+            Way::Ingress(ingress) => ingress.rest(),
+        }
+    }
+
     /// Every counter of the direction.
-    pub(crate) fn report(&self, launch: &DirectionLaunch) -> DirectionReport {
+    pub fn report(&self, launch: &DirectionLaunch) -> DirectionReport {
         let (direction, peer_state, counters) = match &self.way {
             Way::Egress(egress) => ("egress", egress_state(egress), egress_counters(egress)),
             Way::Ingress(ingress) => ("ingress", ingress_state(ingress), ingress_counters(ingress)),

@@ -17,7 +17,7 @@ use hil_models::measure::record::{EgressRecord, UNAVAILABLE};
 use hil_models::message::Envelope;
 use hil_models::time::Instant;
 
-use super::gateway::{GatewayError, PAIR_ATTEMPTS, PAIR_PERIOD, best_stamp, poll_descriptors};
+use super::{GatewayError, PAIR_ATTEMPTS, PAIR_PERIOD, best_stamp, poll_descriptors};
 use crate::channel::{RawInput, Waiter};
 use crate::clock::MonotonicClock;
 use crate::record::RecordSink;
@@ -29,7 +29,11 @@ const PENDING: usize = 256;
 /// and a record must not wait for ever.
 const STAMP_PATIENCE_NS: i64 = 20_000_000;
 
+/// Longer than any reply; what is longer is no reply and is cut.
+const REPLY_BYTES_MAX: usize = 1024;
+
 /// Everything the thread works with.
+#[derive(Debug)]
 pub(crate) struct Egress {
     pub(crate) input: RawInput,
     pub(crate) waiter: Option<Waiter>,
@@ -38,9 +42,22 @@ pub(crate) struct Egress {
     pub(crate) wait: WaitStrategy,
     pub(crate) sent: Arc<AtomicU64>,
     pub(crate) stop: Arc<AtomicBool>,
+    pub(crate) attention: Attention,
 }
 
+/// When to look after the socket: asking it costs system calls that a waiting message would have
+/// to wait for.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Attention {
+    has_news: bool,
+    looked: Instant,
+}
+
+/// A spinning thread looks after its socket this often.
+const LOOK_PERIOD_NS: i64 = 500_000;
+
 /// The socket, the stamps still to come from it, and the records they complete.
+#[derive(Debug)]
 pub(crate) struct Line {
     sender: Box<dyn DatagramSender>,
     pending: Box<[Option<Pending>]>,
@@ -52,6 +69,7 @@ pub(crate) struct Line {
     wants_hardware: bool,
     has_stamps: bool,
     message: Option<EgressRecord>,
+    report_count: u64,
     pub(crate) clock_steps: u64,
 }
 
@@ -89,6 +107,7 @@ impl Line {
             wants_hardware: armed.hardware,
             has_stamps: armed.software,
             message: None,
+            report_count: 0,
             clock_steps: 0,
         })
     }
@@ -203,6 +222,20 @@ impl Line {
         }
     }
 
+    /// A host without a listener answers with a report instead of a reply; reading stamps swallows
+    /// it before any send call could fail with it.
+    fn notice_reports(&mut self, bridge: &mut EgressBridge, now: Instant) {
+        let counters = self.sender.counters();
+        if counters.network_report_count == self.report_count {
+            return;
+        }
+        self.report_count = counters.network_report_count;
+        let newest = counters.newest_report.map(failure);
+        if newest == Some(TransmitFailure::PeerUnreachable) {
+            bridge.on_peer_unreachable(now);
+        }
+    }
+
     fn retire(&mut self, pending: Pending) {
         self.pending_count -= 1;
         if let Some(record) = pending.record {
@@ -260,15 +293,8 @@ impl Egress {
     /// # Errors
     /// When the channel or the socket itself breaks, or the peer refuses the channel for good.
     pub(crate) fn run(&mut self) -> Result<(), GatewayError> {
-        let mut buffer = [0; 2048];
         while !self.stop.load(Ordering::Acquire) {
-            let moved = self.forward()?;
-            if !moved {
-                self.line.transmit(&mut self.bridge);
-                self.hear(&mut buffer)?;
-                let now = MonotonicClock::now();
-                self.line.expire(now);
-                self.line.refresh_clock(now);
+            if !self.step()? {
                 self.rest()?;
             }
         }
@@ -276,6 +302,29 @@ impl Egress {
         self.line.transmit(&mut self.bridge);
         self.line.expire(Instant::from_ns(i64::MAX));
         Ok(())
+    }
+
+    /// Sends what waits, or else looks after stamps, replies and appointments.
+    pub(crate) fn step(&mut self) -> Result<bool, GatewayError> {
+        if self.forward()? {
+            return Ok(true);
+        }
+        let now = MonotonicClock::now();
+        if self.attention.has_news || now.ns_since(self.attention.looked) > LOOK_PERIOD_NS {
+            self.attention = Attention {
+                has_news: false,
+                looked: now,
+            };
+            self.line.take_stamps(&mut self.bridge);
+            self.line.notice_reports(&mut self.bridge, now);
+            self.hear()?;
+            self.line.expire(now);
+            self.line.refresh_clock(now);
+        }
+        if self.bridge.next_wakeup().is_some_and(|due| due <= now) {
+            self.line.transmit(&mut self.bridge);
+        }
+        Ok(false)
     }
 
     /// Sends every waiting message; false when none waited.
@@ -328,11 +377,12 @@ impl Egress {
     }
 
     /// Takes the peer's replies.
-    fn hear(&mut self, buffer: &mut [u8]) -> Result<(), GatewayError> {
+    fn hear(&mut self) -> Result<(), GatewayError> {
+        let mut buffer = [0; REPLY_BYTES_MAX];
         while let Some(received) = self
             .line
             .sender
-            .receive(buffer)
+            .receive(&mut buffer)
             .map_err(GatewayError::Socket)?
         {
             let now = MonotonicClock::now();
@@ -348,7 +398,6 @@ impl Egress {
                 Ok(EgressEvent::Accepted { .. } | EgressEvent::GreetAgain) | Err(_) => {}
             }
         }
-        self.line.transmit(&mut self.bridge);
         Ok(())
     }
 
@@ -370,7 +419,8 @@ impl Egress {
             .push(&[round_trip.rtt_ns(), round_trip.t4_ns]);
     }
 
-    fn rest(&mut self) -> Result<(), GatewayError> {
+    /// Waits for a message, a stamp, a reply or an appointment.
+    pub(crate) fn rest(&mut self) -> Result<(), GatewayError> {
         let now = MonotonicClock::now();
         let mut due = self.bridge.next_wakeup();
         if self.line.pending_count > 0 {
@@ -383,8 +433,10 @@ impl Egress {
             Pause::Sleep(until) => {
                 let listeners = self.waiter.iter().flat_map(Waiter::descriptors);
                 let socket = self.line.sender.poll_fd();
-                poll_descriptors(listeners.chain(socket), until)?;
-                if let Some(waiter) = &mut self.waiter {
+                let [is_announced, has_socket_news] =
+                    poll_descriptors(listeners.chain(socket), until)?;
+                self.attention.has_news |= has_socket_news;
+                if is_announced && let Some(waiter) = &mut self.waiter {
                     waiter.drain()?;
                 }
             }
