@@ -152,6 +152,11 @@ impl Domain {
         Ok(domain)
     }
 
+    /// True when `root_path` is, or was, the root of a domain.
+    pub fn is_at(root_path: &Path) -> bool {
+        root_path.join(MARKER).is_file()
+    }
+
     /// Joins the domain a launcher created.
     ///
     /// # Errors

@@ -12,6 +12,7 @@ use std::time::Duration;
 use hil_gateways::transport::probe::{
     Availability, ProbeReport, ProbeSettings, Sentinel, arm_and_probe,
 };
+use hil_gateways::transport::timestamping::{HardwareStamping, TimestampMode};
 use hil_models::time::Instant;
 
 use super::direction::{self, Opened};
@@ -229,9 +230,29 @@ fn arm_stamps(launch: &GatewayLaunch) -> (Option<Sentinel>, Vec<(String, String)
         proof_count: 5,
         bound: PROBE_BOUND,
     };
+    let card = (settings.timestamps == TimestampMode::Hardware)
+        .then(|| switch_card_on(direction.socket.interface.as_deref()));
     match arm_and_probe(&settings) {
-        Ok((report, sentinel)) => (Some(sentinel), fact(describe_probe(&report))),
+        Ok((report, sentinel)) => {
+            let mut facts = fact(describe_probe(&report));
+            facts.extend(card.map(|text| ("network card stamps".to_owned(), text)));
+            (Some(sentinel), facts)
+        }
         Err(error) => (None, fact(format!("unavailable: {error}"))),
+    }
+}
+
+/// A card stamps nothing until it is told to; says what it settled for.
+fn switch_card_on(interface: Option<&str>) -> String {
+    let Some(interface) = interface else {
+        return "unavailable: the host names no interface in the topology".to_owned();
+    };
+    match HardwareStamping::request(interface) {
+        Ok(settled) => format!(
+            "switched on for {interface}: transmit {}, receive filter {}",
+            settled.is_transmit_on, settled.receive_filter
+        ),
+        Err(error) => format!("unavailable: {interface} cannot be switched on: {error}"),
     }
 }
 
