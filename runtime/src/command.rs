@@ -146,6 +146,7 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
     match supervisor::run(&topology, &options, &signals, console) {
         Ok(result) => {
             let code = exit_code(&result.outcome);
+            console.progress("drawing up the account");
             let origin = (path.as_path(), options.command_line.as_slice());
             match analysis::conclude(&topology, &result, registry, origin) {
                 Ok(summary) => {

@@ -59,7 +59,10 @@ pub(crate) fn conclude(
     registry: &Registry,
     (topology_file, command_line): (&Path, &[String]),
 ) -> Result<RunSummary, AnalysisError> {
-    let records = RunRecords::read(&result.folder.records())?;
+    let mut records = RunRecords::read(&result.folder.records())?;
+    if !result.has_one_clock {
+        records.set_clocks_differ();
+    }
     let mut summary = RunSummary::new(run_facts(topology, result, topology_file, command_line));
     summary.host_facts = result
         .facts
@@ -87,8 +90,8 @@ pub(crate) fn conclude(
         .extend(result.problems.iter().chain(&records.problems).cloned());
     if !result.has_one_clock {
         summary.warnings.push(
-            "clocks not aligned: no figure crosses from one host to the other; lag and error of \
-             the score mix two clocks, so take them as unavailable"
+            "clocks not aligned: no figure crosses from one host to the other; segments on one \
+             host and round trips are given"
                 .to_owned(),
         );
     }

@@ -87,6 +87,11 @@ impl RunRecords {
         }
     }
 
+    /// See [`RunLog::set_clocks_differ`].
+    pub(super) fn set_clocks_differ(&mut self) {
+        self.log.set_clocks_differ();
+    }
+
     /// True when anything was recorded of `channel`.
     pub(super) fn has(&self, channel: &str) -> bool {
         self.channels.contains_key(channel)
