@@ -23,8 +23,9 @@ use hil_models::message::{Message, MessageType};
 use hil_models::time::Instant as HostInstant;
 use hil_runtime::channel::{
     ChannelHolder, ChannelSettings, Domain, DomainAddress, OutputSettings, ShmInput, ShmOutput,
-    TypedInput, TypedOutput, Waiter, monotonic_now,
+    TypedInput, TypedOutput, Waiter,
 };
+use hil_runtime::clock::MonotonicClock;
 use iceoryx2::node::{Node, NodeBuilder};
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
@@ -197,7 +198,7 @@ impl Side for Stamped {
     fn send(&mut self, count: u64) {
         let loan = self.publisher.loan_uninit().unwrap();
         let mut sample = loan.write_payload(line(count));
-        *sample.user_header_mut() = line(monotonic_now().as_ns().unsigned_abs());
+        *sample.user_header_mut() = line(MonotonicClock::now().as_ns().unsigned_abs());
         sample.send().unwrap();
     }
 

@@ -36,7 +36,7 @@ mod tests;
 pub use domain::{Cleanup, Domain, DomainAddress, ROOT_PATH_LENGTH_MAX, Removal};
 pub use error::{ChannelError, DomainError};
 pub use holder::{ChannelHolder, ChannelSettings};
-pub use identity::{clock_id, monotonic_now};
+pub use identity::clock_id;
 pub use raw::{ENVELOPE_TYPE_NAME, RawInput, RawOutput};
 pub use sequence::{InputCounters, OutputSettings, Stamp};
 pub use shm::{ShmInput, ShmOutput, TypedInput, TypedOutput};
