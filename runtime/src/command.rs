@@ -219,7 +219,12 @@ fn simulate(
     let Some(topology) = load(path, overrides, registry, console) else {
         return exit::USAGE;
     };
-    match simulate::simulate(&topology, registry, json) {
+    let form = if json {
+        simulate::Form::Json
+    } else {
+        simulate::Form::Page(columns())
+    };
+    match simulate::simulate(&topology, registry, form) {
         Ok(text) => {
             console.result(&text);
             exit::RAN

@@ -10,7 +10,18 @@ use hil_models::random::RandomStream;
 use hil_models::simulation::{Carrier, Simulation, SimulationResult};
 
 use crate::registry::Registry;
+use crate::report::summary::ScoreMetric;
+use crate::report::terminal::{self, Style};
 use crate::topology::Topology;
+
+/// What the outcome is rendered as.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Form {
+    /// One JSON object.
+    Json,
+    /// A page of so many columns.
+    Page(usize),
+}
 
 /// Runs the topology's case in virtual time and renders counts and score.
 ///
@@ -19,7 +30,7 @@ use crate::topology::Topology;
 pub(crate) fn simulate(
     topology: &Topology,
     registry: &Registry,
-    json: bool,
+    form: Form,
 ) -> Result<String, String> {
     let case = topology
         .case()
@@ -55,19 +66,19 @@ pub(crate) fn simulate(
         .and_then(|simulation| simulation.run(topology.run().duration))
         .map_err(|error| error.to_string())?;
     let score = made.score(&result.log);
-    Ok(render_simulation(topology, &result, &score, json))
+    Ok(match form {
+        Form::Json => render_json(topology, &result, &score),
+        Form::Page(columns) => render_page(topology, &result, &score, columns),
+    })
 }
 
 /// Counts and score of a run in virtual time.
-fn render_simulation(
+fn render_page(
     topology: &Topology,
     result: &SimulationResult,
     score: &Score,
-    json: bool,
+    columns: usize,
 ) -> String {
-    if json {
-        return render_json(topology, result, score);
-    }
     let mut text = format!(
         "{} in virtual time: {} s, seed {}\n\n",
         topology.name(),
@@ -84,17 +95,11 @@ fn render_simulation(
             counts.published_count, counts.taken_count, counts.in_flight_count
         );
     }
-    text.push('\n');
-    for metric in &score.metrics {
-        let value = metric
-            .value
-            .map_or_else(|| "unavailable".to_owned(), |v| format!("{v:.6}"));
-        let _infallible = writeln!(
-            text,
-            "  {:<34} {value:>14} {:<4} {}",
-            metric.label, metric.unit, metric.method
-        );
-    }
+    text.push_str(&terminal::render_score(
+        &ScoreMetric::all_of(score),
+        columns,
+        Style::Coloured,
+    ));
     text
 }
 

@@ -11,7 +11,7 @@ pub(crate) use units::{JOINT, grouped, percent};
 use canvas::{Canvas, INDENT, Tone};
 
 use super::assessment::{Assessment, NetworkVerdict, SKIPPED_TICK_RATIO_MAX};
-use super::summary::{Outcome, RunSummary};
+use super::summary::{Outcome, RunSummary, ScoreMetric};
 
 /// The report of a run as text of at most `width_columns` columns (clamped to 80..=120).
 pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> String {
@@ -30,6 +30,13 @@ pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> Strin
     method(&mut canvas, summary);
     files(&mut canvas, summary);
     canvas.rule(Tone::Faint);
+    canvas.finish()
+}
+
+/// The figures of a score alone, as [`render`] shows them.
+pub fn render_score(score: &[ScoreMetric], width_columns: usize, style: Style) -> String {
+    let mut canvas = Canvas::new(width_columns, style);
+    tables::score(&mut canvas, score);
     canvas.finish()
 }
 
