@@ -4,6 +4,7 @@ use core::time::Duration;
 use std::collections::BTreeMap;
 
 use bytemuck::Zeroable;
+use nalgebra::Vector3;
 
 use super::*;
 use crate::link::bernoulli::BernoulliLink;
@@ -57,15 +58,15 @@ fn track(frame_count: u64, rate_hz: f64) -> Tracked {
     let mut tracked = Tracked::default();
     for frame in 0..frame_count {
         hand = player.at(frame as f64 * frame_s).right_hand;
-        let answer = follower.follow(&hand, frame_s, false);
+        let answer = follower.follow(Some(&hand), frame_s, false);
         tracked.frame_count += 1;
         tracked.failure_count += u64::from(answer.reach != Reach::Reached);
         // Every tenth frame is checked by the full pose: that doubles the work.
         if frame % 10 == 0 {
             let tool = arm.tool(&answer.command.position_rad);
-            let (target, _) = clutch.follow(&hand);
-            let apart = spatial::subtract(tool.position_m, target.position_m);
-            tracked.error_m_max = tracked.error_m_max.max(spatial::length(apart));
+            let (target, _) = clutch.follow(Some(&hand));
+            let apart_m = (tool.translation.vector - target.translation.vector).norm();
+            tracked.error_m_max = tracked.error_m_max.max(apart_m);
         }
         if frame % 4033 == 0 {
             tracked.at_same_phase.push(answer.command.position_rad);
@@ -218,9 +219,9 @@ fn first_frame() -> HumanFrame {
     HumanFrame {
         frame_index: 0,
         source_time_ns: 0,
-        root: pose.root,
-        right_hand: pose.right_hand,
-        left_hand: pose.left_hand,
+        root: pose.root.into(),
+        right_hand: pose.right_hand.into(),
+        left_hand: pose.left_hand.into(),
     }
 }
 
@@ -293,8 +294,8 @@ fn a_motion_file_drives_the_robot_as_the_synthetic_human_does() {
     let last = |case| {
         let result = run(case, None, 6.0);
         let statuses = result.log.messages::<JointStatus>(ARM_STATUS);
-        statuses.last().unwrap().1.right.tool.position_m
+        Vector3::from(statuses.last().unwrap().1.right.tool.position_m)
     };
-    let apart = spatial::subtract(last(&synthetic), last(&recorded));
-    assert!(spatial::length(apart) < 1e-5, "{apart:?}");
+    let apart_m = (last(&synthetic) - last(&recorded)).norm();
+    assert!(apart_m < 1e-5, "{apart_m}");
 }
