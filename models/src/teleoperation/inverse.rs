@@ -98,6 +98,7 @@ impl Tracker {
         } else if cost(&error) < remaining_max * start_cost {
             Reach::Approaching
         } else {
+            // Also where a comparison fails because the target is beyond arithmetic.
             Reach::Unreachable
         };
         if reach != Reach::Unreachable {
@@ -119,8 +120,7 @@ pub struct Solution {
 /// Joint positions that put the tool at `target` (arm base frame) from anywhere: starts at
 /// `seed_rad`, then at up to `restarts_max` random postures.
 ///
-/// `None` means not found; with 50 restarts that happened to 10 of 20 000
-/// random reachable poses.
+/// `None` means not found; with 50 restarts that happened to 38 of 40 000 random reachable poses.
 pub fn search(
     chain: Chain,
     target: &Isometry3<f64>,

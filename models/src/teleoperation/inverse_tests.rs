@@ -88,8 +88,10 @@ fn an_unreachable_target_holds_and_a_reachable_one_frees_again() {
 #[test]
 fn a_target_of_nonsense_numbers_holds() {
     let mut tracker = Tracker::new(CHAIN, RIGHT_START_RAD);
-    let target = target_moved_by([f64::NAN, 0.0, 0.0]);
-    assert_eq!(tracker.track(&target, 0.008), Reach::Unreachable);
+    for nonsense in [f64::NAN, f64::INFINITY, 1e300] {
+        let target = target_moved_by([nonsense, 0.0, 0.0]);
+        assert_eq!(tracker.track(&target, 0.008), Reach::Unreachable);
+    }
     assert_eq!(
         tracker.q_rad().map(f64::to_bits),
         RIGHT_START_RAD.map(f64::to_bits)
