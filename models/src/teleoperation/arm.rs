@@ -5,10 +5,19 @@
 //! that rpiRobotics/yumi-ik publishes from RobotStudio; the widespread URDF of the arm is off by
 //! about 1.4 mm against the same poses.
 
-use crate::teleoperation::messages::{JOINT_COUNT, Joints};
-use crate::teleoperation::spatial::{
-    Columns, Orientation, Pose, Vector3, add, cross, dot, scaled, subtract,
+use nalgebra::{
+    Isometry3, Matrix3, Quaternion, SMatrix, SVector, Translation3, UnitQuaternion, Vector3,
+    Vector6,
 };
+
+use crate::teleoperation::messages::{JOINT_COUNT, Joints};
+
+/// [`Joints`] to compute with.
+pub type JointVector = SVector<f64, JOINT_COUNT>;
+
+/// A Jacobian: one column per joint, in chain order, of the tool's linear (m/rad, rows 0..3) and
+/// angular (1, rows 3..6) velocity in the base frame per unit of joint speed.
+pub type Jacobian = SMatrix<f64, 6, JOINT_COUNT>;
 
 /// Height of the first joint above the arm's base frame as RobotStudio places it, metres.
 pub const BASE_TO_FIRST_JOINT_M: f64 = 0.306;
@@ -46,25 +55,26 @@ const fn degrees(values: Joints) -> Joints {
 /// One row of the table: Rx(alpha) Tx(a) Rz(theta + offset) Tz(d).
 #[derive(Debug, Clone, Copy)]
 struct Link {
-    /// Twist of the previous axis in quarter turns: its sine and cosine are exact.
-    alpha_sine: f64,
-    alpha_cosine: f64,
-    a_m: f64,
-    d_m: f64,
+    /// All but the joint's own rotation, which commutes with Tz(d).
+    fixed: Isometry3<f64>,
     offset_rad: f64,
 }
 
+/// `alpha` comes in quarter turns: -1, 0 or 1.
 const fn link(alpha_quarters: i8, a_m: f64, d_m: f64, offset_rad: f64) -> Link {
-    let (alpha_sine, alpha_cosine) = match alpha_quarters {
-        -1 => (-1.0, 0.0),
-        1 => (1.0, 0.0),
-        _ => (0.0, 1.0),
+    use core::f64::consts::FRAC_1_SQRT_2;
+    let sine = alpha_quarters as f64;
+    let (rotation, height_m) = if alpha_quarters == 0 {
+        (Quaternion::new(1.0, 0.0, 0.0, 0.0), d_m)
+    } else {
+        let half_sine = sine * FRAC_1_SQRT_2;
+        (Quaternion::new(FRAC_1_SQRT_2, half_sine, 0.0, 0.0), 0.0)
+    };
+    let translation = Translation3 {
+        vector: Vector3::new(a_m, -sine * d_m, height_m),
     };
     Link {
-        alpha_sine,
-        alpha_cosine,
-        a_m,
-        d_m,
+        fixed: Isometry3::from_parts(translation, UnitQuaternion::new_unchecked(rotation)),
         offset_rad,
     }
 }
@@ -80,41 +90,35 @@ const LINKS: [Link; JOINT_COUNT] = [
     link(1, -0.027, 0.036, 0.0),
 ];
 
-/// Tool frame and the axes that move it, all in the arm's base frame.
+/// Where the joints put the links, in the arm's base frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ChainState {
-    /// Origin of `tool0`, metres.
-    pub tool_m: Vector3,
-    /// Axes of `tool0`.
-    pub tool_axes: Columns,
-    /// Direction of each joint's axis.
-    pub axes: [Vector3; JOINT_COUNT],
-    /// A point on each joint's axis, metres.
-    pub points_m: [Vector3; JOINT_COUNT],
+    /// Frame of each link, metres; a joint turns about the z axis of its own. The last is `tool0`.
+    pub links: [Isometry3<f64>; JOINT_COUNT],
 }
 
-/// A Jacobian: for each joint the tool's linear (m/rad) and angular (1) velocity in the base
-/// frame per unit of joint speed.
-pub type Jacobian = [[f64; 6]; JOINT_COUNT];
-
 impl ChainState {
-    /// The tool pose with its orientation as a quaternion.
-    pub fn tool(&self) -> Pose {
-        Pose {
-            position_m: self.tool_m,
-            orientation: Orientation::from_columns(self.tool_axes),
-        }
+    /// The frame `tool0`.
+    pub fn tool(&self) -> &Isometry3<f64> {
+        &self.links[JOINT_COUNT - 1]
     }
 
     /// The geometric Jacobian of the tool's origin.
     pub fn jacobian(&self) -> Jacobian {
-        let mut jacobian = [[0.0; 6]; JOINT_COUNT];
-        for ((column, axis), point) in jacobian.iter_mut().zip(&self.axes).zip(&self.points_m) {
-            let [x, y, z] = cross(*axis, subtract(self.tool_m, *point));
-            *column = [x, y, z, axis[0], axis[1], axis[2]];
-        }
-        jacobian
+        let tool_m = self.tool().translation.vector;
+        let columns = self.links.map(|link| {
+            let axis = link.rotation * Vector3::z();
+            stacked(&axis.cross(&(tool_m - link.translation.vector)), &axis)
+        });
+        Jacobian::from_columns(&columns)
     }
+}
+
+/// A linear part (rows 0..3) above an angular one (rows 3..6).
+pub(crate) fn stacked(linear: &Vector3<f64>, angular: &Vector3<f64>) -> Vector6<f64> {
+    Vector6::new(
+        linear.x, linear.y, linear.z, angular.x, angular.y, angular.z,
+    )
 }
 
 /// The chain from an arm's base frame to `tool0`.
@@ -130,32 +134,17 @@ impl Chain {
         Self { first_height_m }
     }
 
-    /// Tool and axes at joint angles `q_rad`, chain order.
+    /// The links at joint angles `q_rad`, chain order.
     pub fn at(&self, q_rad: &Joints) -> ChainState {
-        let mut x: Vector3 = [1.0, 0.0, 0.0];
-        let mut y: Vector3 = [0.0, 1.0, 0.0];
-        let mut z: Vector3 = [0.0, 0.0, 1.0];
-        let mut origin: Vector3 = [0.0, 0.0, self.first_height_m];
-        let mut axes = [[0.0; 3]; JOINT_COUNT];
-        let mut points_m = [[0.0; 3]; JOINT_COUNT];
-        for (index, (link, q)) in LINKS.iter().zip(q_rad).enumerate() {
-            origin = add(origin, scaled(x, link.a_m));
-            let (sine, cosine) = (link.alpha_sine, link.alpha_cosine);
-            let twisted = add(scaled(y, cosine), scaled(z, sine));
-            z = add(scaled(y, -sine), scaled(z, cosine));
-            origin = add(origin, scaled(z, link.d_m));
-            let (sine, cosine) = (q + link.offset_rad).sin_cos();
-            y = add(scaled(x, -sine), scaled(twisted, cosine));
-            x = add(scaled(x, cosine), scaled(twisted, sine));
-            axes[index] = z;
-            points_m[index] = origin;
-        }
-        ChainState {
-            tool_m: origin,
-            tool_axes: [x, y, z],
-            axes,
-            points_m,
-        }
+        let mut frame = Isometry3::translation(0.0, 0.0, self.first_height_m);
+        let links = core::array::from_fn(|joint| {
+            let link = &LINKS[joint];
+            let angle_rad = q_rad[joint] + link.offset_rad;
+            frame *= link.fixed;
+            frame.rotation *= UnitQuaternion::from_axis_angle(&Vector3::z_axis(), angle_rad);
+            frame
+        });
+        ChainState { links }
     }
 }
 
@@ -163,54 +152,41 @@ impl Chain {
 #[derive(Debug, Clone, Copy)]
 pub struct Arm {
     chain: Chain,
-    mount: Pose,
-    mount_inverse: Pose,
+    mount: Isometry3<f64>,
 }
 
-/// Rotation of the right arm's mounting frame in the body frame, rows, as published (4 digits).
-const RIGHT_MOUNT_ROWS: [Vector3; 3] = [
-    [0.5713, -0.1071, 0.8138],
-    [0.6198, 0.7063, -0.3421],
-    [-0.5381, 0.6998, 0.4698],
-];
+/// Rotation of the right arm's mounting frame in the body frame, as published (4 digits).
+const RIGHT_MOUNT: Matrix3<f64> = Matrix3::new(
+    0.5713, -0.1071, 0.8138, //
+    0.6198, 0.7063, -0.3421, //
+    -0.5381, 0.6998, 0.4698,
+);
 
 /// Roll, pitch and yaw of the left arm's first link in the published robot description.
-const LEFT_MOUNT_ROLL_PITCH_YAW_RAD: Vector3 = [0.9781, -0.5716, 2.3180];
+const LEFT_MOUNT_ROLL_PITCH_YAW_RAD: [f64; 3] = [0.9781, -0.5716, 2.3180];
 
 impl Arm {
     /// The right arm.
     pub fn right() -> Self {
-        let [first, second, third] = RIGHT_MOUNT_ROWS;
-        let columns = [
-            [first[0], second[0], third[0]],
-            [first[1], second[1], third[1]],
-            [first[2], second[2], third[2]],
-        ];
-        Self::mounted(Pose {
-            position_m: [0.053_55, -0.0725, 0.414_92],
-            orientation: Orientation::from_columns(orthonormalised(columns)),
-        })
+        // The nearest rotation: four digits leave the published matrix a little off orthogonal.
+        let guess = UnitQuaternion::identity();
+        let rotation = UnitQuaternion::from_matrix_eps(&RIGHT_MOUNT, 1e-15, 100, guess);
+        Self::mounted([0.053_55, -0.0725, 0.414_92], rotation)
     }
 
     /// The left arm. The published numbers of the two arms are not exact mirror images.
     pub fn left() -> Self {
         let [roll, pitch, yaw] = LEFT_MOUNT_ROLL_PITCH_YAW_RAD;
-        let described = Orientation::about_axis(2, yaw)
-            .after(Orientation::about_axis(1, pitch))
-            .after(Orientation::about_axis(0, roll));
+        let described = UnitQuaternion::from_euler_angles(roll, pitch, yaw);
         // That description counts the first joint from the opposite direction.
-        let turned = described.after(Orientation::about_axis(2, core::f64::consts::PI));
-        Self::mounted(Pose {
-            position_m: [0.053_55, 0.0725, 0.414_92],
-            orientation: turned,
-        })
+        let half_turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), core::f64::consts::PI);
+        Self::mounted([0.053_55, 0.0725, 0.414_92], described * half_turn)
     }
 
-    fn mounted(mount: Pose) -> Self {
+    fn mounted(position_m: [f64; 3], rotation: UnitQuaternion<f64>) -> Self {
         Self {
             chain: Chain::new(MOUNT_TO_FIRST_JOINT_M),
-            mount,
-            mount_inverse: mount.inverse(),
+            mount: Isometry3::from_parts(position_m.into(), rotation),
         }
     }
 
@@ -219,33 +195,19 @@ impl Arm {
         &self.chain
     }
 
-    /// Tool pose in the body frame.
-    pub fn tool(&self, q_rad: &Joints) -> Pose {
-        self.mount.compose(&self.chain.at(q_rad).tool())
-    }
-
-    /// Lateral position (body frame, y to the robot's left) of the tool.
-    pub fn tool_y_m(&self, q_rad: &Joints) -> f64 {
-        let tool_m = self.chain.at(q_rad).tool_m;
-        self.mount.position_m[1] + self.mount.orientation.rotate(tool_m)[1]
+    /// Tool pose in the body frame: x forward, y to the robot's left, z up.
+    pub fn tool(&self, q_rad: &Joints) -> Isometry3<f64> {
+        self.mount * self.chain.at(q_rad).tool()
     }
 
     /// A pose of the body frame seen from the arm's mounting frame.
-    pub fn from_body(&self, pose: &Pose) -> Pose {
-        self.mount_inverse.compose(pose)
+    pub fn from_body(&self, pose: &Isometry3<f64>) -> Isometry3<f64> {
+        self.mount.inv_mul(pose)
     }
 }
 
-/// The nearest right-handed orthonormal frame that keeps the first axis (Gram-Schmidt).
-fn orthonormalised([x, y, _]: Columns) -> Columns {
-    let unit = |v: Vector3| scaled(v, 1.0 / dot(v, v).sqrt());
-    let x = unit(x);
-    let y = unit(subtract(y, scaled(x, dot(x, y))));
-    [x, y, cross(x, y)]
-}
-
 /// `q_rad` with every joint inside its position limits, and whether any had to move.
-pub fn within_limits(q_rad: &Joints) -> (Joints, bool) {
+pub fn within_limits(q_rad: &JointVector) -> (JointVector, bool) {
     let mut clipped = *q_rad;
     let mut is_clipped = false;
     let limits = POSITION_MIN_RAD.iter().zip(&POSITION_MAX_RAD);
@@ -260,7 +222,7 @@ pub fn within_limits(q_rad: &Joints) -> (Joints, bool) {
 
 /// The largest factor of at most 1 by which all `speeds_rad_per_s` keep their limits: one ratio
 /// for all joints, so that the direction of motion stays.
-pub fn speed_ratio(speeds_rad_per_s: &Joints) -> f64 {
+pub fn speed_ratio(speeds_rad_per_s: &JointVector) -> f64 {
     speeds_rad_per_s
         .iter()
         .zip(&SPEED_MAX_RAD_PER_S)

@@ -2,7 +2,6 @@
 
 use super::*;
 use crate::random::RandomStream;
-use crate::teleoperation::spatial::length;
 
 /// Ten poses of one arm as published with rpiRobotics/yumi-ik (BSD-3-Clause), taken there from
 /// RobotStudio: seven joint angles (degrees, chain order), position (mm), then roll, pitch and
@@ -50,13 +49,12 @@ fn the_ten_robotstudio_poses_are_met_within_a_hundredth() {
     let chain = Chain::new(BASE_TO_FIRST_JOINT_M);
     for row in &ROBOTSTUDIO_POSES {
         let q: Joints = core::array::from_fn(|joint| row[joint].to_radians());
-        let tool = chain.at(&q).tool();
-        let published_m = [row[7] * 1e-3, row[8] * 1e-3, row[9] * 1e-3];
-        let error_mm = 1e3 * length(subtract(tool.position_m, published_m));
-        let published = Orientation::about_axis(2, row[12].to_radians())
-            .after(Orientation::about_axis(1, row[11].to_radians()))
-            .after(Orientation::about_axis(0, row[10].to_radians()));
-        let error_deg = tool.orientation.angle_to(published).to_degrees();
+        let tool = *chain.at(&q).tool();
+        let published_m = Vector3::new(row[7], row[8], row[9]) * 1e-3;
+        let error_mm = 1e3 * (tool.translation.vector - published_m).norm();
+        let [roll, pitch, yaw] = [row[10], row[11], row[12]].map(f64::to_radians);
+        let published = UnitQuaternion::from_euler_angles(roll, pitch, yaw);
+        let error_deg = tool.rotation.angle_to(&published).to_degrees();
         assert!(error_mm <= 0.01, "{error_mm} mm at {row:?}");
         assert!(error_deg <= 0.01, "{error_deg} deg at {row:?}");
     }
@@ -77,14 +75,11 @@ fn the_jacobian_is_the_derivative_of_the_pose() {
             let (mut before, mut after) = (q, q);
             before[joint] -= step;
             after[joint] += step;
-            let (before, after) = (chain.at(&before).tool(), chain.at(&after).tool());
-            let linear = subtract(after.position_m, before.position_m);
-            let angular = after.orientation.after(before.orientation.inverse());
-            let linear = scaled(linear, 0.5 / step);
-            let angular = scaled(angular.rotation_vector(), 0.5 / step);
-            let column = jacobian[joint];
-            assert!(length(subtract(linear, [column[0], column[1], column[2]])) < 1e-6);
-            assert!(length(subtract(angular, [column[3], column[4], column[5]])) < 1e-6);
+            let (before, after) = (*chain.at(&before).tool(), *chain.at(&after).tool());
+            let linear = after.translation.vector - before.translation.vector;
+            let angular = (after.rotation * before.rotation.inverse()).scaled_axis();
+            let column = stacked(&linear, &angular) * (0.5 / step);
+            assert!((column - jacobian.column(joint)).norm() < 1e-6);
         }
     }
 }
@@ -92,49 +87,49 @@ fn the_jacobian_is_the_derivative_of_the_pose() {
 #[test]
 fn the_start_posture_puts_the_right_tool_in_front_of_the_body() {
     let tool = Arm::right().tool(&RIGHT_START_RAD);
-    let published_m = [0.448, -0.161, 0.122];
-    assert!(
-        length(subtract(tool.position_m, published_m)) < 1e-3,
-        "{tool:?}"
-    );
+    let published_m = Vector3::new(0.448, -0.161, 0.122);
+    let apart_m = (tool.translation.vector - published_m).norm();
+    assert!(apart_m < 1e-3, "{tool:?}");
 }
 
 #[test]
 fn the_left_start_mirrors_the_right_as_far_as_the_mounts_do() {
-    let right = Arm::right().tool(&RIGHT_START_RAD).position_m;
-    let left = Arm::left().tool(&LEFT_START_RAD).position_m;
-    let mirrored = [right[0], -right[1], right[2]];
+    let right = Arm::right().tool(&RIGHT_START_RAD).translation;
+    let left = Arm::left().tool(&LEFT_START_RAD).translation;
+    let mirrored = Vector3::new(right.x, -right.y, right.z);
     // The two published mounting rotations differ by a few thousandths of a radian.
-    assert!(
-        length(subtract(left, mirrored)) < 5e-3,
-        "{left:?} {right:?}"
-    );
+    assert!((left.vector - mirrored).norm() < 5e-3, "{left:?} {right:?}");
 }
 
 #[test]
-fn the_fast_lateral_position_equals_the_full_pose() {
-    for (arm, start) in [
-        (Arm::right(), RIGHT_START_RAD),
-        (Arm::left(), LEFT_START_RAD),
-    ] {
-        let difference = arm.tool_y_m(&start) - arm.tool(&start).position_m[1];
-        assert!(difference.abs() < 1e-15);
-    }
+fn the_right_mount_is_a_rotation_as_near_as_its_four_digits_allow() {
+    let rotation = Arm::right().mount.rotation;
+    assert!((rotation.norm() - 1.0).abs() < 1e-15);
+    let apart = rotation.to_rotation_matrix().into_inner() - RIGHT_MOUNT;
+    assert!(apart.amax() < 1e-4, "{apart}");
+}
+
+#[test]
+fn body_and_mount_frames_are_there_and_back() {
+    let arm = Arm::left();
+    let tool = *arm.chain().at(&LEFT_START_RAD).tool();
+    let back = arm.from_body(&arm.tool(&LEFT_START_RAD));
+    assert!((back.translation.vector - tool.translation.vector).norm() < 1e-15);
+    assert!(back.rotation.angle_to(&tool.rotation) < 1e-15);
 }
 
 #[test]
 fn start_postures_stay_clear_of_the_limits() {
-    for start in [RIGHT_START_RAD, LEFT_START_RAD] {
+    for start in [RIGHT_START_RAD, LEFT_START_RAD].map(JointVector::from) {
         assert!(!within_limits(&start).1);
-        let beyond = start.map(|q| q * 100.0);
-        let (inside, is_clipped) = within_limits(&beyond);
+        let (inside, is_clipped) = within_limits(&(start * 100.0));
         assert!(is_clipped && !within_limits(&inside).1);
     }
 }
 
 #[test]
 fn one_ratio_slows_all_joints_down_to_the_slowest_allowed() {
-    let fast = SPEED_MAX_RAD_PER_S.map(|speed| 2.0 * speed);
+    let fast = JointVector::from(SPEED_MAX_RAD_PER_S) * 2.0;
     assert!((speed_ratio(&fast) - 0.5).abs() < 1e-15);
-    assert!((speed_ratio(&[0.0; JOINT_COUNT]) - 1.0).abs() < 1e-15);
+    assert!((speed_ratio(&JointVector::zeros()) - 1.0).abs() < 1e-15);
 }

@@ -297,7 +297,7 @@ fn write_joint(text: &mut String, skeleton: &Skeleton, index: usize, depth: usiz
     } else {
         "JOINT"
     };
-    let [x, y, z] = joint.offset;
+    let [x, y, z] = joint.offset.into();
     // Writing to a String cannot fail.
     let _infallible = write!(
         text,

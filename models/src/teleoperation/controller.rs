@@ -1,15 +1,16 @@
 //! The role "controller": human frame to joint command, by mapping and inverse kinematics. Only
 //! messages drive it; it has no clock of its own.
 
+use nalgebra::Isometry3;
+
 use crate::component::{Component, Outbox};
-use crate::teleoperation::arm::Arm;
+use crate::teleoperation::arm::{Arm, JointVector};
 use crate::teleoperation::inverse::{Reach, Tracker};
 use crate::teleoperation::mapping::{Clutch, MappingSettings};
 use crate::teleoperation::messages::{
     ArmCommand, HumanFrame, JOINT_COUNT, JointCommand, JointStatus, Joints,
 };
 use crate::teleoperation::parameters::{LeftArm, TeleoperationParameters};
-use crate::teleoperation::spatial::Pose;
 use crate::time::Instant;
 
 crate::message_set! {
@@ -55,7 +56,12 @@ pub(crate) struct Followed {
 
 impl Follower {
     /// Engages `arm` at `q_rad` with the hand at `hand`.
-    pub(crate) fn engage(arm: Arm, q_rad: Joints, settings: MappingSettings, hand: &Pose) -> Self {
+    pub(crate) fn engage(
+        arm: Arm,
+        q_rad: Joints,
+        settings: MappingSettings,
+        hand: &Isometry3<f64>,
+    ) -> Self {
         Self {
             clutch: Some(Clutch::engage(settings, hand, &arm.tool(&q_rad))),
             ..Self::holding(arm, q_rad)
@@ -71,9 +77,15 @@ impl Follower {
         }
     }
 
-    /// The command for the hand at `hand`, `elapsed_s` after the previous frame.
-    pub(crate) fn follow(&mut self, hand: &Pose, elapsed_s: f64, feed_forward: bool) -> Followed {
-        let before = *self.tracker.q_rad();
+    /// The command for the hand at `hand`, `elapsed_s` after the previous frame; without a hand,
+    /// for where it was.
+    pub(crate) fn follow(
+        &mut self,
+        hand: Option<&Isometry3<f64>>,
+        elapsed_s: f64,
+        feed_forward: bool,
+    ) -> Followed {
+        let before = JointVector::from(*self.tracker.q_rad());
         let (mut reach, mut is_jump_limited) = (Reach::Reached, false);
         if let Some(clutch) = &mut self.clutch {
             let (target, is_limited) = clutch.follow(hand);
@@ -82,7 +94,7 @@ impl Follower {
         }
         let position_rad = *self.tracker.q_rad();
         let speed_rad_per_s = if feed_forward && elapsed_s > 0.0 {
-            core::array::from_fn(|joint| (position_rad[joint] - before[joint]) / elapsed_s)
+            ((JointVector::from(position_rad) - before) / elapsed_s).into()
         } else {
             [0.0; JOINT_COUNT]
         };
@@ -108,14 +120,15 @@ impl Controller {
 
     fn engage(&self, frame: &HumanFrame) -> Option<Engaged> {
         let status = self.newest_status.as_ref()?;
+        let hand = frame.right_hand.isometry()?;
         let joints = status.right.measured_rad.iter();
         let mut joints = joints.chain(&status.left.measured_rad);
-        if !frame.right_hand.is_finite() || !joints.all(|q| q.is_finite()) {
+        if !joints.all(|q| q.is_finite()) {
             return None;
         }
         let follow = |arm, q_rad, is_mirrored| {
             let settings = self.parameters.mapping(is_mirrored);
-            Follower::engage(arm, q_rad, settings, &frame.right_hand)
+            Follower::engage(arm, q_rad, settings, &hand)
         };
         Some(Engaged {
             source_time_ns: frame.source_time_ns,
@@ -142,9 +155,9 @@ impl Controller {
         } else {
             frame_s
         };
-        let hand = &frame.right_hand;
-        let right = engaged.right.follow(hand, elapsed_s, feed_forward);
-        let left = engaged.left.follow(hand, elapsed_s, feed_forward);
+        let hand = frame.right_hand.isometry();
+        let right = engaged.right.follow(hand.as_ref(), elapsed_s, feed_forward);
+        let left = engaged.left.follow(hand.as_ref(), elapsed_s, feed_forward);
         let flag = |is_set: bool, bit: u32| if is_set { bit } else { 0 };
         let flags = flag(
             right.reach == Reach::Unreachable,

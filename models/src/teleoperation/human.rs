@@ -68,9 +68,9 @@ impl Component for Human {
         out.send(HumanFrame {
             frame_index: tick.index,
             source_time_ns,
-            root: pose.root,
-            right_hand: pose.right_hand,
-            left_hand: pose.left_hand,
+            root: pose.root.into(),
+            right_hand: pose.right_hand.into(),
+            left_hand: pose.left_hand.into(),
         });
     }
 

@@ -1,8 +1,9 @@
 //! Tests of [`super`].
 
+use nalgebra::Translation3;
+
 use super::*;
 use crate::teleoperation::arm::{MOUNT_TO_FIRST_JOINT_M, RIGHT_START_RAD};
-use crate::teleoperation::spatial::add;
 
 const CHAIN: Chain = Chain::new(MOUNT_TO_FIRST_JOINT_M);
 
@@ -11,17 +12,18 @@ fn of_random_reachable_poses_at_least_995_in_1000_are_found() {
     let mut random = RandomStream::new(17, "inverse");
     let (pose_count, mut found_count, mut first_count) = (400, 0, 0);
     for _ in 0..pose_count {
-        let target = CHAIN.at(&random_posture(&mut random)).tool();
+        let target = *CHAIN.at(&random_posture(&mut random)).tool();
         let seed = random_posture(&mut random);
         let Some(solution) = search(CHAIN, &target, &seed, 50, &mut random) else {
             continue;
         };
         found_count += 1;
         first_count += u32::from(solution.restart_count == 0);
-        let tool = CHAIN.at(&solution.q_rad).tool();
-        assert!(length(subtract(tool.position_m, target.position_m)) <= TOLERANCE_M * 1.0001);
-        assert!(tool.orientation.angle_to(target.orientation) <= TOLERANCE_RAD * 1.0001);
-        assert!(!within_limits(&solution.q_rad).1);
+        let tool = *CHAIN.at(&solution.q_rad).tool();
+        let apart_m = (tool.translation.vector - target.translation.vector).norm();
+        assert!(apart_m <= TOLERANCE_M * 1.0001);
+        assert!(tool.rotation.angle_to(&target.rotation) <= TOLERANCE_RAD * 1.0001);
+        assert!(!within_limits(&solution.q_rad.into()).1);
     }
     assert!(
         f64::from(found_count) >= 0.995 * f64::from(pose_count),
@@ -32,18 +34,16 @@ fn of_random_reachable_poses_at_least_995_in_1000_are_found() {
 #[test]
 fn a_pose_out_of_reach_is_not_found() {
     let mut random = RandomStream::new(1, "inverse");
-    let mut target = CHAIN.at(&RIGHT_START_RAD).tool();
-    target.position_m = [0.9, 0.0, 0.1];
+    let mut target = *CHAIN.at(&RIGHT_START_RAD).tool();
+    target.translation = Translation3::new(0.9, 0.0, 0.1);
     assert_eq!(
         search(CHAIN, &target, &RIGHT_START_RAD, 5, &mut random),
         None
     );
 }
 
-fn target_moved_by(step_m: [f64; 3]) -> Pose {
-    let mut target = CHAIN.at(&RIGHT_START_RAD).tool();
-    target.position_m = add(target.position_m, step_m);
-    target
+fn target_moved_by(step_m: [f64; 3]) -> Isometry3<f64> {
+    Translation3::from(step_m) * CHAIN.at(&RIGHT_START_RAD).tool()
 }
 
 #[test]
@@ -88,8 +88,10 @@ fn an_unreachable_target_holds_and_a_reachable_one_frees_again() {
 #[test]
 fn a_target_of_nonsense_numbers_holds() {
     let mut tracker = Tracker::new(CHAIN, RIGHT_START_RAD);
-    let target = target_moved_by([f64::NAN, 0.0, 0.0]);
-    assert_eq!(tracker.track(&target, 0.008), Reach::Unreachable);
+    for nonsense in [f64::NAN, f64::INFINITY, 1e300] {
+        let target = target_moved_by([nonsense, 0.0, 0.0]);
+        assert_eq!(tracker.track(&target, 0.008), Reach::Unreachable);
+    }
     assert_eq!(
         tracker.q_rad().map(f64::to_bits),
         RIGHT_START_RAD.map(f64::to_bits)

@@ -8,13 +8,12 @@
 //! (relative mapping; Lv et al., section III.C, use the scale 0.8). The formula is ours: the
 //! paper's own mapping strategy is described in its reference 13 only.
 
-use crate::teleoperation::spatial::{Orientation, Pose, Vector3, add, length, scaled, subtract};
+use nalgebra::{Isometry3, Quaternion, UnitQuaternion, Vector3};
 
 /// Turns the capture's axes (x left, y up, z forward) into the body's (x forward, y left, z up):
 /// a third of a turn about the space diagonal.
-pub const CAPTURE_TO_BODY: Orientation = Orientation {
-    wxyz: [0.5, 0.5, 0.5, 0.5],
-};
+pub const CAPTURE_TO_BODY: UnitQuaternion<f64> =
+    UnitQuaternion::new_unchecked(Quaternion::new(0.5, 0.5, 0.5, 0.5));
 
 /// How a hand's motion becomes a tool's.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -33,84 +32,65 @@ pub struct MappingSettings {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Clutch {
     settings: MappingSettings,
-    hand_origin: Pose,
-    tool_origin: Pose,
-    target: Pose,
+    hand_origin: Isometry3<f64>,
+    tool_origin: Isometry3<f64>,
+    target: Isometry3<f64>,
 }
 
 impl Clutch {
-    /// Engages with the hand (capture frame) and the tool (body frame) where they are now. Both
-    /// must be poses of finite numbers.
-    pub fn engage(settings: MappingSettings, hand: &Pose, tool: &Pose) -> Self {
+    /// Engages with the hand (capture frame) and the tool (body frame) where they are now.
+    pub fn engage(settings: MappingSettings, hand: &Isometry3<f64>, tool: &Isometry3<f64>) -> Self {
         Self {
             settings,
-            hand_origin: normalised(hand),
+            hand_origin: *hand,
             tool_origin: *tool,
             target: *tool,
         }
     }
 
     /// Where the tool shall be now that the hand is at `hand`, and whether the jump limit held
-    /// it back. A hand that is not a pose of finite numbers leaves the target where it is.
-    pub fn follow(&mut self, hand: &Pose) -> (Pose, bool) {
-        if !hand.is_finite() {
+    /// it back. Without a hand the target stays where it is and counts as held back.
+    pub fn follow(&mut self, hand: Option<&Isometry3<f64>>) -> (Isometry3<f64>, bool) {
+        let Some(hand) = hand else {
             return (self.target, true);
-        }
-        let wanted = self.wanted(&normalised(hand));
-        let step_m = length(subtract(wanted.position_m, self.target.position_m));
-        let step_rad = self.target.orientation.angle_to(wanted.orientation);
+        };
+        let wanted = self.wanted(hand);
+        let step_m = (wanted.translation.vector - self.target.translation.vector).norm();
+        let step_rad = self.target.rotation.angle_to(&wanted.rotation);
         let share = (self.settings.jump_max_m / step_m)
             .min(self.settings.jump_max_rad / step_rad)
             .min(1.0);
         let is_limited = share < 1.0;
-        self.target = if is_limited {
-            self.target.interpolate(&wanted, share)
+        if is_limited {
+            self.target = self.target.lerp_slerp(&wanted, share);
+            // Frame upon frame of limited steps would let the quaternion's length wander.
+            self.target.rotation.renormalize();
         } else {
-            wanted
-        };
+            self.target = wanted;
+        }
         (self.target, is_limited)
     }
 
-    fn wanted(&self, hand: &Pose) -> Pose {
-        let moved = subtract(hand.position_m, self.hand_origin.position_m);
-        let moved = CAPTURE_TO_BODY.rotate(moved);
-        let turned = hand
-            .orientation
-            .after(self.hand_origin.orientation.inverse());
-        let turned = CAPTURE_TO_BODY
-            .after(turned)
-            .after(CAPTURE_TO_BODY.inverse());
-        let (moved, turned) = if self.settings.is_mirrored {
-            (reflected(moved), reflected_turn(turned))
-        } else {
-            (moved, turned)
-        };
-        let moved = scaled(moved, self.settings.scale_ratio);
-        Pose {
-            position_m: add(self.tool_origin.position_m, moved),
-            orientation: turned.after(self.tool_origin.orientation).normalised(),
+    fn wanted(&self, hand: &Isometry3<f64>) -> Isometry3<f64> {
+        let moved = hand.translation.vector - self.hand_origin.translation.vector;
+        let turned = hand.rotation * self.hand_origin.rotation.inverse();
+        let mut moved = CAPTURE_TO_BODY * moved;
+        let mut turned = CAPTURE_TO_BODY * turned * CAPTURE_TO_BODY.inverse();
+        if self.settings.is_mirrored {
+            (moved, turned) = (reflected(moved), reflected_turn(turned));
         }
+        let position = self.tool_origin.translation.vector + self.settings.scale_ratio * moved;
+        Isometry3::from_parts(position.into(), turned * self.tool_origin.rotation)
     }
 }
 
-/// Another producer's quaternion may be of any length; the mapping needs a rotation.
-fn normalised(hand: &Pose) -> Pose {
-    Pose {
-        orientation: hand.orientation.normalised(),
-        ..*hand
-    }
-}
-
-fn reflected([x, y, z]: Vector3) -> Vector3 {
-    [x, -y, z]
+fn reflected(step: Vector3<f64>) -> Vector3<f64> {
+    Vector3::new(step.x, -step.y, step.z)
 }
 
 /// A rotation seen in a mirror normal to y: its axis is reflected, its sense reversed.
-fn reflected_turn(turn: Orientation) -> Orientation {
-    let [w, x, y, z] = turn.wxyz;
-    Orientation {
-        wxyz: [w, -x, y, -z],
-    }
+fn reflected_turn(turn: UnitQuaternion<f64>) -> UnitQuaternion<f64> {
+    UnitQuaternion::new_unchecked(Quaternion::new(turn.w, -turn.i, turn.j, -turn.k))
 }
 
 #[cfg(test)]
@@ -124,31 +104,29 @@ mod tests {
         jump_max_rad: 3.0,
     };
 
-    const HAND: Pose = Pose {
-        position_m: [-0.2, 1.4, 0.5],
-        orientation: Orientation::IDENTITY,
-    };
-
-    fn tool() -> Pose {
-        Pose {
-            position_m: [0.4, -0.2, 0.1],
-            orientation: Orientation::about_axis(0, 1.0),
-        }
+    fn hand() -> Isometry3<f64> {
+        Isometry3::translation(-0.2, 1.4, 0.5)
     }
 
-    fn moved_by(step: Vector3) -> Pose {
-        Pose {
-            position_m: add(HAND.position_m, step),
-            ..HAND
-        }
+    fn tool() -> Isometry3<f64> {
+        let turned = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), 1.0);
+        Isometry3::from_parts([0.4, -0.2, 0.1].into(), turned)
+    }
+
+    fn moved_by(step: [f64; 3]) -> Isometry3<f64> {
+        Isometry3::from(step) * hand()
+    }
+
+    fn apart_m(a: &Isometry3<f64>, b: &Isometry3<f64>) -> f64 {
+        (a.translation.vector - b.translation.vector).norm()
     }
 
     #[track_caller]
-    fn check_step(settings: MappingSettings, hand_step: Vector3, tool_step: Vector3) {
-        let mut clutch = Clutch::engage(settings, &HAND, &tool());
-        let (target, is_limited) = clutch.follow(&moved_by(hand_step));
-        let moved = subtract(target.position_m, tool().position_m);
-        assert!(length(subtract(moved, tool_step)) < 1e-12, "{moved:?}");
+    fn check_step(settings: MappingSettings, hand_step: [f64; 3], tool_step: [f64; 3]) {
+        let mut clutch = Clutch::engage(settings, &hand(), &tool());
+        let (target, is_limited) = clutch.follow(Some(&moved_by(hand_step)));
+        let expected = Isometry3::from(tool_step) * tool();
+        assert!(apart_m(&target, &expected) < 1e-12, "{target:?}");
         assert!(!is_limited);
     }
 
@@ -166,28 +144,25 @@ mod tests {
 
     #[test]
     fn turning_the_hand_about_up_turns_the_tool_about_up() {
-        let hand = Pose {
-            orientation: Orientation::about_axis(1, 0.3),
-            ..HAND
-        };
+        let turned = hand() * UnitQuaternion::from_axis_angle(&Vector3::y_axis(), 0.3);
         for (is_mirrored, angle) in [(false, 0.3), (true, -0.3)] {
             let settings = MappingSettings {
                 is_mirrored,
                 ..SETTINGS
             };
-            let mut clutch = Clutch::engage(settings, &HAND, &tool());
-            let expected = Orientation::about_axis(2, angle).after(tool().orientation);
-            let (target, _) = clutch.follow(&hand);
-            assert!(target.orientation.angle_to(expected) < 1e-7);
+            let mut clutch = Clutch::engage(settings, &hand(), &tool());
+            let about_up = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), angle);
+            let (target, _) = clutch.follow(Some(&turned));
+            assert!(target.rotation.angle_to(&(about_up * tool().rotation)) < 1e-12);
         }
     }
 
     #[test]
     fn engaging_moves_nothing() {
-        let mut clutch = Clutch::engage(SETTINGS, &HAND, &tool());
-        let (target, _) = clutch.follow(&HAND);
-        assert!(length(subtract(target.position_m, tool().position_m)) < 1e-15);
-        assert!(target.orientation.angle_to(tool().orientation) < 1e-7);
+        let mut clutch = Clutch::engage(SETTINGS, &hand(), &tool());
+        let (target, _) = clutch.follow(Some(&hand()));
+        assert!(apart_m(&target, &tool()) < 1e-15);
+        assert!(target.rotation.angle_to(&tool().rotation) < 1e-15);
     }
 
     #[test]
@@ -196,24 +171,22 @@ mod tests {
             jump_max_m: 0.03,
             ..SETTINGS
         };
-        let mut clutch = Clutch::engage(settings, &HAND, &tool());
-        let hand = moved_by([0.1, 0.0, 0.0]);
+        let mut clutch = Clutch::engage(settings, &hand(), &tool());
+        let far = moved_by([0.1, 0.0, 0.0]);
         let mut last = tool();
         for frame in 0..5 {
-            let (target, is_limited) = clutch.follow(&hand);
-            let step_m = length(subtract(target.position_m, last.position_m));
-            assert!(step_m < 0.03 + 1e-12);
+            let (target, is_limited) = clutch.follow(Some(&far));
+            assert!(apart_m(&target, &last) < 0.03 + 1e-12);
             assert_eq!(is_limited, frame < 2, "frame {frame}");
             last = target;
         }
-        assert!((last.position_m[1] - tool().position_m[1] - 0.08).abs() < 1e-12);
+        assert!((last.translation.y - tool().translation.y - 0.08).abs() < 1e-12);
     }
 
     #[test]
-    fn a_hand_of_nonsense_numbers_leaves_the_target() {
-        let mut clutch = Clutch::engage(SETTINGS, &HAND, &tool());
-        let (target, is_limited) = clutch.follow(&moved_by([f64::NAN, 0.0, 0.0]));
-        assert!(is_limited && target.position_m[0].is_finite());
-        assert!(!clutch.follow(&HAND).1);
+    fn without_a_hand_the_target_stays() {
+        let mut clutch = Clutch::engage(SETTINGS, &hand(), &tool());
+        assert_eq!(clutch.follow(None), (tool(), true));
+        assert!(!clutch.follow(Some(&hand())).1);
     }
 }

@@ -49,7 +49,6 @@ mod score;
 mod series;
 pub mod servo;
 pub mod skeleton;
-pub mod spatial;
 pub mod swing;
 #[cfg(test)]
 mod tests;

@@ -1,20 +1,21 @@
 //! Human motion as a function of time: one loop, synthetic or recorded, and a player that repeats
 //! it. It publishes nothing: the role "human" does.
 
+use nalgebra::Isometry3;
+
 use crate::random::RandomStream;
 use crate::teleoperation::bvh::Bvh;
-use crate::teleoperation::spatial::{Pose, add, scaled, subtract};
 use crate::teleoperation::swing::Swing;
 
 /// Root and hands in the capture's frame: x to the person's left, y up, z forward.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct HumanPose {
     /// Pelvis.
-    pub root: Pose,
+    pub root: Isometry3<f64>,
     /// Right hand.
-    pub right_hand: Pose,
+    pub right_hand: Isometry3<f64>,
     /// Left hand.
-    pub left_hand: Pose,
+    pub left_hand: Isometry3<f64>,
 }
 
 /// Why a motion file cannot be played.
@@ -107,9 +108,9 @@ impl Recording {
         let share = ((time_s - begin_s) / span_s).clamp(0.0, 1.0);
         let (from, to) = (&self.poses[index], &self.poses[next_index]);
         HumanPose {
-            root: from.root.interpolate(&to.root, share),
-            right_hand: from.right_hand.interpolate(&to.right_hand, share),
-            left_hand: from.left_hand.interpolate(&to.left_hand, share),
+            root: from.root.lerp_slerp(&to.root, share),
+            right_hand: from.right_hand.lerp_slerp(&to.right_hand, share),
+            left_hand: from.left_hand.lerp_slerp(&to.left_hand, share),
         }
     }
 }
@@ -136,7 +137,7 @@ impl Motion {
     pub fn lateral_peak_to_peak_m(&self, period_s: f64) -> f64 {
         let samples = (0..2000).map(|step| {
             let pose = self.at(f64::from(step) / 2000.0, period_s);
-            pose.right_hand.position_m[0]
+            pose.right_hand.translation.x
         });
         let (min, max) = samples.fold((f64::INFINITY, f64::NEG_INFINITY), |(min, max), x| {
             (min.min(x), max.max(x))
@@ -197,9 +198,9 @@ impl Player {
             let glide = phase * phase * (3.0 - 2.0 * phase);
             let amplitude =
                 self.amplitude_before + glide * (self.amplitude_after - self.amplitude_before);
-            let origin = self.resting.right_hand.position_m;
-            let apart = subtract(pose.right_hand.position_m, origin);
-            pose.right_hand.position_m = add(origin, scaled(apart, amplitude));
+            let origin = self.resting.right_hand.translation.vector;
+            let position = &mut pose.right_hand.translation.vector;
+            *position = origin + (*position - origin) * amplitude;
         }
         pose
     }
@@ -230,7 +231,6 @@ impl Player {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::teleoperation::spatial::length;
     use crate::teleoperation::swing::{UNIT_M, swing_bvh};
 
     const PERIOD_S: f64 = 4.033;
@@ -250,15 +250,10 @@ mod tests {
         let (mut player, mut fresh) = (player(0.0, 0), player(0.0, 0));
         for loop_index in 0..890 {
             let time_s = f64::from(loop_index) * PERIOD_S + 1.0;
-            let apart = subtract(
-                player.at(time_s).right_hand.position_m,
-                fresh
-                    .motion
-                    .at(1.0 / PERIOD_S, PERIOD_S)
-                    .right_hand
-                    .position_m,
-            );
-            assert!(length(apart) < 1e-10, "{apart:?} in loop {loop_index}");
+            let heard = player.at(time_s).right_hand.translation.vector;
+            let computed = fresh.motion.at(1.0 / PERIOD_S, PERIOD_S).right_hand;
+            let apart_m = (heard - computed.translation.vector).norm();
+            assert!(apart_m < 1e-10, "{apart_m} m in loop {loop_index}");
         }
         assert_eq!(fresh.at(0.0), fresh.resting);
     }
@@ -270,9 +265,10 @@ mod tests {
         let mut loop_index = 0;
         for step in 1..400_000 {
             let pose = player.at(f64::from(step) * 0.004);
-            let moved = subtract(pose.right_hand.position_m, before.right_hand.position_m);
+            let [to, from] = [pose, before].map(|pose| pose.right_hand.translation.vector);
+            let moved_m = (to - from).norm();
             // 0.1875 m * 1.09 * 2 pi / 3.9 s over 4 ms, with the arc's share.
-            assert!(length(moved) < 1.5e-3, "{moved:?} at step {step}");
+            assert!(moved_m < 1.5e-3, "{moved_m} m at step {step}");
             before = pose;
             if player.loop_index > loop_index {
                 loop_index = player.loop_index;

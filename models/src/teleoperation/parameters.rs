@@ -206,7 +206,7 @@ fn motion_file_error(path: &str, reason: &dyn core::fmt::Display) -> ParameterEr
     ParameterError {
         key: "motion_file",
         value: format!("{path} ({reason})"),
-        allowed: "the BVH motion files that fill one motion_period_s",
+        allowed: "what can be played: a BVH motion file that fills one motion_period_s",
     }
 }
 

@@ -76,7 +76,7 @@ fn arm_status((arm, servo): &(Arm, Servo)) -> ArmStatus {
     ArmStatus {
         measured_rad: *servo.q_rad(),
         reference_rad: servo.reference().position_rad,
-        tool: arm.tool(servo.q_rad()),
+        tool: arm.tool(servo.q_rad()).into(),
     }
 }
 

@@ -45,7 +45,7 @@ impl Sent {
         let arm = Arm::right();
         let mut sent = Self::default();
         for (at, command) in log.messages::<JointCommand>(ARM_COMMAND) {
-            let tool_y_m = arm.tool_y_m(&command.right.position_rad);
+            let tool_y_m = arm.tool(&command.right.position_rad).translation.y;
             sent.tool_y.push((at.as_ns(), tool_y_m));
             sent.failure_count += u64::from(command.is_unreachable());
             sent.limited_count += u64::from(command.flags & LIMITED != 0);

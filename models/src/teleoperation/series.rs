@@ -242,9 +242,31 @@ fn correlation(
         square_b += b * b;
         product += a * b;
     }
+    #[cfg(test)]
+    work::add(n);
     let variance = (n * square_a - sum_a * sum_a) * (n * square_b - sum_b * sum_b);
     let is_moving = variance > 0.0 && n > 1.0;
     is_moving.then(|| (n * product - sum_a * sum_b) / variance.sqrt())
+}
+
+/// How many products [`correlation`] has formed on this thread. Everything else here passes over
+/// its samples once; only the search for the lag could come to grow faster than a log.
+#[cfg(test)]
+pub(crate) mod work {
+    use core::cell::Cell;
+
+    std::thread_local! {
+        static PRODUCT_COUNT: Cell<f64> = const { Cell::new(0.0) };
+    }
+
+    pub(crate) fn add(products: f64) {
+        PRODUCT_COUNT.set(PRODUCT_COUNT.get() + products);
+    }
+
+    /// The count since the last call.
+    pub(crate) fn take() -> f64 {
+        PRODUCT_COUNT.take()
+    }
 }
 
 #[cfg(test)]

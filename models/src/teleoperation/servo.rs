@@ -8,7 +8,7 @@
 
 use core::time::Duration;
 
-use crate::teleoperation::arm::{speed_ratio, within_limits};
+use crate::teleoperation::arm::{JointVector, speed_ratio, within_limits};
 use crate::teleoperation::messages::{ArmCommand, JOINT_COUNT, Joints};
 use crate::time::{Instant, duration_ns};
 
@@ -27,8 +27,8 @@ pub struct ServoSettings {
 #[derive(Debug, Clone)]
 pub struct Servo {
     settings: ServoSettings,
-    q_rad: Joints,
-    speed_rad_per_s: Joints,
+    q_rad: JointVector,
+    speed_rad_per_s: JointVector,
     reference: ArmCommand,
     moved_until: Instant,
     is_at_position_limit: bool,
@@ -40,8 +40,8 @@ impl Servo {
     pub fn new(settings: ServoSettings, q_rad: Joints) -> Self {
         Self {
             settings,
-            q_rad,
-            speed_rad_per_s: [0.0; JOINT_COUNT],
+            q_rad: q_rad.into(),
+            speed_rad_per_s: JointVector::zeros(),
             reference: ArmCommand {
                 position_rad: q_rad,
                 speed_rad_per_s: [0.0; JOINT_COUNT],
@@ -86,26 +86,20 @@ impl Servo {
     }
 
     fn step(&mut self, step_s: f64, low_pass_share: f64) {
-        let wanted: Joints = core::array::from_fn(|joint| {
-            let error = self.reference.position_rad[joint] - self.q_rad[joint];
-            self.settings.gain_per_s * error + self.reference.speed_rad_per_s[joint]
-        });
+        let error = JointVector::from(self.reference.position_rad) - self.q_rad;
+        let feed_forward = JointVector::from(self.reference.speed_rad_per_s);
+        let wanted = self.settings.gain_per_s * error + feed_forward;
         let ratio = speed_ratio(&wanted);
         self.is_speed_limited |= ratio < 1.0;
-        let mut moved = self.q_rad;
-        for joint in 0..JOINT_COUNT {
-            let speed = &mut self.speed_rad_per_s[joint];
-            *speed += low_pass_share * (ratio * wanted[joint] - *speed);
-            moved[joint] += *speed * step_s;
-        }
-        let (moved, is_clipped) = within_limits(&moved);
+        self.speed_rad_per_s += low_pass_share * (ratio * wanted - self.speed_rad_per_s);
+        let (moved, is_clipped) = within_limits(&(self.q_rad + step_s * self.speed_rad_per_s));
         self.is_at_position_limit |= is_clipped;
         self.q_rad = moved;
     }
 
     /// Joint positions at [`Servo::moved_until`].
     pub fn q_rad(&self) -> &Joints {
-        &self.q_rad
+        self.q_rad.as_ref()
     }
 
     /// The reference in use.

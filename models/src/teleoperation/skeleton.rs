@@ -1,7 +1,7 @@
 //! A tree of joints and the poses its channel values put them in. It does not read or write
 //! motion files: see [`super::bvh`].
 
-use crate::teleoperation::spatial::{Orientation, Pose, Vector3};
+use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 
 /// What one channel value of a joint means.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -43,7 +43,7 @@ pub struct SkeletonJoint {
     /// Index of the parent, always below the joint's own; `None` for the root.
     pub parent: Option<usize>,
     /// Rest position in the parent's frame, in the file's length unit.
-    pub offset: Vector3,
+    pub offset: Vector3<f64>,
     /// Meaning of the joint's channel values, in file order.
     pub channels: Vec<Channel>,
     /// Where the joint's channel values begin within a frame.
@@ -66,7 +66,7 @@ impl Skeleton {
         &mut self,
         name: &str,
         parent: Option<usize>,
-        offset: Vector3,
+        offset: [f64; 3],
         channels: &[Channel],
     ) -> usize {
         let index = self.joints.len();
@@ -77,7 +77,7 @@ impl Skeleton {
         self.joints.push(SkeletonJoint {
             name: name.to_owned(),
             parent,
-            offset,
+            offset: offset.into(),
             channels: channels.to_vec(),
             first_channel: self.channel_count,
         });
@@ -108,42 +108,37 @@ impl Skeleton {
     ///
     /// # Panics
     /// When there is no joint `index` or `values` is not one frame of [`Self::channel_count`].
-    pub fn pose(&self, index: usize, values: &[f64], unit_m: f64) -> Pose {
+    pub fn pose(&self, index: usize, values: &[f64], unit_m: f64) -> Isometry3<f64> {
         assert_eq!(values.len(), self.channel_count, "one value per channel");
         let joint = &self.joints[index];
         let mut pose = local_pose(joint, values, unit_m);
         let mut parent = joint.parent;
         while let Some(ancestor) = parent.map(|index| &self.joints[index]) {
-            pose = local_pose(ancestor, values, unit_m).compose(&pose);
+            pose = local_pose(ancestor, values, unit_m) * pose;
             parent = ancestor.parent;
         }
-        pose.orientation = pose.orientation.normalised();
         pose
     }
 }
 
-fn local_pose(joint: &SkeletonJoint, values: &[f64], unit_m: f64) -> Pose {
+fn local_pose(joint: &SkeletonJoint, values: &[f64], unit_m: f64) -> Isometry3<f64> {
     let mut position = joint.offset;
-    let mut orientation = Orientation::IDENTITY;
+    let mut rotation = UnitQuaternion::identity();
     for (channel, value) in joint.channels.iter().zip(&values[joint.first_channel..]) {
         match *channel {
             Channel::Position(axis) => position[axis] = *value,
             Channel::Rotation(axis) => {
-                let turn = Orientation::about_axis(axis, value.to_radians());
-                orientation = orientation.after(turn);
+                let axis = Vector3::ith_axis(axis);
+                rotation *= UnitQuaternion::from_axis_angle(&axis, value.to_radians());
             }
         }
     }
-    Pose {
-        position_m: position.map(|part| part * unit_m),
-        orientation,
-    }
+    Isometry3::from_parts((position * unit_m).into(), rotation)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::teleoperation::spatial::{length, subtract};
 
     #[test]
     fn a_bent_arm_ends_where_geometry_says() {
@@ -159,8 +154,9 @@ mod tests {
         let hand = skeleton.push("Hand", Some(elbow), [5.0, 0.0, 0.0], &[]);
         // Root at (1, 2), turned left by 90 degrees; elbow turned back by 90 degrees.
         let pose = skeleton.pose(hand, &[1.0, 2.0, 90.0, -90.0], 0.01);
-        assert!(length(subtract(pose.position_m, [0.06, 0.12, 0.0])) < 1e-15);
-        assert!(pose.orientation.angle_to(Orientation::IDENTITY) < 1e-12);
+        let expected = Isometry3::translation(0.06, 0.12, 0.0);
+        assert!((pose.translation.vector - expected.translation.vector).norm() < 1e-15);
+        assert!(pose.rotation.angle_to(&expected.rotation) < 1e-12);
     }
 
     #[test]

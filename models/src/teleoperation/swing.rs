@@ -142,28 +142,33 @@ fn channel_values(yaw_rad: f64) -> [f64; CHANNEL_COUNT] {
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::{Isometry3, Vector3};
+
     use super::*;
     use crate::teleoperation::motion::Recording;
-    use crate::teleoperation::spatial::{length, subtract};
+
+    fn apart_m(a: &Isometry3<f64>, b: Vector3<f64>) -> f64 {
+        (a.translation.vector - b).norm()
+    }
 
     #[test]
     fn the_hand_follows_a_sine_of_the_given_amplitude() {
         let swing = Swing::new(0.1875).unwrap();
-        let middle_x_m = swing.at(0.0).right_hand.position_m[0];
+        let middle_x_m = swing.at(0.0).right_hand.translation.x;
         for step in 0..100 {
             let phase = f64::from(step) / 100.0;
-            let x_m = swing.at(phase).right_hand.position_m[0] - middle_x_m;
+            let x_m = swing.at(phase).right_hand.translation.x - middle_x_m;
             assert!((x_m - 0.1875 * (TAU * phase).sin()).abs() < 1e-12);
         }
-        let hand_m = swing.at(0.0).right_hand.position_m;
+        let right = swing.at(0.0).right_hand;
         assert!(
-            length(subtract(hand_m, [-0.18, 1.43, 0.54])) < 1e-12,
-            "{hand_m:?}"
+            apart_m(&right, Vector3::new(-0.18, 1.43, 0.54)) < 1e-12,
+            "{right:?}"
         );
-        let left_m = swing.at(0.3).left_hand.position_m;
+        let left = swing.at(0.3).left_hand;
         assert!(
-            length(subtract(left_m, [0.18, 0.89, 0.0])) < 1e-12,
-            "{left_m:?}"
+            apart_m(&left, Vector3::new(0.18, 0.89, 0.0)) < 1e-12,
+            "{left:?}"
         );
     }
 
@@ -182,21 +187,16 @@ mod tests {
         for step in 0..2000 {
             let time_s = 4.033 * f64::from(step) / 2000.0;
             let (read, made) = (recording.at(time_s), swing.at(time_s / 4.033));
-            let apart = subtract(read.right_hand.position_m, made.right_hand.position_m);
             // A chord between frames 8 ms apart misses the sine by at most 4 micrometres.
-            assert!(length(apart) < 5e-6, "{apart:?} at {time_s} s");
-            assert!(
-                read.right_hand
-                    .orientation
-                    .angle_to(made.right_hand.orientation)
-                    < 1e-4
-            );
-            assert!(
-                read.left_hand
-                    .orientation
-                    .angle_to(made.left_hand.orientation)
-                    < 1e-6
-            );
+            let apart_m = apart_m(&read.right_hand, made.right_hand.translation.vector);
+            assert!(apart_m < 5e-6, "{apart_m} m at {time_s} s");
+            let turns = [
+                (read.right_hand, made.right_hand, 1e-4),
+                (read.left_hand, made.left_hand, 1e-6),
+            ];
+            for (read, made, tolerance_rad) in turns {
+                assert!(read.rotation.angle_to(&made.rotation) < tolerance_rad);
+            }
         }
     }
 

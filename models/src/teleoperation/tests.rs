@@ -4,6 +4,7 @@ use core::time::Duration;
 use std::collections::BTreeMap;
 
 use bytemuck::Zeroable;
+use nalgebra::Vector3;
 
 use super::*;
 use crate::link::bernoulli::BernoulliLink;
@@ -57,15 +58,15 @@ fn track(frame_count: u64, rate_hz: f64) -> Tracked {
     let mut tracked = Tracked::default();
     for frame in 0..frame_count {
         hand = player.at(frame as f64 * frame_s).right_hand;
-        let answer = follower.follow(&hand, frame_s, false);
+        let answer = follower.follow(Some(&hand), frame_s, false);
         tracked.frame_count += 1;
         tracked.failure_count += u64::from(answer.reach != Reach::Reached);
         // Every tenth frame is checked by the full pose: that doubles the work.
         if frame % 10 == 0 {
             let tool = arm.tool(&answer.command.position_rad);
-            let (target, _) = clutch.follow(&hand);
-            let apart = spatial::subtract(tool.position_m, target.position_m);
-            tracked.error_m_max = tracked.error_m_max.max(spatial::length(apart));
+            let (target, _) = clutch.follow(Some(&hand));
+            let apart_m = (tool.translation.vector - target.translation.vector).norm();
+            tracked.error_m_max = tracked.error_m_max.max(apart_m);
         }
         if frame % 4033 == 0 {
             tracked.at_same_phase.push(answer.command.position_rad);
@@ -114,6 +115,40 @@ fn at_the_default_gain_the_robot_lags_195_ms_and_executes_every_loop() {
     assert!(figure("motion_loss_ratio").abs() < 1e-12);
     assert!(figure("ik_failure_count") + figure("ik_limited_count") < 0.5);
     assert!(figure("hold_count") < 0.5);
+}
+
+/// The entries of `log` published before `until_s`.
+fn beginning(log: &RunLog, until_s: f64) -> RunLog {
+    let mut beginning = RunLog::default();
+    for channel in [HUMAN_FRAME, ARM_COMMAND, ARM_STATUS] {
+        let messages = log.raw(channel).iter();
+        for logged in
+            messages.take_while(|logged| logged.envelope.published_ns as f64 <= until_s * 1e9)
+        {
+            beginning.push(channel, logged.envelope, &logged.payload);
+        }
+    }
+    beginning
+}
+
+#[test]
+fn scoring_twice_the_loops_takes_twice_the_work() {
+    let case = case(|_| {});
+    let whole = run(&case, None, 120.0 * 4.033).log;
+    let half = beginning(&whole, 60.0 * 4.033);
+    let [small, large] = [&half, &whole].map(|log| {
+        series::work::take();
+        let executed = case.score(log).get("motion_loops_executed_count").cloned();
+        (executed.unwrap().value.unwrap(), series::work::take())
+    });
+    assert!(
+        (large.0 - small.0 - 60.0).abs() < 0.5,
+        "{small:?} {large:?}"
+    );
+    assert!(small.1 > 1e6, "{small:?}");
+    // A little more than twice: of a longer log a smaller share lies in the margins of the search.
+    let ratio = large.1 / small.1;
+    assert!((1.9..2.2).contains(&ratio), "{ratio}");
 }
 
 #[test]
@@ -218,9 +253,9 @@ fn first_frame() -> HumanFrame {
     HumanFrame {
         frame_index: 0,
         source_time_ns: 0,
-        root: pose.root,
-        right_hand: pose.right_hand,
-        left_hand: pose.left_hand,
+        root: pose.root.into(),
+        right_hand: pose.right_hand.into(),
+        left_hand: pose.left_hand.into(),
     }
 }
 
@@ -293,8 +328,8 @@ fn a_motion_file_drives_the_robot_as_the_synthetic_human_does() {
     let last = |case| {
         let result = run(case, None, 6.0);
         let statuses = result.log.messages::<JointStatus>(ARM_STATUS);
-        statuses.last().unwrap().1.right.tool.position_m
+        Vector3::from(statuses.last().unwrap().1.right.tool.position_m)
     };
-    let apart = spatial::subtract(last(&synthetic), last(&recorded));
-    assert!(spatial::length(apart) < 1e-5, "{apart:?}");
+    let apart_m = (last(&synthetic) - last(&recorded)).norm();
+    assert!(apart_m < 1e-5, "{apart_m}");
 }
