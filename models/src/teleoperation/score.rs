@@ -2,7 +2,7 @@
 //! and nothing else, in time linear in the log's length.
 //!
 //! Commands and statuses are compared by the publication times the two producers stamped, so
-//! both must have read one clock.
+//! both must have read one clock. Where they did not, joint error and lag are unavailable.
 
 use crate::case_study::{Metric, Score};
 use crate::run_log::RunLog;
@@ -20,14 +20,35 @@ const PROMINENCE_RATIO: f64 = 0.5;
 /// Scores a run.
 pub(crate) fn score(case: &Teleoperation, log: &RunLog) -> Score {
     let period_s = case.parameters.motion_period_s;
-    let sent = Sent::read(log);
-    let moved = Moved::read(log, period_s);
+    let mut sent = Sent::read(log);
+    let mut moved = Moved::read(log, period_s);
+    if !log.has_one_clock() {
+        // Hosts start together within milliseconds, which is nothing against a motion loop.
+        for series in [&mut sent.tool_y, &mut moved.tool_y] {
+            let start = series.first().map_or(0, |(at, _)| *at);
+            series.iter_mut().for_each(|(at, _)| *at -= start);
+        }
+    }
     let mut metrics = Vec::from(motion_loops(case, &sent.tool_y, &moved.tool_y));
     metrics.extend(moved.joint_error());
     metrics.push(tracking_lag(&sent.tool_y, &moved.tool_y, period_s));
     metrics.push(tool_travel(&moved.tool_y, period_s));
     metrics.extend(events(&sent, &moved));
+    if !log.has_one_clock() {
+        metrics.iter_mut().for_each(withdraw_if_it_compares_clocks);
+    }
     Score { metrics }
+}
+
+/// Error and lag set a command's stamp against a status's: without one clock there is no figure.
+fn withdraw_if_it_compares_clocks(metric: &mut Metric) {
+    let compares = metric.name.starts_with("joint_error") || metric.name == "tracking_lag_ms";
+    if compares {
+        metric.value = None;
+        metric.interval = None;
+        "commands and statuses were stamped by two clocks that are not aligned"
+            .clone_into(&mut metric.method);
+    }
 }
 
 /// What the controller sent.
@@ -363,7 +384,10 @@ fn events(sent: &Sent, moved: &Moved) -> [Metric; 4] {
 mod tests {
     use super::*;
     use crate::case_study::CaseStudy;
+    use crate::simulation::Simulation;
     use crate::teleoperation::TeleoperationParameters;
+    use core::time::Duration;
+    use std::collections::BTreeMap;
 
     #[test]
     fn an_empty_log_gives_no_figure_but_a_reason_for_each() {
@@ -374,6 +398,43 @@ mod tests {
             assert_eq!(metric.value, None, "{metric:?}");
             assert_eq!(metric.interval, None, "{metric:?}");
             assert!(!metric.method.is_empty());
+        }
+    }
+
+    #[test]
+    fn two_clocks_withdraw_error_and_lag_but_not_the_loops() {
+        let case = Teleoperation::new(TeleoperationParameters::default(), 0).unwrap();
+        let simulation = Simulation::new(&case, BTreeMap::new()).unwrap();
+        let whole = simulation.run(Duration::from_secs(20)).unwrap().log;
+        let mut log = RunLog::default();
+        for (channel, offset_ns) in [(ARM_COMMAND, 0), (ARM_STATUS, 77_000_000_000)] {
+            for logged in whole.raw(channel) {
+                let mut envelope = logged.envelope;
+                envelope.published_ns += offset_ns;
+                log.push(channel, envelope, &logged.payload);
+            }
+        }
+        log.set_clocks_differ();
+        let (exact, apart) = (case.score(&whole), case.score(&log));
+        for name in [
+            "motion_loops_sent_count",
+            "motion_loops_executed_count",
+            "hold_count",
+        ] {
+            assert_eq!(
+                apart.get(name).unwrap().value,
+                exact.get(name).unwrap().value,
+                "{name}"
+            );
+        }
+        for name in [
+            "joint_error_rad_rms",
+            "joint_error_ratio",
+            "tracking_lag_ms",
+        ] {
+            assert!(exact.get(name).unwrap().value.is_some());
+            assert_eq!(apart.get(name).unwrap().value, None);
+            assert!(apart.get(name).unwrap().method.contains("not aligned"));
         }
     }
 
