@@ -26,7 +26,9 @@ pub(crate) fn score(case: &Teleoperation, log: &RunLog) -> Score {
         // Hosts start together within milliseconds, which is nothing against a motion loop.
         for series in [&mut sent.tool_y, &mut moved.tool_y] {
             let start = series.first().map_or(0, |(at, _)| *at);
-            series.iter_mut().for_each(|(at, _)| *at -= start);
+            for (at, _) in series.iter_mut() {
+                *at -= start;
+            }
         }
     }
     let mut metrics = Vec::from(motion_loops(case, &sent.tool_y, &moved.tool_y));
@@ -35,7 +37,9 @@ pub(crate) fn score(case: &Teleoperation, log: &RunLog) -> Score {
     metrics.push(tool_travel(&moved.tool_y, period_s));
     metrics.extend(events(&sent, &moved));
     if !log.has_one_clock() {
-        metrics.iter_mut().for_each(withdraw_if_it_compares_clocks);
+        for metric in &mut metrics {
+            withdraw_if_it_compares_clocks(metric);
+        }
     }
     Score { metrics }
 }
