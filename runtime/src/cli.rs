@@ -18,10 +18,11 @@ Examples:
       print a finished run's report again
 
 Exit codes:
-  0  the run ended as planned        70  internal error
-  1  a process or the run failed     77  not permitted
-  2  wrong arguments or topology     78  doctor --strict: host not fit
-  69 a peer host was not reachable   130 interrupted; the report is complete";
+  0  the run ended as planned         70  internal error
+  1  the run failed, or its report    78  doctor --strict: host not fit
+     has gaps                         130 interrupted; the report is
+  2  wrong arguments or topology          complete
+  69 a peer host was not reachable";
 
 /// Runs a robot's controller and its model as separate processes, over shared memory or a real
 /// network, and accounts for every microsecond in between.

@@ -145,7 +145,11 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
     };
     match supervisor::run(&topology, &options, &signals, console) {
         Ok(result) => {
-            let code = exit_code(&result.outcome);
+            let is_incomplete = result.has_gaps();
+            let code = match exit_code(&result.outcome) {
+                exit::RAN if is_incomplete => exit::FAILED,
+                code => code,
+            };
             console.progress("drawing up the account");
             let origin = (path.as_path(), options.command_line.as_slice());
             match analysis::conclude(&topology, &result, registry, origin) {
@@ -161,20 +165,23 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
         }
         Err(error) => {
             console.error(&error.to_string());
-            match error {
-                RunError::Peer(PeerError::Absent { .. } | PeerError::Connection { .. }) => {
-                    exit::PEER_ABSENT
-                }
-                RunError::Peer(PeerError::Mismatch { .. } | PeerError::Listen { .. }) => {
-                    exit::USAGE
-                }
-                RunError::Peer(PeerError::Interrupted { .. }) => interrupted(),
-                RunError::Folder { .. }
-                | RunError::Domains(_)
-                | RunError::Identity(_)
-                | RunError::Start(_) => exit::INTERNAL,
-            }
+            exit_code_of_error(&error)
         }
+    }
+}
+
+/// For a run that did not come about.
+fn exit_code_of_error(error: &RunError) -> u8 {
+    match error {
+        RunError::Peer(PeerError::Absent { .. } | PeerError::Connection { .. }) => {
+            exit::PEER_ABSENT
+        }
+        RunError::Peer(PeerError::Mismatch { .. } | PeerError::Listen { .. }) => exit::USAGE,
+        RunError::Peer(PeerError::Interrupted { .. }) => interrupted(),
+        RunError::Folder { .. }
+        | RunError::Domains(_)
+        | RunError::Identity(_)
+        | RunError::Start(_) => exit::INTERNAL,
     }
 }
 

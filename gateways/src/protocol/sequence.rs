@@ -312,8 +312,8 @@ impl SequenceWindow {
     }
 
     fn lose(&mut self, count: u64) {
-        self.counts.lost_count += count;
-        self.burst_length += count;
+        self.counts.lost_count = self.counts.lost_count.saturating_add(count);
+        self.burst_length = self.burst_length.saturating_add(count);
     }
 
     fn close_burst(&mut self) {

@@ -4,6 +4,8 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use hil_models::time::Instant;
+
 use super::records::RunRecords;
 use crate::realtime::GrantOutcome;
 use crate::report::summary::{
@@ -50,13 +52,18 @@ pub(super) fn run_facts(
         seed: topology.run().seed,
         host: result.own_hosts.join(", "),
         started: result.started.clone(),
-        duration_s: result.span.1.seconds_since(result.span.0),
+        duration_s: own_span(result).map_or(0.0, |(start, end)| end.seconds_since(start)),
         outcome,
         exit_reason: result.outcome.text(),
         folder: result.folder.root().display().to_string(),
         files: files.map(|(name, what)| Fact::new(name, what)).to_vec(),
         repeat_command: shell_words(command_line),
     }
+}
+
+/// The run on the clock of this supervisor.
+fn own_span(result: &RunResult) -> Option<(Instant, Instant)> {
+    result.spans.get(result.own_hosts.first()?).copied()
 }
 
 /// What the kernel granted and refused, each item once with the threads it concerns.
@@ -137,7 +144,10 @@ pub(super) fn run_event(result: &RunResult, event: &Event) -> RunEvent {
         None => "never came back".to_owned(),
     });
     RunEvent {
-        at_s: event.at.seconds_since(result.span.0),
+        at_s: result
+            .spans
+            .get(&event.host)
+            .map_or(0.0, |(start, _)| event.at.seconds_since(*start)),
         what: format!("{}: {}", event.process, event.what),
         cause: gap.unwrap_or_default(),
     }

@@ -88,6 +88,25 @@ pub(crate) fn conclude(
     summary
         .warnings
         .extend(result.problems.iter().chain(&records.problems).cloned());
+    for process in &result.processes {
+        let failures = process
+            .report
+            .iter()
+            .flat_map(|report| &report.recorder_failures);
+        let named = failures.map(|failure| format!("{} could not write {failure}", process.name));
+        summary.warnings.extend(named);
+        let unconnected = process
+            .report
+            .as_ref()
+            .map_or(0, |report| report.connection_failures);
+        if unconnected > 0 {
+            let name = &process.name;
+            summary.warnings.push(format!(
+                "{name} failed {unconnected} times to connect to the other end of a channel; do \
+                 all processes run as one user?"
+            ));
+        }
+    }
     if !result.has_one_clock {
         summary.warnings.push(
             "clocks not aligned: no figure crosses from one host to the other; segments on one \

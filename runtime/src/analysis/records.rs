@@ -14,7 +14,7 @@ use hil_models::measure::record::{
     EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, TakenRecord,
 };
 use hil_models::run_log::RunLog;
-use hil_models::time::Alignment;
+use hil_models::time::{Alignment, Instant};
 
 use super::AnalysisError;
 use crate::record::{RecordFile, RecordFileError, RecordKind};
@@ -112,9 +112,9 @@ impl RunRecords {
         let nothing = ChannelFiles::default();
         let files = self.channels.get(&channel.name).unwrap_or(&nothing);
         let interruptions = interruptions(topology, result, channel);
-        let span = RunSpan {
-            start: result.span.0,
-            end: result.span.1,
+        let span_of = |process: &str| {
+            let (start, end) = *result.spans.get(&topology.process(process)?.host)?;
+            Some(RunSpan { start, end })
         };
         let crossing = topology.crossing(channel);
         let path = if crossing.is_some() {
@@ -127,12 +127,10 @@ impl RunRecords {
         let delay = crossing
             .and_then(|crossing| crossing.impairment)
             .map(|one| one.delay);
-        let is_on_this_clock =
-            |process: &str| result.has_one_clock || is_here(topology, result, process);
         let context = AccountContext {
             interruptions: &interruptions,
-            producer_run: is_on_this_clock(&channel.from).then_some(span),
-            consumer_run: is_on_this_clock(&channel.to).then_some(span),
+            producer_run: span_of(&channel.from),
+            consumer_run: span_of(&channel.to),
             flight_time_max: FLIGHT_TIME_MAX + delay.unwrap_or(Duration::ZERO),
             round_trips_ns: &files.round_trips_ns,
             seed: topology.run().seed,
@@ -153,12 +151,6 @@ fn extend<T>(records: &mut Option<Vec<T>>, more: impl Iterator<Item = T>) {
     records.get_or_insert_default().extend(more);
 }
 
-fn is_here(topology: &Topology, result: &RunResult, process: &str) -> bool {
-    topology
-        .process(process)
-        .is_some_and(|process| result.own_hosts.contains(&process.host))
-}
-
 /// The times in which a process on the channel's way was not there.
 fn interruptions(topology: &Topology, result: &RunResult, channel: &Channel) -> Vec<Interruption> {
     let gateway = |process: &str| {
@@ -171,6 +163,12 @@ fn interruptions(topology: &Topology, result: &RunResult, channel: &Channel) -> 
         (gateway(&channel.to), PathProcess::ReceivingGateway),
         (Some(channel.to.clone()), PathProcess::Consumer),
     ];
+    let end_of = |host: &str| {
+        result
+            .spans
+            .get(host)
+            .map_or(Instant::from_ns(i64::MAX), |span| span.1)
+    };
     let mut found = Vec::new();
     for event in &result.events {
         let Some(gap) = event.interruption else {
@@ -184,7 +182,7 @@ fn interruptions(topology: &Topology, result: &RunResult, channel: &Channel) -> 
                 process: event.process.clone(),
                 place: *place,
                 from: gap.from,
-                until: gap.until.unwrap_or(result.span.1),
+                until: gap.until.unwrap_or(end_of(&event.host)),
                 cause: event.what.clone(),
             });
         }

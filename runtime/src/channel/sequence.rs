@@ -117,7 +117,10 @@ impl SequenceTracker {
             None => self.current = Some((epoch, sequence)),
             Some((current, newest)) if current == epoch => {
                 if sequence > newest {
-                    self.counters.missed_count += sequence - newest - 1;
+                    self.counters.missed_count = self
+                        .counters
+                        .missed_count
+                        .saturating_add(sequence - newest - 1);
                     self.current = Some((epoch, sequence));
                 } else {
                     self.counters.reordered_count += 1;
@@ -130,7 +133,7 @@ impl SequenceTracker {
             }
             Some((ended, _)) => {
                 self.counters.restart_count += 1;
-                self.counters.missed_count += sequence;
+                self.counters.missed_count = self.counters.missed_count.saturating_add(sequence);
                 self.previous_epoch = Some(ended);
                 self.current = Some((epoch, sequence));
             }

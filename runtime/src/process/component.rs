@@ -8,7 +8,7 @@ use std::thread;
 use std::time::Duration;
 
 use hil_models::component::Role;
-use hil_models::endpoint::{Activity, Endpoint, PortCountError};
+use hil_models::endpoint::{Endpoint, PortCountError};
 use hil_models::measure::record::{PublishedRecord, TakenRecord};
 use hil_models::message::{Envelope, MessageType};
 
@@ -89,10 +89,10 @@ fn prepare_and_live(path: &Path, registry: &Registry) -> Result<(), ComponentErr
         realtime: vec![("main".to_owned(), grant)],
         ..ProcessReport::default()
     };
+    let mut lived = Ok(());
     if orders.wait_for_start() {
-        let lived = live(endpoint, waiter.as_mut(), &orders, launch.wait, &mut report);
+        lived = live(endpoint, waiter.as_mut(), &orders, launch.wait, &mut report);
         progress.store(false, Ordering::Release);
-        lived?;
     }
     drop(waiter);
     let outcome = recorder.finish();
@@ -100,7 +100,7 @@ fn prepare_and_live(path: &Path, registry: &Registry) -> Result<(), ComponentErr
     report.recorder_failures = outcome.failures;
     add_usage(&mut report);
     say(&FromProcess::Finished(Box::new(report)));
-    Ok(())
+    Ok(lived?)
 }
 
 fn make_role(card: &ProcessCard, registry: &Registry) -> Result<Box<dyn Role>, ComponentError> {
@@ -279,33 +279,49 @@ fn live(
     report: &mut ProcessReport,
 ) -> Result<(), ChannelError> {
     let own_wait = WaitStrategy::new(mode);
-    let mut total = Activity::default();
     endpoint.start(MonotonicClock::now());
-    while !orders.is_stopping() {
-        let activity = endpoint.poll(MonotonicClock::now())?;
-        total.malformed_count += activity.malformed_count;
-        total.tick_count += activity.tick_count;
-        let now = MonotonicClock::now();
-        let next_tick = endpoint.role().next_tick();
-        let mut pause = own_wait.pause(now, next_tick);
-        for input in endpoint.inputs_mut() {
-            pause = pause.sooner(input.wait.pause(now, None));
-        }
-        match (pause, &mut waiter) {
-            (Pause::Spin, _) => core::hint::spin_loop(),
-            (Pause::Sleep(until), Some(waiter)) => {
-                waiter.wait_until(Some(until))?;
-            }
-            (Pause::Sleep(until), None) => {
-                // An interrupted sleep only means looking again a little early.
-                let (Wake::Due | Wake::Interrupted) = MonotonicClock::sleep_until(until);
-            }
-        }
+    let mut outcome = Ok(());
+    while outcome.is_ok() && !orders.is_stopping() {
+        outcome = turn(&mut endpoint, &mut waiter, &own_wait, report);
     }
     report.skipped_ticks = endpoint.role().skipped_ticks();
-    report.ticks = total.tick_count;
-    report.malformed_count = total.malformed_count;
     report.outbox_dropped = endpoint.role().outbox_dropped();
+    let inputs = endpoint.inputs_mut().iter();
+    report.connection_failures = inputs
+        .map(|one| one.port.counters().connection_failure_count)
+        .sum();
+    let outputs = endpoint.outputs_mut().iter();
+    report.connection_failures += outputs
+        .map(|one| one.port.connection_failure_count())
+        .sum::<u64>();
+    outcome
+}
+
+/// Does what there is to do, then waits for more.
+fn turn(
+    endpoint: &mut ComponentEndpoint,
+    waiter: &mut Option<&mut Waiter>,
+    own_wait: &WaitStrategy,
+    report: &mut ProcessReport,
+) -> Result<(), ChannelError> {
+    let activity = endpoint.poll(MonotonicClock::now())?;
+    report.malformed_count += activity.malformed_count;
+    report.ticks += activity.tick_count;
+    let now = MonotonicClock::now();
+    let mut pause = own_wait.pause(now, endpoint.role().next_tick());
+    for input in endpoint.inputs_mut() {
+        pause = pause.sooner(input.wait.pause(now, None));
+    }
+    match (pause, waiter) {
+        (Pause::Spin, _) => core::hint::spin_loop(),
+        (Pause::Sleep(until), Some(waiter)) => {
+            waiter.wait_until(Some(until))?;
+        }
+        (Pause::Sleep(until), None) => {
+            // An interrupted sleep only means looking again a little early.
+            let (Wake::Due | Wake::Interrupted) = MonotonicClock::sleep_until(until);
+        }
+    }
     Ok(())
 }
 

@@ -61,6 +61,9 @@ pub struct ProcessReport {
     pub malformed_count: u64,
     /// Messages refused by a full outbox.
     pub outbox_dropped: u64,
+    /// Readers or writers of its channels it could not connect to: they hear nothing of it.
+    #[serde(default)]
+    pub connection_failures: u64,
     /// Records dropped by a full ring.
     pub recorder_dropped: u64,
     /// Files that could not be written.

@@ -17,6 +17,11 @@ use super::file::{RecordFileError, RecordHeader, RecordKind};
 /// How often the writer empties the rings: what a kill of the process can lose at most.
 const FLUSH_PERIOD: Duration = Duration::from_millis(20);
 
+/// No ring takes more memory than this, unless its records are enormous.
+const RING_BYTES_MAX: usize = 8 << 20;
+/// Fewer would not bridge the writer's period at a kilohertz.
+const RING_RECORDS_MIN: usize = 64;
+
 /// The producing end of one ring: lives in a measured thread.
 #[derive(Debug)]
 pub struct RecordSink {
@@ -89,7 +94,8 @@ impl Recorder {
         }
     }
 
-    /// Opens the file for `kind` records of `channel` and a ring of `capacity_records`. Call
+    /// Opens the file for `kind` records of `channel` and a ring of `capacity_records`, or of
+    /// as many as 8 MiB hold. Call
     /// before [`Recorder::start`].
     ///
     /// # Errors
@@ -113,12 +119,15 @@ impl Recorder {
         };
         let path = self.folder.join(header.file_name(&self.writer));
         let bytes = header.encode(&path)?;
-        let file = File::create(&path)
+        let file = File::create_new(&path)
             .and_then(|mut file| file.write_all(&bytes).map(|()| file))
             .map_err(|source| RecordFileError::Io {
                 path: path.clone(),
                 source,
             })?;
+        let capacity_records = capacity_records
+            .min(RING_BYTES_MAX / record_bytes)
+            .max(RING_RECORDS_MIN);
         let (producer, ring) = rtrb::RingBuffer::new(record_bytes * capacity_records);
         self.drains.push(Drain { ring, file, path });
         Ok(RecordSink {

@@ -1,5 +1,5 @@
 //! One process the supervisor started: its pipes, its log, its death. When to start, restart or
-//! stop it is decided in `watch.rs`.
+//! stop it is decided in `crew.rs`.
 
 use std::fs::File;
 use std::io::{self, BufRead, BufReader, Write};
@@ -7,7 +7,7 @@ use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::path::Path;
 use std::process::{ChildStdin, Command, ExitStatus, Stdio};
 use std::sync::mpsc::SyncSender;
-use std::thread;
+use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use nix::sys::signal::{Signal, killpg};
@@ -23,6 +23,7 @@ pub(crate) type Word = (usize, u32, FromProcess);
 #[derive(Debug)]
 pub(crate) struct Child {
     process: std::process::Child,
+    words: Option<JoinHandle<()>>,
     stdin: Option<ChildStdin>,
     status: Option<ExitStatus>,
     is_foreign: bool,
@@ -49,7 +50,7 @@ impl Child {
             .stdout
             .take()
             .expect("standard output was piped just above");
-        thread::Builder::new()
+        let words = thread::Builder::new()
             .name(format!("words {index}"))
             .spawn(move || {
                 for line in BufReader::new(output).lines() {
@@ -64,6 +65,7 @@ impl Child {
         let stdin = process.stdin.take();
         Ok(Self {
             process,
+            words: Some(words),
             stdin,
             status: None,
             is_foreign: false,
@@ -80,6 +82,7 @@ impl Child {
         let process = command.stdin(Stdio::null()).spawn()?;
         Ok(Self {
             process,
+            words: None,
             stdin: None,
             status: None,
             is_foreign: true,
@@ -106,6 +109,12 @@ impl Child {
             ),
             Err(_out_of_range) => true,
         }
+    }
+
+    /// True once everything the process said has been handed on. Comes soon after its end, as
+    /// nobody holds the other end of its output then.
+    pub(crate) fn has_said_all(&self) -> bool {
+        self.words.as_ref().is_none_or(JoinHandle::is_finished)
     }
 
     /// Gives an order. A foreign command gets SIGTERM for [`ToProcess::Stop`] and nothing for

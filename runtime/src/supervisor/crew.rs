@@ -5,11 +5,11 @@ use std::collections::BTreeMap;
 use std::env;
 use std::io;
 use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::process::{Command, ExitStatus};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::time::Duration;
 
-use hil_models::time::Instant;
+use hil_models::time::{Instant, duration_ns};
 
 use super::child::{Child, Word, describe_exit};
 use super::event::{Event, Interruption};
@@ -26,6 +26,9 @@ const WORDS_MAX: usize = 4096;
 /// Messages a dead process may have held in its queues were published at most this long before
 /// it was last seen alive.
 const QUEUE_SPAN: Duration = Duration::from_millis(50);
+
+/// The last words of a process that has ended are in its pipe; reading them takes no longer.
+const LAST_WORDS_PATIENCE: Duration = Duration::from_secs(1);
 
 /// Why the processes could not be started.
 #[derive(Debug, thiserror::Error)]
@@ -63,7 +66,6 @@ pub(crate) struct Member {
     pub(crate) progress: Vec<ChannelProgress>,
     child: Option<Child>,
     is_ready: bool,
-    is_stopping: bool,
     seen_alive: Instant,
     complaint: Option<String>,
 }
@@ -97,7 +99,6 @@ impl Crew {
             progress: Vec::new(),
             child: None,
             is_ready: false,
-            is_stopping: false,
             seen_alive: Instant::ZERO,
             complaint: None,
         });
@@ -164,8 +165,13 @@ impl Crew {
             program,
             source,
         })?;
+        let now = MonotonicClock::now();
         member.child = Some(child);
-        member.seen_alive = MonotonicClock::now();
+        member.seen_alive = now;
+        if member.is_ready && self.has_started {
+            // A user's own program says nothing: being started is all that is known of it.
+            self.close_interruptions(index, now);
+        }
         Ok(())
     }
 
@@ -194,7 +200,7 @@ impl Crew {
     }
 
     /// Hears what the processes said, sees who died, and applies the policies.
-    pub(crate) fn watch(&mut self) -> Result<Verdict, CrewError> {
+    pub(crate) fn watch(&mut self) -> Verdict {
         self.listen();
         let now = MonotonicClock::now();
         let mut verdict = Verdict::GoesOn;
@@ -207,46 +213,62 @@ impl Crew {
                 member.seen_alive = now;
                 continue;
             };
-            let died_after = member.seen_alive;
-            member.child = None;
-            let mut what = describe_exit(status);
-            // The words of a process may still be on their way when its end is seen.
-            self.listen();
-            let member = &mut self.members[index];
-            if let Some(complaint) = &member.complaint {
-                what = format!("{what}: {complaint}");
-            }
-            member.end = Some(what.clone());
-            if member.is_stopping {
+            // Its last words decide what its end means; they come within moments.
+            if !child.has_said_all() {
                 continue;
             }
-            let name = member.plan.name.clone();
-            let limit = match member.plan.on_exit {
-                OnExit::EndRun => 0,
-                OnExit::Restart { limit } => limit,
-            };
-            if self.has_started && member.restart_count < limit && member.complaint.is_none() {
-                member.restart_count += 1;
-                let count = member.restart_count;
-                let from = Instant::from_ns(
-                    died_after.as_ns() - hil_models::time::duration_ns(QUEUE_SPAN),
-                );
-                let interruption = Interruption { from, until: None };
-                let text = format!("{what}; restart {count} of at most {limit}");
-                self.note(now, index, text, Some(interruption));
-                self.spawn(index)?;
-            } else {
-                let is_orderly = status.success() && self.members[index].complaint.is_none();
-                self.note(now, index, format!("{what}; policy: end the run"), None);
-                let text = format!("process {name} {what}");
-                verdict = if is_orderly {
-                    Verdict::Finished(text)
-                } else {
-                    Verdict::Failed(text)
-                };
+            member.child = None;
+            self.listen();
+            let judged = self.judge(index, status, now);
+            // A failure is not overridden by an orderly end seen in the same turn.
+            if !matches!(verdict, Verdict::Failed(_)) && judged != Verdict::GoesOn {
+                verdict = judged;
             }
         }
-        Ok(verdict)
+        verdict
+    }
+
+    /// What the end of a process means: it is started again, or the run ends.
+    fn judge(&mut self, index: usize, status: ExitStatus, now: Instant) -> Verdict {
+        let member = &mut self.members[index];
+        let mut what = describe_exit(status);
+        if let Some(complaint) = &member.complaint {
+            what = format!("{what}: {complaint}");
+        }
+        member.end = Some(what.clone());
+        let limit = match member.plan.on_exit {
+            OnExit::EndRun => 0,
+            OnExit::Restart { limit } => limit,
+        };
+        let name = member.plan.name.clone();
+        let is_orderly = status.success() && member.complaint.is_none();
+        if self.has_started && member.restart_count < limit && member.complaint.is_none() {
+            member.restart_count += 1;
+            let text = format!(
+                "{what}; restart {} of at most {limit}",
+                member.restart_count
+            );
+            let from = member.seen_alive.as_ns() - duration_ns(QUEUE_SPAN);
+            let interruption = Interruption {
+                from: Instant::from_ns(from),
+                until: None,
+            };
+            self.note(now, index, text, Some(interruption));
+            return match self.spawn(index) {
+                Ok(()) => Verdict::GoesOn,
+                Err(error) => {
+                    self.note(now, index, error.to_string(), None);
+                    Verdict::Failed(error.to_string())
+                }
+            };
+        }
+        self.note(now, index, format!("{what}; policy: end the run"), None);
+        let text = format!("process {name} {what}");
+        if is_orderly {
+            Verdict::Finished(text)
+        } else {
+            Verdict::Failed(text)
+        }
     }
 
     fn listen(&mut self) {
@@ -263,7 +285,7 @@ impl Crew {
                         if let Some(child) = &mut member.child {
                             child.order(ToProcess::Start);
                         }
-                        self.close_interruption(index, now);
+                        self.close_interruptions(index, now);
                     }
                 }
                 FromProcess::Progress(progress) => member.progress = progress,
@@ -274,16 +296,17 @@ impl Crew {
         }
     }
 
-    fn close_interruption(&mut self, index: usize, now: Instant) {
+    /// The process is back: whatever interruption of it is still open ends here.
+    fn close_interruptions(&mut self, index: usize, now: Instant) {
         let name = &self.members[index].plan.name;
-        let open = self.events.iter_mut().rev().find(|event| {
-            event.process == *name && event.interruption.is_some_and(|gap| gap.until.is_none())
-        });
-        if let Some(event) = open {
-            event.interruption = event.interruption.map(|gap| Interruption {
-                until: Some(now),
-                ..gap
-            });
+        for event in self
+            .events
+            .iter_mut()
+            .filter(|event| event.process == *name)
+        {
+            if let Some(gap) = &mut event.interruption {
+                gap.until.get_or_insert(now);
+            }
         }
     }
 
@@ -312,7 +335,6 @@ impl Crew {
             .collect();
         for index in &chosen {
             let member = &mut self.members[*index];
-            member.is_stopping = true;
             if let Some(child) = &mut member.child {
                 child.order(ToProcess::Stop);
             }
@@ -323,6 +345,11 @@ impl Crew {
                 continue;
             };
             let ended_by_itself = child.end(deadline);
+            let said_all_by = std::time::Instant::now() + LAST_WORDS_PATIENCE;
+            while !child.has_said_all() && std::time::Instant::now() < said_all_by {
+                self.listen();
+                std::thread::sleep(Duration::from_millis(1));
+            }
             let end = child
                 .poll_exit()
                 .map_or_else(|| "ended".to_owned(), describe_exit);
@@ -335,8 +362,6 @@ impl Crew {
             }
             self.members[index].end = Some(end);
         }
-        // The last words travel through a thread per process; they end with its output.
-        std::thread::sleep(Duration::from_millis(20));
         self.listen();
     }
 

@@ -46,3 +46,16 @@ pub struct ProcessStory {
     /// What it said last; `None` when it did not end in order.
     pub report: Option<ProcessReport>,
 }
+
+/// What one host tells of its share of a run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct HostStory {
+    /// The hosts that ran under one supervisor, and so on one clock.
+    pub hosts: Vec<String>,
+    /// Start and end of the run on that clock.
+    pub span: (Instant, Instant),
+    /// What happened, in order of time.
+    pub events: Vec<Event>,
+    /// How the processes fared.
+    pub processes: Vec<ProcessStory>,
+}

@@ -1,109 +1,166 @@
 //! After a run, every host gets the records of all hosts, so that each report is complete: the
-//! others send theirs to the first host of the topology, and it sends everything to each. It
+//! others send theirs to the first host of the topology, and it sends everybody the rest. It
 //! computes nothing from them.
 
+use std::collections::BTreeSet;
 use std::fs::{self, File};
 use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
-use std::thread;
-use std::time::Duration;
+use std::sync::mpsc::{Receiver, RecvTimeoutError};
+use std::thread::{self, ScopedJoinHandle};
+use std::time::{Duration, Instant};
 
-use super::event::{Event, ProcessStory};
+use super::event::HostStory;
 use super::frame::{
     CHUNK_BYTES, Frame, PeerMessage, is_plain_record_name, write_chunk, write_message,
 };
 use super::peer::{Peer, PeerEvent};
 
-/// A peer that sends nothing for this long while records are due has failed to deliver them.
+/// A peer that says nothing for this long while records are due has failed to deliver them.
 const PATIENCE: Duration = Duration::from_secs(20);
+/// How often the first host says that it is still there while it receives.
+const ALIVE_PERIOD: Duration = Duration::from_secs(1);
 
-/// What one host tells of its share of the run.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub(crate) struct HostStory {
-    pub(crate) events: Vec<Event>,
-    pub(crate) processes: Vec<ProcessStory>,
-}
-
-/// What came from the peers.
+/// What came from one peer, or from all of them.
 #[derive(Debug, Default)]
 pub(crate) struct Received {
     pub(crate) stories: Vec<HostStory>,
     /// Why records of a host are missing or incomplete.
     pub(crate) problems: Vec<String>,
+    names: BTreeSet<String>,
 }
 
 /// Sends this host's records and story, and receives those of the others into `records`.
 pub(crate) fn exchange(
     peers: &mut [Peer],
     is_first_host: bool,
-    records: &Path,
-    story: &HostStory,
+    (records, story): (&Path, &HostStory),
 ) -> Received {
-    let mut received = Received::default();
-    let own = match record_files(records) {
-        Ok(own) => own,
-        Err(error) => {
-            received
-                .problems
-                .push(format!("cannot list own records: {error}"));
-            Vec::new()
+    let mut all = Received::default();
+    let own = record_files(records).unwrap_or_else(|error| {
+        all.problems
+            .push(format!("cannot list own records: {error}"));
+        Vec::new()
+    });
+    for peer in peers.iter_mut() {
+        if let Err(error) = peer.allow_writes_to_take(PATIENCE) {
+            all.problems.push(format!("{}: {error}", peer.hello.host));
         }
-    };
+    }
+    let given = (own.as_slice(), core::slice::from_ref(story));
     if is_first_host {
-        for peer in peers.iter_mut() {
-            take_all(peer, records, &mut received);
-        }
-        let everything = record_files(records).unwrap_or(own);
-        let mut stories = received.stories.clone();
-        stories.push(story.clone());
-        for peer in peers.iter_mut() {
-            let host = peer.hello.host.clone();
-            let (writer, _) = peer.halves();
-            if let Err(error) = give_all(writer, &everything, &stories) {
-                received
-                    .problems
-                    .push(format!("records could not be sent to {host}: {error}"));
-            }
+        let received = collect(peers, records);
+        distribute(peers, given, (&received, records), &mut all);
+        for one in received {
+            all.stories.extend(one.stories);
+            all.problems.extend(one.problems);
         }
     } else {
         for peer in peers.iter_mut() {
-            give_and_take(peer, &own, records, (story, &mut received));
+            give_and_take(peer, given, records, &mut all);
         }
     }
-    received
+    all
+}
+
+/// Receives from all peers at once, and says meanwhile that this host is still there.
+fn collect(peers: &mut [Peer], records: &Path) -> Vec<Received> {
+    thread::scope(|scope| {
+        let mut writers = Vec::new();
+        let mut receiving = Vec::new();
+        for peer in peers {
+            let host = peer.hello.host.clone();
+            let (writer, inbox) = peer.halves();
+            writers.push(writer);
+            let take = move || take_from(&host, inbox, records);
+            receiving.push(scope.spawn(take));
+        }
+        let mut said = Instant::now();
+        while !receiving.iter().all(ScopedJoinHandle::is_finished) {
+            if said.elapsed() >= ALIVE_PERIOD {
+                said = Instant::now();
+                for writer in &mut writers {
+                    // A peer that left is noticed by the thread that receives from it.
+                    let _left = write_message(*writer, &PeerMessage::Alive).is_err();
+                }
+            }
+            thread::sleep(Duration::from_millis(2));
+        }
+        receiving.into_iter().map(join_receiving).collect()
+    })
+}
+
+/// Sends every peer what it does not have yet, all at once.
+fn distribute(
+    peers: &mut [Peer],
+    (own, own_story): (&[PathBuf], &[HostStory]),
+    (received, records): (&[Received], &Path),
+    all: &mut Received,
+) {
+    let sent = thread::scope(|scope| {
+        let mut sending = Vec::new();
+        for (index, peer) in peers.iter_mut().enumerate() {
+            let others = received
+                .iter()
+                .enumerate()
+                .filter(|(other, _)| *other != index);
+            let mut files = own.to_vec();
+            let mut stories = own_story.to_vec();
+            for (_, other) in others {
+                files.extend(other.names.iter().map(|name| records.join(name)));
+                stories.extend(other.stories.iter().cloned());
+            }
+            let host = peer.hello.host.clone();
+            let (writer, _) = peer.halves();
+            let give = move || give_all(writer, &files, &stories);
+            sending.push((host, scope.spawn(give)));
+        }
+        sending
+            .into_iter()
+            .map(|(host, one)| (host, join_sending(one)))
+            .collect::<Vec<_>>()
+    });
+    for (host, outcome) in sent {
+        note_unsent(&host, outcome, all);
+    }
 }
 
 /// Sends in a thread of its own: two ends that only send would wait for each other for ever.
 fn give_and_take(
     peer: &mut Peer,
-    own: &[PathBuf],
+    (own, own_story): (&[PathBuf], &[HostStory]),
     records: &Path,
-    (story, received): (&HostStory, &mut Received),
+    all: &mut Received,
 ) {
     let host = peer.hello.host.clone();
     let (writer, inbox) = peer.halves();
-    let stories = [story.clone()];
-    let sent = thread::scope(|scope| {
-        let sending = scope.spawn(|| give_all(writer, own, &stories));
-        let mut next = || inbox.recv_timeout(PATIENCE).ok();
-        take_from(&host, &mut next, records, received);
-        sending
-            .join()
-            .unwrap_or_else(|_panic| Err(io::Error::other("the sending thread panicked")))
+    let (received, sent) = thread::scope(|scope| {
+        let sending = scope.spawn(|| give_all(writer, own, own_story));
+        let received = take_from(&host, inbox, records);
+        (received, join_sending(sending))
     });
-    if let Err(error) = sent {
-        received
-            .problems
-            .push(format!("records could not be sent to {host}: {error}"));
-    }
-    // The first host sends everybody's story back, this host's own included.
-    received.stories.retain(|other| other != story);
+    all.stories.extend(received.stories);
+    all.problems.extend(received.problems);
+    note_unsent(&host, sent, all);
 }
 
-fn take_all(peer: &mut Peer, records: &Path, received: &mut Received) {
-    let host = peer.hello.host.clone();
-    let mut next = || peer.receive(PATIENCE);
-    take_from(&host, &mut next, records, received);
+fn join_receiving(thread: ScopedJoinHandle<'_, Received>) -> Received {
+    thread.join().unwrap_or_else(|_panic| Received {
+        problems: vec!["a receiving thread panicked".to_owned()],
+        ..Received::default()
+    })
+}
+
+fn join_sending(thread: ScopedJoinHandle<'_, io::Result<()>>) -> io::Result<()> {
+    let panicked = |_panic| Err(io::Error::other("the sending thread panicked"));
+    thread.join().unwrap_or_else(panicked)
+}
+
+fn note_unsent(host: &str, sent: io::Result<()>, all: &mut Received) {
+    if let Err(error) = sent {
+        all.problems
+            .push(format!("records could not be sent to {host}: {error}"));
+    }
 }
 
 fn record_files(records: &Path) -> io::Result<Vec<PathBuf>> {
@@ -116,8 +173,7 @@ fn record_files(records: &Path) -> io::Result<Vec<PathBuf>> {
 
 fn give_all(out: &mut impl Write, files: &[PathBuf], stories: &[HostStory]) -> io::Result<()> {
     for story in stories {
-        let HostStory { events, processes } = story.clone();
-        write_message(out, &PeerMessage::Report { events, processes })?;
+        write_message(out, &PeerMessage::Report(story.clone()))?;
     }
     for path in files {
         let Some(name) = path.file_name().and_then(|name| name.to_str()) else {
@@ -150,31 +206,30 @@ struct Incoming {
     left: u64,
 }
 
-fn take_from(
-    host: &str,
-    next: &mut dyn FnMut() -> Option<PeerEvent>,
-    records: &Path,
-    received: &mut Received,
-) {
+fn take_from(host: &str, inbox: &mut Receiver<PeerEvent>, records: &Path) -> Received {
+    let mut received = Received::default();
     let mut incoming = Incoming {
         file: None,
         left: 0,
     };
     let problem = loop {
-        let frame = match next() {
-            Some(PeerEvent::Frame(frame)) => frame,
-            Some(PeerEvent::Closed(reason)) => break reason,
-            None => break format!("silent for {} s", PATIENCE.as_secs()),
+        let frame = match inbox.recv_timeout(PATIENCE) {
+            Ok(PeerEvent::Frame(frame)) => frame,
+            Ok(PeerEvent::Closed(reason)) => break reason,
+            Err(RecvTimeoutError::Disconnected) => break "connection closed".to_owned(),
+            Err(RecvTimeoutError::Timeout) => {
+                break format!("silent for {} s", PATIENCE.as_secs());
+            }
         };
-        match take_frame(frame, records, &mut incoming, &mut received.stories) {
-            Ok(true) => return,
+        match take_frame(frame, records, &mut incoming, &mut received) {
+            Ok(true) => return received,
             Ok(false) => {}
             Err(error) => break error.to_string(),
         }
     };
+    let text = format!("records of {host} are incomplete: {problem}");
+    received.problems.push(text);
     received
-        .problems
-        .push(format!("records of {host} are incomplete: {problem}"));
 }
 
 /// Deals with one frame; true when it was the last.
@@ -182,28 +237,21 @@ fn take_frame(
     frame: Frame,
     records: &Path,
     incoming: &mut Incoming,
-    stories: &mut Vec<HostStory>,
+    received: &mut Received,
 ) -> io::Result<bool> {
     let invalid = |text: String| io::Error::new(io::ErrorKind::InvalidData, text);
     match frame {
         Frame::Message(PeerMessage::Done) => return Ok(true),
-        Frame::Message(PeerMessage::Report { events, processes }) => {
-            stories.push(HostStory { events, processes });
-        }
+        Frame::Message(PeerMessage::Report(story)) => received.stories.push(story),
         Frame::Message(PeerMessage::File { name, size_bytes }) => {
             if !is_plain_record_name(&name) {
                 return Err(invalid(format!(
                     "file name {name:?} is not a record file's"
                 )));
             }
-            // A file that is here already is this host's own, come back from the first host.
-            let created = File::create_new(records.join(&name));
+            incoming.file = Some(File::create_new(records.join(&name))?);
             incoming.left = size_bytes;
-            incoming.file = match created {
-                Ok(file) => Some(file),
-                Err(error) if error.kind() == io::ErrorKind::AlreadyExists => None,
-                Err(error) => return Err(error),
-            };
+            received.names.insert(name);
         }
         Frame::Chunk(bytes) => {
             let length = bytes.len() as u64;

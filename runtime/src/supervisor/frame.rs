@@ -5,7 +5,7 @@ use std::io::{self, Read, Write};
 
 use serde::{Deserialize, Serialize};
 
-use super::event::{Event, ProcessStory};
+use super::event::HostStory;
 
 /// Largest frame either side accepts; a longer length field is an error, not an allocation.
 pub(crate) const FRAME_BYTES_MAX: usize = 1 << 20;
@@ -25,8 +25,6 @@ pub(crate) struct PeerHello {
     pub clock_id: u64,
     /// Fingerprint of the host's shared-memory domain; must differ.
     pub domain: [u8; 16],
-    /// Name of the run's folder, chosen by the first host of the topology.
-    pub run_id: String,
 }
 
 /// What supervisors tell each other.
@@ -40,15 +38,18 @@ pub(crate) enum PeerMessage {
     /// Every process of this host is ready.
     Ready,
     /// Begin.
-    Start,
+    Start {
+        /// All hosts of the run read one clock.
+        has_one_clock: bool,
+    },
     /// Nothing new; sent so that silence means something.
     Alive,
     /// The run ends here, and why.
     Stop {
         /// In words.
         reason: String,
-        /// The run ended as planned.
-        is_planned: bool,
+        /// How the other hosts are to take it.
+        meaning: EndMeaning,
     },
     /// Components have stopped; gateways still run for what is under way.
     Quiet,
@@ -59,15 +60,22 @@ pub(crate) enum PeerMessage {
         /// Its size.
         size_bytes: u64,
     },
-    /// What happened on this host and how its processes fared.
-    Report {
-        /// In order of time.
-        events: Vec<Event>,
-        /// One per process.
-        processes: Vec<ProcessStory>,
-    },
+    /// What happened on a host and how its processes fared.
+    Report(HostStory),
     /// Everything has been sent.
     Done,
+}
+
+/// How the other hosts are to take the end of a run on one of them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub(crate) enum EndMeaning {
+    /// The planned time passed.
+    Planned,
+    /// A program ended by itself without a fault.
+    Early,
+    /// It was interrupted, or something failed.
+    Broken,
 }
 
 /// One frame as read.
@@ -153,12 +161,12 @@ mod tests {
     #[test]
     fn frames_survive_the_stream() {
         let mut wire = Vec::new();
-        write_message(&mut wire, &PeerMessage::Start).unwrap();
+        write_message(&mut wire, &PeerMessage::Ready).unwrap();
         write_chunk(&mut wire, &[1, 2, 3]).unwrap();
         let mut input = wire.as_slice();
         assert_eq!(
             read_frame(&mut input).unwrap(),
-            Frame::Message(PeerMessage::Start)
+            Frame::Message(PeerMessage::Ready)
         );
         assert_eq!(read_frame(&mut input).unwrap(), Frame::Chunk(vec![1, 2, 3]));
         assert_eq!(
@@ -172,7 +180,7 @@ mod tests {
         let mut good = Vec::new();
         let stop = PeerMessage::Stop {
             reason: "Ctrl-C".to_owned(),
-            is_planned: false,
+            meaning: EndMeaning::Broken,
         };
         write_message(&mut good, &stop).unwrap();
         write_message(

@@ -7,10 +7,12 @@ pub(crate) mod domains;
 pub mod event;
 pub(crate) mod exchange;
 pub(crate) mod frame;
+mod outcome;
 pub(crate) mod peer;
 pub(crate) mod plan;
 mod session;
 
 pub use domains::DomainsError;
+pub use outcome::{Outcome, RunError, RunOptions, RunResult};
 pub use peer::PeerError;
-pub use session::{Outcome, RunError, RunOptions, RunResult, run};
+pub use session::run;

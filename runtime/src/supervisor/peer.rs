@@ -12,6 +12,8 @@ use super::frame::{Frame, PeerHello, PeerMessage, read_frame, write_message};
 
 /// How often a host that cannot connect yet tries again.
 const RETRY_PERIOD: Duration = Duration::from_millis(200);
+/// How often the caller is told whom the host waits for, and may end the waiting.
+const TELL_PERIOD: Duration = Duration::from_millis(200);
 /// A connected peer that says nothing for this long counts as gone.
 pub(crate) const SILENCE_MAX: Duration = Duration::from_secs(3);
 const GREETING_TIMEOUT: Duration = Duration::from_secs(3);
@@ -146,9 +148,16 @@ impl Peer {
         self.heard.elapsed()
     }
 
+    /// Records are larger than greetings: a write may take up to `limit`.
+    pub(crate) fn allow_writes_to_take(&mut self, limit: Duration) -> io::Result<()> {
+        self.writer.get_ref().set_write_timeout(Some(limit))
+    }
+
     /// The sending half by itself, so that a thread can send while another receives.
-    pub(crate) fn halves(&mut self) -> (&mut (impl Write + Send + use<>), &Receiver<PeerEvent>) {
-        (&mut self.writer, &self.inbox)
+    pub(crate) fn halves(
+        &mut self,
+    ) -> (&mut (impl Write + Send + use<>), &mut Receiver<PeerEvent>) {
+        (&mut self.writer, &mut self.inbox)
     }
 }
 
@@ -173,7 +182,7 @@ fn forward(input: TcpStream, out: &SyncSender<PeerEvent>) {
     }
 }
 
-/// Brings the hosts of a run together. `waiting` is told whom it waits for, about once a second;
+/// Brings the hosts of a run together. `waiting` is told whom it waits for, a few times a second;
 /// it returns false to give up.
 ///
 /// # Errors
@@ -204,8 +213,8 @@ struct Patience<'a> {
 }
 
 impl Patience<'_> {
-    /// Waits a moment for `missing`, or says why not.
-    fn wait(&mut self, missing: &str) -> Result<(), PeerError> {
+    /// Waits a moment for `missing`, or says why not. True a few times a second.
+    fn wait(&mut self, missing: &str) -> Result<bool, PeerError> {
         let waited = self.began.elapsed();
         if waited > self.meeting.timeout {
             return Err(PeerError::Absent {
@@ -214,10 +223,8 @@ impl Patience<'_> {
                 address: self.meeting.address,
             });
         }
-        if self
-            .told
-            .is_none_or(|told| told.elapsed() >= Duration::from_secs(1))
-        {
+        let is_time = self.told.is_none_or(|told| told.elapsed() >= TELL_PERIOD);
+        if is_time {
             self.told = Some(Instant::now());
             if !(self.waiting)(missing, waited) {
                 return Err(PeerError::Interrupted {
@@ -225,8 +232,8 @@ impl Patience<'_> {
                 });
             }
         }
-        thread::sleep(RETRY_PERIOD.min(Duration::from_millis(50)));
-        Ok(())
+        thread::sleep(Duration::from_millis(20));
+        Ok(is_time)
     }
 }
 
@@ -251,35 +258,43 @@ fn host(
         match listener.accept() {
             // Strangers are turned away before a byte of theirs is read.
             Ok((stream, from)) if meeting.expected.iter().any(|(_, ip)| *ip == from.ip()) => {
-                if let Some(peer) = welcome(stream, &missing, hello)? {
+                if let Some(peer) = welcome(stream, &meeting.expected, hello)? {
+                    // One that gave up and came again: its first connection is a dead one.
+                    peers.retain(|known| known.hello.host != peer.hello.host);
                     peers.push(peer);
                 }
             }
             Ok(_stranger) => {}
-            Err(error) if error.kind() == io::ErrorKind::WouldBlock => patience.wait(&missing)?,
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
+                if patience.wait(&missing)? {
+                    // Those that are here must not take the waiting for an absence.
+                    for peer in &mut peers {
+                        peer.say(&PeerMessage::Alive);
+                    }
+                }
+            }
             Err(source) => return Err(listen(source)),
         }
     }
     Ok(peers)
 }
 
-/// Greets one that connected; `None` when it left before it had said who it is.
-fn welcome(stream: TcpStream, missing: &str, hello: &PeerHello) -> Result<Option<Peer>, PeerError> {
-    let Ok((mut stream, theirs)) = read_hello(stream) else {
+/// Greets one that connected; `None` when it left before it had said who it is, or is nobody of
+/// this run.
+fn welcome(
+    stream: TcpStream,
+    expected: &[(String, IpAddr)],
+    hello: &PeerHello,
+) -> Result<Option<Peer>, PeerError> {
+    let Ok((mut stream, PeerMessage::Hello(theirs))) = read_hello(stream) else {
         return Ok(None);
     };
-    let PeerMessage::Hello(theirs) = theirs else {
+    if !expected.iter().any(|(name, _)| *name == theirs.host) {
+        let text = format!("host {} is not awaited here", theirs.host);
+        let _left = write_message(&mut stream, &PeerMessage::Refused(text)).is_err();
         return Ok(None);
-    };
-    let unexpected = !missing.split(", ").any(|name| name == theirs.host);
-    let reason = if unexpected {
-        Some(format!(
-            "host {} is not awaited; awaited: {missing}",
-            theirs.host
-        ))
-    } else {
-        misfit(hello, &theirs)
-    };
+    }
+    let reason = misfit(hello, &theirs);
     let connection = |source| PeerError::Connection {
         host: theirs.host.clone(),
         source,
@@ -333,7 +348,9 @@ fn join(
                 return Err(PeerError::Mismatch { host: name, reason });
             }
             // Somebody else's service, or a peer that is just going away.
-            Ok(_) | Err(_) => patience.wait(&name)?,
+            Ok(_) | Err(_) => {
+                patience.wait(&name)?;
+            }
         }
     }
 }
@@ -388,7 +405,6 @@ mod tests {
             host: host.to_owned(),
             clock_id: 1,
             domain: [domain; 16],
-            run_id: "run".to_owned(),
         }
     }
 
@@ -414,11 +430,11 @@ mod tests {
         let [left, right] = pair(&hello("a", 1, 1), &hello("b", 1, 2));
         let (mut left, mut right) = (left.unwrap(), right.unwrap());
         assert_eq!(left[0].hello.host, "b");
-        left[0].say(&PeerMessage::Start);
+        left[0].say(&PeerMessage::Ready);
         let event = right[0].receive(Duration::from_secs(5));
         assert!(matches!(
             event,
-            Some(PeerEvent::Frame(Frame::Message(PeerMessage::Start)))
+            Some(PeerEvent::Frame(Frame::Message(PeerMessage::Ready)))
         ));
         drop(left);
         let event = right[0].receive(Duration::from_secs(5));

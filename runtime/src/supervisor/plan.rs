@@ -5,6 +5,8 @@ use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
+use nix::unistd::{AccessFlags, Uid, access};
+
 use crate::process::launch::{DirectionLaunch, EmulationLaunch, Side, SocketLaunch};
 use crate::realtime::{RealtimeRequest, SchedulingPolicy};
 use crate::topology::{
@@ -240,13 +242,17 @@ pub(crate) fn domain_base(base: Option<&PathBuf>) -> PathBuf {
     base.cloned().unwrap_or_else(default_domain_base)
 }
 
+/// `/run/hil` where this user may use it, else the user's own runtime folder, else a folder of the
+/// user's own among the temporary ones.
 fn default_domain_base() -> PathBuf {
-    let run = PathBuf::from("/run/hil");
-    let is_usable = std::fs::create_dir_all(&run).is_ok()
-        && nix::unistd::access(&run, nix::unistd::AccessFlags::W_OK).is_ok();
-    if is_usable {
-        run
-    } else {
-        std::env::temp_dir().join("hil")
-    }
+    let is_usable = |folder: &PathBuf| {
+        std::fs::create_dir_all(folder).is_ok() && access(folder, AccessFlags::W_OK).is_ok()
+    };
+    let runtime_folder =
+        std::env::var_os("XDG_RUNTIME_DIR").map(|path| PathBuf::from(path).join("hil"));
+    [Some(PathBuf::from("/run/hil")), runtime_folder]
+        .into_iter()
+        .flatten()
+        .find(is_usable)
+        .unwrap_or_else(|| std::env::temp_dir().join(format!("hil-{}", Uid::current())))
 }

@@ -2,7 +2,6 @@
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::io;
 use std::path::PathBuf;
 use std::thread;
 use std::time::{Duration, Instant as WallInstant, SystemTime};
@@ -10,14 +9,15 @@ use std::time::{Duration, Instant as WallInstant, SystemTime};
 use hil_models::time::Instant;
 use serde_json::json;
 
-use super::crew::{Crew, CrewError, Verdict};
-use super::domains::{Domains, DomainsError};
-use super::event::{Event, ProcessStory};
-use super::exchange::{HostStory, exchange};
+use super::crew::{Crew, Verdict};
+use super::domains::Domains;
+use super::event::{Event, HostStory, ProcessStory};
+use super::exchange::exchange;
 use super::frame::{Frame, PeerHello, PeerMessage};
-use super::peer::{Meeting, Peer, PeerError, PeerEvent, SILENCE_MAX, meet};
+use super::outcome::{Heard, Outcome, RunError, RunOptions, RunResult};
+use super::peer::{Meeting, Peer, PeerEvent, SILENCE_MAX, meet};
 use super::plan::plan;
-use crate::channel::{DomainError, clock_id};
+use crate::channel::clock_id;
 use crate::clock::MonotonicClock;
 use crate::console::Console;
 use crate::host_facts::HostFacts;
@@ -36,111 +36,6 @@ const PROGRESS_PERIOD: Duration = Duration::from_millis(500);
 const STOP_PATIENCE: Duration = Duration::from_secs(3);
 /// Time for what is still under way when the components have stopped.
 const DRAIN: Duration = Duration::from_millis(200);
-
-/// What the command line asks of a run beyond the topology.
-#[derive(Debug, Clone, Default)]
-pub struct RunOptions {
-    /// Names of the hosts that run here; at least one.
-    pub hosts: Vec<String>,
-    /// Folder for shared-memory domains, if not the default.
-    pub domain_root: Option<PathBuf>,
-    /// The command line, for the manifest.
-    pub command_line: Vec<String>,
-}
-
-/// Why a run did not come about.
-#[derive(Debug, thiserror::Error)]
-pub enum RunError {
-    /// The run folder cannot be written.
-    #[error("run folder below {folder}: {source}")]
-    Folder {
-        /// Parent folder.
-        folder: PathBuf,
-        /// What the system said.
-        source: io::Error,
-    },
-    /// Shared memory cannot be set up.
-    #[error(transparent)]
-    Domains(#[from] DomainsError),
-    /// The host's identity cannot be read.
-    #[error(transparent)]
-    Identity(#[from] DomainError),
-    /// The other hosts did not come.
-    #[error(transparent)]
-    Peer(#[from] PeerError),
-    /// A process cannot be started.
-    #[error("{0}")]
-    Start(String),
-}
-
-impl From<CrewError> for RunError {
-    fn from(error: CrewError) -> Self {
-        Self::Start(error.to_string())
-    }
-}
-
-/// How a run ended.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Outcome {
-    /// The planned time passed.
-    Completed,
-    /// A process ended by itself without a fault.
-    EndedEarly(String),
-    /// The user ended it.
-    Interrupted(String),
-    /// A process failed and its policy ended the run.
-    Failed(String),
-    /// Another host ended it.
-    EndedByPeer(String),
-    /// Another host vanished.
-    PeerLost(String),
-}
-
-impl Outcome {
-    /// In words.
-    pub fn text(&self) -> String {
-        match self {
-            Self::Completed => "completed as planned".to_owned(),
-            Self::EndedEarly(text) => format!("ended early: {text}"),
-            Self::Interrupted(by) => format!("interrupted by {by}"),
-            Self::Failed(text) => format!("failed: {text}"),
-            Self::EndedByPeer(text) => format!("ended by another host: {text}"),
-            Self::PeerLost(text) => format!("another host vanished: {text}"),
-        }
-    }
-
-    /// The other hosts need not worry about an end for this reason.
-    fn is_planned(&self) -> bool {
-        matches!(self, Self::Completed | Self::EndedEarly(_))
-    }
-}
-
-/// Everything a finished run knows, before any figure is computed.
-#[derive(Debug)]
-pub struct RunResult {
-    /// Where its files are.
-    pub folder: RunFolder,
-    /// How it ended.
-    pub outcome: Outcome,
-    /// Start and end on this host's monotonic clock.
-    pub span: (Instant, Instant),
-    /// When it started, as people write it.
-    pub started: String,
-    /// What happened, on all hosts.
-    pub events: Vec<Event>,
-    /// How the processes of all hosts fared.
-    pub processes: Vec<ProcessStory>,
-    /// True when all hosts read one clock.
-    pub has_one_clock: bool,
-    /// Hosts whose records are here.
-    pub hosts: Vec<String>,
-    /// Hosts that ran here.
-    pub own_hosts: Vec<String>,
-    /// What spoils the completeness of the report.
-    pub problems: Vec<String>,
-    /// Facts of this host.
-    pub facts: HostFacts,
-}
 
 /// Runs `topology` here.
 ///
@@ -163,11 +58,8 @@ pub fn run(
     let plan = plan(topology, &hosts);
     let domains = Domains::create(&plan.hosts, options.domain_root.as_ref(), &folder.name())?;
     console.say(&format!("run folder {}", folder.root().display()));
-    let peers = gather_peers(topology, &hosts, (&domains, &folder), (signals, console))?;
-    let has_one_clock = {
-        let here = clock_id()?;
-        peers.iter().all(|peer| peer.hello.clock_id == here)
-    };
+    let peers = gather_peers(topology, &hosts, &domains, (signals, console))?;
+    let here = clock_id()?;
     let crew = Crew::new(plan.processes, domains.addresses(), &folder)?;
     let mut session = Session {
         topology,
@@ -175,30 +67,26 @@ pub fn run(
             .hosts()
             .first()
             .is_some_and(|host| is_here(host, &hosts)),
+        has_one_clock: peers.iter().all(|peer| peer.hello.clock_id == here),
+        crew,
         domains,
         peers,
-        crew,
         signals,
         console,
         cleaned: WallInstant::now(),
         greeted: WallInstant::now(),
         told: WallInstant::now(),
     };
-    let begun = session.begin(topology.run().start_timeout)?;
+    let begun = session.begin(topology.run().start_timeout);
     let start = MonotonicClock::now();
     let started = utc_text(SystemTime::now());
     let outcome = match begun {
-        Some(outcome) => outcome,
-        None => session.watch(start, topology.run().duration)?,
+        Err(outcome) => outcome,
+        Ok(()) => session.watch(start, topology.run().duration),
     };
-    let end = MonotonicClock::now();
+    let span = (start, MonotonicClock::now());
     session.stop(&outcome);
-    Ok(session.conclude(
-        folder,
-        outcome,
-        (start, end),
-        (started, has_one_clock, facts),
-    ))
+    Ok(session.conclude(folder, outcome, span, (started, facts)))
 }
 
 fn is_here(host: &Host, hosts: &[&Host]) -> bool {
@@ -241,7 +129,7 @@ fn write_manifest(
 fn gather_peers(
     topology: &Topology,
     hosts: &[&Host],
-    (domains, folder): (&Domains, &RunFolder),
+    domains: &Domains,
     (signals, console): (&Signals, &mut Console),
 ) -> Result<Vec<Peer>, RunError> {
     let first = &topology.hosts()[0];
@@ -269,7 +157,6 @@ fn gather_peers(
         host: hosts[0].name.clone(),
         clock_id: clock_id()?,
         domain: domains.fingerprint()?,
-        run_id: folder.name(),
     };
     let peers = meet(&meeting, &hello, &mut |missing, waited| {
         let waited_s = waited.as_secs();
@@ -287,9 +174,12 @@ fn gather_peers(
 struct Session<'a> {
     topology: &'a Topology,
     is_first_host: bool,
+    /// All hosts of the run read one clock.
+    has_one_clock: bool,
+    // Before the domains: no process may be left when its shared memory goes.
+    crew: Crew,
     domains: Domains,
     peers: Vec<Peer>,
-    crew: Crew,
     signals: &'a Signals,
     console: &'a mut Console,
     cleaned: WallInstant,
@@ -299,15 +189,23 @@ struct Session<'a> {
 
 impl Session<'_> {
     /// Starts the processes and waits until those of all hosts are ready, then begins
-    /// everywhere. `Some` when the run ended before it began.
-    fn begin(&mut self, timeout: Duration) -> Result<Option<Outcome>, RunError> {
-        self.crew.start()?;
+    /// everywhere.
+    ///
+    /// # Errors
+    /// Why the run ended before it began.
+    fn begin(&mut self, timeout: Duration) -> Result<(), Outcome> {
+        self.crew
+            .start()
+            .map_err(|error| Outcome::Failed(error.to_string()))?;
         let deadline = WallInstant::now() + timeout;
         let mut ready_peers = 0;
         let mut has_told = false;
         loop {
-            if let Some(outcome) = self.look_after()? {
-                return Ok(Some(outcome));
+            match self.look_after() {
+                None => {}
+                // Whoever ends before the run has begun has failed, however politely.
+                Some(Outcome::EndedEarly(text)) => return Err(Outcome::Failed(text)),
+                Some(outcome) => return Err(outcome),
             }
             let is_ready = self.crew.is_ready();
             if is_ready && !has_told && !self.is_first_host {
@@ -318,10 +216,13 @@ impl Session<'_> {
             for event in self.hear() {
                 match event {
                     Heard::Said(PeerMessage::Ready) => ready_peers += 1,
-                    Heard::Said(PeerMessage::Start) => may_begin = true,
+                    Heard::Said(PeerMessage::Start { has_one_clock }) => {
+                        self.has_one_clock = has_one_clock;
+                        may_begin = true;
+                    }
                     other => {
                         if let Some(outcome) = other.outcome() {
-                            return Ok(Some(outcome));
+                            return Err(outcome);
                         }
                     }
                 }
@@ -330,9 +231,10 @@ impl Session<'_> {
                 may_begin = true;
             }
             if is_ready && may_begin {
-                self.say_to_all(&PeerMessage::Start);
+                let has_one_clock = self.has_one_clock;
+                self.say_to_all(&PeerMessage::Start { has_one_clock });
                 self.crew.begin();
-                return Ok(None);
+                return Ok(());
             }
             if WallInstant::now() > deadline {
                 let missing = self.crew.missing();
@@ -341,23 +243,22 @@ impl Session<'_> {
                 } else {
                     missing
                 };
-                return Ok(Some(Outcome::Failed(format!(
-                    "{text} was not ready within {} s",
-                    timeout.as_secs()
-                ))));
+                let limit_s = timeout.as_secs();
+                let text = format!("{text} was not ready within {limit_s} s");
+                return Err(Outcome::Failed(text));
             }
             thread::sleep(WATCH_PERIOD);
         }
     }
 
     /// Watches until the time is up or something ends the run.
-    fn watch(&mut self, start: Instant, duration: Duration) -> Result<Outcome, RunError> {
+    fn watch(&mut self, start: Instant, duration: Duration) -> Outcome {
         loop {
-            if let Some(outcome) = self.look_after()? {
-                return Ok(outcome);
+            if let Some(outcome) = self.look_after() {
+                return outcome;
             }
             if let Some(outcome) = self.hear().into_iter().find_map(Heard::outcome) {
-                return Ok(outcome);
+                return outcome;
             }
             let elapsed = MonotonicClock::now().saturating_duration_since(start);
             // The others end when the first host says so; on their own only if it does not.
@@ -367,7 +268,7 @@ impl Session<'_> {
                 SILENCE_MAX
             };
             if elapsed >= duration + grace {
-                return Ok(Outcome::Completed);
+                return Outcome::Completed;
             }
             self.show_progress(elapsed, duration);
             thread::sleep(WATCH_PERIOD);
@@ -375,7 +276,7 @@ impl Session<'_> {
     }
 
     /// What must be done all the time, and the first reason to end.
-    fn look_after(&mut self) -> Result<Option<Outcome>, RunError> {
+    fn look_after(&mut self) -> Option<Outcome> {
         if self.cleaned.elapsed() >= CLEANUP_PERIOD {
             self.domains.free_what_the_dead_held();
             self.cleaned = WallInstant::now();
@@ -385,19 +286,19 @@ impl Session<'_> {
             self.greeted = WallInstant::now();
         }
         if let Some(signal) = self.signals.received() {
-            return Ok(Some(Outcome::Interrupted(signal.to_owned())));
+            return Some(Outcome::Interrupted(signal.to_owned()));
         }
         let known = self.crew.events().len();
-        let verdict = self.crew.watch()?;
+        let verdict = self.crew.watch();
         for event in &self.crew.events()[known..] {
             self.console
                 .warn(&format!("{}: {}", event.process, event.what));
         }
-        Ok(match verdict {
+        match verdict {
             Verdict::GoesOn => None,
             Verdict::Finished(text) => Some(Outcome::EndedEarly(text)),
             Verdict::Failed(text) => Some(Outcome::Failed(text)),
-        })
+        }
     }
 
     fn say_to_all(&mut self, message: &PeerMessage) {
@@ -468,10 +369,8 @@ impl Session<'_> {
     /// Ends components everywhere first, then gateways, so that what is under way arrives.
     fn stop(&mut self, outcome: &Outcome) {
         let reason = outcome.text();
-        self.say_to_all(&PeerMessage::Stop {
-            reason,
-            is_planned: outcome.is_planned(),
-        });
+        let meaning = outcome.meaning();
+        self.say_to_all(&PeerMessage::Stop { reason, meaning });
         self.crew.stop(STOP_PATIENCE, |plan| !plan.is_gateway());
         self.say_to_all(&PeerMessage::Quiet);
         if !matches!(outcome, Outcome::PeerLost(_)) {
@@ -502,50 +401,54 @@ impl Session<'_> {
         folder: RunFolder,
         outcome: Outcome,
         span: (Instant, Instant),
-        (started, has_one_clock, facts): (String, bool, HostFacts),
+        (started, facts): (String, HostFacts),
     ) -> RunResult {
-        let mut problems = Vec::new();
-        let story = HostStory {
+        let own_hosts: Vec<String> = self.domains.addresses().into_keys().collect();
+        let own = HostStory {
+            hosts: own_hosts.clone(),
+            span,
             events: self.crew.events().to_vec(),
             processes: self.stories(),
         };
-        let own_hosts: Vec<String> = self.domains.addresses().into_keys().collect();
-        let mut hosts = own_hosts.clone();
-        let mut stories = vec![story.clone()];
-        if !self.peers.is_empty() {
+        let mut problems = Vec::new();
+        let mut stories = vec![own.clone()];
+        if let Outcome::PeerLost(who) = &outcome {
+            problems.push(format!("no records of the host that vanished ({who})"));
+        } else if !self.peers.is_empty() {
             self.console
                 .progress("exchanging records with the other host");
+            let records = folder.records();
             let first = self.is_first_host;
-            let received = exchange(&mut self.peers, first, &folder.records(), &story);
+            let received = exchange(&mut self.peers, first, (&records, &own));
             problems.extend(received.problems);
-            hosts.extend(
-                received
-                    .stories
-                    .iter()
-                    .flat_map(|story| story.processes.iter().map(|process| process.host.clone())),
-            );
             stories.extend(received.stories);
         }
+        let has_one_clock = self.has_one_clock;
         drop(self.crew);
         let left = self.domains.remove();
         problems.extend(
             left.into_iter()
                 .map(|what| format!("left in shared memory: {what}")),
         );
-        hosts.sort();
-        hosts.dedup();
+        let spans = stories.iter().flat_map(|story| {
+            let span = story.span;
+            story.hosts.iter().map(move |host| (host.clone(), span))
+        });
+        let spans: BTreeMap<String, (Instant, Instant)> = spans.collect();
         let mut events: Vec<Event> = stories.iter().flat_map(|one| one.events.clone()).collect();
-        events.sort_by_key(|event| event.at);
+        // Each host counts from its own start of the run.
+        let since_start =
+            |event: &Event| spans.get(&event.host).map(|span| event.at.ns_since(span.0));
+        events.sort_by_key(since_start);
         let processes = stories.into_iter().flat_map(|one| one.processes).collect();
         RunResult {
             folder,
             outcome,
-            span,
+            spans,
             started,
             events,
             processes,
             has_one_clock,
-            hosts,
             own_hosts,
             problems,
             facts,
@@ -567,42 +470,5 @@ impl Session<'_> {
                 report: member.report.clone(),
             })
             .collect()
-    }
-}
-
-/// What came from a peer during the run.
-enum Heard {
-    Said(PeerMessage),
-    Stopped {
-        host: String,
-        reason: String,
-        is_planned: bool,
-    },
-    Lost(String),
-}
-
-impl Heard {
-    fn named(self, host: &str) -> Self {
-        match self {
-            Self::Said(PeerMessage::Stop { reason, is_planned }) => Self::Stopped {
-                host: host.to_owned(),
-                reason,
-                is_planned,
-            },
-            other => other,
-        }
-    }
-
-    fn outcome(self) -> Option<Outcome> {
-        match self {
-            Self::Said(_) => None,
-            Self::Stopped {
-                is_planned: true, ..
-            } => Some(Outcome::Completed),
-            Self::Stopped { host, reason, .. } => {
-                Some(Outcome::EndedByPeer(format!("{host} {reason}")))
-            }
-            Self::Lost(text) => Some(Outcome::PeerLost(text)),
-        }
     }
 }
