@@ -59,6 +59,20 @@ impl ClockPair {
         Instant::from_ns(realtime_ns.saturating_sub(self.offset_ns))
     }
 
+    /// Takes over a newer reading; true when the real-time clock was stepped in between.
+    ///
+    /// Only a step changes the offset, so a wider reading, taken by a thread that was held up
+    /// between its reads, does not replace a narrower one.
+    pub fn renew(&mut self, newer: Self) -> bool {
+        let is_stepped = newer.step_since(self).is_some();
+        if is_stepped || newer.bound_ns <= self.bound_ns {
+            *self = newer;
+        } else {
+            self.taken = newer.taken;
+        }
+        is_stepped
+    }
+
     /// By how much the real-time clock was stepped since `earlier`, in nanoseconds; `None` when
     /// the two offsets agree within their bounds. Stamps taken in between are of no use then.
     ///
@@ -97,6 +111,22 @@ mod tests {
             bound_ns,
             taken: Instant::from_ns(taken_ns),
         }
+    }
+
+    #[test]
+    fn a_held_up_reading_does_not_replace_a_good_one_but_a_step_does() {
+        let pair = |at_ns: i64, offset_ns: i64, bound_ns: u64| ClockPair {
+            offset_ns,
+            bound_ns,
+            taken: Instant::from_ns(at_ns),
+        };
+        let mut kept = pair(0, 1000, 20);
+        assert!(!kept.renew(pair(100, 40_000, 50_000)));
+        assert_eq!(kept, pair(100, 1000, 20));
+        assert!(!kept.renew(pair(200, 1010, 15)));
+        assert_eq!(kept, pair(200, 1010, 15));
+        assert!(kept.renew(pair(300, 9_000_000, 30)));
+        assert_eq!(kept, pair(300, 9_000_000, 30));
     }
 
     #[test]

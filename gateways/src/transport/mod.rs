@@ -101,7 +101,8 @@ pub enum SendRefusal {
     /// The peer's host answered an *earlier* datagram that nobody listens (`ECONNREFUSED`).
     #[error("nobody listens at the peer (ECONNREFUSED)")]
     PeerRefused,
-    /// No way to the peer: `ENETUNREACH`, `EHOSTUNREACH`, `ENETDOWN` or `EHOSTDOWN`.
+    /// No way to the peer: `ENETUNREACH`, `EHOSTUNREACH`, `ENETDOWN`, `EHOSTDOWN`, `ENONET` or
+    /// `EACCES`.
     #[error("peer is unreachable (errno {errno})")]
     Unreachable {
         /// Which of them.
@@ -132,9 +133,13 @@ impl SendRefusal {
     pub fn from_errno(errno: i32, length_bytes: usize) -> Self {
         match errno {
             libc::ECONNREFUSED => Self::PeerRefused,
-            libc::ENETUNREACH | libc::EHOSTUNREACH | libc::ENETDOWN | libc::EHOSTDOWN => {
-                Self::Unreachable { errno }
-            }
+            // ENONET and EACCES are what ICMP reports of an unknown or forbidding network become.
+            libc::ENETUNREACH
+            | libc::EHOSTUNREACH
+            | libc::ENETDOWN
+            | libc::EHOSTDOWN
+            | libc::ENONET
+            | libc::EACCES => Self::Unreachable { errno },
             // EWOULDBLOCK has the value of EAGAIN on Linux.
             libc::ENOBUFS | libc::EAGAIN => Self::QueueFull { errno },
             libc::EMSGSIZE => Self::TooLong { length_bytes },

@@ -248,10 +248,10 @@ impl DatagramSender for UdpSender {
                 Ok(None) => return Ok(None),
                 // A report about an earlier datagram, handed to whichever call comes first. It
                 // stays in the error queue as well, where it is counted.
-                Err(error) => match SendRefusal::from_io(&error, 0) {
-                    SendRefusal::Other { .. } => return Err(error),
-                    report => self.counters.newest_report = Some(report),
-                },
+                Err(error) if is_broken(&error) => return Err(error),
+                Err(error) => {
+                    self.counters.newest_report = Some(SendRefusal::from_io(&error, 0));
+                }
             }
         }
         Ok(None)
@@ -264,6 +264,20 @@ impl DatagramSender for UdpSender {
     fn counters(&self) -> SenderCounters {
         self.counters
     }
+}
+
+/// True for errors of the call itself; every other one is a report of the network.
+fn is_broken(error: &io::Error) -> bool {
+    let ours = [
+        libc::EBADF,
+        libc::EFAULT,
+        libc::EINVAL,
+        libc::ENOTSOCK,
+        libc::ENOMEM,
+    ];
+    error
+        .raw_os_error()
+        .is_none_or(|errno| ours.contains(&errno))
 }
 
 /// The receiving socket, open to anyone.

@@ -67,7 +67,8 @@ pub struct EgressRecord {
 }
 
 impl EgressRecord {
-    /// The send call failed: nothing left this host.
+    /// It did not leave this host whole: the kernel refused it, or the gateway had nobody to send
+    /// it to.
     pub const REFUSED_BY_KERNEL: u32 = 1;
 }
 

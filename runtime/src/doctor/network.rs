@@ -136,10 +136,10 @@ fn judge(finding: Finding, capabilities: StampCapabilities, is_wireless: bool) -
     if is_wireless {
         return worsen(finding)
             .because(
-                "wireless drivers give no software transmit stamp whatever they claim, so the send \
-                 side falls back to a stamp before the queue, labelled as such",
+                "wireless drivers give no software transmit stamp whatever they claim, so a report \
+                 shows the time from handing over to the receive stamp as one segment",
             )
-            .fixed_by("none needed; the report of a run names the stamp each delay starts from");
+            .fixed_by("none needed; the report says which stamps there were");
     }
     if !capabilities.has(RX_SOFTWARE) || !capabilities.has(TX_SOFTWARE) {
         return worsen(finding)

@@ -37,7 +37,7 @@ pub struct ComponentLaunch {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GatewayLaunch {
-    /// Name of the process, e.g. `gateway hop@robot-pc`.
+    /// Name of the process, e.g. `gateway-hop-robot-pc`.
     pub process: String,
     /// How often it was restarted before.
     pub instance: u32,
