@@ -19,9 +19,21 @@ pub struct LoggedMessage {
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct RunLog {
     channels: BTreeMap<String, Vec<LoggedMessage>>,
+    clocks_differ: bool,
 }
 
 impl RunLog {
+    /// Notes that the producers read clocks of different hosts that are not aligned: stamps of
+    /// one channel compare with each other, stamps of two channels do not.
+    pub fn set_clocks_differ(&mut self) {
+        self.clocks_differ = true;
+    }
+
+    /// True when all stamps are of one clock.
+    pub fn has_one_clock(&self) -> bool {
+        !self.clocks_differ
+    }
+
     /// Appends a message to a channel.
     pub fn push(&mut self, channel: &str, envelope: Envelope, payload: &[u8]) {
         let message = LoggedMessage {

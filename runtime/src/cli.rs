@@ -138,6 +138,16 @@ pub enum Command {
         #[arg(long)]
         launch: PathBuf,
     },
+    /// Become a user's own program that ends with its supervisor; not for use by hand.
+    #[command(hide = true)]
+    Become {
+        /// Process id of the supervisor.
+        #[arg(long)]
+        supervisor: u32,
+        /// Program and arguments.
+        #[arg(last = true, required = true)]
+        program: Vec<String>,
+    },
     /// Run the gateway of one link; started by a run, not by hand.
     #[command(hide = true)]
     Gateway {

@@ -16,7 +16,7 @@ use crate::cli::{Cli, Command, RunArgs};
 use crate::console::Console;
 use crate::doctor::{self, DoctorRequest, StampCapabilities};
 use crate::gateway;
-use crate::process::component;
+use crate::process::{component, own_program};
 use crate::registry::Registry;
 use crate::report::summary::RunSummary;
 use crate::report::terminal::{self, Style};
@@ -50,6 +50,10 @@ pub(crate) fn run(registry: &Registry) -> ExitCode {
 fn run_command(command: Command, registry: &Registry, console: &mut Console) -> u8 {
     match command {
         Command::Component { launch } => code_of(component::run(&launch, registry), console),
+        Command::Become {
+            supervisor,
+            program,
+        } => code_of(own_program::become_program(supervisor, &program), console),
         Command::Gateway { launch } => code_of(gateway::process::run(&launch), console),
         Command::Simulate {
             topology,
@@ -142,6 +146,7 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
     match supervisor::run(&topology, &options, &signals, console) {
         Ok(result) => {
             let code = exit_code(&result.outcome);
+            console.progress("drawing up the account");
             let origin = (path.as_path(), options.command_line.as_slice());
             match analysis::conclude(&topology, &result, registry, origin) {
                 Ok(summary) => {

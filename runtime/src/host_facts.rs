@@ -298,7 +298,7 @@ pub(crate) fn limit(resource: Resource, unit: &str) -> Fact<String> {
 fn git_revision() -> Fact<String> {
     match option_env!("HIL_GIT_REVISION") {
         Some(revision) if !revision.is_empty() => Fact::Available(revision.to_owned()),
-        _ => Fact::Unavailable("built without HIL_GIT_REVISION in the environment".to_owned()),
+        _ => Fact::Unavailable("built outside a git checkout".to_owned()),
     }
 }
 

@@ -20,8 +20,9 @@ use nix::errno::Errno;
 use nix::fcntl::{Flock, FlockArg};
 
 use super::error::{DomainError, explain};
-use super::identity::{Fnv128, SHARED_MEMORY_DIRECTORY, fingerprint, monotonic_now};
+use super::identity::{Fnv128, SHARED_MEMORY_DIRECTORY, fingerprint};
 use super::sequence::OPEN_WITHIN;
+use crate::clock::MonotonicClock;
 
 /// Longest root path: a listener's socket below it must fit into the 107 bytes of a Unix socket
 /// address, with our 10-byte prefix, up to 33 digits of port id and iceoryx2's `.event`.
@@ -150,6 +151,11 @@ impl Domain {
         let mut domain = Self::join(DomainAddress { root_path, prefix })?;
         domain.lock = Some(lock);
         Ok(domain)
+    }
+
+    /// True when `root_path` is, or was, the root of a domain.
+    pub fn is_at(root_path: &Path) -> bool {
+        root_path.join(MARKER).is_file()
     }
 
     /// Joins the domain a launcher created.
@@ -371,7 +377,7 @@ fn fresh_prefix(root_path: &Path) -> Result<String, DomainError> {
         ] {
             hash.add(&number.to_le_bytes());
         }
-        hash.add(&monotonic_now().as_ns().to_le_bytes());
+        hash.add(&MonotonicClock::now().as_ns().to_le_bytes());
         let [a, b, c, d, ..] = hash.0.to_le_bytes();
         let prefix = format!("h{:08x}_", u32::from_le_bytes([a, b, c, d]));
         if shared_memory_files(&prefix).is_empty() {

@@ -149,6 +149,8 @@ pub enum ChannelError {
 }
 
 impl ChannelError {
+    // Cold, so that the paths which may fail stay short where they do not.
+    #[cold]
     pub(crate) fn refused(channel: &str, operation: &'static str, reason: &dyn Debug) -> Self {
         let name = format!("{reason:?}");
         Self::Refused {

@@ -7,7 +7,8 @@ use iceoryx2::service::port_factory::event;
 
 use super::domain::Domain;
 use super::error::ChannelError;
-use super::raw::{self, ByteService, TypeInfo};
+use super::raw::{self, ByteService};
+use super::type_info::TypeInfo;
 
 /// A channel to be created.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -4,9 +4,6 @@ use std::fs;
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 
-use hil_models::time::Instant;
-use nix::time::{ClockId, clock_gettime};
-
 use super::error::DomainError;
 
 /// Where iceoryx2's shared memory lives on Linux.
@@ -58,15 +55,6 @@ pub fn clock_id() -> Result<u64, DomainError> {
     Ok(fold(low) ^ fold(high))
 }
 
-/// The monotonic clock of this host (`CLOCK_MONOTONIC`), which all of its processes share.
-///
-/// # Panics
-/// When the kernel has no monotonic clock, which Linux always has.
-pub fn monotonic_now() -> Instant {
-    let now = clock_gettime(ClockId::CLOCK_MONOTONIC).expect("Linux always has this clock");
-    Instant::from_ns(now.tv_sec() * 1_000_000_000 + now.tv_nsec())
-}
-
 fn boot_id() -> Result<String, DomainError> {
     const BOOT_ID: &str = "/proc/sys/kernel/random/boot_id";
     fs::read_to_string(BOOT_ID).map_err(DomainError::io("read", BOOT_ID))
@@ -98,12 +86,6 @@ mod tests {
     #[test]
     fn the_clock_id_is_stable_within_a_process() {
         assert_eq!(clock_id().unwrap(), clock_id().unwrap());
-    }
-
-    #[test]
-    fn the_monotonic_clock_does_not_go_back() {
-        let first = monotonic_now();
-        assert!(monotonic_now() >= first);
     }
 
     #[test]

@@ -27,6 +27,7 @@ mod identity;
 mod raw;
 mod sequence;
 mod shm;
+mod type_info;
 mod wake;
 
 #[cfg(test)]
@@ -35,8 +36,9 @@ mod tests;
 pub use domain::{Cleanup, Domain, DomainAddress, ROOT_PATH_LENGTH_MAX, Removal};
 pub use error::{ChannelError, DomainError};
 pub use holder::{ChannelHolder, ChannelSettings};
-pub use identity::{clock_id, monotonic_now};
-pub use raw::{ENVELOPE_TYPE_NAME, RawInput, RawOutput, TypeInfo};
+pub use identity::clock_id;
+pub use raw::{ENVELOPE_TYPE_NAME, RawInput, RawOutput};
 pub use sequence::{InputCounters, OutputSettings, Stamp};
 pub use shm::{ShmInput, ShmOutput, TypedInput, TypedOutput};
+pub use type_info::TypeInfo;
 pub use wake::{WAITER_CHANNELS_MAX, Waiter, Wake};

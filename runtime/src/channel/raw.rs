@@ -2,16 +2,12 @@
 //! other port. The only file that uses iceoryx2's hidden interface for foreign types
 //! (`CustomPayloadMarker`, `CustomHeaderMarker`, `__internal_*`, the same that its own network
 //! link and its C bindings use); the tests beside it say what an upgrade broke.
-#![allow(
-    unsafe_code,
-    reason = "shared memory is read and written as bytes whose type is known only at run time"
-)]
 
 use core::fmt;
 use core::slice;
 use std::os::fd::BorrowedFd;
 
-use hil_models::message::{Envelope, MessageType};
+use hil_models::message::Envelope;
 use iceoryx2::identifiers::UniqueNodeId;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
@@ -30,6 +26,7 @@ use super::degradation::ConnectionFailures;
 use super::domain::Domain;
 use super::error::{ChannelError, retry};
 use super::holder::ChannelSettings;
+use super::type_info::TypeInfo;
 
 /// What every channel's user header is called; changes when the envelope's layout does.
 pub const ENVELOPE_TYPE_NAME: &str = "hil.Envelope.v1";
@@ -41,6 +38,7 @@ pub(crate) struct SharedEnvelope(pub(crate) Envelope);
 
 // SAFETY: the envelope is plain old data without padding or pointers, and the name below is bound
 // to its layout.
+#[allow(unsafe_code, reason = "marks the envelope as fit for shared memory")]
 unsafe impl ZeroCopySend for SharedEnvelope {
     // SAFETY: nothing is required of the caller; the trait marks the promise made above.
     unsafe fn type_name() -> &'static str {
@@ -48,61 +46,27 @@ unsafe impl ZeroCopySend for SharedEnvelope {
     }
 }
 
-/// Name, size and alignment of a channel's messages.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct TypeInfo {
-    /// [`Message::NAME`](hil_models::message::Message::NAME); at most 255 characters.
-    pub name: String,
-    /// Size of one message.
-    pub size_bytes: usize,
-    /// Alignment in shared memory.
-    pub alignment_bytes: usize,
+fn info_of(detail: &TypeDetail) -> TypeInfo {
+    TypeInfo {
+        name: detail.type_name().to_string(),
+        size_bytes: detail.size(),
+        alignment_bytes: detail.alignment(),
+    }
 }
 
-impl TypeInfo {
-    /// The identity of a message type as this process was compiled.
-    pub fn of(message: &MessageType) -> Self {
-        Self {
-            name: message.name.to_owned(),
-            size_bytes: message.size_bytes,
-            alignment_bytes: message.alignment_bytes,
-        }
+fn detail_of(message: &TypeInfo, channel: &str) -> Result<TypeDetail, ChannelError> {
+    if message.size_bytes == 0 || !message.alignment_bytes.is_power_of_two() {
+        let reason = format_args!("{message}");
+        return Err(ChannelError::refused(
+            channel,
+            "describe its messages",
+            &reason,
+        ));
     }
-
-    fn from_detail(detail: &TypeDetail) -> Self {
-        Self {
-            name: detail.type_name().to_string(),
-            size_bytes: detail.size(),
-            alignment_bytes: detail.alignment(),
-        }
-    }
-
-    fn to_detail(&self, channel: &str) -> Result<TypeDetail, ChannelError> {
-        if self.size_bytes == 0 || !self.alignment_bytes.is_power_of_two() {
-            return Err(ChannelError::refused(
-                channel,
-                "describe its messages",
-                &format_args!("{self}"),
-            ));
-        }
-        TypeDetail::__internal_new_from_parts(
-            TypeVariant::FixedSize,
-            &self.name,
-            self.size_bytes,
-            self.alignment_bytes,
-        )
+    let (name, size) = (&message.name, message.size_bytes);
+    let variant = TypeVariant::FixedSize;
+    TypeDetail::__internal_new_from_parts(variant, name, size, message.alignment_bytes)
         .map_err(|error| ChannelError::refused(channel, "name its messages", &error))
-    }
-}
-
-impl fmt::Display for TypeInfo {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(
-            f,
-            "{} ({} bytes aligned to {})",
-            self.name, self.size_bytes, self.alignment_bytes
-        )
-    }
 }
 
 pub(crate) type ByteService =
@@ -120,12 +84,16 @@ fn envelope_detail() -> TypeDetail {
 }
 
 /// A builder for samples of `message` that is not told their Rust type.
+#[allow(
+    unsafe_code,
+    reason = "the hidden interface for foreign types is unsafe"
+)]
 fn byte_builder(
     domain: &Domain,
     channel: &str,
     message: &TypeInfo,
 ) -> Result<Builder<[CustomPayloadMarker], (), ipc::Service>, ChannelError> {
-    let detail = message.to_detail(channel)?;
+    let detail = detail_of(message, channel)?;
     let name = service_name(channel)?;
     let builder = domain
         .with_node(|node| node.service_builder(&name))
@@ -135,17 +103,29 @@ fn byte_builder(
     Ok(unsafe { builder.__internal_set_payload_type_details(&detail) })
 }
 
+/// The same with our envelope as the user header, in the form a byte-wise writer needs.
+#[allow(
+    unsafe_code,
+    reason = "the hidden interface for foreign types is unsafe"
+)]
+fn writing_builder(
+    domain: &Domain,
+    channel: &str,
+    message: &TypeInfo,
+) -> Result<Builder<[CustomPayloadMarker], CustomHeaderMarker, ipc::Service>, ChannelError> {
+    let builder = byte_builder(domain, channel, message)?.user_header::<CustomHeaderMarker>();
+    let detail = envelope_detail();
+    // SAFETY: the detail describes `Envelope`, which is what every port of ours writes and reads.
+    Ok(unsafe { builder.__internal_set_user_header_type_details(&detail) })
+}
+
 /// Creates the sample service; only the launcher does.
 pub(crate) fn create_samples(
     domain: &Domain,
     settings: &ChannelSettings,
     nodes_max: usize,
 ) -> Result<ByteService, ChannelError> {
-    let builder = byte_builder(domain, &settings.name, &settings.message)?
-        .user_header::<CustomHeaderMarker>();
-    // SAFETY: the detail describes `Envelope`, which is what every port of ours writes and reads.
-    let builder = unsafe { builder.__internal_set_user_header_type_details(&envelope_detail()) };
-    builder
+    writing_builder(domain, &settings.name, &settings.message)?
         .enable_safe_overflow(true)
         .history_size(0)
         .subscriber_max_buffer_size(settings.depth_max)
@@ -162,10 +142,7 @@ fn open_for_writing(
     channel: &str,
     message: &TypeInfo,
 ) -> Result<ByteService, ChannelError> {
-    let builder = byte_builder(domain, channel, message)?.user_header::<CustomHeaderMarker>();
-    // SAFETY: as in `create_samples`.
-    let builder = unsafe { builder.__internal_set_user_header_type_details(&envelope_detail()) };
-    builder
+    writing_builder(domain, channel, message)?
         .open()
         .map_err(|error| open_error(domain, channel, message, error))
 }
@@ -219,15 +196,15 @@ fn discover(domain: &Domain, channel: &str) -> Result<TypeInfo, ChannelError> {
     if types.user_header != wanted {
         return Err(ChannelError::ForeignHeader {
             channel: channel.to_owned(),
-            found: TypeInfo::from_detail(&types.user_header).to_string(),
-            wanted: TypeInfo::from_detail(&wanted).to_string(),
+            found: info_of(&types.user_header).to_string(),
+            wanted: info_of(&wanted).to_string(),
         });
     }
     if types.payload.variant() != TypeVariant::FixedSize {
         let variant = types.payload.variant();
         return Err(ChannelError::refused(channel, OPERATION, &variant));
     }
-    Ok(TypeInfo::from_detail(&types.payload))
+    Ok(info_of(&types.payload))
 }
 
 /// Opens the wake-up half for a writer.
@@ -247,6 +224,7 @@ pub(crate) fn open_notifier(
 }
 
 /// The descriptor that becomes readable when `listener` is notified.
+#[allow(unsafe_code, reason = "a descriptor is a bare number to iceoryx2")]
 pub(crate) fn descriptor(listener: &Listener<ipc::Service>) -> BorrowedFd<'_> {
     // SAFETY: the number is used only for the borrow made below.
     let raw = unsafe { listener.file_descriptor().native_handle() };
@@ -332,6 +310,10 @@ impl RawOutput {
     ///
     /// # Errors
     /// As [`RawOutput::publish`].
+    #[allow(
+        unsafe_code,
+        reason = "writes a message whose type is known only at run time"
+    )]
     pub fn publish_with(
         &mut self,
         payload: &[u8],
@@ -351,9 +333,10 @@ impl RawOutput {
         // the loan is exclusively ours.
         unsafe { target.copy_from_nonoverlapping(payload.as_ptr(), payload.len()) };
         let header: *mut CustomHeaderMarker = loan.user_header_mut();
+        let envelope = envelope();
         // SAFETY: the service was opened with a user header of the envelope's size and alignment,
         // and the marker reference is iceoryx2's pointer to that memory.
-        unsafe { header.cast::<Envelope>().write(envelope()) };
+        unsafe { header.cast::<Envelope>().write(envelope) };
         // SAFETY: header and payload were written in full just above.
         let sample = unsafe { loan.assume_init() };
         sample.send().map_err(|error| refused("send", &error))?;
@@ -418,6 +401,10 @@ impl ByteReader {
     }
 
     /// Hands the oldest waiting sample to `take`; `None` when none waits.
+    #[allow(
+        unsafe_code,
+        reason = "reads a message whose type is known only at run time"
+    )]
     pub(crate) fn receive<T>(
         &mut self,
         take: impl FnOnce(UniqueNodeId, &Envelope, &[u8]) -> T,

@@ -1,12 +1,13 @@
 //! Sequence numbers of a channel: given by its writer, judged by its readers. Pure.
 
+use crate::clock::MonotonicClock;
 use core::fmt;
 use core::time::Duration;
 
 use hil_models::message::Envelope;
 use hil_models::time::Instant;
 
-/// Reads the clock at the moment of publication, e.g. [`monotonic_now`](super::monotonic_now).
+/// Reads the clock at the moment of publication, e.g. [`MonotonicClock::now`](crate::clock::MonotonicClock::now).
 ///
 /// A port's `send` gets the `now` of the poll it happens in; a controller that computes for
 /// 200 µs publishes 200 µs after that. Accounts want the later moment, so it is read last.
@@ -28,7 +29,7 @@ impl Default for OutputSettings {
     fn default() -> Self {
         Self {
             epoch: 0,
-            stamp: Some(super::monotonic_now),
+            stamp: Some(MonotonicClock::now),
             notifies_readers: true,
         }
     }

@@ -17,8 +17,9 @@ use iceoryx2::service::port_factory::publish_subscribe;
 use super::degradation::ConnectionFailures;
 use super::domain::Domain;
 use super::error::{ChannelError, retry};
-use super::raw::{self, ByteReader, RawOutput, SharedEnvelope, TypeInfo};
+use super::raw::{self, ByteReader, RawOutput, SharedEnvelope};
 use super::sequence::{InputCounters, OutputSettings, SequenceTracker, Sequencer};
+use super::type_info::TypeInfo;
 
 /// A role's output on a channel.
 #[derive(Debug)]

@@ -14,8 +14,8 @@ use nix::sys::time::TimeSpec;
 
 use super::domain::Domain;
 use super::error::{ChannelError, retry};
-use super::identity::monotonic_now;
 use super::raw;
+use crate::clock::MonotonicClock;
 
 /// Most channels one waiter waits for.
 pub const WAITER_CHANNELS_MAX: usize = 16;
@@ -73,7 +73,8 @@ impl Waiter {
     /// # Errors
     /// When the wait itself fails.
     pub fn wait_until(&mut self, deadline: Option<Instant>) -> Result<Wake, ChannelError> {
-        let left = deadline.map(|deadline| deadline.saturating_duration_since(monotonic_now()));
+        let left =
+            deadline.map(|deadline| deadline.saturating_duration_since(MonotonicClock::now()));
         self.poll(left)
     }
 

@@ -3,7 +3,7 @@
 
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
-use std::sync::atomic::AtomicU64;
+use std::sync::atomic::{AtomicBool, AtomicU64};
 use std::time::Duration;
 
 use hil_gateways::protocol::ingress::IngressCounts;
@@ -46,6 +46,7 @@ pub struct Opened {
     socket: Socket,
     sinks: Sinks,
     count: Arc<AtomicU64>,
+    is_established: Arc<AtomicBool>,
     facts: Vec<(String, String)>,
 }
 
@@ -97,6 +98,8 @@ pub fn open<'a>(
             socket,
             sinks,
             count: Arc::default(),
+            // A receiver has nobody to wait for: it takes what comes.
+            is_established: Arc::new(AtomicBool::new(launch.side == Side::Ingress)),
             facts,
         },
     ))
@@ -203,6 +206,11 @@ impl Opened {
         Arc::clone(&self.count)
     }
 
+    /// True while the peer takes this direction's messages.
+    pub fn is_established(&self) -> Arc<AtomicBool> {
+        Arc::clone(&self.is_established)
+    }
+
     /// Joins the local channel; call it in the thread that will carry the messages.
     ///
     /// # Errors
@@ -226,7 +234,7 @@ impl Opened {
                 Way::Egress(Box::new(egress(
                     sender,
                     self.sinks,
-                    self.count,
+                    (self.count, self.is_established),
                     (launch, surroundings),
                 )?))
             }
@@ -244,7 +252,7 @@ impl Opened {
 fn egress(
     sender: Box<UdpSender>,
     sinks: Sinks,
-    count: Arc<AtomicU64>,
+    (count, is_established): (Arc<AtomicU64>, Arc<AtomicBool>),
     (launch, around): (&DirectionLaunch, &Surroundings),
 ) -> Result<Egress, GatewayError> {
     let bridge = EgressBridge::new(EgressSettings {
@@ -272,6 +280,7 @@ fn egress(
         sent: count,
         stop: Arc::clone(&around.stop),
         attention: Attention::default(),
+        is_established,
     })
 }
 

@@ -43,6 +43,8 @@ pub(crate) struct Egress {
     pub(crate) sent: Arc<AtomicU64>,
     pub(crate) stop: Arc<AtomicBool>,
     pub(crate) attention: Attention,
+    /// Set while the peer takes messages.
+    pub(crate) is_established: Arc<AtomicBool>,
 }
 
 /// When to look after the socket: asking it costs system calls that a waiting message would have
@@ -320,6 +322,8 @@ impl Egress {
             self.hear()?;
             self.line.expire(now);
             self.line.refresh_clock(now);
+            let is_established = self.bridge.peer_state() == PeerState::Established;
+            self.is_established.store(is_established, Ordering::Release);
         }
         if self.bridge.next_wakeup().is_some_and(|due| due <= now) {
             self.line.transmit(&mut self.bridge);

@@ -4,7 +4,7 @@
 
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc::{Sender, channel};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
@@ -12,7 +12,7 @@ use std::time::Duration;
 use hil_gateways::transport::probe::{
     Availability, ProbeReport, ProbeSettings, Sentinel, arm_and_probe,
 };
-use hil_models::time::Instant;
+use hil_gateways::transport::timestamping::{HardwareStamping, TimestampMode};
 
 use super::direction::{self, Opened};
 use super::{GatewayError, Surroundings};
@@ -28,6 +28,8 @@ use crate::record::Recorder;
 use crate::wait::WaitMode;
 
 const PROGRESS_PERIOD: Duration = Duration::from_millis(250);
+/// How often orders and threads are looked at.
+const WATCH_PERIOD: Duration = Duration::from_millis(5);
 /// How long each half of the stamp probe may take; a restart must not wait long for it.
 const PROBE_BOUND: Duration = Duration::from_millis(300);
 
@@ -60,6 +62,7 @@ fn prepare_and_live(path: &Path) -> Result<(), GatewayError> {
         .iter()
         .map(|(launch, one)| counter(launch, one))
         .collect();
+    let established: Vec<_> = opened.iter().map(|(_, one)| one.is_established()).collect();
     let (sender, ready) = channel();
     let mut threads = Vec::new();
     for (direction, one) in opened {
@@ -72,17 +75,36 @@ fn prepare_and_live(path: &Path) -> Result<(), GatewayError> {
         )?);
     }
     drop(sender);
-    let mut failed = wait_until_open(&ready, threads.len());
-    if failed.is_none() {
-        say(&FromProcess::Ready);
-        while !orders.is_stopping() && failed.is_none() {
-            thread::sleep(PROGRESS_PERIOD.min(Duration::from_millis(20)));
-            report_progress(&counters);
-            failed = threads.iter().any(JoinHandle::is_finished).then_some(());
-        }
+    if wait_until_open(&ready, threads.len()) {
+        watch(&orders, &threads, &counters, &established);
     }
     surroundings.stop.store(true, Ordering::Release);
     finish(threads, recorder, &stamp_facts)
+}
+
+/// Says when every direction is ready and how many messages passed, until told to stop or a
+/// thread ends.
+fn watch(
+    orders: &Orders,
+    threads: &[JoinHandle<Lived>],
+    counters: &[Counter],
+    established: &[Arc<AtomicBool>],
+) {
+    let mut is_ready = false;
+    let mut told = MonotonicClock::now();
+    while !orders.is_stopping() && !threads.iter().any(JoinHandle::is_finished) {
+        // Messages published before the peer has greeted back would be refused.
+        if !is_ready && established.iter().all(|one| one.load(Ordering::Acquire)) {
+            is_ready = true;
+            say(&FromProcess::Ready);
+        }
+        let now = MonotonicClock::now();
+        if now.saturating_duration_since(told) >= PROGRESS_PERIOD {
+            told = now;
+            report_progress(counters);
+        }
+        thread::sleep(WATCH_PERIOD);
+    }
 }
 
 type Counter = (String, &'static str, Arc<AtomicU64>);
@@ -96,14 +118,6 @@ fn counter(launch: &DirectionLaunch, opened: &Opened) -> Counter {
 }
 
 fn report_progress(counters: &[Counter]) {
-    thread_local! {
-        static NEXT: core::cell::Cell<Option<Instant>> = const { core::cell::Cell::new(None) };
-    }
-    let now = MonotonicClock::now();
-    if NEXT.get().is_some_and(|next| now < next) {
-        return;
-    }
-    NEXT.set(Some(now + PROGRESS_PERIOD));
     let progress = counters
         .iter()
         .map(|(channel, what, count)| ChannelProgress {
@@ -160,9 +174,9 @@ fn spawn(
         .map_err(GatewayError::Thread)
 }
 
-fn wait_until_open(ready: &std::sync::mpsc::Receiver<bool>, count: usize) -> Option<()> {
+fn wait_until_open(ready: &std::sync::mpsc::Receiver<bool>, count: usize) -> bool {
     let opened = (0..count).filter(|_| ready.recv() == Ok(true)).count();
-    (opened < count).then_some(())
+    opened == count
 }
 
 fn finish(
@@ -229,9 +243,29 @@ fn arm_stamps(launch: &GatewayLaunch) -> (Option<Sentinel>, Vec<(String, String)
         proof_count: 5,
         bound: PROBE_BOUND,
     };
+    let card = (settings.timestamps == TimestampMode::Hardware)
+        .then(|| switch_card_on(direction.socket.interface.as_deref()));
     match arm_and_probe(&settings) {
-        Ok((report, sentinel)) => (Some(sentinel), fact(describe_probe(&report))),
+        Ok((report, sentinel)) => {
+            let mut facts = fact(describe_probe(&report));
+            facts.extend(card.map(|text| ("network card stamps".to_owned(), text)));
+            (Some(sentinel), facts)
+        }
         Err(error) => (None, fact(format!("unavailable: {error}"))),
+    }
+}
+
+/// A card stamps nothing until it is told to; says what it settled for.
+fn switch_card_on(interface: Option<&str>) -> String {
+    let Some(interface) = interface else {
+        return "unavailable: the host names no interface in the topology".to_owned();
+    };
+    match HardwareStamping::request(interface) {
+        Ok(settled) => format!(
+            "switched on for {interface}: transmit {}, receive filter {}",
+            settled.is_transmit_on, settled.receive_filter
+        ),
+        Err(error) => format!("unavailable: {interface} cannot be switched on: {error}"),
     }
 }
 

@@ -3,6 +3,7 @@
 
 pub(crate) mod component;
 pub mod launch;
+pub(crate) mod own_program;
 pub mod pipe;
 pub(crate) mod recording;
 pub(crate) mod usage;

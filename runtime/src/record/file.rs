@@ -240,8 +240,12 @@ impl RecordFile {
             .filter_map(|bytes| bytemuck::try_pod_read_unaligned(bytes).ok())
     }
 
-    /// The messages, appended to a run log under the channel's name.
+    /// The messages, appended to a run log under the channel's name; nothing when the file holds
+    /// records of another kind.
     pub fn append_messages(&self, log: &mut RunLog) {
+        if self.header.kind != RecordKind::Message {
+            return;
+        }
         for bytes in self.raw() {
             let (envelope, payload) = bytes.split_at(size_of::<Envelope>());
             log.push(

@@ -16,6 +16,7 @@ use super::event::{Event, Interruption};
 use super::plan::{ProcessKind, ProcessPlan};
 use crate::clock::MonotonicClock;
 use crate::process::launch::{ComponentLaunch, GatewayLaunch, LaunchError, write};
+use crate::process::own_program;
 use crate::process::pipe::{ChannelProgress, FromProcess, ProcessReport, ToProcess};
 use crate::run_folder::RunFolder;
 use crate::topology::OnExit;
@@ -130,8 +131,20 @@ impl Crew {
         {
             let card_path = self.folder.card(&name);
             write(&card_path, card)?;
-            let mut program = Command::new(&command[0]);
-            program.args(&command[1..]).envs(environment);
+            let found = own_program::find(&command[0]);
+            found.map_err(|source| CrewError::Spawn {
+                process: name.clone(),
+                program: command[0].clone(),
+                source,
+            })?;
+            let mut program = Command::new(&self.own_program);
+            program.args([
+                "become",
+                "--supervisor",
+                &std::process::id().to_string(),
+                "--",
+            ]);
+            program.args(command).envs(environment);
             program
                 .env("HIL_DOMAIN", &domain)
                 .env("HIL_CARD", &card_path);

@@ -2,9 +2,11 @@
 //! created and held, so that the processes it starts only ever open.
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
 
-use super::plan::{HostPlan, domain_root};
+use super::plan::{HostPlan, domain_base, domain_root};
 use crate::channel::{ChannelError, ChannelHolder, ChannelSettings, Domain, DomainError, TypeInfo};
 
 /// Writers at a time: one, and its successor while the dead one is not cleaned up yet.
@@ -54,6 +56,7 @@ impl Domains {
         base: Option<&PathBuf>,
         run: &str,
     ) -> Result<Self, DomainsError> {
+        sweep(&domain_base(base));
         let hosts = plans.iter().map(|plan| create_host(plan, base, run));
         Ok(Self {
             hosts: hosts.collect::<Result<_, _>>()?,
@@ -112,6 +115,29 @@ impl Domains {
             }
         }
         left
+    }
+}
+
+/// A younger folder may belong to a run that is just starting and has not locked it yet.
+const STALE_AGE: Duration = Duration::from_secs(30);
+
+/// Removes the domains of supervisors that were killed: nobody holds their lock any more.
+fn sweep(base: &Path) {
+    let Ok(entries) = fs::read_dir(base) else {
+        return;
+    };
+    for entry in entries.flatten() {
+        let age = entry.metadata().and_then(|data| data.modified()).ok();
+        let is_old = age
+            .and_then(|at| at.elapsed().ok())
+            .is_some_and(|age| age > STALE_AGE);
+        // A domain in use is locked and refuses; anything else there is not a domain's folder.
+        if is_old
+            && Domain::is_at(&entry.path())
+            && let Ok(domain) = Domain::create(&entry.path())
+        {
+            domain.remove();
+        }
     }
 }
 

@@ -228,12 +228,16 @@ fn wait_mode(wait: Wait) -> WaitMode {
 /// Where the shared-memory domain of `host` lies: short, because a socket path below it must
 /// stay under 108 bytes.
 pub(crate) fn domain_root(base: Option<&PathBuf>, run: &str, host: &str) -> PathBuf {
-    let base = base.cloned().unwrap_or_else(default_domain_base);
     let mut hash: u64 = 0xcbf2_9ce4_8422_2325;
     for byte in run.bytes().chain([0]).chain(host.bytes()) {
         hash = (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3);
     }
-    base.join(format!("{:012x}", hash & 0xffff_ffff_ffff))
+    domain_base(base).join(format!("{:012x}", hash & 0xffff_ffff_ffff))
+}
+
+/// Folder of all domains: `base`, or the default.
+pub(crate) fn domain_base(base: Option<&PathBuf>) -> PathBuf {
+    base.cloned().unwrap_or_else(default_domain_base)
 }
 
 fn default_domain_base() -> PathBuf {

@@ -11,9 +11,10 @@ use hil_models::time::Instant;
 
 use super::super::{
     ChannelError, ChannelHolder, ChannelSettings, Domain, OutputSettings, RawInput, RawOutput,
-    ShmInput, ShmOutput, TypedInput, TypedOutput, Waiter, Wake, monotonic_now,
+    ShmInput, ShmOutput, TypedInput, TypedOutput, Waiter, Wake,
 };
 use super::{POSE, Pose, assert_nothing_left, launch, pose};
+use crate::clock::MonotonicClock;
 
 fn output(domain: &Domain, epoch: u32) -> ShmOutput {
     let settings = OutputSettings {
@@ -29,7 +30,7 @@ fn send(
 ) {
     for index in indices {
         output
-            .send(monotonic_now(), bytemuck::bytes_of(&pose(index)))
+            .send(MonotonicClock::now(), bytemuck::bytes_of(&pose(index)))
             .unwrap();
     }
 }
@@ -39,7 +40,7 @@ fn drain(input: &mut impl InputPort<Error = ChannelError>) -> Vec<(Envelope, Pos
     let mut take = |envelope: &Envelope, payload: &[u8]| {
         seen.push((*envelope, bytemuck::pod_read_unaligned(payload)));
     };
-    while input.receive(monotonic_now(), &mut take).unwrap() {}
+    while input.receive(MonotonicClock::now(), &mut take).unwrap() {}
     seen
 }
 
@@ -310,7 +311,7 @@ fn a_waiter_wakes_on_either_channel_and_drains() {
             "{channel}"
         );
     }
-    let past = Instant::from_ns(monotonic_now().as_ns() - 1);
+    let past = Instant::from_ns(MonotonicClock::now().as_ns() - 1);
     assert_eq!(waiter.wait_until(Some(past)).unwrap(), Wake::TimedOut);
     assert_eq!(waiter.descriptors().count(), 2);
     assert!(!waiter.drain().unwrap());

@@ -13,9 +13,9 @@ use hil_models::random::RandomStream;
 
 use super::super::{
     ChannelHolder, ChannelSettings, Domain, OutputSettings, ShmInput, ShmOutput, Waiter,
-    monotonic_now,
 };
 use super::{POSE, assert_nothing_left, pose, root_path, shared_memory_count};
+use crate::clock::MonotonicClock;
 
 const ROLE: &str = "HIL_TEST_KILL_ROLE";
 const ADDRESS: &str = "HIL_TEST_KILL_ADDRESS";
@@ -45,14 +45,17 @@ fn child() {
         loop {
             let payload = pose(output.sent_count());
             output
-                .send(monotonic_now(), bytemuck::bytes_of(&payload))
+                .send(MonotonicClock::now(), bytemuck::bytes_of(&payload))
                 .unwrap();
         }
     }
     let mut input = ShmInput::open(&domain, "arm/pose", &POSE, 1).unwrap();
     let mut waiter = Waiter::open(&domain, &["arm/pose"]).unwrap();
     loop {
-        while input.receive(monotonic_now(), &mut |_, _| {}).unwrap() {}
+        while input
+            .receive(MonotonicClock::now(), &mut |_, _| {})
+            .unwrap()
+        {}
         waiter.wait(Duration::from_millis(1)).unwrap();
     }
 }
@@ -87,13 +90,13 @@ fn assert_usable(domain: &Domain, witness: &mut ShmInput, seed: u64) {
     let mut last = [None; 2];
     for index in 0..3 {
         output
-            .send(monotonic_now(), bytemuck::bytes_of(&pose(index)))
+            .send(MonotonicClock::now(), bytemuck::bytes_of(&pose(index)))
             .unwrap();
         for (reader, last) in [&mut *witness, &mut input].into_iter().zip(&mut last) {
             let mut take = |_: &_, payload: &[u8]| {
                 *last = Some(bytemuck::pod_read_unaligned::<super::Pose>(payload).index);
             };
-            while reader.receive(monotonic_now(), &mut take).unwrap() {}
+            while reader.receive(MonotonicClock::now(), &mut take).unwrap() {}
         }
         assert_eq!(last, [Some(index); 2], "seed {seed}");
     }
@@ -119,7 +122,9 @@ fn kill_at_random_moments(seed: u64) {
         let lifetime = Duration::from_secs_f64(LIFETIME_S * random.uniform());
         let started = Instant::now();
         while started.elapsed() < lifetime {
-            witness.receive(monotonic_now(), &mut |_, _| {}).unwrap();
+            witness
+                .receive(MonotonicClock::now(), &mut |_, _| {})
+                .unwrap();
             thread::sleep(Duration::from_micros(200));
         }
         for child in &mut children {
@@ -129,7 +134,10 @@ fn kill_at_random_moments(seed: u64) {
             child.wait().unwrap();
         }
         domain.cleanup_dead_nodes();
-        while witness.receive(monotonic_now(), &mut |_, _| {}).unwrap() {}
+        while witness
+            .receive(MonotonicClock::now(), &mut |_, _| {})
+            .unwrap()
+        {}
     }
     assert_usable(&domain, &mut witness, seed);
     drop((witness, holder));

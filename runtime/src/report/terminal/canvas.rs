@@ -109,15 +109,19 @@ impl Canvas {
 
     /// A label and a text that wraps beside it.
     pub(super) fn field(&mut self, label: &str, tone: Tone, text: &str) {
-        const LABEL_WIDTH: usize = 14;
-        let start = INDENT + LABEL_WIDTH;
+        self.field_of(14, label, tone, text);
+    }
+
+    /// As [`Canvas::field`], with a label column of `label_width`.
+    pub(super) fn field_of(&mut self, label_width: usize, label: &str, tone: Tone, text: &str) {
+        let start = INDENT + label_width;
         let rows = wrapped(text, self.width - start);
         for (index, row) in rows.iter().enumerate() {
             let label = if index == 0 { label } else { "" };
             let line = format!(
                 "{:INDENT$}{}{}",
                 "",
-                self.paint(Tone::Faint, &left(label, LABEL_WIDTH)),
+                self.paint(Tone::Faint, &left(label, label_width)),
                 self.paint(tone, row)
             );
             self.line(&line);

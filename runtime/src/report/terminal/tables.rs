@@ -142,6 +142,6 @@ pub(super) fn host(canvas: &mut Canvas, facts: &[Fact]) {
     }
     canvas.heading("Host", "");
     for fact in facts {
-        canvas.field(&fact.label, Tone::Plain, &fact.value);
+        canvas.field_of(22, &fact.label, Tone::Plain, &fact.value);
     }
 }

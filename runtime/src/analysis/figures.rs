@@ -1,0 +1,215 @@
+//! The parts of a summary: from what the supervisor and the processes said to what a report shows.
+//! It draws up no account itself.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use super::records::RunRecords;
+use crate::realtime::GrantOutcome;
+use crate::report::summary::{
+    ChannelSummary, CountByName, DirectionSummary, Fact, LinkKind, Outcome, ProcessSummary,
+    RealtimeFacts, RunEvent, RunFacts,
+};
+use crate::supervisor::event::{Event, ProcessStory};
+use crate::supervisor::{self, RunResult};
+use crate::topology::{Channel, Topology};
+
+pub(super) fn run_facts(
+    topology: &Topology,
+    result: &RunResult,
+    topology_file: &Path,
+    command_line: &[String],
+) -> RunFacts {
+    let outcome = match &result.outcome {
+        supervisor::Outcome::Completed | supervisor::Outcome::EndedEarly(_) => Outcome::Completed,
+        supervisor::Outcome::Interrupted(_) | supervisor::Outcome::EndedByPeer(_) => {
+            Outcome::Stopped
+        }
+        supervisor::Outcome::Failed(_) | supervisor::Outcome::PeerLost(_) => Outcome::Failed,
+    };
+    let files = [
+        ("summary.json", "every figure of this report"),
+        (
+            "manifest.json",
+            "topology as resolved, versions, host, seed",
+        ),
+        (
+            "records/",
+            "one record per message and stage; layout in the runtime's docs",
+        ),
+        ("logs/", "what each process said on standard error"),
+    ];
+    RunFacts {
+        name: result.folder.name(),
+        case: topology
+            .case()
+            .map(|case| case.name.clone())
+            .unwrap_or_default(),
+        topology_file: topology_file.display().to_string(),
+        topology_hash: format!("{:016x}", topology.hash()),
+        seed: topology.run().seed,
+        host: result.own_hosts.join(", "),
+        started: result.started.clone(),
+        duration_s: result.span.1.seconds_since(result.span.0),
+        outcome,
+        exit_reason: result.outcome.text(),
+        folder: result.folder.root().display().to_string(),
+        files: files.map(|(name, what)| Fact::new(name, what)).to_vec(),
+        repeat_command: shell_words(command_line),
+    }
+}
+
+/// What the kernel granted and refused, each item once with the threads it concerns.
+pub(super) fn realtime_facts(processes: &[ProcessStory]) -> RealtimeFacts {
+    let mut items: BTreeMap<(bool, String), Vec<String>> = BTreeMap::new();
+    let mut thread_count = 0;
+    for process in processes {
+        for (thread, grant) in process.report.iter().flat_map(|report| &report.realtime) {
+            thread_count += 1;
+            let who = if thread == "main" {
+                process.name.clone()
+            } else {
+                format!("{} ({thread})", process.name)
+            };
+            for item in &grant.items {
+                let is_refused = item.outcome != GrantOutcome::Granted;
+                items
+                    .entry((is_refused, item.to_string()))
+                    .or_default()
+                    .push(who.clone());
+            }
+        }
+    }
+    let mut facts = RealtimeFacts::default();
+    for ((is_refused, what), who) in items {
+        let who = if who.len() == thread_count {
+            format!("all {thread_count} measured threads")
+        } else {
+            who.join(", ")
+        };
+        let side = if is_refused {
+            &mut facts.refused
+        } else {
+            &mut facts.granted
+        };
+        side.push(Fact::new(what, who));
+    }
+    facts
+}
+
+/// A command line that a shell reads back as it was.
+fn shell_words(words: &[String]) -> String {
+    let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b"/._-=:@,+".contains(&byte);
+    let quoted = words.iter().map(|word| {
+        if !word.is_empty() && word.bytes().all(is_plain) {
+            word.clone()
+        } else {
+            format!("'{}'", word.replace('\'', r"'\''"))
+        }
+    });
+    quoted.collect::<Vec<_>>().join(" ")
+}
+
+pub(super) fn process_summary(process: &ProcessStory) -> ProcessSummary {
+    let report = process.report.as_ref();
+    // A gateway has no period of its own.
+    let ticking = report.filter(|report| report.directions.is_empty());
+    ProcessSummary {
+        name: process.name.clone(),
+        host: process.host.clone(),
+        role: process.role.clone(),
+        exit: process.end.clone(),
+        restart_count: u64::from(process.restart_count),
+        tick_count: ticking.map(|report| report.ticks),
+        skipped_tick_count: ticking.map(|report| report.skipped_ticks),
+        cpu_time_s: report.map(|report| report.cpu_s),
+        voluntary_switch_count: report.map(|report| report.voluntary_switches),
+        involuntary_switch_count: report.map(|report| report.involuntary_switches),
+        malformed_count: report.map(|report| report.malformed_count),
+        outbox_drop_count: report.map(|report| report.outbox_dropped),
+        recorder_drop_count: report.map(|report| report.recorder_dropped),
+    }
+}
+
+pub(super) fn run_event(result: &RunResult, event: &Event) -> RunEvent {
+    let gap = event.interruption.map(|gap| match gap.until {
+        Some(until) => format!("away for {:.0} ms", until.seconds_since(gap.from) * 1e3),
+        None => "never came back".to_owned(),
+    });
+    RunEvent {
+        at_s: event.at.seconds_since(result.span.0),
+        what: format!("{}: {}", event.process, event.what),
+        cause: gap.unwrap_or_default(),
+    }
+}
+
+pub(super) fn channel_summary(
+    topology: &Topology,
+    result: &RunResult,
+    channel: &Channel,
+    records: &RunRecords,
+) -> ChannelSummary {
+    let crossing = topology.crossing(channel);
+    let directions = directions(result, &channel.name);
+    let refusals = directions
+        .iter()
+        .flat_map(|direction| &direction.counters)
+        .filter(|counter| counter.count > 0)
+        .filter_map(|counter| {
+            let name = counter.name.strip_prefix("refused: ")?.to_owned();
+            Some(CountByName {
+                name,
+                count: counter.count,
+            })
+        })
+        .collect();
+    ChannelSummary {
+        name: channel.name.clone(),
+        from: channel.from.clone(),
+        to: channel.to.clone(),
+        link: match crossing.map(|crossing| crossing.impairment.is_some()) {
+            None => LinkKind::SharedMemory,
+            Some(false) => LinkKind::Udp,
+            Some(true) => LinkKind::Emulated,
+        },
+        account: records
+            .has(&channel.name)
+            .then(|| records.account(topology, result, channel)),
+        refusals,
+        directions,
+    }
+}
+
+fn directions(result: &RunResult, channel: &str) -> Vec<DirectionSummary> {
+    let mut found = Vec::new();
+    for process in &result.processes {
+        let Some(report) = &process.report else {
+            continue;
+        };
+        for direction in report
+            .directions
+            .iter()
+            .filter(|one| one.channel == channel)
+        {
+            found.push(DirectionSummary {
+                process: process.name.clone(),
+                direction: direction.direction.clone(),
+                peer_state: direction.peer_state.clone(),
+                counters: direction
+                    .counters
+                    .iter()
+                    .map(|(name, count)| CountByName {
+                        name: name.clone(),
+                        count: *count,
+                    })
+                    .collect(),
+                facts: direction
+                    .facts
+                    .iter()
+                    .map(|(label, value)| Fact::new(label.clone(), value.clone()))
+                    .collect(),
+            });
+        }
+    }
+    found
+}

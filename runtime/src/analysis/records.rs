@@ -1,0 +1,193 @@
+//! The record files of a finished run, joined by channel, and the account drawn up from them. What
+//! the account means for a reader is decided elsewhere.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use hil_models::measure::account::{
+    AccountContext, ChannelAccount, ChannelPath, ChannelRecords, FLIGHT_TIME_MAX, Interruption,
+    PathProcess, RunSpan, account,
+};
+use hil_models::measure::record::{
+    EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, TakenRecord,
+};
+use hil_models::run_log::RunLog;
+use hil_models::time::Alignment;
+
+use super::AnalysisError;
+use crate::record::{RecordFile, RecordFileError, RecordKind};
+use crate::supervisor::RunResult;
+use crate::topology::{Channel, Topology};
+
+/// All records of one channel.
+#[derive(Debug, Default)]
+pub(crate) struct ChannelFiles {
+    published: Option<Vec<PublishedRecord>>,
+    egress: Option<Vec<EgressRecord>>,
+    ingress: Option<Vec<IngressRecord>>,
+    follow_up: Option<Vec<FollowUpRecord>>,
+    taken: Option<Vec<TakenRecord>>,
+    round_trips_ns: Vec<i64>,
+}
+
+/// Every record file of a run.
+#[derive(Debug, Default)]
+pub(crate) struct RunRecords {
+    channels: BTreeMap<String, ChannelFiles>,
+    log: RunLog,
+    /// Files that could not be read, with the reason.
+    pub(crate) problems: Vec<String>,
+}
+
+impl RunRecords {
+    /// Reads the records folder.
+    pub(crate) fn read(folder: &Path) -> Result<Self, AnalysisError> {
+        let failed = |source| AnalysisError::Folder {
+            folder: folder.to_owned(),
+            source,
+        };
+        let mut paths: Vec<PathBuf> = fs::read_dir(folder)
+            .and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect())
+            .map_err(failed)?;
+        // By name, so that the instances of a restarted process come in order.
+        paths.sort();
+        let mut records = Self::default();
+        for path in paths {
+            match RecordFile::read(&path) {
+                Ok(file) => records.add(&file),
+                // A process killed while it opened its files leaves one without a header.
+                Err(error @ RecordFileError::Malformed { offset: 0, .. }) => {
+                    records.problems.push(format!("{error}; left out"));
+                }
+                Err(error) => records.problems.push(error.to_string()),
+            }
+        }
+        Ok(records)
+    }
+
+    fn add(&mut self, file: &RecordFile) {
+        let channel = self
+            .channels
+            .entry(file.header.channel.clone())
+            .or_default();
+        match file.header.kind {
+            RecordKind::Published => extend(&mut channel.published, file.records()),
+            RecordKind::Taken => extend(&mut channel.taken, file.records()),
+            RecordKind::Egress => extend(&mut channel.egress, file.records()),
+            RecordKind::Ingress => extend(&mut channel.ingress, file.records()),
+            RecordKind::FollowUp => extend(&mut channel.follow_up, file.records()),
+            RecordKind::RoundTrip => {
+                channel
+                    .round_trips_ns
+                    .extend(file.records::<[i64; 2]>().map(|[rtt, _]| rtt));
+            }
+            RecordKind::Message => file.append_messages(&mut self.log),
+        }
+    }
+
+    /// See [`RunLog::set_clocks_differ`].
+    pub(super) fn set_clocks_differ(&mut self) {
+        self.log.set_clocks_differ();
+    }
+
+    /// True when anything was recorded of `channel`.
+    pub(super) fn has(&self, channel: &str) -> bool {
+        self.channels.contains_key(channel)
+    }
+
+    /// Every message of the run.
+    pub(crate) fn log(&self) -> &RunLog {
+        &self.log
+    }
+
+    /// The account of `channel`.
+    pub(crate) fn account(
+        &self,
+        topology: &Topology,
+        result: &RunResult,
+        channel: &Channel,
+    ) -> ChannelAccount {
+        let nothing = ChannelFiles::default();
+        let files = self.channels.get(&channel.name).unwrap_or(&nothing);
+        let interruptions = interruptions(topology, result, channel);
+        let span = RunSpan {
+            start: result.span.0,
+            end: result.span.1,
+        };
+        let crossing = topology.crossing(channel);
+        let path = if crossing.is_some() {
+            let alignment = result.has_one_clock.then_some(Alignment::SAME_CLOCK);
+            ChannelPath::Gateway { alignment }
+        } else {
+            ChannelPath::SharedMemory
+        };
+        // A link that delays on purpose keeps messages under way for that much longer.
+        let delay = crossing
+            .and_then(|crossing| crossing.impairment)
+            .map(|one| one.delay);
+        let is_on_this_clock =
+            |process: &str| result.has_one_clock || is_here(topology, result, process);
+        let context = AccountContext {
+            interruptions: &interruptions,
+            producer_run: is_on_this_clock(&channel.from).then_some(span),
+            consumer_run: is_on_this_clock(&channel.to).then_some(span),
+            flight_time_max: FLIGHT_TIME_MAX + delay.unwrap_or(Duration::ZERO),
+            round_trips_ns: &files.round_trips_ns,
+            seed: topology.run().seed,
+            ..AccountContext::new(path)
+        };
+        let records = ChannelRecords {
+            published: files.published.as_deref(),
+            egress: files.egress.as_deref(),
+            ingress: files.ingress.as_deref(),
+            follow_up: files.follow_up.as_deref(),
+            taken: files.taken.as_deref(),
+        };
+        account(&records, &context)
+    }
+}
+
+fn extend<T>(records: &mut Option<Vec<T>>, more: impl Iterator<Item = T>) {
+    records.get_or_insert_default().extend(more);
+}
+
+fn is_here(topology: &Topology, result: &RunResult, process: &str) -> bool {
+    topology
+        .process(process)
+        .is_some_and(|process| result.own_hosts.contains(&process.host))
+}
+
+/// The times in which a process on the channel's way was not there.
+fn interruptions(topology: &Topology, result: &RunResult, channel: &Channel) -> Vec<Interruption> {
+    let gateway = |process: &str| {
+        let host = &topology.process(process)?.host;
+        Some(format!("gateway-{}-{host}", channel.link.as_deref()?))
+    };
+    let places = [
+        (Some(channel.from.clone()), PathProcess::Producer),
+        (gateway(&channel.from), PathProcess::SendingGateway),
+        (gateway(&channel.to), PathProcess::ReceivingGateway),
+        (Some(channel.to.clone()), PathProcess::Consumer),
+    ];
+    let mut found = Vec::new();
+    for event in &result.events {
+        let Some(gap) = event.interruption else {
+            continue;
+        };
+        for (_, place) in places
+            .iter()
+            .filter(|(name, _)| name.as_ref() == Some(&event.process))
+        {
+            found.push(Interruption {
+                process: event.process.clone(),
+                place: *place,
+                from: gap.from,
+                until: gap.until.unwrap_or(result.span.1),
+                cause: event.what.clone(),
+            });
+        }
+    }
+    found
+}
