@@ -27,7 +27,7 @@ use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::{Trial, wait_until};
 
 const CHANNEL: &str = "shuttle/command";
-const LIMIT: Duration = Duration::from_secs(60);
+const LIMIT: Duration = Duration::from_mins(1);
 const REASON: &str = "one shared-memory domain, so messages would bypass the network";
 
 /// Lets an egress with `domain` greet an ingress with domain 2; gives the answer.
@@ -98,8 +98,14 @@ impl Gateway {
         wait_until(LIMIT, "the end of a gateway", || !self.is_running());
         let mut words = String::new();
         for pipe in [
-            self.process.stdout.take().map(|pipe| Box::new(pipe) as Box<dyn std::io::Read>),
-            self.process.stderr.take().map(|pipe| Box::new(pipe) as Box<dyn std::io::Read>),
+            self.process
+                .stdout
+                .take()
+                .map(|pipe| Box::new(pipe) as Box<dyn std::io::Read>),
+            self.process
+                .stderr
+                .take()
+                .map(|pipe| Box::new(pipe) as Box<dyn std::io::Read>),
         ] {
             pipe.unwrap().read_to_string(&mut words).unwrap();
         }
@@ -268,7 +274,10 @@ fn two_supervisors_with_one_domain_folder_keep_their_memory_apart() {
             let account = account(&summary, &channel.name);
             let taken_count = account.fates.of(MessageFate::Taken);
             let received = account.coverage.rx_software.unwrap();
-            assert!(taken_count > 0 && received.eligible_count >= taken_count, "{account:?}");
+            assert!(
+                taken_count > 0 && received.eligible_count >= taken_count,
+                "{account:?}"
+            );
         }
         files.assert_nothing_left_here();
     }

@@ -1,6 +1,6 @@
 //! The real binary on two hosts: the teleoperated arm over a real UDP hop, started once on each,
 //! compared with the same arm on one host.
-#![allow(clippy::unwrap_used, reason = "tests")]
+#![allow(clippy::unwrap_used, clippy::print_stdout, reason = "tests")]
 
 use std::fs;
 use std::os::unix::fs::MetadataExt;
@@ -20,8 +20,8 @@ use hil_tests::trial::{RunFiles, Trial, wait_until};
 
 const HOSTS: [&str; 2] = ["control-pc", "robot-pc"];
 const CROSSING: [&str; 2] = ["arm/command", "arm/status"];
-const START_LIMIT: Duration = Duration::from_secs(60);
-const RUN_LIMIT: Duration = Duration::from_secs(120);
+const START_LIMIT: Duration = Duration::from_mins(1);
+const RUN_LIMIT: Duration = Duration::from_mins(2);
 
 /// What a component is: the file it executes and the card it was given.
 #[derive(Debug, Clone, PartialEq, Eq)]
