@@ -176,12 +176,12 @@ fn exit_code_of_error(error: &RunError) -> u8 {
         RunError::Peer(PeerError::Absent { .. } | PeerError::Connection { .. }) => {
             exit::PEER_ABSENT
         }
-        RunError::Peer(PeerError::Mismatch { .. } | PeerError::Listen { .. }) => exit::USAGE,
+        RunError::Peer(
+            PeerError::Mismatch { .. } | PeerError::Listen { .. } | PeerError::Own { .. },
+        ) => exit::USAGE,
         RunError::Peer(PeerError::Interrupted { .. }) => interrupted(),
-        RunError::Folder { .. }
-        | RunError::Domains(_)
-        | RunError::Identity(_)
-        | RunError::Start(_) => exit::INTERNAL,
+        RunError::Start(_) => exit::FAILED,
+        RunError::Folder { .. } | RunError::Domains(_) | RunError::Identity(_) => exit::INTERNAL,
     }
 }
 

@@ -9,7 +9,7 @@ use hil_models::component::Role;
 use hil_models::run_log::RunLog;
 use serde_json::Value;
 
-use crate::topology::KnownCases;
+use crate::topology::{KnownCase, KnownCases, ParameterFault, check_parameters_with};
 
 /// A case whose type is no longer known: what `[case]` resolves to.
 pub trait Case: Debug {
@@ -99,7 +99,11 @@ impl Registry {
             make: make::<C>,
             defaults: || serde_json::to_value(C::Parameters::default()).unwrap_or(Value::Null),
         });
-        self.known = core::mem::take(&mut self.known).with::<C>();
+        let known = KnownCase {
+            check_parameters: check_parameters::<C>,
+            ..KnownCase::of::<C>()
+        };
+        self.known = core::mem::take(&mut self.known).with_case(known);
     }
 
     /// The case called `name`.
@@ -131,6 +135,16 @@ fn make<C: CaseStudy>(parameters: Value, seed: u64) -> Result<Box<dyn Case>, Cas
     C::read_files(&mut parameters, &mut read_text).map_err(named)?;
     let case = C::new(parameters, seed).map_err(named)?;
     Ok(Box::new(Erased(case)))
+}
+
+/// Checks parameters as the topology reader does, with the files that they name.
+fn check_parameters<C: CaseStudy>(
+    table: &toml::Table,
+    seed: u64,
+) -> Result<toml::Table, Vec<ParameterFault>> {
+    check_parameters_with::<C>(table, seed, &mut |parameters| {
+        C::read_files(parameters, &mut read_text)
+    })
 }
 
 /// Reads a file that a parameter names, relative to the working directory.

@@ -2,8 +2,10 @@
 //! binary, children that do not outlive their test, folders that clean up after themselves. It
 //! holds no test of the product.
 
+pub mod account;
 pub mod binary;
 pub mod child;
 pub mod lab;
 pub mod run_folder;
 pub mod source_tree;
+pub mod trial;

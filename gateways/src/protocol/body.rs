@@ -161,6 +161,21 @@ pub enum HelloStatus {
 }
 
 impl HelloStatus {
+    /// The words a report prints.
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Accepted => "accepted",
+            Self::TypeMismatch => "the message types differ; use the same build on both hosts",
+            Self::SizeMismatch => "size or alignment of the messages differ",
+            Self::SharedDomain => {
+                "both ends are in one shared-memory domain, so messages would bypass the network"
+            }
+            Self::UnknownChannel => "the channel is not carried there",
+            Self::VersionMismatch => "the gateways speak different versions of the protocol",
+            Self::GreetAgain => "the session is not known there",
+        }
+    }
+
     const fn from_wire(code: u8) -> Option<Self> {
         match code {
             0 => Some(Self::Accepted),

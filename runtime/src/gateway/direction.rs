@@ -372,7 +372,7 @@ fn egress_state(egress: &Egress) -> String {
         PeerState::Greeting => "never answered".to_owned(),
         PeerState::Established => "established".to_owned(),
         PeerState::Down => "unreachable".to_owned(),
-        PeerState::Refused(status) => format!("refused the channel: {status:?}"),
+        PeerState::Refused(status) => format!("refused the channel: {}", status.label()),
     }
 }
 

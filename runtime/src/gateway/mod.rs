@@ -74,7 +74,7 @@ pub enum GatewayError {
     #[error("cannot choose a session number: {0}")]
     Session(io::Error),
     /// The other end does not want this channel.
-    #[error("the gateway at the other end refused the channel: {0:?}")]
+    #[error("the gateway at the other end refused the channel: {}", .0.label())]
     Refused(HelloStatus),
     /// A thread panicked.
     #[error("a gateway thread panicked")]

@@ -215,7 +215,14 @@ mod tests {
     #[test]
     fn a_child_that_does_not_stop_is_killed_and_its_end_is_told() {
         let log = env::temp_dir().join(format!("hil-kill-{}.log", std::process::id()));
-        let mut child = Child::spawn_foreign(shell("trap '' TERM; sleep 60"), &log).unwrap();
+        let script = "trap '' TERM; echo deaf; sleep 60";
+        let mut child = Child::spawn_foreign(shell(script), &log).unwrap();
+        let deadline = Instant::now() + Duration::from_secs(10);
+        // Asked before it has set its trap it would stop.
+        while !fs::read_to_string(&log).unwrap().contains("deaf") {
+            assert!(Instant::now() < deadline, "the script did not begin");
+            thread::sleep(Duration::from_millis(2));
+        }
         child.order(ToProcess::Stop);
         assert!(!child.end(Instant::now() + Duration::from_millis(50)));
         assert_eq!(

@@ -4,7 +4,6 @@
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 use super::plan::{HostPlan, domain_base, domain_root};
 use crate::channel::{ChannelError, ChannelHolder, ChannelSettings, Domain, DomainError, TypeInfo};
@@ -118,22 +117,15 @@ impl Domains {
     }
 }
 
-/// A younger folder may belong to a run that is just starting and has not locked it yet.
-const STALE_AGE: Duration = Duration::from_secs(30);
-
-/// Removes the domains of supervisors that were killed: nobody holds their lock any more.
+/// Removes the domains of supervisors that were killed: nobody holds their lock any more. A run
+/// that is just starting has taken the lock before its folder can be told for a domain's.
 fn sweep(base: &Path) {
     let Ok(entries) = fs::read_dir(base) else {
         return;
     };
     for entry in entries.flatten() {
-        let age = entry.metadata().and_then(|data| data.modified()).ok();
-        let is_old = age
-            .and_then(|at| at.elapsed().ok())
-            .is_some_and(|age| age > STALE_AGE);
         // A domain in use is locked and refuses; anything else there is not a domain's folder.
-        if is_old
-            && Domain::is_at(&entry.path())
+        if Domain::is_at(&entry.path())
             && let Ok(domain) = Domain::create(&entry.path())
         {
             domain.remove();

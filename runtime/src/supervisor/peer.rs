@@ -8,6 +8,8 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use socket2::{Domain, Socket, Type};
+
 use super::frame::{Frame, PeerHello, PeerMessage, read_frame, write_message};
 
 /// How often a host that cannot connect yet tries again.
@@ -45,6 +47,14 @@ pub enum PeerError {
         /// What the system said.
         source: io::Error,
     },
+    /// This host's address cannot be used.
+    #[error("cannot connect from {own}: {source}; is it this host's address?")]
+    Own {
+        /// The address that the topology gives this host.
+        own: IpAddr,
+        /// What the system said.
+        source: io::Error,
+    },
     /// The ends do not fit.
     #[error("{host} does not fit this run: {reason}")]
     Mismatch {
@@ -76,6 +86,8 @@ pub(crate) struct Meeting {
     pub(crate) address: SocketAddr,
     /// True on that first host.
     pub(crate) is_here: bool,
+    /// This host's own address, by which the first host knows it.
+    pub(crate) own: IpAddr,
     /// Names and addresses of the other hosts this one connects with.
     pub(crate) expected: Vec<(String, IpAddr)>,
     /// How long to wait for all of them.
@@ -327,8 +339,7 @@ fn join(
         source,
     };
     loop {
-        let attempt = TcpStream::connect_timeout(&meeting.address, RETRY_PERIOD);
-        let Ok(mut stream) = attempt else {
+        let Ok(mut stream) = connect(meeting)? else {
             patience.wait(&name)?;
             continue;
         };
@@ -353,6 +364,21 @@ fn join(
             }
         }
     }
+}
+
+/// One attempt to reach the first host, from this host's own address: the kernel would choose the
+/// sender's address by the route, and the first host turns strangers away.
+fn connect(meeting: &Meeting) -> Result<io::Result<TcpStream>, PeerError> {
+    let own = meeting.own;
+    let prepare = || {
+        let domain = Domain::for_address(meeting.address);
+        let socket = Socket::new(domain, Type::STREAM, None)?;
+        socket.bind(&SocketAddr::new(own, 0).into())?;
+        Ok(socket)
+    };
+    let socket = prepare().map_err(|source| PeerError::Own { own, source })?;
+    let connected = socket.connect_timeout(&meeting.address.into(), RETRY_PERIOD);
+    Ok(connected.map(|()| socket.into()))
 }
 
 fn read_hello(stream: TcpStream) -> io::Result<(TcpStream, PeerMessage)> {
@@ -415,6 +441,7 @@ mod tests {
         let meeting = |is_here, other: &PeerHello| Meeting {
             address,
             is_here,
+            own: address.ip(),
             expected: vec![(other.host.clone(), address.ip())],
             timeout: Duration::from_secs(10),
         };
@@ -466,6 +493,7 @@ mod tests {
         let meeting = Meeting {
             address: SocketAddr::from((Ipv4Addr::LOCALHOST, 1)),
             is_here: false,
+            own: Ipv4Addr::LOCALHOST.into(),
             expected: vec![("robot-pc".to_owned(), Ipv4Addr::LOCALHOST.into())],
             timeout: Duration::from_millis(1),
         };

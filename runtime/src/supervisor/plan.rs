@@ -228,7 +228,8 @@ fn wait_mode(wait: Wait) -> WaitMode {
 }
 
 /// Where the shared-memory domain of `host` lies: short, because a socket path below it must
-/// stay under 108 bytes.
+/// stay under 108 bytes. `run` is the whole path of the run folder: runs that record into
+/// different folders may bear one name.
 pub(crate) fn domain_root(base: Option<&PathBuf>, run: &str, host: &str) -> PathBuf {
     let mut hash: u64 = 0xcbf2_9ce4_8422_2325;
     for byte in run.bytes().chain([0]).chain(host.bytes()) {
@@ -255,4 +256,18 @@ fn default_domain_base() -> PathBuf {
         .flatten()
         .find(is_usable)
         .unwrap_or_else(|| std::env::temp_dir().join(format!("hil-{}", Uid::current())))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn runs_of_one_name_in_different_folders_have_different_domains() {
+        let base = PathBuf::from("/run/hil");
+        let root = |run, host| domain_root(Some(&base), run, host);
+        assert_ne!(root("/a/run-1", "x"), root("/b/run-1", "x"));
+        assert_ne!(root("/a/run-1", "x"), root("/a/run-1", "y"));
+        assert_eq!(root("/a/run-1", "x"), root("/a/run-1", "x"));
+    }
 }

@@ -56,7 +56,8 @@ pub fn run(
     let facts = HostFacts::gather();
     write_manifest(topology, options, &folder, &facts)?;
     let plan = plan(topology, &hosts);
-    let domains = Domains::create(&plan.hosts, options.domain_root.as_ref(), &folder.name())?;
+    let run = folder.root().to_string_lossy();
+    let domains = Domains::create(&plan.hosts, options.domain_root.as_ref(), &run)?;
     console.say(&format!("run folder {}", folder.root().display()));
     let peers = gather_peers(topology, &hosts, &domains, (signals, console))?;
     let here = clock_id()?;
@@ -148,6 +149,7 @@ fn gather_peers(
     let meeting = Meeting {
         address,
         is_here: is_first,
+        own: hosts[0].gateway_address(),
         expected,
         timeout: topology.run().start_timeout,
     };

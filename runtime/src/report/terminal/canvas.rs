@@ -61,10 +61,12 @@ impl Canvas {
         self.text
     }
 
-    /// `text` in `tone`; call it after padding, since sequences have no width.
+    /// `text` in `tone`; call it after padding, since sequences have no width. Padding stays
+    /// unpainted, so that a line's trailing blanks can be dropped in both styles.
     pub(super) fn paint(&self, tone: Tone, text: &str) -> String {
+        let (shown, padding) = text.split_at(text.trim_end().len());
         let ansi = match tone {
-            _ if self.style == Style::Plain || text.is_empty() => return text.to_owned(),
+            _ if self.style == Style::Plain || shown.is_empty() => return text.to_owned(),
             Tone::Plain => return text.to_owned(),
             Tone::Strong => Ansi::new().bold(),
             Tone::Good => Ansi::new().bold().fg_color(Some(AnsiColor::Green.into())),
@@ -73,7 +75,7 @@ impl Canvas {
             Tone::Faint => Ansi::new().dimmed(),
             Tone::Bar => Ansi::new().fg_color(Some(AnsiColor::Cyan.into())),
         };
-        format!("{}{text}{}", ansi.render(), ansi.render_reset())
+        format!("{}{shown}{}{padding}", ansi.render(), ansi.render_reset())
     }
 
     /// Ends a line; trailing blanks are dropped.
