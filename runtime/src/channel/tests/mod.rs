@@ -3,6 +3,7 @@
 mod domain;
 mod exchange;
 mod kill;
+mod upgrade;
 
 use std::fs;
 use std::path::PathBuf;
