@@ -3,7 +3,7 @@
 //! to application with a thread per party; then what hybrid waiting costs at 1 kHz. Not a test: it
 //! states its aims and whether they were met, and ends with code 0.
 //!
-//! `cargo bench -p hil-benches --bench gateway_overhead [-- --quick] [-- --rounds N]`, about 50 s,
+//! `cargo bench -p hil-benches --bench gateway_overhead -- [--quick] [--rounds N] [--only TEXT]`, about 50 s,
 //! quick 15 s. Namespaces and real-time priority take root; without, it says what is missing.
 #![allow(clippy::print_stdout, reason = "a bench prints its result")]
 
@@ -12,7 +12,7 @@ use std::thread::Thread;
 use std::time::Duration;
 
 use hil_benches::gateway::applications::{Crew, PARTY_COUNT};
-use hil_benches::gateway::cases::{CasePlan, Kind, PERIOD, case_plans};
+use hil_benches::gateway::cases::{CasePlan, Kind, PERIOD, case_plans, only};
 use hil_benches::gateway::ends::{NearEnd, Setup};
 use hil_benches::gateway::hosts::{Hosts, SetupError};
 use hil_benches::gateway::parties::{PRIORITY, Party, Usage};
@@ -41,14 +41,14 @@ struct Extent {
     paced_slice: Duration,
 }
 
+fn argument_after(name: &str) -> Option<String> {
+    std::env::args().skip_while(|argument| argument != name).nth(1)
+}
+
 impl Extent {
     fn from_arguments() -> Self {
-        let arguments: Vec<String> = std::env::args().collect();
-        let is_quick = arguments.iter().any(|argument| argument == "--quick");
-        let given = arguments
-            .iter()
-            .position(|argument| argument == "--rounds")
-            .and_then(|at| arguments.get(at + 1)?.parse().ok());
+        let is_quick = std::env::args().any(|argument| argument == "--quick");
+        let given = argument_after("--rounds").and_then(|text| text.parse().ok());
         Self {
             rounds: given.unwrap_or(if is_quick { 6 } else { 24 }),
             slice: Duration::from_millis(30),
@@ -302,7 +302,10 @@ fn report(
 
 fn measure_all(cpu_count: usize) -> Result<(), SetupError> {
     let extent = Extent::from_arguments();
-    let cases = case_plans(cpu_count);
+    let mut cases = case_plans(cpu_count);
+    if let Some(text) = argument_after("--only") {
+        cases = only(&cases, &text);
+    }
     let mut setup = Setup::open(&cases, cpu_count)?;
     let facts = HostFacts::read(&format!(
         "near host on cpu 0, far host on cpu 1, SCHED_FIFO {PRIORITY} asked for"

@@ -94,6 +94,23 @@ pub fn case_plans(cpu_count: usize) -> Vec<CasePlan> {
     list.cases
 }
 
+/// Those of which the title holds `text`, and what they are compared with.
+pub fn only(cases: &[CasePlan], text: &str) -> Vec<CasePlan> {
+    let is_named = |case: &CasePlan| case.title.contains(text);
+    let is_wanted = |index: usize| {
+        let refers = |case: &CasePlan| is_named(case) && case.reference == index;
+        is_named(&cases[index]) || cases.iter().any(refers)
+    };
+    let kept: Vec<usize> = (0..cases.len()).filter(|index| is_wanted(*index)).collect();
+    let place = |index: usize| kept.iter().position(|kept| *kept == index);
+    let mut list: Vec<CasePlan> = kept.iter().map(|index| cases[*index]).collect();
+    for (own, case) in list.iter_mut().enumerate() {
+        // The reference of a mere reference may be gone.
+        case.reference = place(case.reference).unwrap_or(own);
+    }
+    list
+}
+
 #[derive(Default)]
 struct List {
     cases: Vec<CasePlan>,
@@ -149,6 +166,16 @@ mod tests {
         let is_crew = |case: &CasePlan| matches!(case.kind, Kind::Applications { .. });
         let first = cases.iter().position(is_crew).unwrap();
         assert!(cases[first..].iter().all(is_crew));
+    }
+
+    #[test]
+    fn a_choice_keeps_what_it_is_compared_with() {
+        let chosen = only(&case_plans(2), "gateways spin 64");
+        assert_eq!(chosen.len(), 4);
+        for case in chosen.iter().filter(|case| matches!(case.kind, Kind::Gateway)) {
+            let reference = &chosen[case.reference];
+            assert_eq!(reference.title.replace("UDP echo", "gateways"), case.title);
+        }
     }
 
     #[test]

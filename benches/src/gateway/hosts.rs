@@ -10,6 +10,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use hil_models::measure::record::{EgressRecord, IngressRecord};
 use hil_models::message::MessageType;
 use hil_runtime::channel::{
     ChannelHolder, ChannelSettings, Domain, DomainAddress, OutputSettings, ShmInput, ShmOutput,
@@ -19,7 +20,7 @@ use hil_runtime::gateway::Surroundings;
 use hil_runtime::gateway::direction::{self, Direction, Opened};
 use hil_runtime::process::launch::{DirectionLaunch, Side, SocketLaunch};
 use hil_runtime::realtime::RealtimeRequest;
-use hil_runtime::record::{RecordFile, Recorder};
+use hil_runtime::record::{RecordFile, RecordKind, RecordSink, Recorder};
 use hil_runtime::wait::WaitMode;
 
 use super::network::Network;
@@ -182,15 +183,16 @@ impl Hosts {
         })
     }
 
-    /// Creates the channels of `plan` and opens its sockets; call it from a thread of normal
-    /// priority, as kernel stamps are switched on by a worker.
+    /// How the processes of `host` find its shared memory.
+    pub fn address(&self, host: usize) -> &DomainAddress {
+        self.domains[host].address()
+    }
+
+    /// Creates the channels of `plan` on both hosts, without gateways.
     ///
     /// # Errors
-    /// When the kernel or iceoryx2 refuses something.
-    ///
-    /// # Panics
-    /// After [`Hosts::start_recording`].
-    pub fn add(&mut self, plan: Plan) -> Result<[Joint; 2], SetupError> {
+    /// When iceoryx2 refuses.
+    pub fn create_channels(&mut self, plan: &Plan) -> Result<(), SetupError> {
         for domain in &self.domains {
             for host in 0..2 {
                 let name = plan.channel_of(host);
@@ -201,6 +203,34 @@ impl Hosts {
                 self.holders.push(ChannelHolder::create(domain, &settings)?);
             }
         }
+        Ok(())
+    }
+
+    /// Rings for the records of a gateway at either end of the channel that host 0 writes.
+    ///
+    /// # Errors
+    /// When a file cannot be made, or recording has started already.
+    pub fn sinks(&mut self, plan: &Plan) -> Result<[RecordSink; 2], SetupError> {
+        let channel = plan.channel_of(0);
+        let [near, far] = &mut self.recorders;
+        let (near, far) = near.as_mut().zip(far.as_mut()).ok_or("recording has ended")?;
+        let capacity = 16_384;
+        Ok([
+            near.sink(RecordKind::Egress, &channel, size_of::<EgressRecord>(), capacity)?,
+            far.sink(RecordKind::Ingress, &channel, size_of::<IngressRecord>(), capacity)?,
+        ])
+    }
+
+    /// Creates the channels of `plan` and opens its sockets; call it from a thread of normal
+    /// priority, as kernel stamps are switched on by a worker.
+    ///
+    /// # Errors
+    /// When the kernel or iceoryx2 refuses something.
+    ///
+    /// # Panics
+    /// After [`Hosts::start_recording`].
+    pub fn add(&mut self, plan: Plan) -> Result<[Joint; 2], SetupError> {
+        self.create_channels(&plan)?;
         let mut ends = [[None, None], [None, None]];
         for way in 0..2 {
             let addresses = [self.network.free_address(0)?, self.network.free_address(1)?];

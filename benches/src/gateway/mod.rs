@@ -6,6 +6,7 @@
 //! - [`cases`] and [`ends`]: what `gateway_overhead` compares, and with what.
 //! - [`turns`]: which case the far thread answers.
 //! - [`applications`]: a party per thread, as in a run.
+//! - [`stages`]: a hop taken apart in one thread.
 //! - [`segments`]: where the time of a hop went.
 //! - [`parties`]: processor time and wake-ups of threads; [`verdict`]: aims met and missed.
 
@@ -17,5 +18,6 @@ pub mod network;
 pub mod parties;
 pub mod segments;
 pub mod side;
+pub mod stages;
 pub mod turns;
 pub mod verdict;

@@ -102,6 +102,11 @@ impl EchoSide {
         };
         Ok([open(0)?, open(1)?])
     }
+
+    /// The bare sockets: this end sends with the one and receives with the other.
+    pub fn into_sockets(self) -> (UdpSender, UdpReceiver) {
+        (self.sender, self.receiver)
+    }
 }
 
 impl Side for EchoSide {
