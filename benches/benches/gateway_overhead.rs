@@ -66,11 +66,11 @@ fn measure(
 ) -> Vec<u64> {
     match end {
         NearEnd::PingPong(side) => {
-            ping((turns, far), index, side.as_mut(), (count, extent.slice))
+            ping((turns, far), index, side.as_mut(), (count, extent.slice)).whole
         }
-        NearEnd::Gateway(side) => {
-            ping((turns, far), index, side.as_mut(), (count, extent.slice))
-        }
+        NearEnd::Gateway(shared, column) => shared.column(*column, |case, side| {
+            ping((turns, far), case, side, (count, extent.slice))
+        }),
         NearEnd::Hop { side, noted, usage } => {
             let time = (extent.paced_slice, PERIOD);
             let listening = (far_party, noted.as_ref());
@@ -122,7 +122,7 @@ fn ratio_verdicts(outcome: &Comparison, cases: &[CasePlan]) -> Vec<Verdict> {
     let rows = outcome.rows.iter().zip(cases);
     let judged = rows.filter_map(|(row, case)| {
         let aim_max = match case.kind {
-            Kind::Gateway if case.plan.is_stamped => GATEWAY_RATIO_MAX,
+            Kind::BetweenGateways if case.plan.is_stamped => GATEWAY_RATIO_MAX,
             Kind::Applications { is_paced: false } => APPLICATION_RATIO_MAX,
             Kind::Hop if case.plan.wait == WaitMode::Hybrid => HYBRID_RATIO_MAX,
             _ => return None,

@@ -16,8 +16,11 @@ pub const PERIOD: Duration = Duration::from_millis(1);
 pub enum Kind {
     /// Bare UDP over the product's sockets.
     Echo,
-    /// Through gateways, one thread per host.
+    /// Through gateways, one thread per host: application to application in the two threads.
     Gateway,
+    /// The round trips of the case before, less what the applications took: from where a gateway
+    /// takes a message to where the other has delivered it, both ways.
+    BetweenGateways,
     /// Blocking sockets of the standard library.
     Plain,
     /// One way at 1 kHz.
@@ -63,7 +66,8 @@ pub fn case_plans(cpu_count: usize) -> Vec<CasePlan> {
                 let name = |what: &str| format!("{what} {} {size} B {stamps}", word(wait));
                 let traits = (size, wait, is_stamped);
                 let echo = list.add(Kind::Echo, name("UDP echo"), traits, None);
-                list.add(Kind::Gateway, name("gateways"), traits, Some(echo));
+                list.add(Kind::Gateway, name("put-gateways-take"), traits, Some(echo));
+                list.add(Kind::BetweenGateways, name("gateways"), traits, Some(echo));
                 if is_stamped && wait == BLOCK {
                     blocking_echo.insert(size, echo);
                 }
@@ -99,7 +103,10 @@ pub fn only(cases: &[CasePlan], text: &str) -> Vec<CasePlan> {
     let is_named = |case: &CasePlan| case.title.contains(text);
     let is_wanted = |index: usize| {
         let refers = |case: &CasePlan| is_named(case) && case.reference == index;
-        is_named(&cases[index]) || cases.iter().any(refers)
+        let follows = cases.get(index + 1).is_some_and(|next| {
+            is_named(next) && matches!(next.kind, Kind::BetweenGateways)
+        });
+        is_named(&cases[index]) || follows || cases.iter().any(refers)
     };
     let kept: Vec<usize> = (0..cases.len()).filter(|index| is_wanted(*index)).collect();
     let place = |index: usize| kept.iter().position(|kept| *kept == index);
@@ -151,7 +158,7 @@ mod tests {
         let cases = case_plans(2);
         for case in &cases {
             let reference = &cases[case.reference];
-            if matches!(case.kind, Kind::Gateway) {
+            if matches!(case.kind, Kind::Gateway | Kind::BetweenGateways) {
                 assert!(matches!(reference.kind, Kind::Echo));
                 assert_eq!(
                     (case.plan.size_bytes, case.plan.wait, case.plan.is_stamped),
@@ -171,11 +178,20 @@ mod tests {
     #[test]
     fn a_choice_keeps_what_it_is_compared_with() {
         let chosen = only(&case_plans(2), "gateways spin 64");
-        assert_eq!(chosen.len(), 4);
-        for case in chosen.iter().filter(|case| matches!(case.kind, Kind::Gateway)) {
-            let reference = &chosen[case.reference];
-            assert_eq!(reference.title.replace("UDP echo", "gateways"), case.title);
-        }
+        let titles: Vec<&str> = chosen.iter().map(|case| case.title).collect();
+        assert_eq!(
+            titles,
+            [
+                "UDP echo spin 64 B stamps",
+                "put-gateways-take spin 64 B stamps",
+                "gateways spin 64 B stamps",
+                "UDP echo spin 64 B no stamps",
+                "put-gateways-take spin 64 B no stamps",
+                "gateways spin 64 B no stamps",
+            ]
+        );
+        assert_eq!(chosen[2].reference, 0);
+        assert_eq!(chosen[4].reference, 3);
     }
 
     #[test]

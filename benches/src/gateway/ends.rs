@@ -1,7 +1,9 @@
 //! Both ends of every case of `gateway_overhead`, each opened in the thread that uses it. What is
 //! timed is in [`super::turns`] and [`super::applications`].
 
-use std::sync::atomic::AtomicUsize;
+use std::cell::{RefCell, RefMut};
+use std::rc::Rc;
+use std::sync::atomic::{AtomicU64, AtomicUsize};
 use std::sync::mpsc::{Sender, channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
@@ -14,7 +16,7 @@ use super::hosts::{Hosts, Joint, SetupError, greet};
 use super::network::Network;
 use super::parties::{Party, Usage, claim};
 use super::side::{EchoSide, GatewaySide, PlainSide, Side};
-use super::turns::{Turns, answer};
+use super::turns::{RoundTrips, Turns, answer};
 
 /// Latencies the far thread noted, for the near one to fetch.
 pub type Noted = Arc<Mutex<Vec<u64>>>;
@@ -47,8 +49,8 @@ impl Side for Sink {
 pub enum NearEnd {
     /// Bare UDP.
     PingPong(Box<dyn Side>),
-    /// Gateways in this thread.
-    Gateway(Box<GatewaySide>),
+    /// Gateways in this thread, measured in two ways at once.
+    Gateway(Shared, Column),
     /// The same, towards a far end that only listens.
     Hop {
         /// The gateways.
@@ -62,11 +64,65 @@ pub enum NearEnd {
     Applications(Box<Crew>),
 }
 
+/// Which of the two ways.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Column {
+    /// With what the applications took.
+    Whole,
+    /// Without.
+    BetweenGateways,
+}
+
+/// The near end of two cases that are measured together.
+#[derive(Debug, Clone)]
+pub struct Shared(Rc<RefCell<Pair>>);
+
+#[derive(Debug)]
+struct Pair {
+    side: GatewaySide,
+    /// The case the far thread knows.
+    case: usize,
+    whole: Option<Vec<u64>>,
+    between_gateways: Option<Vec<u64>>,
+}
+
+impl Shared {
+    /// The `column` of this round: whoever asks first has `measure` called for the case the far
+    /// thread knows, the other gets what was left.
+    pub fn column(
+        &self,
+        column: Column,
+        measure: impl FnOnce(usize, &mut GatewaySide) -> RoundTrips,
+    ) -> Vec<u64> {
+        let mut pair = self.0.borrow_mut();
+        let pair = &mut *pair;
+        let left = match column {
+            Column::Whole => pair.whole.take(),
+            Column::BetweenGateways => pair.between_gateways.take(),
+        };
+        left.unwrap_or_else(|| {
+            let found = measure(pair.case, &mut pair.side);
+            match column {
+                Column::Whole => {
+                    pair.between_gateways = Some(found.between_gateways);
+                    found.whole
+                }
+                Column::BetweenGateways => {
+                    pair.whole = Some(found.whole);
+                    found.between_gateways
+                }
+            }
+        })
+    }
+}
+
 /// An end on its way to its thread.
 #[derive(Debug)]
 enum Loose {
     Ready(Box<dyn Side + Send>),
-    Gateway(Box<Joint>),
+    Gateway(Box<Joint>, Arc<AtomicU64>),
+    /// The other way to measure the case before.
+    Twin,
     Hop(Box<Joint>, Noted),
     Applications(Box<[Joint; 2]>),
     /// Another thread's.
@@ -106,7 +162,7 @@ impl Setup {
             far_ends.push(far);
         }
         hosts.start_recording()?;
-        let is_gateway = |end: &&Loose| matches!(end, Loose::Gateway(_) | Loose::Hop(..));
+        let is_gateway = |end: &&Loose| matches!(end, Loose::Gateway(..) | Loose::Hop(..));
         let gateways = far_ends.iter().filter(is_gateway).count();
         let remaining = Arc::new(AtomicUsize::new(2 * gateways));
         let (ready, far_answer) = channel();
@@ -114,10 +170,12 @@ impl Setup {
             let (turns, remaining) = (Arc::clone(&turns), Arc::clone(&remaining));
             move || far_thread(far_ends, &turns, &remaining, &ready)
         });
-        let near = near_ends.into_iter().enumerate();
-        let near = near.map(|(case, end)| connect(end, (case, &turns, cpu_count)));
-        let mut near: Vec<NearEnd> = near.collect::<Result<_, _>>()?;
-        greet_all(near.iter_mut().filter_map(NearEnd::gateway), &remaining)?;
+        let mut near: Vec<NearEnd> = Vec::new();
+        for (case, end) in near_ends.into_iter().enumerate() {
+            let connected = connect(end, near.last(), (case, &turns, cpu_count))?;
+            near.push(connected);
+        }
+        greet_near(&mut near, &remaining)?;
         let far_party = far_answer.recv()??;
         Ok(Self {
             hosts,
@@ -145,8 +203,13 @@ fn open_case(
         }
         Kind::Gateway => {
             let [near, far] = hosts.add(*plan)?.map(Box::new);
-            (Loose::Gateway(near), Loose::Gateway(far))
+            let noted = Arc::<AtomicU64>::default();
+            (
+                Loose::Gateway(near, Arc::clone(&noted)),
+                Loose::Gateway(far, noted),
+            )
         }
+        Kind::BetweenGateways => (Loose::Twin, Loose::Twin),
         Kind::Hop => {
             let [near, far] = hosts.add(*plan)?.map(Box::new);
             let noted = Noted::default();
@@ -161,13 +224,28 @@ fn open_case(
 
 fn connect(
     end: Loose,
+    before: Option<&NearEnd>,
     (case, turns, cpu_count): (usize, &Arc<Turns>, usize),
 ) -> Result<NearEnd, SetupError> {
     Ok(match end {
         Loose::Ready(side) => NearEnd::PingPong(side),
-        Loose::Gateway(joint) => NearEnd::Gateway(Box::new(GatewaySide::connect(*joint)?)),
+        Loose::Gateway(joint, noted) => {
+            let pair = Pair {
+                side: GatewaySide::connect(*joint, noted)?,
+                case,
+                whole: None,
+                between_gateways: None,
+            };
+            NearEnd::Gateway(Shared(Rc::new(RefCell::new(pair))), Column::Whole)
+        }
+        Loose::Twin => match before {
+            Some(NearEnd::Gateway(shared, _)) => {
+                NearEnd::Gateway(shared.clone(), Column::BetweenGateways)
+            }
+            _ => return Err("a twin follows its gateways".into()),
+        },
         Loose::Hop(joint, noted) => NearEnd::Hop {
-            side: Box::new(GatewaySide::connect(*joint)?),
+            side: Box::new(GatewaySide::connect(*joint, Arc::default())?),
             noted,
             usage: Usage::default(),
         },
@@ -179,23 +257,30 @@ fn connect(
 }
 
 impl NearEnd {
-    fn gateway(&mut self) -> Option<&mut GatewaySide> {
-        match self {
-            Self::Gateway(side) | Self::Hop { side, .. } => Some(side),
-            Self::PingPong(_) | Self::Applications(_) => None,
-        }
-    }
-
     /// Datagrams with a receive stamp and datagrams received by this end; `None` where no stamps
     /// were asked for.
     pub fn stamp_coverage(&self) -> Option<(u64, u64)> {
         match self {
             Self::PingPong(side) => side.stamp_coverage(),
-            Self::Gateway(side) => side.stamp_coverage(),
+            Self::Gateway(shared, Column::Whole) => shared.0.borrow().side.stamp_coverage(),
             // The traffic of a hop goes the other way; a crew's is in its records.
-            Self::Hop { .. } | Self::Applications(_) => None,
+            Self::Gateway(..) | Self::Hop { .. } | Self::Applications(_) => None,
         }
     }
+}
+
+fn greet_near(ends: &mut [NearEnd], remaining: &AtomicUsize) -> Result<(), SetupError> {
+    let mut shared: Vec<RefMut<'_, Pair>> = Vec::new();
+    let mut sides: Vec<&mut GatewaySide> = Vec::new();
+    for end in ends {
+        match end {
+            NearEnd::Gateway(pair, Column::Whole) => shared.push(pair.0.borrow_mut()),
+            NearEnd::Hop { side, .. } => sides.push(side),
+            _ => {}
+        }
+    }
+    sides.extend(shared.iter_mut().map(|pair| &mut pair.side));
+    greet_all(sides.into_iter(), remaining)
 }
 
 fn greet_all<'a>(
@@ -210,6 +295,23 @@ enum FarSide {
     Any(Box<dyn Side>),
     Gateway(Box<GatewaySide>),
     Sink(Box<Sink>),
+    /// Keeps the place of a case the far thread knows by another number.
+    Nobody(Nobody),
+}
+
+#[derive(Debug)]
+struct Nobody;
+
+impl Side for Nobody {
+    fn send(&mut self, _count: u64) {}
+
+    fn receive(&mut self) -> Option<u64> {
+        None
+    }
+
+    fn sleeps(&self) -> bool {
+        false
+    }
 }
 
 impl FarSide {
@@ -218,12 +320,13 @@ impl FarSide {
             Self::Any(side) => side.as_mut(),
             Self::Gateway(side) => side.as_mut(),
             Self::Sink(sink) => sink.as_mut(),
+            Self::Nobody(nobody) => nobody,
         }
     }
 
     fn gateway(&mut self) -> Option<&mut GatewaySide> {
         match self {
-            Self::Any(_) => None,
+            Self::Any(_) | Self::Nobody(_) => None,
             Self::Gateway(side) => Some(side),
             Self::Sink(sink) => Some(&mut sink.side),
         }
@@ -255,9 +358,12 @@ fn far_sides(ends: Vec<Loose>, remaining: &AtomicUsize) -> Result<Vec<FarSide>, 
     for end in ends {
         sides.push(match end {
             Loose::Ready(side) => FarSide::Any(side),
-            Loose::Gateway(joint) => FarSide::Gateway(Box::new(GatewaySide::connect(*joint)?)),
+            Loose::Gateway(joint, noted) => {
+                FarSide::Gateway(Box::new(GatewaySide::connect(*joint, noted)?))
+            }
+            Loose::Twin => FarSide::Nobody(Nobody),
             Loose::Hop(joint, noted) => FarSide::Sink(Box::new(Sink {
-                side: GatewaySide::connect(*joint)?,
+                side: GatewaySide::connect(*joint, Arc::default())?,
                 noted,
             })),
             // Crews come last and have threads of their own.

@@ -4,6 +4,8 @@
 
 use std::io;
 use std::net::{SocketAddr, UdpSocket};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use hil_gateways::transport::timestamping::TimestampMode;
@@ -35,6 +37,12 @@ pub trait Side: core::fmt::Debug {
     /// Waits in the kernel.
     fn sleeps(&self) -> bool;
 
+    /// How much of the round trip that ended last the applications at both ends took to put and
+    /// take its messages: what is not from one gateway's input to the other's output.
+    fn applications_ns(&self) -> u64 {
+        0
+    }
+
     /// When the message received last was published by its sender, for ends that know.
     fn published(&self) -> Option<Instant> {
         None
@@ -44,6 +52,10 @@ pub trait Side: core::fmt::Debug {
     fn stamp_coverage(&self) -> Option<(u64, u64)> {
         None
     }
+}
+
+fn since(started: Instant) -> u64 {
+    u64::try_from(MonotonicClock::now().ns_since(started)).unwrap_or(0)
 }
 
 fn count_of(bytes: &[u8]) -> Option<u64> {
@@ -207,14 +219,19 @@ pub struct GatewaySide {
     ingress: (DirectionLaunch, Direction),
     message: Vec<u8>,
     published: Option<Instant>,
+    put_ns: u64,
+    take_ns: u64,
+    /// What the answering end noted of its application.
+    far_application_ns: Arc<AtomicU64>,
 }
 
 impl GatewaySide {
-    /// Connects everything; call it in the thread that will use it.
+    /// Connects everything; call it in the thread that will use it. Both ends of a pair get the
+    /// same `far_application_ns`.
     ///
     /// # Errors
     /// When a channel cannot be opened.
-    pub fn connect(joint: Joint) -> Result<Self, SetupError> {
+    pub fn connect(joint: Joint, far_application_ns: Arc<AtomicU64>) -> Result<Self, SetupError> {
         let (plan, host, address) = (joint.plan, joint.host, joint.address.clone());
         // The application opens first, so that the gateway finds its reader.
         let ports = Ports::open(&address, &plan, host, false)?;
@@ -226,6 +243,9 @@ impl GatewaySide {
             ingress: ingress.connect()?,
             message: vec![0; plan.size_bytes],
             published: None,
+            put_ns: 0,
+            take_ns: 0,
+            far_application_ns,
         })
     }
 
@@ -250,11 +270,14 @@ impl GatewaySide {
 impl Side for GatewaySide {
     fn send(&mut self, count: u64) {
         self.message[..8].copy_from_slice(&count.to_le_bytes());
+        let started = MonotonicClock::now();
         // A failure shows as a message that does not come.
-        self.ports
-            .output
-            .publish(MonotonicClock::now(), &self.message)
-            .ok();
+        self.ports.output.publish(started, &self.message).ok();
+        self.put_ns = since(started);
+        if self.ingress.0.channel.ends_with("out") {
+            self.far_application_ns
+                .store(self.take_ns + self.put_ns, Ordering::Relaxed);
+        }
         // The second step finds no message and looks after replies and appointments, as the
         // direction's own loop would now.
         while matches!(self.egress.1.step(), Ok(true)) {}
@@ -267,6 +290,7 @@ impl Side for GatewaySide {
         if !self.ingress.1.step().ok()? {
             return None;
         }
+        let started = MonotonicClock::now();
         let mut count = None;
         let mut published = None;
         self.ports
@@ -277,7 +301,12 @@ impl Side for GatewaySide {
             })
             .ok()?;
         self.published = published;
+        self.take_ns = since(started);
         count
+    }
+
+    fn applications_ns(&self) -> u64 {
+        self.put_ns + self.take_ns + self.far_application_ns.load(Ordering::Relaxed)
     }
 
     fn sleeps(&self) -> bool {

@@ -24,6 +24,8 @@ const WARM_UP: usize = 200;
 const PACE_WARM_UP: u64 = 20;
 /// A message that has not come back by then never will.
 const PATIENCE: Duration = Duration::from_millis(100);
+/// Samples of one slice at most.
+const SAMPLES_MAX: usize = 1 << 18;
 /// Looks without a message between two looks at the clock.
 const LOOKS: u32 = 4096;
 
@@ -84,10 +86,10 @@ impl Turns {
             while self.floor.0.load(Ordering::Acquire) == count {
                 core::hint::spin_loop();
             }
-            true
+            Some(0)
         });
         self.turn.store(IDLE, Ordering::Release);
-        samples
+        samples.whole
     }
 }
 
@@ -109,28 +111,37 @@ pub fn answer(turns: &Turns, sides: &mut [&mut dyn Side]) {
     }
 }
 
-/// Round trips of `side` for `slice`, in nanoseconds, while the far thread answers `case`.
+/// What [`ping`] found, in nanoseconds.
+#[derive(Debug, Default)]
+pub struct RoundTrips {
+    /// From before a message is put to after its answer is taken.
+    pub whole: Vec<u64>,
+    /// The same less what the applications took to put and take.
+    pub between_gateways: Vec<u64>,
+}
+
+/// Round trips of `side` for `slice` while the far thread answers `case`.
 pub fn ping(
     (turns, far): (&Turns, &Thread),
     case: usize,
     side: &mut dyn Side,
     (count, slice): (&mut u64, Duration),
-) -> Vec<u64> {
+) -> RoundTrips {
     // Lets ordinary work have the processors before they are taken for a slice.
     thread::sleep(Duration::from_millis(3));
     turns.give(case, core::slice::from_ref(far));
-    let samples = sample(slice, || {
+    let found = sample(slice, || {
         *count += 1;
         side.send(*count);
         let has_come = await_answer(side, *count);
         turns.lost.fetch_add(u64::from(!has_come), Ordering::Relaxed);
-        has_come
+        has_come.then(|| side.applications_ns())
     });
     turns.turn.store(IDLE, Ordering::Release);
     // Wakes the far thread if it sleeps for a message; its answer is an old one to the next round.
     *count += 1;
     side.send(*count);
-    samples
+    found
 }
 
 fn await_answer(side: &mut dyn Side, count: u64) -> bool {
@@ -147,22 +158,28 @@ fn await_answer(side: &mut dyn Side, count: u64) -> bool {
     false
 }
 
-/// Times `round_trip` again and again; those that say false do not count.
-fn sample(slice: Duration, mut round_trip: impl FnMut() -> bool) -> Vec<u64> {
-    let mut samples = Vec::with_capacity(1 << 18);
+/// Times `round_trip` again and again; it gives what of its time was the applications', or `None`
+/// when it does not count.
+fn sample(slice: Duration, mut round_trip: impl FnMut() -> Option<u64>) -> RoundTrips {
+    let mut found = RoundTrips {
+        whole: Vec::with_capacity(SAMPLES_MAX),
+        between_gateways: Vec::with_capacity(SAMPLES_MAX),
+    };
     for _ in 0..WARM_UP {
         round_trip();
     }
     let started = Instant::now();
-    while started.elapsed() < slice && samples.len() < samples.capacity() {
+    while started.elapsed() < slice && found.whole.len() < SAMPLES_MAX {
         let sent = Instant::now();
-        let is_whole = round_trip();
+        let of_applications = round_trip();
         let elapsed = sent.elapsed().as_nanos();
-        if is_whole {
-            samples.push(u64::try_from(elapsed).unwrap_or(u64::MAX));
+        if let Some(of_applications) = of_applications {
+            let whole = u64::try_from(elapsed).unwrap_or(u64::MAX);
+            found.whole.push(whole);
+            found.between_gateways.push(whole.saturating_sub(of_applications));
         }
     }
-    samples
+    found
 }
 
 /// Sends a message every `period` for `slice` while the far thread listens as `case`, after a
