@@ -445,7 +445,7 @@ fn a_program_that_does_not_exist_is_named_before_the_run_begins() {
     let finished = child.wait_within(LIMIT).unwrap();
     assert_code(&finished, 1);
     assert_says(&finished, &["process robot", "cannot start no-such-robot"]);
-    let mut left = std::fs::read_dir(record.path()).unwrap();
+    let mut left = fs::read_dir(record.path()).unwrap();
     assert!(
         left.next().is_none(),
         "a run that never began left a folder"
