@@ -42,7 +42,9 @@ struct Extent {
 }
 
 fn argument_after(name: &str) -> Option<String> {
-    std::env::args().skip_while(|argument| argument != name).nth(1)
+    std::env::args()
+        .skip_while(|argument| argument != name)
+        .nth(1)
 }
 
 impl Extent {
@@ -103,7 +105,14 @@ fn run(setup: &mut Setup, cases: &[CasePlan], extent: Extent) -> Comparison {
         .enumerate()
         .map(|(index, (end, case))| {
             let (far, mut count) = (far.clone(), 0);
-            move || measure((end, case, index), (turns, &far), far_party, (extent, &mut count))
+            move || {
+                measure(
+                    (end, case, index),
+                    (turns, &far),
+                    far_party,
+                    (extent, &mut count),
+                )
+            }
         })
         .collect();
     let mut contestants: Vec<_> = rounds
@@ -181,9 +190,9 @@ fn hybrid_verdicts(setup: &Setup, cases: &[CasePlan], cpu_count: usize) -> Vec<V
 fn print_usage(setup: &Setup, cases: &[CasePlan]) {
     println!("\nprocessor share and sleeps per round trip (or per message of a hop)");
     let line = |title: &str, name: &str, usage: &Usage, trips: u64| {
-        let share = usage
-            .share()
-            .map_or("unavailable".to_owned(), |share| format!("{:.1} %", share * 100.0));
+        let share = usage.share().map_or("unavailable".to_owned(), |share| {
+            format!("{:.1} %", share * 100.0)
+        });
         let sleeps = usage.sleep_count as f64 / trips.max(1) as f64;
         println!("{title:<38} {name:<18} {share:>12} {sleeps:>8.2}");
         println!(
@@ -311,9 +320,14 @@ fn measure_all(cpu_count: usize) -> Result<(), SetupError> {
         "near host on cpu 0, far host on cpu 1, SCHED_FIFO {PRIORITY} asked for"
     ));
     let network = setup.hosts.network.note().to_owned();
-    println!("{}", json!({"bench": BENCH, "host": facts.to_json(), "network": network}));
-    println!("network: {network}; load {} at the start; policy {}; governor {}",
-        facts.load_average, facts.scheduling_policy, facts.governor);
+    println!(
+        "{}",
+        json!({"bench": BENCH, "host": facts.to_json(), "network": network})
+    );
+    println!(
+        "network: {network}; load {} at the start; policy {}; governor {}",
+        facts.load_average, facts.scheduling_policy, facts.governor
+    );
     println!("without stamps means: these sockets ask for none; the host's receive stamps are on");
     let outcome = run(&mut setup, &cases, extent);
     report(setup, &cases, (&outcome, cpu_count))

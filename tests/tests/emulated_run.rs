@@ -52,7 +52,7 @@ fn check_loss(channel: &ChannelSummary, account: &ChannelAccount) {
         let chosen = counters.clone().filter(|counter| counter.name == name);
         chosen.map(|counter| counter.count).sum()
     };
-    let emulated_count = count_of("emulated_loss_count");
+    let emulated_count = count_of("socket: link_lost_count");
     let offered_count = emulated_count + count_of("delivered_count");
     let interval = clopper_pearson(emulated_count, offered_count, CONFIDENCE).unwrap();
     println!(
@@ -66,7 +66,7 @@ fn check_loss(channel: &ChannelSummary, account: &ChannelAccount) {
         (interval.low..=interval.high).contains(&LOSS_RATIO),
         "{LOSS_RATIO} is not in {interval:?}"
     );
-    assert_eq!(count_of("emulated_overflow_count"), 0);
+    assert_eq!(count_of("socket: link_overflow_count"), 0);
     // A message lost just before the end may still have been under way, for all the account knows.
     let lost_count = account.fates.of(MessageFate::LostOnWire);
     let in_flight_count = account.fates.of(MessageFate::InFlight);

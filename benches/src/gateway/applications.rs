@@ -177,7 +177,10 @@ impl Crew {
             case,
             turns: Arc::clone(turns),
             near: NearApplication(near),
-            threads: handles.iter().map(|handle| handle.thread().clone()).collect(),
+            threads: handles
+                .iter()
+                .map(|handle| handle.thread().clone())
+                .collect(),
             handles,
             parties,
             active,
@@ -257,16 +260,15 @@ impl Crew {
             // A panic has printed itself.
             handle.join().ok();
         }
-        let mut far = self.far_woken.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut far = self
+            .far_woken
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
         [self.near.0.woken_after_ns, core::mem::take(&mut *far)]
     }
 }
 
-fn far_application(
-    berth: Berth,
-    joint: &Joint,
-    woken: Arc<Mutex<Vec<u64>>>,
-) -> JoinHandle<()> {
+fn far_application(berth: Berth, joint: &Joint, woken: Arc<Mutex<Vec<u64>>>) -> JoinHandle<()> {
     let opening = Opening::of(joint);
     thread::spawn(move || {
         claim(berth.cpu);

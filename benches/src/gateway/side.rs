@@ -254,10 +254,7 @@ impl GatewaySide {
         let Self {
             egress, ingress, ..
         } = self;
-        [
-            (&egress.0, &mut egress.1),
-            (&ingress.0, &mut ingress.1),
-        ]
+        [(&egress.0, &mut egress.1), (&ingress.0, &mut ingress.1)]
     }
 
     fn counter(&self, name: &str) -> u64 {

@@ -189,6 +189,28 @@ pub struct SenderCounters {
 }
 
 impl SenderCounters {
+    /// Every counter with its name, in the order above.
+    pub fn iter(&self) -> impl Iterator<Item = (&'static str, u64)> + use<> {
+        [
+            ("sent_count", self.sent_count),
+            ("peer_refused_count", self.peer_refused_count),
+            ("unreachable_count", self.unreachable_count),
+            ("queue_full_count", self.queue_full_count),
+            ("too_long_count", self.too_long_count),
+            ("other_refusal_count", self.other_refusal_count),
+            ("stamp_count", self.stamp_count),
+            ("unmatched_stamp_count", self.unmatched_stamp_count),
+            ("stamp_overflow_count", self.stamp_overflow_count),
+            ("network_report_count", self.network_report_count),
+            ("local_report_count", self.local_report_count),
+            ("undecodable_report_count", self.undecodable_report_count),
+            ("reply_count", self.reply_count),
+        ]
+        .into_iter()
+    }
+}
+
+impl SenderCounters {
     pub(crate) fn count_refusal(&mut self, refusal: SendRefusal) {
         let counter = match refusal {
             SendRefusal::PeerRefused => &mut self.peer_refused_count,
@@ -236,6 +258,26 @@ pub struct ReceiverCounters {
     pub link_lost_count: u64,
     /// Datagrams dropped because the emulation already held as many as it may.
     pub link_overflow_count: u64,
+}
+
+impl ReceiverCounters {
+    /// Every counter with its name, in the order above.
+    pub fn iter(&self) -> impl Iterator<Item = (&'static str, u64)> + use<> {
+        [
+            ("received_count", self.received_count),
+            ("software_stamp_count", self.software_stamp_count),
+            ("hardware_stamp_count", self.hardware_stamp_count),
+            ("truncated_count", self.truncated_count),
+            ("damaged_control_count", self.damaged_control_count),
+            ("sourceless_count", self.sourceless_count),
+            ("kernel_drop_count", self.kernel_drop_count),
+            ("reply_count", self.reply_count),
+            ("reply_refused_count", self.reply_refused_count),
+            ("link_lost_count", self.link_lost_count),
+            ("link_overflow_count", self.link_overflow_count),
+        ]
+        .into_iter()
+    }
 }
 
 impl ReceiverCounters {

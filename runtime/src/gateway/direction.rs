@@ -6,25 +6,23 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64};
 use std::time::Duration;
 
-use hil_gateways::protocol::ingress::IngressCounts;
 use hil_gateways::protocol::wire::{self, Kind};
-use hil_gateways::protocol::{
-    EgressBridge, EgressSettings, IngressBridge, IngressSettings, PeerState, RefusalCounts,
-};
-use hil_gateways::transport::clock_pair::ClockPair;
+use hil_gateways::protocol::{EgressBridge, EgressSettings, IngressBridge, IngressSettings};
+use hil_gateways::transport::DatagramReceiver;
 use hil_gateways::transport::emulated::{EmulatedReceiver, EmulatedSettings};
 use hil_gateways::transport::timestamping::TimestampMode;
-use hil_gateways::transport::udp::{GrantedOptions, UdpReceiver, UdpSender, UdpSettings};
-use hil_gateways::transport::{DatagramReceiver, ReceiverCounters, SenderCounters};
+use hil_gateways::transport::udp::{GrantedOptions, PathMtu, UdpReceiver, UdpSender, UdpSettings};
 use hil_models::link::bernoulli::BernoulliLink;
 use hil_models::measure::record::{EgressRecord, FollowUpRecord, IngressRecord};
 use hil_models::random::RandomStream;
 
+use super::counters;
 use super::egress::{Armed, Attention, Egress, Line};
 use super::ingress::{Ingress, Notes};
-use super::{GatewayError, PAIR_ATTEMPTS, Surroundings};
+use super::kernel_clock::KernelClock;
+use super::{GatewayError, Surroundings};
 use crate::channel::{RawInput, RawOutput, Waiter};
-use crate::process::launch::{DirectionLaunch, Side};
+use crate::process::launch::{DirectionLaunch, EmulationLaunch, Side};
 use crate::process::pipe::DirectionReport;
 use crate::record::{RecordKind, RecordSink, Recorder};
 use crate::wait::{WaitMode, WaitStrategy};
@@ -91,7 +89,17 @@ pub fn open<'a>(
             (Socket::Receiver(emulate(receiver, launch)?), granted)
         }
     };
-    let facts = socket_facts(&settings, granted);
+    let mut facts = socket_facts(&settings, granted);
+    if let Some(EmulationLaunch {
+        delay, loss_ratio, ..
+    }) = launch.emulation
+    {
+        let text = format!(
+            "{} ms delay (part of RX stamp → received by gateway), loss ratio {loss_ratio}",
+            delay.as_secs_f64() * 1e3
+        );
+        facts.push(("link model behind the socket".to_owned(), text));
+    }
     Ok((
         launch,
         Opened {
@@ -167,6 +175,11 @@ fn socket_facts(settings: &UdpSettings, granted: GrantedOptions) -> Vec<(String,
     facts
 }
 
+/// Room for everything that is under way at once, up to 4000 datagrams per second.
+fn emulated_capacity(delay: Duration) -> usize {
+    EmulatedSettings::default().capacity_count + delay.as_millis() as usize * 4
+}
+
 /// Puts the receiver behind the launch's link model, if it has one. Greetings and clock exchanges
 /// pass freely: the model stands for what happens to the robot's messages.
 fn emulate(
@@ -179,8 +192,8 @@ fn emulate(
     let stream = RandomStream::new(emulation.seed, &launch.channel);
     let link = BernoulliLink::new(emulation.delay, emulation.loss_ratio, stream)?;
     let settings = EmulatedSettings {
+        capacity_count: emulated_capacity(emulation.delay),
         datagram_bytes_max: launch.socket.path_mtu_bytes,
-        ..EmulatedSettings::default()
     };
     let is_exempt =
         |bytes: &[u8]| wire::decode(bytes).is_ok_and(|datagram| datagram.header.kind != Kind::Data);
@@ -192,12 +205,17 @@ fn emulate(
     )))
 }
 
-fn datagram_bytes_max(launch: &DirectionLaunch) -> usize {
+/// What a datagram may carry: as much as the topology says, but no more than the path takes.
+fn datagram_bytes_max(launch: &DirectionLaunch, path: PathMtu) -> usize {
     let headers = match launch.peer.ip() {
         IpAddr::V4(_) => IPV4_HEADERS,
         IpAddr::V6(_) => IPV6_HEADERS,
     };
-    launch.socket.path_mtu_bytes.saturating_sub(headers)
+    let configured = launch.socket.path_mtu_bytes.saturating_sub(headers);
+    if path.is_assumed {
+        return configured;
+    }
+    configured.min(usize::try_from(path.datagram_bytes).unwrap_or(configured))
 }
 
 impl Opened {
@@ -260,7 +278,7 @@ fn egress(
         session: around.session,
         domain: around.fingerprint,
         clock_id: around.clock_id,
-        datagram_max_bytes: datagram_bytes_max(launch),
+        datagram_max_bytes: datagram_bytes_max(launch, sender.path_mtu()),
         sync_period: SYNC_PERIOD,
     })?;
     let mode = timestamp_mode(&launch.socket.timestamps);
@@ -312,8 +330,7 @@ fn ingress(
         received: count,
         stop: Arc::clone(&around.stop),
         foreign_count: 0,
-        clock_steps: 0,
-        clock: ClockPair::read(PAIR_ATTEMPTS).map_err(GatewayError::Clock)?,
+        clock: KernelClock::read()?,
         buffer: vec![0; usize::from(u16::MAX)].into_boxed_slice(),
     })
 }
@@ -355,8 +372,16 @@ impl Direction {
     /// Every counter of the direction.
     pub fn report(&self, launch: &DirectionLaunch) -> DirectionReport {
         let (direction, peer_state, counters) = match &self.way {
-            Way::Egress(egress) => ("egress", egress_state(egress), egress_counters(egress)),
-            Way::Ingress(ingress) => ("ingress", ingress_state(ingress), ingress_counters(ingress)),
+            Way::Egress(egress) => (
+                "egress",
+                counters::egress_state(egress),
+                counters::of_egress(egress),
+            ),
+            Way::Ingress(ingress) => (
+                "ingress",
+                counters::ingress_state(ingress),
+                counters::of_ingress(ingress),
+            ),
         };
         DirectionReport {
             channel: launch.channel.clone(),
@@ -366,117 +391,6 @@ impl Direction {
             facts: self.facts.clone(),
         }
     }
-}
-
-fn egress_state(egress: &Egress) -> String {
-    match egress.bridge.peer_state() {
-        PeerState::Greeting => "never answered".to_owned(),
-        PeerState::Established => "established".to_owned(),
-        PeerState::Down => "unreachable".to_owned(),
-        PeerState::Refused(status) => format!("refused the channel: {}", status.label()),
-    }
-}
-
-fn ingress_state(ingress: &Ingress) -> String {
-    match (ingress.bridge.session(), ingress.bridge.has_left()) {
-        (None, _) => "never greeted".to_owned(),
-        (Some(_), true) => "said farewell".to_owned(),
-        (Some(_), false) => "established".to_owned(),
-    }
-}
-
-fn named<'a>(prefix: &str, counts: impl IntoIterator<Item = (&'a str, u64)>) -> Vec<(String, u64)> {
-    counts
-        .into_iter()
-        .map(|(name, count)| (format!("{prefix}{name}"), count))
-        .collect()
-}
-
-fn refusals(counts: &RefusalCounts) -> Vec<(String, u64)> {
-    named("refused: ", counts.iter())
-}
-
-fn egress_counters(egress: &Egress) -> Vec<(String, u64)> {
-    let mut all = named("", egress.bridge.counts().iter());
-    all.extend(refusals(egress.bridge.refusals()));
-    let SenderCounters {
-        stamp_count,
-        unmatched_stamp_count,
-        network_report_count,
-        local_report_count,
-        peer_refused_count,
-        unreachable_count,
-        queue_full_count,
-        too_long_count,
-        other_refusal_count,
-        ..
-    } = egress.line.sender().counters();
-    all.extend(named(
-        "",
-        [
-            ("transmit_stamp_count", stamp_count),
-            ("transmit_stamp_unmatched_count", unmatched_stamp_count),
-            ("network_report_count", network_report_count),
-            ("local_report_count", local_report_count),
-            ("send_peer_refused_count", peer_refused_count),
-            ("send_unreachable_count", unreachable_count),
-            ("send_queue_full_count", queue_full_count),
-            ("send_too_long_count", too_long_count),
-            ("send_other_refusal_count", other_refusal_count),
-            ("clock_step_count", egress.line.clock_steps),
-        ],
-    ));
-    all
-}
-
-fn ingress_counters(ingress: &Ingress) -> Vec<(String, u64)> {
-    let IngressCounts {
-        datagram_count,
-        delivered_count,
-        duplicate_count,
-        late_count,
-        fragment_count,
-        hello_count,
-        sync_count,
-        bye_count,
-        session_restart_count,
-        ..
-    } = *ingress.bridge.counts();
-    let sequence = ingress.bridge.sequence_counts();
-    let ReceiverCounters {
-        software_stamp_count,
-        truncated_count,
-        kernel_drop_count,
-        link_lost_count,
-        link_overflow_count,
-        ..
-    } = ingress.receiver.counters();
-    let mut all = named(
-        "",
-        [
-            ("datagram_count", datagram_count),
-            ("delivered_count", delivered_count),
-            ("lost_count", sequence.lost_count),
-            ("reordered_count", sequence.reordered_count),
-            ("duplicate_count", duplicate_count),
-            ("late_count", late_count),
-            ("fragment_count", fragment_count),
-            ("hello_count", hello_count),
-            ("sync_count", sync_count),
-            ("bye_count", bye_count),
-            ("session_restart_count", session_restart_count),
-            ("stream_restart_count", sequence.restart_count),
-            ("receive_stamp_count", software_stamp_count),
-            ("truncated_count", truncated_count),
-            ("kernel_drop_count", kernel_drop_count),
-            ("emulated_loss_count", link_lost_count),
-            ("emulated_overflow_count", link_overflow_count),
-            ("clock_step_count", ingress.clock_steps),
-        ],
-    );
-    all.push(("refused: foreign source".to_owned(), ingress.foreign_count));
-    all.extend(refusals(ingress.bridge.refusals()));
-    all
 }
 
 /// Where a transmit probe of this direction may go: the peer's discard port.

@@ -6,18 +6,14 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use hil_gateways::protocol::egress::{RoundTrip, TransmitFailure};
 use hil_gateways::protocol::wire::Kind;
-use hil_gateways::protocol::{
-    ArrivalStamps, EgressBridge, EgressEvent, LocalRefusal, PeerState, StampSource,
-};
-use hil_gateways::transport::clock_pair::ClockPair;
-use hil_gateways::transport::{
-    DatagramSender, Received, SendRefusal, TransmitStage, TransmitStamp, TxToken,
-};
+use hil_gateways::protocol::{EgressBridge, EgressEvent, LocalRefusal, PeerState};
+use hil_gateways::transport::{DatagramSender, SendRefusal, TransmitStage, TransmitStamp, TxToken};
 use hil_models::measure::record::{EgressRecord, UNAVAILABLE};
 use hil_models::message::Envelope;
 use hil_models::time::Instant;
 
-use super::{GatewayError, PAIR_ATTEMPTS, PAIR_PERIOD, best_stamp, poll_descriptors};
+use super::kernel_clock::KernelClock;
+use super::{GatewayError, poll_descriptors};
 use crate::channel::{RawInput, Waiter};
 use crate::clock::MonotonicClock;
 use crate::record::RecordSink;
@@ -53,9 +49,12 @@ pub(crate) struct Egress {
 pub(crate) struct Attention {
     has_news: bool,
     is_announced: bool,
+    is_overdue: bool,
     looked: Instant,
 }
 
+/// A thread that finds a message in every turn looks after its socket this often.
+const LOOK_PERIOD_BUSY_NS: i64 = 5_000_000;
 /// A spinning thread looks after its socket this often.
 const LOOK_PERIOD_NS: i64 = 500_000;
 
@@ -68,12 +67,12 @@ pub(crate) struct Line {
     records: RecordSink,
     round_trips: RecordSink,
     session: u32,
-    clock: ClockPair,
+    clock: KernelClock,
     wants_hardware: bool,
     has_stamps: bool,
     message: Option<EgressRecord>,
+    newest_handed: Instant,
     report_count: u64,
-    pub(crate) clock_steps: u64,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -106,12 +105,12 @@ impl Line {
             records,
             round_trips,
             session,
-            clock: ClockPair::read(PAIR_ATTEMPTS).map_err(GatewayError::Clock)?,
+            clock: KernelClock::read()?,
             wants_hardware: armed.hardware,
             has_stamps: armed.software,
             message: None,
+            newest_handed: Instant::ZERO,
             report_count: 0,
-            clock_steps: 0,
         })
     }
 
@@ -126,6 +125,7 @@ impl Line {
             let Some(transmit) = bridge.poll_transmit(handed) else {
                 break;
             };
+            self.newest_handed = handed;
             let (kind, sequence) = (transmit.kind, transmit.sequence);
             let is_last = transmit.is_last_fragment;
             if kind == Kind::Data
@@ -213,13 +213,16 @@ impl Line {
             return false;
         };
         let slot = slot_of(token);
-        let offset = self.clock.offset_ns;
+        let offset = self.clock.offset_ns();
         let pending = self.pending[slot].as_mut();
-        let Some(pending) = pending.filter(|one| stage == TransmitStage::Sent && one.token == token)
+        let Some(pending) =
+            pending.filter(|one| stage == TransmitStage::Sent && one.token == token)
         else {
             return true;
         };
-        if let Some(software_ns) = stamps.software_ns {
+        // Of a message in pieces only the last piece's stamp is the message's.
+        let is_whole = pending.kind != Kind::Data || pending.record.is_some();
+        if let Some(software_ns) = stamps.software_ns.filter(|_| is_whole) {
             let first_handed = pending
                 .record
                 .map_or(pending.handed.as_ns(), |record| record.handed_ns);
@@ -281,14 +284,9 @@ impl Line {
         }
     }
 
-    fn refresh_clock(&mut self, now: Instant) {
-        if now.saturating_duration_since(self.clock.taken) < PAIR_PERIOD {
-            return;
-        }
-        if let Ok(pair) = ClockPair::read(PAIR_ATTEMPTS) {
-            self.clock_steps += u64::from(pair.step_since(&self.clock).is_some());
-            self.clock = pair;
-        }
+    /// How often the real-time clock was stepped.
+    pub(crate) fn clock_step_count(&self) -> u64 {
+        self.clock.step_count()
     }
 }
 
@@ -327,18 +325,24 @@ impl Egress {
     /// Sends one waiting message, or else looks after stamps, replies and appointments; false when
     /// no message waited and none was announced.
     pub(crate) fn step(&mut self) -> Result<bool, GatewayError> {
-        if self.forward()? {
+        let moved = self.forward()?;
+        if moved && !self.attention.is_overdue {
+            // A producer faster than the socket must not keep replies and orders waiting for ever.
+            let now = self.line.newest_handed;
+            self.attention.is_overdue = now.ns_since(self.attention.looked) > LOOK_PERIOD_BUSY_NS;
             return Ok(true);
         }
         let now = MonotonicClock::now();
-        if self.attention.has_news || now.ns_since(self.attention.looked) > LOOK_PERIOD_NS {
+        let since_look = now.ns_since(self.attention.looked);
+        if self.attention.has_news || self.attention.is_overdue || since_look > LOOK_PERIOD_NS {
+            self.attention.is_overdue = false;
             self.attention.has_news = false;
             self.attention.looked = now;
             self.line.take_stamps(&mut self.bridge);
             self.line.notice_reports(&mut self.bridge, now);
             self.hear()?;
             self.line.expire(now);
-            self.line.refresh_clock(now);
+            self.line.clock.refresh(now);
             let is_established = self.bridge.peer_state() == PeerState::Established;
             self.is_established.store(is_established, Ordering::Release);
         }
@@ -351,7 +355,7 @@ impl Egress {
         if was_announced && let Some(waiter) = &mut self.waiter {
             waiter.drain()?;
         }
-        Ok(was_announced)
+        Ok(moved || was_announced)
     }
 
     /// Sends the oldest waiting message; false when none waited.
@@ -374,7 +378,7 @@ impl Egress {
                 handed_ns: UNAVAILABLE,
                 tx_software_ns: UNAVAILABLE,
                 tx_hardware_ns: UNAVAILABLE,
-                realtime_offset_ns: line.clock.offset_ns,
+                realtime_offset_ns: line.clock.offset_ns(),
                 epoch: envelope.epoch,
                 session: line.session,
                 flags: 0,
@@ -384,7 +388,7 @@ impl Egress {
                 Ok(()) => {
                     line.message = Some(record);
                     line.transmit(bridge);
-                    sent.fetch_add(1, Ordering::Relaxed);
+                    sent.store(bridge.counts().sent_count, Ordering::Relaxed);
                 }
                 // Another gateway's message: not this gateway's to account for.
                 Err(LocalRefusal::Forwarded) => {}
@@ -407,7 +411,7 @@ impl Egress {
             .map_err(GatewayError::Socket)?
         {
             let now = MonotonicClock::now();
-            let arrival = self.arrival(&received, now);
+            let arrival = self.line.clock.arrival(&received, now);
             let bytes = &buffer[..received.length_bytes];
             match self.bridge.on_datagram(now, arrival, bytes) {
                 Ok(EgressEvent::RoundTrip { round_trip, .. }) => self.note_round_trip(&round_trip),
@@ -420,18 +424,6 @@ impl Egress {
             }
         }
         Ok(())
-    }
-
-    fn arrival(&self, received: &Received, now: Instant) -> ArrivalStamps {
-        let (received_ns, received_source) = match best_stamp(received.stamps, &self.line.clock) {
-            Some(stamp) => (stamp.as_ns(), StampSource::KernelSoftware),
-            None => (now.as_ns(), StampSource::Application),
-        };
-        ArrivalStamps {
-            received_ns,
-            received_source,
-            peer: Some(received.source),
-        }
     }
 
     fn note_round_trip(&mut self, round_trip: &RoundTrip) {

@@ -7,14 +7,14 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use hil_gateways::protocol::ingress::{FollowUp, MessageInfo};
 use hil_gateways::protocol::sequence::Order;
-use hil_gateways::protocol::{ArrivalStamps, Delivery, Disposition, IngressBridge, StampSource};
-use hil_gateways::transport::clock_pair::ClockPair;
+use hil_gateways::protocol::{Delivery, Disposition, IngressBridge};
 use hil_gateways::transport::{DatagramReceiver, Received};
 use hil_models::measure::record::{FollowUpRecord, IngressRecord, UNAVAILABLE};
 use hil_models::message::Envelope;
 use hil_models::time::Instant;
 
-use super::{GatewayError, PAIR_ATTEMPTS, PAIR_PERIOD, best_stamp, poll_descriptors};
+use super::kernel_clock::KernelClock;
+use super::{GatewayError, poll_descriptors};
 use crate::channel::{ChannelError, RawOutput};
 use crate::clock::MonotonicClock;
 use crate::record::RecordSink;
@@ -35,8 +35,7 @@ pub(crate) struct Ingress {
     pub(crate) stop: Arc<AtomicBool>,
     /// Datagrams from an address that is not the peer's, dropped unread.
     pub(crate) foreign_count: u64,
-    pub(crate) clock_steps: u64,
-    pub(crate) clock: ClockPair,
+    pub(crate) clock: KernelClock,
     pub(crate) buffer: Box<[u8]>,
 }
 
@@ -101,7 +100,7 @@ impl Ingress {
         }
         let now = MonotonicClock::now();
         self.bridge.on_wakeup(now);
-        self.refresh_clock(now);
+        self.clock.refresh(now);
         Ok(false)
     }
 
@@ -129,9 +128,9 @@ impl Ingress {
         let arrival = Arrival {
             received,
             at,
-            offset_ns: self.clock.offset_ns,
+            offset_ns: self.clock.offset_ns(),
         };
-        let stamps = self.stamps(&arrival);
+        let stamps = self.clock.arrival(&received, at);
         let Self {
             bridge,
             output,
@@ -155,36 +154,11 @@ impl Ingress {
         failed.map_or(Ok(true), |error| Err(error.into()))
     }
 
-    fn stamps(&self, arrival: &Arrival) -> ArrivalStamps {
-        let peer = Some(arrival.received.source);
-        match best_stamp(arrival.received.stamps, &self.clock) {
-            Some(stamp) => ArrivalStamps {
-                received_ns: stamp.as_ns(),
-                received_source: StampSource::KernelSoftware,
-                peer,
-            },
-            None => ArrivalStamps {
-                peer,
-                ..ArrivalStamps::application(arrival.at.as_ns())
-            },
-        }
-    }
-
     /// Sends the replies that are due; a reply that cannot leave is counted by the transport.
     fn answer(&mut self) {
         while let Some(reply) = self.bridge.poll_transmit(MonotonicClock::now()) {
             let to = reply.destination.unwrap_or(self.peer);
             let _counted = self.receiver.reply(reply.datagram, to).is_err();
-        }
-    }
-
-    fn refresh_clock(&mut self, now: Instant) {
-        if now.saturating_duration_since(self.clock.taken) < PAIR_PERIOD {
-            return;
-        }
-        if let Ok(pair) = ClockPair::read(PAIR_ATTEMPTS) {
-            self.clock_steps += u64::from(pair.step_since(&self.clock).is_some());
-            self.clock = pair;
         }
     }
 

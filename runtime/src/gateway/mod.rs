@@ -6,9 +6,11 @@
 //! - [`direction`]: one direction from its launch description to its final counters.
 //! - `egress`: shared memory to network; `ingress`: network to shared memory.
 
+mod counters;
 pub mod direction;
 pub(crate) mod egress;
 pub(crate) mod ingress;
+pub(crate) mod kernel_clock;
 pub(crate) mod process;
 
 use std::fs::File;
@@ -16,12 +18,9 @@ use std::io::{self, Read};
 use std::os::fd::BorrowedFd;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
-use std::time::Duration;
 
 use hil_gateways::protocol::body::HelloStatus;
 use hil_gateways::protocol::{ChannelIdentity, SettingsError};
-use hil_gateways::transport::KernelStamps;
-use hil_gateways::transport::clock_pair::ClockPair;
 use hil_gateways::transport::udp::UdpError;
 use hil_models::case_study::ParameterError;
 use hil_models::time::Instant;
@@ -120,25 +119,11 @@ impl Surroundings {
 /// Descriptors one thread waits for: its listener and its socket.
 const DESCRIPTORS_MAX: usize = 2;
 
-/// How often the relation of real-time and monotonic clock is read anew: it changes by steps
-/// only, so this bounds how many messages a step can spoil.
-pub(crate) const PAIR_PERIOD: Duration = Duration::from_millis(100);
-
-/// Reads of a clock pair of which the narrowest counts.
-pub(crate) const PAIR_ATTEMPTS: u32 = 5;
-
 /// Sessions must differ between starts, and not be guessable from the last one.
 fn random_session() -> io::Result<u32> {
     let mut bytes = [0; 4];
     File::open("/dev/urandom")?.read_exact(&mut bytes)?;
     Ok(u32::from_le_bytes(bytes).max(1))
-}
-
-/// The kernel's software stamp on the monotonic clock, if there is one.
-pub(crate) fn best_stamp(stamps: KernelStamps, clock: &ClockPair) -> Option<Instant> {
-    stamps
-        .software_ns
-        .map(|realtime_ns| clock.to_monotonic(realtime_ns))
 }
 
 /// Sleeps until a descriptor has something or `until`; says for each whether it has.

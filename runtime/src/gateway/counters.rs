@@ -1,0 +1,74 @@
+//! The counters of one channel direction under the names a report prints. It counts nothing itself.
+
+use hil_gateways::protocol::{PeerState, RefusalCounts};
+
+use super::egress::Egress;
+use super::ingress::Ingress;
+use crate::clock::MonotonicClock;
+
+/// A peer that was silent for longer when the run ended is reported as such.
+const SILENCE_NS: i64 = 1_000_000_000;
+
+/// How the receiving gateway stood to this one, in words.
+pub(super) fn egress_state(egress: &Egress) -> String {
+    match egress.bridge.peer_state() {
+        PeerState::Greeting => "never answered".to_owned(),
+        PeerState::Down => "unreachable".to_owned(),
+        PeerState::Refused(status) => format!("refused the channel: {}", status.label()),
+        PeerState::Established => {
+            let heard = egress.bridge.last_heard();
+            let silence_ns = heard.map(|at| MonotonicClock::now().ns_since(at));
+            match silence_ns.filter(|silence_ns| *silence_ns > SILENCE_NS) {
+                Some(silence_ns) => format!("silent for {:.1} s", silence_ns as f64 * 1e-9),
+                None => "established".to_owned(),
+            }
+        }
+    }
+}
+
+/// How the sending gateway stood to this one, in words.
+pub(super) fn ingress_state(ingress: &Ingress) -> String {
+    match (ingress.bridge.session(), ingress.bridge.has_left()) {
+        (None, _) => "never greeted".to_owned(),
+        (Some(_), true) => "said farewell".to_owned(),
+        (Some(_), false) => "established".to_owned(),
+    }
+}
+
+fn named<'a>(
+    prefix: &str,
+    counts: impl IntoIterator<Item = (&'a str, u64)>,
+) -> impl Iterator<Item = (String, u64)> {
+    counts
+        .into_iter()
+        .map(move |(name, count)| (format!("{prefix}{name}"), count))
+}
+
+fn refusals(counts: &RefusalCounts) -> impl Iterator<Item = (String, u64)> {
+    named("refused: ", counts.iter())
+}
+
+/// Everything a sending direction counted.
+pub(super) fn of_egress(egress: &Egress) -> Vec<(String, u64)> {
+    let steps = ("clock_step_count", egress.line.clock_step_count());
+    named("", egress.bridge.counts().iter())
+        .chain(named("socket: ", egress.line.sender().counters().iter()))
+        .chain(named("", [steps]))
+        .chain(refusals(egress.bridge.refusals()))
+        .collect()
+}
+
+/// Everything a receiving direction counted.
+pub(super) fn of_ingress(ingress: &Ingress) -> Vec<(String, u64)> {
+    let bridge = &ingress.bridge;
+    let steps = ("clock_step_count", ingress.clock.step_count());
+    let foreign = ("refused: foreign source", ingress.foreign_count);
+    named("", bridge.counts().iter())
+        .chain(named("messages: ", bridge.sequence_counts().iter()))
+        .chain(named("pieces: ", bridge.reassembly_counts().iter()))
+        .chain(named("replies: ", bridge.reply_counts().iter()))
+        .chain(named("socket: ", ingress.receiver.counters().iter()))
+        .chain(named("", [steps, foreign]))
+        .chain(refusals(bridge.refusals()))
+        .collect()
+}
