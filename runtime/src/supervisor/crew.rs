@@ -132,12 +132,6 @@ impl Crew {
         {
             let card_path = self.folder.card(&name);
             write(&card_path, card)?;
-            let found = own_program::find(&command[0]);
-            found.map_err(|source| CrewError::Spawn {
-                process: name.clone(),
-                program: command[0].clone(),
-                source,
-            })?;
             let mut program = Command::new(&self.own_program);
             program.args([
                 "become",
@@ -374,6 +368,23 @@ impl Crew {
     pub(crate) fn events(&self) -> &[Event] {
         &self.events
     }
+}
+
+/// Looks for every user's own program before the run begins.
+///
+/// # Errors
+/// Names the process and the program that is not there.
+pub(crate) fn find_programs(plans: &[ProcessPlan]) -> Result<(), CrewError> {
+    for plan in plans {
+        if let ProcessKind::Foreign { command, .. } = &plan.kind {
+            own_program::find(&command[0]).map_err(|source| CrewError::Spawn {
+                process: plan.name.clone(),
+                program: command[0].clone(),
+                source,
+            })?;
+        }
+    }
+    Ok(())
 }
 
 fn write_launch(

@@ -7,12 +7,13 @@ pub(crate) mod domains;
 pub mod event;
 pub(crate) mod exchange;
 pub(crate) mod frame;
+pub(crate) mod meet;
 mod outcome;
 pub(crate) mod peer;
 pub(crate) mod plan;
 mod session;
 
 pub use domains::DomainsError;
+pub use meet::PeerError;
 pub use outcome::{Outcome, RunError, RunOptions, RunResult};
-pub use peer::PeerError;
 pub use session::run;

@@ -11,7 +11,7 @@ use super::crew::CrewError;
 use super::domains::DomainsError;
 use super::event::{Event, ProcessStory};
 use super::frame::{EndMeaning, PeerMessage};
-use super::peer::PeerError;
+use super::meet::PeerError;
 use crate::channel::DomainError;
 use crate::host_facts::HostFacts;
 use crate::run_folder::RunFolder;

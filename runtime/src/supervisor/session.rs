@@ -9,13 +9,14 @@ use std::time::{Duration, Instant as WallInstant, SystemTime};
 use hil_models::time::Instant;
 use serde_json::json;
 
-use super::crew::{Crew, Verdict};
+use super::crew::{self, Crew, Verdict};
 use super::domains::Domains;
 use super::event::{Event, HostStory, ProcessStory};
 use super::exchange::exchange;
 use super::frame::{Frame, PeerHello, PeerMessage};
+use super::meet::{Meeting, meet};
 use super::outcome::{Heard, Outcome, RunError, RunOptions, RunResult};
-use super::peer::{Meeting, Peer, PeerEvent, SILENCE_MAX, meet};
+use super::peer::{Peer, PeerEvent, SILENCE_MAX};
 use super::plan::plan;
 use crate::channel::clock_id;
 use crate::clock::MonotonicClock;
@@ -52,10 +53,11 @@ pub fn run(
         .iter()
         .filter(|host| options.hosts.contains(&host.name))
         .collect();
+    let plan = plan(topology, &hosts);
+    crew::find_programs(&plan.processes)?;
     let folder = make_folder(topology, &hosts)?;
     let facts = HostFacts::gather();
     write_manifest(topology, options, &folder, &facts)?;
-    let plan = plan(topology, &hosts);
     let run = folder.root().to_string_lossy();
     let domains = Domains::create(&plan.hosts, options.domain_root.as_ref(), &run)?;
     console.say(&format!("run folder {}", folder.root().display()));
