@@ -116,7 +116,7 @@ fn killed_gateways_and_components_come_back_and_their_loss_is_put_down_to_them()
     };
     let record = RunFolder::new("kills");
     let trial = Trial::shipped("split.toml", record.path())
-        .set("run.duration=\"25 s\"")
+        .set("run.duration=\"20 s\"")
         .set("processes.controller.on_exit=\"restart\"")
         .set("processes.robot.on_exit=\"restart\"");
     let mut split = Split::start(lab, &trial);
