@@ -23,7 +23,7 @@ use crate::report::terminal::{self, Style};
 use crate::run_folder::RunFolder;
 use crate::signals::{EXIT_INTERRUPTED, Signals};
 use crate::simulate;
-use crate::supervisor::{self, Outcome, PeerError, RunError, RunOptions};
+use crate::supervisor::{self, Outcome, PeerError, RunError, RunOptions, RunResult};
 use crate::topology::{self, HOST_VARIABLE, HostChoice, MachineIdentity, Topology, which_host};
 
 /// Exit codes, as `--help` lists them (after `sysexits.h`, which systemd knows).
@@ -155,6 +155,9 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
             match analysis::conclude(&topology, &result, registry, origin) {
                 Ok(summary) => {
                     console.result(&terminal::render(&summary, columns(), Style::Coloured));
+                    if code != exit::RAN {
+                        console.error(&complaint(&result));
+                    }
                     code
                 }
                 Err(error) => {
@@ -167,6 +170,16 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
             console.error(&error.to_string());
             exit_code_of_error(&error)
         }
+    }
+}
+
+/// Why a run does not end with exit code 0, for those who do not read its report.
+fn complaint(result: &RunResult) -> String {
+    let is_incomplete = result.has_gaps() && exit_code(&result.outcome) == exit::RAN;
+    if is_incomplete {
+        "the report is incomplete; see its warnings".to_owned()
+    } else {
+        result.outcome.text()
     }
 }
 

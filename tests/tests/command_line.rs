@@ -142,19 +142,59 @@ fn a_misspelt_key_is_shown_in_its_file_with_what_was_meant() {
     assert_says(&finished, &["--check"]);
 }
 
-/// A split run on this machine alone, whose other host nobody starts.
-fn lonely(record: &RunFolder, host: &str) -> ChildGuard {
+/// A split run whose two hosts are on this machine.
+fn split_here(record: &RunFolder) -> Trial {
     let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
     let port = listener.local_addr().unwrap().port();
     drop(listener);
-    let trial = Trial::shipped("split.toml", record.path())
-        .set("run.start_timeout=\"2 s\"")
+    Trial::shipped("split.toml", record.path())
         .set("hosts.control-pc.address=\"127.0.0.1\"")
         .set("hosts.robot-pc.address=\"127.0.0.2\"")
-        .set(&format!("hosts.control-pc.control_port={port}"));
+        .set(&format!("hosts.control-pc.control_port={port}"))
+}
+
+fn start_as(trial: &Trial, host: &str) -> ChildGuard {
     let mut command = trial.command_here();
     command.arg("--host").arg(host);
     ChildGuard::spawn(&mut command).unwrap()
+}
+
+/// A split run whose other host nobody starts.
+fn lonely(record: &RunFolder, host: &str) -> ChildGuard {
+    let trial = split_here(record).set("run.start_timeout=\"2 s\"");
+    start_as(&trial, host)
+}
+
+#[test]
+fn hosts_with_different_topologies_refuse_each_other() {
+    let record = RunFolder::new("different");
+    let trial = split_here(&record);
+    let mut hosts = [
+        start_as(&trial, "control-pc"),
+        start_as(&trial.clone().set("run.seed=2"), "robot-pc"),
+    ];
+    for host in &mut hosts {
+        let finished = host.wait_within(LIMIT).unwrap();
+        assert_code(&finished, 2);
+        assert_says(&finished, &["does not fit this run", "use the same file"]);
+    }
+}
+
+#[test]
+fn a_host_whose_address_is_elsewhere_says_so() {
+    let record = RunFolder::new("elsewhere");
+    // A block reserved for documentation (RFC 5737): nobody's address.
+    let trial = split_here(&record)
+        .set("hosts.control-pc.address=\"203.0.113.1\"")
+        .set("hosts.robot-pc.address=\"203.0.113.2\"");
+    for (host, words) in [
+        ("control-pc", "cannot listen on 203.0.113.1"),
+        ("robot-pc", "cannot connect from 203.0.113.2"),
+    ] {
+        let finished = start_as(&trial, host).wait_within(LIMIT).unwrap();
+        assert_code(&finished, 2);
+        assert_says(&finished, &[words, "is it this host's address"]);
+    }
 }
 
 #[test]
@@ -445,9 +485,6 @@ fn a_program_that_does_not_exist_is_named_before_the_run_begins() {
     let finished = child.wait_within(LIMIT).unwrap();
     assert_code(&finished, 1);
     assert_says(&finished, &["process robot", "cannot start no-such-robot"]);
-    let mut left = fs::read_dir(record.path()).unwrap();
-    assert!(
-        left.next().is_none(),
-        "a run that never began left a folder"
-    );
+    let entry_count = fs::read_dir(record.path()).unwrap().count();
+    assert_eq!(entry_count, 0, "a run folder of no run");
 }

@@ -116,7 +116,7 @@ fn killed_gateways_and_components_come_back_and_their_loss_is_put_down_to_them()
     };
     let record = RunFolder::new("kills");
     let trial = Trial::shipped("split.toml", record.path())
-        .set("run.duration=\"25 s\"")
+        .set("run.duration=\"20 s\"")
         .set("processes.controller.on_exit=\"restart\"")
         .set("processes.robot.on_exit=\"restart\"");
     let mut split = Split::start(lab, &trial);
@@ -228,33 +228,13 @@ fn a_killed_supervisor_takes_its_processes_along_and_the_other_host_says_who_van
     let Some(lab) = Lab::two_hosts_or_skip() else {
         return;
     };
-    let record = RunFolder::new("supervisor-killed");
-    let trial = Trial::shipped("split.toml", record.path()).set("run.duration=\"10 min\"");
-    let mut split = Split::start(lab, &trial);
-    assert!(split.files[1].processes().len() >= 2);
-    split.hosts[1].signal(Signal::SIGKILL).unwrap();
-    wait_until(LIMIT, "the end of the dead supervisor's processes", || {
-        split.files[1].processes().is_empty()
-    });
-    let survivor = split.hosts[0].wait_within(RUN_LIMIT).unwrap();
-    assert_eq!(code(&survivor), 69, "{survivor:?}");
-    split.files[0].assert_nothing_left_on(split.lab.host(0));
-    let summary = split.files[0].summary();
-    assert_eq!(summary.run.outcome, Outcome::Failed);
-    let reason = &summary.run.exit_reason;
-    assert!(
-        reason.contains("another host vanished: robot-pc"),
-        "{reason}"
-    );
-    assert!(split.files[0].has_report());
-    let warnings = summary.warnings.join("\n");
-    assert!(warnings.contains("robot-pc"), "{warnings}");
-    assert!(account(&summary, "arm/command").published_count > 0);
+    // First the host that joins, then the one that is joined.
+    let lab = kill_supervisor(lab, 1);
+    let lab = kill_supervisor(lab, 0);
 
     // The hosts are as good as before, and the next run sweeps what the dead one left.
     let record = RunFolder::new("after-the-kill");
     let trial = Trial::shipped("split.toml", record.path()).set("run.duration=\"2 s\"");
-    let Split { lab, .. } = split;
     let mut next = Split::start(lab, &trial);
     for finished in next.finish() {
         finished.assert_success();
@@ -263,4 +243,91 @@ fn a_killed_supervisor_takes_its_processes_along_and_the_other_host_says_who_van
     for summary in next.summaries() {
         assert_every_message_is_accounted_for(&summary);
     }
+}
+
+/// Starts a run, kills the supervisor of host `victim`, and checks what the other one makes of it.
+fn kill_supervisor(lab: Lab, victim: usize) -> Lab {
+    let other = 1 - victim;
+    let record = RunFolder::new("supervisor-killed");
+    let trial = Trial::shipped("split.toml", record.path()).set("run.duration=\"10 min\"");
+    let mut split = Split::start(lab, &trial);
+    assert!(split.files[victim].processes().len() >= 2);
+    split.hosts[victim].signal(Signal::SIGKILL).unwrap();
+    wait_until(LIMIT, "the end of the dead supervisor's processes", || {
+        split.files[victim].processes().is_empty()
+    });
+    let survivor = split.hosts[other].wait_within(RUN_LIMIT).unwrap();
+    assert_eq!(code(&survivor), 69, "{survivor:?}");
+    split.files[other].assert_nothing_left_on(split.lab.host(other));
+    let summary = split.files[other].summary();
+    assert_eq!(summary.run.outcome, Outcome::Failed);
+    let vanished = format!("another host vanished: {}", HOSTS[victim]);
+    let reason = &summary.run.exit_reason;
+    assert!(reason.contains(&vanished), "{reason}");
+    assert!(split.files[other].has_report());
+    let warnings = summary.warnings.join("\n");
+    assert!(warnings.contains(HOSTS[victim]), "{warnings}");
+    for channel in &summary.channels {
+        let account = channel.account.as_ref();
+        let said = account.map(|account| describe(&channel.name, account));
+        println!("{} alone: {said:?}", HOSTS[other]);
+    }
+    assert!(account(&summary, "arm/command").published_count > 0);
+    split.lab
+}
+
+#[test]
+fn an_interrupted_host_ends_the_run_on_both_with_complete_reports() {
+    let _alone = alone();
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let record = RunFolder::new("one-interrupted");
+    let trial = Trial::shipped("split.toml", record.path()).set("run.duration=\"10 min\"");
+    let mut split = Split::start(lab, &trial);
+    split.hosts[1].signal(Signal::SIGINT).unwrap();
+    let [control, robot] = split.finish();
+    assert_eq!((code(&control), code(&robot)), (1, 130), "{control:?}");
+    split.assert_nothing_left();
+    let [control, robot] = split.summaries();
+    assert_eq!(robot.run.exit_reason, "interrupted by Ctrl-C (SIGINT)");
+    let reason = &control.run.exit_reason;
+    assert!(
+        reason.contains("robot-pc interrupted by Ctrl-C"),
+        "{reason}"
+    );
+    for summary in [control, robot] {
+        assert_eq!(summary.run.outcome, Outcome::Stopped);
+        assert_every_message_is_accounted_for(&summary);
+    }
+}
+
+#[test]
+fn a_process_that_dies_too_often_ends_the_run() {
+    let _alone = alone();
+    let record = RunFolder::new("too-often");
+    let trial = Trial::shipped("shuttle-local.toml", record.path())
+        .set("run.duration=\"10 min\"")
+        .set("processes.robot.on_exit=\"restart\"")
+        .set("processes.robot.restart_limit=1");
+    let mut child = trial.start_here();
+    let files = trial.folder("", LIMIT);
+    for instance in 0..2 {
+        let taken = format!("shuttle.command.taken.robot.{instance}.");
+        wait_until(LIMIT, &taken, || files.record_bytes(&taken) > FLOWING_BYTES);
+        files.kill_process("robot", instance, LIMIT);
+    }
+    let finished = child.wait_within(RUN_LIMIT).unwrap();
+    assert_eq!(code(&finished), 1, "{finished:?}");
+    files.assert_nothing_left_here();
+    let summary = files.summary();
+    let events: Vec<&str> = summary.events.iter().map(|one| one.what.as_str()).collect();
+    let expected = [
+        "robot: was killed by SIGKILL; restart 1 of at most 1",
+        "robot: was killed by SIGKILL; policy: end the run",
+    ];
+    assert_eq!(events, expected);
+    assert_every_message_is_accounted_for(&summary);
+    let status = account(&summary, "shuttle/status");
+    assert_eq!(status.producer_restart_count, 1);
 }

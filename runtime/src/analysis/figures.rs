@@ -54,7 +54,7 @@ pub(super) fn run_facts(
         started: result.started.clone(),
         duration_s: own_span(result).map_or(0.0, |(start, end)| end.seconds_since(start)),
         outcome,
-        exit_reason: result.outcome.text(),
+        exit_reason: result.outcome.reason(),
         folder: result.folder.root().display().to_string(),
         files: files.map(|(name, what)| Fact::new(name, what)).to_vec(),
         repeat_command: shell_words(command_line),

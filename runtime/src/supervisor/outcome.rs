@@ -88,6 +88,15 @@ impl Outcome {
         }
     }
 
+    /// Why it ended so, to be said after a word for how.
+    pub fn reason(&self) -> String {
+        match self {
+            Self::Completed => "as planned".to_owned(),
+            Self::Failed(text) => text.clone(),
+            other => other.text(),
+        }
+    }
+
     /// How the other hosts are to take it.
     pub(super) fn meaning(&self) -> EndMeaning {
         match self {
