@@ -42,7 +42,9 @@ struct Extent {
 }
 
 fn argument_after(name: &str) -> Option<String> {
-    std::env::args().skip_while(|argument| argument != name).nth(1)
+    std::env::args()
+        .skip_while(|argument| argument != name)
+        .nth(1)
 }
 
 impl Extent {
@@ -103,7 +105,14 @@ fn run(setup: &mut Setup, cases: &[CasePlan], extent: Extent) -> Comparison {
         .enumerate()
         .map(|(index, (end, case))| {
             let (far, mut count) = (far.clone(), 0);
-            move || measure((end, case, index), (turns, &far), far_party, (extent, &mut count))
+            move || {
+                measure(
+                    (end, case, index),
+                    (turns, &far),
+                    far_party,
+                    (extent, &mut count),
+                )
+            }
         })
         .collect();
     let mut contestants: Vec<_> = rounds
@@ -181,9 +190,9 @@ fn hybrid_verdicts(setup: &Setup, cases: &[CasePlan], cpu_count: usize) -> Vec<V
 fn print_usage(setup: &Setup, cases: &[CasePlan]) {
     println!("\nprocessor share and sleeps per round trip (or per message of a hop)");
     let line = |title: &str, name: &str, usage: &Usage, trips: u64| {
-        let share = usage
-            .share()
-            .map_or("unavailable".to_owned(), |share| format!("{:.1} %", share * 100.0));
+        let share = usage.share().map_or("unavailable".to_owned(), |share| {
+            format!("{:.1} %", share * 100.0)
+        });
         let sleeps = usage.sleep_count as f64 / trips.max(1) as f64;
         println!("{title:<38} {name:<18} {share:>12} {sleeps:>8.2}");
         println!(
@@ -218,7 +227,7 @@ fn print_segments(
     title: &str,
     (plan, woken): (hil_benches::gateway::hosts::Plan, [Vec<u64>; 2]),
 ) -> Result<(), SetupError> {
-    let found = segments(hosts, &plan, woken)?;
+    let found = segments(hosts, &plan, &woken)?;
     println!("\n{title}: one way, microseconds (p50, p99, p99.9, max)");
     for (index, (name, quantiles)) in SEGMENTS.iter().zip(found).enumerate() {
         let Some(quantiles) = quantiles else {
@@ -283,6 +292,22 @@ fn report(
         .collect();
     let refused_far = setup.far.join().unwrap_or_default();
     println!("\nrecords dropped: {}", setup.hosts.finish_recording());
+    let stepped = cases
+        .iter()
+        .filter(|case| matches!(case.kind, Kind::BetweenGateways) && case.plan.is_stamped);
+    for case in stepped {
+        // Their channels are those of the case before.
+        let before = cases.iter().rfind(|other| {
+            matches!(other.kind, Kind::Gateway) && other.reference == case.reference
+        });
+        if let Some(before) = before {
+            print_segments(
+                &setup.hosts,
+                case.title,
+                (before.plan, [Vec::new(), Vec::new()]),
+            )?;
+        }
+    }
     for (case, woken) in woken {
         print_segments(&setup.hosts, case.title, (case.plan, woken))?;
     }
@@ -311,9 +336,14 @@ fn measure_all(cpu_count: usize) -> Result<(), SetupError> {
         "near host on cpu 0, far host on cpu 1, SCHED_FIFO {PRIORITY} asked for"
     ));
     let network = setup.hosts.network.note().to_owned();
-    println!("{}", json!({"bench": BENCH, "host": facts.to_json(), "network": network}));
-    println!("network: {network}; load {} at the start; policy {}; governor {}",
-        facts.load_average, facts.scheduling_policy, facts.governor);
+    println!(
+        "{}",
+        json!({"bench": BENCH, "host": facts.to_json(), "network": network})
+    );
+    println!(
+        "network: {network}; load {} at the start; policy {}; governor {}",
+        facts.load_average, facts.scheduling_policy, facts.governor
+    );
     println!("without stamps means: these sockets ask for none; the host's receive stamps are on");
     let outcome = run(&mut setup, &cases, extent);
     report(setup, &cases, (&outcome, cpu_count))

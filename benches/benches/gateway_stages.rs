@@ -77,7 +77,11 @@ impl WholeHop {
         self.ingress.1.step()?;
         let received = handed_over.elapsed();
         let mut has_come = false;
-        while self.far.input.receive(Instant::ZERO, &mut |_, _| has_come = true)? {}
+        while self
+            .far
+            .input
+            .receive(Instant::ZERO, &mut |_, _| has_come = true)?
+        {}
         // What is due besides messages is done here, untimed.
         while self.egress.1.step()? || self.ingress.1.step()? {}
         if !has_come {
@@ -94,7 +98,10 @@ struct Measured {
     columns: Vec<Vec<u64>>,
 }
 
-const WHOLE: [&str; 2] = ["Direction::step, sending end", "Direction::step, receiving end"];
+const WHOLE: [&str; 2] = [
+    "Direction::step, sending end",
+    "Direction::step, receiving end",
+];
 
 impl Measured {
     /// The column of this round; the first to ask makes the pass.
@@ -150,7 +157,13 @@ fn name(what: &str, size: usize) -> &'static str {
 }
 
 fn run(measured: &[RefCell<Measured>], rounds: usize) -> Comparison {
-    let whats = || STAGES.iter().map(|stage| stage.name).chain(WHOLE).enumerate();
+    let whats = || {
+        STAGES
+            .iter()
+            .map(|stage| stage.name)
+            .chain(WHOLE)
+            .enumerate()
+    };
     let mut columns: Vec<_> = measured
         .iter()
         .zip(SIZES)
@@ -163,7 +176,7 @@ fn run(measured: &[RefCell<Measured>], rounds: usize) -> Comparison {
         .collect();
     let mut cases: Vec<_> = columns
         .iter_mut()
-        .map(|(name, round)| Case { name: *name, round })
+        .map(|(name, round)| Case { name, round })
         .collect();
     compare(rounds, &mut clock_batch, &mut cases)
 }
@@ -175,7 +188,9 @@ fn p50(row: &Row) -> Option<u64> {
 /// Sum of the medians of the stages `wanted` picks, each as often as a hop does it.
 fn sum_ns(rows: &[Row], wanted: impl Fn(&Stage) -> bool) -> Option<u64> {
     let stages = rows.iter().zip(STAGES).filter(|(_, stage)| wanted(stage));
-    stages.map(|(row, stage)| Some(p50(row)? * stage.per_hop)).sum()
+    stages
+        .map(|(row, stage)| Some(p50(row)? * stage.per_hop))
+        .sum()
 }
 
 fn report(outcome: &Comparison, size: usize, rows: &[Row]) {
@@ -189,7 +204,10 @@ fn report(outcome: &Comparison, size: usize, rows: &[Row]) {
     println!("{size} B: whole hop by Direction::step: {}", text(whole));
     let beside = own.zip(calls).zip(whole);
     let beside = beside.map(|((own, calls), whole)| i128::from(whole) - i128::from(own + calls));
-    println!("{size} B: of it in none of the stages: {} ns", beside.unwrap_or(0));
+    println!(
+        "{size} B: of it in none of the stages: {} ns",
+        beside.unwrap_or(0)
+    );
     println!(
         "{}",
         json!({"bench": BENCH, "size_bytes": size, "own_sum_ns": own, "socket_calls_ns": calls,
@@ -213,7 +231,10 @@ fn measure_all() -> Result<(), SetupError> {
     let rounds = given.unwrap_or(if is_quick { 20 } else { 100 });
     let mut hosts = Hosts::create(Network::open())?;
     let mut opened = Vec::new();
-    for (size, names) in SIZES.into_iter().zip([["stages64", "whole64"], ["stages1k", "whole1k"]]) {
+    for (size, names) in SIZES
+        .into_iter()
+        .zip([["stages64", "whole64"], ["stages1k", "whole1k"]])
+    {
         let plan = |name| Plan {
             name,
             size_bytes: size,
@@ -236,9 +257,14 @@ fn measure_all() -> Result<(), SetupError> {
     // Receive stamps are switched on by a kernel worker, which needs a moment.
     thread::sleep(Duration::from_millis(300));
     let refusals = claim(0);
-    let facts = HostFacts::read(&format!("one thread on cpu 0, SCHED_FIFO {PRIORITY} asked for"));
+    let facts = HostFacts::read(&format!(
+        "one thread on cpu 0, SCHED_FIFO {PRIORITY} asked for"
+    ));
     let network = hosts.network.note().to_owned();
-    println!("{}", json!({"bench": BENCH, "host": facts.to_json(), "network": network}));
+    println!(
+        "{}",
+        json!({"bench": BENCH, "host": facts.to_json(), "network": network})
+    );
     println!(
         "network: {network}; load {} at the start; policy {}; governor {}",
         facts.load_average, facts.scheduling_policy, facts.governor

@@ -103,9 +103,9 @@ pub fn only(cases: &[CasePlan], text: &str) -> Vec<CasePlan> {
     let is_named = |case: &CasePlan| case.title.contains(text);
     let is_wanted = |index: usize| {
         let refers = |case: &CasePlan| is_named(case) && case.reference == index;
-        let follows = cases.get(index + 1).is_some_and(|next| {
-            is_named(next) && matches!(next.kind, Kind::BetweenGateways)
-        });
+        let follows = cases
+            .get(index + 1)
+            .is_some_and(|next| is_named(next) && matches!(next.kind, Kind::BetweenGateways));
         is_named(&cases[index]) || follows || cases.iter().any(refers)
     };
     let kept: Vec<usize> = (0..cases.len()).filter(|index| is_wanted(*index)).collect();

@@ -171,7 +171,9 @@ impl Hosts {
         fs::create_dir_all(&folder)?;
         let domains = [Domain::create(&root(0))?, Domain::create(&root(1))?];
         let around = |domain: &Domain| -> Result<_, SetupError> {
-            Ok(Arc::new(Surroundings::new(Domain::open(domain.address())?)?))
+            Ok(Arc::new(Surroundings::new(Domain::open(
+                domain.address(),
+            )?)?))
         };
         Ok(Self {
             surroundings: [around(&domains[0])?, around(&domains[1])?],
@@ -213,11 +215,24 @@ impl Hosts {
     pub fn sinks(&mut self, plan: &Plan) -> Result<[RecordSink; 2], SetupError> {
         let channel = plan.channel_of(0);
         let [near, far] = &mut self.recorders;
-        let (near, far) = near.as_mut().zip(far.as_mut()).ok_or("recording has ended")?;
+        let (near, far) = near
+            .as_mut()
+            .zip(far.as_mut())
+            .ok_or("recording has ended")?;
         let capacity = 16_384;
         Ok([
-            near.sink(RecordKind::Egress, &channel, size_of::<EgressRecord>(), capacity)?,
-            far.sink(RecordKind::Ingress, &channel, size_of::<IngressRecord>(), capacity)?,
+            near.sink(
+                RecordKind::Egress,
+                &channel,
+                size_of::<EgressRecord>(),
+                capacity,
+            )?,
+            far.sink(
+                RecordKind::Ingress,
+                &channel,
+                size_of::<IngressRecord>(),
+                capacity,
+            )?,
         ])
     }
 
@@ -235,14 +250,18 @@ impl Hosts {
         for way in 0..2 {
             let addresses = [self.network.free_address(0)?, self.network.free_address(1)?];
             for host in 0..2 {
-                let side = if way == host { Side::Egress } else { Side::Ingress };
+                let side = if way == host {
+                    Side::Egress
+                } else {
+                    Side::Ingress
+                };
                 let mut launch = launch(&plan, way, side);
                 (launch.local, launch.peer) = (addresses[host], addresses[1 - host]);
                 let recorder = self.recorders[host].as_mut();
                 let recorder = recorder.expect("plans are added before recording starts");
-                let opened = self
-                    .network
-                    .on(host, || direction::open(&launch, recorder).map(|(_, one)| one))?;
+                let opened = self.network.on(host, || {
+                    direction::open(&launch, recorder).map(|(_, one)| one)
+                })?;
                 let slot = usize::from(side == Side::Ingress);
                 ends[host][slot] = Some((launch, opened));
             }

@@ -19,7 +19,9 @@ pub fn claim(cpu: usize) -> Vec<String> {
         timer_slack: Some(Duration::from_nanos(1)),
     });
     let refusals = grant.refusals();
-    refusals.map(|item| format!("{:?}: {:?}", item.item, item.outcome)).collect()
+    refusals
+        .map(|item| format!("{:?}: {:?}", item.item, item.outcome))
+        .collect()
 }
 
 /// One thread of a case.
@@ -62,11 +64,13 @@ impl Party {
 
     /// What it has used so far; any thread of the process may ask.
     pub fn used(&self) -> Used {
-        let read = |file: &str| {
-            fs::read_to_string(format!("/proc/self/task/{}/{file}", self.task)).ok()
-        };
-        let processor_ns = read("schedstat")
-            .and_then(|text| text.split_whitespace().next().and_then(|word| word.parse().ok()));
+        let read =
+            |file: &str| fs::read_to_string(format!("/proc/self/task/{}/{file}", self.task)).ok();
+        let processor_ns = read("schedstat").and_then(|text| {
+            text.split_whitespace()
+                .next()
+                .and_then(|word| word.parse().ok())
+        });
         let sleep_count = read("status").and_then(|text| {
             let line = text
                 .lines()

@@ -104,7 +104,7 @@ impl Workbench {
             receiver,
             payload: vec![7; plan.size_bytes],
             messages: vec![empty; BATCH],
-            datagrams: vec![Vec::with_capacity(2048); BATCH],
+            datagrams: (0..BATCH).map(|_| Vec::with_capacity(2048)).collect(),
             buffer: vec![0; 2048],
             _domains: domains,
         })
@@ -119,7 +119,11 @@ impl Workbench {
             self.near.output.publish(Instant::ZERO, &self.payload)?;
         }
         let taken = self.take()?;
-        let looked = timed(|| self.raw_input.receive(&mut |_, _| {}).is_ok_and(|some| !some));
+        let looked = timed(|| {
+            self.raw_input
+                .receive(&mut |_, _| {})
+                .is_ok_and(|some| !some)
+        });
         let encoded = self.encode();
         let sent = self.send();
         let stamped = timed(|| self.sender.next_stamp().is_some());
@@ -193,7 +197,11 @@ impl Workbench {
             sender, datagrams, ..
         } = self;
         let mut slots = datagrams.iter();
-        timed(|| slots.next().is_some_and(|datagram| sender.send(datagram).is_ok()))
+        timed(|| {
+            slots
+                .next()
+                .is_some_and(|datagram| sender.send(datagram).is_ok())
+        })
     }
 
     fn receive(&mut self) -> Timed {
@@ -214,7 +222,9 @@ impl Workbench {
             let mut is_delivered = false;
             if let Some(datagram) = slots.next() {
                 let mut deliver = |_: hil_gateways::protocol::Delivery<'_>| is_delivered = true;
-                ingress.on_datagram(now, arrival, datagram, &mut deliver).ok();
+                ingress
+                    .on_datagram(now, arrival, datagram, &mut deliver)
+                    .ok();
             }
             is_delivered
         })
@@ -284,10 +294,18 @@ fn bridges(
     let fingerprint = domains[1].fingerprint()?;
     let mut ingress = IngressBridge::new(IngressSettings::new(channel, 2, fingerprint, clock_id))?;
     let arrival = ArrivalStamps::application(now.as_ns());
-    let hello = egress.poll_transmit(now).ok_or("no greeting")?.datagram.to_vec();
+    let hello = egress
+        .poll_transmit(now)
+        .ok_or("no greeting")?
+        .datagram
+        .to_vec();
     let greeted = ingress.on_datagram(now, arrival, &hello, &mut |_| {});
     greeted.map_err(|refusal| format!("{refusal:?}"))?;
-    let answer = ingress.poll_transmit(now).ok_or("no answer")?.datagram.to_vec();
+    let answer = ingress
+        .poll_transmit(now)
+        .ok_or("no answer")?
+        .datagram
+        .to_vec();
     let accepted = egress.on_datagram(now, arrival, &answer);
     accepted.map_err(|refusal| format!("{refusal:?}"))?;
     while egress.poll_transmit(MonotonicClock::now()).is_some() {}

@@ -1,8 +1,8 @@
 //! Whose turn it is: the near thread picks a case, the far thread answers it and sleeps between
 //! cases. It times nothing but the round trips of [`ping`].
 
-use std::sync::{Mutex, PoisonError};
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::sync::{Mutex, PoisonError};
 use std::thread::{self, Thread};
 use std::time::{Duration, Instant};
 
@@ -134,7 +134,9 @@ pub fn ping(
         *count += 1;
         side.send(*count);
         let has_come = await_answer(side, *count);
-        turns.lost.fetch_add(u64::from(!has_come), Ordering::Relaxed);
+        turns
+            .lost
+            .fetch_add(u64::from(!has_come), Ordering::Relaxed);
         has_come.then(|| side.applications_ns())
     });
     turns.turn.store(IDLE, Ordering::Release);
@@ -176,7 +178,9 @@ fn sample(slice: Duration, mut round_trip: impl FnMut() -> Option<u64>) -> Round
         if let Some(of_applications) = of_applications {
             let whole = u64::try_from(elapsed).unwrap_or(u64::MAX);
             found.whole.push(whole);
-            found.between_gateways.push(whole.saturating_sub(of_applications));
+            found
+                .between_gateways
+                .push(whole.saturating_sub(of_applications));
         }
     }
     found

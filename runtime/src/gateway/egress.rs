@@ -213,7 +213,8 @@ impl Line {
         let slot = slot_of(token);
         let offset = self.clock.offset_ns;
         let pending = self.pending[slot].as_mut();
-        let Some(pending) = pending.filter(|one| stage == TransmitStage::Sent && one.token == token)
+        let Some(pending) =
+            pending.filter(|one| stage == TransmitStage::Sent && one.token == token)
         else {
             return true;
         };
