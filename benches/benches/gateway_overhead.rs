@@ -227,7 +227,7 @@ fn print_segments(
     title: &str,
     (plan, woken): (hil_benches::gateway::hosts::Plan, [Vec<u64>; 2]),
 ) -> Result<(), SetupError> {
-    let found = segments(hosts, &plan, woken)?;
+    let found = segments(hosts, &plan, &woken)?;
     println!("\n{title}: one way, microseconds (p50, p99, p99.9, max)");
     for (index, (name, quantiles)) in SEGMENTS.iter().zip(found).enumerate() {
         let Some(quantiles) = quantiles else {
@@ -292,6 +292,22 @@ fn report(
         .collect();
     let refused_far = setup.far.join().unwrap_or_default();
     println!("\nrecords dropped: {}", setup.hosts.finish_recording());
+    let stepped = cases
+        .iter()
+        .filter(|case| matches!(case.kind, Kind::BetweenGateways) && case.plan.is_stamped);
+    for case in stepped {
+        // Their channels are those of the case before.
+        let before = cases.iter().rfind(|other| {
+            matches!(other.kind, Kind::Gateway) && other.reference == case.reference
+        });
+        if let Some(before) = before {
+            print_segments(
+                &setup.hosts,
+                case.title,
+                (before.plan, [Vec::new(), Vec::new()]),
+            )?;
+        }
+    }
     for (case, woken) in woken {
         print_segments(&setup.hosts, case.title, (case.plan, woken))?;
     }

@@ -176,7 +176,7 @@ fn run(measured: &[RefCell<Measured>], rounds: usize) -> Comparison {
         .collect();
     let mut cases: Vec<_> = columns
         .iter_mut()
-        .map(|(name, round)| Case { name: *name, round })
+        .map(|(name, round)| Case { name, round })
         .collect();
     compare(rounds, &mut clock_batch, &mut cases)
 }

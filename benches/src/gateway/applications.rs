@@ -201,13 +201,13 @@ impl Crew {
         let mut samples = Vec::with_capacity(1 << 16);
         let mut due = MonotonicClock::now();
         for _ in 0..WARM_UP {
-            due = self.wait_for_tick(due, period);
+            due = wait_for_tick(due, period);
             self.round_trip();
         }
         let before: Vec<_> = self.parties.iter().map(|(party, _)| party.used()).collect();
         let end = MonotonicClock::now() + slice;
         while MonotonicClock::now() < end {
-            due = self.wait_for_tick(due, period);
+            due = wait_for_tick(due, period);
             let sent = MonotonicClock::now();
             if self.round_trip() {
                 let elapsed = MonotonicClock::now().ns_since(sent);
@@ -223,13 +223,6 @@ impl Crew {
             thread::sleep(Duration::from_millis(1));
         }
         samples
-    }
-
-    fn wait_for_tick(&self, due: Instant, period: Option<Duration>) -> Instant {
-        let Some(period) = period else { return due };
-        while MonotonicClock::sleep_until(due) == Wake::Interrupted {}
-        // A tick that was overslept by much is skipped, not made up for.
-        (due + period).max(MonotonicClock::now())
     }
 
     fn round_trip(&mut self) -> bool {
@@ -266,6 +259,13 @@ impl Crew {
             .unwrap_or_else(PoisonError::into_inner);
         [self.near.0.woken_after_ns, core::mem::take(&mut *far)]
     }
+}
+
+fn wait_for_tick(due: Instant, period: Option<Duration>) -> Instant {
+    let Some(period) = period else { return due };
+    while MonotonicClock::sleep_until(due) == Wake::Interrupted {}
+    // A tick that was overslept by much is skipped, not made up for.
+    (due + period).max(MonotonicClock::now())
 }
 
 fn far_application(berth: Berth, joint: &Joint, woken: Arc<Mutex<Vec<u64>>>) -> JoinHandle<()> {

@@ -29,7 +29,7 @@ pub const WAKE_UPS: [usize; 3] = [0, 4, 6];
 pub fn segments(
     hosts: &Hosts,
     plan: &Plan,
-    applications: [Vec<u64>; 2],
+    applications: &[Vec<u64>; 2],
 ) -> Result<[Option<Quantiles>; 7], SetupError> {
     let mut samples: [Vec<u64>; 7] = Default::default();
     for host in 0..2 {

@@ -80,15 +80,11 @@ impl EchoSide {
     /// # Errors
     /// When the kernel refuses a socket or an option.
     pub fn pair(network: &Network, plan: Plan) -> Result<[Self; 2], SetupError> {
-        let mut addresses = [[None; 2]; 2];
-        for (host, ports) in addresses.iter_mut().enumerate() {
-            for port in ports {
-                *port = Some(network.free_address(host)?);
-            }
-        }
-        let address = |host: usize, port: usize| -> SocketAddr {
-            addresses[host][port].expect("filled just above")
+        let ports = |host| -> io::Result<[SocketAddr; 2]> {
+            Ok([network.free_address(host)?, network.free_address(host)?])
         };
+        let addresses = [ports(0)?, ports(1)?];
+        let address = |host: usize, port: usize| addresses[host][port];
         let open = |host: usize| -> Result<Self, SetupError> {
             let settings = |own: usize, peer: usize| UdpSettings {
                 timestamps: if plan.is_stamped {

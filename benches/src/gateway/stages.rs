@@ -104,7 +104,7 @@ impl Workbench {
             receiver,
             payload: vec![7; plan.size_bytes],
             messages: vec![empty; BATCH],
-            datagrams: vec![Vec::with_capacity(2048); BATCH],
+            datagrams: (0..BATCH).map(|_| Vec::with_capacity(2048)).collect(),
             buffer: vec![0; 2048],
             _domains: domains,
         })
