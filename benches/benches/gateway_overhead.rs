@@ -251,6 +251,27 @@ fn print_segments(
     Ok(())
 }
 
+/// What a hop takes longer than the datagram alone, in microseconds.
+fn print_added(outcome: &Comparison, cases: &[CasePlan]) {
+    for (row, case) in outcome.rows.iter().zip(cases) {
+        let reference = &outcome.rows[case.reference];
+        let pairs = row.round_p50_ns.iter().zip(&reference.round_p50_ns);
+        let mut added: Vec<i64> = pairs
+            .filter_map(|(own, floor)| Some((own.checked_signed_diff(*floor)?) / 2))
+            .collect();
+        added.sort_unstable();
+        if matches!(case.kind, Kind::BetweenGateways)
+            && let Some(ns) = added.get(added.len() / 2)
+        {
+            println!("{}: {:.2} us more per hop", case.title, *ns as f64 * 1e-3);
+            println!(
+                "{}",
+                json!({"bench": BENCH, "case": case.title, "added_per_hop_ns": ns})
+            );
+        }
+    }
+}
+
 fn print_coverage(setup: &Setup, cases: &[CasePlan]) {
     let coverage = setup.near.iter().zip(cases).filter_map(|(end, case)| {
         let (stamped, all) = end.stamp_coverage()?;
@@ -274,6 +295,7 @@ fn report(
     println!("\nround trips (one way for `one hop`); the floor is a cache line's round trip,");
     println!("the reference of a gateway row the UDP echo above it");
     println!("{}", table(outcome, &references));
+    print_added(outcome, cases);
     println!("messages lost: {}", setup.turns.lost_count());
     print_coverage(&setup, cases);
     print_usage(&setup, cases);

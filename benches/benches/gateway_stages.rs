@@ -200,6 +200,8 @@ fn report(outcome: &Comparison, size: usize, rows: &[Row]) {
     let whole = whole.map(|(sending, receiving)| sending + receiving);
     let text = |ns: Option<u64>| ns.map_or("unavailable".to_owned(), |ns| format!("{ns} ns"));
     println!("{size} B: not a socket call, in sum: {}", text(own));
+    let shared_memory = sum_ns(rows, |stage| stage.is_shared_memory);
+    println!("{size} B: of that shared memory: {}", text(shared_memory));
     println!("{size} B: three socket calls: {}", text(calls));
     println!("{size} B: whole hop by Direction::step: {}", text(whole));
     let beside = own.zip(calls).zip(whole);
@@ -210,7 +212,8 @@ fn report(outcome: &Comparison, size: usize, rows: &[Row]) {
     );
     println!(
         "{}",
-        json!({"bench": BENCH, "size_bytes": size, "own_sum_ns": own, "socket_calls_ns": calls,
+        json!({"bench": BENCH, "size_bytes": size, "own_sum_ns": own,
+            "shared_memory_ns": shared_memory, "socket_calls_ns": calls,
             "whole_hop_ns": whole, "floor_p50_ns": outcome.floor.quantiles.map(|q| q.p50_ns)})
     );
     if size == 64 {

@@ -30,14 +30,24 @@ pub struct Stage {
     pub name: &'static str,
     /// A system call on a socket; the rest is what the gateway adds.
     pub is_socket_call: bool,
+    /// Work of iceoryx2, which any program on such a channel has done.
+    pub is_shared_memory: bool,
     /// How often a hop does it.
     pub per_hop: u64,
 }
 
-const fn stage(name: &'static str, is_socket_call: bool, per_hop: u64) -> Stage {
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Whose {
+    Socket,
+    SharedMemory,
+    Own,
+}
+
+const fn stage(name: &'static str, whose: Whose, per_hop: u64) -> Stage {
     Stage {
         name,
-        is_socket_call,
+        is_socket_call: matches!(whose, Whose::Socket),
+        is_shared_memory: matches!(whose, Whose::SharedMemory),
         per_hop,
     }
 }
@@ -45,16 +55,16 @@ const fn stage(name: &'static str, is_socket_call: bool, per_hop: u64) -> Stage 
 /// All stages in the order of the way. The clock is read when a message is taken, handed to the
 /// kernel, received and published. A look at the empty channel is waiting and no part of a hop.
 pub const STAGES: [Stage; 10] = [
-    stage("receive from shared memory", false, 1),
-    stage("look at the empty channel", false, 0),
-    stage("bridge: take and encode", false, 1),
-    stage("send call", true, 1),
-    stage("error queue read (TX stamp)", true, 1),
-    stage("receive call", true, 1),
-    stage("bridge: decode and window", false, 1),
-    stage("loan and publish", false, 1),
-    stage("record pushes, both ends", false, 1),
-    stage("clock read", false, 4),
+    stage("receive from shared memory", Whose::SharedMemory, 1),
+    stage("look at the empty channel", Whose::SharedMemory, 0),
+    stage("bridge: take and encode", Whose::Own, 1),
+    stage("send call", Whose::Socket, 1),
+    stage("error queue read (TX stamp)", Whose::Socket, 1),
+    stage("receive call", Whose::Socket, 1),
+    stage("bridge: decode and window", Whose::Own, 1),
+    stage("loan and publish", Whose::SharedMemory, 1),
+    stage("record pushes, both ends", Whose::Own, 1),
+    stage("clock read", Whose::Own, 4),
 ];
 
 /// What the stages work with.
