@@ -318,8 +318,10 @@ mod tests {
         command.args(["-c", "read line", "sh"]).arg(&path);
         command.stdin(std::process::Stdio::piped());
         let mut child = command.spawn().unwrap();
-        let found = processes_mentioning(&path.to_string_lossy());
-        assert_eq!(found.len(), 1, "{found:?}");
+        // A new program runs a moment before the kernel knows its command line.
+        wait_until(Duration::from_secs(20), "the process", || {
+            processes_mentioning(&path.to_string_lossy()).len() == 1
+        });
         child.kill().unwrap();
         wait_until(Duration::from_secs(20), "the end of the process", || {
             processes_mentioning(&path.to_string_lossy()).is_empty()
