@@ -118,7 +118,7 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
     };
     if args.check {
         console.result(&format!(
-            "{}: fit to run\n{}",
+            "{}: the file is valid; it comes to\n\n{}",
             path.display(),
             topology.to_toml()
         ));
@@ -189,12 +189,13 @@ fn exit_code_of_error(error: &RunError) -> u8 {
         RunError::Peer(PeerError::Absent { .. } | PeerError::Connection { .. }) => {
             exit::PEER_ABSENT
         }
-        RunError::Peer(
+        RunError::Folder { .. }
+        | RunError::Peer(
             PeerError::Mismatch { .. } | PeerError::Listen { .. } | PeerError::Own { .. },
         ) => exit::USAGE,
         RunError::Peer(PeerError::Interrupted { .. }) => interrupted(),
         RunError::Start(_) => exit::FAILED,
-        RunError::Folder { .. } | RunError::Domains(_) | RunError::Identity(_) => exit::INTERNAL,
+        RunError::Domains(_) | RunError::Identity(_) => exit::INTERNAL,
     }
 }
 
@@ -261,7 +262,13 @@ fn show_report(run: &Path, json: bool, console: &mut Console) -> u8 {
     let text = match fs::read_to_string(folder.summary()) {
         Ok(text) => text,
         Err(error) => {
-            console.error(&format!("{}: {error}", folder.summary().display()));
+            let path = folder.summary();
+            let text = if folder.manifest().is_file() {
+                "this run never began or was killed outright, so it left no summary".to_owned()
+            } else {
+                format!("not a run's folder: {error}")
+            };
+            console.error(&format!("{}: {text}", path.display()));
             return exit::USAGE;
         }
     };

@@ -119,8 +119,8 @@ fn shell_words(words: &[String]) -> String {
 
 pub(super) fn process_summary(process: &ProcessStory) -> ProcessSummary {
     let report = process.report.as_ref();
-    // A gateway has no period of its own.
-    let ticking = report.filter(|report| report.directions.is_empty());
+    // A gateway has no period of its own, and a component that messages drive has none either.
+    let ticking = report.filter(|report| report.ticks + report.skipped_ticks > 0);
     ProcessSummary {
         name: process.name.clone(),
         host: process.host.clone(),

@@ -4,7 +4,7 @@
 use hil_models::measure::account::{ChannelAccount, ClosingFigures, Coverage, MessageFate};
 use serde::{Deserialize, Serialize};
 
-use super::summary::{ChannelSummary, LinkKind, ProcessSummary, RunSummary};
+use super::summary::{ChannelSummary, Fact, LinkKind, Outcome, ProcessSummary, RunSummary};
 use super::terminal::{JOINT, grouped, percent};
 
 /// Share of skipped ticks above which the host, not the network, shaped the run.
@@ -20,8 +20,12 @@ const STAMPED_RATIO_MIN: f64 = 0.99;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "state", rename_all = "snake_case")]
 pub enum NetworkVerdict {
+    /// The run did not take place as planned.
+    RunFailed,
     /// No channel went over a network.
     NoNetwork,
+    /// Channels went over emulated links only.
+    EmulatedLink,
     /// The host kept its ticks: what remains is the network's.
     NetworkResult,
     /// A process skipped too many ticks: the run says nothing about the network.
@@ -29,7 +33,7 @@ pub enum NetworkVerdict {
         /// The processes that did.
         processes: Vec<Overrun>,
     },
-    /// No process reported its ticks, so nobody can tell.
+    /// A component left no report, so nobody can tell whether it kept its ticks.
     TicksUnknown,
 }
 
@@ -63,25 +67,42 @@ impl Assessment {
         warnings.extend(summary.warnings.iter().cloned());
         warnings.extend(summary.processes.iter().flat_map(process_warnings));
         warnings.extend(summary.channels.iter().flat_map(channel_warnings));
-        let is_networked = |channel: &ChannelSummary| channel.link != LinkKind::SharedMemory;
-        let has_ticks = |process: &ProcessSummary| process.tick_count.is_some();
-        let network = if !overruns.is_empty() {
-            NetworkVerdict::HostOverran {
-                processes: overruns,
-            }
-        } else if !summary.channels.iter().any(is_networked) {
-            NetworkVerdict::NoNetwork
-        } else if summary.processes.iter().any(has_ticks) {
-            NetworkVerdict::NetworkResult
-        } else {
-            NetworkVerdict::TicksUnknown
-        };
+        warnings.extend(summary.realtime.refused.iter().map(refused_warning));
+        let network = verdict(summary, overruns);
         // The joint is for pages; in JSON it would only surprise.
         for warning in &mut warnings {
             *warning = warning.replace(JOINT, " ");
         }
         Self { network, warnings }
     }
+}
+
+fn verdict(summary: &RunSummary, overruns: Vec<Overrun>) -> NetworkVerdict {
+    let has = |link: LinkKind| summary.channels.iter().any(|channel| channel.link == link);
+    // A gateway keeps no ticks; a component that was killed took its count with it.
+    let is_silent = |process: &ProcessSummary| {
+        process.role != "gateway" && process.role != "own program" && process.cpu_time_s.is_none()
+    };
+    let has_ticks = |process: &ProcessSummary| process.tick_count.is_some();
+    if summary.run.outcome == Outcome::Failed {
+        NetworkVerdict::RunFailed
+    } else if !has(LinkKind::Udp) && !has(LinkKind::Emulated) {
+        NetworkVerdict::NoNetwork
+    } else if !overruns.is_empty() {
+        NetworkVerdict::HostOverran {
+            processes: overruns,
+        }
+    } else if summary.processes.iter().any(is_silent) || !summary.processes.iter().any(has_ticks) {
+        NetworkVerdict::TicksUnknown
+    } else if has(LinkKind::Udp) {
+        NetworkVerdict::NetworkResult
+    } else {
+        NetworkVerdict::EmulatedLink
+    }
+}
+
+fn refused_warning(refused: &Fact) -> String {
+    format!("{}: {}", refused.value, refused.label)
 }
 
 fn overrun(process: &ProcessSummary) -> Option<Overrun> {

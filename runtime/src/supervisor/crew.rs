@@ -4,6 +4,7 @@
 use std::collections::BTreeMap;
 use std::env;
 use std::io;
+use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitStatus};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
@@ -344,9 +345,12 @@ impl Crew {
                 self.listen();
                 std::thread::sleep(Duration::from_millis(1));
             }
-            let end = child
-                .poll_exit()
-                .map_or_else(|| "ended".to_owned(), describe_exit);
+            let end = match child.poll_exit() {
+                // What a program of the user's does when it is told to stop.
+                Some(status) if status.signal() == Some(libc::SIGTERM) => "stopped".to_owned(),
+                Some(status) => describe_exit(status),
+                None => "ended".to_owned(),
+            };
             if !ended_by_itself {
                 let text = format!(
                     "did not stop within {} s and was killed",

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use socket2::{Domain, Socket, Type};
 
 use super::frame::{Frame, PeerHello, PeerMessage, read_frame, write_message};
-use super::peer::{Peer, SILENCE_MAX};
+use super::peer::Peer;
 
 /// How often a host that cannot connect yet tries again.
 const RETRY_PERIOD: Duration = Duration::from_millis(200);
@@ -280,7 +280,7 @@ fn read_hello(stream: TcpStream) -> io::Result<(TcpStream, PeerMessage)> {
     stream.set_nonblocking(false)?;
     stream.set_nodelay(true)?;
     stream.set_read_timeout(Some(GREETING_TIMEOUT))?;
-    stream.set_write_timeout(Some(SILENCE_MAX))?;
+    stream.set_write_timeout(Some(GREETING_TIMEOUT))?;
     let mut input = &stream;
     match read_frame(&mut input)? {
         Frame::Message(message) => Ok((stream, message)),
@@ -293,16 +293,18 @@ fn read_hello(stream: TcpStream) -> io::Result<(TcpStream, PeerMessage)> {
 
 /// Why two hosts cannot share a run.
 fn misfit(ours: &PeerHello, theirs: &PeerHello) -> Option<String> {
+    let (our_name, their_name) = (&ours.host, &theirs.host);
     if ours.version != theirs.version {
         return Some(format!(
-            "version {} here, {} on {}; install the same on both",
-            ours.version, theirs.version, theirs.host
+            "version {} on {our_name}, {} on {their_name}; install the same on both",
+            ours.version, theirs.version
         ));
     }
     if ours.topology_hash != theirs.topology_hash {
         return Some(format!(
-            "topology {:016x} here, {:016x} on {}; use the same file and the same --set on both",
-            ours.topology_hash, theirs.topology_hash, theirs.host
+            "topology {:016x} on {our_name}, {:016x} on {their_name}; use the same file and the \
+             same --set on both (--check prints what a file comes to)",
+            ours.topology_hash, theirs.topology_hash
         ));
     }
     (ours.domain == theirs.domain).then(|| {

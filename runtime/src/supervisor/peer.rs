@@ -9,8 +9,6 @@ use std::time::{Duration, Instant};
 
 use super::frame::{Frame, PeerHello, PeerMessage, read_frame, write_message};
 
-/// A connected peer that says nothing for this long counts as gone.
-pub(crate) const SILENCE_MAX: Duration = Duration::from_secs(3);
 /// Frames that may wait between the reader thread and the supervisor.
 const INBOX_FRAMES: usize = 256;
 
@@ -106,6 +104,9 @@ fn forward(input: TcpStream, out: &SyncSender<PeerEvent>) {
     loop {
         let event = match read_frame(&mut input) {
             Ok(frame) => PeerEvent::Frame(frame),
+            Err(error) if error.kind() == io::ErrorKind::UnexpectedEof => {
+                PeerEvent::Closed("it closed the connection".to_owned())
+            }
             Err(error) => PeerEvent::Closed(error.to_string()),
         };
         let is_last = matches!(event, PeerEvent::Closed(_));

@@ -16,7 +16,7 @@ use super::exchange::exchange;
 use super::frame::{Frame, PeerHello, PeerMessage};
 use super::meet::{Meeting, meet};
 use super::outcome::{Heard, Outcome, RunError, RunOptions, RunResult};
-use super::peer::{Peer, PeerEvent, SILENCE_MAX};
+use super::peer::{Peer, PeerEvent};
 use super::plan::plan;
 use crate::channel::clock_id;
 use crate::clock::MonotonicClock;
@@ -35,6 +35,8 @@ const ALIVE_PERIOD: Duration = Duration::from_millis(500);
 const PROGRESS_PERIOD: Duration = Duration::from_millis(500);
 /// How long components and gateways may take to end in order.
 const STOP_PATIENCE: Duration = Duration::from_secs(3);
+/// How long the other hosts wait for the first host's word that the time is up.
+const END_GRACE: Duration = Duration::from_secs(3);
 /// Time for what is still under way when the components have stopped.
 const DRAIN: Duration = Duration::from_millis(200);
 
@@ -164,7 +166,11 @@ fn gather_peers(
     };
     let peers = meet(&meeting, &hello, &mut |missing, waited| {
         let waited_s = waited.as_secs();
-        let role = if is_first { "at" } else { "to answer at" };
+        let role = if is_first {
+            "to connect to"
+        } else {
+            "to answer at"
+        };
         console.progress(&format!(
             "waiting for {missing} {role} {address} ({waited_s} s)"
         ));
@@ -269,7 +275,7 @@ impl Session<'_> {
             let grace = if self.is_first_host {
                 Duration::ZERO
             } else {
-                SILENCE_MAX
+                END_GRACE
             };
             if elapsed >= duration + grace {
                 return Outcome::Completed;
@@ -330,8 +336,9 @@ impl Session<'_> {
                     }
                 }
             }
-            if !peer.is_quiet && peer.silence() > SILENCE_MAX {
-                let silence_s = SILENCE_MAX.as_secs();
+            let silence_max = self.topology.run().peer_timeout;
+            if !peer.is_quiet && peer.silence() > silence_max {
+                let silence_s = silence_max.as_secs();
                 heard.push(Heard::Lost(format!(
                     "{host} has been silent for {silence_s} s"
                 )));
@@ -354,7 +361,7 @@ impl Session<'_> {
         {
             counts.insert((&progress.channel, &progress.what), progress.count);
         }
-        let channels = self.topology.channels().iter().map(|channel| {
+        let channels = self.topology.channels().iter().filter_map(|channel| {
             let told = ["published", "sent", "received", "taken"]
                 .iter()
                 .filter_map(|what| {
@@ -362,7 +369,8 @@ impl Session<'_> {
                         .get(&(channel.name.as_str(), *what))
                         .map(|count| format!("{what} {count}"))
                 });
-            format!("{}: {}", channel.name, told.collect::<Vec<_>>().join(", "))
+            let told = told.collect::<Vec<_>>().join(", ");
+            (!told.is_empty()).then(|| format!("{}: {told}", channel.name))
         });
         let channels = channels.collect::<Vec<_>>().join(" | ");
         let (elapsed_s, total_s) = (elapsed.as_secs_f64(), duration.as_secs_f64());

@@ -131,6 +131,7 @@ fn read_run(reader: Option<Reader<'_>>) -> Run {
         seed: limits::RUN_SEED.default.unsigned_abs(),
         record_folder: "runs".to_owned(),
         start_timeout: limits::RUN_START_TIMEOUT.default,
+        peer_timeout: limits::RUN_PEER_TIMEOUT.default,
     };
     let Some(mut reader) = reader else {
         return run;
@@ -150,6 +151,9 @@ fn read_run(reader: Option<Reader<'_>>) -> Run {
     }
     if let Some(timeout) = reader.duration("start_timeout", &limits::RUN_START_TIMEOUT) {
         run.start_timeout = timeout;
+    }
+    if let Some(timeout) = reader.duration("peer_timeout", &limits::RUN_PEER_TIMEOUT) {
+        run.peer_timeout = timeout;
     }
     reader.finish();
     run

@@ -31,6 +31,8 @@ pub(super) const VERSION: Limit<i64> = limit(1, 1, 1);
 pub(super) const RUN_DURATION: Limit<Duration> = limit(ms(20_000), ms(100), ms(7 * 86_400_000));
 pub(super) const RUN_SEED: Limit<i64> = limit(1, 0, i64::MAX);
 pub(super) const RUN_START_TIMEOUT: Limit<Duration> = limit(ms(30_000), ms(1_000), ms(3_600_000));
+/// Long enough for a radio to roam; a host that really vanished is noticed within half a minute.
+pub(super) const RUN_PEER_TIMEOUT: Limit<Duration> = limit(ms(30_000), ms(1_000), ms(3_600_000));
 
 pub(super) const HOST_CONTROL_PORT: Limit<i64> = limit(7_399, 1_024, 65_535);
 
@@ -132,7 +134,13 @@ mod tests {
         ] {
             assert!(limit.allows(&limit.default), "{limit:?}");
         }
-        for limit in [RUN_DURATION, RUN_START_TIMEOUT, TIMER_SLACK, LINK_DELAY] {
+        for limit in [
+            RUN_DURATION,
+            RUN_START_TIMEOUT,
+            RUN_PEER_TIMEOUT,
+            TIMER_SLACK,
+            LINK_DELAY,
+        ] {
             assert!(limit.allows(&limit.default), "{limit:?}");
         }
         assert!(LINK_LOSS_RATIO.allows(&LINK_LOSS_RATIO.default));

@@ -32,6 +32,8 @@ pub struct Run {
     pub record_folder: String,
     /// How long a host waits for its peers before the run starts.
     pub start_timeout: Duration,
+    /// How long a host may be silent during the run before it counts as gone.
+    pub peer_timeout: Duration,
 }
 
 /// `[case]`: the case study.

@@ -67,6 +67,7 @@ impl Topology {
         put(&mut table, "seed", integer(run.seed));
         put(&mut table, "record", run.record_folder.as_str());
         put(&mut table, "start_timeout", duration(run.start_timeout));
+        put(&mut table, "peer_timeout", duration(run.peer_timeout));
         table
     }
 }

@@ -67,10 +67,20 @@ fn fates(canvas: &mut Canvas, account: &ChannelAccount) {
         canvas.paragraph(INDENT, Tone::Caution, "no message was published");
         return;
     }
-    let title = format!(
-        "{} messages published, and what became of them",
-        grouped(total)
-    );
+    // Without the producer's records, messages after the last one seen are not counted.
+    let is_total_known = account.published_unrecorded_count.is_some();
+    let title = if is_total_known {
+        format!(
+            "{} messages published, and what became of them",
+            grouped(total)
+        )
+    } else {
+        format!(
+            "{} messages known here; how many were published is not: the producer's records are \
+             not at hand",
+            grouped(total)
+        )
+    };
     canvas.paragraph(INDENT, Tone::Faint, &title);
     let bar_width = canvas.width() - INDENT - 38 - 12 - 10 - BAR_GAP;
     for (fate, count) in account.fates.iter() {
@@ -86,7 +96,14 @@ fn fates(canvas: &mut Canvas, account: &ChannelAccount) {
             "",
             canvas.paint(tone, &left(fate.label(), 38)),
             right(&grouped(count), 12),
-            right(&percent(ratio), 10),
+            right(
+                &if is_total_known {
+                    percent(ratio)
+                } else {
+                    String::new()
+                },
+                10
+            ),
             "",
             canvas.paint(Tone::Bar, &bar(0.0, ratio, bar_width))
         );

@@ -82,6 +82,17 @@ fn verdict(canvas: &mut Canvas, summary: &RunSummary, assessment: &Assessment) {
 fn network_words(verdict: &NetworkVerdict) -> (Tone, String) {
     let limit = percent(SKIPPED_TICK_RATIO_MAX);
     match verdict {
+        NetworkVerdict::RunFailed => {
+            let text = "no verdict: the run failed";
+            (Tone::Caution, text.to_owned())
+        }
+        NetworkVerdict::EmulatedLink => {
+            let text = format!(
+                "an emulated link: a result about the model, not about a network; no process \
+                 skipped more than {limit} of its ticks"
+            );
+            (Tone::Good, text)
+        }
         NetworkVerdict::NoNetwork => {
             let text = "no channel went over a network; nothing here says anything about one";
             (Tone::Plain, text.to_owned())
@@ -104,7 +115,7 @@ fn network_words(verdict: &NetworkVerdict) -> (Tone, String) {
             (Tone::Bad, text)
         }
         NetworkVerdict::TicksUnknown => {
-            let text = "cannot be called a network result: no process reported its ticks";
+            let text = "no verdict: a component left no count of its ticks";
             (Tone::Caution, text.to_owned())
         }
     }
