@@ -291,6 +291,7 @@ fn ingress(
     let (messages, follow_ups) = sinks;
     Ok(Ingress {
         receiver,
+        is_emulated: launch.emulation.is_some(),
         bridge: IngressBridge::new(settings)?,
         output: RawOutput::open(&around.domain, &launch.channel, true)?,
         wait: WaitStrategy::new(launch.wait),

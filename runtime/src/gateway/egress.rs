@@ -45,11 +45,12 @@ pub(crate) struct Egress {
     pub(crate) attention: Attention,
 }
 
-/// When to look after the socket: asking it costs system calls that a waiting message would have
-/// to wait for.
+/// What waiting found: to look after the socket costs system calls that a waiting message would
+/// have to wait for, and so does taking back announcements.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Attention {
     has_news: bool,
+    is_announced: bool,
     looked: Instant,
 }
 
@@ -152,8 +153,12 @@ impl Line {
                     }
                 }
             }
+            // Asked before the clock is read again: after most messages nothing is due.
+            if bridge.next_wakeup().is_none_or(|due| due > handed) {
+                break;
+            }
         }
-        self.take_stamps(bridge);
+        self.take_due_stamps(bridge);
     }
 
     fn expect_stamp(
@@ -183,43 +188,57 @@ impl Line {
         self.pending_count += 1;
     }
 
-    /// Takes stamps without blocking; a record is complete when all it waits for has come.
+    /// Takes the stamps that are still to come, as far as they have come; asks no further, as
+    /// each look is a system call.
+    fn take_due_stamps(&mut self, bridge: &mut EgressBridge) {
+        while self.pending_count > 0 && self.take_stamp(bridge) {}
+    }
+
+    /// Takes every stamp there is, and with them the reports of the network.
     fn take_stamps(&mut self, bridge: &mut EgressBridge) {
-        while let Some(TransmitStamp {
+        while self.take_stamp(bridge) {}
+    }
+
+    /// Takes one stamp without blocking, false when there is none; a record is complete when all
+    /// it waits for has come.
+    fn take_stamp(&mut self, bridge: &mut EgressBridge) -> bool {
+        let Some(TransmitStamp {
             token,
             stage,
             stamps,
         }) = self.sender.next_stamp()
-        {
-            if stage != TransmitStage::Sent {
-                continue;
-            }
-            let slot = slot_of(token);
-            let offset = self.clock.offset_ns;
-            let Some(pending) = self.pending[slot].as_mut().filter(|one| one.token == token) else {
-                continue;
-            };
-            if let Some(software_ns) = stamps.software_ns {
-                let first_handed = pending
-                    .record
-                    .map_or(pending.handed.as_ns(), |record| record.handed_ns);
-                bridge.on_transmit_stamp(
-                    pending.kind,
-                    pending.sequence,
-                    software_ns - offset - first_handed,
-                );
-            }
-            let mut is_complete = !self.wants_hardware;
-            if let Some(record) = &mut pending.record {
-                record.tx_software_ns = stamps.software_ns.unwrap_or(record.tx_software_ns);
-                record.tx_hardware_ns = stamps.hardware_ns.unwrap_or(record.tx_hardware_ns);
-                is_complete = record.tx_software_ns != UNAVAILABLE
-                    && (record.tx_hardware_ns != UNAVAILABLE || !self.wants_hardware);
-            }
-            if is_complete && let Some(pending) = self.pending[slot].take() {
-                self.retire(pending);
-            }
+        else {
+            return false;
+        };
+        let slot = slot_of(token);
+        let offset = self.clock.offset_ns;
+        let pending = self.pending[slot].as_mut();
+        let Some(pending) =
+            pending.filter(|one| stage == TransmitStage::Sent && one.token == token)
+        else {
+            return true;
+        };
+        if let Some(software_ns) = stamps.software_ns {
+            let first_handed = pending
+                .record
+                .map_or(pending.handed.as_ns(), |record| record.handed_ns);
+            bridge.on_transmit_stamp(
+                pending.kind,
+                pending.sequence,
+                software_ns - offset - first_handed,
+            );
         }
+        let mut is_complete = !self.wants_hardware;
+        if let Some(record) = &mut pending.record {
+            record.tx_software_ns = stamps.software_ns.unwrap_or(record.tx_software_ns);
+            record.tx_hardware_ns = stamps.hardware_ns.unwrap_or(record.tx_hardware_ns);
+            is_complete = record.tx_software_ns != UNAVAILABLE
+                && (record.tx_hardware_ns != UNAVAILABLE || !self.wants_hardware);
+        }
+        if is_complete && let Some(pending) = self.pending[slot].take() {
+            self.retire(pending);
+        }
+        true
     }
 
     /// A host without a listener answers with a report instead of a reply; reading stamps swallows
@@ -304,17 +323,16 @@ impl Egress {
         Ok(())
     }
 
-    /// Sends what waits, or else looks after stamps, replies and appointments.
+    /// Sends one waiting message, or else looks after stamps, replies and appointments; false when
+    /// no message waited and none was announced.
     pub(crate) fn step(&mut self) -> Result<bool, GatewayError> {
         if self.forward()? {
             return Ok(true);
         }
         let now = MonotonicClock::now();
         if self.attention.has_news || now.ns_since(self.attention.looked) > LOOK_PERIOD_NS {
-            self.attention = Attention {
-                has_news: false,
-                looked: now,
-            };
+            self.attention.has_news = false;
+            self.attention.looked = now;
             self.line.take_stamps(&mut self.bridge);
             self.line.notice_reports(&mut self.bridge, now);
             self.hear()?;
@@ -324,10 +342,16 @@ impl Egress {
         if self.bridge.next_wakeup().is_some_and(|due| due <= now) {
             self.line.transmit(&mut self.bridge);
         }
-        Ok(false)
+        // Announcements are taken back only now, for the message waited for its datagram, not
+        // for this. A message published before they were is seen by the look that follows.
+        let was_announced = core::mem::take(&mut self.attention.is_announced);
+        if was_announced && let Some(waiter) = &mut self.waiter {
+            waiter.drain()?;
+        }
+        Ok(was_announced)
     }
 
-    /// Sends every waiting message; false when none waited.
+    /// Sends the oldest waiting message; false when none waited.
     fn forward(&mut self) -> Result<bool, GatewayError> {
         let Self {
             input,
@@ -337,43 +361,37 @@ impl Egress {
             sent,
             ..
         } = self;
-        let mut moved = false;
-        loop {
-            let mut take = |envelope: &Envelope, payload: &[u8]| {
-                let taken = MonotonicClock::now();
-                wait.on_arrival(taken);
-                let record = EgressRecord {
-                    sequence: envelope.sequence,
-                    published_ns: envelope.published_ns,
-                    taken_ns: taken.as_ns(),
-                    handed_ns: UNAVAILABLE,
-                    tx_software_ns: UNAVAILABLE,
-                    tx_hardware_ns: UNAVAILABLE,
-                    realtime_offset_ns: line.clock.offset_ns,
-                    epoch: envelope.epoch,
-                    session: line.session,
-                    flags: 0,
-                    fragment_count: 0,
-                };
-                match bridge.on_local(taken, envelope, payload) {
-                    Ok(()) => {
-                        line.message = Some(record);
-                        line.transmit(bridge);
-                        sent.fetch_add(1, Ordering::Relaxed);
-                    }
-                    // Another gateway's message: not this gateway's to account for.
-                    Err(LocalRefusal::Forwarded) => {}
-                    Err(_counted) => line.finish(EgressRecord {
-                        flags: EgressRecord::REFUSED_BY_KERNEL,
-                        ..record
-                    }),
-                }
+        let mut take = |envelope: &Envelope, payload: &[u8]| {
+            let taken = MonotonicClock::now();
+            wait.on_arrival(taken);
+            let record = EgressRecord {
+                sequence: envelope.sequence,
+                published_ns: envelope.published_ns,
+                taken_ns: taken.as_ns(),
+                handed_ns: UNAVAILABLE,
+                tx_software_ns: UNAVAILABLE,
+                tx_hardware_ns: UNAVAILABLE,
+                realtime_offset_ns: line.clock.offset_ns,
+                epoch: envelope.epoch,
+                session: line.session,
+                flags: 0,
+                fragment_count: 0,
             };
-            if !input.receive(&mut take)? {
-                return Ok(moved);
+            match bridge.on_local(taken, envelope, payload) {
+                Ok(()) => {
+                    line.message = Some(record);
+                    line.transmit(bridge);
+                    sent.fetch_add(1, Ordering::Relaxed);
+                }
+                // Another gateway's message: not this gateway's to account for.
+                Err(LocalRefusal::Forwarded) => {}
+                Err(_counted) => line.finish(EgressRecord {
+                    flags: EgressRecord::REFUSED_BY_KERNEL,
+                    ..record
+                }),
             }
-            moved = true;
-        }
+        };
+        Ok(input.receive(&mut take)?)
     }
 
     /// Takes the peer's replies.
@@ -435,10 +453,13 @@ impl Egress {
                 let socket = self.line.sender.poll_fd();
                 let [is_announced, has_socket_news] =
                     poll_descriptors(listeners.chain(socket), until)?;
+                // Without a waiter the socket comes first.
+                let (is_announced, has_socket_news) = match self.waiter {
+                    Some(_) => (is_announced, has_socket_news),
+                    None => (false, is_announced),
+                };
                 self.attention.has_news |= has_socket_news;
-                if is_announced && let Some(waiter) = &mut self.waiter {
-                    waiter.drain()?;
-                }
+                self.attention.is_announced |= is_announced;
             }
         }
         Ok(())

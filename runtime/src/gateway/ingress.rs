@@ -20,13 +20,12 @@ use crate::clock::MonotonicClock;
 use crate::record::RecordSink;
 use crate::wait::{Pause, WaitStrategy};
 
-/// Datagrams taken in one go before replies and orders get their turn.
-const BURST_MAX: usize = 64;
-
 /// Everything the thread works with.
 #[derive(Debug)]
 pub(crate) struct Ingress {
     pub(crate) receiver: Box<dyn DatagramReceiver>,
+    /// The receiver holds datagrams back, so it must be told the time.
+    pub(crate) is_emulated: bool,
     pub(crate) bridge: IngressBridge,
     pub(crate) output: RawOutput,
     pub(crate) wait: WaitStrategy,
@@ -90,28 +89,30 @@ impl Ingress {
         Ok(())
     }
 
-    /// Delivers what waits and answers what asks; false when nothing waited.
+    /// Delivers one waiting datagram, or else does what is due; false when none waited. Asking
+    /// for a second one at once would cost a system call that a message just delivered, or the
+    /// thread's other work, would have to wait for.
     pub(crate) fn step(&mut self) -> Result<bool, GatewayError> {
-        let mut moved = false;
-        for _ in 0..BURST_MAX {
-            if !self.take()? {
-                break;
+        if self.take()? {
+            if self.bridge.has_reply() {
+                self.answer();
             }
-            moved = true;
+            return Ok(true);
         }
-        if moved {
-            self.answer();
-        } else {
-            let now = MonotonicClock::now();
-            self.bridge.on_wakeup(now);
-            self.refresh_clock(now);
-        }
-        Ok(moved)
+        let now = MonotonicClock::now();
+        self.bridge.on_wakeup(now);
+        self.refresh_clock(now);
+        Ok(false)
     }
 
     /// Takes one datagram; false when none waits.
     fn take(&mut self) -> Result<bool, GatewayError> {
-        let now = MonotonicClock::now();
+        // Only a link model asks what time it is.
+        let now = if self.is_emulated {
+            MonotonicClock::now()
+        } else {
+            Instant::ZERO
+        };
         let Some(received) = self
             .receiver
             .receive(now, &mut self.buffer)

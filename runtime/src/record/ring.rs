@@ -27,21 +27,23 @@ pub struct RecordSink {
 impl RecordSink {
     /// Stores one record.
     pub fn push<T: Pod>(&mut self, record: &T) {
-        self.push_parts(bytemuck::bytes_of(record), &[]);
+        let stored = self.ring.push_entire_slice(bytemuck::bytes_of(record));
+        self.count_unless(stored.is_ok());
     }
 
     /// Stores one message: envelope and payload.
     pub fn push_message(&mut self, envelope: &Envelope, payload: &[u8]) {
-        self.push_parts(bytemuck::bytes_of(envelope), payload);
+        let envelope = bytemuck::bytes_of(envelope);
+        // Only this end fills the ring, so free slots can only become more between the calls.
+        let fits = self.ring.slots() >= envelope.len() + payload.len();
+        let stored = fits
+            && self.ring.push_entire_slice(envelope).is_ok()
+            && self.ring.push_entire_slice(payload).is_ok();
+        self.count_unless(stored);
     }
 
-    fn push_parts(&mut self, first: &[u8], second: &[u8]) {
-        // Only this end fills the ring, so free slots can only become more between the calls.
-        let fits = self.ring.slots() >= first.len() + second.len();
-        let stored = fits
-            && self.ring.push_entire_slice(first).is_ok()
-            && self.ring.push_entire_slice(second).is_ok();
-        if !stored {
+    fn count_unless(&mut self, is_stored: bool) {
+        if !is_stored {
             self.dropped.fetch_add(1, Ordering::Relaxed);
         }
     }

@@ -129,6 +129,11 @@ impl IngressBridge {
         self.replies.next(now)
     }
 
+    /// Whether [`IngressBridge::poll_transmit`] has something to give, without reading a clock.
+    pub fn has_reply(&self) -> bool {
+        self.replies.waiting_since().is_some()
+    }
+
     /// The kernel's transmit stamp of a reply given earlier, minus the `now` it was polled with;
     /// it rides on the next response, as a refined t3.
     pub fn on_transmit_stamp(&mut self, kind: Kind, sequence: u64, handed_to_tx_ns: i64) {
