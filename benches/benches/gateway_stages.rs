@@ -14,7 +14,7 @@ use std::time::{Duration, Instant as Stopwatch};
 
 use hil_benches::gateway::hosts::{Hosts, Plan, Ports, SetupError, greet};
 use hil_benches::gateway::network::Network;
-use hil_benches::gateway::parties::{PRIORITY, claim};
+use hil_benches::gateway::parties::{MachineTime, PRIORITY, claim, stolen_text};
 use hil_benches::gateway::stages::{BATCH, STAGES, Stage, Workbench};
 use hil_benches::gateway::verdict::Verdict;
 use hil_benches::{Case, Comparison, HostFacts, Row, compare, json_line, table};
@@ -275,7 +275,9 @@ fn measure_all() -> Result<(), SetupError> {
     println!("nanoseconds per message; stages are means of {BATCH} messages, steps are single;");
     println!("sending includes the way to the receiving socket, as both are on one processor");
     let measured: Vec<_> = opened.into_iter().map(RefCell::new).collect();
+    let before = MachineTime::read();
     let outcome = run(&measured, rounds);
+    println!("{}", stolen_text(before, MachineTime::read()));
     for row in &outcome.rows {
         println!("{}", json_line(BENCH, &outcome, row, row));
     }

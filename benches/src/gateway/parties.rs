@@ -24,6 +24,49 @@ pub fn claim(cpu: usize) -> Vec<String> {
         .collect()
 }
 
+/// Processor time of the whole machine so far, in clock ticks (`proc(5)`, `stat`).
+#[derive(Debug, Clone, Copy)]
+pub struct MachineTime {
+    all: u64,
+    stolen: u64,
+}
+
+impl MachineTime {
+    /// Reads it; `None` where the kernel does not tell.
+    pub fn read() -> Option<Self> {
+        let text = fs::read_to_string("/proc/stat").ok()?;
+        let fields = text
+            .lines()
+            .next()?
+            .strip_prefix("cpu ")?
+            .split_whitespace();
+        // User, nice, system, idle, waiting, two kinds of interrupts, stolen; guests are in user.
+        let ticks: Option<Vec<u64>> = fields.take(8).map(|field| field.parse().ok()).collect();
+        let ticks = ticks?;
+        Some(Self {
+            all: ticks.iter().sum(),
+            stolen: *ticks.get(7)?,
+        })
+    }
+
+    /// Share of the time since `earlier` in which the hypervisor kept a processor from running.
+    pub fn stolen_since(&self, earlier: &Self) -> f64 {
+        let all = self.all.saturating_sub(earlier.all).max(1);
+        self.stolen.saturating_sub(earlier.stolen) as f64 / all as f64
+    }
+}
+
+/// In words, how much was stolen between two readings; above a few per cent no tail means much.
+pub fn stolen_text(before: Option<MachineTime>, after: Option<MachineTime>) -> String {
+    match before.zip(after) {
+        Some((before, after)) => {
+            let share = 100.0 * after.stolen_since(&before);
+            format!("stolen by the hypervisor while measuring: {share:.1} %")
+        }
+        None => "stolen by the hypervisor while measuring: unavailable".to_owned(),
+    }
+}
+
 /// One thread of a case.
 #[derive(Debug, Clone)]
 pub struct Party {

@@ -22,6 +22,8 @@ pub const FLOOR: usize = usize::MAX - 2;
 const WARM_UP: usize = 200;
 /// Messages that teach a hybrid listener the period and do not count.
 const PACE_WARM_UP: u64 = 20;
+/// Before a case that keeps a pace.
+const PACE_REST: Duration = Duration::from_millis(30);
 /// A message that has not come back by then never will.
 const PATIENCE: Duration = Duration::from_millis(100);
 /// Samples of one slice at most.
@@ -195,6 +197,8 @@ pub fn pace(
     (slice, period): (Duration, Duration),
     (listening, noted): (&Party, &Mutex<Vec<u64>>),
 ) -> (Vec<u64>, [Used; 2]) {
+    // A case that spun has starved ordinary work, and the kernel pays that back.
+    thread::sleep(PACE_REST);
     turns.give(case, core::slice::from_ref(far));
     let mut due = MonotonicClock::now();
     let mut tick = |side: &mut dyn Side, count| {
