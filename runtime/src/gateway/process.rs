@@ -2,6 +2,7 @@
 //! opens and arms the sockets, because kernel stamps are switched on by a worker that a spinning
 //! real-time thread would starve; then it only reports.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -52,6 +53,7 @@ fn prepare_and_live(path: &Path) -> Result<(), GatewayError> {
     let surroundings = Arc::new(Surroundings::new(domain)?);
     // Held until the end, so that the kernel never switches receive stamps off in between.
     let (_sentinel, stamp_facts) = arm_stamps(&launch);
+    warn_of_shared_cpus(&launch);
     let mut recorder = Recorder::new(&launch.records, &launch.process, launch.instance);
     let mut opened = Vec::new();
     for direction in &launch.directions {
@@ -223,6 +225,31 @@ fn warn_of_spinning(launch: &DirectionLaunch) {
                 "{channel}: wait = spin without a cpu of its own"
             )));
         }
+    }
+}
+
+/// Threads that spin on one CPU wait for each other, and the wait shows as delay.
+fn warn_of_shared_cpus(launch: &GatewayLaunch) {
+    let mut spinning: BTreeMap<usize, Vec<&str>> = BTreeMap::new();
+    for direction in launch
+        .directions
+        .iter()
+        .filter(|one| one.wait == WaitMode::Spin)
+    {
+        if let Some(cpu) = direction.realtime.cpu {
+            spinning.entry(cpu).or_default().push(&direction.channel);
+        }
+    }
+    for (cpu, channels) in spinning
+        .into_iter()
+        .filter(|(_, channels)| channels.len() > 1)
+    {
+        let text = format!(
+            "wait = spin: the threads of {} share CPU {cpu}; list one CPU for each in \
+             gateway.cpu",
+            channels.join(" and ")
+        );
+        say(&FromProcess::Warning(text));
     }
 }
 
