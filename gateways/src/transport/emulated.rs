@@ -16,12 +16,16 @@ use hil_models::time::Instant;
 use super::{DatagramReceiver, EmulatedDelay, Received, ReceiverCounters, SendRefusal};
 
 /// How much an emulated link may hold.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy)]
 pub struct EmulatedSettings {
     /// Datagrams held at a time; further arrivals are dropped and counted.
     pub capacity_count: usize,
     /// Longest datagram; longer ones are cut and say so.
     pub datagram_bytes_max: usize,
+    /// Read after each datagram was taken from below: the caller's `now` is older than that, by
+    /// milliseconds if the thread was held up in between, and a datagram would be early by as
+    /// much. `None` trusts `now`, as virtual time does.
+    pub clock: Option<fn() -> Instant>,
 }
 
 impl Default for EmulatedSettings {
@@ -30,6 +34,7 @@ impl Default for EmulatedSettings {
         Self {
             capacity_count: 1024,
             datagram_bytes_max: 1472,
+            clock: None,
         }
     }
 }
@@ -43,6 +48,7 @@ pub struct EmulatedReceiver<R> {
     link: Box<dyn LinkModel>,
     is_exempt: fn(&[u8]) -> bool,
     datagram_bytes_max: usize,
+    clock: Option<fn() -> Instant>,
     /// One buffer per place and a last one for arrivals that find no place.
     storage: Box<[u8]>,
     held: Box<[Option<Received>]>,
@@ -68,6 +74,7 @@ impl<R: DatagramReceiver> EmulatedReceiver<R> {
         let EmulatedSettings {
             capacity_count,
             datagram_bytes_max,
+            clock,
         } = settings;
         assert!(
             capacity_count > 0 && datagram_bytes_max > 0,
@@ -79,6 +86,7 @@ impl<R: DatagramReceiver> EmulatedReceiver<R> {
             link,
             is_exempt,
             datagram_bytes_max,
+            clock,
             storage: storage.into_boxed_slice(),
             held: vec![None; capacity_count].into_boxed_slice(),
             free: (0..capacity_count).rev().collect(),
@@ -110,6 +118,8 @@ impl<R: DatagramReceiver> EmulatedReceiver<R> {
             let Some(received) = self.inner.receive(now, buffer)? else {
                 break;
             };
+            let arrived = self.clock.map_or(now, |clock| clock());
+            self.newest_arrival = self.newest_arrival.max(arrived);
             self.admit(received, place);
         }
         Ok(())
@@ -243,6 +253,7 @@ mod tests {
         let settings = EmulatedSettings {
             capacity_count,
             datagram_bytes_max: 16,
+            clock: None,
         };
         let is_handshake = |datagram: &[u8]| datagram.first() == Some(&b'h');
         let receiver = EmulatedReceiver::new(inner, Box::new(link), is_handshake, settings);
@@ -253,6 +264,28 @@ mod tests {
         let mut buffer = [0; 16];
         let arrival = receiver.receive(now, &mut buffer).unwrap()?;
         Some((buffer[0], arrival))
+    }
+
+    #[test]
+    fn a_caller_that_was_held_up_does_not_make_a_datagram_early() {
+        let (mut sender, inner) = queue_pair(&QueueSettings::default());
+        let stream = RandomStream::new(1, "late caller");
+        let delay = Duration::from_millis(50);
+        let link = BernoulliLink::new(delay, 0.0, stream).unwrap();
+        let settings = EmulatedSettings {
+            clock: Some(|| Instant::from_ns(8_000_000)),
+            ..EmulatedSettings::default()
+        };
+        let mut receiver = EmulatedReceiver::new(inner, Box::new(link), |_| false, settings);
+        sender.send(b"x").unwrap();
+        let mut buffer = [0; 8];
+        assert!(
+            receiver
+                .receive(Instant::ZERO, &mut buffer)
+                .unwrap()
+                .is_none()
+        );
+        assert_eq!(receiver.next_due(), Some(Instant::from_ns(58_000_000)));
     }
 
     #[test]

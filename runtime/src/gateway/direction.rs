@@ -22,6 +22,7 @@ use super::ingress::{Ingress, Notes};
 use super::kernel_clock::KernelClock;
 use super::{GatewayError, Surroundings};
 use crate::channel::{RawInput, RawOutput, Waiter};
+use crate::clock::MonotonicClock;
 use crate::process::launch::{DirectionLaunch, EmulationLaunch, Side};
 use crate::process::pipe::DirectionReport;
 use crate::record::{RecordKind, RecordSink, Recorder};
@@ -194,6 +195,7 @@ fn emulate(
     let settings = EmulatedSettings {
         capacity_count: emulated_capacity(emulation.delay),
         datagram_bytes_max: launch.socket.path_mtu_bytes,
+        clock: Some(MonotonicClock::now),
     };
     let is_exempt =
         |bytes: &[u8]| wire::decode(bytes).is_ok_and(|datagram| datagram.header.kind != Kind::Data);

@@ -237,17 +237,17 @@ impl Crew {
         };
         let name = member.plan.name.clone();
         let is_orderly = status.success() && member.complaint.is_none();
+        let from = member.seen_alive.as_ns() - duration_ns(QUEUE_SPAN);
+        let interruption = Interruption {
+            from: Instant::from_ns(from),
+            until: None,
+        };
         if self.has_started && member.restart_count < limit && member.complaint.is_none() {
             member.restart_count += 1;
             let text = format!(
                 "{what}; restart {} of at most {limit}",
                 member.restart_count
             );
-            let from = member.seen_alive.as_ns() - duration_ns(QUEUE_SPAN);
-            let interruption = Interruption {
-                from: Instant::from_ns(from),
-                until: None,
-            };
             self.note(now, index, text, Some(interruption));
             return match self.spawn(index) {
                 Ok(()) => Verdict::GoesOn,
@@ -257,7 +257,14 @@ impl Crew {
                 }
             };
         }
-        self.note(now, index, format!("{what}; policy: end the run"), None);
+        // What it had in its queues, or came for it until the end, is lost with it.
+        let interruption = Some(interruption).filter(|_| !is_orderly);
+        self.note(
+            now,
+            index,
+            format!("{what}; policy: end the run"),
+            interruption,
+        );
         let text = format!("process {name} {what}");
         if is_orderly {
             Verdict::Finished(text)
