@@ -13,6 +13,9 @@ const SILENCE_NS: i64 = 1_000_000_000;
 pub(super) fn egress_state(egress: &Egress) -> String {
     match egress.bridge.peer_state() {
         PeerState::Greeting => "never answered".to_owned(),
+        // Gateways of two hosts stop one after the other: the later one may still have asked the
+        // earlier one for the time, with no message concerned.
+        PeerState::Down if !has_lost_messages(egress) => "left after the last message".to_owned(),
         PeerState::Down => "unreachable".to_owned(),
         PeerState::Refused(status) => format!("refused the channel: {}", status.label()),
         PeerState::Established => {
@@ -24,6 +27,12 @@ pub(super) fn egress_state(egress: &Egress) -> String {
             }
         }
     }
+}
+
+/// True when a message could not go because the peer was unreachable.
+fn has_lost_messages(egress: &Egress) -> bool {
+    let counts = egress.bridge.counts();
+    counts.refused_peer_down_count + counts.message_failed_count > 0
 }
 
 /// How the sending gateway stood to this one, in words.
