@@ -92,37 +92,39 @@ pub fn outputs_of<'a>(
     channels.iter().filter(move |channel| channel.from == role)
 }
 
-/// A parameter outside its range.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-#[error("{key} {value} is outside {allowed}")]
+/// A parameter that the case cannot work with.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{key} {problem}")]
 pub struct ParameterError {
-    /// Key below `[case.parameters]`.
-    pub key: &'static str,
-    /// What it was.
-    pub value: String,
-    /// What it may be, e.g. `0..=20`.
-    pub allowed: &'static str,
+    /// Key below `[case.parameters]`; dots lead into tables.
+    pub key: String,
+    /// What is wrong with it, with its value and what it may be.
+    pub problem: String,
 }
 
 impl ParameterError {
+    /// The parameter `key` has a problem that is more than a number outside its range.
+    pub fn new(key: &str, problem: impl Into<String>) -> Self {
+        Self {
+            key: key.to_owned(),
+            problem: problem.into(),
+        }
+    }
+
     /// `Ok` when `value` lies in `allowed`; NaN never does.
     ///
     /// # Errors
     /// Names the key, the value and the text `allowed_text`.
     pub fn check(
-        key: &'static str,
+        key: &str,
         value: f64,
         allowed: core::ops::RangeInclusive<f64>,
-        allowed_text: &'static str,
+        allowed_text: &str,
     ) -> Result<(), Self> {
         if allowed.contains(&value) {
             return Ok(());
         }
-        Err(Self {
-            key,
-            value: value.to_string(),
-            allowed: allowed_text,
-        })
+        Err(Self::new(key, format!("{value} is outside {allowed_text}")))
     }
 }
 

@@ -15,6 +15,7 @@ pub mod arrival;
 pub mod case_study;
 pub mod component;
 pub mod endpoint;
+pub mod fleet;
 pub mod link;
 pub mod measure;
 pub mod message;

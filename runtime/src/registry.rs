@@ -129,7 +129,7 @@ fn make<C: CaseStudy>(parameters: Value, seed: u64) -> Result<Box<dyn Case>, Cas
             message: error.to_string(),
         })?;
     let named = |error: ParameterError| CaseError {
-        key: Some(error.key.to_owned()),
+        key: Some(error.key.clone()),
         message: error.to_string(),
     };
     C::read_files(&mut parameters, &mut read_text).map_err(named)?;

@@ -203,11 +203,11 @@ impl TeleoperationParameters {
 }
 
 fn motion_file_error(path: &str, reason: &dyn core::fmt::Display) -> ParameterError {
-    ParameterError {
-        key: "motion_file",
-        value: format!("{path} ({reason})"),
-        allowed: "what can be played: a BVH motion file that fills one motion_period_s",
-    }
+    let problem = format!(
+        "{path} ({reason}) is not what can be played: a BVH motion file that fills one \
+         motion_period_s"
+    );
+    ParameterError::new("motion_file", problem)
 }
 
 #[cfg(test)]

@@ -119,7 +119,7 @@ pub fn check_parameters_with<C: CaseStudy>(
         Ok(()) => Ok(complete),
         Err(error) => Err(vec![ParameterFault {
             key: error.key.split('.').map(str::to_owned).collect(),
-            message: format!("{} is outside {}", error.value, error.allowed),
+            message: error.problem,
             is_unknown_key: false,
             valid_keys: Vec::new(),
         }]),
