@@ -9,6 +9,7 @@ use serde::de::DeserializeOwned;
 use crate::component::Role;
 use crate::message::{Message, MessageType};
 use crate::run_log::RunLog;
+use crate::study::Batch;
 
 /// A kind of experiment that a topology file can name in `[case]`.
 ///
@@ -49,6 +50,15 @@ pub trait CaseStudy: Sized + Debug + 'static {
 
     /// What the robot did, from the messages of a finished run.
     fn score(&self, log: &RunLog) -> Score;
+
+    /// The tables this case can compute in virtual time, of the size its parameters ask for;
+    /// `None` for a case without any.
+    ///
+    /// # Errors
+    /// Names the parameter that keeps the tables from being computed.
+    fn study(&self) -> Result<Option<Box<dyn Batch>>, ParameterError> {
+        Ok(None)
+    }
 }
 
 /// One channel of a case study: who publishes what to whom.

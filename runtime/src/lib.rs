@@ -36,6 +36,7 @@ pub mod report;
 pub mod run_folder;
 pub mod signals;
 mod simulate;
+mod study;
 pub mod supervisor;
 pub mod topology;
 pub mod wait;
