@@ -2,6 +2,7 @@
 //! II.B and III.B, Tables I to III).
 
 mod analytic;
+pub mod coordinator;
 pub mod geometry;
 pub mod messages;
 pub mod mission;
