@@ -1,9 +1,12 @@
 //! Case study 1: safe coordination of a fleet of automated guided vehicles (Lv et al., sections
 //! II.B and III.B, Tables I to III).
 
+mod analytic;
 pub mod coordinator;
 pub mod geometry;
 pub mod messages;
+pub mod mission;
 pub mod path;
+pub mod scenario;
 pub mod section;
 pub mod world;
