@@ -9,7 +9,6 @@ pub mod roster;
 pub mod sections;
 
 use core::fmt::Debug;
-use std::sync::Arc;
 
 use crate::fleet::coordinator::counters::CoordinatorCounters;
 use crate::fleet::coordinator::legacy::LegacyRules;
@@ -17,7 +16,7 @@ use crate::fleet::coordinator::parameters::{CoordinatorMode, CoordinatorParamete
 use crate::fleet::coordinator::policy::OrderingPolicy;
 use crate::fleet::coordinator::roster::{MissionSupply, Roster, SectionKind};
 use crate::fleet::messages::{State, ToRobot};
-use crate::fleet::world::{BayIndex, World};
+use crate::fleet::scenario::Scene;
 use crate::time::Instant;
 
 /// What rules decide on, and with, in one control cycle.
@@ -48,22 +47,21 @@ pub struct Coordinator {
 }
 
 impl Coordinator {
-    /// The coordinator of fleet `fleet_id`, whose robot `i` is parked in bay `starts[i]`.
+    /// The coordinator of fleet `fleet_id`, its robots parked where the scene starts them.
     pub fn new(
-        world: &Arc<World>,
-        starts: &[BayIndex],
+        scene: &Scene,
         parameters: &CoordinatorParameters,
         fleet_id: u32,
         missions: impl MissionSupply + 'static,
     ) -> Self {
         let (kind, rules): (_, Box<dyn Rules>) = match parameters.mode {
             CoordinatorMode::Legacy => {
-                let rules = LegacyRules::new(world, starts.len(), parameters);
+                let rules = LegacyRules::new(scene, parameters);
                 (SectionKind::Exact, Box::new(rules))
             }
         };
         Self {
-            roster: Roster::new(Arc::clone(world), starts, parameters, fleet_id, kind),
+            roster: Roster::new(scene, parameters, fleet_id, kind),
             rules,
             policy: parameters.policy.policy(),
             missions: Box::new(missions),

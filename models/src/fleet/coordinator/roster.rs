@@ -11,7 +11,9 @@ use crate::fleet::coordinator::parameters::{CoordinatorParameters, MessageOrder}
 use crate::fleet::coordinator::policy::Contender;
 use crate::fleet::coordinator::sections::SectionBook;
 use crate::fleet::messages::{Header, Mission, Phase, State, ToRobot};
+use crate::fleet::mission::MissionSource;
 use crate::fleet::path::Path;
+use crate::fleet::scenario::Scene;
 use crate::fleet::section::Side;
 use crate::fleet::world::{BayIndex, Route, SectionLibrary, World};
 use crate::time::Instant;
@@ -28,8 +30,21 @@ pub trait MissionSupply: Debug {
     ) -> Option<Route>;
 
     /// How long a robot stays parked before its next mission.
+    fn parking(&self) -> Duration;
+}
+
+impl MissionSupply for MissionSource {
+    fn next(
+        &mut self,
+        robot: usize,
+        at: BayIndex,
+        is_free: &dyn Fn(BayIndex) -> bool,
+    ) -> Option<Route> {
+        self.next(robot, at, is_free)
+    }
+
     fn parking(&self) -> Duration {
-        Duration::from_secs(3)
+        self.parking()
     }
 }
 
@@ -172,7 +187,6 @@ pub struct Roster {
     message_order: MessageOrder,
     missions_per_cycle: u32,
     stuck_after: Duration,
-    parking: Duration,
     robots: Vec<RobotView>,
     sections: SectionBook,
     /// Robots that stand in, leave or head for each bay.
@@ -186,20 +200,19 @@ pub struct Roster {
 const RESET_PAUSE: Duration = Duration::from_secs(10);
 
 impl Roster {
-    /// The robots of fleet `fleet_id`, robot `i` parked in bay `starts[i]`.
+    /// The robots of fleet `fleet_id`, each parked where the scene starts it.
     ///
     /// # Panics
     /// When a start is no bay of the world.
     pub fn new(
-        world: Arc<World>,
-        starts: &[BayIndex],
+        scene: &Scene,
         parameters: &CoordinatorParameters,
         fleet_id: u32,
         kind: SectionKind,
     ) -> Self {
-        let mut bay_users = vec![0; world.bays.len()];
-        let mut robots = Vec::with_capacity(starts.len());
-        for &bay in starts {
+        let mut bay_users = vec![0; scene.world.bays.len()];
+        let mut robots = Vec::with_capacity(scene.starts.len());
+        for &bay in &scene.starts {
             assert!(bay < bay_users.len(), "bay {bay} of {}", bay_users.len());
             bay_users[bay] += 1;
             robots.push(RobotView {
@@ -217,8 +230,7 @@ impl Roster {
             parked: (0..robots.len()).collect(),
             robots,
             bay_users,
-            world,
-            parking: Duration::ZERO,
+            world: Arc::clone(&scene.world),
             next_reset: Instant::ZERO,
         }
     }
@@ -345,16 +357,14 @@ impl Roster {
         counts: &mut CoordinatorCounts,
         send: &mut dyn FnMut(ToRobot),
     ) {
-        self.parking = missions.parking();
+        let parking = missions.parking();
         let mut begun_count = 0;
         let mut position = 0;
         while begun_count < self.missions_per_cycle
             && let Some(&robot) = self.parked.get(position)
         {
             let view = &self.robots[robot];
-            let is_rested = view
-                .parked_since
-                .is_none_or(|since| now >= since + self.parking);
+            let is_rested = view.parked_since.is_none_or(|since| now >= since + parking);
             if !is_rested {
                 // Those behind it parked later still.
                 break;

@@ -20,8 +20,8 @@ use crate::fleet::coordinator::parameters::CoordinatorParameters;
 use crate::fleet::coordinator::roster::Roster;
 use crate::fleet::coordinator::{Cycle, Rules};
 use crate::fleet::messages::{Authority, Header, ToRobot};
+use crate::fleet::scenario::Scene;
 use crate::fleet::section::Side;
-use crate::fleet::world::World;
 use crate::time::Instant;
 
 /// The legacy mode's state between control cycles.
@@ -52,14 +52,11 @@ struct Commanded {
 }
 
 impl LegacyRules {
-    pub(crate) fn new(
-        world: &World,
-        robot_count: usize,
-        parameters: &CoordinatorParameters,
-    ) -> Self {
+    pub(crate) fn new(scene: &Scene, parameters: &CoordinatorParameters) -> Self {
+        let robot_count = scene.starts.len();
         let (period, delay) = (parameters.control_period(), parameters.known_delay());
         Self {
-            forward: ForwardModel::new(&world.vehicle, parameters),
+            forward: ForwardModel::new(&scene.world.vehicle, parameters),
             trailing_points: parameters.trailing_points as usize,
             replicas: parameters.replicas,
             breaks_deadlocks: parameters.break_deadlocks,
