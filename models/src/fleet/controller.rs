@@ -8,11 +8,9 @@ use crate::component::{Component, OUTBOX_CAPACITY, Outbox};
 use crate::fleet::coordinator::Coordinator;
 use crate::fleet::coordinator::counters::CoordinatorCounters;
 use crate::fleet::coordinator::parameters::CoordinatorParameters;
-use crate::fleet::coordinator::roster::MissionSupply;
 use crate::fleet::messages::{State, ToRobot};
 use crate::fleet::mission::{MissionParameters, MissionSource};
 use crate::fleet::scenario::Scene;
-use crate::fleet::world::{BayIndex, Route};
 use crate::random::RandomStream;
 use crate::time::{Instant, PeriodicTimer};
 
@@ -78,33 +76,8 @@ pub(crate) fn coordinator_of(
     (fleet, seed): (u32, u64),
 ) -> Coordinator {
     let random = RandomStream::new(seed, &format!("fleet/{fleet}/missions"));
-    let supply = Missions {
-        source: MissionSource::new(missions, scene, random),
-        parking: Duration::from_secs_f64(missions.parking_s),
-    };
-    Coordinator::new(&scene.world, &scene.starts, parameters, fleet, supply)
-}
-
-/// A source of missions and how long robots park between them.
-#[derive(Debug)]
-struct Missions {
-    source: MissionSource,
-    parking: Duration,
-}
-
-impl MissionSupply for Missions {
-    fn next(
-        &mut self,
-        robot: usize,
-        at: BayIndex,
-        is_free: &dyn Fn(BayIndex) -> bool,
-    ) -> Option<Route> {
-        self.source.next(robot, at, is_free)
-    }
-
-    fn parking(&self) -> Duration {
-        self.parking
-    }
+    let source = MissionSource::new(missions, scene, random);
+    Coordinator::new(scene, parameters, fleet, source)
 }
 
 impl Component for Controller {

@@ -4,7 +4,7 @@
 use crate::fleet::coordinator::parameters::{CoordinatorMode, MessageOrder};
 use crate::fleet::experiment::published::{Condition, HARBOR, PublishedRow, WAREHOUSE};
 use crate::fleet::experiment::setup::{Links, Setup, StatusPath};
-use crate::fleet::robot::Tracker;
+use crate::fleet::robot::TrackerKind;
 use crate::fleet::scenario::Scenario;
 use crate::link::impaired::{DelayLaw, Impairments};
 
@@ -128,7 +128,7 @@ pub(crate) fn published_cells(base: &Setup, law: DelayLaw) -> Vec<Cell> {
 /// status read past the network, the delay known to the coordinator.
 fn original(base: &Setup, (delay_ms, law): (f64, DelayLaw), (loss_ratio, copies): (f64, u32)) -> Setup {
     let mut setup = base.clone();
-    setup.robot.tracker = Tracker::LegacyRk4;
+    setup.robot.tracker = TrackerKind::LegacyRk4;
     setup.robot.step_inflation = true;
     setup.robot.inflation_delay_ms = delay_ms;
     setup.coordinator.mode = CoordinatorMode::Legacy;
@@ -182,7 +182,7 @@ fn variants(base: &Setup, law: DelayLaw) -> Vec<Cell> {
             setup.robot.step_inflation = false;
         }),
         variant("100 ms, exact tracker", |setup| {
-            setup.robot.tracker = Tracker::Exact;
+            setup.robot.tracker = TrackerKind::Exact;
         }),
         variant("100 ms, margin of 6 poses", |setup| {
             setup.coordinator.trailing_points = 6;
@@ -253,7 +253,7 @@ pub(crate) fn mechanism_cells(base: &Setup) -> Vec<Cell> {
         for scenario in SCENARIOS {
             for mode in [CoordinatorMode::Legacy, CoordinatorMode::Safe] {
                 let mut setup = base.clone();
-                setup.robot.tracker = Tracker::Exact;
+                setup.robot.tracker = TrackerKind::Exact;
                 setup.coordinator.mode = mode;
                 setup.coordinator.known_delay_ms = 0.0;
                 setup.coordinator.message_order = match mode {

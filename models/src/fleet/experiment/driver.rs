@@ -5,19 +5,23 @@
 use core::time::Duration;
 
 use crate::case_study::ParameterError;
+use crate::fleet::controller::coordinator_of;
 use crate::fleet::coordinator::Coordinator;
 use crate::fleet::experiment::agenda::Agenda;
 use crate::fleet::experiment::post::{Letter, Post, Rank};
 use crate::fleet::experiment::setup::{Setup, StatusPath};
 use crate::fleet::experiment::tally::FleetTally;
 use crate::fleet::messages::{State, ToRobot, Truth};
-use crate::fleet::mission::MissionSource;
 use crate::fleet::referee::{Referee, SCAN_PERIOD};
-use crate::fleet::robot::Robot;
+use crate::fleet::robot::{Robot, RobotParameters};
+use crate::fleet::robots::robot_stream;
 use crate::fleet::scenario::Scene;
 use crate::link::impaired::ImpairedLink;
 use crate::random::RandomStream;
 use crate::time::Instant;
+
+/// The number of the only fleet of an experiment.
+const FLEET: u32 = 0;
 
 /// A fleet at some instant of its run.
 #[derive(Debug)]
@@ -75,7 +79,7 @@ impl Experiment {
     pub fn new(scene: &Scene, setup: &Setup, seed: u64) -> Result<Self, ParameterError> {
         setup.check()?;
         let robots: Vec<_> = (0..scene.starts.len())
-            .map(|robot| setup.robot_of(scene, (seed, 0), robot))
+            .map(|robot| robot_of(scene, &setup.robot, (seed, robot)))
             .collect();
         let links = &setup.links;
         let stalls = || RandomStream::new(seed, "fleet stalls");
@@ -85,7 +89,7 @@ impl Experiment {
         let status_count = links.status_keeps_order.then_some(scene.starts.len());
         Ok(Self {
             now: Instant::ZERO,
-            coordinator: setup.coordinator_of(scene, (seed, 0)),
+            coordinator: coordinator_of(scene, &setup.coordinator, &setup.missions, (FLEET, seed)),
             agenda: Agenda::new(robots.len()),
             robots,
             referee: Referee::new(scene, 1),
@@ -323,8 +327,7 @@ impl Network {
     }
 }
 
-/// The source of missions of a fleet.
-pub(crate) fn missions_of(scene: &Scene, setup: &Setup, (seed, fleet): (u64, u32)) -> MissionSource {
-    let random = RandomStream::new(seed, &format!("fleet {fleet} missions"));
-    MissionSource::new(&setup.missions, scene, random)
+fn robot_of(scene: &Scene, parameters: &RobotParameters, (seed, robot): (u64, usize)) -> Robot {
+    let id = (FLEET, u32::try_from(robot).expect("at most a few hundred robots"));
+    Robot::new(scene, parameters, id, robot_stream(seed, id))
 }

@@ -3,14 +3,10 @@
 use serde::{Deserialize, Serialize};
 
 use crate::case_study::ParameterError;
-use crate::fleet::coordinator::Coordinator;
 use crate::fleet::coordinator::parameters::CoordinatorParameters;
-use crate::fleet::experiment::driver::missions_of;
 use crate::fleet::mission::MissionParameters;
-use crate::fleet::robot::{Robot, RobotParameters};
-use crate::fleet::scenario::Scene;
+use crate::fleet::robot::RobotParameters;
 use crate::link::impaired::Impairments;
-use crate::random::RandomStream;
 
 /// How the coordinator learns what the robots do.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -65,18 +61,5 @@ impl Setup {
         self.links.status.check()?;
         let overrun_s = self.overrun_max_s;
         ParameterError::check("overrun_max_s", overrun_s, 0.0..=600.0, "0..=600")
-    }
-
-    /// Robot `robot` of a fleet, given as seed and number.
-    pub(crate) fn robot_of(&self, scene: &Scene, (seed, fleet): (u64, u32), robot: usize) -> Robot {
-        let random = RandomStream::new(seed, &format!("fleet {fleet} robot {robot}"));
-        let robot = u32::try_from(robot).expect("at most a few hundred robots");
-        Robot::new(scene, &self.robot, fleet, robot, random)
-    }
-
-    /// The coordinator of a fleet, given as seed and number.
-    pub(crate) fn coordinator_of(&self, scene: &Scene, fleet: (u64, u32)) -> Coordinator {
-        let missions = missions_of(scene, self, fleet);
-        Coordinator::new(scene, &self.coordinator, fleet.1, missions)
     }
 }
