@@ -11,6 +11,10 @@ use crate::message::{Message, MessageType};
 use crate::run_log::RunLog;
 use crate::study::Batch;
 
+pub use crate::score::{
+    EVENT_MESSAGES_MAX, EVENTS_MAX, MessageRef, Metric, Score, ScoreEvent, Severity,
+};
+
 /// A kind of experiment that a topology file can name in `[case]`.
 ///
 /// To swap only the controller of a shipped case, wrap the case: forward every function and
@@ -61,7 +65,7 @@ pub trait CaseStudy: Sized + Debug + 'static {
     }
 }
 
-/// One channel of a case study: who publishes what to whom.
+/// One channel of a case study: who publishes what to whom, or only to the record.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ChannelSpec {
     /// Name, also of the shared-memory service, e.g. `arm/command`.
@@ -70,8 +74,9 @@ pub struct ChannelSpec {
     pub message: MessageType,
     /// The role that publishes.
     pub from: &'static str,
-    /// The role that subscribes.
-    pub to: &'static str,
+    /// The role that subscribes; `None` when the messages only go to the run's record, for the
+    /// score. Such a channel is in no shared memory and crosses no link.
+    pub to: Option<&'static str>,
 }
 
 impl ChannelSpec {
@@ -81,8 +86,24 @@ impl ChannelSpec {
             name,
             message: MessageType::of::<M>(),
             from,
-            to,
+            to: Some(to),
         }
+    }
+
+    /// The channel `name` on which a role tells the record, and nobody else, what only a score
+    /// may know: a model's true state, say.
+    pub const fn recorded<M: Message>(name: &'static str, from: &'static str) -> Self {
+        Self {
+            name,
+            message: MessageType::of::<M>(),
+            from,
+            to: None,
+        }
+    }
+
+    /// True when the messages go to the run's record only.
+    pub const fn is_recorded_only(&self) -> bool {
+        self.to.is_none()
     }
 }
 
@@ -91,10 +112,12 @@ pub fn inputs_of<'a>(
     channels: &'a [ChannelSpec],
     role: &'a str,
 ) -> impl Iterator<Item = &'a ChannelSpec> {
-    channels.iter().filter(move |channel| channel.to == role)
+    channels
+        .iter()
+        .filter(move |channel| channel.to == Some(role))
 }
 
-/// The channels `role` writes, in port order.
+/// The channels `role` writes, those that are only recorded included, in port order.
 pub fn outputs_of<'a>(
     channels: &'a [ChannelSpec],
     role: &'a str,
@@ -135,36 +158,5 @@ impl ParameterError {
             return Ok(());
         }
         Err(Self::new(key, format!("{value} is outside {allowed_text}")))
-    }
-}
-
-/// What the robot did, as named figures.
-#[derive(Debug, Clone, Default, PartialEq, Serialize)]
-pub struct Score {
-    /// The figures, in the order a report prints them.
-    pub metrics: Vec<Metric>,
-}
-
-/// One figure with its unit, interval and method.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Metric {
-    /// Snake-case name with unit suffix, e.g. `joint_error_rad_rms`.
-    pub name: &'static str,
-    /// The words a report prints.
-    pub label: &'static str,
-    /// The figure; `None` when the run did not allow it, with the reason in `method`.
-    pub value: Option<f64>,
-    /// 95 % interval, when the figure is a statistic.
-    pub interval: Option<(f64, f64)>,
-    /// SI unit, or `1` for a pure number.
-    pub unit: &'static str,
-    /// How it was obtained, or why it was not.
-    pub method: String,
-}
-
-impl Score {
-    /// The metric called `name`.
-    pub fn get(&self, name: &str) -> Option<&Metric> {
-        self.metrics.iter().find(|metric| metric.name == name)
     }
 }

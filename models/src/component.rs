@@ -27,6 +27,12 @@ pub trait Component {
 
     /// Grid points of the component's own timer that went by without a tick.
     fn skipped_ticks(&self) -> u64;
+
+    /// Messages one call may give at most; asked once, when the component becomes a role.
+    /// Beyond it messages are dropped and counted.
+    fn outbox_capacity(&self) -> usize {
+        OUTBOX_CAPACITY
+    }
 }
 
 /// The messages a component gives in one call; bounded, and every refusal is counted.
@@ -99,15 +105,14 @@ pub trait Role: Debug {
     fn outbox_dropped(&self) -> u64;
 }
 
-/// Messages one call of a component may give.
-pub const OUTBOX_CAPACITY: usize = 64;
+/// Messages one call of a component may give unless it says otherwise: a few for each of dozens
+/// of robots.
+pub const OUTBOX_CAPACITY: usize = 256;
 
 /// Hides the message types of `component` behind [`Role`].
 pub fn into_role<C: Component + Debug + 'static>(component: C) -> Box<dyn Role> {
-    Box::new(ErasedComponent {
-        component,
-        outbox: Outbox::with_capacity(OUTBOX_CAPACITY),
-    })
+    let outbox = Outbox::with_capacity(component.outbox_capacity());
+    Box::new(ErasedComponent { component, outbox })
 }
 
 #[derive(Debug)]

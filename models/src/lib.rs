@@ -22,6 +22,7 @@ pub mod measure;
 pub mod message;
 pub mod random;
 pub mod run_log;
+mod score;
 pub mod shuttle;
 pub mod simulation;
 pub mod study;

@@ -128,6 +128,7 @@ impl CaseStudy for Shuttle {
                 unit: "m",
                 method: format!("sum of status steps; {} commands sent", commands.len()),
             }],
+            ..Score::default()
         }
     }
 }

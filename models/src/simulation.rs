@@ -1,7 +1,7 @@
 //! The virtual-time driver: the same endpoints that run as processes, joined by link models
 //! instead of channels. It waits for nothing and reads no clock.
 
-use core::cell::RefCell;
+use core::cell::{Cell, RefCell};
 use core::cmp::Reverse;
 use core::convert::Infallible;
 use core::time::Duration;
@@ -75,6 +75,14 @@ pub enum SimulationError {
         /// The role.
         role: &'static str,
     },
+    /// A carrier was given for a channel that nothing carries.
+    #[error("channel {channel} of case {case} is only recorded; nothing carries it")]
+    RecordedChannel {
+        /// The case.
+        case: &'static str,
+        /// The channel.
+        channel: &'static str,
+    },
     /// Roles kept answering each other without any delay.
     #[error("roles answer each other without delay at {at}; give one of them a period")]
     ZeroDelayLoop {
@@ -97,10 +105,12 @@ pub struct ChannelCounts {
 /// The outcome of a run in virtual time.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct SimulationResult {
-    /// Every published message.
+    /// Every published message, and every one that was only recorded.
     pub log: RunLog,
-    /// Counts by channel name.
+    /// Counts by name of channel between two roles.
     pub channels: BTreeMap<&'static str, ChannelCounts>,
+    /// Messages by name of channel that is only recorded.
+    pub recorded_counts: BTreeMap<&'static str, u64>,
 }
 
 /// A case in virtual time.
@@ -108,6 +118,7 @@ pub struct SimulationResult {
 pub struct Simulation {
     endpoints: Vec<Endpoint<SimInput, SimOutput>>,
     channels: BTreeMap<&'static str, Rc<RefCell<SimChannel>>>,
+    recorded: BTreeMap<&'static str, Rc<Cell<u64>>>,
     log: Rc<RefCell<RunLog>>,
 }
 
@@ -145,10 +156,18 @@ impl Simulation {
     ) -> Result<Self, SimulationError> {
         let log = Rc::new(RefCell::new(RunLog::default()));
         let mut channels = BTreeMap::new();
+        let mut recorded: BTreeMap<&'static str, Rc<Cell<u64>>> = BTreeMap::new();
         for spec in specs {
-            let carrier = carriers
-                .remove(spec.name)
-                .unwrap_or_else(|| Box::new(PerfectLink));
+            let carrier = carriers.remove(spec.name);
+            if spec.is_recorded_only() {
+                if carrier.is_some() {
+                    let channel = spec.name;
+                    return Err(SimulationError::RecordedChannel { case, channel });
+                }
+                recorded.insert(spec.name, Rc::default());
+                continue;
+            }
+            let carrier = carrier.unwrap_or_else(|| Box::new(PerfectLink));
             channels.insert(spec.name, Rc::new(RefCell::new(SimChannel::new(carrier))));
         }
         if let Some(channel) = carriers.into_keys().next() {
@@ -164,7 +183,10 @@ impl Simulation {
             let outputs = outputs_of(specs, role)
                 .map(|spec| SimOutput {
                     name: spec.name,
-                    channel: Rc::clone(&channels[spec.name]),
+                    destination: match recorded.get(spec.name) {
+                        Some(count) => SimDestination::Record(Rc::clone(count)),
+                        None => SimDestination::Channel(Rc::clone(&channels[spec.name])),
+                    },
                     log: Rc::clone(&log),
                 })
                 .collect();
@@ -175,6 +197,7 @@ impl Simulation {
         Ok(Self {
             endpoints,
             channels,
+            recorded,
             log,
         })
     }
@@ -228,8 +251,10 @@ impl Simulation {
             .channels
             .iter()
             .map(|(name, channel)| (*name, counts(channel)));
+        let recorded = self.recorded.iter();
         SimulationResult {
             channels: channels.collect(),
+            recorded_counts: recorded.map(|(name, count)| (*name, count.get())).collect(),
             log: self.log.take(),
         }
     }
@@ -339,69 +364,33 @@ impl InputPort for SimInput {
 #[derive(Debug)]
 struct SimOutput {
     name: &'static str,
-    channel: Rc<RefCell<SimChannel>>,
+    destination: SimDestination,
     log: Rc<RefCell<RunLog>>,
+}
+
+#[derive(Debug)]
+enum SimDestination {
+    Channel(Rc<RefCell<SimChannel>>),
+    /// Nobody takes it; what is counted are the messages so far.
+    Record(Rc<Cell<u64>>),
 }
 
 impl OutputPort for SimOutput {
     type Error = Infallible;
 
     fn send(&mut self, now: Instant, payload: &[u8]) -> Result<(), Infallible> {
-        let envelope = self.channel.borrow_mut().send(now, payload);
+        let envelope = match &self.destination {
+            SimDestination::Channel(channel) => channel.borrow_mut().send(now, payload),
+            SimDestination::Record(count) => Envelope {
+                sequence: count.replace(count.get() + 1),
+                published_ns: now.as_ns(),
+                ..Envelope::default()
+            },
+        };
         self.log.borrow_mut().push(self.name, envelope, payload);
         Ok(())
     }
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::link::bernoulli::BernoulliLink;
-    use crate::random::RandomStream;
-    use crate::shuttle::{Shuttle, ShuttleParameters};
-
-    fn run(seed: u64, loss_ratio: f64, delay_ms: u64) -> SimulationResult {
-        let case = Shuttle::new(ShuttleParameters::default(), seed).unwrap();
-        let stream = RandomStream::new(seed, "shuttle/command");
-        let link = BernoulliLink::new(Duration::from_millis(delay_ms), loss_ratio, stream).unwrap();
-        let carriers = BTreeMap::from([(
-            "shuttle/command".to_owned(),
-            Box::new(link) as Box<dyn Carrier>,
-        )]);
-        Simulation::new(&case, carriers)
-            .unwrap()
-            .run(Duration::from_secs(10))
-            .unwrap()
-    }
-
-    #[test]
-    fn equal_seeds_give_equal_runs() {
-        assert_eq!(run(7, 0.1, 10), run(7, 0.1, 10));
-    }
-
-    #[test]
-    fn unequal_seeds_give_unequal_runs() {
-        assert_ne!(run(7, 0.1, 10).log, run(8, 0.1, 10).log);
-    }
-
-    #[test]
-    fn every_message_is_taken_lost_or_in_flight() {
-        let clean = run(1, 0.0, 50).channels["shuttle/command"];
-        assert_eq!(
-            clean.published_count,
-            clean.taken_count + clean.in_flight_count
-        );
-        assert!(clean.in_flight_count > 0);
-        let lossy = run(1, 0.5, 50).channels["shuttle/command"];
-        assert!(lossy.taken_count < lossy.published_count * 6 / 10);
-    }
-
-    #[test]
-    fn an_unknown_channel_is_named() {
-        let case = Shuttle::new(ShuttleParameters::default(), 0).unwrap();
-        let carriers =
-            BTreeMap::from([("nope".to_owned(), Box::new(PerfectLink) as Box<dyn Carrier>)]);
-        let error = Simulation::new(&case, carriers).unwrap_err();
-        assert_eq!(error.to_string(), "case shuttle has no channel nope");
-    }
-}
+mod tests;

@@ -397,7 +397,7 @@ fn list_cases(registry: &Registry, console: &mut Console) -> u8 {
                 "  {:<16} {} -> {}  {} ({} bytes)\n",
                 channel.name,
                 channel.from,
-                channel.to,
+                channel.to.unwrap_or("the record only"),
                 channel.message.name,
                 channel.message.size_bytes
             ));

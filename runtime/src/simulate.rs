@@ -10,6 +10,7 @@ use hil_models::random::RandomStream;
 use hil_models::simulation::{Carrier, Simulation, SimulationResult};
 
 use crate::registry::Registry;
+use crate::report::score_event::ScoreEvents;
 use crate::report::summary::ScoreMetric;
 use crate::report::terminal::{self, Style};
 use crate::topology::Topology;
@@ -95,8 +96,12 @@ fn render_page(
             counts.published_count, counts.taken_count, counts.in_flight_count
         );
     }
+    for (name, count) in &result.recorded_counts {
+        let _infallible = writeln!(text, "  {name:<18} recorded  {count:>8}");
+    }
     text.push_str(&terminal::render_score(
         &ScoreMetric::all_of(score),
+        &ScoreEvents::in_virtual_time(score),
         columns,
         Style::Coloured,
     ));
@@ -121,6 +126,7 @@ fn render_json(topology: &Topology, result: &SimulationResult, score: &Score) ->
         "seed": topology.run().seed,
         "duration_s": topology.run().duration.as_secs_f64(),
         "channels": channels,
+        "recorded_counts": result.recorded_counts,
         "score": score,
     });
     format!("{document:#}\n")

@@ -6,7 +6,7 @@ use std::fmt::Write;
 use hil_models::measure::account::{
     ChannelAccount, ClosingFigures, MessageFate, RESIDUAL_LIMIT_NS,
 };
-use hil_runtime::report::summary::{ChannelSummary, RunSummary};
+use hil_runtime::report::summary::{ChannelSummary, LinkKind, RunSummary};
 
 /// Share of messages whose account must close.
 pub const CLOSED_RATIO_MIN: f64 = 0.999;
@@ -19,6 +19,12 @@ const UNEXPLAINED: [MessageFate; 3] = [
     MessageFate::UnknownPeerRecordsUnavailable,
     MessageFate::RefusedAtIngress,
 ];
+
+/// The channels that carry messages to someone: the others have no account.
+pub fn carried(summary: &RunSummary) -> impl Iterator<Item = &ChannelSummary> {
+    let channels = summary.channels.iter();
+    channels.filter(|channel| channel.link != LinkKind::RecordOnly)
+}
 
 /// The channel called `name`.
 ///
@@ -43,7 +49,7 @@ pub fn account<'a>(summary: &'a RunSummary, name: &str) -> &'a ChannelAccount {
 /// # Panics
 /// With the fates when one has not.
 pub fn assert_every_message_is_accounted_for(summary: &RunSummary) {
-    for channel in &summary.channels {
+    for channel in carried(summary) {
         let account = account(summary, &channel.name);
         let said = describe(&channel.name, account);
         assert!(account.published_count > 0, "{said}");
@@ -59,7 +65,7 @@ pub fn assert_every_message_is_accounted_for(summary: &RunSummary) {
 /// # Panics
 /// With the figures when they do not.
 pub fn assert_accounts_close(summary: &RunSummary) {
-    for channel in &summary.channels {
+    for channel in carried(summary) {
         let account = account(summary, &channel.name);
         let said = describe(&channel.name, account);
         let closing = closing(&channel.name, account);

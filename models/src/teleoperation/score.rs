@@ -41,7 +41,10 @@ pub(crate) fn score(case: &Teleoperation, log: &RunLog) -> Score {
             withdraw_if_it_compares_clocks(metric);
         }
     }
-    Score { metrics }
+    Score {
+        metrics,
+        ..Score::default()
+    }
 }
 
 /// Error and lag set a command's stamp against a status's: without one clock there is no figure.

@@ -127,6 +127,7 @@ pub(super) fn process_summary(process: &ProcessStory) -> ProcessSummary {
         role: process.role.clone(),
         exit: process.end.clone(),
         restart_count: u64::from(process.restart_count),
+        preparation_s: report.and_then(|report| report.preparation_s),
         tick_count: ticking.map(|report| report.ticks),
         skipped_tick_count: ticking.map(|report| report.skipped_ticks),
         cpu_time_s: report.map(|report| report.cpu_s),
@@ -178,13 +179,17 @@ pub(super) fn channel_summary(
         from: channel.from.clone(),
         to: channel.to.clone(),
         link: match crossing.map(|crossing| crossing.impairment.is_some()) {
+            None if channel.is_recorded_only() => LinkKind::RecordOnly,
             None => LinkKind::SharedMemory,
             Some(false) => LinkKind::Udp,
             Some(true) => LinkKind::Emulated,
         },
-        account: records
-            .has(&channel.name)
+        account: (records.has(&channel.name) && !channel.is_recorded_only())
             .then(|| records.account(topology, result, channel)),
+        recorded: channel
+            .is_recorded_only()
+            .then(|| records.recorded(&channel.name))
+            .flatten(),
         refusals,
         directions,
     }

@@ -1,6 +1,7 @@
 //! From the records of a finished run to its summary: reads the record files, draws up the
 //! account of each channel, and lets the case score what the robot did.
 
+mod events;
 mod figures;
 mod records;
 
@@ -84,7 +85,20 @@ pub(crate) fn conclude(
         .iter()
         .map(|channel| channel_summary(topology, result, channel, &records))
         .collect();
-    summary.score = ScoreMetric::all_of(&score(topology, registry, records.log())?);
+    let score = score(topology, registry, records.log())?;
+    summary.score = ScoreMetric::all_of(&score);
+    summary.score_events =
+        events::explained(&score, (topology, result), &records, &summary.channels);
+    add_warnings(&mut summary, result, &records);
+    summary.write(&result.folder.summary())?;
+    let plain = terminal::render(&summary, REPORT_FILE_WIDTH, Style::Plain);
+    let path = result.folder.report();
+    fs::write(&path, plain).map_err(|source| AnalysisError::Write { path, source })?;
+    Ok(summary)
+}
+
+/// What spoils the run or the reading of its figures.
+fn add_warnings(summary: &mut RunSummary, result: &RunResult, records: &RunRecords) {
     summary
         .warnings
         .extend(result.problems.iter().chain(&records.problems).cloned());
@@ -114,11 +128,6 @@ pub(crate) fn conclude(
                 .to_owned(),
         );
     }
-    summary.write(&result.folder.summary())?;
-    let plain = terminal::render(&summary, REPORT_FILE_WIDTH, Style::Plain);
-    let path = result.folder.report();
-    fs::write(&path, plain).map_err(|source| AnalysisError::Write { path, source })?;
-    Ok(summary)
 }
 
 /// Width of `report.txt`.

@@ -1,14 +1,14 @@
 //! The record files of a finished run, joined by channel, and the account drawn up from them. What
 //! the account means for a reader is decided elsewhere.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use hil_models::measure::account::{
     AccountContext, ChannelAccount, ChannelPath, ChannelRecords, FLIGHT_TIME_MAX, Interruption,
-    PathProcess, RunSpan, account,
+    MessageStory, PathProcess, RunSpan, account, stories,
 };
 use hil_models::measure::record::{
     EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, TakenRecord,
@@ -18,6 +18,7 @@ use hil_models::time::{Alignment, Instant};
 
 use super::AnalysisError;
 use crate::record::{RecordFile, RecordFileError, RecordKind};
+use crate::report::summary::RecordedFigures;
 use crate::supervisor::RunResult;
 use crate::topology::{Channel, Topology};
 
@@ -102,6 +103,23 @@ impl RunRecords {
         &self.log
     }
 
+    /// What there is of a channel that is only recorded; `None` when nothing is.
+    pub(super) fn recorded(&self, channel: &str) -> Option<RecordedFigures> {
+        let mut next_of_epoch: BTreeMap<u32, u64> = BTreeMap::new();
+        let messages = self.log.raw(channel);
+        for message in messages {
+            let next = next_of_epoch.entry(message.envelope.epoch).or_default();
+            *next = (*next).max(message.envelope.sequence.saturating_add(1));
+        }
+        let message_count = messages.len() as u64;
+        let given = next_of_epoch.values();
+        let given_count = given.fold(0_u64, |sum, count| sum.saturating_add(*count));
+        self.has(channel).then(|| RecordedFigures {
+            message_count,
+            missing_count: given_count.saturating_sub(message_count),
+        })
+    }
+
     /// The account of `channel`.
     pub(crate) fn account(
         &self,
@@ -109,6 +127,28 @@ impl RunRecords {
         result: &RunResult,
         channel: &Channel,
     ) -> ChannelAccount {
+        self.consult((topology, result), channel, account)
+    }
+
+    /// What became of the `wanted` messages of `channel`, by start of the producer and number.
+    pub(super) fn stories(
+        &self,
+        run: (&Topology, &RunResult),
+        channel: &Channel,
+        wanted: &BTreeSet<(u32, u64)>,
+    ) -> BTreeMap<(u32, u64), MessageStory> {
+        self.consult(run, channel, |records, context| {
+            stories(records, context, wanted)
+        })
+    }
+
+    /// Asks something of the records of `channel` and of what the run knows about its way.
+    fn consult<T>(
+        &self,
+        (topology, result): (&Topology, &RunResult),
+        channel: &Channel,
+        ask: impl FnOnce(&ChannelRecords<'_>, &AccountContext<'_>) -> T,
+    ) -> T {
         let nothing = ChannelFiles::default();
         let files = self.channels.get(&channel.name).unwrap_or(&nothing);
         let interruptions = interruptions(topology, result, channel);
@@ -130,7 +170,7 @@ impl RunRecords {
         let context = AccountContext {
             interruptions: &interruptions,
             producer_run: span_of(&channel.from),
-            consumer_run: span_of(&channel.to),
+            consumer_run: channel.to.as_deref().and_then(span_of),
             flight_time_max: FLIGHT_TIME_MAX + delay.unwrap_or(Duration::ZERO),
             round_trips_ns: &files.round_trips_ns,
             seed: topology.run().seed,
@@ -143,7 +183,7 @@ impl RunRecords {
             follow_up: files.follow_up.as_deref(),
             taken: files.taken.as_deref(),
         };
-        account(&records, &context)
+        ask(&records, &context)
     }
 }
 
@@ -160,8 +200,11 @@ fn interruptions(topology: &Topology, result: &RunResult, channel: &Channel) -> 
     let places = [
         (Some(channel.from.clone()), PathProcess::Producer),
         (gateway(&channel.from), PathProcess::SendingGateway),
-        (gateway(&channel.to), PathProcess::ReceivingGateway),
-        (Some(channel.to.clone()), PathProcess::Consumer),
+        (
+            channel.to.as_deref().and_then(gateway),
+            PathProcess::ReceivingGateway,
+        ),
+        (channel.to.clone(), PathProcess::Consumer),
     ];
     let end_of = |host: &str| {
         result

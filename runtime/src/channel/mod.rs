@@ -38,6 +38,7 @@ pub use error::{ChannelError, DomainError};
 pub use holder::{ChannelHolder, ChannelSettings};
 pub use identity::clock_id;
 pub use raw::{ENVELOPE_TYPE_NAME, RawInput, RawOutput};
+pub(crate) use sequence::Sequencer;
 pub use sequence::{InputCounters, OutputSettings, Stamp};
 pub use shm::{ShmInput, ShmOutput, TypedInput, TypedOutput};
 pub use type_info::TypeInfo;

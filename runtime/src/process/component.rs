@@ -14,10 +14,10 @@ use hil_models::message::{Envelope, MessageType};
 
 use super::launch::{ComponentLaunch, LaunchError, read};
 use super::pipe::{ChannelProgress, FromProcess, Orders, ProcessReport, say};
-use super::recording::{RecordedInput, RecordedOutput};
+use super::recording::{Destination, RecordedInput, RecordedOutput};
 use super::usage::add_usage;
 use crate::channel::{
-    ChannelError, Domain, DomainError, OutputSettings, ShmInput, ShmOutput, Waiter,
+    ChannelError, Domain, DomainError, OutputSettings, Sequencer, ShmInput, ShmOutput, Waiter,
 };
 use crate::clock::{MonotonicClock, Wake};
 use crate::realtime::{self, SpinAdvice};
@@ -71,7 +71,9 @@ fn prepare_and_live(path: &Path, registry: &Registry) -> Result<(), ComponentErr
     let orders = Orders::listen()?;
     let launch: ComponentLaunch = read(path)?;
     let card: ProcessCard = read(&launch.card)?;
+    let asked = MonotonicClock::now();
     let role = make_role(&card, registry)?;
+    let prepared_in = MonotonicClock::now().saturating_duration_since(asked);
     let counts = Counts::of(&card);
     let mut recorder = Recorder::new(&launch.records, &launch.process, launch.instance);
     let sinks = Sinks::open(&card, &mut recorder)?;
@@ -87,6 +89,7 @@ fn prepare_and_live(path: &Path, registry: &Registry) -> Result<(), ComponentErr
     say(&FromProcess::Ready);
     let mut report = ProcessReport {
         realtime: vec![("main".to_owned(), grant)],
+        preparation_s: Some(prepared_in.as_secs_f64()),
         ..ProcessReport::default()
     };
     let mut lived = Ok(());
@@ -119,34 +122,56 @@ fn make_role(card: &ProcessCard, registry: &Registry) -> Result<Box<dyn Role>, C
 
 /// Live counters of a component's ports, in port order.
 struct Counts {
-    taken: Vec<(String, Arc<AtomicU64>)>,
-    published: Vec<(String, Arc<AtomicU64>)>,
+    taken: Vec<Count>,
+    given: Vec<Count>,
+}
+
+/// How many messages of a channel went which way.
+struct Count {
+    channel: String,
+    what: &'static str,
+    so_far: Arc<AtomicU64>,
 }
 
 impl Counts {
     fn of(card: &ProcessCard) -> Self {
-        let counters = |channels: &[CardChannel]| {
-            channels
-                .iter()
-                .map(|card| (card.name.clone(), Arc::default()))
-                .collect()
+        let count = |channel: &CardChannel, what| Count {
+            channel: channel.name.clone(),
+            what,
+            so_far: Arc::default(),
+        };
+        let given = |channel: &CardChannel| {
+            let is_recorded_only = channel.is_recorded_only;
+            count(
+                channel,
+                if is_recorded_only {
+                    "recorded"
+                } else {
+                    "published"
+                },
+            )
         };
         Self {
-            taken: counters(&card.inputs),
-            published: counters(&card.outputs),
+            taken: card.inputs.iter().map(|one| count(one, "taken")).collect(),
+            given: card.outputs.iter().map(given).collect(),
         }
     }
 
     /// Tells the supervisor the counts a few times a second, from a thread of its own.
     fn report_progress(&self) -> Result<Arc<AtomicBool>, std::io::Error> {
-        let named = |what: &str, counters: &[(String, Arc<AtomicU64>)]| {
-            counters
-                .iter()
-                .map(|(channel, count)| (channel.clone(), what.to_owned(), Arc::clone(count)))
-                .collect::<Vec<_>>()
-        };
-        let mut all = named("taken", &self.taken);
-        all.extend(named("published", &self.published));
+        let all: Vec<(ChannelProgress, Arc<AtomicU64>)> = self
+            .taken
+            .iter()
+            .chain(&self.given)
+            .map(|one| {
+                let progress = ChannelProgress {
+                    channel: one.channel.clone(),
+                    what: one.what.to_owned(),
+                    count: 0,
+                };
+                (progress, Arc::clone(&one.so_far))
+            })
+            .collect();
         let is_running = Arc::new(AtomicBool::new(true));
         let running = Arc::clone(&is_running);
         thread::Builder::new()
@@ -154,10 +179,9 @@ impl Counts {
             .spawn(move || {
                 while running.load(Ordering::Acquire) {
                     thread::sleep(PROGRESS_PERIOD);
-                    let counts = all.iter().map(|(channel, what, count)| ChannelProgress {
-                        channel: channel.clone(),
-                        what: what.clone(),
+                    let counts = all.iter().map(|(progress, count)| ChannelProgress {
                         count: count.load(Ordering::Relaxed),
+                        ..progress.clone()
                     });
                     say(&FromProcess::Progress(counts.collect()));
                 }
@@ -169,7 +193,14 @@ impl Counts {
 /// The record rings of a component, in port order.
 struct Sinks {
     taken: Vec<RecordSink>,
-    published: Vec<(RecordSink, RecordSink)>,
+    given: Vec<GivenSinks>,
+}
+
+/// The record rings of one output.
+struct GivenSinks {
+    /// The producer's side of the account; `None` when there is nothing to account for.
+    published: Option<RecordSink>,
+    messages: RecordSink,
 }
 
 impl Sinks {
@@ -179,16 +210,19 @@ impl Sinks {
             let size = size_of::<TakenRecord>();
             taken.push(recorder.sink(RecordKind::Taken, &channel.name, size, RING_RECORDS)?);
         }
-        let mut published = Vec::new();
+        let mut given = Vec::new();
         for channel in &card.outputs {
-            let size = size_of::<PublishedRecord>();
-            let message = size_of::<Envelope>() + channel.message_size_bytes;
-            published.push((
-                recorder.sink(RecordKind::Published, &channel.name, size, RING_RECORDS)?,
-                recorder.sink(RecordKind::Message, &channel.name, message, RING_RECORDS)?,
-            ));
+            let mut sink = |kind, size| recorder.sink(kind, &channel.name, size, RING_RECORDS);
+            let is_accounted = !channel.is_recorded_only;
+            let message_size = size_of::<Envelope>() + channel.message_size_bytes;
+            given.push(GivenSinks {
+                published: is_accounted
+                    .then(|| sink(RecordKind::Published, size_of::<PublishedRecord>()))
+                    .transpose()?,
+                messages: sink(RecordKind::Message, message_size)?,
+            });
         }
-        Ok(Self { taken, published })
+        Ok(Self { taken, given })
     }
 }
 
@@ -208,7 +242,7 @@ fn connect(
     };
     let mut inputs = Vec::new();
     let declared: Vec<MessageType> = role.inputs().to_vec();
-    for (((channel, message), sink), (_, taken)) in card
+    for (((channel, message), sink), taken) in card
         .inputs
         .iter()
         .zip(declared)
@@ -218,24 +252,31 @@ fn connect(
         inputs.push(RecordedInput {
             port: ShmInput::open(domain, &channel.name, &message, channel.depth)?,
             sink,
-            taken: Arc::clone(taken),
+            taken: Arc::clone(&taken.so_far),
             wait: WaitStrategy::new(wait),
         });
     }
     let mut outputs = Vec::new();
     let declared: Vec<MessageType> = role.outputs().to_vec();
-    for (((channel, message), (sink, messages)), (_, published)) in card
+    for (((channel, message), sinks), given) in card
         .outputs
         .iter()
         .zip(declared)
-        .zip(sinks.published)
-        .zip(&counts.published)
+        .zip(sinks.given)
+        .zip(&counts.given)
     {
+        let destination = match sinks.published {
+            Some(sink) => {
+                let port = ShmOutput::open(domain, &channel.name, &message, settings)?;
+                let port = Box::new(port);
+                Destination::Channel { port, sink }
+            }
+            None => Destination::Record(Sequencer::new(settings)),
+        };
         outputs.push(RecordedOutput {
-            port: ShmOutput::open(domain, &channel.name, &message, settings)?,
-            sink,
-            messages,
-            published: Arc::clone(published),
+            destination,
+            messages: sinks.messages,
+            given: Arc::clone(&given.so_far),
         });
     }
     Ok(Endpoint::new(role, inputs, outputs)?)
@@ -292,7 +333,7 @@ fn live(
         .sum();
     let outputs = endpoint.outputs_mut().iter();
     report.connection_failures += outputs
-        .map(|one| one.port.connection_failure_count())
+        .map(RecordedOutput::connection_failure_count)
         .sum::<u64>();
     outcome
 }

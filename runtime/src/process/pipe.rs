@@ -53,6 +53,9 @@ pub struct ChannelProgress {
 pub struct ProcessReport {
     /// What the kernel granted or refused, per thread.
     pub realtime: Vec<(String, RealtimeGrant)>,
+    /// How long the role took to make: reading its parameters and computing what it needs.
+    #[serde(default)]
+    pub preparation_s: Option<f64>,
     /// Grid points of the role's timer that passed without a tick.
     pub skipped_ticks: u64,
     /// Ticks that ran.

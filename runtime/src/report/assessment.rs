@@ -151,6 +151,9 @@ fn process_warnings(process: &ProcessSummary) -> Vec<String> {
 
 fn channel_warnings(channel: &ChannelSummary) -> Vec<String> {
     let name = &channel.name;
+    if channel.link == LinkKind::RecordOnly {
+        return recorded_warnings(channel);
+    }
     let Some(account) = &channel.account else {
         return vec![format!("{name} left no records: it has no account")];
     };
@@ -175,6 +178,21 @@ fn channel_warnings(channel: &ChannelSummary) -> Vec<String> {
     }
     warnings.extend(stamp_warnings(name, account));
     warnings
+}
+
+/// The record is all there is of such a channel, and a score rests on it.
+fn recorded_warnings(channel: &ChannelSummary) -> Vec<String> {
+    let name = &channel.name;
+    match &channel.recorded {
+        None => vec![format!("{name} left no record")],
+        Some(figures) if figures.missing_count > 0 => {
+            let count = grouped(figures.missing_count);
+            vec![format!(
+                "{name}: {count} messages are missing in its record"
+            )]
+        }
+        Some(_) => Vec::new(),
+    }
 }
 
 fn stamp_warnings(name: &str, account: &ChannelAccount) -> Vec<String> {

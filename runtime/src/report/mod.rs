@@ -2,8 +2,11 @@
 //! rendering for a terminal. It measures nothing and prints nothing; the caller writes the text.
 
 pub mod assessment;
+pub mod score_event;
 pub mod summary;
 pub mod terminal;
 
 #[cfg(test)]
 mod sample;
+#[cfg(test)]
+mod sample_events;

@@ -13,6 +13,7 @@ use hil_models::random::RandomStream;
 use hil_models::time::{Alignment, Instant};
 
 use super::assessment::{Assessment, NetworkVerdict};
+use super::sample_events::{few_events, many_events, recorded_channel};
 use super::summary::{
     ChannelSummary, CountByName, DirectionSummary, Fact, LinkKind, Outcome, ProcessSummary,
     RealtimeFacts, RunEvent, RunFacts, RunSummary, ScoreMetric, SummaryError,
@@ -174,6 +175,7 @@ fn process(name: &str, role: &str, skipped_tick_count: Option<u64>) -> ProcessSu
         role: role.to_owned(),
         exit: "ended by itself, code 0".to_owned(),
         restart_count: 0,
+        preparation_s: (role != "gateway").then_some(0.812),
         tick_count: skipped_tick_count.map(|_| 5_000),
         skipped_tick_count,
         cpu_time_s: Some(1.234),
@@ -205,9 +207,10 @@ fn channel(
     ChannelSummary {
         name: name.to_owned(),
         from: roles[0].to_owned(),
-        to: roles[1].to_owned(),
+        to: Some(roles[1].to_owned()),
         link,
         account: Some(account),
+        recorded: None,
         refusals: Vec::new(),
         directions: Vec::new(),
     }
@@ -238,7 +241,7 @@ fn channels() -> Vec<ChannelSummary> {
         LinkKind::SharedMemory,
         files.direct(),
     );
-    vec![command, status, motion]
+    vec![command, status, motion, recorded_channel()]
 }
 
 /// A whole report.
@@ -282,6 +285,7 @@ fn full() -> RunSummary {
             ),
             metric("tracking lag", None, "s", "no swing was complete"),
         ],
+        score_events: few_events(),
         ..RunSummary::new(run_facts())
     }
 }
@@ -310,6 +314,7 @@ fn awkward() -> RunSummary {
     summary.score[0].label.clone_from(&long);
     summary.score[0].value = Some(-123_456_789.123);
     summary.events[0].what.clone_from(&long);
+    summary.score_events = many_events(&long);
     summary
 }
 
@@ -329,9 +334,10 @@ fn empty() -> RunSummary {
         summary.channels.push(ChannelSummary {
             name: name.to_owned(),
             from: "controller".to_owned(),
-            to: "robot".to_owned(),
+            to: Some("robot".to_owned()),
             link: LinkKind::Udp,
             account,
+            recorded: None,
             refusals: Vec::new(),
             directions: Vec::new(),
         });

@@ -13,6 +13,7 @@ use hil_models::measure::account::ChannelAccount;
 use serde::{Deserialize, Serialize};
 
 use super::assessment::Assessment;
+use super::score_event::ScoreEvents;
 
 /// Version of the `summary.json` layout.
 pub const SCHEMA_VERSION: u32 = 1;
@@ -36,6 +37,9 @@ pub struct RunSummary {
     pub channels: Vec<ChannelSummary>,
     /// What the robot did.
     pub score: Vec<ScoreMetric>,
+    /// What happened to the robot, and what the network had done to the messages concerned.
+    #[serde(default)]
+    pub score_events: ScoreEvents,
     /// Anything else a reader must know; [`Assessment::warnings`] come on top.
     pub warnings: Vec<String>,
 }
@@ -52,6 +56,7 @@ impl RunSummary {
             events: Vec::new(),
             channels: Vec::new(),
             score: Vec::new(),
+            score_events: ScoreEvents::default(),
             warnings: Vec::new(),
         }
     }
@@ -220,6 +225,9 @@ pub struct ProcessSummary {
     pub exit: String,
     /// Starts after the first.
     pub restart_count: u64,
+    /// How long its role took to prepare, seconds; `None` for a process without a role.
+    #[serde(default)]
+    pub preparation_s: Option<f64>,
     /// Periodic ticks it ran; `None` for a process without a period.
     pub tick_count: Option<u64>,
     /// Ticks it could not run in time and passed over.
@@ -259,6 +267,8 @@ pub enum LinkKind {
     Udp,
     /// A gateway pair over an emulated link.
     Emulated,
+    /// Nothing: its messages go to the run's record only.
+    RecordOnly,
 }
 
 impl LinkKind {
@@ -268,6 +278,7 @@ impl LinkKind {
             Self::SharedMemory => "shared memory",
             Self::Udp => "UDP",
             Self::Emulated => "emulated link",
+            Self::RecordOnly => "recorded only",
         }
     }
 }
@@ -279,16 +290,29 @@ pub struct ChannelSummary {
     pub name: String,
     /// The role that publishes.
     pub from: String,
-    /// The role that subscribes.
-    pub to: String,
+    /// The role that subscribes; `None` for a channel that is only recorded.
+    pub to: Option<String>,
     /// How it is carried.
     pub link: LinkKind,
-    /// Its latency account; `None` when no records were found.
+    /// Its latency account; `None` when no records were found or it is only recorded.
     pub account: Option<ChannelAccount>,
+    /// What was recorded of a channel that is only recorded; `None` when nothing was.
+    #[serde(default)]
+    pub recorded: Option<RecordedFigures>,
     /// Datagrams the gateways refused, by reason; only reasons that occurred.
     pub refusals: Vec<CountByName>,
     /// The gateway threads that carried it; empty on a direct channel.
     pub directions: Vec<DirectionSummary>,
+}
+
+/// What the record holds of a channel that goes nowhere else.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RecordedFigures {
+    /// Messages in the record.
+    pub message_count: u64,
+    /// Sequence numbers below the highest of each start that are not: the recorder was full, or
+    /// its process was killed.
+    pub missing_count: u64,
 }
 
 /// One gateway thread of a channel.

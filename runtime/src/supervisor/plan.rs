@@ -28,7 +28,7 @@ pub(crate) struct Plan {
 #[derive(Debug)]
 pub(crate) struct HostPlan {
     pub(crate) name: String,
-    /// Channels with an end on this host.
+    /// Channels in shared memory with an end on this host.
     pub(crate) channels: Vec<Channel>,
 }
 
@@ -78,10 +78,12 @@ pub(crate) fn plan(topology: &Topology, hosts: &[&Host]) -> Plan {
     let is_here = |name: &str| hosts.iter().any(|host| host.name == name);
     let host_plans = hosts.iter().map(|host| {
         let channels = topology.channels().iter().filter(|channel| {
-            [&channel.from, &channel.to]
-                .into_iter()
-                .filter_map(|name| topology.process(name))
-                .any(|process| process.host == host.name)
+            // What is only recorded needs no memory to share.
+            let ends = channel.to.iter().chain([&channel.from]);
+            !channel.is_recorded_only()
+                && ends
+                    .filter_map(|name| topology.process(name))
+                    .any(|process| process.host == host.name)
         });
         HostPlan {
             name: host.name.clone(),

@@ -362,7 +362,7 @@ impl Session<'_> {
             counts.insert((&progress.channel, &progress.what), progress.count);
         }
         let channels = self.topology.channels().iter().filter_map(|channel| {
-            let told = ["published", "sent", "received", "taken"]
+            let told = ["published", "sent", "received", "taken", "recorded"]
                 .iter()
                 .filter_map(|what| {
                     counts

@@ -38,8 +38,10 @@ pub struct CardChannel {
     pub message_size_bytes: usize,
     /// Alignment of a message in shared memory.
     pub message_alignment_bytes: usize,
-    /// Messages its queue holds.
+    /// Messages its queue holds; 0 when there is none.
     pub depth: usize,
+    /// True for an output that is in no shared memory: its messages only go to the run's record.
+    pub is_recorded_only: bool,
 }
 
 impl CardChannel {
@@ -50,6 +52,7 @@ impl CardChannel {
             message_size_bytes: channel.message.size_bytes,
             message_alignment_bytes: channel.message.alignment_bytes,
             depth: channel.depth,
+            is_recorded_only: channel.is_recorded_only(),
         }
     }
 
@@ -79,7 +82,7 @@ impl Topology {
             case: case.map(|case| case.name.clone()),
             role: role.map(str::to_owned),
             seed: self.run.seed,
-            inputs: ends(|channel, process| channel.to == process.name),
+            inputs: ends(|channel, process| channel.to.as_ref() == Some(&process.name)),
             outputs: ends(|channel, process| channel.from == process.name),
             parameters: case.map(|case| case.parameters.clone()).unwrap_or_default(),
         })

@@ -1,6 +1,8 @@
 //! What channels and links say about processes and hosts: which process ends a channel, which
 //! link carries it, and on which ports. See `check`.
 
+use hil_models::case_study::ChannelSpec;
+
 use super::errors::{Fault, Faults, Place};
 use super::file::{ChannelEntry, ProcessEntry};
 use super::file_links::LinkEntry;
@@ -80,20 +82,7 @@ fn case_channels(
     for spec in case.channels {
         let entry = entries.iter().find(|entry| entry.name == spec.name);
         if let Some(entry) = entry {
-            let places = [
-                (
-                    "message",
-                    entry.message.as_ref().map(|message| message.place),
-                ),
-                ("from", entry.from.as_ref().map(|from| from.place)),
-                ("to", entry.to.as_ref().map(|to| to.place)),
-            ];
-            for (key, place) in places {
-                if place.is_some() {
-                    let fault = format!("is given by case `{}` for this channel", case.name);
-                    faults.add(join(&entry.path, key), place, Fault::Inconsistent(fault));
-                }
-            }
+            check_case_entry(case, spec, entry, faults);
         }
         let player = |role| {
             processes
@@ -101,7 +90,8 @@ fn case_channels(
                 .find(|process| process.role() == Some(role))
         };
         // An unplayed role is a fault already.
-        let (Some(from), Some(to)) = (player(spec.from), player(spec.to)) else {
+        let (from, to) = (player(spec.from), spec.to.and_then(player));
+        let Some(from) = from.filter(|_| to.is_some() || spec.is_recorded_only()) else {
             continue;
         };
         channels.push(Channel {
@@ -113,14 +103,48 @@ fn case_channels(
                 alignment_bytes: spec.message.alignment_bytes,
             },
             from: from.name.clone(),
-            to: to.name.clone(),
-            depth: entry.map_or_else(ChannelEntry::default_depth, |entry| entry.depth),
+            to: to.map(|to| to.name.clone()),
+            depth: match (spec.is_recorded_only(), entry) {
+                (true, _) => 0,
+                (false, Some(entry)) => entry.depth,
+                (false, None) => ChannelEntry::default_depth(),
+            },
             link: entry.and_then(ChannelEntry::link_name),
             ports: None,
             is_foreign: false,
         });
     }
     channels
+}
+
+/// What the file may say of a channel that the case declares.
+fn check_case_entry(case: &KnownCase, spec: &ChannelSpec, entry: &ChannelEntry, faults: &Faults) {
+    let places = [
+        (
+            "message",
+            entry.message.as_ref().map(|message| message.place),
+        ),
+        ("from", entry.from.as_ref().map(|from| from.place)),
+        ("to", entry.to.as_ref().map(|to| to.place)),
+    ];
+    for (key, place) in places {
+        if place.is_some() {
+            let fault = format!("is given by case `{}` for this channel", case.name);
+            faults.add(join(&entry.path, key), place, Fault::Inconsistent(fault));
+        }
+    }
+    if !spec.is_recorded_only() {
+        return;
+    }
+    let why = "the messages of this channel only go to the run's record, on the host of their \
+               producer";
+    if let Some(link) = &entry.link {
+        let fault = Fault::Inconsistent(format!("is `{}`, but {why}", link.value));
+        faults.add(join(&entry.path, "link"), Some(link.place), fault);
+    } else {
+        let fault = Fault::Inconsistent(format!("has nothing to set: {why}"));
+        faults.add(entry.path.clone(), Some(entry.place), fault);
+    }
 }
 
 /// A channel between the user's own programs.
@@ -159,7 +183,7 @@ fn foreign_channel(
         name: entry.name.clone(),
         message: entry.message.as_ref()?.value.clone(),
         from,
-        to,
+        to: Some(to),
         depth: entry.depth,
         link: entry.link_name(),
         ports: None,
@@ -216,7 +240,9 @@ impl Routes<'_> {
     /// Checks the link of `channel` against the hosts of its ends; gives it its ports.
     fn assign(&mut self, channel: &mut Channel) {
         let host_of = |name: &str| self.topology.process(name).map(|process| &process.host);
-        let (Some(from), Some(to)) = (host_of(&channel.from), host_of(&channel.to)) else {
+        // A link given to a channel without consumer is a fault already.
+        let to = channel.to.as_deref().and_then(host_of);
+        let (Some(from), Some(to)) = (host_of(&channel.from), to) else {
             return;
         };
         let known = |name: &str| self.topology.host(name).is_some();
@@ -304,9 +330,10 @@ impl Routes<'_> {
     }
 
     fn refuse_unlinked(&self, channel: &Channel, [from, to]: [&String; 2]) {
+        let consumer = channel.to.as_deref().unwrap_or_default();
         let ends = format!(
-            "`{}` on host `{from}` and `{}` on host `{to}`",
-            channel.from, channel.to
+            "`{}` on host `{from}` and `{consumer}` on host `{to}`",
+            channel.from
         );
         let hint = format!("the channel joins {ends}: name a link via \"udp\" or \"emulated\"");
         let fault = match &channel.link {
@@ -326,7 +353,7 @@ impl Routes<'_> {
         let place = entry.map(|entry| place_of(entry.link.as_ref(), entry.place));
         let consumer = || {
             let mut processes = self.tables.processes.iter();
-            let consumer = processes.find(|process| process.name == channel.to)?;
+            let consumer = processes.find(|process| Some(&process.name) == channel.to.as_ref())?;
             Some(place_of(consumer.host.as_ref(), consumer.place))
         };
         self.faults.add(key, place.or_else(consumer), fault);

@@ -183,7 +183,7 @@ impl MessageLayout {
     }
 }
 
-/// One channel: one producer, one consumer.
+/// One channel: one producer, and one consumer or none but the record.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Channel {
     /// Number in datagrams: the case's channels in their order, then foreign ones by name.
@@ -194,9 +194,9 @@ pub struct Channel {
     pub message: MessageLayout,
     /// Process that publishes.
     pub from: String,
-    /// Process that subscribes.
-    pub to: String,
-    /// Messages the shared-memory queue holds.
+    /// Process that subscribes; `None` when its messages go to the run's record only.
+    pub to: Option<String>,
+    /// Messages the shared-memory queue holds; 0 without a consumer, as there is no queue.
     pub depth: usize,
     /// Name of its link, if the file gives one.
     pub link: Option<String>,
@@ -204,6 +204,13 @@ pub struct Channel {
     pub ports: Option<ChannelPorts>,
     /// True when the file declares it, false when the case does.
     pub is_foreign: bool,
+}
+
+impl Channel {
+    /// True when its messages go to the run's record only: it is in no shared memory.
+    pub fn is_recorded_only(&self) -> bool {
+        self.to.is_none()
+    }
 }
 
 /// The two UDP ports of a channel on a hop.
@@ -428,7 +435,7 @@ impl Topology {
         let link = self.link(channel.link.as_deref()?)?;
         let hop = link.hop()?;
         let from_host = self.host(&self.process(&channel.from)?.host)?;
-        let to_host = self.host(&self.process(&channel.to)?.host)?;
+        let to_host = self.host(&self.process(channel.to.as_deref()?)?.host)?;
         let is_forward = link.between.as_ref()?[0] == from_host.name;
         let direction = if is_forward {
             Direction::Forward

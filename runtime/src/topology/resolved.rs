@@ -41,7 +41,9 @@ impl Topology {
         let processes = self.processes.iter();
         let processes = processes.map(|process| (process.name.clone(), resolved_process(process)));
         put_named(&mut table, "processes", processes);
+        // What is only recorded has nothing to set, and a file that says otherwise is refused.
         let channels = self.channels.iter();
+        let channels = channels.filter(|channel| !channel.is_recorded_only());
         let channels = channels.map(|channel| (channel.name.clone(), resolved_channel(channel)));
         put_named(&mut table, "channels", channels);
         let links = self
@@ -182,7 +184,9 @@ fn resolved_channel(channel: &Channel) -> Table {
         );
         put(&mut table, "message", message);
         put(&mut table, "from", channel.from.as_str());
-        put(&mut table, "to", channel.to.as_str());
+        if let Some(to) = &channel.to {
+            put(&mut table, "to", to.as_str());
+        }
     }
     table
 }

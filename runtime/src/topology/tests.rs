@@ -6,6 +6,7 @@ mod hosts;
 mod layers;
 mod misspelt;
 mod mutation;
+mod recorded;
 mod relations;
 
 use core::time::Duration;

@@ -21,6 +21,8 @@ pub(super) struct Judge<'a> {
     flight_ns: i64,
     interruptions: &'a [Interruption],
     lost_counts: Vec<u64>,
+    /// The interruption that cost the message judged last.
+    last_hit: Option<usize>,
     /// Where the previous message of known place was, for those without any.
     previous_producer_ns: Option<i64>,
     previous_consumer_ns: Option<i64>,
@@ -47,6 +49,7 @@ impl<'a> Judge<'a> {
             flight_ns: duration_ns(context.flight_time_max),
             interruptions: context.interruptions,
             lost_counts: vec![0; context.interruptions.len()],
+            last_hit: None,
             previous_producer_ns: None,
             previous_consumer_ns: None,
         }
@@ -59,6 +62,11 @@ impl<'a> Judge<'a> {
         self.previous_producer_ns = place.producer_ns.or(self.previous_producer_ns);
         self.previous_consumer_ns = place.consumer_ns.or(self.previous_consumer_ns);
         fate
+    }
+
+    /// The interruption that cost the message judged last, by its place in the context.
+    pub(super) const fn last_interruption(&self) -> Option<usize> {
+        self.last_hit
     }
 
     /// What each interruption cost, with the silence it caused.
@@ -78,6 +86,7 @@ impl<'a> Judge<'a> {
     }
 
     fn fate(&mut self, joined: &Joined<'_>, place: Place) -> MessageFate {
+        self.last_hit = None;
         if joined.taken.is_some() {
             return MessageFate::Taken;
         }
@@ -90,6 +99,7 @@ impl<'a> Judge<'a> {
             let interruption = &self.interruptions[*index];
             self.is_within_reach(joined, interruption) && self.is_hit(fate, place, interruption)
         });
+        self.last_hit = hit;
         match hit {
             Some(index) => {
                 self.lost_counts[index] = self.lost_counts[index].saturating_add(joined.count);

@@ -17,6 +17,7 @@ mod join;
 mod random_fates;
 mod segments;
 mod stage;
+mod story;
 #[cfg(test)]
 mod synthetic;
 #[cfg(test)]
@@ -29,6 +30,7 @@ pub use figures::{
     InterruptionFigures, SegmentFigures, StampCoverage,
 };
 pub use stage::{MessageFate, Side, Stage};
+pub use story::{MessageStory, stories};
 
 use crate::measure::histogram::LatencyHistogram;
 use crate::measure::record::{
@@ -62,6 +64,21 @@ pub struct ChannelRecords<'a> {
     pub follow_up: Option<&'a [FollowUpRecord]>,
     /// The consumer's.
     pub taken: Option<&'a [TakenRecord]>,
+}
+
+impl ChannelRecords<'_> {
+    /// Those that a channel carried so can have.
+    fn on(self, path: ChannelPath) -> Self {
+        if path.is_gateway() {
+            return self;
+        }
+        Self {
+            egress: None,
+            ingress: None,
+            follow_up: None,
+            ..self
+        }
+    }
 }
 
 /// How a channel gets from its producer to its consumer.
@@ -189,16 +206,7 @@ impl<'a> AccountContext<'a> {
 /// Never for any records; it asserts its own invariant, that the fates sum to the published
 /// count.
 pub fn account(records: &ChannelRecords<'_>, context: &AccountContext<'_>) -> ChannelAccount {
-    let records = if context.path.is_gateway() {
-        *records
-    } else {
-        ChannelRecords {
-            egress: None,
-            ingress: None,
-            follow_up: None,
-            ..*records
-        }
-    };
+    let records = records.on(context.path);
     let join = join::Join::new(&records);
     let producer_restart_count = join.epoch_count().saturating_sub(1);
     let mut judge = fate::Judge::new(&records, context, &join);

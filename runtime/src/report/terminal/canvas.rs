@@ -116,12 +116,22 @@ impl Canvas {
 
     /// As [`Canvas::field`], with a label column of `label_width`.
     pub(super) fn field_of(&mut self, label_width: usize, label: &str, tone: Tone, text: &str) {
-        let start = INDENT + label_width;
-        let rows = wrapped(text, self.width - start);
+        self.field_at(INDENT, (label_width, label), tone, text);
+    }
+
+    /// As [`Canvas::field_of`], behind `margin` columns.
+    pub(super) fn field_at(
+        &mut self,
+        margin: usize,
+        (label_width, label): (usize, &str),
+        tone: Tone,
+        text: &str,
+    ) {
+        let rows = wrapped(text, self.width - margin - label_width);
         for (index, row) in rows.iter().enumerate() {
             let label = if index == 0 { label } else { "" };
             let line = format!(
-                "{:INDENT$}{}{}",
+                "{:margin$}{}{}",
                 "",
                 self.paint(Tone::Faint, &left(label, label_width)),
                 self.paint(tone, row)

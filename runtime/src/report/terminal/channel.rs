@@ -9,7 +9,7 @@ use hil_models::measure::statistics::IntervalNs;
 
 use super::canvas::{Canvas, INDENT, Tone, bar, left, right};
 use super::units::{duration, grouped, percent};
-use crate::report::summary::{ChannelSummary, CountByName};
+use crate::report::summary::{ChannelSummary, CountByName, RecordedFigures};
 
 /// Columns of a stage's name, of each of the four figures, and between figures and bar.
 const NAME_WIDTH: usize = 22;
@@ -18,8 +18,13 @@ const BAR_GAP: usize = 2;
 
 pub(super) fn channel(canvas: &mut Canvas, channel: &ChannelSummary) {
     let link = channel.link.label();
-    let aside = format!("{} → {} · {link}", channel.from, channel.to);
-    canvas.heading(&format!("Channel {}", channel.name), &aside);
+    let title = format!("Channel {}", channel.name);
+    let Some(to) = &channel.to else {
+        canvas.heading(&title, &format!("{} · {link}", channel.from));
+        recorded(canvas, channel.recorded);
+        return;
+    };
+    canvas.heading(&title, &format!("{} → {to} · {link}", channel.from));
     let Some(account) = &channel.account else {
         canvas.paragraph(
             INDENT,
@@ -59,6 +64,25 @@ pub(super) fn channel(canvas: &mut Canvas, channel: &ChannelSummary) {
             .collect();
         canvas.field(&direction.direction, Tone::Faint, &words.join(" · "));
     }
+}
+
+fn recorded(canvas: &mut Canvas, figures: Option<RecordedFigures>) {
+    let Some(figures) = figures else {
+        canvas.paragraph(
+            INDENT,
+            Tone::Faint,
+            "unavailable: no record of this channel",
+        );
+        return;
+    };
+    let mut text = format!("{} messages recorded", grouped(figures.message_count));
+    let mut tone = Tone::Plain;
+    if figures.missing_count > 0 {
+        let count = grouped(figures.missing_count);
+        text.push_str(&[", ", &count, " missing in the record"].concat());
+        tone = Tone::Caution;
+    }
+    canvas.paragraph(INDENT, tone, &text);
 }
 
 fn fates(canvas: &mut Canvas, account: &ChannelAccount) {

@@ -2,15 +2,17 @@
 
 mod canvas;
 mod channel;
+mod events;
 mod tables;
 mod units;
 
 pub use canvas::Style;
-pub(crate) use units::{JOINT, grouped, percent};
+pub(crate) use units::{JOINT, duration_s, grouped, percent};
 
 use canvas::{Canvas, INDENT, Tone};
 
 use super::assessment::{Assessment, NetworkVerdict, SKIPPED_TICK_RATIO_MAX};
+use super::score_event::ScoreEvents;
 use super::summary::{Outcome, RunSummary, ScoreMetric};
 
 /// The report of a run as text of at most `width_columns` columns (clamped to 80..=120).
@@ -20,6 +22,7 @@ pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> Strin
     title(&mut canvas, summary);
     verdict(&mut canvas, summary, &assessment);
     tables::score(&mut canvas, &summary.score);
+    events::score_events(&mut canvas, &summary.score_events);
     for channel in &summary.channels {
         channel::channel(&mut canvas, channel);
     }
@@ -33,10 +36,16 @@ pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> Strin
     canvas.finish()
 }
 
-/// The figures of a score alone, as [`render`] shows them.
-pub fn render_score(score: &[ScoreMetric], width_columns: usize, style: Style) -> String {
+/// The figures and events of a score alone, as [`render`] shows them.
+pub fn render_score(
+    score: &[ScoreMetric],
+    events: &ScoreEvents,
+    width_columns: usize,
+    style: Style,
+) -> String {
     let mut canvas = Canvas::new(width_columns, style);
     tables::score(&mut canvas, score);
+    events::score_events(&mut canvas, events);
     canvas.finish()
 }
 

@@ -1,8 +1,11 @@
 //! The parts of a report that are not about one channel: score, processes, events, host.
 
 use super::canvas::{Canvas, INDENT, Tone, columns, left, right};
-use super::units::{figure, grouped, seconds};
+use super::units::{duration_s, figure, grouped, seconds};
 use crate::report::summary::{Fact, ProcessSummary, RealtimeFacts, RunEvent, ScoreMetric};
+
+/// Shorter preparations concern nobody.
+const PREPARATION_S_MIN: f64 = 0.01;
 
 /// Columns of margins, value and interval beside a label of the score.
 const FIGURES_WIDTH: usize = 46;
@@ -97,7 +100,14 @@ pub(super) fn processes(canvas: &mut Canvas, processes: &[ProcessSummary]) {
             right(&switches, 17),
         );
         canvas.line(&line);
-        canvas.paragraph(INDENT + 2, Tone::Faint, &process.exit);
+        let exit = match process.preparation_s {
+            Some(s) if s >= PREPARATION_S_MIN => {
+                let prepared = duration_s(s);
+                format!("{}; case prepared in {prepared}", process.exit)
+            }
+            _ => process.exit.clone(),
+        };
+        canvas.paragraph(INDENT + 2, Tone::Faint, &exit);
     }
 }
 

@@ -20,6 +20,15 @@ pub(crate) fn duration(ns: i64) -> String {
     )
 }
 
+/// As [`duration`], of seconds.
+#[allow(
+    clippy::cast_possible_truncation,
+    reason = "a run's durations are far below 292 years; beyond, the conversion saturates"
+)]
+pub(crate) fn duration_s(seconds: f64) -> String {
+    duration((seconds * 1e9).round() as i64)
+}
+
 /// Seconds after the start of a run.
 pub(crate) fn seconds(value: f64) -> String {
     format!("{value:.3}{JOINT}s")

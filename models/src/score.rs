@@ -1,0 +1,193 @@
+//! What a case says of a finished run: figures, and the events a reader will want explained. It
+//! names the messages concerned; what the network did to them is not known here.
+
+use serde::{Deserialize, Serialize};
+
+use crate::message::Envelope;
+use crate::time::Instant;
+
+/// Events a score keeps at most.
+pub const EVENTS_MAX: usize = 1_000;
+/// Messages an event names at most.
+pub const EVENT_MESSAGES_MAX: usize = 16;
+
+/// What the robot did.
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
+pub struct Score {
+    /// The figures, in the order a report prints them.
+    pub metrics: Vec<Metric>,
+    /// What happened to the robot, in order of time; at most [`EVENTS_MAX`]. Fill it by
+    /// [`Score::add_event`].
+    pub events: Vec<ScoreEvent>,
+    /// Events that found no room.
+    pub events_dropped_count: u64,
+}
+
+/// One figure with its unit, interval and method.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Metric {
+    /// Snake-case name with unit suffix, e.g. `joint_error_rad_rms`.
+    pub name: &'static str,
+    /// The words a report prints.
+    pub label: &'static str,
+    /// The figure; `None` when the run did not allow it, with the reason in `method`.
+    pub value: Option<f64>,
+    /// 95 % interval, when the figure is a statistic.
+    pub interval: Option<(f64, f64)>,
+    /// SI unit, or `1` for a pure number.
+    pub unit: &'static str,
+    /// How it was obtained, or why it was not.
+    pub method: String,
+}
+
+/// How much an event matters; where room is short, the higher one is shown.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Severity {
+    /// Worth knowing: the robot coped.
+    Notice,
+    /// What must not happen, e.g. a collision.
+    Incident,
+}
+
+/// Something the robot did, with the messages a report shows beside it.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ScoreEvent {
+    /// How much it matters.
+    pub severity: Severity,
+    /// When, on the clock of the host that publishes [`ScoreEvent::clock_of`].
+    pub at: Instant,
+    /// The channel whose producer's clock `at` is read from. With unaligned clocks a time means
+    /// nothing without it.
+    pub clock_of: &'static str,
+    /// What happened, in words without full stop.
+    pub what: String,
+    /// The messages that led to it, or should have prevented it; at most
+    /// [`EVENT_MESSAGES_MAX`]. Fill it by [`ScoreEvent::naming`].
+    pub messages: Vec<MessageRef>,
+    /// Messages that found no room.
+    pub messages_dropped_count: u64,
+}
+
+/// Points at one message of a run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+pub struct MessageRef {
+    /// Its channel.
+    pub channel: &'static str,
+    /// The producer's start, as in [`Envelope::epoch`].
+    pub epoch: u32,
+    /// Its number on the channel, as in [`Envelope::sequence`].
+    pub sequence: u64,
+}
+
+impl MessageRef {
+    /// The message of `channel` that was logged with `envelope`.
+    pub const fn of(channel: &'static str, envelope: &Envelope) -> Self {
+        Self {
+            channel,
+            epoch: envelope.epoch,
+            sequence: envelope.sequence,
+        }
+    }
+}
+
+impl ScoreEvent {
+    /// An event that names no message yet.
+    pub fn new(
+        severity: Severity,
+        at: Instant,
+        clock_of: &'static str,
+        what: impl Into<String>,
+    ) -> Self {
+        Self {
+            severity,
+            at,
+            clock_of,
+            what: what.into(),
+            messages: Vec::new(),
+            messages_dropped_count: 0,
+        }
+    }
+
+    /// The same with one more message, unless there is no room.
+    #[must_use]
+    pub fn naming(mut self, message: MessageRef) -> Self {
+        if self.messages.len() < EVENT_MESSAGES_MAX {
+            self.messages.push(message);
+        } else {
+            self.messages_dropped_count += 1;
+        }
+        self
+    }
+}
+
+impl Score {
+    /// The metric called `name`.
+    pub fn get(&self, name: &str) -> Option<&Metric> {
+        self.metrics.iter().find(|metric| metric.name == name)
+    }
+
+    /// Appends an event. Without room an incident takes the place of the latest notice; whatever
+    /// is left out is counted.
+    pub fn add_event(&mut self, event: ScoreEvent) {
+        if self.events.len() >= EVENTS_MAX {
+            self.events_dropped_count += 1;
+            let is_notice = |event: &ScoreEvent| event.severity == Severity::Notice;
+            if event.severity == Severity::Notice {
+                return;
+            }
+            match self.events.iter().rposition(is_notice) {
+                Some(index) => drop(self.events.remove(index)),
+                None => return,
+            }
+        }
+        self.events.push(event);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn event(severity: Severity, at_ns: i64) -> ScoreEvent {
+        ScoreEvent::new(severity, Instant::from_ns(at_ns), "a/b", "something")
+    }
+
+    #[test]
+    fn a_full_score_keeps_incidents_before_notices_and_counts_the_rest() {
+        let mut score = Score::default();
+        for at_ns in 0..1_000 {
+            score.add_event(event(Severity::Notice, at_ns));
+        }
+        score.add_event(event(Severity::Notice, 1_000));
+        score.add_event(event(Severity::Incident, 1_001));
+        assert_eq!(score.events.len(), EVENTS_MAX);
+        assert_eq!(score.events_dropped_count, 2);
+        assert_eq!(score.events.last().unwrap().severity, Severity::Incident);
+        assert_eq!(score.events[998].at, Instant::from_ns(998));
+        let mut score = Score::default();
+        for at_ns in 0..1_005 {
+            score.add_event(event(Severity::Incident, at_ns));
+        }
+        assert_eq!((score.events.len(), score.events_dropped_count), (1_000, 5));
+        assert_eq!(score.events.last().unwrap().at, Instant::from_ns(999));
+    }
+
+    #[test]
+    fn an_event_names_a_bounded_number_of_messages() {
+        let mut named = event(Severity::Notice, 0);
+        for sequence in 0..20 {
+            let envelope = Envelope {
+                sequence,
+                epoch: 3,
+                ..Envelope::default()
+            };
+            named = named.naming(MessageRef::of("a/b", &envelope));
+        }
+        assert_eq!(
+            (named.messages.len(), named.messages_dropped_count),
+            (16, 4)
+        );
+        assert_eq!(named.messages[15].sequence, 15);
+    }
+}

@@ -1,0 +1,178 @@
+//! Joins what the robot did with what the network did: looks up the fate of every message that an
+//! event of the score names. Which messages led to an event is the case's to say.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use hil_models::case_study::{MessageRef, Score, ScoreEvent};
+use hil_models::measure::account::{MessageFate, MessageStory};
+use hil_models::time::Instant;
+
+use super::records::RunRecords;
+use crate::report::score_event::{ExplainedEvent, ExplainedMessage, ScoreEvents};
+use crate::report::summary::{ChannelSummary, LinkKind};
+use crate::report::terminal::duration_s;
+use crate::supervisor::RunResult;
+use crate::topology::{Channel, Topology};
+
+/// The events of `score` with the fates of their messages.
+pub(super) fn explained(
+    score: &Score,
+    run: (&Topology, &RunResult),
+    records: &RunRecords,
+    channels: &[ChannelSummary],
+) -> ScoreEvents {
+    let mut wanted: BTreeMap<&str, BTreeSet<(u32, u64)>> = BTreeMap::new();
+    for message in score.events.iter().flat_map(|event| &event.messages) {
+        let of_channel = wanted.entry(message.channel).or_default();
+        of_channel.insert((message.epoch, message.sequence));
+    }
+    let (topology, result) = run;
+    let ways = wanted.iter().filter_map(|(name, wanted)| {
+        let channel = topology.channel(name)?;
+        let way = Way {
+            start: start_of(run, channel),
+            stories: if channel.is_recorded_only() {
+                BTreeMap::new()
+            } else {
+                records.stories(run, channel, wanted)
+            },
+            channel,
+            summary: channels.iter().find(|one| one.name == *name)?,
+        };
+        Some((*name, way))
+    });
+    let ways: BTreeMap<&str, Way<'_>> = ways.collect();
+    let events = score.events.iter();
+    ScoreEvents {
+        events: events.map(|event| explain(event, run, &ways)).collect(),
+        dropped_count: score.events_dropped_count,
+        clocks_differ: !result.has_one_clock,
+    }
+}
+
+/// Start of the run on the clock of the channel's producer.
+fn start_of((topology, result): (&Topology, &RunResult), channel: &Channel) -> Option<Instant> {
+    let host = &topology.process(&channel.from)?.host;
+    result.spans.get(host).map(|span| span.0)
+}
+
+fn explain(
+    event: &ScoreEvent,
+    run: (&Topology, &RunResult),
+    ways: &BTreeMap<&str, Way<'_>>,
+) -> ExplainedEvent {
+    let clock_of = run.0.channel(event.clock_of);
+    let process = clock_of.and_then(|channel| run.0.process(&channel.from));
+    let start = clock_of.and_then(|channel| start_of(run, channel));
+    let messages = event.messages.iter().map(|message| {
+        ways.get(message.channel).map_or_else(
+            || unavailable(message, "the run has no such channel"),
+            |way| way.explain(message),
+        )
+    });
+    ExplainedEvent {
+        at_s: start.map(|start| event.at.seconds_since(start)),
+        clock: process.map_or_else(|| "unknown".to_owned(), |process| process.host.clone()),
+        severity: event.severity,
+        what: event.what.clone(),
+        messages: messages.collect(),
+        messages_dropped_count: event.messages_dropped_count,
+    }
+}
+
+fn unavailable(message: &MessageRef, why: &str) -> ExplainedMessage {
+    ExplainedMessage {
+        channel: message.channel.to_owned(),
+        epoch: message.epoch,
+        sequence: message.sequence,
+        published_at_s: None,
+        fate: None,
+        delay_s: None,
+        words: format!("unavailable: {why}"),
+    }
+}
+
+/// All that is known of one channel's messages.
+struct Way<'a> {
+    channel: &'a Channel,
+    summary: &'a ChannelSummary,
+    stories: BTreeMap<(u32, u64), MessageStory>,
+    start: Option<Instant>,
+}
+
+impl Way<'_> {
+    fn explain(&self, message: &MessageRef) -> ExplainedMessage {
+        if self.channel.is_recorded_only() {
+            return unavailable(message, "its channel is only recorded and crosses no link");
+        }
+        let Some(story) = self.stories.get(&(message.epoch, message.sequence)) else {
+            return unavailable(message, "no process left a record of it");
+        };
+        let published = story.published_ns.map(Instant::from_ns);
+        ExplainedMessage {
+            published_at_s: published
+                .zip(self.start)
+                .map(|(published, start)| published.seconds_since(start)),
+            fate: Some(story.fate),
+            delay_s: story.delay_ns.map(|ns| ns as f64 * 1e-9),
+            words: self.words(story),
+            ..unavailable(message, "")
+        }
+    }
+
+    fn words(&self, story: &MessageStory) -> String {
+        let link = self.channel.link.as_deref().unwrap_or_default();
+        match story.fate {
+            MessageFate::Taken => {
+                let how = match story.delay_ns {
+                    Some(ns) => format!("delivered after {}", duration_s(ns as f64 * 1e-9)),
+                    None => "delivered; delay unavailable: clocks not aligned".to_owned(),
+                };
+                let overtaken = if story.is_overtaken {
+                    ", overtaken by a later message"
+                } else {
+                    ""
+                };
+                format!("{how}{overtaken}")
+            }
+            MessageFate::LostOnWire if self.is_all_loss_emulated() => {
+                format!("lost on link {link}: emulated loss")
+            }
+            MessageFate::LostOnWire => format!("lost on link {link}"),
+            MessageFate::LostInInterruption => self.words_of_interruption(story),
+            MessageFate::InFlight => "still in flight at the end of the run".to_owned(),
+            MessageFate::UnknownPeerRecordsUnavailable => {
+                "unavailable: no records of the other host".to_owned()
+            }
+            fate => fate.label().to_owned(),
+        }
+    }
+
+    fn words_of_interruption(&self, story: &MessageStory) -> String {
+        let account = self.summary.account.as_ref();
+        let interruption = account
+            .zip(story.interruption_index)
+            .and_then(|(account, index)| account.interruptions.get(index));
+        interruption.map_or_else(
+            || story.fate.label().to_owned(),
+            |one| format!("lost while {} was down ({})", one.process, one.cause),
+        )
+    }
+
+    /// True when the link's model counted at least as many losses as the account has: then none
+    /// is left that anything else could have caused.
+    fn is_all_loss_emulated(&self) -> bool {
+        let counters = self.summary.directions.iter().flat_map(|one| &one.counters);
+        let emulated_count: u64 = counters
+            .filter(|counter| counter.name == EMULATED_LOSS_COUNTER)
+            .map(|counter| counter.count)
+            .sum();
+        let account = self.summary.account.as_ref();
+        let lost_count = account.map(|account| account.fates.of(MessageFate::LostOnWire));
+        self.summary.link == LinkKind::Emulated
+            && lost_count.is_some_and(|lost_count| lost_count <= emulated_count)
+    }
+}
+
+/// What the receiving gateway calls the messages that the link's model dropped.
+const EMULATED_LOSS_COUNTER: &str = "socket: link_lost_count";

@@ -1,0 +1,113 @@
+//! What happened to the robot and, beside it, to the messages concerned. Which events matter most
+//! is said by their severity alone.
+
+use hil_models::case_study::Severity;
+use hil_models::measure::account::MessageFate;
+
+use super::canvas::{Canvas, INDENT, Tone, shortened};
+use super::units::{grouped, seconds};
+use crate::report::score_event::{ExplainedEvent, ExplainedMessage, ScoreEvents};
+
+/// Events on the page; all of them are in the summary.
+const SHOWN_COUNT: usize = 12;
+
+/// Columns of an event's time, of a message's name, and the margin of messages.
+const TIME_WIDTH: usize = 14;
+const NAME_WIDTH: usize = 40;
+const MESSAGE_MARGIN: usize = INDENT + 4;
+
+pub(super) fn score_events(canvas: &mut Canvas, all: &ScoreEvents) {
+    if all.events.is_empty() {
+        return;
+    }
+    let count = |severity| {
+        let chosen = all.events.iter().filter(|one| one.severity == severity);
+        chosen.count() as u64
+    };
+    let (incidents, notices) = (count(Severity::Incident), count(Severity::Notice));
+    let aside = format!(
+        "{}, {}",
+        counted(incidents, "incident"),
+        counted(notices, "notice")
+    );
+    canvas.heading(
+        "What the robot did, and what the network had done to it",
+        &aside,
+    );
+    if all.clocks_differ {
+        let text = "Clocks are not aligned: each time counts from the start of the run on the \
+                    host named with it, and times of different hosts do not compare.";
+        canvas.paragraph(INDENT, Tone::Caution, text);
+    }
+    for event in shown(&all.events) {
+        one_event(canvas, event, all.clocks_differ);
+    }
+    let hidden = all.events.len().saturating_sub(SHOWN_COUNT) as u64;
+    let mut more = Vec::new();
+    if hidden > 0 {
+        more.push(format!(
+            "{} more events are in summary.json",
+            grouped(hidden)
+        ));
+    }
+    if all.dropped_count > 0 {
+        let dropped = grouped(all.dropped_count);
+        more.push(format!("{dropped} found no room in the score"));
+    }
+    if !more.is_empty() {
+        canvas.paragraph(INDENT, Tone::Faint, &more.join("; "));
+    }
+}
+
+fn counted(count: u64, what: &str) -> String {
+    let plural = if count == 1 { "" } else { "s" };
+    format!("{} {what}{plural}", grouped(count))
+}
+
+/// The gravest events, the earlier ones first among equals, in the order of the score.
+fn shown(events: &[ExplainedEvent]) -> Vec<&ExplainedEvent> {
+    let mut order: Vec<usize> = (0..events.len()).collect();
+    order.sort_by_key(|index| core::cmp::Reverse(events[*index].severity));
+    order.truncate(SHOWN_COUNT);
+    order.sort_unstable();
+    order.into_iter().map(|index| &events[index]).collect()
+}
+
+fn one_event(canvas: &mut Canvas, event: &ExplainedEvent, clocks_differ: bool) {
+    let time = event.at_s.map_or_else(|| "unavailable".to_owned(), seconds);
+    let tone = match event.severity {
+        Severity::Incident => Tone::Bad,
+        Severity::Notice => Tone::Plain,
+    };
+    let what = if clocks_differ {
+        format!("{} (clock of {})", event.what, event.clock)
+    } else {
+        event.what.clone()
+    };
+    canvas.field_of(TIME_WIDTH, &time, tone, &what);
+    for message in &event.messages {
+        let tone = match message.fate {
+            None | Some(MessageFate::UnknownPeerRecordsUnavailable) => Tone::Faint,
+            Some(fate) if fate.is_loss() => Tone::Caution,
+            Some(_) => Tone::Plain,
+        };
+        let name = shortened(&name(message), NAME_WIDTH - 1);
+        canvas.field_at(MESSAGE_MARGIN, (NAME_WIDTH, &name), tone, &message.words);
+    }
+    if event.messages_dropped_count > 0 {
+        let text = format!(
+            "and {} more messages",
+            grouped(event.messages_dropped_count)
+        );
+        canvas.paragraph(MESSAGE_MARGIN, Tone::Faint, &text);
+    }
+}
+
+/// Which message, and when it was published.
+fn name(message: &ExplainedMessage) -> String {
+    let number = format!("{} {}", message.channel, grouped(message.sequence));
+    match message.published_at_s {
+        Some(at_s) => format!("{number} at {}", seconds(at_s)),
+        None => number,
+    }
+}
