@@ -264,7 +264,7 @@ impl Experiment {
 
     /// Critical sections passed so far.
     pub fn section_count(&self) -> u64 {
-        self.coordinator.counters().counts.sections_obsolete
+        self.referee.tally().sections_passed_count
     }
 
     /// What came of the run so far.

@@ -5,6 +5,7 @@
 mod agenda;
 mod cells;
 mod driver;
+mod judgement;
 mod post;
 pub mod published;
 mod report;
