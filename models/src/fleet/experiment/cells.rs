@@ -126,7 +126,11 @@ pub(crate) fn published_cells(base: &Setup, law: DelayLaw) -> Vec<Cell> {
 
 /// The original's mechanisms: believed delivery, stepped tracker whose steps the delay stretches,
 /// status read past the network, the delay known to the coordinator.
-fn original(base: &Setup, (delay_ms, law): (f64, DelayLaw), (loss_ratio, copies): (f64, u32)) -> Setup {
+fn original(
+    base: &Setup,
+    (delay_ms, law): (f64, DelayLaw),
+    (loss_ratio, copies): (f64, u32),
+) -> Setup {
     let mut setup = base.clone();
     setup.robot.tracker = TrackerKind::LegacyRk4;
     setup.robot.step_inflation = true;
@@ -187,11 +191,14 @@ fn variants(base: &Setup, law: DelayLaw) -> Vec<Cell> {
         variant("100 ms, margin of 6 poses", |setup| {
             setup.coordinator.trailing_points = 6;
         }),
-        variant("100 ms, nominal steps, delayed status, delay unknown", |setup| {
-            setup.robot.step_inflation = false;
-            setup.links.status_path = StatusPath::Network;
-            setup.coordinator.known_delay_ms = 0.0;
-        }),
+        variant(
+            "100 ms, nominal steps, delayed status, delay unknown",
+            |setup| {
+                setup.robot.step_inflation = false;
+                setup.links.status_path = StatusPath::Network;
+                setup.coordinator.known_delay_ms = 0.0;
+            },
+        ),
     ]
 }
 
@@ -201,11 +208,21 @@ type Mechanism = (&'static str, fn(&mut Setup));
 /// What the network, or the controller's host, does in each row of the table of mechanisms.
 pub(crate) const MECHANISMS: [Mechanism; 13] = [
     ("clean", |_| {}),
-    ("delay 300 ms", |setup| delay_both(setup, 300.0, DelayLaw::Constant)),
-    ("delay 1 s", |setup| delay_both(setup, 1000.0, DelayLaw::Constant)),
-    ("delay 0 to 1 s", |setup| delay_both(setup, 1000.0, DelayLaw::Uniform)),
-    ("loss 10 %, commands", |setup| setup.links.commands.loss_ratio = 0.1),
-    ("loss 10 %, status", |setup| setup.links.status.loss_ratio = 0.1),
+    ("delay 300 ms", |setup| {
+        delay_both(setup, 300.0, DelayLaw::Constant)
+    }),
+    ("delay 1 s", |setup| {
+        delay_both(setup, 1000.0, DelayLaw::Constant)
+    }),
+    ("delay 0 to 1 s", |setup| {
+        delay_both(setup, 1000.0, DelayLaw::Uniform)
+    }),
+    ("loss 10 %, commands", |setup| {
+        setup.links.commands.loss_ratio = 0.1
+    }),
+    ("loss 10 %, status", |setup| {
+        setup.links.status.loss_ratio = 0.1
+    }),
     ("loss 10 %, both", |setup| lose_both(setup, 0.1)),
     ("loss 30 %, both", |setup| lose_both(setup, 0.3)),
     ("stalls, mean 1 s", |setup| stall_both(setup, 1.0)),

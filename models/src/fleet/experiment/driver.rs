@@ -155,7 +155,10 @@ impl Experiment {
         let first = robot
             .min((self.cycle.next, Rank::Cycle))
             .min((self.next_scan, Rank::Scan));
-        self.network.post.next().map_or(first, |post| first.min(post))
+        self.network
+            .post
+            .next()
+            .map_or(first, |post| first.min(post))
     }
 
     /// One control cycle.
@@ -328,6 +331,7 @@ impl Network {
 }
 
 fn robot_of(scene: &Scene, parameters: &RobotParameters, (seed, robot): (u64, usize)) -> Robot {
-    let id = (FLEET, u32::try_from(robot).expect("at most a few hundred robots"));
-    Robot::new(scene, parameters, id, robot_stream(seed, id))
+    let robot = u32::try_from(robot).expect("at most a few hundred robots");
+    let random = robot_stream(seed, FLEET, robot);
+    Robot::new(scene, parameters, FLEET, robot, random)
 }

@@ -2,9 +2,7 @@
 //! the number of critical sections does not allow is not given.
 
 use crate::fleet::coordinator::parameters::CoordinatorMode;
-use crate::fleet::experiment::cells::{
-    Cell, Demand, Place, SCENARIOS, mode_name, scenario_name,
-};
+use crate::fleet::experiment::cells::{Cell, Demand, Place, SCENARIOS, mode_name, scenario_name};
 use crate::fleet::experiment::report::Results;
 use crate::fleet::experiment::study::FleetStudy;
 use crate::fleet::experiment::tally::FleetTally;
@@ -67,10 +65,12 @@ pub(crate) fn criteria(study: &FleetStudy, results: &Results<'_>) -> Vec<Criteri
         .any(|cell| matches!(cell.place, Place::Mechanism { .. }));
     if has_mechanisms {
         criteria.extend(safe_criteria(results));
-        criteria.extend(SCENARIOS.map(|scenario| throughput(scenario_name(scenario), {
-            let of = |mode| results.mechanism(scenario, "clean", mode);
-            (of(CoordinatorMode::Legacy), of(CoordinatorMode::Safe))
-        })));
+        criteria.extend(SCENARIOS.map(|scenario| {
+            throughput(scenario_name(scenario), {
+                let of = |mode| results.mechanism(scenario, "clean", mode);
+                (of(CoordinatorMode::Legacy), of(CoordinatorMode::Safe))
+            })
+        }));
         criteria.extend(SCENARIOS.map(|scenario| {
             let of = |row| results.mechanism(scenario, row, CoordinatorMode::Legacy);
             loss_exceeds_delay(
@@ -101,9 +101,11 @@ fn of_cell(cell: &Cell, tally: Option<&FleetTally>) -> Criterion {
 
 fn collisions_text(tally: &FleetTally) -> String {
     let seen = &tally.referee;
-    let per_1000 = tally.collision_interval().map_or_else(String::new, |(low, high)| {
-        format!(", {:.2} to {:.2} per 1000", 1e3 * low, 1e3 * high)
-    });
+    let per_1000 = tally
+        .collision_interval()
+        .map_or_else(String::new, |(low, high)| {
+            format!(", {:.2} to {:.2} per 1000", 1e3 * low, 1e3 * high)
+        });
     format!(
         "{} collisions, {} overlaps in {} CS{per_1000}",
         seen.section_collisions_count,
@@ -114,9 +116,7 @@ fn collisions_text(tally: &FleetTally) -> String {
 
 /// The safe coordinator: no collision by any checker, no reset, no fleet at a stand.
 fn safe_criteria(results: &Results<'_>) -> [Criterion; 2] {
-    let is_safe = |cell: &Cell| {
-        matches!(cell.place, Place::Mechanism { mode, .. } if mode == CoordinatorMode::Safe)
-    };
+    let is_safe = |cell: &Cell| matches!(cell.place, Place::Mechanism { mode, .. } if mode == CoordinatorMode::Safe);
     let (mut sections, mut collisions, mut resets, mut stands) = (0, 0, 0, 0);
     let (mut seen_again, mut ended_count) = (Vec::new(), 0);
     for (cell, tally) in results.all().filter(|(cell, _)| is_safe(cell)) {
@@ -231,7 +231,8 @@ mod tests {
 
     #[test]
     fn few_sections_give_a_verdict_only_when_it_is_beyond_doubt() {
-        let verdict = |demand, collisions, sections| verdict_of(demand, &tally(collisions, sections));
+        let verdict =
+            |demand, collisions, sections| verdict_of(demand, &tally(collisions, sections));
         // No collision in 10 000 leaves up to 0.37 per 1000.
         assert_eq!(verdict(Demand::Below(0.2), 0, 10_000), None);
         assert_eq!(verdict(Demand::Below(0.37), 0, 10_000), Some(true));

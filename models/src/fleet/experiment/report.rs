@@ -141,7 +141,8 @@ fn published_table(scenario: Scenario, results: &Results<'_>) -> Table {
     let mut rows = Vec::new();
     for published in published_rows(scenario) {
         let ours = results.all().filter(|(cell, _)| {
-            let is_row = |place: &Place| matches!(place, Place::Published { row, .. } if row == published);
+            let is_row =
+                |place: &Place| matches!(place, Place::Published { row, .. } if row == published);
             cell.scenario == scenario && is_row(&cell.place)
         });
         let before = rows.len();
