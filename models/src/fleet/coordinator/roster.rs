@@ -120,6 +120,7 @@ impl RobotView {
                 .as_ref()
                 .map_or(Instant::ZERO, |mission| mission.started),
             waiting_since: self.waiting_since,
+            held_up_count: 0,
         }
     }
 
