@@ -7,6 +7,7 @@ pub mod parameters;
 pub mod policy;
 pub mod roster;
 pub mod sections;
+mod view;
 
 use core::fmt::Debug;
 
@@ -80,6 +81,12 @@ impl Coordinator {
     /// Takes a robot's state in.
     pub fn on_state(&mut self, now: Instant, state: &State) {
         self.roster.on_state(now, state, &mut self.counters.counts);
+    }
+
+    /// Takes in a robot's true state, past all channels: what the original does in simulation.
+    /// Then only commands suffer from the network.
+    pub fn observe(&mut self, now: Instant, state: &State) {
+        self.roster.observe(now, state, &mut self.counters.counts);
     }
 
     /// One control cycle; gives each message to `send`.
