@@ -8,6 +8,7 @@ pub mod policy;
 pub mod roster;
 pub mod safe;
 pub mod sections;
+mod view;
 
 use core::fmt::Debug;
 
@@ -96,6 +97,12 @@ impl Coordinator {
     pub fn on_state(&mut self, now: Instant, state: &State) {
         self.roster.on_state(now, state, &mut self.counters.counts);
         self.rules.on_state(now, state);
+    }
+
+    /// Takes in a robot's true state, past all channels: what the original does in simulation.
+    /// Then only commands suffer from the network.
+    pub fn observe(&mut self, now: Instant, state: &State) {
+        self.roster.observe(now, state, &mut self.counters.counts);
     }
 
     /// One control cycle; gives each message to `send`.
