@@ -1,8 +1,14 @@
 //! Case study 1: safe coordination of a fleet of automated guided vehicles (Lv et al., sections
 //! II.B and III.B, Tables I to III).
 
+mod analytic;
 pub mod geometry;
 pub mod messages;
+pub mod mission;
 pub mod path;
+pub mod referee;
+pub mod robot;
+pub mod robots;
+pub mod scenario;
 pub mod section;
 pub mod world;

@@ -1,0 +1,131 @@
+//! Which bay a robot is sent to next. When it goes, and whether it may, is the coordinator's
+//! business.
+
+use serde::{Deserialize, Serialize};
+
+use crate::case_study::ParameterError;
+use crate::fleet::geometry::floor_index;
+use crate::fleet::scenario::Scene;
+use crate::fleet::world::{BayIndex, Route};
+use crate::random::RandomStream;
+
+/// How goals are chosen.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum MissionMode {
+    /// Any free bay a path leads to, each as likely.
+    #[default]
+    Random,
+    /// To the bay at the other end of the start's shuttle line, and back, for ever.
+    Shuttle,
+    /// Once to the other end of the shuttle line.
+    Once,
+}
+
+/// `[case.parameters.missions]`.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct MissionParameters {
+    /// How goals are chosen.
+    pub mode: MissionMode,
+    /// Missions after which a robot stays parked; 0 for no end. `once` gives one at most.
+    pub missions_per_robot: u32,
+    /// How long a robot stays in a bay before its next mission, seconds, 0..=3600.
+    pub parking_s: f64,
+}
+
+impl Default for MissionParameters {
+    fn default() -> Self {
+        Self {
+            mode: MissionMode::default(),
+            missions_per_robot: 0,
+            parking_s: 3.0,
+        }
+    }
+}
+
+impl MissionParameters {
+    /// Checks every number against its range.
+    ///
+    /// # Errors
+    /// Names the key, below `missions`, and its range.
+    pub fn check(&self) -> Result<(), ParameterError> {
+        ParameterError::check(
+            "missions.parking_s",
+            self.parking_s,
+            0.0..=3600.0,
+            "0..=3600",
+        )
+    }
+}
+
+/// Gives out missions.
+#[derive(Debug, Clone)]
+pub struct MissionSource {
+    mode: MissionMode,
+    left_counts: Vec<u32>,
+    scene: Scene,
+    random: RandomStream,
+}
+
+impl MissionSource {
+    /// A source for the robots of `scene`; all its choices come from `random`.
+    pub fn new(parameters: &MissionParameters, scene: &Scene, random: RandomStream) -> Self {
+        let asked = match parameters.missions_per_robot {
+            0 => u32::MAX,
+            count => count,
+        };
+        let limit = match parameters.mode {
+            MissionMode::Once => asked.min(1),
+            MissionMode::Random | MissionMode::Shuttle => asked,
+        };
+        Self {
+            mode: parameters.mode,
+            left_counts: vec![limit; scene.starts.len()],
+            scene: scene.clone(),
+            random,
+        }
+    }
+
+    /// The next way for `robot`, which stands in bay `at`; `None` when it has had all its missions
+    /// or when no bay it could go to is free now. A bay that the robot itself stands in is never
+    /// asked about.
+    ///
+    /// # Panics
+    /// When the scene has no such robot.
+    pub fn next(
+        &mut self,
+        robot: usize,
+        at: BayIndex,
+        is_free: &dyn Fn(BayIndex) -> bool,
+    ) -> Option<Route> {
+        if self.left_counts[robot] == 0 {
+            return None;
+        }
+        let routes = self.scene.world.routes_from(at);
+        let route = match self.mode {
+            MissionMode::Random => {
+                let free_count = routes.iter().filter(|route| is_free(route.to)).count();
+                if free_count == 0 {
+                    return None;
+                }
+                let pick = floor_index(self.random.uniform() * free_count as f64);
+                let mut free = routes.iter().filter(|route| is_free(route.to));
+                free.nth(pick.min(free_count - 1))
+            }
+            MissionMode::Shuttle | MissionMode::Once => {
+                let partner = self.scene.partners.get(at).copied().flatten()?;
+                let mut there = routes.iter().filter(|route| route.to == partner);
+                there.next().filter(|route| is_free(route.to))
+            }
+        }?;
+        // Without a limit the count never runs out within a run's mission numbers.
+        self.left_counts[robot] -= 1;
+        Some(*route)
+    }
+
+    /// True when every robot has had all its missions.
+    pub fn is_exhausted(&self) -> bool {
+        self.left_counts.iter().all(|count| *count == 0)
+    }
+}
