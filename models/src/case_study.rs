@@ -9,6 +9,7 @@ use serde::de::DeserializeOwned;
 use crate::component::Role;
 use crate::message::{Message, MessageType};
 use crate::run_log::RunLog;
+use crate::study::Batch;
 
 pub use crate::score::{
     EVENT_MESSAGES_MAX, EVENTS_MAX, MessageRef, Metric, Score, ScoreEvent, Severity,
@@ -53,6 +54,15 @@ pub trait CaseStudy: Sized + Debug + 'static {
 
     /// What the robot did, from the messages of a finished run.
     fn score(&self, log: &RunLog) -> Score;
+
+    /// The tables this case can compute in virtual time, of the size its parameters ask for;
+    /// `None` for a case without any.
+    ///
+    /// # Errors
+    /// Names the parameter that keeps the tables from being computed.
+    fn study(&self) -> Result<Option<Box<dyn Batch>>, ParameterError> {
+        Ok(None)
+    }
 }
 
 /// One channel of a case study: who publishes what to whom, or only to the record.

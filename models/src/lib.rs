@@ -9,6 +9,7 @@
 //! 4. [`shuttle`]: a whole case study in one short file.
 //! 5. [`link`]: what a network does to a message; [`measure`]: how that is accounted.
 //! 6. [`teleoperation`]: the dual-arm `YuMi` of the seed paper.
+//! 7. [`study`]: batches of virtual-time runs that end in tables.
 #![forbid(unsafe_code)]
 
 pub mod arrival;
@@ -24,5 +25,6 @@ pub mod run_log;
 mod score;
 pub mod shuttle;
 pub mod simulation;
+pub mod study;
 pub mod teleoperation;
 pub mod time;

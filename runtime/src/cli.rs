@@ -1,5 +1,6 @@
 //! The command line: definitions only. What a command does is elsewhere.
 
+use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand};
@@ -14,6 +15,8 @@ Examples:
       say what is wrong with the file, start nothing
   hil-runtime simulate --topology deploy/topologies/emulated.toml
       the same loop and link in virtual time, in a moment
+  hil-runtime tables --topology deploy/topologies/tables.toml
+      the published tables of case study 1 beside our own, in virtual time
   hil-runtime report runs/teleop-local-20261121-101500
       print a finished run's report again
 
@@ -91,6 +94,33 @@ pub enum Command {
         /// Print JSON instead of a table.
         #[arg(long)]
         json: bool,
+    },
+    /// Compute a case's tables in virtual time, on all processors.
+    #[command(
+        after_help = "Example:\n  hil-runtime tables --topology deploy/topologies/tables.toml --sections 100000\n\nEqual seeds give equal tables, whatever the number of threads. Ctrl-C prints what is\ncomplete. Exit code 1 when a criterion is missed."
+    )]
+    Tables {
+        /// The topology file (TOML); [case] and [run] are enough.
+        #[arg(long, short, value_name = "FILE")]
+        topology: PathBuf,
+        /// Change one value of the file; may be repeated.
+        #[arg(long = "set", value_name = "KEY=VALUE")]
+        overrides: Vec<String>,
+        /// Critical sections per cell; short for --set case.parameters.tables.sections=N.
+        #[arg(long, value_name = "N")]
+        sections: Option<u64>,
+        /// Threads; all processors if left out.
+        #[arg(long, short, value_name = "N")]
+        jobs: Option<NonZeroUsize>,
+        /// Print JSON instead of tables.
+        #[arg(long)]
+        json: bool,
+        /// Also write the tables to this folder: one CSV file each, report.txt and report.json.
+        #[arg(long, short, value_name = "DIR")]
+        output: Option<PathBuf>,
+        /// Print no progress, only the tables.
+        #[arg(long, short)]
+        quiet: bool,
     },
     /// Print the report of a finished run again.
     #[command(after_help = "Example:\n  hil-runtime report runs/teleop-local-20261121-101500")]

@@ -24,6 +24,7 @@ use crate::report::terminal::{self, Style};
 use crate::run_folder::RunFolder;
 use crate::signals::{EXIT_INTERRUPTED, Signals};
 use crate::simulate;
+use crate::study::{self, StudyEnd, StudyOptions};
 use crate::supervisor::{self, Outcome, PeerError, RunError, RunOptions, RunResult};
 use crate::topology::{self, HOST_VARIABLE, HostChoice, MachineIdentity, Topology, which_host};
 
@@ -61,6 +62,25 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
             overrides,
             json,
         } => simulate(&topology, &overrides, registry, (json, console)),
+        Command::Tables {
+            topology,
+            mut overrides,
+            sections,
+            jobs,
+            json,
+            output,
+            quiet,
+        } => {
+            overrides
+                .extend(sections.map(|count| format!("case.parameters.tables.sections={count}")));
+            let options = StudyOptions {
+                jobs,
+                is_json: json,
+                output,
+            };
+            let mut console = Console::new(quiet);
+            compute_tables((&topology, &overrides), &options, registry, &mut console)
+        }
         Command::Report { run, json } => show_report(&run, json, console),
         Command::Doctor { strict, json } => {
             let worst = examine(json, console);
@@ -257,6 +277,47 @@ fn simulate(
         Err(text) => {
             console.error(&text);
             exit::USAGE
+        }
+    }
+}
+
+fn compute_tables(
+    (path, overrides): (&Path, &[String]),
+    options: &StudyOptions,
+    registry: &Registry,
+    console: &mut Console,
+) -> u8 {
+    let topology = match topology::load_case(path, overrides, registry.known()) {
+        Ok(topology) => topology,
+        Err(errors) => {
+            console.rendered(&errors.render(std::io::stderr().is_terminal()));
+            return exit::USAGE;
+        }
+    };
+    let batch = match study::batch_of(&topology, registry) {
+        Ok(batch) => batch,
+        Err(error) => {
+            console.error(&error.to_string());
+            return exit::USAGE;
+        }
+    };
+    let signals = match Signals::install() {
+        Ok(signals) => signals,
+        Err(error) => {
+            console.error(&format!("cannot handle signals: {error}"));
+            return exit::INTERNAL;
+        }
+    };
+    match study::run(batch.as_ref(), options, &signals, console) {
+        Ok(StudyEnd::Passed) => exit::RAN,
+        Ok(StudyEnd::Missed) => {
+            console.error("a criterion is missed; see the end of the tables");
+            exit::FAILED
+        }
+        Ok(StudyEnd::Interrupted) => interrupted(),
+        Err(error) => {
+            console.error(&error.to_string());
+            exit::FAILED
         }
     }
 }

@@ -37,6 +37,7 @@ pub mod report;
 pub mod run_folder;
 pub mod signals;
 mod simulate;
+mod study;
 pub mod supervisor;
 pub mod topology;
 pub mod wait;

@@ -7,6 +7,7 @@ use std::fs;
 use hil_models::case_study::{CaseStudy, ChannelSpec, ParameterError, Score};
 use hil_models::component::Role;
 use hil_models::run_log::RunLog;
+use hil_models::study::Batch;
 use serde_json::Value;
 
 use crate::topology::{KnownCase, KnownCases, ParameterFault, check_parameters_with};
@@ -18,6 +19,12 @@ pub trait Case: Debug {
 
     /// See [`CaseStudy::score`].
     fn score(&self, log: &RunLog) -> Score;
+
+    /// See [`CaseStudy::study`].
+    ///
+    /// # Errors
+    /// Names the parameter that keeps the tables from being computed.
+    fn study(&self) -> Result<Option<Box<dyn Batch>>, ParameterError>;
 }
 
 #[derive(Debug)]
@@ -30,6 +37,10 @@ impl<C: CaseStudy> Case for Erased<C> {
 
     fn score(&self, log: &RunLog) -> Score {
         self.0.score(log)
+    }
+
+    fn study(&self) -> Result<Option<Box<dyn Batch>>, ParameterError> {
+        self.0.study()
     }
 }
 

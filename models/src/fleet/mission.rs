@@ -1,6 +1,8 @@
 //! Which bay a robot is sent to next. When it goes, and whether it may, is the coordinator's
 //! business.
 
+use core::time::Duration;
+
 use serde::{Deserialize, Serialize};
 
 use crate::case_study::ParameterError;
@@ -63,6 +65,7 @@ impl MissionParameters {
 #[derive(Debug, Clone)]
 pub struct MissionSource {
     mode: MissionMode,
+    parking: Duration,
     left_counts: Vec<u32>,
     scene: Scene,
     random: RandomStream,
@@ -81,6 +84,7 @@ impl MissionSource {
         };
         Self {
             mode: parameters.mode,
+            parking: Duration::from_secs_f64(parameters.parking_s),
             left_counts: vec![limit; scene.starts.len()],
             scene: scene.clone(),
             random,
@@ -122,6 +126,11 @@ impl MissionSource {
         // Without a limit the count never runs out within a run's mission numbers.
         self.left_counts[robot] -= 1;
         Some(*route)
+    }
+
+    /// How long a robot stays in a bay before its next mission.
+    pub fn parking(&self) -> Duration {
+        self.parking
     }
 
     /// True when every robot has had all its missions.

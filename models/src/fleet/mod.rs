@@ -2,13 +2,22 @@
 //! II.B and III.B, Tables I to III).
 
 mod analytic;
+mod case;
+pub mod controller;
+pub mod coordinator;
+pub mod experiment;
 pub mod geometry;
 pub mod messages;
 pub mod mission;
+mod parameters;
 pub mod path;
 pub mod referee;
 pub mod robot;
 pub mod robots;
 pub mod scenario;
+mod score;
 pub mod section;
 pub mod world;
+
+pub use case::{FLEET_AUTHORITY, FLEET_MISSION, FLEET_STATE, FLEET_TRUTH, Fleet};
+pub use parameters::FleetParameters;

@@ -2,6 +2,7 @@
 //! stream. They carry no bytes; virtual time and `via = "emulated"` ask them for each message.
 
 pub mod bernoulli;
+pub mod impaired;
 
 use core::fmt::Debug;
 

@@ -13,8 +13,18 @@ use super::tree::{Node, Table, Value, join, to_plain_table};
 /// Name of the host of a file without `[hosts]`.
 const IMPLICIT_HOST: &str = "local";
 
+/// What a file must say.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Needs {
+    /// Where every role runs.
+    Processes,
+    /// The case; a file without any process is complete.
+    Case,
+}
+
 /// Checks `file`; the result is meaningless if `faults` is not empty afterwards.
-pub(super) fn check(file: File<'_>, known: &KnownCases, faults: &Faults) -> Topology {
+pub(super) fn check(file: File<'_>, known: &KnownCases, needs: Needs, faults: &Faults) -> Topology {
+    let runs_nothing = file.processes.is_empty() && needs == Needs::Case;
     let case_entry = file.case.as_ref();
     let known_case = case_entry.and_then(|entry| find_case(entry, known, faults));
     let case = match (case_entry, known_case) {
@@ -26,7 +36,7 @@ pub(super) fn check(file: File<'_>, known: &KnownCases, faults: &Faults) -> Topo
         known: known_case,
         has_case: case_entry.is_some(),
     };
-    if file.processes.is_empty() {
+    if file.processes.is_empty() && !runs_nothing {
         let hint = "a topology has at least one [processes.<name>]";
         faults.add(
             "processes",
@@ -35,7 +45,7 @@ pub(super) fn check(file: File<'_>, known: &KnownCases, faults: &Faults) -> Topo
         );
     }
     let processes = check_processes(&file.processes, &hosts, &roles, faults);
-    if let (Some(entry), Some(known)) = (case_entry, known_case) {
+    if let (Some(entry), Some(known), false) = (case_entry, known_case, runs_nothing) {
         check_every_role_is_played(known, &processes, entry.place, faults);
     }
     let mut topology = Topology {

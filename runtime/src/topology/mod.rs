@@ -41,6 +41,7 @@ pub use model::{
     Topology, Via, Wait,
 };
 
+use check::Needs;
 use errors::Place;
 use layers::Layers;
 
@@ -54,7 +55,19 @@ pub fn load(
     overrides: &[String],
     known: &KnownCases,
 ) -> Result<Topology, TopologyErrors> {
-    read_and_check(path, None, overrides, known)
+    read_and_check(path, None, overrides, (known, Needs::Processes))
+}
+
+/// Like [`load`], for whoever wants the case alone: the file need not say where its roles run.
+///
+/// # Errors
+/// As [`load`].
+pub fn load_case(
+    path: &Path,
+    overrides: &[String],
+    known: &KnownCases,
+) -> Result<Topology, TopologyErrors> {
+    read_and_check(path, None, overrides, (known, Needs::Case))
 }
 
 /// Like [`load`], but from a text; `name` stands in error messages, and what the text extends is
@@ -87,14 +100,15 @@ pub fn parse(
     overrides: &[String],
     known: &KnownCases,
 ) -> Result<Topology, TopologyErrors> {
-    read_and_check(Path::new(name), Some(text.to_owned()), overrides, known)
+    let text = Some(text.to_owned());
+    read_and_check(Path::new(name), text, overrides, (known, Needs::Processes))
 }
 
 fn read_and_check(
     path: &Path,
     text: Option<String>,
     overrides: &[String],
-    known: &KnownCases,
+    (known, needs): (&KnownCases, Needs),
 ) -> Result<Topology, TopologyErrors> {
     let mut layers = Layers::default();
     let Some(mut table) = layers.read(path, text) else {
@@ -111,7 +125,7 @@ fn read_and_check(
     };
     let topology = {
         let file = file::read(&table, top, &layers.faults);
-        check::check(file, known, &layers.faults)
+        check::check(file, known, needs, &layers.faults)
     };
     if layers.faults.is_empty() {
         Ok(topology)

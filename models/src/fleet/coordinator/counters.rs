@@ -1,0 +1,86 @@
+//! What a coordinator counts. It counts only what the coordinator itself can know: collisions
+//! are the referee's business.
+
+use serde::Serialize;
+
+use crate::measure::histogram::LatencyHistogram;
+
+/// Figures of one coordinator since its start.
+#[derive(Debug, Clone, Default)]
+pub struct CoordinatorCounters {
+    /// The plain counts.
+    pub counts: CoordinatorCounts,
+    /// Age of the state each decision rests on, per driving robot and control cycle,
+    /// nanoseconds. Empty unless robots and controller share a clock.
+    pub state_age: LatencyHistogram,
+}
+
+impl CoordinatorCounters {
+    /// Adds what another coordinator counted.
+    pub fn merge(&mut self, other: &Self) {
+        self.counts.merge(&other.counts);
+        self.state_age.merge(&other.state_age);
+    }
+}
+
+macro_rules! counts {
+    ($($(#[$doc:meta])* $name:ident,)*) => {
+        /// The plain counts of a coordinator.
+        #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+        pub struct CoordinatorCounts {
+            $($(#[$doc])* pub $name: u64,)*
+        }
+
+        impl CoordinatorCounts {
+            /// Adds what another coordinator counted.
+            pub fn merge(&mut self, other: &Self) {
+                $(self.$name += other.$name;)*
+            }
+        }
+    };
+}
+
+counts! {
+    /// Control cycles.
+    cycle_count,
+    /// States taken over into a robot's view.
+    states_accepted,
+    /// States of robots without a mission, or of the mission before the present one.
+    states_outdated,
+    /// States with a number that is not finite, an unknown phase or an index beyond the path.
+    states_unsound,
+    /// States of a fleet or robot this coordinator does not have, or of a mission it never gave.
+    states_unknown,
+    /// States that arrived after one with a newer header.
+    states_reordered,
+    /// States with the header of one that arrived before.
+    states_duplicate,
+    /// Of the reordered and duplicate states, those that the strict order dropped.
+    states_dropped,
+    /// Missions begun.
+    missions_started,
+    /// Missions whose end a state showed, those ended by a reset included.
+    missions_done,
+    /// Mission messages sent, repeats included.
+    mission_messages,
+    /// Decisions that changed a robot's authority.
+    authority_changes,
+    /// Authorities sent again because the robot did not show them in time.
+    authority_repeats,
+    /// Authority messages sent; each change and each repeat makes one per replica.
+    authority_messages,
+    /// Critical sections that a robot passed: the "total CS counts" of the seed paper's tables.
+    sections_obsolete,
+    /// Critical sections that went away because a robot was reset.
+    sections_abandoned,
+    /// Changes of the order in which two robots go through a section.
+    order_reversals,
+    /// Dependencies made on purpose because neither robot could get past the other.
+    artificial_dependencies,
+    /// Cycles of waiting robots that broke up because one order was reversed.
+    deadlocks_broken,
+    /// Control cycles with a cycle of waiting robots that no reversal could break.
+    deadlocked_cycles,
+    /// Robots put at their goal because they made no way for too long.
+    resets,
+}

@@ -1,0 +1,262 @@
+//! What the figures are held against: per cell, and over the table of mechanisms. A verdict that
+//! the number of critical sections does not allow is not given.
+
+use crate::fleet::coordinator::parameters::CoordinatorMode;
+use crate::fleet::experiment::cells::{Cell, Demand, Place, SCENARIOS, mode_name, scenario_name};
+use crate::fleet::experiment::report::Results;
+use crate::fleet::experiment::study::FleetStudy;
+use crate::fleet::experiment::tally::FleetTally;
+use crate::study::Criterion;
+
+/// Critical sections from which a demand is judged whatever its interval.
+const DECISIVE_COUNT: u64 = 100_000;
+/// Critical sections from which "none at all" is said to be met.
+const TELLING_COUNT: u64 = 10_000;
+/// What the safe coordinator must keep of the legacy one's throughput on a clean channel.
+const THROUGHPUT_RATIO_MIN: f64 = 0.9;
+
+/// A demand in words, per 1000 critical sections.
+pub(crate) fn demand_text(demand: Demand) -> String {
+    match demand {
+        Demand::None => "reported only".to_owned(),
+        Demand::Below(high) => format!("95 % < {high}"),
+        Demand::Within(low, high) => format!("> 0 and {low} to {high}"),
+        Demand::NoneAtAll => "none".to_owned(),
+    }
+}
+
+/// Whether a demand is met; `None` when there are too few critical sections to say. With few of
+/// them, a demand is missed only if its whole interval is, and met only if its whole interval is.
+pub(crate) fn verdict_of(demand: Demand, tally: &FleetTally) -> Option<bool> {
+    let is_decisive = tally.section_count() >= DECISIVE_COUNT;
+    // Without an interval there are no sections, or more collisions than sections.
+    let Some((low, high)) = tally.collision_interval() else {
+        return (tally.any_collision_count() > 0 && demand != Demand::None).then_some(false);
+    };
+    let (low, high) = (1e3 * low, 1e3 * high);
+    let per_1000 = 1e3 * tally.collision_ratio()?;
+    match demand {
+        Demand::None => None,
+        Demand::Below(bound) if high < bound => Some(true),
+        Demand::Below(bound) => (is_decisive || low >= bound).then_some(false),
+        Demand::Within(least, most) if is_decisive => {
+            Some(low > 0.0 && (least..=most).contains(&per_1000))
+        }
+        Demand::Within(least, most) if high < least || low > most => Some(false),
+        Demand::Within(least, most) => (low >= least && high <= most).then_some(true),
+        Demand::NoneAtAll if tally.any_collision_count() > 0 => Some(false),
+        Demand::NoneAtAll => (tally.section_count() >= TELLING_COUNT).then_some(true),
+    }
+}
+
+/// Everything the study is held against.
+pub(crate) fn criteria(study: &FleetStudy, results: &Results<'_>) -> Vec<Criterion> {
+    let mut criteria: Vec<_> = results
+        .all()
+        .filter(|(cell, _)| {
+            let is_published = !matches!(cell.place, Place::Mechanism { .. });
+            is_published && cell.demand != Demand::None
+        })
+        .map(|(cell, tally)| of_cell(cell, tally))
+        .collect();
+    let has_mechanisms = study
+        .cells()
+        .iter()
+        .any(|cell| matches!(cell.place, Place::Mechanism { .. }));
+    if has_mechanisms {
+        criteria.extend(safe_criteria(results));
+        criteria.extend(SCENARIOS.map(|scenario| {
+            throughput(scenario_name(scenario), {
+                let of = |mode| results.mechanism(scenario, "clean", mode);
+                (of(CoordinatorMode::Legacy), of(CoordinatorMode::Safe))
+            })
+        }));
+        criteria.extend(SCENARIOS.map(|scenario| {
+            let of = |row| results.mechanism(scenario, row, CoordinatorMode::Legacy);
+            loss_exceeds_delay(
+                scenario_name(scenario),
+                of("loss 10 %, commands"),
+                of("delay 300 ms"),
+            )
+        }));
+    }
+    criteria
+}
+
+fn of_cell(cell: &Cell, tally: Option<&FleetTally>) -> Criterion {
+    let text = format!("{}: {}", cell.name(), demand_text(cell.demand));
+    let Some(tally) = tally else {
+        return Criterion {
+            text,
+            is_met: None,
+            finding: "not run to its end".to_owned(),
+        };
+    };
+    Criterion {
+        text,
+        is_met: verdict_of(cell.demand, tally),
+        finding: collisions_text(tally),
+    }
+}
+
+fn collisions_text(tally: &FleetTally) -> String {
+    let seen = &tally.referee;
+    let per_1000 = tally
+        .collision_interval()
+        .map_or_else(String::new, |(low, high)| {
+            format!(", {:.2} to {:.2} per 1000", 1e3 * low, 1e3 * high)
+        });
+    format!(
+        "{} collisions, {} overlaps in {} CS{per_1000}",
+        seen.section_collisions_count,
+        seen.overlaps_count,
+        tally.section_count()
+    )
+}
+
+/// The safe coordinator: no collision by any checker, no reset, no fleet at a stand.
+fn safe_criteria(results: &Results<'_>) -> [Criterion; 2] {
+    let is_safe = |cell: &Cell| matches!(cell.place, Place::Mechanism { mode, .. } if mode == CoordinatorMode::Safe);
+    let (mut sections, mut collisions, mut resets, mut stands) = (0, 0, 0, 0);
+    let (mut seen_again, mut ended_count) = (Vec::new(), 0);
+    for (cell, tally) in results.all().filter(|(cell, _)| is_safe(cell)) {
+        let Some(tally) = tally else {
+            continue;
+        };
+        ended_count += 1;
+        sections += tally.section_count();
+        collisions += tally.any_collision_count();
+        resets += tally.coordinator.resets;
+        stands += tally.stand_count;
+        seen_again.extend(tally.collided.iter().map(|run| {
+            format!(
+                "{}, run {}, seed {}, first at {}",
+                cell.name(),
+                run.replica,
+                run.seed,
+                run.first_at
+            )
+        }));
+    }
+    let judged = |is_met| (ended_count > 0).then_some(is_met);
+    let mut finding = format!("{collisions} in {sections} CS of {ended_count} cells");
+    if !seen_again.is_empty() {
+        finding.push_str("; ");
+        finding.push_str(&seen_again.join("; "));
+    }
+    let safe = mode_name(CoordinatorMode::Safe);
+    [
+        Criterion {
+            text: format!("{safe}: no collision by any checker, in any row"),
+            // One collision is enough; that there is none is said of what was run.
+            is_met: judged(collisions == 0),
+            finding,
+        },
+        Criterion {
+            text: format!("{safe}: no deadlock reset, no fleet at a stand"),
+            is_met: judged(resets == 0 && stands == 0),
+            finding: format!("{resets} resets, {stands} runs that came to a stand"),
+        },
+    ]
+}
+
+fn throughput(
+    scenario: &str,
+    (legacy, safe): (Option<&FleetTally>, Option<&FleetTally>),
+) -> Criterion {
+    let rates = legacy
+        .and_then(FleetTally::missions_per_hour)
+        .zip(safe.and_then(FleetTally::missions_per_hour));
+    let text = format!("{scenario}: safe keeps 90 % of legacy's missions per hour when clean");
+    let Some((legacy, safe)) = rates else {
+        return Criterion {
+            text,
+            is_met: None,
+            finding: "not run to its end".to_owned(),
+        };
+    };
+    let ratio = safe / legacy;
+    Criterion {
+        text,
+        is_met: Some(ratio >= THROUGHPUT_RATIO_MIN),
+        finding: format!("{safe:.0} of {legacy:.0} per hour, {:.1} %", 100.0 * ratio),
+    }
+}
+
+/// Losing commands causes collisions where delaying them does not.
+fn loss_exceeds_delay(
+    scenario: &str,
+    loss: Option<&FleetTally>,
+    delay: Option<&FleetTally>,
+) -> Criterion {
+    let ends = loss
+        .and_then(FleetTally::collision_interval)
+        .zip(delay.and_then(FleetTally::collision_interval));
+    let text = format!("{scenario}, legacy: losing 10 % of the commands is worse than 300 ms");
+    let Some((loss, delay)) = ends else {
+        return Criterion {
+            text,
+            is_met: None,
+            finding: "not run to its end".to_owned(),
+        };
+    };
+    let is_met = if loss.0 > delay.1 {
+        Some(true)
+    } else {
+        (loss.1 < delay.0).then_some(false)
+    };
+    Criterion {
+        text,
+        is_met,
+        finding: format!(
+            "{:.2} to {:.2} against {:.2} to {:.2} per 1000",
+            1e3 * loss.0,
+            1e3 * loss.1,
+            1e3 * delay.0,
+            1e3 * delay.1
+        ),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn tally(collisions: u64, sections: u64) -> FleetTally {
+        let mut tally = FleetTally::default();
+        tally.referee.section_collisions_count = collisions;
+        tally.referee.sections_passed_count = sections;
+        tally
+    }
+
+    #[test]
+    fn few_sections_give_a_verdict_only_when_it_is_beyond_doubt() {
+        let verdict =
+            |demand, collisions, sections| verdict_of(demand, &tally(collisions, sections));
+        // No collision in 10 000 leaves up to 0.37 per 1000.
+        assert_eq!(verdict(Demand::Below(0.2), 0, 10_000), None);
+        assert_eq!(verdict(Demand::Below(0.37), 0, 10_000), Some(true));
+        assert_eq!(verdict(Demand::Below(0.2), 0, 100_000), Some(true));
+        assert_eq!(verdict(Demand::Below(0.2), 50, 10_000), Some(false));
+        assert_eq!(verdict(Demand::Below(0.2), 15, 100_000), Some(false));
+        assert_eq!(verdict(Demand::Within(0.2, 4.0), 0, 10_000), None);
+        assert_eq!(verdict(Demand::Within(0.2, 4.0), 0, 100_000), Some(false));
+        assert_eq!(verdict(Demand::Within(0.2, 4.0), 13, 10_000), Some(true));
+        assert_eq!(verdict(Demand::Within(0.2, 4.0), 130, 100_000), Some(true));
+        assert_eq!(verdict(Demand::None, 500, 100_000), None);
+    }
+
+    #[test]
+    fn one_collision_by_any_checker_misses_none_at_all() {
+        let verdict = |tally| verdict_of(Demand::NoneAtAll, &tally);
+        assert_eq!(verdict(tally(0, 10_000)), Some(true));
+        assert_eq!(verdict(tally(0, 100)), None);
+        assert_eq!(verdict(tally(1, 100)), Some(false));
+        let mut overlap = tally(0, 1_000_000);
+        overlap.referee.overlaps_count = 1;
+        assert_eq!(verdict(overlap), Some(false));
+        let mut early = tally(0, 0);
+        early.referee.overlaps_count = 1;
+        assert_eq!(verdict(early), Some(false));
+    }
+}

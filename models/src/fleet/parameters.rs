@@ -1,0 +1,58 @@
+//! `[case.parameters]` of the fleet case. Each table has its own checks; here they are only
+//! joined.
+
+use serde::{Deserialize, Serialize};
+
+use crate::case_study::ParameterError;
+use crate::fleet::coordinator::parameters::CoordinatorParameters;
+use crate::fleet::experiment::TableParameters;
+use crate::fleet::mission::MissionParameters;
+use crate::fleet::robot::RobotParameters;
+use crate::fleet::scenario::WorldParameters;
+
+/// `[case.parameters]` of the fleet case. The defaults are the seed paper's figures where it
+/// gives them (section III.B, Table I) and the original implementation's otherwise.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct FleetParameters {
+    /// Independent fleets that share the channels, 1..=64: critical sections come so many times
+    /// faster.
+    pub fleets: u32,
+    /// Vehicle, map and number of robots.
+    pub world: WorldParameters,
+    /// How robots drive and take orders.
+    pub robot: RobotParameters,
+    /// Who goes first, and how it is told.
+    pub coordinator: CoordinatorParameters,
+    /// Where robots are sent.
+    pub missions: MissionParameters,
+    /// What `hil-runtime tables` computes.
+    pub tables: TableParameters,
+}
+
+impl Default for FleetParameters {
+    fn default() -> Self {
+        Self {
+            fleets: 1,
+            world: WorldParameters::default(),
+            robot: RobotParameters::default(),
+            coordinator: CoordinatorParameters::default(),
+            missions: MissionParameters::default(),
+            tables: TableParameters::default(),
+        }
+    }
+}
+
+impl FleetParameters {
+    /// Checks every number but the world's, which is checked when it is built.
+    ///
+    /// # Errors
+    /// The first key outside its range.
+    pub fn check(&self) -> Result<(), ParameterError> {
+        ParameterError::check("fleets", f64::from(self.fleets), 1.0..=64.0, "1..=64")?;
+        self.robot.check()?;
+        self.coordinator.check()?;
+        self.missions.check()?;
+        self.tables.check()
+    }
+}

@@ -1,0 +1,325 @@
+//! A study: a batch of independent computations in virtual time that ends in tables. It owns no
+//! thread and reads no clock; whoever has processors runs its tasks, in any order and number at
+//! once, and the tables come out the same.
+
+use core::any::Any;
+use core::fmt::Debug;
+
+use serde::Serialize;
+
+/// Looks in on a running task: it hands over the share done, 0..=1, and is told whether to go on.
+pub type Watch<'a> = &'a mut dyn FnMut(f64) -> bool;
+
+/// What a case study implements to offer tables.
+pub trait Study: Debug + Sync {
+    /// What a task finds out.
+    type Outcome: Debug + Send + 'static;
+
+    /// Number of tasks; they are numbered from 0.
+    fn task_count(&self) -> usize;
+
+    /// What the task is about, for a progress line.
+    fn label(&self, task: usize) -> String;
+
+    /// Runs one task. Equal tasks give equal outcomes, whichever thread runs them and whatever
+    /// ran before. `None` when `watch` said stop.
+    fn run(&self, task: usize, watch: Watch<'_>) -> Option<Self::Outcome>;
+
+    /// The tables, from what is there: a task that did not end has no outcome.
+    fn report(&self, outcomes: &[Option<&Self::Outcome>]) -> StudyReport;
+}
+
+/// A [`Study`] whose kind of outcome is no longer known: what a registry keeps. Made by
+/// [`into_batch`].
+pub trait Batch: Debug + Sync {
+    /// See [`Study::task_count`].
+    fn task_count(&self) -> usize;
+
+    /// See [`Study::label`].
+    fn label(&self, task: usize) -> String;
+
+    /// See [`Study::run`].
+    fn run(&self, task: usize, watch: Watch<'_>) -> Option<TaskOutcome>;
+
+    /// See [`Study::report`]; an outcome of another study counts as none.
+    fn report(&self, outcomes: &[Option<TaskOutcome>]) -> StudyReport;
+}
+
+/// What a task found out, to be handed back to the study it came from.
+pub struct TaskOutcome(Box<dyn Any + Send>);
+
+impl Debug for TaskOutcome {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        f.debug_struct("TaskOutcome").finish_non_exhaustive()
+    }
+}
+
+/// Hides the kind of outcome of `study`.
+pub fn into_batch<S: Study + 'static>(study: S) -> Box<dyn Batch> {
+    Box::new(ErasedStudy(study))
+}
+
+#[derive(Debug)]
+struct ErasedStudy<S>(S);
+
+impl<S: Study> Batch for ErasedStudy<S> {
+    fn task_count(&self) -> usize {
+        self.0.task_count()
+    }
+
+    fn label(&self, task: usize) -> String {
+        self.0.label(task)
+    }
+
+    fn run(&self, task: usize, watch: Watch<'_>) -> Option<TaskOutcome> {
+        let outcome = self.0.run(task, watch)?;
+        Some(TaskOutcome(Box::new(outcome)))
+    }
+
+    fn report(&self, outcomes: &[Option<TaskOutcome>]) -> StudyReport {
+        let known: Vec<_> = outcomes
+            .iter()
+            .map(|outcome| outcome.as_ref()?.0.downcast_ref::<S::Outcome>())
+            .collect();
+        self.0.report(&known)
+    }
+}
+
+/// What a study comes to.
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
+pub struct StudyReport {
+    /// What was studied, one line.
+    pub title: String,
+    /// What a reader must know before the tables: seed, method.
+    pub notes: Vec<String>,
+    /// The tables.
+    pub tables: Vec<Table>,
+    /// What the figures were held against.
+    pub criteria: Vec<Criterion>,
+    /// Work done, for whoever measures the time it took.
+    pub work: Vec<Work>,
+}
+
+impl StudyReport {
+    /// True when no criterion that could be judged is missed.
+    pub fn is_passed(&self) -> bool {
+        let is_missed = |criterion: &Criterion| criterion.is_met == Some(false);
+        !self.criteria.iter().any(is_missed)
+    }
+}
+
+/// One table.
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
+pub struct Table {
+    /// Short name without blanks: the file it is written to.
+    pub name: String,
+    /// What stands above it.
+    pub title: String,
+    /// Its columns.
+    pub columns: Vec<Column>,
+    /// Its rows, each with one cell per column.
+    pub rows: Vec<Vec<Cell>>,
+    /// What stands below it.
+    pub notes: Vec<String>,
+}
+
+/// One column of a table.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Column {
+    /// Snake-case name with unit suffix, for a file.
+    pub name: &'static str,
+    /// The words a page prints.
+    pub label: &'static str,
+}
+
+/// One cell of a table.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Cell {
+    /// Words.
+    Text(String),
+    /// A number of things.
+    Count(u64),
+    /// A figure, printed with so many decimals.
+    Number {
+        /// The figure.
+        value: f64,
+        /// Digits behind the point on a page.
+        decimals: usize,
+    },
+    /// An interval, printed with so many decimals.
+    Interval {
+        /// Lower end.
+        low: f64,
+        /// Upper end.
+        high: f64,
+        /// Digits behind the point on a page.
+        decimals: usize,
+    },
+    /// Whether a criterion is met.
+    Verdict(bool),
+    /// No figure.
+    Absent,
+}
+
+impl Cell {
+    /// The cell of a text.
+    pub fn text(text: impl Into<String>) -> Self {
+        Self::Text(text.into())
+    }
+
+    /// The cell of a figure that may be missing or not finite.
+    pub fn number(value: Option<f64>, decimals: usize) -> Self {
+        match value {
+            Some(value) if value.is_finite() => Self::Number { value, decimals },
+            _ => Self::Absent,
+        }
+    }
+
+    /// The cell of an interval that may be missing.
+    pub fn interval(ends: Option<(f64, f64)>, decimals: usize) -> Self {
+        match ends {
+            Some((low, high)) => Self::Interval {
+                low,
+                high,
+                decimals,
+            },
+            None => Self::Absent,
+        }
+    }
+
+    /// What a page shows.
+    pub fn shown(&self) -> String {
+        match self {
+            Self::Text(text) => text.clone(),
+            Self::Count(count) => count.to_string(),
+            Self::Number { value, decimals } => format!("{value:.decimals$}"),
+            Self::Interval {
+                low,
+                high,
+                decimals,
+            } => format!("{low:.decimals$} to {high:.decimals$}"),
+            Self::Verdict(true) => "met".to_owned(),
+            Self::Verdict(false) => "MISSED".to_owned(),
+            Self::Absent => "-".to_owned(),
+        }
+    }
+
+    /// True for what a page puts at the right edge of its column.
+    pub fn is_figure(&self) -> bool {
+        !matches!(self, Self::Text(_) | Self::Verdict(_))
+    }
+}
+
+/// Something the figures were held against.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Criterion {
+    /// What was asked.
+    pub text: String,
+    /// Whether it is met; `None` when there was too little to judge.
+    pub is_met: Option<bool>,
+    /// What was found, and how to see it again.
+    pub finding: String,
+}
+
+/// A quantity of work.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Work {
+    /// What was done, e.g. `robot-seconds`.
+    pub name: &'static str,
+    /// How much of it.
+    pub amount: f64,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Adds up the numbers below its task's number, one at a time.
+    #[derive(Debug)]
+    struct Sums;
+
+    impl Study for Sums {
+        type Outcome = u64;
+
+        fn task_count(&self) -> usize {
+            4
+        }
+
+        fn label(&self, task: usize) -> String {
+            format!("sum below {task}")
+        }
+
+        fn run(&self, task: usize, watch: Watch<'_>) -> Option<u64> {
+            let mut sum = 0;
+            for number in 0..task {
+                if !watch(number as f64 / task as f64) {
+                    return None;
+                }
+                sum += number as u64;
+            }
+            Some(sum)
+        }
+
+        fn report(&self, outcomes: &[Option<&u64>]) -> StudyReport {
+            let cell =
+                |outcome: &Option<&u64>| outcome.map_or(Cell::Absent, |sum| Cell::Count(*sum));
+            let row = outcomes.iter().map(cell).collect();
+            StudyReport {
+                tables: vec![Table {
+                    rows: vec![row],
+                    ..Table::default()
+                }],
+                ..StudyReport::default()
+            }
+        }
+    }
+
+    #[test]
+    fn an_erased_study_gives_its_outcomes_back_to_itself() {
+        let batch = into_batch(Sums);
+        let outcomes: Vec<_> = (0..batch.task_count())
+            .map(|task| batch.run(task, &mut |_| true))
+            .collect();
+        let report = batch.report(&outcomes);
+        let expected = [0, 0, 1, 3].map(Cell::Count).to_vec();
+        assert_eq!(report.tables[0].rows, [expected]);
+    }
+
+    #[test]
+    fn a_stopped_task_has_no_outcome_and_leaves_its_cell_empty() {
+        let batch = into_batch(Sums);
+        let outcomes = [
+            batch.run(1, &mut |_| true),
+            batch.run(3, &mut |done| done < 0.5),
+        ];
+        let report = batch.report(&outcomes);
+        assert_eq!(report.tables[0].rows, [vec![Cell::Count(0), Cell::Absent]]);
+    }
+
+    #[test]
+    fn only_a_missed_criterion_fails_a_report() {
+        let criterion = |is_met| Criterion {
+            text: "no collision".to_owned(),
+            is_met,
+            finding: String::new(),
+        };
+        let report = |criteria| StudyReport {
+            criteria,
+            ..StudyReport::default()
+        };
+        assert!(report(vec![criterion(Some(true)), criterion(None)]).is_passed());
+        assert!(!report(vec![criterion(Some(true)), criterion(Some(false))]).is_passed());
+    }
+
+    #[test]
+    fn cells_are_shown_with_their_decimals() {
+        assert_eq!(Cell::number(Some(0.499_102), 2).shown(), "0.50");
+        assert_eq!(
+            Cell::interval(Some((0.0, 0.3686)), 2).shown(),
+            "0.00 to 0.37"
+        );
+        assert_eq!(Cell::number(Some(f64::NAN), 2), Cell::Absent);
+        assert_eq!(Cell::Absent.shown(), "-");
+    }
+}
