@@ -12,6 +12,7 @@ use hil_models::case_study::ParameterError;
 use hil_models::teleoperation::swing::swing_bvh;
 
 use crate::analysis;
+use crate::cases;
 use crate::cli::{Cli, Command, RunArgs};
 use crate::console::Console;
 use crate::doctor::{self, DoctorRequest, StampCapabilities};
@@ -89,7 +90,10 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
                 exit::RAN
             }
         }
-        Command::Cases => list_cases(registry, console),
+        Command::Cases => {
+            console.result(&cases::list(registry));
+            exit::RAN
+        }
         Command::Motion {
             output,
             period,
@@ -387,28 +391,6 @@ fn columns() -> usize {
         .ok()
         .and_then(|text| text.parse().ok())
         .unwrap_or(100)
-}
-
-fn list_cases(registry: &Registry, console: &mut Console) -> u8 {
-    for entry in registry.entries() {
-        console.result(&format!("{}: {}\n", entry.name, entry.summary));
-        for channel in entry.channels {
-            console.result(&format!(
-                "  {:<16} {} -> {}  {} ({} bytes)\n",
-                channel.name,
-                channel.from,
-                channel.to.unwrap_or("the record only"),
-                channel.message.name,
-                channel.message.size_bytes
-            ));
-        }
-        if let serde_json::Value::Object(parameters) = entry.defaults() {
-            for (key, value) in parameters {
-                console.result(&format!("  {key} = {value}\n"));
-            }
-        }
-    }
-    exit::RAN
 }
 
 fn write_motion(

@@ -20,6 +20,7 @@
 //! 5. [`realtime`], [`clock`], [`wait`], [`host_facts`], [`doctor`]: the machine.
 
 mod analysis;
+mod cases;
 pub mod channel;
 pub mod cli;
 pub mod clock;

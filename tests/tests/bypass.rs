@@ -20,6 +20,7 @@ use hil_models::time::Instant;
 use hil_runtime::channel::{ChannelHolder, ChannelSettings, Domain};
 use hil_runtime::process::launch::{DirectionLaunch, GatewayLaunch, Side, SocketLaunch, write};
 use hil_runtime::realtime::RealtimeRequest;
+use hil_runtime::topology::Timestamps;
 use hil_runtime::wait::WaitMode;
 use hil_tests::account::{account, assert_every_message_is_accounted_for};
 use hil_tests::binary::hil_runtime_binary;
@@ -146,7 +147,7 @@ fn direction(side: Side, [local, peer]: [SocketAddr; 2]) -> DirectionLaunch {
             send_buffer_bytes: 1 << 16,
             receive_buffer_bytes: 1 << 16,
             path_mtu_bytes: 1500,
-            timestamps: "off".to_owned(),
+            timestamps: Timestamps::Off,
         },
         wait: WaitMode::Block,
         realtime: RealtimeRequest::default(),

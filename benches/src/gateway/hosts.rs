@@ -21,6 +21,7 @@ use hil_runtime::gateway::direction::{self, Direction, Opened};
 use hil_runtime::process::launch::{DirectionLaunch, Side, SocketLaunch};
 use hil_runtime::realtime::RealtimeRequest;
 use hil_runtime::record::{RecordFile, RecordKind, RecordSink, Recorder};
+use hil_runtime::topology::Timestamps;
 use hil_runtime::wait::WaitMode;
 
 use super::network::Network;
@@ -358,7 +359,11 @@ fn launch(plan: &Plan, way: usize, side: Side) -> DirectionLaunch {
             send_buffer_bytes: 212_992,
             receive_buffer_bytes: 212_992,
             path_mtu_bytes: 1500,
-            timestamps: if plan.is_stamped { "software" } else { "off" }.to_owned(),
+            timestamps: if plan.is_stamped {
+                Timestamps::Software
+            } else {
+                Timestamps::Off
+            },
         },
         wait: plan.wait,
         realtime: RealtimeRequest::default(),

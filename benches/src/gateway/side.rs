@@ -253,10 +253,11 @@ impl GatewaySide {
         [(&egress.0, &mut egress.1), (&ingress.0, &mut ingress.1)]
     }
 
-    fn counter(&self, name: &str) -> u64 {
+    /// The receiving direction's counter; `None` when it counts no such thing.
+    fn counter(&self, name: &str) -> Option<u64> {
         let counters = self.ingress.1.report(&self.ingress.0).counters;
-        let found = counters.iter().find(|(known, _)| known == name);
-        found.map_or(0, |(_, count)| *count)
+        let found = counters.into_iter().find(|(known, _)| known == name);
+        found.map(|(_, count)| count)
     }
 }
 
@@ -311,10 +312,9 @@ impl Side for GatewaySide {
     }
 
     fn stamp_coverage(&self) -> Option<(u64, u64)> {
-        let coverage = (
-            self.counter("receive_stamp_count"),
-            self.counter("datagram_count"),
-        );
-        self.plan.is_stamped.then_some(coverage)
+        let coverage = self
+            .counter("socket: software_stamp_count")
+            .zip(self.counter("socket: received_count"));
+        coverage.filter(|_| self.plan.is_stamped)
     }
 }

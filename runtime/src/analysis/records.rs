@@ -20,6 +20,7 @@ use super::AnalysisError;
 use crate::record::{RecordFile, RecordFileError, RecordKind};
 use crate::report::summary::RecordedFigures;
 use crate::supervisor::RunResult;
+use crate::supervisor::plan::gateway_name;
 use crate::topology::{Channel, Topology};
 
 /// All records of one channel.
@@ -195,7 +196,7 @@ fn extend<T>(records: &mut Option<Vec<T>>, more: impl Iterator<Item = T>) {
 fn interruptions(topology: &Topology, result: &RunResult, channel: &Channel) -> Vec<Interruption> {
     let gateway = |process: &str| {
         let host = &topology.process(process)?.host;
-        Some(format!("gateway-{}-{host}", channel.link.as_deref()?))
+        Some(gateway_name(channel.link.as_deref()?, host))
     };
     let places = [
         (Some(channel.from.clone()), PathProcess::Producer),

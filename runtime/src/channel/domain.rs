@@ -33,6 +33,10 @@ const PREFIX_LENGTH: usize = "h0123abcd_".len();
 /// File in the root path that says whose it is; its content is the prefix of the run.
 const MARKER: &str = "hil-domain";
 
+/// Ended writers of a channel whose unread samples a reader keeps; at least the samples a reader may
+/// borrow.
+const ENDED_WRITERS_MAX: usize = 4;
+
 /// How a process finds its domain: hand it over as one argument or environment variable.
 ///
 /// ```
@@ -296,6 +300,11 @@ fn configuration(address: &DomainAddress) -> Result<Config, DomainError> {
     // A service is created by the launcher before any worker starts; whoever waits longer for a
     // half-created one waits for a dead process, and our own retry covers the rest.
     config.global.creation_timeout = Duration::from_millis(250);
+    // A reader that finds nothing has looked at the place of every connection it could have, and
+    // iceoryx2 reserves 128 for ended writers alone: a kilobyte per look. What an ended writer left
+    // unread is of its last start, or of the one before; anything older is discarded anyway.
+    let reading = &mut config.defaults.publish_subscribe;
+    reading.subscriber_expired_connection_buffer = ENDED_WRITERS_MAX;
     Ok(config)
 }
 

@@ -19,6 +19,7 @@
 //!
 //! Ports are not [`Send`]: open each in the thread that uses it. A [`Domain`] can be shared.
 
+mod ahead;
 mod degradation;
 mod domain;
 mod error;

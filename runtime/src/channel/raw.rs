@@ -4,11 +4,13 @@
 //! link and its C bindings use); the tests beside it say what an upgrade broke.
 
 use core::fmt;
+use core::mem::MaybeUninit;
 use core::slice;
 use std::os::fd::BorrowedFd;
 
 use hil_models::message::Envelope;
 use iceoryx2::identifiers::UniqueNodeId;
+use iceoryx2::port::LoanError;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
 use iceoryx2::port::publisher::Publisher;
@@ -17,16 +19,19 @@ use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::{
     FileDescriptorBased, MessagingPattern, PayloadHeader, Service, ServiceName, ZeroCopySend, ipc,
 };
+use iceoryx2::sample_mut_uninit::SampleMutUninit;
 use iceoryx2::service::builder::publish_subscribe::{Builder, PublishSubscribeOpenError};
 use iceoryx2::service::marker::{CustomHeaderMarker, CustomPayloadMarker};
 use iceoryx2::service::port_factory::publish_subscribe;
 use iceoryx2::service::static_config::message_type_details::{TypeDetail, TypeVariant};
 
+use super::ahead::Ahead;
 use super::degradation::ConnectionFailures;
 use super::domain::Domain;
 use super::error::{ChannelError, retry};
 use super::holder::ChannelSettings;
 use super::type_info::TypeInfo;
+use super::wake;
 
 /// What every channel's user header is called; changes when the envelope's layout does.
 pub const ENVELOPE_TYPE_NAME: &str = "hil.Envelope.v1";
@@ -207,22 +212,6 @@ fn discover(domain: &Domain, channel: &str) -> Result<TypeInfo, ChannelError> {
     Ok(info_of(&types.payload))
 }
 
-/// Opens the wake-up half for a writer.
-pub(crate) fn open_notifier(
-    domain: &Domain,
-    channel: &str,
-) -> Result<Notifier<ipc::Service>, ChannelError> {
-    let name = service_name(channel)?;
-    domain
-        .with_node(|node| node.service_builder(&name))
-        .event()
-        .open()
-        .map_err(|error| ChannelError::refused(channel, "open the wake-up service", &error))?
-        .notifier_builder()
-        .create()
-        .map_err(|error| ChannelError::refused(channel, "become a notifier", &error))
-}
-
 /// The descriptor that becomes readable when `listener` is notified.
 #[allow(unsafe_code, reason = "a descriptor is a bare number to iceoryx2")]
 pub(crate) fn descriptor(listener: &Listener<ipc::Service>) -> BorrowedFd<'_> {
@@ -232,12 +221,28 @@ pub(crate) fn descriptor(listener: &Listener<ipc::Service>) -> BorrowedFd<'_> {
     unsafe { BorrowedFd::borrow_raw(raw) }
 }
 
+type BytePublisher = Publisher<ipc::Service, [CustomPayloadMarker], CustomHeaderMarker>;
+type ByteLoan =
+    SampleMutUninit<ipc::Service, [MaybeUninit<CustomPayloadMarker>], CustomHeaderMarker>;
+
+/// Memory for one message.
+#[allow(
+    unsafe_code,
+    reason = "the hidden interface for foreign types is unsafe"
+)]
+fn loan(publisher: &BytePublisher) -> Result<ByteLoan, LoanError> {
+    // SAFETY: one element is what a fixed-size message has.
+    unsafe { publisher.loan_custom_payload(1) }
+}
+
 /// Publishes bytes with a given envelope: the far end of a gateway.
 #[derive(Debug)]
 pub struct RawOutput {
+    // Before the publisher: it goes first.
+    next: Ahead<ByteLoan>,
     channel: String,
     message: TypeInfo,
-    publisher: Publisher<ipc::Service, [CustomPayloadMarker], CustomHeaderMarker>,
+    publisher: BytePublisher,
     notifier: Option<Notifier<ipc::Service>>,
     failures: ConnectionFailures,
 }
@@ -276,11 +281,12 @@ impl RawOutput {
                 .map_err(|error| ChannelError::refused(channel, "become a writer", &error))
         })?;
         let notifier = notifies_readers
-            .then(|| retry(within, || open_notifier(domain, channel)))
+            .then(|| retry(within, || wake::open_notifier(domain, channel)))
             .transpose()?;
         Ok(Self {
             channel: channel.to_owned(),
             message,
+            next: Ahead::keep(loan(&publisher)),
             publisher,
             notifier,
             failures,
@@ -323,28 +329,30 @@ impl RawOutput {
             ChannelError::refused(&self.channel, operation, error)
         };
         self.check_size(payload.len())?;
-        // SAFETY: one element is what a fixed-size message has.
-        let mut loan = unsafe { self.publisher.loan_custom_payload(1) }
+        let mut memory = self
+            .next
+            .take(|| loan(&self.publisher))
             .map_err(|error| refused("get memory", &error))?;
-        let target = loan.payload_mut();
+        let target = memory.payload_mut();
         self.check_size(target.len())?;
         let target = target.as_mut_ptr().cast::<u8>();
         // SAFETY: source and target have one message's size, checked above, and do not overlap as
         // the loan is exclusively ours.
         unsafe { target.copy_from_nonoverlapping(payload.as_ptr(), payload.len()) };
-        let header: *mut CustomHeaderMarker = loan.user_header_mut();
+        let header: *mut CustomHeaderMarker = memory.user_header_mut();
         let envelope = envelope();
         // SAFETY: the service was opened with a user header of the envelope's size and alignment,
         // and the marker reference is iceoryx2's pointer to that memory.
         unsafe { header.cast::<Envelope>().write(envelope) };
         // SAFETY: header and payload were written in full just above.
-        let sample = unsafe { loan.assume_init() };
+        let sample = unsafe { memory.assume_init() };
         sample.send().map_err(|error| refused("send", &error))?;
         if let Some(notifier) = &self.notifier {
             notifier
                 .notify()
                 .map_err(|error| refused("wake its readers", &error))?;
         }
+        self.next = Ahead::keep(loan(&self.publisher));
         Ok(())
     }
 

@@ -3,6 +3,7 @@
 //! [`raw`](super::raw).
 
 use core::fmt::Debug;
+use core::mem::MaybeUninit;
 
 use hil_models::endpoint::{InputPort, OutputPort};
 use hil_models::message::{Envelope, Message, MessageType};
@@ -12,14 +13,17 @@ use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::{ZeroCopySend, ipc};
+use iceoryx2::sample_mut_uninit::SampleMutUninit;
 use iceoryx2::service::port_factory::publish_subscribe;
 
+use super::ahead::Ahead;
 use super::degradation::ConnectionFailures;
 use super::domain::Domain;
 use super::error::{ChannelError, retry};
 use super::raw::{self, ByteReader, RawOutput, SharedEnvelope};
 use super::sequence::{InputCounters, OutputSettings, SequenceTracker, Sequencer};
 use super::type_info::TypeInfo;
+use super::wake;
 
 /// A role's output on a channel.
 #[derive(Debug)]
@@ -175,9 +179,13 @@ fn open_typed<M: Message>(domain: &Domain, channel: &str) -> Result<TypedService
     })
 }
 
+type TypedLoan<M> = SampleMutUninit<ipc::Service, MaybeUninit<Shared<M>>, SharedEnvelope>;
+
 /// Writes messages of one Rust type, without a role around it.
 #[derive(Debug)]
 pub struct TypedOutput<M: Message> {
+    // Before the publisher: it goes first.
+    next: Ahead<TypedLoan<M>>,
     channel: String,
     publisher: Publisher<ipc::Service, Shared<M>, SharedEnvelope>,
     notifier: Option<Notifier<ipc::Service>>,
@@ -208,10 +216,11 @@ impl<M: Message> TypedOutput<M> {
         })?;
         let notifier = settings
             .notifies_readers
-            .then(|| retry(within, || raw::open_notifier(domain, channel)))
+            .then(|| retry(within, || wake::open_notifier(domain, channel)))
             .transpose()?;
         Ok(Self {
             channel: channel.to_owned(),
+            next: Ahead::keep(publisher.loan_uninit()),
             publisher,
             notifier,
             sequencer: Sequencer::new(settings),
@@ -231,11 +240,11 @@ impl<M: Message> TypedOutput<M> {
     pub fn send(&mut self, now: Instant, message: M) -> Result<(), ChannelError> {
         let refused =
             |operation, error: &dyn Debug| ChannelError::refused(&self.channel, operation, error);
-        let loan = self
-            .publisher
-            .loan_uninit()
+        let memory = self
+            .next
+            .take(|| self.publisher.loan_uninit())
             .map_err(|error| refused("get memory", &error))?;
-        let mut sample = loan.write_payload(Shared(message));
+        let mut sample = memory.write_payload(Shared(message));
         *sample.user_header_mut() = SharedEnvelope(self.sequencer.envelope(now));
         sample.send().map_err(|error| refused("send", &error))?;
         if let Some(notifier) = &self.notifier {
@@ -243,6 +252,7 @@ impl<M: Message> TypedOutput<M> {
                 .notify()
                 .map_err(|error| refused("wake its readers", &error))?;
         }
+        self.next = Ahead::keep(self.publisher.loan_uninit());
         self.sequencer.advance();
         Ok(())
     }

@@ -7,6 +7,7 @@ use std::os::fd::{AsFd, BorrowedFd};
 
 use hil_models::time::Instant;
 use iceoryx2::port::listener::{Listener, ListenerWaitError};
+use iceoryx2::port::notifier::Notifier;
 use iceoryx2::prelude::ipc;
 use nix::errno::Errno;
 use nix::poll::{PollFd, PollFlags, ppoll};
@@ -139,6 +140,22 @@ fn open_listener(domain: &Domain, channel: &str) -> Result<Listener<ipc::Service
             .create()
             .map_err(|error| ChannelError::refused(channel, "become a listener", &error))
     })
+}
+
+/// Opens the wake-up half for a writer.
+pub(crate) fn open_notifier(
+    domain: &Domain,
+    channel: &str,
+) -> Result<Notifier<ipc::Service>, ChannelError> {
+    let name = raw::service_name(channel)?;
+    domain
+        .with_node(|node| node.service_builder(&name))
+        .event()
+        .open()
+        .map_err(|error| ChannelError::refused(channel, "open the wake-up service", &error))?
+        .notifier_builder()
+        .create()
+        .map_err(|error| ChannelError::refused(channel, "become a notifier", &error))
 }
 
 fn drain(channel: &str, listener: &Listener<ipc::Service>) -> Result<bool, ChannelError> {

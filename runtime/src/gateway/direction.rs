@@ -26,6 +26,7 @@ use crate::clock::MonotonicClock;
 use crate::process::launch::{DirectionLaunch, EmulationLaunch, Side};
 use crate::process::pipe::DirectionReport;
 use crate::record::{RecordKind, RecordSink, Recorder};
+use crate::topology::Timestamps;
 use crate::wait::{WaitMode, WaitStrategy};
 
 /// Records a ring holds.
@@ -140,15 +141,15 @@ fn socket_settings(launch: &DirectionLaunch) -> UdpSettings {
         priority: socket.priority,
         send_buffer_bytes: Some(socket.send_buffer_bytes),
         receive_buffer_bytes: Some(socket.receive_buffer_bytes),
-        timestamps: timestamp_mode(&socket.timestamps),
+        timestamps: timestamp_mode(socket.timestamps),
     }
 }
 
-pub(crate) fn timestamp_mode(word: &str) -> TimestampMode {
-    match word {
-        "off" => TimestampMode::Off,
-        "hardware" => TimestampMode::Hardware,
-        _ => TimestampMode::Software,
+pub(crate) const fn timestamp_mode(asked: Timestamps) -> TimestampMode {
+    match asked {
+        Timestamps::Off => TimestampMode::Off,
+        Timestamps::Software => TimestampMode::Software,
+        Timestamps::Hardware => TimestampMode::Hardware,
     }
 }
 
@@ -283,7 +284,7 @@ fn egress(
         datagram_max_bytes: datagram_bytes_max(launch, sender.path_mtu()),
         sync_period: SYNC_PERIOD,
     })?;
-    let mode = timestamp_mode(&launch.socket.timestamps);
+    let mode = timestamp_mode(launch.socket.timestamps);
     let armed = Armed {
         software: mode != TimestampMode::Off,
         hardware: mode == TimestampMode::Hardware,

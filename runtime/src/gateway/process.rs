@@ -26,6 +26,7 @@ use crate::process::pipe::{
 use crate::process::usage::add_usage;
 use crate::realtime::{self, RealtimeGrant, SpinAdvice};
 use crate::record::Recorder;
+use crate::topology::Timestamps;
 use crate::wait::WaitMode;
 
 const PROGRESS_PERIOD: Duration = Duration::from_millis(250);
@@ -259,12 +260,12 @@ fn arm_stamps(launch: &GatewayLaunch) -> (Option<Sentinel>, Vec<(String, String)
     let Some(direction) = launch
         .directions
         .iter()
-        .find(|one| one.socket.timestamps != "off")
+        .find(|one| one.socket.timestamps != Timestamps::Off)
     else {
         return (None, fact("switched off in the topology".to_owned()));
     };
     let settings = ProbeSettings {
-        timestamps: direction::timestamp_mode(&direction.socket.timestamps),
+        timestamps: direction::timestamp_mode(direction.socket.timestamps),
         interface: direction.socket.interface.clone(),
         transmit_target: Some(direction::probe_target(direction)),
         proof_count: 5,

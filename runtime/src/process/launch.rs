@@ -11,6 +11,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use crate::realtime::RealtimeRequest;
+use crate::topology::Timestamps;
 use crate::wait::WaitMode;
 
 /// How to start one component here.
@@ -107,8 +108,8 @@ pub struct SocketLaunch {
     pub receive_buffer_bytes: usize,
     /// Largest IP packet of the path.
     pub path_mtu_bytes: usize,
-    /// `off`, `software` or `hardware`.
-    pub timestamps: String,
+    /// Kernel stamps to ask for.
+    pub timestamps: Timestamps,
 }
 
 /// A static link model (seed paper, section II.B).

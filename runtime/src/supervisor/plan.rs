@@ -102,6 +102,11 @@ pub(crate) fn plan(topology: &Topology, hosts: &[&Host]) -> Plan {
     }
 }
 
+/// What the gateway process of `link` on `host` is called, in reports and in record files.
+pub(crate) fn gateway_name(link: &str, host: &str) -> String {
+    format!("gateway-{link}-{host}")
+}
+
 fn component(topology: &Topology, process: &Process) -> ProcessPlan {
     let card = topology
         .process_card(&process.name)
@@ -150,7 +155,7 @@ fn gateways_on(topology: &Topology, host: &Host) -> Vec<ProcessPlan> {
         }
         if !directions.is_empty() {
             plans.push(ProcessPlan {
-                name: format!("gateway-{}-{}", link.name, host.name),
+                name: gateway_name(&link.name, &host.name),
                 host: host.name.clone(),
                 kind: ProcessKind::Gateway(directions),
                 realtime: RealtimeRequest::default(),
@@ -193,7 +198,7 @@ fn direction(crossing: &Crossing<'_>, side: Side, index: usize, seed: u64) -> Di
             send_buffer_bytes: hop.send_buffer_bytes,
             receive_buffer_bytes: hop.receive_buffer_bytes,
             path_mtu_bytes: hop.path_mtu_bytes,
-            timestamps: hop.timestamps.word().to_owned(),
+            timestamps: hop.timestamps,
         },
         wait: wait_mode(hop.gateway.execution.wait),
         realtime: realtime(&hop.gateway.execution, index),

@@ -7,6 +7,7 @@ use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use hil_models::message::type_hash;
+use serde::{Deserialize, Serialize};
 
 /// A topology file after every check. Only [`load`](super::load) and [`parse`](super::parse)
 /// make one.
@@ -297,7 +298,8 @@ pub struct Gateway {
 }
 
 /// Kernel time stamps of a hop.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum Timestamps {
     /// None: only the gateways' own clock readings.
     Off,
