@@ -13,6 +13,8 @@ pub struct CoordinatorCounters {
     /// Age of the state each decision rests on, per driving robot and control cycle,
     /// nanoseconds. Empty unless robots and controller share a clock.
     pub state_age: LatencyHistogram,
+    /// What only the safe rules count.
+    pub safe: SafeCounts,
 }
 
 impl CoordinatorCounters {
@@ -20,18 +22,19 @@ impl CoordinatorCounters {
     pub fn merge(&mut self, other: &Self) {
         self.counts.merge(&other.counts);
         self.state_age.merge(&other.state_age);
+        self.safe.merge(&other.safe);
     }
 }
 
 macro_rules! counts {
-    ($($(#[$doc:meta])* $name:ident,)*) => {
-        /// The plain counts of a coordinator.
+    ($(#[$of:meta])* $type:ident: $($(#[$doc:meta])* $name:ident,)*) => {
+        $(#[$of])*
         #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
-        pub struct CoordinatorCounts {
+        pub struct $type {
             $($(#[$doc])* pub $name: u64,)*
         }
 
-        impl CoordinatorCounts {
+        impl $type {
             /// Adds what another coordinator counted.
             pub fn merge(&mut self, other: &Self) {
                 $(self.$name += other.$name;)*
@@ -41,6 +44,8 @@ macro_rules! counts {
 }
 
 counts! {
+    /// The plain counts of a coordinator.
+    CoordinatorCounts:
     /// Control cycles.
     cycle_count,
     /// States taken over into a robot's view.
@@ -83,4 +88,41 @@ counts! {
     deadlocked_cycles,
     /// Robots put at their goal because they made no way for too long.
     resets,
+}
+
+counts! {
+    /// Counts of the safe rules.
+    SafeCounts:
+    /// Extensions of authority.
+    grants,
+    /// Authority messages sent, repeats included.
+    messages,
+    /// Shrinks of authority asked for.
+    shrinks,
+    /// Of these, applied by the robot.
+    shrinks_acknowledged,
+    /// Of these, refused because the robot could not stop any more.
+    shrinks_refused,
+    /// Extensions not given because no order was found in which all could still finish.
+    grants_withheld,
+    /// Extensions for which another order of all was found.
+    plans_reordered,
+    /// Missions not begun in a cycle because no order with them was found, per cycle.
+    admissions_deferred,
+    /// Cycles in which the order was kept because a robot had waited beyond its patience.
+    cycles_in_order,
+    /// Robots that made no way for too long, once per standstill.
+    stuck,
+    /// States that say what cannot be.
+    states_impossible,
+    /// States that show an authority that was never given.
+    authorities_exceeded,
+    /// States that show a robot beyond its authority by more than the stop margin.
+    margins_exceeded,
+    /// Authorities counted as ended because their lease ran out unanswered.
+    leases_expired,
+    /// States older than the delay bound a lease rests on.
+    delay_bound_violations,
+    /// Cycles without grants because the delay bound was violated.
+    cycles_frozen,
 }

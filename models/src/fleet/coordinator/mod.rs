@@ -6,7 +6,9 @@ mod legacy;
 pub mod parameters;
 pub mod policy;
 pub mod roster;
+pub mod safe;
 pub mod sections;
+mod view;
 
 use core::fmt::Debug;
 
@@ -15,6 +17,7 @@ use crate::fleet::coordinator::legacy::LegacyRules;
 use crate::fleet::coordinator::parameters::{CoordinatorMode, CoordinatorParameters};
 use crate::fleet::coordinator::policy::OrderingPolicy;
 use crate::fleet::coordinator::roster::{MissionSupply, Roster, SectionKind};
+use crate::fleet::coordinator::safe::SafeRules;
 use crate::fleet::messages::{State, ToRobot};
 use crate::fleet::scenario::Scene;
 use crate::time::Instant;
@@ -33,6 +36,14 @@ pub(crate) trait Rules: Debug {
     /// Decides and sends authorities. The roster is settled: missions that ended, and sections
     /// that were passed, are gone from it; missions that begin are in it.
     fn decide(&mut self, cycle: &mut Cycle<'_>);
+
+    /// Sees every state as it arrives, also those the roster does not take.
+    fn on_state(&mut self, _now: Instant, _state: &State) {}
+
+    /// Whether a robot that makes no way may be put at its goal.
+    fn resets_stuck_robots(&self) -> bool {
+        true
+    }
 }
 
 /// One fleet's coordinator.
@@ -59,6 +70,11 @@ impl Coordinator {
                 let rules = LegacyRules::new(scene, parameters);
                 (SectionKind::Exact, Box::new(rules))
             }
+            CoordinatorMode::Safe => {
+                // The roster's sections are only counted here, as in the other mode.
+                let rules = SafeRules::new(&scene.world, &scene.starts, parameters, fleet_id);
+                (SectionKind::Exact, Box::new(rules))
+            }
         };
         Self {
             roster: Roster::new(scene, parameters, fleet_id, kind),
@@ -80,6 +96,13 @@ impl Coordinator {
     /// Takes a robot's state in.
     pub fn on_state(&mut self, now: Instant, state: &State) {
         self.roster.on_state(now, state, &mut self.counters.counts);
+        self.rules.on_state(now, state);
+    }
+
+    /// Takes in a robot's true state, past all channels: what the original does in simulation.
+    /// Then only commands suffer from the network.
+    pub fn observe(&mut self, now: Instant, state: &State) {
+        self.roster.observe(now, state, &mut self.counters.counts);
     }
 
     /// One control cycle; gives each message to `send`.
@@ -103,8 +126,10 @@ impl Coordinator {
             counters: &mut self.counters,
             send,
         });
-        self.roster
-            .reset_stuck(now, &mut self.counters.counts, send);
+        if self.rules.resets_stuck_robots() {
+            self.roster
+                .reset_stuck(now, &mut self.counters.counts, send);
+        }
     }
 
     /// What it counted so far.

@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::case_study::ParameterError;
 use crate::fleet::coordinator::policy::PolicyName;
+use crate::fleet::coordinator::safe::parameters::SafeParameters;
 
 /// Which rules give robots their way.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -14,6 +15,8 @@ pub enum CoordinatorMode {
     /// The original's: orders are believed delivered.
     #[default]
     Legacy,
+    /// Acknowledged movement authority.
+    Safe,
 }
 
 /// What to do with a message that arrives after a newer one.
@@ -55,6 +58,8 @@ pub struct CoordinatorParameters {
     pub break_deadlocks: bool,
     /// Robots stamp states with the controller's clock, so that a state's age means something.
     pub clock_is_shared: bool,
+    /// What only the safe mode needs.
+    pub safe: SafeParameters,
 }
 
 impl Default for CoordinatorParameters {
@@ -72,6 +77,7 @@ impl Default for CoordinatorParameters {
             stuck_after_s: 120.0,
             break_deadlocks: true,
             clock_is_shared: true,
+            safe: SafeParameters::default(),
         }
     }
 }
@@ -105,7 +111,7 @@ impl CoordinatorParameters {
             let key = format!("coordinator.{key}");
             ParameterError::check(&key, value, min..=max, &format!("{min}..={max}"))?;
         }
-        Ok(())
+        self.safe.check()
     }
 
     /// Tc.

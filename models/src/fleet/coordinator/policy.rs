@@ -26,6 +26,8 @@ pub struct Contender {
     pub mission_started: Instant,
     /// Since when it stands at the end of its authority; `None` while it moves.
     pub waiting_since: Option<Instant>,
+    /// Robots that stand and wait for it, directly or behind others; known in the safe mode.
+    pub held_up_count: u32,
 }
 
 /// Two robots and the section both need.
@@ -70,6 +72,10 @@ pub enum PolicyName {
     ClosestFirst,
     /// [`FirstCome`].
     FirstCome,
+    /// [`LongestQueue`].
+    LongestQueue,
+    /// [`FirstOut`].
+    FirstOut,
 }
 
 impl PolicyName {
@@ -78,6 +84,8 @@ impl PolicyName {
         match self {
             Self::ClosestFirst => Box::new(ClosestFirst),
             Self::FirstCome => Box::new(FirstCome),
+            Self::LongestQueue => Box::new(LongestQueue),
+            Self::FirstOut => Box::new(FirstOut),
         }
     }
 }
@@ -89,6 +97,30 @@ pub struct ClosestFirst;
 impl OrderingPolicy for ClosestFirst {
     fn compare(&self, contest: &Contest<'_>) -> Ordering {
         contest.first.to_start.cmp(&contest.second.to_start)
+    }
+}
+
+/// The robot that holds up more others goes first; among equals the closer one.
+#[derive(Debug, Clone, Copy)]
+pub struct LongestQueue;
+
+impl OrderingPolicy for LongestQueue {
+    fn compare(&self, contest: &Contest<'_>) -> Ordering {
+        let (first, second) = (&contest.first, &contest.second);
+        let by_queue = second.held_up_count.cmp(&first.held_up_count);
+        by_queue.then_with(|| ClosestFirst.compare(contest))
+    }
+}
+
+/// The robot that has less way left goes first: what leaves the ground soonest is in nobody's
+/// way afterwards.
+#[derive(Debug, Clone, Copy)]
+pub struct FirstOut;
+
+impl OrderingPolicy for FirstOut {
+    fn compare(&self, contest: &Contest<'_>) -> Ordering {
+        let (first, second) = (&contest.first, &contest.second);
+        first.path_poses_left.cmp(&second.path_poses_left)
     }
 }
 

@@ -10,7 +10,8 @@ use crate::fleet::coordinator::counters::CoordinatorCounts;
 use crate::fleet::coordinator::parameters::{CoordinatorParameters, MessageOrder};
 use crate::fleet::coordinator::policy::Contender;
 use crate::fleet::coordinator::sections::SectionBook;
-use crate::fleet::messages::{Header, Mission, Phase, State, ToRobot};
+pub use crate::fleet::coordinator::view::{ActiveMission, RobotView};
+use crate::fleet::messages::{Header, State, ToRobot};
 use crate::fleet::mission::MissionSource;
 use crate::fleet::path::Path;
 use crate::fleet::scenario::Scene;
@@ -45,127 +46,6 @@ impl MissionSupply for MissionSource {
 
     fn parking(&self) -> Duration {
         self.parking()
-    }
-}
-
-/// A mission on its way.
-#[derive(Debug, Clone)]
-pub struct ActiveMission {
-    /// Its number, from 1, per robot.
-    pub id: u32,
-    /// From where to where, on which path.
-    pub route: Route,
-    /// The path's poses.
-    pub path: Arc<Path>,
-    /// When it was first sent.
-    pub started: Instant,
-    /// A state showed it.
-    pub is_shown: bool,
-    /// The robot was told to stand at its goal at once.
-    pub is_reset: bool,
-    /// First pose at which the robot is clear of the bay it left.
-    clear_index: usize,
-    has_left_bay: bool,
-    /// When a state first showed the goal reached.
-    done_at: Option<Instant>,
-    best_index: usize,
-    last_progress: Instant,
-}
-
-/// What the coordinator knows of one robot.
-#[derive(Debug, Clone, Default)]
-pub struct RobotView {
-    /// Newest state of the present mission; `None` before the first.
-    pub state: Option<State>,
-    /// The mission; `None` while the robot is parked.
-    pub mission: Option<ActiveMission>,
-    /// Where it is parked, or where its mission began.
-    pub bay: BayIndex,
-    /// When its last mission ended; `None` before the first.
-    pub parked_since: Option<Instant>,
-    /// Since when it stands at the end of its authority.
-    pub waiting_since: Option<Instant>,
-    newest_header_id: Option<u32>,
-    newest_mission_id: u32,
-    mission_header_id: u32,
-    /// The index changed since the sections were last looked at.
-    has_moved: bool,
-}
-
-impl RobotView {
-    /// Last pose of its path the robot reported to have passed; 0 before the first report.
-    pub fn index(&self) -> usize {
-        self.state
-            .map_or(0, |state| usize::try_from(state.path_index).unwrap_or(0))
-    }
-
-    /// Last pose of its mission's path; 0 without a mission.
-    pub fn last_index(&self) -> usize {
-        self.mission
-            .as_ref()
-            .map_or(0, |mission| mission.path.last_index())
-    }
-
-    /// The robot as an ordering policy sees it before a section that starts at `start`.
-    pub fn contender(&self, robot: usize, start: usize) -> Contender {
-        let index = self.index();
-        Contender {
-            robot,
-            index,
-            speed_mps: self.state.map_or(0.0, |state| f64::from(state.speed_mps)),
-            to_start: start.saturating_sub(index),
-            path_poses_left: self.last_index().saturating_sub(index),
-            mission_started: self
-                .mission
-                .as_ref()
-                .map_or(Instant::ZERO, |mission| mission.started),
-            waiting_since: self.waiting_since,
-        }
-    }
-
-    /// The message of the present mission; without one, of mission 0, which robots ignore.
-    fn mission_message(&mut self, now: Instant, fleet_id: u32, robot_id: u32) -> ToRobot {
-        self.mission_header_id = self.mission_header_id.wrapping_add(1);
-        let mut message = Mission {
-            header: Header {
-                fleet_id,
-                robot_id,
-                header_id: self.mission_header_id,
-                mission_id: 0,
-                sent_ns: now.as_ns(),
-            },
-            ..Mission::default()
-        };
-        if let Some(mission) = &self.mission {
-            message.header.mission_id = mission.id;
-            message.path_id = mission.route.path.0;
-            message.end_index = u32::try_from(mission.path.last_index()).unwrap_or(u32::MAX);
-            message.flags = u32::from(mission.is_reset) * Mission::REPLACE;
-            message.path_hash = mission.path.hash();
-        }
-        ToRobot::Mission(message)
-    }
-
-    fn take(&mut self, now: Instant, state: &State) {
-        let old_index = self.index();
-        self.state = Some(*state);
-        let index = self.index();
-        self.has_moved |= index != old_index;
-        match Phase::of(state.phase) {
-            Some(Phase::AtPoint) => self.waiting_since = self.waiting_since.or(Some(now)),
-            _ => self.waiting_since = None,
-        }
-        let Some(mission) = &mut self.mission else {
-            return;
-        };
-        mission.is_shown = true;
-        if index > mission.best_index {
-            mission.best_index = index;
-            mission.last_progress = now;
-        }
-        if Phase::of(state.phase) == Some(Phase::Done) {
-            mission.done_at.get_or_insert(now);
-        }
     }
 }
 
@@ -263,8 +143,7 @@ impl Roster {
     /// Takes over a robot's state, if it is one of the robot's present mission.
     pub fn on_state(&mut self, now: Instant, state: &State, counts: &mut CoordinatorCounts) {
         let header = &state.header;
-        let view = self.robots.get_mut(header.robot_id as usize);
-        let Some(view) = view.filter(|_| header.fleet_id == self.fleet_id) else {
+        let Some(view) = view_of(&mut self.robots, self.fleet_id, header) else {
             counts.states_unknown += 1;
             return;
         };
@@ -284,20 +163,27 @@ impl Roster {
             counts.states_dropped += 1;
             return;
         }
-        if header.mission_id > view.newest_mission_id {
+        self.observe(now, state, counts);
+    }
+
+    /// The same for a state that came by no channel, so that it has no place in the order of
+    /// messages: what a coordinator that looks at the simulated robots themselves sees.
+    pub fn observe(&mut self, now: Instant, state: &State, counts: &mut CoordinatorCounts) {
+        let header = &state.header;
+        let Some(view) = view_of(&mut self.robots, self.fleet_id, header)
+            .filter(|view| ahead_of(header.mission_id, view.newest_mission_id) <= 0)
+        else {
             counts.states_unknown += 1;
             return;
-        }
-        let Some(mission) = &view.mission else {
+        };
+        let mission = view.mission.as_ref();
+        let Some(mission) = mission.filter(|mission| mission.id == header.mission_id) else {
             counts.states_outdated += 1;
             return;
         };
-        if header.mission_id != mission.id {
-            counts.states_outdated += 1;
-            return;
-        }
         let last_index = mission.path.last_index();
-        if usize::try_from(state.path_index).is_ok_and(|index| index <= last_index) {
+        let is_on_path = usize::try_from(state.path_index).is_ok_and(|index| index <= last_index);
+        if is_on_path && state.is_sound() {
             counts.states_accepted += 1;
             view.take(now, state);
         } else {
@@ -477,6 +363,17 @@ impl Roster {
     }
 }
 
+/// The robot a message names, if it is one of fleet `fleet_id`.
+fn view_of<'a>(
+    robots: &'a mut [RobotView],
+    fleet_id: u32,
+    header: &Header,
+) -> Option<&'a mut RobotView> {
+    robots
+        .get_mut(header.robot_id as usize)
+        .filter(|_| header.fleet_id == fleet_id)
+}
+
 /// How far header `id` is ahead of `newest`, across the wrap of the counter.
 fn ahead_of(id: u32, newest: u32) -> i32 {
     id.wrapping_sub(newest).cast_signed()
@@ -491,3 +388,7 @@ fn clear_index(world: &World, bay: BayIndex, path: &Path) -> usize {
         .position(|pose| !footprint.at(pose).overlaps(&parked))
         .unwrap_or(path.last_index())
 }
+
+#[cfg(test)]
+#[path = "roster_tests.rs"]
+mod tests;

@@ -8,6 +8,8 @@
 mod deadlock;
 mod forward;
 mod precedence;
+#[cfg(test)]
+mod tests;
 
 use core::time::Duration;
 
