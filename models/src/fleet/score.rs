@@ -282,7 +282,7 @@ mod tests {
     fn two_fleets_at_a_crossing_are_scored_from_what_they_left_in_the_log() {
         let case = crossing();
         let result = Simulation::new(&case, BTreeMap::new()).unwrap();
-        let result = result.run(Duration::from_secs(120)).unwrap();
+        let result = result.run(Duration::from_mins(2)).unwrap();
         let score = case.score(&result.log);
         let value = |name: &str| score.get(name).and_then(|metric| metric.value);
         assert_eq!(value("section_collisions_count"), Some(0.0));
