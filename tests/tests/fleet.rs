@@ -175,8 +175,7 @@ fn assert_losses_are_explained(summary: &RunSummary) {
 #[test]
 fn an_interrupted_fleet_leaves_its_report() {
     let record = RunFolder::new("fleet-stop");
-    let trial =
-        Trial::shipped("fleet-emulated.toml", record.path()).set("run.duration=\"10 min\"");
+    let trial = Trial::shipped("fleet-emulated.toml", record.path()).set("run.duration=\"10 min\"");
     let mut child = trial.start_here();
     let files = trial.folder("", START_LIMIT);
     wait_until(START_LIMIT, "a few hundred states", || {

@@ -6,18 +6,15 @@ use core::time::Duration;
 use std::collections::BTreeMap;
 
 use crate::case_study::{MessageRef, ScoreEvent, Severity};
+use crate::fleet::case::{FLEET_AUTHORITY, FLEET_MISSION, FLEET_TRUTH};
 use crate::fleet::messages::{Authority, Mission, Truth, TruthKind};
 use crate::fleet::referee::{Incident, IncidentKind};
 use crate::message::Message;
 use crate::run_log::RunLog;
 use crate::time::Instant;
 
-const FLEET_AUTHORITY: &str = "fleet/authority";
-const FLEET_MISSION: &str = "fleet/mission";
-const FLEET_TRUTH: &str = "fleet/truth";
-
-/// A command counts as held up when it is taken so long after its first copy was sent. The control
-/// period of one second, after which it is repeated, is well above; a plain delay well below.
+/// A command counts as held up when the copy that was taken left so long after the first. Repeats
+/// come after a control period, a second, and replicas at once.
 const HELD_UP_AFTER: Duration = Duration::from_millis(300);
 
 /// Copies of one command that an event names.
@@ -80,7 +77,12 @@ impl Orders {
     }
 
     /// What was sent of a mission's authorities after number `after` and below `below`.
-    fn between(&self, (fleet, robot, mission): (u32, u32, u32), after: u32, below: u32) -> Vec<Sent> {
+    fn between(
+        &self,
+        (fleet, robot, mission): (u32, u32, u32),
+        after: u32,
+        below: u32,
+    ) -> Vec<Sent> {
         let from = (fleet, robot, mission, after.saturating_add(1));
         let to = (fleet, robot, mission, below);
         if from >= to {
@@ -90,14 +92,16 @@ impl Orders {
         range.flat_map(|(_, copies)| copies).copied().collect()
     }
 
-    /// How long after its first copy a command was taken at `at`, and how many copies went before
-    /// the one that was; `None` when it was not held up, or no one can say.
+    /// How long after its first copy a command was taken at `at`, and how many copies left well
+    /// before the one that was; `None` when it was not held up, or no one can say.
     fn held_up(&self, copies: &[Sent], at: Instant) -> Option<(f64, usize)> {
         let first = copies.first().filter(|_| self.has_one_clock)?;
-        let late_s = at.seconds_since(first.at);
-        let sent_by_then = copies.iter().filter(|copy| copy.at <= at).count();
-        let is_late = late_s >= HELD_UP_AFTER.as_secs_f64() && sent_by_then > 1;
-        is_late.then_some((late_s, sent_by_then - 1))
+        let taken = copies.iter().rfind(|copy| copy.at <= at)?;
+        let missed = copies
+            .iter()
+            .filter(|copy| copy.at + HELD_UP_AFTER <= taken.at);
+        let missed_count = missed.count();
+        (missed_count > 0).then(|| (at.seconds_since(first.at), missed_count))
     }
 }
 
@@ -111,10 +115,7 @@ impl Orders {
     }
 }
 
-fn sent<M: Message>(
-    log: &RunLog,
-    channel: &'static str,
-) -> impl Iterator<Item = (Sent, M)> {
+fn sent<M: Message>(log: &RunLog, channel: &'static str) -> impl Iterator<Item = (Sent, M)> {
     log.raw(channel).iter().filter_map(move |logged| {
         let message = bytemuck::try_pod_read_unaligned(&logged.payload).ok()?;
         let sent = Sent {
@@ -165,7 +166,8 @@ impl Watch {
     /// One event per authority taken: the gravest that applies.
     fn hear(&mut self, truth: &Truth, kind: TruthKind, orders: &Orders) -> Option<ScoreEvent> {
         let number = truth.caused_by_sequence;
-        let before = core::mem::replace(&mut self.heard, self.heard.max(number));
+        let before = self.heard;
+        self.heard = before.max(number);
         let robot = (truth.fleet_id, truth.robot_id, truth.mission_id);
         let missed = orders.between(robot, before, number);
         let copies = orders.authority(key(truth));
@@ -194,7 +196,10 @@ impl Watch {
                 } else {
                     format!("authorities {first} to {}", number - 1)
                 };
-                format!("{who} took no {numbers} of mission {} before {number}", truth.mission_id)
+                format!(
+                    "{who} took no {numbers} of mission {} before {number}",
+                    truth.mission_id
+                )
             }
             _ => return None,
         };
@@ -243,11 +248,17 @@ fn incident(incident: &Incident, orders: &Orders) -> ScoreEvent {
         incident.fleet_id
     );
     let event = ScoreEvent::new(Severity::Incident, incident.at, FLEET_TRUTH, what);
-    let sides = incident.robots.iter().zip(incident.mission_ids).zip(incident.causes);
+    let sides = incident
+        .robots
+        .iter()
+        .zip(incident.mission_ids)
+        .zip(incident.causes);
     sides.fold(event, |event, ((robot, mission), cause)| {
         let robot = (incident.fleet_id, *robot, mission);
         let taken = cause.caused_by_sequence;
-        let last = orders.authority((robot.0, robot.1, robot.2, taken)).to_vec();
+        let last = orders
+            .authority((robot.0, robot.1, robot.2, taken))
+            .to_vec();
         let event = orders.named(event, last);
         orders.named(event, orders.between(robot, taken, u32::MAX))
     })
@@ -304,7 +315,8 @@ mod tests {
                 ..Envelope::default()
             };
             *count += 1;
-            self.log.push(channel, envelope, bytemuck::bytes_of(message));
+            self.log
+                .push(channel, envelope, bytemuck::bytes_of(message));
         }
 
         fn send(&mut self, at_ms: i64, number: u32) -> &mut Self {
@@ -395,7 +407,8 @@ mod tests {
         diary.publish(FLEET_MISSION, 0, &mission);
         diary.publish(FLEET_MISSION, 1_000, &mission);
         diary.take(1_010, TruthKind::MissionStarted, 0);
-        let what = "robot 2 of fleet 1 began mission 3 1.01 s after it was first sent, 1 copy before";
+        let what =
+            "robot 2 of fleet 1 began mission 3 1.01 s after it was first sent, 1 copy before";
         assert_eq!(diary.told(), [(what.to_owned(), vec![0, 1])]);
     }
 
@@ -412,7 +425,11 @@ mod tests {
     #[test]
     fn an_incident_names_what_each_robot_took_last_and_what_it_was_sent_after() {
         let mut diary = Diary::default();
-        diary.send(0, 1).take(20, Applied, 1).send(1_000, 2).send(9_000, 3);
+        diary
+            .send(0, 1)
+            .take(20, Applied, 1)
+            .send(1_000, 2)
+            .send(9_000, 3);
         let seen = Incident {
             at: Instant::from_ns(5_000 * MS),
             kind: IncidentKind::Overlap,
@@ -438,7 +455,8 @@ mod tests {
         let named: Vec<_> = event.messages.iter().map(|one| one.sequence).collect();
         assert_eq!(named, [0, 1], "the third was sent afterwards");
         assert!(event.messages.iter().all(|one| one.epoch == 5));
-        let what = "robots 2 and 4 of fleet 1 overlapped in a critical section, at x 1.0 m, y 2.0 m";
+        let what =
+            "robots 2 and 4 of fleet 1 overlapped in a critical section, at x 1.0 m, y 2.0 m";
         assert_eq!(event.what, what);
     }
 }

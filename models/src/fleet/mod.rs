@@ -5,6 +5,7 @@ mod analytic;
 mod case;
 pub mod controller;
 pub mod coordinator;
+mod events;
 pub mod experiment;
 pub mod geometry;
 pub mod messages;
