@@ -20,6 +20,5 @@ pub use setup::{Links, Setup, StatusPath};
 pub use study::{TableParameters, TablePart};
 pub use tally::FleetTally;
 
-pub(crate) use tally::collision_interval;
 
 pub(crate) use study::FleetStudy;
