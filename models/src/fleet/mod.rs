@@ -3,9 +3,13 @@
 
 mod analytic;
 pub mod geometry;
+mod layout;
+pub mod map;
 pub mod messages;
 pub mod mission;
 pub mod path;
+pub mod planner;
+mod routes;
 pub mod scenario;
 pub mod section;
 pub mod world;
