@@ -1,6 +1,8 @@
 //! The fleet's coordinator: from the robots' states to missions and authorities, once per control
 //! period. A pure state machine; what carries the messages, and how badly, it does not know.
 
+#[cfg(test)]
+mod closed_loop;
 pub mod counters;
 mod legacy;
 pub mod parameters;

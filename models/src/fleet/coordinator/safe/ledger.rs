@@ -145,7 +145,7 @@ impl Ledger {
 
     /// Takes over what `state` proves.
     pub fn on_state(&mut self, state: &State) -> StateEffect {
-        if state.header.mission_id != self.mission_id {
+        if state.header.mission_id != self.mission_id || self.mission_id == 0 {
             return StateEffect::Nothing;
         }
         let (Some(held), Some(passed)) = (self.held(state), self.passed(state)) else {

@@ -23,6 +23,8 @@ pub mod ledger;
 mod liveness;
 pub mod parameters;
 pub mod reservation;
+#[cfg(test)]
+mod tests;
 
 use core::time::Duration;
 use std::sync::Arc;

@@ -1,0 +1,5 @@
+//! Claims about the safe rules in closed loop: random worlds, fleets and channels.
+
+mod claims;
+mod rig;
+mod world;
