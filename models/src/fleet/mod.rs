@@ -12,6 +12,7 @@ mod layout;
 pub mod map;
 pub mod messages;
 pub mod mission;
+mod overlap;
 mod parameters;
 pub mod path;
 pub mod planner;
@@ -22,6 +23,7 @@ mod routes;
 pub mod scenario;
 mod score;
 pub mod section;
+mod section_library;
 pub mod world;
 
 pub use case::{FLEET_AUTHORITY, FLEET_MISSION, FLEET_STATE, FLEET_TRUTH, Fleet};
