@@ -4,12 +4,16 @@
 mod analytic;
 pub mod coordinator;
 pub mod geometry;
+mod layout;
+pub mod map;
 pub mod messages;
 pub mod mission;
 pub mod path;
+pub mod planner;
 pub mod referee;
 pub mod robot;
 pub mod robots;
+mod routes;
 pub mod scenario;
 pub mod section;
 pub mod world;

@@ -7,8 +7,12 @@ use serde::{Deserialize, Serialize};
 
 use crate::case_study::ParameterError;
 use crate::fleet::analytic::{self, Line};
-use crate::fleet::geometry::{Bounds, Footprint, Pose};
+use crate::fleet::geometry::{Bounds, Footprint, Pose, wrap_angle};
+use crate::fleet::layout::{self, BAYS_PER_SIDE};
+use crate::fleet::map::{Map, MapBay};
 use crate::fleet::path::{Path, PathLibrary};
+use crate::fleet::planner::At;
+use crate::fleet::routes::{Connection, Connector, Network, check_connection, lifted};
 use crate::fleet::section::MergePolicy;
 use crate::fleet::world::{Bay, BayIndex, Route, Vehicle, World};
 
@@ -56,6 +60,8 @@ pub struct WorldParameters {
     pub acceleration_mps2: Option<f64>,
     /// Smallest turning radius of planned paths, metres, 0.05..=1000.
     pub turning_radius_m: Option<f64>,
+    /// What planned paths keep between vehicle and everything else, metres, 0..=100.
+    pub clearance_m: Option<f64>,
     /// `custom`: the ground, metres.
     pub bounds: Option<Bounds>,
     /// `custom`: what no vehicle may touch.
@@ -78,6 +84,7 @@ impl Default for WorldParameters {
             speed_max_mps: None,
             acceleration_mps2: None,
             turning_radius_m: None,
+            clearance_m: None,
             bounds: None,
             obstacles: Vec::new(),
             bays: Vec::new(),
@@ -123,6 +130,9 @@ pub struct PathParameters {
     pub poses: Vec<Pose>,
 }
 
+/// How near the ends of a given path must be to its bays, metres and radians.
+const END_TOLERANCE: f64 = 1e-3;
+
 /// A world with its robots in their starting bays.
 #[derive(Debug, Clone)]
 pub struct Scene {
@@ -158,11 +168,45 @@ impl WorldParameters {
             Scenario::HeadOn => self.lines(vehicle, &analytic::head_on(&vehicle)),
             Scenario::Following => self.lines(vehicle, &analytic::following(&vehicle)),
             Scenario::ThreeCycle => self.lines(vehicle, &analytic::three_cycle(&vehicle)),
-            Scenario::Harbor | Scenario::Warehouse | Scenario::Custom => Err(ParameterError::new(
-                "world.scenario",
-                "is not available yet",
-            )),
+            Scenario::Harbor => self.hall(vehicle, &layout::harbor(self.clearance_m())),
+            Scenario::Warehouse => self.hall(vehicle, &layout::warehouse(self.clearance_m())),
+            Scenario::Custom => self.custom(vehicle),
         }
+    }
+
+    /// The map of the scenario; `None` for the small scenarios, whose ground has neither edge nor
+    /// obstacles.
+    ///
+    /// # Errors
+    /// When `custom` lacks its bounds.
+    pub fn map(&self) -> Result<Option<Map>, ParameterError> {
+        Ok(match self.scenario {
+            Scenario::Harbor => Some(layout::harbor(self.clearance_m()).stacked(self.tiles())),
+            Scenario::Warehouse => {
+                Some(layout::warehouse(self.clearance_m()).stacked(self.tiles()))
+            }
+            Scenario::Custom => Some(self.custom_map()?),
+            _ => None,
+        })
+    }
+
+    /// The smallest turning radius of planned paths: as given, or 10 m in the harbor, else 4 m.
+    pub fn turning_radius_m(&self) -> f64 {
+        let own = match self.scenario {
+            Scenario::Harbor => 10.0,
+            _ => 4.0,
+        };
+        self.turning_radius_m.unwrap_or(own)
+    }
+
+    /// What planned paths keep between vehicle and obstacles, as given or half a width.
+    pub fn clearance_m(&self) -> f64 {
+        let own = 0.5 * self.vehicle().footprint.width_m;
+        self.clearance_m.unwrap_or(own)
+    }
+
+    fn tiles(&self) -> usize {
+        (self.robots as usize).div_ceil(BAYS_PER_SIDE).max(1)
     }
 
     /// The vehicle: that of Table I for the scenario (the warehouse's unless harbor), with what
@@ -186,15 +230,19 @@ impl WorldParameters {
         let vehicle = self.vehicle();
         let size = (0.05..=100.0, "0.05..=100");
         let rate = (0.01..=100.0, "0.01..=100");
+        let spacing = (0.01..=5.0, "0.01..=5");
+        let radius = (0.05..=1000.0, "0.05..=1000");
         let numbers = [
             ("world.length_m", vehicle.footprint.length_m, &size),
             ("world.width_m", vehicle.footprint.width_m, &size),
             ("world.speed_max_mps", vehicle.speed_max_mps, &rate),
             ("world.acceleration_mps2", vehicle.acceleration_mps2, &rate),
+            ("world.path_spacing_m", self.path_spacing_m, &spacing),
+            ("world.turning_radius_m", self.turning_radius_m(), &radius),
             (
-                "world.path_spacing_m",
-                self.path_spacing_m,
-                &(0.01..=5.0, "0.01..=5"),
+                "world.clearance_m",
+                self.clearance_m(),
+                &(0.0..=100.0, "0..=100"),
             ),
             (
                 "world.robots",
@@ -205,7 +253,176 @@ impl WorldParameters {
         for (key, value, (allowed, text)) in numbers {
             ParameterError::check(key, value, allowed.clone(), text)?;
         }
+        if self.scenario != Scenario::Custom {
+            let given = [
+                ("world.bounds", self.bounds.is_some()),
+                ("world.obstacles", !self.obstacles.is_empty()),
+                ("world.bays", !self.bays.is_empty()),
+                ("world.paths", !self.paths.is_empty()),
+            ];
+            if let Some((key, _)) = given.iter().find(|(_, is_given)| *is_given) {
+                let problem = "is for scenario = \"custom\"; this one has its own";
+                return Err(ParameterError::new(key, problem));
+            }
+        }
         Ok(())
+    }
+
+    /// A built-in map, as often as the robots need it. Robots start in left bays.
+    fn hall(&self, vehicle: Vehicle, tile: &Map) -> Result<Scene, ParameterError> {
+        let limits = (self.turning_radius_m(), self.path_spacing_m);
+        let count = self.tiles();
+        let (bay_count, height_m) = (tile.bays.len(), tile.height_m());
+        let mut connector = Connector::new(tile, &vehicle, limits)?;
+        let within = connector.connect(&|_, _| true)?;
+        let mut planning = connector.summary;
+        let mut network = Network::default();
+        for number in 0..count {
+            for connection in &within {
+                let lifted = lifted(connection, number, (bay_count, height_m));
+                network.add(&lifted, self.path_spacing_m)?;
+            }
+        }
+        if count > 1 {
+            let pair = tile.stacked(2);
+            let mut connector = Connector::new(&pair, &vehicle, limits)?;
+            // To the nearer bays of the neighbour only, lest paths grow in number with no use.
+            let near_m = pair.bays[..2 * bay_count].iter();
+            let near: Vec<_> = near_m
+                .map(|bay| (bay.pose.y_m - pair.bounds.y_min_m - height_m).abs() < 0.5 * height_m)
+                .collect();
+            let across = connector.connect(&|from, to| {
+                from / bay_count != to / bay_count && near[from] && near[to]
+            })?;
+            planning.planned_count += connector.summary.planned_count;
+            planning.expanded_count += connector.summary.expanded_count;
+            for number in 0..count - 1 {
+                for connection in &across {
+                    let lifted = lifted(connection, number, (bay_count, height_m));
+                    network.add(&lifted, self.path_spacing_m)?;
+                }
+            }
+        }
+        let bays: Vec<_> = tile.stacked(count).bays;
+        Ok(self.scene(vehicle, &bays, network, planning))
+    }
+
+    fn custom_map(&self) -> Result<Map, ParameterError> {
+        let Some(bounds) = self.bounds else {
+            let problem = "is missing, and scenario = \"custom\" needs it";
+            return Err(ParameterError::new("world.bounds", problem));
+        };
+        let bays = self.bays.iter().map(|bay| MapBay {
+            pose: Pose::new(bay.x_m, bay.y_m, bay.heading_rad),
+            side: bay.side,
+        });
+        Ok(Map {
+            bounds,
+            obstacles: self.obstacles.clone(),
+            bays: bays.collect(),
+            clearance_m: self.clearance_m(),
+        })
+    }
+
+    fn custom(&self, vehicle: Vehicle) -> Result<Scene, ParameterError> {
+        let map = self.custom_map()?;
+        for side in [BaySide::Left, BaySide::Right] {
+            if map.bays_of(side).next().is_none() {
+                let problem = format!("has no {side:?} one; robots need one on each side");
+                return Err(ParameterError::new("world.bays", problem.to_lowercase()));
+            }
+        }
+        let limits = (self.turning_radius_m(), self.path_spacing_m);
+        let mut connector = Connector::new(&map, &vehicle, limits)?;
+        let connections = if self.paths.is_empty() {
+            connector.connect(&|_, _| true)?
+        } else {
+            self.given_connections(&map, &vehicle)?
+        };
+        let mut network = Network::default();
+        for connection in &connections {
+            network.add(connection, self.path_spacing_m)?;
+        }
+        Ok(self.scene(vehicle, &map.bays, network, connector.summary))
+    }
+
+    fn given_connections(
+        &self,
+        map: &Map,
+        vehicle: &Vehicle,
+    ) -> Result<Vec<Connection>, ParameterError> {
+        let mut connections = Vec::<Connection>::new();
+        for (index, path) in self.paths.iter().enumerate() {
+            let key = format!("world.paths[{index}]");
+            let error = |problem: String| Err(ParameterError::new(&key, problem));
+            let ends = [(path.from, BaySide::Left), (path.to, BaySide::Right)];
+            for (bay, side) in ends {
+                if !map.bays_of(side).any(|known| known == bay as usize) {
+                    return error(format!("names bay {bay}, which is no {side:?} bay"));
+                }
+            }
+            let connection = Connection {
+                from: path.from as usize,
+                to: path.to as usize,
+                poses: path.poses.clone(),
+            };
+            let is_known = |known: &Connection| (known.from, known.to);
+            let pair = is_known(&connection);
+            if connections.iter().any(|known| is_known(known) == pair) {
+                return error(format!("joins bays {} and {} again", path.from, path.to));
+            }
+            // Names a NaN pose before anything compares with it.
+            if let Err(problem) = Path::new(&path.poses, self.path_spacing_m) {
+                return error(problem.to_string());
+            }
+            let ends = [
+                (path.poses.first(), path.from),
+                (path.poses.last(), path.to),
+            ];
+            for (pose, bay) in ends {
+                let parked = map.bays[bay as usize].pose;
+                let is_there = |pose: &Pose| {
+                    let turn = wrap_angle(pose.heading_rad - parked.heading_rad);
+                    pose.distance_m(&parked) < END_TOLERANCE && turn.abs() < END_TOLERANCE
+                };
+                if !pose.is_some_and(is_there) {
+                    return error(format!("does not end in bay {bay}, at {}", At(&parked)));
+                }
+            }
+            check_connection(map, vehicle, &connection, &key)?;
+            connections.push(connection);
+        }
+        Ok(connections)
+    }
+
+    /// Robots in the first left bays of every seven, each left bay's shuttle line leading to
+    /// the right bay of equal rank.
+    fn scene(
+        &self,
+        vehicle: Vehicle,
+        bays: &[MapBay],
+        network: Network,
+        planning: PlanningSummary,
+    ) -> Scene {
+        let of = |side| {
+            let numbered = bays.iter().enumerate();
+            let own = numbered.filter(move |(_, bay)| bay.side == side);
+            own.map(|(index, _)| index).collect::<Vec<_>>()
+        };
+        let (left, right) = (of(BaySide::Left), of(BaySide::Right));
+        let mut partners = vec![None; bays.len()];
+        for (&from, &to) in left.iter().zip(&right) {
+            partners[from] = Some(to);
+            partners[to] = Some(from);
+        }
+        let bays = bays.iter().map(|bay| Bay { pose: bay.pose }).collect();
+        let Network { paths, routes } = network;
+        Scene {
+            world: Arc::new(World::new(vehicle, bays, routes, paths, self.merge)),
+            starts: left.into_iter().take(self.robots as usize).collect(),
+            partners,
+            planning,
+        }
     }
 
     /// A world of one line per robot; bay `i` is where robot `i` starts, bay `n + i` where its
