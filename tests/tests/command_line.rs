@@ -378,7 +378,15 @@ fn the_doctor_speaks_json_and_is_strict_when_told_to() {
 fn the_cases_are_listed_with_channels_and_parameters() {
     let finished = run(&["cases"]);
     finished.assert_success();
-    for words in ["teleoperation:", "shuttle:", "arm/command", "rate_hz = "] {
+    for words in [
+        "teleoperation:",
+        "shuttle:",
+        "fleet:",
+        "arm/command",
+        "rate_hz = ",
+        "robots -> the record only",
+        "  [case.parameters.world]\n",
+    ] {
         assert!(finished.stdout.contains(words), "{}", finished.stdout);
     }
 }

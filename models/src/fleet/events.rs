@@ -130,6 +130,8 @@ fn sent<M: Message>(log: &RunLog, channel: &'static str) -> impl Iterator<Item =
 #[derive(Debug, Default)]
 struct Watch {
     mission_id: u32,
+    /// When the robot began it.
+    begun: Instant,
     heard: u32,
 }
 
@@ -140,6 +142,7 @@ impl Watch {
         };
         if truth.mission_id != self.mission_id {
             self.mission_id = truth.mission_id;
+            self.begun = at(truth);
             self.heard = 0;
         }
         match kind {
@@ -171,6 +174,9 @@ impl Watch {
         let robot = (truth.fleet_id, truth.robot_id, truth.mission_id);
         let missed = orders.between(robot, before, number);
         let copies = orders.authority(key(truth));
+        // What was sent before the robot had the mission had to wait for it, not for the network.
+        let since = copies.partition_point(|copy| orders.has_one_clock && copy.at < self.begun);
+        let copies = &copies[since..];
         let order = format!("authority {number} of mission {}", truth.mission_id);
         let (who, held_up) = (name(truth), orders.held_up(copies, at(truth)));
         let is_repeat = number <= before;

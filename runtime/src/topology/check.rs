@@ -113,14 +113,24 @@ fn check_case(
     }
 }
 
-/// Finds the line of a parameter; a parameter left at its default has none, then the case's.
+/// Finds the line of a parameter; a parameter left at its default has none, then the case's. A
+/// key may end in an index, as in `bays[2]`.
 fn add_parameter_fault(fault: ParameterFault, table: &Table, place: Place, faults: &Faults) {
     let mut path = "case.parameters".to_owned();
     let mut below = Some(table);
     let mut deepest: Option<&Node> = None;
-    for key in &fault.key {
+    for step in &fault.key {
+        let (key, index) = split_index(step);
         path = join(&path, key);
-        let Some(node) = below.and_then(|table| table.get(key)) else {
+        let node = below.and_then(|table| table.get(key));
+        let item = match (node.map(|node| &node.value), index) {
+            (Some(Value::Array(items)), Some(index)) => items.get(index),
+            _ => None,
+        };
+        if let Some(index) = index {
+            path.push_str(&format!("[{index}]"));
+        }
+        let Some(node) = item.or(node) else {
             break;
         };
         deepest = Some(node);
@@ -144,6 +154,13 @@ fn add_parameter_fault(fault: ParameterFault, table: &Table, place: Place, fault
         Fault::Parameter(fault.message)
     };
     faults.add(path, Some(place), fault);
+}
+
+/// `bays[2]` as `bays` and 2.
+fn split_index(step: &str) -> (&str, Option<usize>) {
+    let parts = step.strip_suffix(']').and_then(|rest| rest.split_once('['));
+    let found = parts.and_then(|(key, index)| Some((key, index.parse().ok()?)));
+    found.map_or((step, None), |(key, index)| (key, Some(index)))
 }
 
 fn check_hosts(entries: Vec<HostEntry>, faults: &Faults) -> Vec<Host> {

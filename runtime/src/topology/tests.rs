@@ -2,6 +2,7 @@
 //! Faulty ones are in `tests/faulty.rs`.
 
 mod faulty;
+mod fleet;
 mod hosts;
 mod layers;
 mod misspelt;
@@ -15,6 +16,7 @@ use std::path::{Path, PathBuf};
 use bytemuck::{Pod, Zeroable};
 use hil_models::case_study::{CaseStudy, ChannelSpec, ParameterError, Score};
 use hil_models::component::Role;
+use hil_models::fleet::Fleet;
 use hil_models::message::Message;
 use hil_models::run_log::RunLog;
 use hil_models::shuttle::{Shuttle, ShuttleParameters};
@@ -79,7 +81,10 @@ impl CaseStudy for Teleoperation {
 }
 
 fn known() -> KnownCases {
-    KnownCases::new().with::<Shuttle>().with::<Teleoperation>()
+    KnownCases::new()
+        .with::<Fleet>()
+        .with::<Shuttle>()
+        .with::<Teleoperation>()
 }
 
 fn shipped(name: &str) -> PathBuf {

@@ -20,5 +20,4 @@ pub use setup::{Links, Setup, StatusPath};
 pub use study::{TableParameters, TablePart};
 pub use tally::FleetTally;
 
-
 pub(crate) use study::FleetStudy;

@@ -231,7 +231,7 @@ const FAULTY: &[Faulty] = &[
         "name = \"teleoperation\"",
         "name = \"harbour\" #!",
         "case.name",
-        &["allowed: `shuttle`, `teleoperation`"],
+        &["allowed: `fleet`, `shuttle`, `teleoperation`"],
     ),
     Faulty(
         "[case]\nname = \"teleoperation\"",
