@@ -12,6 +12,7 @@ pub mod path;
 pub mod planner;
 mod routes;
 pub mod scenario;
+mod scene;
 pub mod section;
 mod section_library;
 pub mod world;
