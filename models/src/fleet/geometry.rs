@@ -132,6 +132,26 @@ impl OrientedBox {
         !is_apart(self, other) && !is_apart(other, self)
     }
 
+    /// The largest gap between the two along any of their sides: at least 0 when they are apart,
+    /// and then no more than their distance; below 0 when they overlap, and then by as much as
+    /// one must move to leave the other.
+    pub fn gap_m(&self, other: &Self) -> f64 {
+        let offset = [
+            other.centre[0] - self.centre[0],
+            other.centre[1] - self.centre[1],
+        ];
+        let cosine = (self.axis[0] * other.axis[0] + self.axis[1] * other.axis[1]).abs();
+        let sine = (self.axis[0] * other.axis[1] - self.axis[1] * other.axis[0]).abs();
+        let gap = |from: &Self, to: &Self| {
+            let along = (offset[0] * from.axis[0] + offset[1] * from.axis[1]).abs();
+            let across = (offset[1] * from.axis[0] - offset[0] * from.axis[1]).abs();
+            let along_m = along - (from.half_m[0] + to.half_m[0] * cosine + to.half_m[1] * sine);
+            let across_m = across - (from.half_m[1] + to.half_m[0] * sine + to.half_m[1] * cosine);
+            along_m.max(across_m)
+        };
+        gap(self, other).max(gap(other, self))
+    }
+
     /// The corners, counter-clockwise from the front left.
     pub fn corners(&self) -> [[f64; 2]; 4] {
         let [cx, cy] = self.centre;
@@ -259,6 +279,8 @@ mod tests {
             let (a, b) = (CAR.at(&pose()), CAR.at(&pose()));
             overlaps += u32::from(a.overlaps(&b));
             assert_eq!(a.overlaps(&b), a.distance_m(&b) <= 0.0);
+            assert_eq!(a.overlaps(&b), a.gap_m(&b) < 0.0);
+            assert!(a.gap_m(&b) <= a.distance_m(&b) + 1e-12);
             assert!(!a.overlaps(&b) || a.bounds().meets(&b.bounds()));
         }
         assert!(overlaps > 1000);

@@ -42,6 +42,25 @@ impl Blocks {
         }
         blocks
     }
+
+    /// Lanes within the gaps of every other column from `first_column` on, `aside_m` to both sides
+    /// of each gap's middle.
+    fn gates(&self, first_column: usize, height_m: f64, aside_m: f64) -> Vec<Vec<Pose>> {
+        let shift = if first_column % 2 == 0 { 0.0 } else { 0.5 };
+        // A lane keeps from the edge what it keeps from the blocks beside it.
+        let edge_m = 0.5 * (self.pitch_m - self.size_m[1]) - aside_m;
+        let gate = |column: usize| {
+            let x_m = self.column_m.0 + column as f64 * self.column_m.1;
+            let gaps = (-20..20_i32)
+                .map(|row| 0.5 * height_m + (f64::from(row) + shift) * self.pitch_m)
+                .flat_map(|y_m| [y_m - aside_m, y_m + aside_m]);
+            gaps.filter(|y_m| *y_m >= edge_m && *y_m <= height_m - edge_m)
+                .map(|y_m| Pose::new(x_m, y_m, 0.0))
+                .collect()
+        };
+        let columns = (first_column..self.column_count).step_by(2);
+        columns.map(gate).collect()
+    }
 }
 
 /// Left bays from bottom to top, then right bays from top to bottom: the shuttle line of a bay
@@ -80,6 +99,7 @@ pub(crate) fn warehouse(clearance_m: f64) -> Map {
         bounds: ground(80.0, 44.0),
         obstacles: racks.within(44.0, 2.0),
         bays: bays([2.5, 77.5], 22.0, 5.6),
+        gates: racks.gates(0, 44.0, 1.0),
         clearance_m,
     }
 }
@@ -96,6 +116,7 @@ pub(crate) fn harbor(clearance_m: f64) -> Map {
         bounds: ground(400.0, 220.0),
         obstacles: blocks.within(220.0, 12.0),
         bays: bays([14.0, 386.0], 110.0, 29.0),
+        gates: blocks.gates(1, 220.0, 7.0),
         clearance_m,
     }
 }

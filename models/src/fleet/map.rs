@@ -4,9 +4,13 @@
 use crate::case_study::ParameterError;
 use crate::fleet::geometry::{Bounds, Footprint, Pose};
 use crate::fleet::planner::At;
-use crate::fleet::planner::space::{Blocker, Space};
+use crate::fleet::planner::space::Space;
 use crate::fleet::scenario::BaySide;
 use crate::fleet::world::{BayIndex, Vehicle};
+use crate::message::{FNV_OFFSET, fnv1a};
+
+/// Lanes of a gate that a path may be led through.
+const LANES: usize = 6;
 
 /// The ground a fleet drives on.
 #[derive(Debug, Clone, PartialEq)]
@@ -17,6 +21,10 @@ pub struct Map {
     pub obstacles: Vec<Bounds>,
     /// Where vehicles park.
     pub bays: Vec<MapBay>,
+    /// Gates across the ground from left to right, each with its lanes. Paths between bays are
+    /// led through one lane of each gate, so that traffic spreads over the ground instead of
+    /// gathering on the shortest line.
+    pub gates: Vec<Vec<Pose>>,
     /// What planned paths keep between vehicle and everything else, metres.
     pub clearance_m: f64,
 }
@@ -81,6 +89,7 @@ impl Map {
         let mut whole = Self {
             obstacles: Vec::new(),
             bays: Vec::new(),
+            gates: vec![Vec::new(); self.gates.len()],
             ..self.clone()
         };
         for tile in 0..count {
@@ -96,9 +105,37 @@ impl Map {
                 pose: raised(&bay.pose, rise_m),
                 ..*bay
             }));
+            for (gate, lanes) in whole.gates.iter_mut().zip(&self.gates) {
+                gate.extend(lanes.iter().map(|lane| raised(lane, rise_m)));
+            }
             whole.bounds.y_max_m = self.bounds.y_max_m + rise_m;
         }
         whole
+    }
+
+    /// The lanes for the path between two bays: in each gate one of those about the straight line,
+    /// which one being a matter of the bays' numbers.
+    pub(crate) fn lanes_between(&self, from: BayIndex, to: BayIndex) -> Vec<Pose> {
+        let (start, goal) = (self.bays[from].pose, self.bays[to].pose);
+        let lane_of = |(number, lanes): (usize, &Vec<Pose>)| {
+            let mixed = [from, to, number]
+                .iter()
+                .fold(FNV_OFFSET, |hash, value| fnv1a(hash, &value.to_le_bytes()));
+            let is_farther = |a: &&Pose, b: &&Pose| {
+                let aside_m = |lane: &Pose| {
+                    let ratio = (lane.x_m - start.x_m) / (goal.x_m - start.x_m);
+                    (lane.y_m - start.towards(&goal, ratio).y_m).abs()
+                };
+                aside_m(a).total_cmp(&aside_m(b))
+            };
+            let mut nearest: Vec<_> = lanes.iter().collect();
+            nearest.sort_by(is_farther);
+            let choice = usize::try_from((mixed >> 32) % LANES as u64).unwrap_or(0);
+            nearest
+                .get(choice.min(nearest.len() - 1))
+                .map(|lane| **lane)
+        };
+        self.gates.iter().enumerate().filter_map(lane_of).collect()
     }
 
     /// From the lower edge to the upper one, metres.
@@ -115,16 +152,14 @@ impl Map {
         self.space_with(vehicle.footprint, &parked)
     }
 
-    /// The space of a vehicle that goes between two bays, all others being taken, with half the
-    /// clearance: what a planned path keeps everywhere.
-    pub(crate) fn space_between(&self, vehicle: &Vehicle, ends: [BayIndex; 2]) -> Space {
-        let all = self.bays.iter().map(|bay| bay.pose).enumerate();
-        let others: Vec<_> = all.filter(|(bay, _)| !ends.contains(bay)).collect();
+    /// The space around vehicles in all bays with half the clearance: what a planned path keeps
+    /// everywhere.
+    pub(crate) fn space_with_half_clearance(&self, vehicle: &Vehicle) -> Space {
         let halved = Self {
             clearance_m: 0.5 * self.clearance_m,
             ..self.clone()
         };
-        halved.space_with(vehicle.footprint, &others)
+        halved.space_around_parked(vehicle)
     }
 
     fn space_with(&self, footprint: Footprint, parked: &[(usize, Pose)]) -> Space {
@@ -139,13 +174,6 @@ pub(crate) fn raised(pose: &Pose, rise_m: f64) -> Pose {
         y_m: pose.y_m + rise_m,
         ..*pose
     }
-}
-
-/// What a vehicle which drives through `poses` would touch, and at which pose.
-pub(crate) fn first_blocker(space: &Space, poses: &[Pose]) -> Option<(usize, Blocker)> {
-    let numbered = poses.iter().enumerate();
-    let mut blocked = numbered.filter_map(|(index, pose)| Some((index, space.blocker(pose)?)));
-    blocked.next()
 }
 
 fn check_rectangle(key: &str, bounds: &Bounds) -> Result<(), ParameterError> {

@@ -12,7 +12,7 @@ use crate::fleet::layout::{self, BAYS_PER_SIDE};
 use crate::fleet::map::{Map, MapBay};
 use crate::fleet::path::{Path, PathLibrary};
 use crate::fleet::planner::At;
-use crate::fleet::routes::{Connection, Connector, Network, check_connection, lifted};
+use crate::fleet::routes::{Connection, Connector, Network, lifted};
 use crate::fleet::section::MergePolicy;
 use crate::fleet::world::{Bay, BayIndex, Route, Vehicle, World};
 
@@ -320,6 +320,7 @@ impl WorldParameters {
             bounds,
             obstacles: self.obstacles.clone(),
             bays: bays.collect(),
+            gates: Vec::new(),
             clearance_m: self.clearance_m(),
         })
     }
@@ -337,7 +338,7 @@ impl WorldParameters {
         let connections = if self.paths.is_empty() {
             connector.connect(&|_, _| true)?
         } else {
-            self.given_connections(&map, &vehicle)?
+            self.given_connections(&map, &connector)?
         };
         let mut network = Network::default();
         for connection in &connections {
@@ -349,7 +350,7 @@ impl WorldParameters {
     fn given_connections(
         &self,
         map: &Map,
-        vehicle: &Vehicle,
+        connector: &Connector<'_>,
     ) -> Result<Vec<Connection>, ParameterError> {
         let mut connections = Vec::<Connection>::new();
         for (index, path) in self.paths.iter().enumerate() {
@@ -389,7 +390,7 @@ impl WorldParameters {
                     return error(format!("does not end in bay {bay}, at {}", At(&parked)));
                 }
             }
-            check_connection(map, vehicle, &connection, &key)?;
+            connector.check(&connection, &key)?;
             connections.push(connection);
         }
         Ok(connections)

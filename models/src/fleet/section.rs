@@ -2,6 +2,7 @@
 //! overlap (Lv et al., section II.B). Who goes first is the coordinator's business.
 
 use crate::fleet::geometry::{Footprint, floor_index};
+use crate::fleet::overlap::{CoveredPath, Run, components};
 use crate::fleet::path::Path;
 
 /// One of the two paths of a section.
@@ -100,28 +101,68 @@ impl Section {
         }
     }
 
-    fn of_pairs(pairs: &[(u32, u32)]) -> Self {
-        let swapped: Vec<_> = pairs.iter().map(|&(i, j)| (j, i)).collect();
-        Self {
-            sides: [
-                SectionSide::of_pairs(pairs),
-                SectionSide::of_pairs(&swapped),
-            ],
+    /// The same section when the path of `side` is driven backwards and `last_index` is its last
+    /// pose.
+    #[must_use]
+    pub fn reversed(&self, side: Side, last_index: usize) -> Self {
+        let last_index = u32::try_from(last_index).expect("a path has fewer than 2^32 poses");
+        let mut reversed = self.clone();
+        let own = &mut reversed.sides[side.index()];
+        own.partners.reverse();
+        own.start = last_index - (own.start + own.last_offset());
+        for partners in &mut reversed.sides[side.other().index()].partners {
+            if *partners != NO_PARTNER {
+                *partners = (last_index - partners.1, last_index - partners.0);
+            }
         }
+        reversed
+    }
+
+    fn of_runs(runs: &[Run]) -> Self {
+        let mut sides = [
+            SectionSide::empty(runs.iter().map(|run| (run.row, run.row))),
+            SectionSide::empty(runs.iter().map(|run| (run.first, run.last))),
+        ];
+        for run in runs {
+            sides[0].meet(run.row, run.first, run.last);
+            for column in run.first..=run.last {
+                sides[1].meet(column, run.row, run.row);
+            }
+        }
+        Self { sides }
+    }
+
+    /// By which sections of one pair of paths are listed.
+    fn order(&self) -> [u32; 4] {
+        let [first, second] = &self.sides;
+        let lengths = [first.last_offset(), second.last_offset()];
+        [first.start, second.start, lengths[0], lengths[1]]
     }
 }
 
+/// Puts the sections of one pair of paths in order along the first path.
+pub(crate) fn sort(sections: &mut [Section]) {
+    sections.sort_by_key(Section::order);
+}
+
 impl SectionSide {
-    fn of_pairs(pairs: &[(u32, u32)]) -> Self {
-        let start = pairs.iter().map(|pair| pair.0).min().unwrap_or(0);
-        let end = pairs.iter().map(|pair| pair.0).max().unwrap_or(0);
-        let mut partners = vec![NO_PARTNER; (end - start + 1) as usize];
-        for &(index, partner) in pairs {
-            let (first, last) = &mut partners[(index - start) as usize];
-            *first = (*first).min(partner);
-            *last = (*last).max(partner);
+    /// A side that spans these ranges and meets nothing yet.
+    fn empty(ranges: impl Iterator<Item = (u32, u32)>) -> Self {
+        let widen = |all: (u32, u32), one: (u32, u32)| (all.0.min(one.0), all.1.max(one.1));
+        let (start, end) = ranges.fold(NO_PARTNER, widen);
+        Self {
+            start,
+            partners: vec![NO_PARTNER; (end - start + 1) as usize],
         }
-        Self { start, partners }
+    }
+
+    fn meet(&mut self, index: u32, first: u32, last: u32) {
+        let partners = &mut self.partners[(index - self.start) as usize];
+        *partners = (partners.0.min(first), partners.1.max(last));
+    }
+
+    fn last_offset(&self) -> u32 {
+        u32::try_from(self.partners.len() - 1).expect("a path has fewer than 2^32 poses")
     }
 }
 
@@ -132,93 +173,60 @@ pub fn sections_between(
     footprint: &Footprint,
     merge: MergePolicy,
 ) -> Vec<Section> {
-    let boxes = |path: &Path| -> Vec<_> {
-        let with_bounds = |pose| {
-            let covered = footprint.at(pose);
-            (covered, covered.bounds())
+    let (rows, columns) = (
+        CoveredPath::new(first, footprint),
+        CoveredPath::new(second, footprint),
+    );
+    sections_of(&rows, &columns, merge)
+}
+
+/// As [`sections_between`], of paths whose ground is known already.
+pub(crate) fn sections_of(
+    first: &CoveredPath,
+    second: &CoveredPath,
+    merge: MergePolicy,
+) -> Vec<Section> {
+    let mut parts = components(first, second);
+    if merge == MergePolicy::WithinVehicle {
+        let gap = |path: &CoveredPath| {
+            let gap = floor_index(path.footprint().size_max_m() / path.spacing_m());
+            u32::try_from(gap).unwrap_or(u32::MAX)
         };
-        path.poses().iter().map(with_bounds).collect()
-    };
-    let (rows, columns) = (boxes(first), boxes(second));
-    let mut groups = Groups::default();
-    for (i, (row, row_bounds)) in (0_u32..).zip(&rows) {
-        for (j, (column, column_bounds)) in (0_u32..).zip(&columns) {
-            if row_bounds.meets(column_bounds) && row.overlaps(column) {
-                groups.add((i, j));
-            }
-        }
+        parts = merged(parts, [gap(first), gap(second)]);
     }
-    let gap = match merge {
-        MergePolicy::Never => None,
-        MergePolicy::WithinVehicle => Some([first, second].map(|path| {
-            u32::try_from(floor_index(footprint.size_max_m() / path.spacing_m()))
-                .unwrap_or(u32::MAX)
-        })),
-    };
-    let mut sections: Vec<_> = groups
-        .merged(gap)
-        .iter()
-        .map(|pairs| Section::of_pairs(pairs))
-        .collect();
-    sections.sort_by_key(|section| (section.start(Side::First), section.start(Side::Second)));
+    let mut sections: Vec<_> = parts.iter().map(|runs| Section::of_runs(runs)).collect();
+    sort(&mut sections);
     sections
 }
 
-/// Pose pairs gathered into 8-connected sets.
-#[derive(Debug, Default)]
-struct Groups {
-    sets: Vec<Vec<(u32, u32)>>,
-}
-
-impl Groups {
-    fn add(&mut self, pair: (u32, u32)) {
-        let is_near = |set: &Vec<(u32, u32)>| {
-            set.iter()
-                .rev()
-                .take_while(|known| known.0 + 1 >= pair.0)
-                .any(|known| known.0.abs_diff(pair.0) <= 1 && known.1.abs_diff(pair.1) <= 1)
+/// Joins parts that are at most `gap` poses apart on both paths, until none are. Joining only
+/// widens, so the result does not depend on the order.
+fn merged(parts: Vec<Vec<Run>>, gap: [u32; 2]) -> Vec<Vec<Run>> {
+    let mut open: Vec<([(u32, u32); 2], Vec<Run>)> = Vec::new();
+    for mut runs in parts {
+        let widen = |all: (u32, u32), one: (u32, u32)| (all.0.min(one.0), all.1.max(one.1));
+        let mut range = [
+            runs.iter()
+                .map(|run| (run.row, run.row))
+                .fold(NO_PARTNER, widen),
+            runs.iter()
+                .map(|run| (run.first, run.last))
+                .fold(NO_PARTNER, widen),
+        ];
+        let is_near = |a: &[(u32, u32); 2], b: &[(u32, u32); 2]| {
+            (0..2).all(|side| {
+                a[side].0 <= b[side].1.saturating_add(gap[side])
+                    && b[side].0 <= a[side].1.saturating_add(gap[side])
+            })
         };
-        let mut joined = vec![pair];
-        let mut index = 0;
-        while index < self.sets.len() {
-            if is_near(&self.sets[index]) {
-                joined.append(&mut self.sets.swap_remove(index));
-            } else {
-                index += 1;
-            }
+        while let Some(index) = open.iter().position(|(known, _)| is_near(known, &range)) {
+            let (known, mut others) = open.swap_remove(index);
+            range = [widen(range[0], known[0]), widen(range[1], known[1])];
+            runs.append(&mut others);
         }
-        joined.sort_unstable();
-        self.sets.push(joined);
+        open.push((range, runs));
     }
-
-    fn merged(mut self, gap: Option<[u32; 2]>) -> Vec<Vec<(u32, u32)>> {
-        let Some(gap) = gap else {
-            return self.sets;
-        };
-        let range = |set: &[(u32, u32)], pick: fn(&(u32, u32)) -> u32| {
-            let low = set.iter().map(pick).min().unwrap_or(0);
-            (low, set.iter().map(pick).max().unwrap_or(0))
-        };
-        let near = |a: (u32, u32), b: (u32, u32), gap: u32| {
-            a.0 <= b.1.saturating_add(gap) && b.0 <= a.1.saturating_add(gap)
-        };
-        let mut index = 0;
-        while index < self.sets.len() {
-            let partner = (index + 1..self.sets.len()).find(|&other| {
-                let (a, b) = (&self.sets[index], &self.sets[other]);
-                near(range(a, |p| p.0), range(b, |p| p.0), gap[0])
-                    && near(range(a, |p| p.1), range(b, |p| p.1), gap[1])
-            });
-            if let Some(other) = partner {
-                let mut set = self.sets.swap_remove(other);
-                self.sets[index].append(&mut set);
-                index = 0;
-            } else {
-                index += 1;
-            }
-        }
-        self.sets
-    }
+    open.into_iter().map(|(_, runs)| runs).collect()
 }
 
 #[cfg(test)]

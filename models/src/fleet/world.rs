@@ -1,11 +1,13 @@
 //! What a fleet's controller, robots and referee share and never change: the vehicle, its bays,
 //! the paths between them and the critical sections of each two paths.
 
-use std::sync::{Arc, OnceLock};
+use std::sync::Arc;
 
-use crate::fleet::geometry::{Footprint, Pose};
+use crate::fleet::geometry::{Footprint, Pose, wrap_angle};
 use crate::fleet::path::{Path, PathId, PathLibrary};
-use crate::fleet::section::{MergePolicy, Section, sections_between};
+use crate::fleet::section::MergePolicy;
+
+pub use crate::fleet::section_library::SectionLibrary;
 
 /// A vehicle of Table I of the seed paper.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -52,7 +54,7 @@ pub struct World {
     pub paths: PathLibrary,
     /// Sections at the exact footprint: the original's.
     pub sections: SectionLibrary,
-    /// Sections at a footprint grown so that no overlap hides between two poses.
+    /// Sections at the [`guarded_footprint`]: no overlap hides between two poses.
     pub guarded_sections: SectionLibrary,
 }
 
@@ -66,12 +68,9 @@ impl World {
         merge: MergePolicy,
     ) -> Self {
         routes.sort_by_key(|route| (route.from, route.to));
-        let library = |clearance_m| {
-            let footprint = vehicle.footprint.grown(clearance_m);
-            SectionLibrary::new(paths.clone(), footprint, merge)
-        };
-        let (sections, guarded_sections) =
-            (library(0.0), library(between_poses_m(&vehicle, &paths)));
+        let library = |footprint| SectionLibrary::new(paths.clone(), footprint, merge);
+        let sections = library(vehicle.footprint);
+        let guarded_sections = library(guarded_footprint(&vehicle.footprint, &paths));
         Self {
             vehicle,
             bays,
@@ -100,69 +99,38 @@ impl World {
     }
 }
 
-/// How far a vehicle between two poses can stick out of its ground at both of them together, at
-/// most: what a corner moves sideways in half a step. Along the way none sticks out, a step being
-/// shorter than the vehicle.
-fn between_poses_m(vehicle: &Vehicle, paths: &PathLibrary) -> f64 {
-    let radius_m = vehicle.footprint.radius_m();
-    let of_path = |path: &Path| {
-        path.poses()
-            .windows(2)
-            .map(|two| {
-                let turn = (two[1].heading_rad - two[0].heading_rad).sin().abs();
-                0.5 * turn * radius_m
-            })
-            .fold(0.0, f64::max)
-    };
-    paths
-        .ids()
-        .filter_map(|id| paths.get(id))
-        .map(|path| of_path(path))
-        .fold(0.0, f64::max)
-}
-
-/// The critical sections of every two paths, each computed when first asked for and kept.
-#[derive(Debug)]
-pub struct SectionLibrary {
-    paths: PathLibrary,
-    footprint: Footprint,
-    merge: MergePolicy,
-    cells: Vec<OnceLock<Arc<[Section]>>>,
-}
-
-impl SectionLibrary {
-    /// A library without any section computed yet.
-    pub fn new(paths: PathLibrary, footprint: Footprint, merge: MergePolicy) -> Self {
-        let cells = (0..paths.len() * paths.len())
-            .map(|_| OnceLock::new())
-            .collect();
-        Self {
-            paths,
-            footprint,
-            merge,
-            cells,
+/// A footprint within which a vehicle anywhere on a path is covered at the pose nearest to it.
+///
+/// Let a vehicle be the share `t <= 1/2` of the way from the pose nearest to it to a neighbour,
+/// which lies at `(dx, dy)` and turned by `D` in the frame of the nearest pose. Position and
+/// heading go linearly ([`Path::pose_at`]), so the point `(u, v)` of the vehicle is at
+///
+/// ```text
+/// x = t dx + u cos(t D) - v sin(t D)      |x| <= l/2 + |dx|/2 + w/2 sin(|D|/2)
+/// y = t dy + u sin(t D) + v cos(t D)      |y| <= w/2 + |dy|/2 + l/2 sin(|D|/2)
+/// ```
+///
+/// since `|u| <= l/2`, `|v| <= w/2` and `|D| <= pi`. The grown footprint has these half length and
+/// half width at their largest over all steps of all paths, so it covers the vehicle. When
+/// the grown footprints of two paths overlap at no pair of poses out of two ranges, the vehicles
+/// overlap at no pair of positions between them: each is covered by its own at its nearest
+/// pose, which lies in the range.
+pub fn guarded_footprint(footprint: &Footprint, paths: &PathLibrary) -> Footprint {
+    let (mut length_m, mut width_m) = (footprint.length_m, footprint.width_m);
+    // The way back has the same steps.
+    for path in paths.ids().step_by(2).filter_map(|id| paths.get(id)) {
+        for two in path.poses().windows(2) {
+            let half_turn = 0.5 * wrap_angle(two[1].heading_rad - two[0].heading_rad);
+            let sine = half_turn.sin().abs();
+            let step = [two[1].x_m - two[0].x_m, two[1].y_m - two[0].y_m];
+            for pose in two {
+                let (s, c) = pose.heading_rad.sin_cos();
+                let along_m = (step[0] * c + step[1] * s).abs();
+                let across_m = (step[1] * c - step[0] * s).abs();
+                length_m = length_m.max(footprint.length_m + along_m + footprint.width_m * sine);
+                width_m = width_m.max(footprint.width_m + across_m + footprint.length_m * sine);
+            }
         }
     }
-
-    /// The sections of two paths, `first` being [`Side::First`](super::section::Side::First).
-    /// Several threads may ask at once; each pair is the same whoever computed it.
-    ///
-    /// # Panics
-    /// When a path is not in the library.
-    pub fn between(&self, first: PathId, second: PathId) -> &Arc<[Section]> {
-        let cell = &self.cells[first.index() * self.paths.len() + second.index()];
-        cell.get_or_init(|| {
-            let path = |id| self.paths.get(id).expect("a path of this library");
-            if second < first {
-                let mut mirrored: Vec<_> = self
-                    .between(second, first)
-                    .iter()
-                    .map(Section::mirrored)
-                    .collect();
-                mirrored.sort_by_key(|section| section.start(super::section::Side::First));
-                return mirrored.into();
-            }
-            sections_between(path(first), path(second), &self.footprint, self.merge).into()
-        })
-    }
+    Footprint { length_m, width_m }
 }

@@ -27,6 +27,9 @@ pub const EXPANDED_MAX: u64 = 200_000;
 /// Cells of place a search may have: with their headings, 77 MB.
 const CELLS_MAX: f64 = 200_000.0;
 
+/// Goals a planner remembers the surroundings of.
+const GOALS_MAX: usize = 64;
+
 /// A way from start to goal: arcs and straight lines, none curved more than the turning radius
 /// allows.
 #[derive(Debug, Clone, PartialEq)]
@@ -181,7 +184,8 @@ pub struct Planner {
     space: Space,
     search: Search,
     turning_radius_m: f64,
-    distances: Option<(Pose, Distances)>,
+    /// What is known of recent goals, the latest last.
+    distances: Vec<(Pose, Distances)>,
 }
 
 impl Planner {
@@ -223,7 +227,7 @@ impl Planner {
             search: Search::new(&space, cell_m, turning_radius_m),
             space,
             turning_radius_m,
-            distances: None,
+            distances: Vec::new(),
         })
     }
 
@@ -245,13 +249,17 @@ impl Planner {
         if let Some(blocker) = self.space.blocker(&goal) {
             return Err(PlanError::GoalBlocked { goal, blocker });
         }
-        let distances = match self.distances.take() {
-            Some((known, distances)) if known == goal => distances,
-            _ => Distances::new(&self.space, &goal),
+        let known = self.distances.iter().position(|(known, _)| *known == goal);
+        let latest = match known {
+            Some(index) => self.distances.remove(index),
+            None => (goal, Distances::new(&self.space, &goal)),
         };
         let ends = (&start, &goal);
-        let found = self.search.run(&self.space, &distances, ends, EXPANDED_MAX);
-        self.distances = Some((goal, distances));
+        let found = self.search.run(&self.space, &latest.1, ends, EXPANDED_MAX);
+        self.distances.push(latest);
+        if self.distances.len() > GOALS_MAX {
+            self.distances.remove(0);
+        }
         let expanded_count = found.expanded_count;
         let Some(segments) = found.segments else {
             return Err(PlanError::NoPath {

@@ -140,12 +140,21 @@ impl Space {
 
     /// What a vehicle at `pose`, with its clearance, would touch first; `None` when it is free.
     pub(crate) fn blocker(&self, pose: &Pose) -> Option<Blocker> {
+        self.blocker_but(&[], pose)
+    }
+
+    /// As [`blocker`](Self::blocker), when vehicles in these bays are not there.
+    pub(crate) fn blocker_but(&self, empty: &[usize], pose: &Pose) -> Option<Blocker> {
         let covered = self.footprint.at(pose);
         if !self.bounds.contains(&covered.bounds()) {
             return Some(Blocker::Bounds);
         }
+        let is_there = |blocker: &Blocker| match blocker {
+            Blocker::ParkedIn(bay) => !empty.contains(bay),
+            Blocker::Bounds | Blocker::Obstacle(_) => true,
+        };
         let mut near = self.near(covered.centre);
-        near.find(|entry| entry.0.overlaps(&covered))
+        near.find(|entry| is_there(&entry.1) && entry.0.overlaps(&covered))
             .map(|entry| entry.1)
     }
 
