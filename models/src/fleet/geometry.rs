@@ -44,6 +44,10 @@ impl Pose {
 /// The angle in -pi..=pi that points the same way.
 pub fn wrap_angle(angle_rad: f64) -> f64 {
     use core::f64::consts::{PI, TAU};
+    // Most angles need no wrapping, and a remainder costs more than all else that is done to them.
+    if (-PI..=PI).contains(&angle_rad) {
+        return angle_rad;
+    }
     let wrapped = (angle_rad + PI).rem_euclid(TAU) - PI;
     if wrapped < -PI {
         wrapped + TAU
@@ -59,7 +63,8 @@ pub fn wrap_angle(angle_rad: f64) -> f64 {
     reason = "saturating float casts are what an index wants"
 )]
 pub(crate) fn floor_index(value: f64) -> usize {
-    value.floor() as usize
+    // The cast cuts towards zero, which for all but negative values is down.
+    value as usize
 }
 
 /// A rectangular vehicle, its reference point in the middle.

@@ -160,3 +160,59 @@ impl Component for Robots {
             .sum()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::component::OUTBOX_CAPACITY;
+    use crate::fleet::messages::{Authority, TO_GOAL};
+    use crate::fleet::robot::tests::{authority, mission, scene};
+    use crate::fleet::scenario::Scenario;
+
+    fn drive(seed: u64, until: Instant) -> (Vec<FromRobot>, u64, RobotCounters) {
+        let scene = scene(Scenario::ThreeCycle);
+        let mut robots = Robots::new(&scene, &RobotParameters::default(), 20, seed);
+        let mut out = Outbox::with_capacity(OUTBOX_CAPACITY);
+        let mut given = Vec::new();
+        robots.on_start(Instant::ZERO);
+        for fleet_id in 0..25 {
+            let mut mission = mission(&scene, 1, 1, 2);
+            mission.header.fleet_id = fleet_id;
+            robots.on_message(Instant::ZERO, &ToRobot::Mission(mission), &mut out);
+            let mut go: Authority = authority(1, 1, TO_GOAL, 0);
+            (go.header.fleet_id, go.header.robot_id) = (fleet_id, 1);
+            robots.on_message(Instant::ZERO, &ToRobot::Authority(go), &mut out);
+            given.extend(out.drain());
+        }
+        while let Some(due) = robots.next_tick().filter(|due| *due <= until) {
+            robots.on_tick(due, &mut out);
+            given.extend(out.drain());
+        }
+        assert_eq!(robots.unknown_count(), 10);
+        (given, out.dropped_count(), robots.counters())
+    }
+
+    #[test]
+    fn every_robot_of_every_fleet_reports_and_nothing_is_dropped() {
+        let (given, dropped_count, counters) = drive(1, Instant::from_ns(60_000_000_000));
+        assert_eq!(dropped_count, 0);
+        assert_eq!(counters.missions_done_count, 20);
+        assert_eq!(counters.skipped_ticks_count, 0);
+        let states = given.iter().filter_map(|message| match message {
+            FromRobot::State(state) => Some((state.header.fleet_id, state.header.robot_id)),
+            FromRobot::Truth(_) => None,
+        });
+        let mut ids: Vec<_> = states.collect();
+        assert_eq!(ids.len() as u64, counters.states_count);
+        ids.sort_unstable();
+        ids.dedup();
+        assert_eq!(ids.len(), 60);
+    }
+
+    #[test]
+    fn equal_seeds_give_equal_robots_and_other_seeds_other_phases() {
+        let until = Instant::from_ns(3_000_000_000);
+        assert_eq!(drive(1, until), drive(1, until));
+        assert_ne!(drive(1, until).0, drive(2, until).0);
+    }
+}

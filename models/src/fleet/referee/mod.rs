@@ -294,3 +294,11 @@ fn axis_gap_m(one: &OrientedBox, other: &OrientedBox) -> f64 {
     };
     gap(one, other).max(gap(other, one))
 }
+
+/// The track of a robot of `scene` after `truth`, for tests of other modules.
+#[cfg(test)]
+pub(crate) fn test_track(scene: &Scene, truth: &Truth) -> Track {
+    let mut track = Track::standing(scene.world.bays[0].pose);
+    track.take(truth, scene.world.paths.get(PathId(truth.path_id)));
+    track
+}

@@ -28,6 +28,7 @@ pub(crate) struct ExactTracker {
     legs: [Leg; LEGS_MAX],
     leg_count: usize,
     current: usize,
+    next_change: Option<Instant>,
 }
 
 impl ExactTracker {
@@ -39,6 +40,7 @@ impl ExactTracker {
             legs: [Leg::default(); LEGS_MAX],
             leg_count: 1,
             current: 0,
+            next_change: None,
         }
     }
 
@@ -125,15 +127,20 @@ impl ExactTracker {
     }
 
     /// When its acceleration changes next, rounded up to the nanosecond.
-    pub(crate) fn next_change(&self) -> Option<Instant> {
-        let next = self.current + 1;
-        (next < self.leg_count)
-            .then(|| Instant::from_ns(self.anchor.as_ns() + ceil_ns(self.legs[next].start_s)))
+    pub(crate) const fn next_change(&self) -> Option<Instant> {
+        self.next_change
     }
 
     /// Goes over to the next leg; call at [`ExactTracker::next_change`].
     pub(crate) fn change(&mut self) {
         self.current = (self.current + 1).min(self.leg_count - 1);
+        self.next_change = self.change_after(self.current);
+    }
+
+    fn change_after(&self, leg: usize) -> Option<Instant> {
+        let next = self.legs[..self.leg_count].get(leg + 1)?;
+        let at_ns = self.anchor.as_ns() + ceil_ns(next.start_s);
+        Some(Instant::from_ns(at_ns))
     }
 
     fn rest_m(&self) -> f64 {
@@ -154,8 +161,10 @@ impl ExactTracker {
         self.leg_count += 1;
     }
 
+    /// The last leg of a plan.
     fn rest_at(&mut self, start_s: f64, way_m: f64) {
         self.push(start_s, way_m, 0.0, 0.0);
+        self.next_change = self.change_after(0);
     }
 }
 

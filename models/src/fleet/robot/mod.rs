@@ -15,14 +15,14 @@ mod exact_tests;
 #[cfg(test)]
 mod legacy_tests;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 
 use std::sync::Arc;
 
 pub use self::counters::RobotCounters;
 pub use self::parameters::{MessageOrder, RobotParameters, TrackerKind};
 
-use crate::fleet::geometry::Pose;
+use crate::fleet::geometry::{Pose, floor_index};
 use crate::fleet::messages::{Header, Phase, State, Truth, TruthKind};
 use crate::fleet::path::{Path, PathId};
 use crate::fleet::robot::authority::Grant;
@@ -148,17 +148,14 @@ impl Robot {
     /// the last call.
     pub fn state(&self, now: Instant) -> State {
         let motion = self.tracker.motion(now);
-        let (pose, path_index, stop_index) = match &self.path {
-            Some(path) => {
-                let stop_m =
-                    motion.way_m + Limits::of(&self.world.vehicle).braking_m(motion.speed_mps);
-                (
-                    path.pose_at(motion.way_m),
-                    index_i32(path.index_at(motion.way_m)),
-                    index_i32(first_index_from(path, stop_m)),
-                )
-            }
-            None => (self.stand, 0, 0),
+        let braking_m = Limits::of(&self.world.vehicle).braking_m(motion.speed_mps);
+        let place = match &self.path {
+            Some(path) => Place::on(path, motion.way_m, braking_m),
+            None => Place {
+                pose: self.stand,
+                index: 0,
+                stop_index: 0,
+            },
         };
         let has_mission = self.mission_id != 0;
         State {
@@ -170,16 +167,16 @@ impl Robot {
                 sent_ns: now.as_ns(),
             },
             sampled_ns: now.as_ns(),
-            x_m: pose.x_m,
-            y_m: pose.y_m,
-            heading_rad: pose.heading_rad,
+            x_m: place.pose.x_m,
+            y_m: place.pose.y_m,
+            heading_rad: place.pose.heading_rad,
             travelled_m: if has_mission { motion.way_m } else { 0.0 },
             speed_mps: single(motion.speed_mps),
             acceleration_mps2: single(motion.acceleration_mps2),
-            path_index: if has_mission { path_index } else { -1 },
+            path_index: if has_mission { place.index } else { -1 },
             authority_index: self.grant.index,
             applied_sequence: self.grant.applied.unwrap_or(0),
-            stop_index: if has_mission { stop_index } else { -1 },
+            stop_index: if has_mission { place.stop_index } else { -1 },
             phase: self.phase as u8,
             flags: if self.grant.is_refused {
                 State::REFUSED
@@ -253,12 +250,11 @@ impl Robot {
     }
 
     fn update_phase(&mut self, at: Instant) -> TruthKind {
+        let way_m = self.tracker.motion(at).way_m;
+        self.account(way_m);
         let Some(path) = &self.path else {
             return TruthKind::Motion;
         };
-        let way_m = self.tracker.motion(at).way_m;
-        self.counters.travelled_m += (way_m - self.accounted_m).max(0.0);
-        self.accounted_m = way_m;
         if !self.tracker.is_at_rest() {
             self.phase = Phase::Driving;
             return TruthKind::Motion;
@@ -284,6 +280,11 @@ impl Robot {
         }
         self.phase = Phase::AtPoint;
         TruthKind::Motion
+    }
+
+    fn account(&mut self, way_m: f64) {
+        self.counters.travelled_m += (way_m - self.accounted_m).max(0.0);
+        self.accounted_m = way_m;
     }
 
     fn record(&self, at: Instant, kind: TruthKind, caused_by_sequence: u32) -> Truth {
@@ -348,10 +349,30 @@ fn standing_way(world: &World, bay: BayIndex) -> (u32, f64) {
     }
 }
 
-/// First pose at or beyond `way_m`; within a nanometre beyond a pose counts as at it.
-fn first_index_from(path: &Path, way_m: f64) -> usize {
-    let position = (way_m / path.spacing_m() - 1e-9).ceil();
-    crate::fleet::geometry::floor_index(position).min(path.last_index())
+/// What a state says of a way along a path.
+struct Place {
+    pose: Pose,
+    index: i32,
+    stop_index: i32,
+}
+
+impl Place {
+    /// Positions within a nanometre short of a pose count as at it, as [`Path::index_at`] has it.
+    fn on(path: &Path, way_m: f64, braking_m: f64) -> Self {
+        const TOLERANCE: f64 = 1e-9;
+        let (poses, last) = (path.poses(), path.last_index());
+        let position = way_m / path.spacing_m();
+        let before = floor_index(position).min(last - 1);
+        let ratio = (position - before as f64).clamp(0.0, 1.0);
+        let stop = position + braking_m / path.spacing_m() - TOLERANCE;
+        let stop_before = floor_index(stop);
+        let stop_index = stop_before + usize::from(stop > stop_before as f64);
+        Self {
+            pose: poses[before].towards(&poses[before + 1], ratio),
+            index: index_i32(floor_index(position + TOLERANCE).min(last)),
+            stop_index: index_i32(stop_index.min(last)),
+        }
+    }
 }
 
 fn index_i32(index: usize) -> i32 {

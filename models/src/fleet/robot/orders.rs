@@ -182,6 +182,7 @@ impl Robot {
         truth: &mut dyn FnMut(Truth),
     ) {
         let length_m = path.length_m();
+        self.account(self.tracker.motion(now).way_m);
         self.begin(now, mission, path);
         self.tracker.place(now, length_m, length_m);
         self.accounted_m = length_m;
