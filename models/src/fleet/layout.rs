@@ -26,7 +26,7 @@ impl Blocks {
         for column in 0..self.column_count {
             let x_m = self.column_m.0 + column as f64 * self.column_m.1;
             // Odd columns have a block in the middle, even ones a lane.
-            let shift = if column % 2 == 0 { 0.5 } else { 0.0 };
+            let shift = if column.is_multiple_of(2) { 0.5 } else { 0.0 };
             for row in -20..20_i32 {
                 let y_m = 0.5 * height_m + (f64::from(row) + shift) * self.pitch_m;
                 let block = Bounds {
@@ -46,7 +46,11 @@ impl Blocks {
     /// Lanes within the gaps of every other column from `first_column` on, `aside_m` to both sides
     /// of each gap's middle.
     fn gates(&self, first_column: usize, height_m: f64, aside_m: f64) -> Vec<Vec<Pose>> {
-        let shift = if first_column % 2 == 0 { 0.0 } else { 0.5 };
+        let shift = if first_column.is_multiple_of(2) {
+            0.0
+        } else {
+            0.5
+        };
         // A lane keeps from the edge what it keeps from the blocks beside it.
         let edge_m = 0.5 * (self.pitch_m - self.size_m[1]) - aside_m;
         let gate = |column: usize| {

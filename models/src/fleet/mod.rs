@@ -16,6 +16,7 @@ pub mod robot;
 pub mod robots;
 mod routes;
 pub mod scenario;
+mod scene;
 pub mod section;
 mod section_library;
 pub mod world;
