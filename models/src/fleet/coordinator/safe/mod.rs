@@ -134,11 +134,6 @@ impl SafeRules {
         }
     }
 
-    /// The reservations, for checks from outside.
-    pub fn traffic(&self) -> &Traffic {
-        &self.traffic
-    }
-
     /// `robot` is given the mission `mission_id` along `path`.
     fn begin(&mut self, now: Instant, robot: usize, mission_id: u32, path: PathId) {
         let last = self.world.path(path).last_index();
@@ -298,6 +293,10 @@ impl Rules for SafeRules {
             "reservations overlap: {:?}",
             self.traffic.first_overlap()
         );
+    }
+
+    fn reservations(&self) -> Option<&Traffic> {
+        Some(&self.traffic)
     }
 
     fn resets_stuck_robots(&self) -> bool {

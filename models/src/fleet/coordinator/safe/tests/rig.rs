@@ -198,6 +198,12 @@ impl Rig {
                 for message in out {
                     self.post(|| Letter::ToRobot(message));
                 }
+                if cfg!(debug_assertions)
+                    && let Some(traffic) = self.coordinator.reservations()
+                {
+                    assert_eq!(traffic.first_overlap_by_library(), None, "at {at:?}");
+                    assert_eq!(traffic.first_overlap(), None, "at {at:?}");
+                }
                 next_cycle = at + CYCLE;
                 if is_over(self) {
                     return at;
