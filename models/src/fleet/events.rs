@@ -17,6 +17,10 @@ use crate::time::Instant;
 /// come after a control period, a second, and replicas at once.
 const HELD_UP_AFTER: Duration = Duration::from_millis(300);
 
+/// A robot dates what it does to the moment it began to read its channels; a command may come in
+/// while it reads, and so leave after its effect.
+const READING: Duration = Duration::from_millis(20);
+
 /// Copies of one command that an event names.
 const COPIES_NAMED_MAX: usize = 4;
 
@@ -96,7 +100,7 @@ impl Orders {
     /// before the one that was; `None` when it was not held up, or no one can say.
     fn held_up(&self, copies: &[Sent], at: Instant) -> Option<(f64, usize)> {
         let first = copies.first().filter(|_| self.has_one_clock)?;
-        let taken = copies.iter().rfind(|copy| copy.at <= at)?;
+        let taken = copies.iter().rfind(|copy| copy.at <= at + READING)?;
         let missed = copies
             .iter()
             .filter(|copy| copy.at + HELD_UP_AFTER <= taken.at);
@@ -108,7 +112,7 @@ impl Orders {
 impl Orders {
     /// The first of `copies` that went out before `event`: what was sent later did not lead to it.
     fn named(&self, event: ScoreEvent, mut copies: Vec<Sent>) -> ScoreEvent {
-        copies.retain(|sent| !self.has_one_clock || sent.at <= event.at);
+        copies.retain(|sent| !self.has_one_clock || sent.at <= event.at + READING);
         copies.sort_by_key(|sent| sent.at);
         let copies = copies.iter().take(COPIES_NAMED_MAX);
         copies.fold(event, |event, sent| event.naming(sent.message))

@@ -4,10 +4,10 @@
 use hil_models::case_study::Severity;
 use hil_models::measure::account::MessageFate;
 
-use super::assessment::Assessment;
+use super::assessment::{Assessment, NetworkVerdict};
 use super::score_event::{ExplainedEvent, ExplainedMessage, ScoreEvents};
 use super::summary::{
-    ChannelSummary, Fact, LinkKind, Outcome, RecordedFigures, RunFacts, RunSummary,
+    ChannelSummary, Fact, LinkKind, Outcome, ProcessSummary, RecordedFigures, RunFacts, RunSummary,
 };
 use super::terminal::{Style, render};
 
@@ -149,6 +149,40 @@ fn a_recorded_channel_needs_no_account_but_every_message() {
         Assessment::of(&absent).warnings,
         ["fleet/truth left no record"]
     );
+}
+
+#[test]
+fn one_emulated_link_among_real_ones_makes_no_network_result() {
+    let mut run = summary(recorded_channel());
+    for link in [LinkKind::Udp, LinkKind::Emulated] {
+        run.channels.push(ChannelSummary {
+            link,
+            ..recorded_channel()
+        });
+    }
+    run.processes.push(ticking());
+    assert_eq!(Assessment::of(&run).network, NetworkVerdict::EmulatedLink);
+    run.channels.pop();
+    assert_eq!(Assessment::of(&run).network, NetworkVerdict::NetworkResult);
+}
+
+fn ticking() -> ProcessSummary {
+    ProcessSummary {
+        name: "robots".to_owned(),
+        host: "robot-pc".to_owned(),
+        role: "robots".to_owned(),
+        exit: "ended".to_owned(),
+        restart_count: 0,
+        preparation_s: Some(0.001),
+        tick_count: Some(1_000),
+        skipped_tick_count: Some(0),
+        cpu_time_s: Some(1.0),
+        voluntary_switch_count: None,
+        involuntary_switch_count: None,
+        malformed_count: None,
+        outbox_drop_count: None,
+        recorder_drop_count: None,
+    }
 }
 
 #[test]
