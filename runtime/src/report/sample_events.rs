@@ -53,7 +53,7 @@ pub(super) fn few_events() -> ScoreEvents {
         events: vec![
             event(
                 3.75,
-                Severity::Notice,
+                Severity::Hazard,
                 "robot 2 of fleet 1 was told to stop where it no longer could",
                 vec![late.clone()],
             ),
@@ -190,7 +190,7 @@ fn the_page_shows_the_gravest_events_and_counts_the_rest() {
     let mut all = summary(recorded_channel());
     all.score_events = many_events("met");
     let text = render(&all, 100, Style::Plain);
-    assert!(text.contains("1 incident, 20 notices"), "{text}");
+    assert!(text.contains("1 incident, 0 hazards, 20 notices"), "{text}");
     assert!(text.contains("met (clock of robot-pc)"), "{text}");
     assert_eq!(text.matches("braked (clock of robot-pc)").count(), 11);
     assert!(text.contains("9 more events are in summary.json; 17 found no room in the score"));
