@@ -46,6 +46,8 @@ pub struct Metric {
 pub enum Severity {
     /// Worth knowing: the robot coped.
     Notice,
+    /// The robot could not do as it was told: an incident was possible.
+    Hazard,
     /// What must not happen, e.g. a collision.
     Incident,
 }
@@ -127,16 +129,15 @@ impl Score {
         self.metrics.iter().find(|metric| metric.name == name)
     }
 
-    /// Appends an event. Without room an incident takes the place of the latest notice; whatever
-    /// is left out is counted.
+    /// Appends an event. Without room it takes the place of the latest of the least grave events,
+    /// if it is graver than they are; whatever is left out is counted.
     pub fn add_event(&mut self, event: ScoreEvent) {
         if self.events.len() >= EVENTS_MAX {
             self.events_dropped_count += 1;
-            let is_notice = |event: &ScoreEvent| event.severity == Severity::Notice;
-            if event.severity == Severity::Notice {
-                return;
-            }
-            match self.events.iter().rposition(is_notice) {
+            let severities = self.events.iter().map(|known| known.severity);
+            let least = severities.min().filter(|least| *least < event.severity);
+            let is_least = |known: &ScoreEvent| Some(known.severity) == least;
+            match self.events.iter().rposition(is_least) {
                 Some(index) => drop(self.events.remove(index)),
                 None => return,
             }
@@ -154,17 +155,19 @@ mod tests {
     }
 
     #[test]
-    fn a_full_score_keeps_incidents_before_notices_and_counts_the_rest() {
+    fn a_full_score_keeps_what_is_graver_and_counts_the_rest() {
         let mut score = Score::default();
         for at_ns in 0..1_000 {
             score.add_event(event(Severity::Notice, at_ns));
         }
         score.add_event(event(Severity::Notice, 1_000));
+        score.add_event(event(Severity::Hazard, 1_000));
         score.add_event(event(Severity::Incident, 1_001));
         assert_eq!(score.events.len(), EVENTS_MAX);
-        assert_eq!(score.events_dropped_count, 2);
+        assert_eq!(score.events_dropped_count, 3);
         assert_eq!(score.events.last().unwrap().severity, Severity::Incident);
-        assert_eq!(score.events[998].at, Instant::from_ns(998));
+        assert_eq!(score.events[998].severity, Severity::Hazard);
+        assert_eq!(score.events[997].at, Instant::from_ns(997));
         let mut score = Score::default();
         for at_ns in 0..1_005 {
             score.add_event(event(Severity::Incident, at_ns));

@@ -9,6 +9,7 @@ use std::env;
 use std::time::Duration;
 
 use hil_models::measure::account::MessageFate;
+use hil_runtime::report::assessment::{Assessment, NetworkVerdict};
 use hil_runtime::report::score_event::ExplainedMessage;
 use hil_runtime::report::summary::{LinkKind, Outcome, RunSummary};
 use hil_tests::account::{
@@ -167,9 +168,27 @@ fn assert_losses_are_explained(summary: &RunSummary) {
         assert!(message.fate.is_some(), "{message:?}");
     }
     for event in &summary.score_events.events {
-        let span = -1.0..summary.run.duration_s + 1.0;
-        assert!(event.at_s.is_some_and(|at_s| span.contains(&at_s)));
+        let at_s = event.at_s.unwrap();
+        assert!(
+            (0.0..summary.run.duration_s + 1.0).contains(&at_s),
+            "{at_s}"
+        );
+        // What led to an event was sent before it, or while the robot read: the hosts' times
+        // compare.
+        for message in &event.messages {
+            let sent_s = message.published_at_s.unwrap();
+            assert!(
+                (0.0..=at_s + 0.1).contains(&sent_s),
+                "{sent_s} of {event:?}"
+            );
+        }
     }
+    let verdict = Assessment::of(summary).network;
+    assert_ne!(
+        verdict,
+        NetworkVerdict::NetworkResult,
+        "commands went over an emulated link"
+    );
 }
 
 #[test]

@@ -50,10 +50,19 @@ pub(super) fn explained(
     }
 }
 
-/// Start of the run on the clock of the channel's producer.
+/// Start of the run on the clock of the channel's producer. Hosts begin milliseconds apart; where
+/// they read one clock, one beginning holds for all, lest an effect come before its cause.
 fn start_of((topology, result): (&Topology, &RunResult), channel: &Channel) -> Option<Instant> {
     let host = &topology.process(&channel.from)?.host;
-    result.spans.get(host).map(|span| span.0)
+    let starts = || result.spans.values().map(|span| span.0);
+    let own = result.spans.get(host).map(|span| span.0);
+    own.and_then(|own| {
+        if result.has_one_clock {
+            starts().min()
+        } else {
+            Some(own)
+        }
+    })
 }
 
 fn explain(

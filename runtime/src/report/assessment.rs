@@ -24,7 +24,7 @@ pub enum NetworkVerdict {
     RunFailed,
     /// No channel went over a network.
     NoNetwork,
-    /// Channels went over emulated links only.
+    /// A channel went over an emulated link, whatever carried the others.
     EmulatedLink,
     /// The host kept its ticks: what remains is the network's.
     NetworkResult,
@@ -94,10 +94,10 @@ fn verdict(summary: &RunSummary, overruns: Vec<Overrun>) -> NetworkVerdict {
         }
     } else if summary.processes.iter().any(is_silent) || !summary.processes.iter().any(has_ticks) {
         NetworkVerdict::TicksUnknown
-    } else if has(LinkKind::Udp) {
-        NetworkVerdict::NetworkResult
-    } else {
+    } else if has(LinkKind::Emulated) {
         NetworkVerdict::EmulatedLink
+    } else {
+        NetworkVerdict::NetworkResult
     }
 }
 

@@ -4,10 +4,10 @@
 use hil_models::case_study::Severity;
 use hil_models::measure::account::MessageFate;
 
-use super::assessment::Assessment;
+use super::assessment::{Assessment, NetworkVerdict};
 use super::score_event::{ExplainedEvent, ExplainedMessage, ScoreEvents};
 use super::summary::{
-    ChannelSummary, Fact, LinkKind, Outcome, RecordedFigures, RunFacts, RunSummary,
+    ChannelSummary, Fact, LinkKind, Outcome, ProcessSummary, RecordedFigures, RunFacts, RunSummary,
 };
 use super::terminal::{Style, render};
 
@@ -53,7 +53,7 @@ pub(super) fn few_events() -> ScoreEvents {
         events: vec![
             event(
                 3.75,
-                Severity::Notice,
+                Severity::Hazard,
                 "robot 2 of fleet 1 was told to stop where it no longer could",
                 vec![late.clone()],
             ),
@@ -152,11 +152,45 @@ fn a_recorded_channel_needs_no_account_but_every_message() {
 }
 
 #[test]
+fn one_emulated_link_among_real_ones_makes_no_network_result() {
+    let mut run = summary(recorded_channel());
+    for link in [LinkKind::Udp, LinkKind::Emulated] {
+        run.channels.push(ChannelSummary {
+            link,
+            ..recorded_channel()
+        });
+    }
+    run.processes.push(ticking());
+    assert_eq!(Assessment::of(&run).network, NetworkVerdict::EmulatedLink);
+    run.channels.pop();
+    assert_eq!(Assessment::of(&run).network, NetworkVerdict::NetworkResult);
+}
+
+fn ticking() -> ProcessSummary {
+    ProcessSummary {
+        name: "robots".to_owned(),
+        host: "robot-pc".to_owned(),
+        role: "robots".to_owned(),
+        exit: "ended".to_owned(),
+        restart_count: 0,
+        preparation_s: Some(0.001),
+        tick_count: Some(1_000),
+        skipped_tick_count: Some(0),
+        cpu_time_s: Some(1.0),
+        voluntary_switch_count: None,
+        involuntary_switch_count: None,
+        malformed_count: None,
+        outbox_drop_count: None,
+        recorder_drop_count: None,
+    }
+}
+
+#[test]
 fn the_page_shows_the_gravest_events_and_counts_the_rest() {
     let mut all = summary(recorded_channel());
     all.score_events = many_events("met");
     let text = render(&all, 100, Style::Plain);
-    assert!(text.contains("1 incident, 20 notices"), "{text}");
+    assert!(text.contains("1 incident, 0 hazards, 20 notices"), "{text}");
     assert!(text.contains("met (clock of robot-pc)"), "{text}");
     assert_eq!(text.matches("braked (clock of robot-pc)").count(), 11);
     assert!(text.contains("9 more events are in summary.json; 17 found no room in the score"));

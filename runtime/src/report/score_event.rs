@@ -20,7 +20,8 @@ pub struct ScoreEvents {
 /// One event.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ExplainedEvent {
-    /// When, seconds after the start of the run; `None` when that start is unknown.
+    /// When, seconds after the start of the run: the earliest of all hosts where they read one
+    /// clock, else that of the host named in `clock`; `None` when it is unknown.
     pub at_s: Option<f64>,
     /// The host on whose clock.
     pub clock: String,
@@ -43,7 +44,8 @@ pub struct ExplainedMessage {
     pub epoch: u32,
     /// Its number.
     pub sequence: u64,
-    /// When it was published, seconds after the start of the run on its producer's host.
+    /// When it was published, seconds after the start of the run, as in
+    /// [`ExplainedEvent::at_s`] but on its producer's host.
     pub published_at_s: Option<f64>,
     /// Its fate, as the account has it; `None` when that is unavailable.
     pub fate: Option<MessageFate>,

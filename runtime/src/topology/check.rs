@@ -128,7 +128,7 @@ fn add_parameter_fault(fault: ParameterFault, table: &Table, place: Place, fault
             _ => None,
         };
         if let Some(index) = index {
-            path.push_str(&format!("[{index}]"));
+            path = format!("{path}[{index}]");
         }
         let Some(node) = item.or(node) else {
             break;

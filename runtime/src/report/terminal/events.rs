@@ -24,12 +24,14 @@ pub(super) fn score_events(canvas: &mut Canvas, all: &ScoreEvents) {
         let chosen = all.events.iter().filter(|one| one.severity == severity);
         chosen.count() as u64
     };
-    let (incidents, notices) = (count(Severity::Incident), count(Severity::Notice));
-    let aside = format!(
-        "{}, {}",
+    let [incidents, hazards, notices] =
+        [Severity::Incident, Severity::Hazard, Severity::Notice].map(count);
+    let aside = [
         counted(incidents, "incident"),
-        counted(notices, "notice")
-    );
+        counted(hazards, "hazard"),
+        counted(notices, "notice"),
+    ];
+    let aside = aside.join(", ");
     canvas.heading(
         "What the robot did, and what the network had done to it",
         &aside,
@@ -77,6 +79,7 @@ fn one_event(canvas: &mut Canvas, event: &ExplainedEvent, clocks_differ: bool) {
     let time = event.at_s.map_or_else(|| "unavailable".to_owned(), seconds);
     let tone = match event.severity {
         Severity::Incident => Tone::Bad,
+        Severity::Hazard => Tone::Caution,
         Severity::Notice => Tone::Plain,
     };
     let what = if clocks_differ {
