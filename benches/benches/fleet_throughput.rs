@@ -108,7 +108,11 @@ impl Case {
 
     /// Robot-seconds per processor second: lower quartile, median, upper quartile of the rounds.
     fn robot_seconds_per_s(&self) -> [f64; 3] {
-        quartiles(self.rounds.iter().map(|round| round.robot_s / round.processor_s))
+        quartiles(
+            self.rounds
+                .iter()
+                .map(|round| round.robot_s / round.processor_s),
+        )
     }
 
     fn sections_per_s(&self) -> [f64; 3] {

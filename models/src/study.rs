@@ -262,9 +262,11 @@ mod tests {
         }
 
         fn report(&self, outcomes: &[Option<&u64>]) -> StudyReport {
-            let cell =
-                |outcome: &Option<&u64>| outcome.map_or(Cell::Absent, |sum| Cell::Count(*sum));
-            let row = outcomes.iter().map(cell).collect();
+            let cell = |sum: &u64| Cell::Count(*sum);
+            let row = outcomes
+                .iter()
+                .map(|outcome| outcome.map_or(Cell::Absent, cell))
+                .collect();
             StudyReport {
                 tables: vec![Table {
                     rows: vec![row],

@@ -45,7 +45,7 @@ impl Agenda {
     /// Sets the next event of `entry`.
     pub(crate) fn set(&mut self, entry: usize, due: Instant) {
         self.due[entry] = due;
-        let mut node = (self.leaf_start + entry) / 2;
+        let mut node = (self.leaf_start + entry) >> 1;
         while node > 0 {
             self.play(node);
             node /= 2;

@@ -209,19 +209,19 @@ type Mechanism = (&'static str, fn(&mut Setup));
 pub(crate) const MECHANISMS: [Mechanism; 13] = [
     ("clean", |_| {}),
     ("delay 300 ms", |setup| {
-        delay_both(setup, 300.0, DelayLaw::Constant)
+        delay_both(setup, 300.0, DelayLaw::Constant);
     }),
     ("delay 1 s", |setup| {
-        delay_both(setup, 1000.0, DelayLaw::Constant)
+        delay_both(setup, 1000.0, DelayLaw::Constant);
     }),
     ("delay 0 to 1 s", |setup| {
-        delay_both(setup, 1000.0, DelayLaw::Uniform)
+        delay_both(setup, 1000.0, DelayLaw::Uniform);
     }),
     ("loss 10 %, commands", |setup| {
-        setup.links.commands.loss_ratio = 0.1
+        setup.links.commands.loss_ratio = 0.1;
     }),
     ("loss 10 %, status", |setup| {
-        setup.links.status.loss_ratio = 0.1
+        setup.links.status.loss_ratio = 0.1;
     }),
     ("loss 10 %, both", |setup| lose_both(setup, 0.1)),
     ("loss 30 %, both", |setup| lose_both(setup, 0.3)),

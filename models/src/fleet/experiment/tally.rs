@@ -6,7 +6,7 @@ use crate::fleet::experiment::driver::Experiment;
 use crate::fleet::referee::Tally;
 use crate::fleet::robot::RobotCounters;
 use crate::fleet::scenario::Scene;
-use crate::link::impaired::LinkCounts;
+use crate::link::impaired::{ImpairedLink, LinkCounts};
 use crate::measure::statistics::clopper_pearson;
 use crate::time::Instant;
 
@@ -53,7 +53,7 @@ const COLLIDED_MAX: usize = 8;
 
 impl FleetTally {
     pub(crate) fn of(experiment: &Experiment) -> Self {
-        let [commands, status] = experiment.links().map(|link| link.counts());
+        let [commands, status] = experiment.links().map(ImpairedLink::counts);
         let mut robots = RobotCounters::default();
         for robot in experiment.robots() {
             robots.add(robot.counters());
