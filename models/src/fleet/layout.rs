@@ -26,7 +26,7 @@ impl Blocks {
         for column in 0..self.column_count {
             let x_m = self.column_m.0 + column as f64 * self.column_m.1;
             // Odd columns have a block in the middle, even ones a lane.
-            let shift = if column % 2 == 0 { 0.5 } else { 0.0 };
+            let shift = if column.is_multiple_of(2) { 0.5 } else { 0.0 };
             for row in -20..20_i32 {
                 let y_m = 0.5 * height_m + (f64::from(row) + shift) * self.pitch_m;
                 let block = Bounds {
@@ -43,21 +43,27 @@ impl Blocks {
         blocks
     }
 
-    /// Lanes within the gaps of the odd columns, `aside_m` to both sides of each gap's middle.
-    fn gates(&self, height_m: f64, edge_m: f64, aside_m: f64) -> Vec<Vec<Pose>> {
+    /// Lanes within the gaps of every other column from `first_column` on, `aside_m` to both sides
+    /// of each gap's middle.
+    fn gates(&self, first_column: usize, height_m: f64, aside_m: f64) -> Vec<Vec<Pose>> {
+        let shift = if first_column.is_multiple_of(2) {
+            0.0
+        } else {
+            0.5
+        };
+        // A lane keeps from the edge what it keeps from the blocks beside it.
+        let edge_m = 0.5 * (self.pitch_m - self.size_m[1]) - aside_m;
         let gate = |column: usize| {
             let x_m = self.column_m.0 + column as f64 * self.column_m.1;
-            let gaps =
-                (-20..20_i32).map(|row| 0.5 * height_m + (f64::from(row) + 0.5) * self.pitch_m);
-            let lanes = gaps.flat_map(|y_m| [y_m - aside_m, y_m + aside_m]);
-            let lanes = lanes.filter(|y_m| *y_m >= edge_m && *y_m <= height_m - edge_m);
-            lanes.map(|y_m| Pose::new(x_m, y_m, 0.0)).collect()
+            let gaps = (-20..20_i32)
+                .map(|row| 0.5 * height_m + (f64::from(row) + shift) * self.pitch_m)
+                .flat_map(|y_m| [y_m - aside_m, y_m + aside_m]);
+            gaps.filter(|y_m| *y_m >= edge_m && *y_m <= height_m - edge_m)
+                .map(|y_m| Pose::new(x_m, y_m, 0.0))
+                .collect()
         };
-        (0..self.column_count)
-            .skip(1)
-            .step_by(2)
-            .map(gate)
-            .collect()
+        let columns = (first_column..self.column_count).step_by(2);
+        columns.map(gate).collect()
     }
 }
 
@@ -97,7 +103,7 @@ pub(crate) fn warehouse(clearance_m: f64) -> Map {
         bounds: ground(80.0, 44.0),
         obstacles: racks.within(44.0, 2.0),
         bays: bays([2.5, 77.5], 22.0, 5.6),
-        gates: racks.gates(44.0, 3.0, 1.0),
+        gates: racks.gates(0, 44.0, 1.0),
         clearance_m,
     }
 }
@@ -114,7 +120,7 @@ pub(crate) fn harbor(clearance_m: f64) -> Map {
         bounds: ground(400.0, 220.0),
         obstacles: blocks.within(220.0, 12.0),
         bays: bays([14.0, 386.0], 110.0, 29.0),
-        gates: blocks.gates(220.0, 16.0, 7.0),
+        gates: blocks.gates(1, 220.0, 7.0),
         clearance_m,
     }
 }

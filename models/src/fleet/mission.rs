@@ -138,3 +138,98 @@ impl MissionSource {
         self.left_counts.iter().all(|count| *count == 0)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fleet::scenario::{Scenario, WorldParameters};
+
+    fn scene(scenario: Scenario) -> Scene {
+        let parameters = WorldParameters {
+            scenario,
+            ..WorldParameters::default()
+        };
+        parameters.build().unwrap()
+    }
+
+    fn source(
+        scene: &Scene,
+        mode: MissionMode,
+        missions_per_robot: u32,
+        seed: u64,
+    ) -> MissionSource {
+        let parameters = MissionParameters {
+            mode,
+            missions_per_robot,
+            ..MissionParameters::default()
+        };
+        MissionSource::new(&parameters, scene, RandomStream::new(seed, "missions"))
+    }
+
+    /// Sends seven robots about in turn; gives all routes.
+    fn tour(scene: &Scene, mut source: MissionSource, rounds: usize) -> Vec<Route> {
+        let mut places = scene.starts.clone();
+        let mut routes = Vec::new();
+        for _ in 0..rounds {
+            for robot in 0..places.len() {
+                let taken = places.clone();
+                let is_free = |bay: BayIndex| !taken.contains(&bay);
+                if let Some(route) = source.next(robot, places[robot], &is_free) {
+                    assert!(route.from == places[robot] && is_free(route.to));
+                    places[robot] = route.to;
+                    routes.push(route);
+                }
+            }
+        }
+        routes
+    }
+
+    #[test]
+    fn random_missions_reach_all_bays_alike_and_repeat_with_their_seed() {
+        let scene = scene(Scenario::Warehouse);
+        let once = tour(&scene, source(&scene, MissionMode::Random, 0, 1), 1000);
+        assert_eq!(once.len(), 7000);
+        for bay in 0..14 {
+            let count = once.iter().filter(|route| route.to == bay).count();
+            assert!((400..600).contains(&count), "{bay} {count}");
+        }
+        let again = tour(&scene, source(&scene, MissionMode::Random, 0, 1), 1000);
+        assert_eq!(once, again);
+        let other = tour(&scene, source(&scene, MissionMode::Random, 0, 2), 1000);
+        assert_ne!(once, other);
+    }
+
+    #[test]
+    fn shuttles_go_there_and_back_and_end_with_their_missions() {
+        let scene = scene(Scenario::Warehouse);
+        let routes = tour(&scene, source(&scene, MissionMode::Shuttle, 3, 1), 10);
+        assert_eq!(routes.len(), 21);
+        assert!(
+            routes
+                .iter()
+                .all(|route| route.from.abs_diff(route.to) == 7)
+        );
+        assert_eq!(routes[7].path, routes[0].path.reversed());
+    }
+
+    #[test]
+    fn once_is_once_and_only_to_a_free_bay() {
+        let scene = scene(Scenario::Crossing);
+        let mut once = source(&scene, MissionMode::Once, 0, 1);
+        assert_eq!(once.next(0, 0, &|_| false), None);
+        assert_eq!(once.next(0, 0, &|_| true).map(|route| route.to), Some(2));
+        assert_eq!(once.next(0, 2, &|_| true), None);
+        assert!(!once.is_exhausted());
+        assert_eq!(once.next(1, 1, &|_| true).map(|route| route.to), Some(3));
+        assert!(once.is_exhausted());
+    }
+
+    #[test]
+    fn parking_for_no_number_of_seconds_is_refused() {
+        let parameters = MissionParameters {
+            parking_s: f64::NAN,
+            ..MissionParameters::default()
+        };
+        assert_eq!(parameters.check().unwrap_err().key, "missions.parking_s");
+    }
+}

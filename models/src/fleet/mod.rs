@@ -21,6 +21,7 @@ pub mod robot;
 pub mod robots;
 mod routes;
 pub mod scenario;
+mod scene;
 mod score;
 pub mod section;
 mod section_library;

@@ -103,8 +103,16 @@ impl Section {
 
     /// The same section when the path of `side` is driven backwards and `last_index` is its last
     /// pose.
+    ///
+    /// # Panics
+    /// When the section does not lie on a path that short.
     #[must_use]
     pub fn reversed(&self, side: Side, last_index: usize) -> Self {
+        assert!(
+            last_index >= self.end(side),
+            "a section to pose {} lies on no path to pose {last_index}",
+            self.end(side)
+        );
         let last_index = u32::try_from(last_index).expect("a path has fewer than 2^32 poses");
         let mut reversed = self.clone();
         let own = &mut reversed.sides[side.index()];
@@ -199,10 +207,13 @@ pub(crate) fn sections_of(
     sections
 }
 
+/// First and last pose on both paths.
+type Ranges = [(u32, u32); 2];
+
 /// Joins parts that are at most `gap` poses apart on both paths, until none are. Joining only
 /// widens, so the result does not depend on the order.
 fn merged(parts: Vec<Vec<Run>>, gap: [u32; 2]) -> Vec<Vec<Run>> {
-    let mut open: Vec<([(u32, u32); 2], Vec<Run>)> = Vec::new();
+    let mut open: Vec<(Ranges, Vec<Run>)> = Vec::new();
     for mut runs in parts {
         let widen = |all: (u32, u32), one: (u32, u32)| (all.0.min(one.0), all.1.max(one.1));
         let mut range = [
@@ -213,7 +224,7 @@ fn merged(parts: Vec<Vec<Run>>, gap: [u32; 2]) -> Vec<Vec<Run>> {
                 .map(|run| (run.first, run.last))
                 .fold(NO_PARTNER, widen),
         ];
-        let is_near = |a: &[(u32, u32); 2], b: &[(u32, u32); 2]| {
+        let is_near = |a: &Ranges, b: &Ranges| {
             (0..2).all(|side| {
                 a[side].0 <= b[side].1.saturating_add(gap[side])
                     && b[side].0 <= a[side].1.saturating_add(gap[side])

@@ -13,7 +13,6 @@ type Cell = OnceLock<Arc<[Section]>>;
 /// The critical sections of every two paths, each computed when first asked for and kept. Only
 /// paths near each other have a place to keep them, so a large world costs no more than many
 /// small ones.
-#[derive(Debug)]
 pub struct SectionLibrary {
     paths: PathLibrary,
     footprint: Footprint,
@@ -32,6 +31,17 @@ struct Near {
     /// Per other path: own direction, the other's direction (times 2), which comes first (times
     /// 4).
     cells: Vec<[Cell; 8]>,
+}
+
+impl core::fmt::Debug for SectionLibrary {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        // Which sections were asked for yet says nothing of the world.
+        f.debug_struct("SectionLibrary")
+            .field("paths", &self.paths.len())
+            .field("footprint", &self.footprint)
+            .field("merge", &self.merge)
+            .finish_non_exhaustive()
+    }
 }
 
 impl SectionLibrary {
@@ -143,3 +153,7 @@ fn bounds_of(path: &Path, radius_m: f64) -> Bounds {
     }
     bounds
 }
+
+#[cfg(test)]
+#[path = "section_tests.rs"]
+mod tests;

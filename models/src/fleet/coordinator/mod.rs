@@ -20,6 +20,7 @@ use crate::fleet::coordinator::parameters::{CoordinatorMode, CoordinatorParamete
 use crate::fleet::coordinator::policy::OrderingPolicy;
 use crate::fleet::coordinator::roster::{MissionSupply, Roster, SectionKind};
 use crate::fleet::coordinator::safe::SafeRules;
+use crate::fleet::coordinator::safe::reservation::Traffic;
 use crate::fleet::messages::{State, ToRobot};
 use crate::fleet::scenario::Scene;
 use crate::time::Instant;
@@ -41,6 +42,11 @@ pub(crate) trait Rules: Debug {
 
     /// Sees every state as it arrives, also those the roster does not take.
     fn on_state(&mut self, _now: Instant, _state: &State) {}
+
+    /// The way each robot has to itself, if the rules keep account of it.
+    fn reservations(&self) -> Option<&Traffic> {
+        None
+    }
 
     /// Whether a robot that makes no way may be put at its goal.
     fn resets_stuck_robots(&self) -> bool {
@@ -132,6 +138,11 @@ impl Coordinator {
             self.roster
                 .reset_stuck(now, &mut self.counters.counts, send);
         }
+    }
+
+    /// The way each robot has to itself; `None` in the legacy mode.
+    pub fn reservations(&self) -> Option<&Traffic> {
+        self.rules.reservations()
     }
 
     /// What it counted so far.

@@ -2,13 +2,14 @@
 //! forwards, around obstacles, from any start to any goal pose. It reads no clock; what a plan
 //! cost is counted in expanded states.
 //!
-//! A search over poses finds a way ([`search`]), which is then shortened ([`shorten`]).
+//! A search over poses finds a way, which is then shortened; [`trajectory`] adds time.
 
 pub(crate) mod dubins;
 mod grid;
 mod search;
 mod shorten;
 pub(crate) mod space;
+pub mod trajectory;
 
 use crate::fleet::geometry::{Pose, floor_index};
 use crate::fleet::map::Map;
@@ -17,6 +18,7 @@ use crate::fleet::planner::grid::Distances;
 use crate::fleet::planner::search::Search;
 use crate::fleet::planner::shorten::shortened;
 use crate::fleet::planner::space::{Space, extent};
+use crate::fleet::planner::trajectory::Trajectory;
 use crate::fleet::world::Vehicle;
 
 pub use crate::fleet::planner::dubins::Segment;
@@ -164,6 +166,14 @@ impl Plan {
     }
 }
 
+impl Plan {
+    /// The fastest run along the plan for a vehicle that begins and ends at rest.
+    pub fn trajectory(&self, vehicle: &Vehicle) -> Trajectory {
+        let limits = (vehicle.speed_max_mps, vehicle.acceleration_mps2);
+        Trajectory::new(self.length_m(), limits.0, limits.1)
+    }
+}
+
 /// Plans the path from `start` to `goal` around the map's obstacles; bays count as empty.
 ///
 /// # Errors
@@ -292,3 +302,6 @@ fn joined(segments: Vec<Segment>) -> Vec<Segment> {
     }
     joined
 }
+
+#[cfg(test)]
+mod tests;

@@ -116,14 +116,16 @@ impl Search {
                 continue;
             }
             expanded_count += 1;
-            let home = shortest(&here.pose, goal, self.turning_radius_m);
-            if space.is_way_free(&here.pose, &home.segments, self.check_m) {
-                let mut segments = self.way_to(open.number);
-                segments.extend(home.segments);
-                return Found {
-                    segments: Some(segments),
-                    expanded_count,
-                };
+            if is_home_tried(expanded_count) {
+                let home = shortest(&here.pose, goal, self.turning_radius_m);
+                if space.is_way_free(&here.pose, &home.segments, self.check_m) {
+                    let mut segments = self.way_to(open.number);
+                    segments.extend(home.segments);
+                    return Found {
+                        segments: Some(segments),
+                        expanded_count,
+                    };
+                }
             }
             for ratio in CURVATURES {
                 let segment = Segment {
@@ -188,6 +190,12 @@ impl Search {
         segments.reverse();
         segments
     }
+}
+
+/// Whether the direct way home is tried from this state: from every early one, from some of the
+/// many states of a search that has not found it soon.
+fn is_home_tried(expanded_count: u64) -> bool {
+    expanded_count <= 1000 || expanded_count.is_multiple_of(8)
 }
 
 fn is_within(space: &Space, pose: &Pose) -> bool {

@@ -127,13 +127,19 @@ impl Space {
         &self.bounds
     }
 
-    /// True when a vehicle at this position, heading along the unit vector `axis`, is free.
-    pub(crate) fn is_free_at(&self, centre: [f64; 2], axis: [f64; 2]) -> bool {
-        let covered = OrientedBox {
-            centre,
-            axis,
-            half_m: [0.5 * self.footprint.length_m, 0.5 * self.footprint.width_m],
-        };
+    /// True when a vehicle at `pose` is free.
+    fn is_free(&self, pose: &Pose) -> bool {
+        let centre = [pose.x_m, pose.y_m];
+        // Far from everything the heading, and so its sine and cosine, does not matter.
+        let reach_m = self.footprint.radius_m();
+        let is_inside = centre[0] - reach_m >= self.bounds.x_min_m
+            && centre[0] + reach_m <= self.bounds.x_max_m
+            && centre[1] - reach_m >= self.bounds.y_min_m
+            && centre[1] + reach_m <= self.bounds.y_max_m;
+        if is_inside && self.near(centre).next().is_none() {
+            return true;
+        }
+        let covered = self.footprint.at(pose);
         self.bounds.contains(&covered.bounds())
             && !self.near(centre).any(|entry| entry.0.overlaps(&covered))
     }
@@ -188,15 +194,24 @@ impl Space {
         let mut from = *start;
         for segment in segments {
             let count = floor_index((segment.length_m / step_m).ceil());
+            let end = segment.pose_after(&from, segment.length_m);
+            let is_straight = segment.curvature_per_m.abs() < 1e-12;
             for step in 0..count {
-                let way_m = segment.length_m * step as f64 / count as f64;
-                let pose = segment.pose_after(&from, way_m);
-                let (sine, cosine) = pose.heading_rad.sin_cos();
-                if !self.is_free_at([pose.x_m, pose.y_m], [cosine, sine]) {
+                let ratio = step as f64 / count as f64;
+                let pose = if is_straight {
+                    Pose {
+                        x_m: from.x_m + ratio * (end.x_m - from.x_m),
+                        y_m: from.y_m + ratio * (end.y_m - from.y_m),
+                        heading_rad: from.heading_rad,
+                    }
+                } else {
+                    segment.pose_after(&from, ratio * segment.length_m)
+                };
+                if !self.is_free(&pose) {
                     return false;
                 }
             }
-            from = segment.pose_after(&from, segment.length_m);
+            from = end;
         }
         true
     }

@@ -59,6 +59,8 @@ pub struct SafeRules {
     lease: LeaseWatch,
     counts: SafeCounts,
     order: Vec<grants::Candidate>,
+    /// The robots were parked apart; where not, nothing is granted to those that are not.
+    starts_apart: bool,
 }
 
 /// What the safe rules know of a robot beyond its reservation.
@@ -112,15 +114,17 @@ impl SafeRules {
             retracted: Instant::ZERO,
             heard: Instant::ZERO,
         };
+        let traffic = Traffic::new(world, starts);
         Self {
             fleet_id,
+            starts_apart: traffic.first_overlap().is_none(),
             control_period: parameters.control_period(),
             patience: parameters.safe.patience(),
             stuck_after: parameters.stuck_after(),
             reserve_ms: parameters.safe.reserve_ms,
             takes_back: parameters.safe.takes_back,
             margin,
-            traffic: Traffic::new(world, starts),
+            traffic,
             plan: Plan::new(margin, starts.len()),
             robots: vec![robot; starts.len()],
             lease: LeaseWatch::new(&parameters.safe, parameters.clock_is_shared),
@@ -128,11 +132,6 @@ impl SafeRules {
             order: Vec::with_capacity(starts.len()),
             world: Arc::clone(world),
         }
-    }
-
-    /// The reservations, for checks from outside.
-    pub fn traffic(&self) -> &Traffic {
-        &self.traffic
     }
 
     /// `robot` is given the mission `mission_id` along `path`.
@@ -289,7 +288,15 @@ impl Rules for SafeRules {
         self.send_all(cycle);
         self.count_stuck(cycle.now);
         cycle.counters.safe = self.counts;
-        debug_assert_eq!(self.traffic.first_overlap(), None, "reservations overlap");
+        debug_assert!(
+            !self.starts_apart || self.traffic.first_overlap().is_none(),
+            "reservations overlap: {:?}",
+            self.traffic.first_overlap()
+        );
+    }
+
+    fn reservations(&self) -> Option<&Traffic> {
+        Some(&self.traffic)
     }
 
     fn resets_stuck_robots(&self) -> bool {

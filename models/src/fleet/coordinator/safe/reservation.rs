@@ -201,9 +201,14 @@ impl Traffic {
     /// Two robots whose reservations are not apart, if any: the safety invariant's checker.
     pub fn first_overlap(&self) -> Option<(usize, usize)> {
         (0..self.robot_count()).find_map(|robot| {
-            let Span { lower, upper } = self.spans[robot];
-            let conflict = self.first_conflict(robot, lower, upper, &self.spans);
-            conflict.map(|(_, other)| (robot, other))
+            let own = self.spans[robot];
+            let contacts = self.contacts[robot].iter();
+            contacts
+                .filter(|contact| contact.other > robot)
+                .find(|contact| {
+                    common_pair(contact.section(), own, self.spans[contact.other]).is_some()
+                })
+                .map(|contact| (robot, contact.other))
         })
     }
 
@@ -217,19 +222,10 @@ impl Traffic {
         pairs
             .filter_map(|(robot, other)| Some((robot, other, self.ways[robot]?, self.ways[other]?)))
             .find(|&(robot, other, way, others)| {
+                let sections = library.between(way.path, others.path);
                 let (own, taken) = (self.spans[robot], self.spans[other]);
-                library
-                    .between(way.path, others.path)
-                    .iter()
-                    .any(|section| {
-                        (own.lower..=own.upper).any(|index| {
-                            section
-                                .partners(Side::First, index)
-                                .is_some_and(|(first, last)| {
-                                    first <= taken.upper && taken.lower <= last
-                                })
-                        })
-                    })
+                let mut sections = sections.iter();
+                sections.any(|section| common_pair(section, own, taken).is_some())
             })
             .map(|(robot, other, ..)| (robot, other))
     }
@@ -259,4 +255,20 @@ impl Traffic {
         };
         sections.iter().enumerate().filter_map(contact).collect()
     }
+}
+
+/// A pose of `own` and one of `taken` that overlap, if any. Each side of a section knows of a
+/// pose only the first and the last partner; a pair that both sides know is meant.
+fn common_pair(section: &Section, own: Span, taken: Span) -> Option<(usize, usize)> {
+    let from = own.lower.max(section.start(Side::First));
+    let to = own.upper.min(section.end(Side::First));
+    (from..=to).find_map(|index| {
+        let (first, last) = section.partners(Side::First, index)?;
+        (first.max(taken.lower)..=last.min(taken.upper))
+            .find(|&partner| {
+                let back = section.partners(Side::Second, partner);
+                back.is_some_and(|(first, last)| first <= index && index <= last)
+            })
+            .map(|partner| (index, partner))
+    })
 }

@@ -1,7 +1,9 @@
 use super::rig::{CONDITIONS, Chaos, Rig, RigSetup, safe_parameters};
 use super::world::random_scene;
+use crate::fleet::coordinator::parameters::CoordinatorParameters;
+use crate::fleet::coordinator::safe::parameters::{SafeParameters, stop_error_max_m};
 use crate::fleet::mission::MissionMode;
-use crate::fleet::robot::RobotParameters;
+use crate::fleet::robot::{RobotParameters, TrackerKind};
 use crate::fleet::scenario::{Scenario, WorldParameters};
 use crate::random::RandomStream;
 use crate::time::Instant;
@@ -34,6 +36,10 @@ fn check_run(scene: &crate::fleet::scenario::Scene, setup: &RigSetup, seed: u64)
     assert_eq!(tally.section_collisions_count, 0, "{context}");
     assert_eq!(tally.overlaps_count, 0, "{context}");
     assert_eq!(tally.outside_count, 0, "{context}");
+    assert!(
+        tally.stop_error_max_m <= setup.coordinator.safe.stop_error_m + 1e-6,
+        "{context}"
+    );
     assert_eq!(counters.safe.margins_exceeded, 0, "{context}");
     assert_eq!(counters.safe.authorities_exceeded, 0, "{context}");
     assert_eq!(counters.safe.states_impossible, 0, "{context}");
@@ -86,4 +92,120 @@ fn small_scenarios_end_without_overlap_over_any_channel() {
             println!("{scenario:?} {name}: {time_s:.0} s");
         }
     }
+}
+
+#[test]
+fn a_coarse_tracker_keeps_within_the_margin_of_its_stop_error() {
+    let inflation_ms = 100.0;
+    let robot = RobotParameters {
+        tracker: TrackerKind::LegacyRk4,
+        step_inflation: true,
+        inflation_delay_ms: inflation_ms,
+        ..RobotParameters::default()
+    };
+    let step_s = 1e-3 * robot.tracking_period_ms;
+    let stop_error_m = stop_error_max_m(
+        super::world::CART.speed_max_mps,
+        step_s + 1e-3 * inflation_ms,
+        step_s,
+    );
+    for (name, chaos) in CONDITIONS {
+        for seed in 0..3_u64 {
+            let scene = random_scene(5, &mut RandomStream::new(seed, "world"));
+            let setup = RigSetup {
+                coordinator: CoordinatorParameters {
+                    safe: SafeParameters {
+                        stop_error_m,
+                        ..SafeParameters::default()
+                    },
+                    ..safe_parameters()
+                },
+                robot: robot.clone(),
+                missions_per_robot: 3,
+                ..setup(chaos)
+            };
+            let (time_s, _) = check_run(&scene, &setup, seed);
+            println!("{name}, seed {seed}: {time_s:.0} s");
+        }
+    }
+}
+
+#[test]
+fn leases_that_run_out_unanswered_give_way_free_and_stay_safe() {
+    let mut expired_count = 0;
+    for seed in 0..6_u64 {
+        let scene = random_scene(6, &mut RandomStream::new(seed, "world"));
+        let setup = RigSetup {
+            coordinator: CoordinatorParameters {
+                safe: SafeParameters {
+                    lease_ms: 3000.0,
+                    delay_bound_ms: 1000.0,
+                    ..SafeParameters::default()
+                },
+                ..safe_parameters()
+            },
+            missions_per_robot: 4,
+            ..setup(Chaos {
+                loss_ratio: 0.6,
+                delay_max_s: 1.0,
+                ..Chaos::default()
+            })
+        };
+        let mut rig = Rig::new(&scene, &setup, seed);
+        let wanted = u64::from(setup.missions_per_robot) * scene.starts.len() as u64;
+        rig.run(seconds(20_000), |rig| {
+            rig.coordinator.counters().counts.missions_done == wanted
+        });
+        let (counters, tally) = (rig.coordinator.counters(), rig.referee.tally());
+        let context = format!("seed {seed}: {:?} {tally:?}", counters.safe);
+        assert_eq!(counters.counts.missions_done, wanted, "{context}");
+        assert_eq!(
+            tally.overlaps_count + tally.section_collisions_count,
+            0,
+            "{context}"
+        );
+        assert_eq!(counters.safe.delay_bound_violations, 0, "{context}");
+        expired_count += counters.safe.leases_expired;
+    }
+    assert!(expired_count > 0);
+}
+
+#[test]
+fn a_delay_above_the_bound_of_the_lease_freezes_grants() {
+    let scene = random_scene(3, &mut RandomStream::new(1, "world"));
+    let setup = RigSetup {
+        coordinator: CoordinatorParameters {
+            safe: SafeParameters {
+                lease_ms: 3000.0,
+                delay_bound_ms: 500.0,
+                ..SafeParameters::default()
+            },
+            ..safe_parameters()
+        },
+        ..setup(Chaos {
+            delay_max_s: 1.0,
+            ..Chaos::default()
+        })
+    };
+    let mut rig = Rig::new(&scene, &setup, 1);
+    rig.run(seconds(200), |_| false);
+    let safe = &rig.coordinator.counters().safe;
+    assert!(safe.delay_bound_violations > 100 && safe.cycles_frozen > 150);
+}
+
+#[test]
+fn equal_seeds_give_equal_runs() {
+    let run = || {
+        let scene = random_scene(5, &mut RandomStream::new(3, "world"));
+        let (_, chaos) = CONDITIONS[5];
+        let mut rig = Rig::new(&scene, &setup(chaos), 3);
+        rig.run(seconds(600), |_| false);
+        let counters = rig.coordinator.counters();
+        (
+            counters.counts,
+            counters.safe,
+            rig.referee.tally().travelled_m.to_bits(),
+        )
+    };
+    assert_eq!(run(), run());
 }

@@ -94,6 +94,7 @@ pub(super) struct Rig {
     random: RandomStream,
     queue: BinaryHeap<Reverse<(Instant, u64)>>,
     letters: Vec<Option<Letter>>,
+    free: Vec<usize>,
 }
 
 pub(super) struct RigSetup {
@@ -136,6 +137,7 @@ impl Rig {
             random: stream("channel"),
             queue: BinaryHeap::new(),
             letters: Vec::new(),
+            free: Vec::new(),
         }
     }
 
@@ -152,8 +154,7 @@ impl Rig {
             if phase_s < chaos.stall_s {
                 at = at + Duration::from_secs_f64(chaos.stall_s - phase_s);
             }
-            let free = self.letters.iter().position(Option::is_none);
-            let slot = free.unwrap_or(self.letters.len());
+            let slot = self.free.pop().unwrap_or(self.letters.len());
             if slot == self.letters.len() {
                 self.letters.push(None);
             }
@@ -197,6 +198,12 @@ impl Rig {
                 for message in out {
                     self.post(|| Letter::ToRobot(message));
                 }
+                if cfg!(debug_assertions)
+                    && let Some(traffic) = self.coordinator.reservations()
+                {
+                    assert_eq!(traffic.first_overlap_by_library(), None, "at {at:?}");
+                    assert_eq!(traffic.first_overlap(), None, "at {at:?}");
+                }
                 next_cycle = at + CYCLE;
                 if is_over(self) {
                     return at;
@@ -213,6 +220,7 @@ impl Rig {
             return;
         };
         let slot = usize::try_from(slot).unwrap();
+        self.free.push(slot);
         let referee = &mut self.referee;
         let mut truth = |truth| referee.on_truth(&truth);
         match self.letters[slot].take().unwrap() {

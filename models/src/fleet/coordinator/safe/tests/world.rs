@@ -25,7 +25,7 @@ const POSES: u32 = 200;
 /// each two bays of different sides.
 pub(super) fn random_scene(robot_count: usize, random: &mut RandomStream) -> Scene {
     let length_m = 20.0 + 20.0 * random.uniform();
-    let gap_m = 1.0 + 2.0 * random.uniform();
+    let gap_m = 1.2 + 2.0 * random.uniform();
     let mut bays = Vec::new();
     for x_m in [0.0, length_m] {
         for row in 0..robot_count {
@@ -57,8 +57,10 @@ pub(super) fn random_scene(robot_count: usize, random: &mut RandomStream) -> Sce
 /// From one bay to the other, straight for two vehicle lengths at the ends, wavy between.
 fn curve(from: &Pose, to: &Pose, random: &mut RandomStream) -> Vec<Pose> {
     let straight_m = 4.0;
-    let (wave_m, waves) = (3.0 * random.normal(), 1.0 + 2.0 * random.uniform());
+    let waves = 1.0 + 2.0 * random.uniform();
     let free_m = to.x_m - from.x_m - 2.0 * straight_m;
+    // Curves too tight for a cart would make the guarded footprints of neighbouring bays meet.
+    let wave_m = 0.08 * free_m * (2.0 * random.uniform() - 1.0);
     let height_m = |x_m: f64| {
         let ratio = ((x_m - from.x_m - straight_m) / free_m).clamp(0.0, 1.0);
         let blend = ratio * ratio * (3.0 - 2.0 * ratio);
