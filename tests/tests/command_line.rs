@@ -93,12 +93,16 @@ fn every_shipped_topology_is_fit_and_so_are_the_commands_it_tells_of() {
         if path.extension().is_none_or(|extension| extension != "toml") {
             continue;
         }
-        topology_count += 1;
         let name = path.file_name().unwrap().to_str().unwrap();
+        let text = fs::read_to_string(&path).unwrap();
+        // A file for the tables alone runs no process; the tests of the tables run it.
+        if text.contains("hil-runtime tables ") && !text.contains("[processes") {
+            continue;
+        }
+        topology_count += 1;
         let checked = run_in(&folder, &["--topology", name, "--check"]);
         assert_code(&checked, 0);
         assert!(checked.stdout.contains("the file is valid"), "{checked:?}");
-        let text = fs::read_to_string(&path).unwrap();
         let told = text.lines().filter_map(|line| {
             let (comment, command) = line.split_once("hil-runtime ")?;
             comment.starts_with('#').then_some(command)

@@ -150,7 +150,7 @@ fn an_incident_names_what_each_robot_took_last_and_what_it_was_sent_after() {
         fleet_id: 1,
         robots: [2, 4],
         mission_ids: [3, 1],
-        is_under_way: [true, true],
+        is_under_way: [true; 2],
         position_m: [1.0, 2.0],
         causes: [
             Cause {
