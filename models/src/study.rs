@@ -205,9 +205,12 @@ impl Cell {
         }
     }
 
-    /// True for what a page puts at the right edge of its column.
+    /// True for a number or an interval: what a page puts at the right edge of its column.
     pub fn is_figure(&self) -> bool {
-        !matches!(self, Self::Text(_) | Self::Verdict(_))
+        matches!(
+            self,
+            Self::Count(_) | Self::Number { .. } | Self::Interval { .. }
+        )
     }
 }
 

@@ -111,6 +111,7 @@ impl Coordinator {
     /// Then only commands suffer from the network.
     pub fn observe(&mut self, now: Instant, state: &State) {
         self.roster.observe(now, state, &mut self.counters.counts);
+        self.rules.on_state(now, state);
     }
 
     /// One control cycle; gives each message to `send`.

@@ -27,6 +27,8 @@ pub(crate) struct Candidate {
 
 /// Ends that are tried for one extension, each nearer than the one before.
 const ENDS_MAX: usize = 4;
+/// Robots that are looked at along one queue.
+const QUEUE_MAX: usize = 16;
 /// A robot from which authority was taken back keeps what it then gets for this long.
 const SPARED: Duration = Duration::from_secs(30);
 
@@ -48,7 +50,12 @@ impl SafeRules {
             view.stopped_by = None;
         }
         for candidate in &order {
-            self.extend(cycle.now, candidate, may_reorder);
+            if self.extend(candidate, may_reorder) {
+                self.robots[candidate.robot].waiting_since = None;
+            } else {
+                let since = &mut self.robots[candidate.robot].waiting_since;
+                *since = since.or(Some(cycle.now));
+            }
         }
         if self.takes_back && may_reorder {
             for candidate in &order {
@@ -60,13 +67,8 @@ impl SafeRules {
     }
 
     fn is_anyone_starving(&self, now: Instant) -> bool {
-        (0..self.robots.len()).any(|robot| {
-            let view = &self.robots[robot];
-            view.is_admitted
-                && !view.ledger.is_done()
-                && view.ledger.bound() < self.traffic.last(robot)
-                && now > view.served + self.patience
-        })
+        let mut waits = self.robots.iter().filter_map(|view| view.waiting_since);
+        waits.any(|since| now > since + self.patience)
     }
 
     fn admit_all(&mut self, may_reorder: bool) {
@@ -100,7 +102,9 @@ impl SafeRules {
         // The robot may be almost a pose beyond the one it passed last.
         let way_m = path.way_to_m(ledger.lower() + 1)
             + reach_m(&self.world.vehicle, view.speed_mps, time_s);
-        let want = (path.index_at(way_m) + 1).min(last);
+        // One that came to stand short of the end of its authority still needs more to go on.
+        let least = ledger.lower() + self.margin.below + 2;
+        let want = (path.index_at(way_m) + 1).max(least).min(last);
         (want > ledger.bound()).then_some(Candidate {
             robot,
             want,
@@ -109,22 +113,29 @@ impl SafeRules {
     }
 
     /// Sorts by how many rivals go before, so that no inconsistency of a policy matters.
-    fn rank(&self, order: &mut [Candidate], cycle: &Cycle<'_>) {
-        for position in 0..order.len() {
-            for rival in position + 1..order.len() {
-                let (first, second) = (order[position], order[rival]);
-                for contact in self.wanted(&first) {
-                    if contact.other != second.robot
-                        || contact.others.lower > self.margin.upper(second.want, usize::MAX)
-                        || contact.others.upper <= self.traffic.span(second.robot).upper
-                    {
-                        continue;
-                    }
-                    match self.compare(cycle, first.robot, contact) {
-                        Ordering::Less => order[rival].rivals_before += 1,
-                        Ordering::Greater => order[position].rivals_before += 1,
-                        Ordering::Equal => {}
-                    }
+    fn rank(&mut self, order: &mut [Candidate], cycle: &Cycle<'_>) {
+        self.places.fill(None);
+        for (place, candidate) in order.iter().enumerate() {
+            self.places[candidate.robot] = Some(place);
+        }
+        for place in 0..order.len() {
+            let first = order[place];
+            for contact in self.wanted(&first) {
+                // Each pair once, from the lower number.
+                let rival = self.places[contact.other].filter(|rival| *rival > place);
+                let Some(rival) = rival else {
+                    continue;
+                };
+                let second = order[rival];
+                if contact.others.lower > self.margin.upper(second.want, usize::MAX)
+                    || contact.others.upper <= self.traffic.span(second.robot).upper
+                {
+                    continue;
+                }
+                match self.compare(cycle, first.robot, contact) {
+                    Ordering::Less => order[rival].rivals_before += 1,
+                    Ordering::Greater => order[place].rivals_before += 1,
+                    Ordering::Equal => {}
                 }
             }
         }
@@ -154,7 +165,8 @@ impl SafeRules {
         cycle.policy.compare(&contest).then_with(by_number)
     }
 
-    fn extend(&mut self, now: Instant, candidate: &Candidate, may_reorder: bool) {
+    /// Gives the candidate as much as it may have; false when that is nothing.
+    fn extend(&mut self, candidate: &Candidate, may_reorder: bool) -> bool {
         let robot = candidate.robot;
         let (last, margin) = (self.traffic.last(robot), self.margin);
         let bound = self.robots[robot].ledger.bound();
@@ -178,8 +190,7 @@ impl SafeRules {
                 Verdict::Withheld => self.counts.grants_withheld += 1,
                 verdict => {
                     self.counts.plans_reordered += u64::from(verdict == Verdict::Reorders);
-                    self.give(now, robot, end);
-                    return;
+                    return self.give(robot, end);
                 }
             }
             let start = section_start(self.traffic.contacts(robot), upper);
@@ -190,18 +201,19 @@ impl SafeRules {
         if planned > bound {
             let upper = margin.upper(planned, last);
             if self.plan.extend(&self.traffic, robot, upper, false) != Verdict::Withheld {
-                self.give(now, robot, planned);
+                return self.give(robot, planned);
             }
         }
+        false
     }
 
-    fn give(&mut self, now: Instant, robot: usize, end: usize) {
-        let view = &mut self.robots[robot];
-        if view.ledger.send(end).is_some() {
-            view.served = now;
+    fn give(&mut self, robot: usize, end: usize) -> bool {
+        let is_given = self.robots[robot].ledger.send(end).is_some();
+        if is_given {
             self.counts.grants += 1;
             self.update_span(robot);
         }
+        is_given
     }
 
     /// Asks way back from the robot that stops `robot`, where the policy prefers the latter and
@@ -255,9 +267,9 @@ impl SafeRules {
             if roster.robots()[robot].waiting_since.is_none() {
                 continue;
             }
-            // Whoever waits for one that waits is held up by the one in front; chains are short.
+            // Whoever waits for one that waits is held up by the one in front as well.
             let mut next = self.robots[robot].stopped_by;
-            for _ in 0..self.robots.len() {
+            for _ in 0..QUEUE_MAX {
                 let Some(holder) = next.filter(|holder| *holder != robot) else {
                     break;
                 };

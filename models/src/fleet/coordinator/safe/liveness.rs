@@ -18,7 +18,9 @@
 //! is free of all reservations, and giving it keeps this very plan valid. With eventual delivery
 //! it gets there, the move is dropped, and the same holds for the next.
 //!
-//! **No starvation.** Plans may be reordered only while no robot has waited beyond its patience.
+//! **No starvation.** A robot *waits* while it could use more way and gets none; a path being
+//! finite, one that does not wait for ever arrives. Plans may be reordered only while no robot has
+//! waited beyond its patience.
 //! From then on the present plan is kept and new missions are added at its end; it has finitely
 //! many moves, the waiting robot's last one among them, so its mission ends.
 //!
@@ -82,6 +84,9 @@ pub(crate) struct Plan {
     spans: Vec<Span>,
     pending: Vec<usize>,
     is_pending: Vec<bool>,
+    /// Robots a search is about: those connected by sections. The rest keeps its moves.
+    is_member: Vec<bool>,
+    found: Vec<usize>,
 }
 
 impl Plan {
@@ -93,6 +98,8 @@ impl Plan {
             spans: Vec::with_capacity(robot_count),
             pending: Vec::with_capacity(robot_count),
             is_pending: vec![false; robot_count],
+            is_member: vec![false; robot_count],
+            found: Vec::with_capacity(robot_count),
         }
     }
 
@@ -135,9 +142,9 @@ impl Plan {
             return true;
         }
         may_reorder && {
-            self.begin_search(traffic, None);
-            self.pending.push(robot);
-            self.is_pending[robot] = true;
+            self.begin_search(traffic, robot);
+            // Not yet among the moves, so it is tried first; last is where it belongs.
+            self.pending.rotate_left(1);
             self.search(traffic)
         }
     }
@@ -156,7 +163,7 @@ impl Plan {
         if !may_reorder {
             return Verdict::Withheld;
         }
-        self.begin_search(traffic, Some(robot));
+        self.begin_search(traffic, robot);
         self.spans[robot].upper = upper;
         if self.search(traffic) {
             Verdict::Reorders
@@ -174,7 +181,15 @@ impl Plan {
                 && contact.others.upper > traffic.span(contact.other).upper
         };
         let contacts = traffic.contacts(robot);
-        if !contacts.iter().any(is_new) {
+        self.is_member.fill(false);
+        self.spans.resize(traffic.robot_count(), Span::at(0));
+        let mut may_block = false;
+        for contact in contacts.iter().filter(|contact| is_new(contact)) {
+            may_block = true;
+            self.is_member[contact.other] = true;
+            self.spans[contact.other] = traffic.span(contact.other);
+        }
+        if !may_block {
             return true;
         }
         let last = traffic.last(robot);
@@ -182,8 +197,6 @@ impl Plan {
             lower: traffic.span(robot).lower,
             upper,
         };
-        self.spans.clear();
-        self.spans.extend_from_slice(traffic.spans());
         for step in &self.moves {
             if step.robot == robot {
                 let standing = self.margin.standing(step.to, last);
@@ -194,6 +207,9 @@ impl Plan {
                     let lower = end.saturating_sub(self.margin.below).max(own.lower);
                     Span { lower, ..own }
                 };
+                continue;
+            }
+            if !self.is_member[step.robot] {
                 continue;
             }
             let end = self.margin.standing(step.to, traffic.last(step.robot));
@@ -214,21 +230,37 @@ impl Plan {
 
     /// Starts from the present reservations; robots are tried in the order in which the present
     /// plan finishes them, `first` before all.
-    fn begin_search(&mut self, traffic: &Traffic, first: Option<usize>) {
+    fn begin_search(&mut self, traffic: &Traffic, first: usize) {
         self.spans.clear();
         self.spans.extend_from_slice(traffic.spans());
+        self.is_pending.fill(false);
+        self.is_pending[first] = true;
         self.pending.clear();
-        self.pending.extend(first);
+        self.pending.push(first);
+        self.mark_connected(traffic, first);
         for step in &self.moves {
-            if step.to >= traffic.last(step.robot) && Some(step.robot) != first {
+            let is_last = step.to >= traffic.last(step.robot);
+            if is_last && self.is_member[step.robot] && step.robot != first {
                 self.pending.push(step.robot);
+                self.is_pending[step.robot] = true;
             }
         }
-        self.is_pending.fill(false);
-        for &robot in &self.pending {
-            self.is_pending[robot] = true;
-        }
         self.trial.clear();
+    }
+
+    fn mark_connected(&mut self, traffic: &Traffic, first: usize) {
+        self.is_member.fill(false);
+        self.is_member[first] = true;
+        self.found.clear();
+        self.found.push(first);
+        while let Some(robot) = self.found.pop() {
+            for contact in traffic.contacts(robot) {
+                if !self.is_member[contact.other] {
+                    self.is_member[contact.other] = true;
+                    self.found.push(contact.other);
+                }
+            }
+        }
     }
 
     fn search(&mut self, traffic: &Traffic) -> bool {
@@ -254,6 +286,10 @@ impl Plan {
             }
             aside_left -= 1;
         }
+        // Robots without a section in common do not care in which order they move.
+        let is_member = &self.is_member;
+        let others = self.moves.iter().filter(|step| !is_member[step.robot]);
+        self.trial.extend(others);
         core::mem::swap(&mut self.moves, &mut self.trial);
         true
     }

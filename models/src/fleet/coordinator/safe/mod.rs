@@ -59,6 +59,8 @@ pub struct SafeRules {
     lease: LeaseWatch,
     counts: SafeCounts,
     order: Vec<grants::Candidate>,
+    /// Per robot its place in `order`.
+    places: Vec<Option<usize>>,
     /// The robots were parked apart; where not, nothing is granted to those that are not.
     starts_apart: bool,
 }
@@ -73,8 +75,8 @@ struct SafeRobot {
     round_trip: RoundTrip,
     speed_mps: f64,
     header_id: u32,
-    /// Last time it got more authority, or its mission.
-    served: Instant,
+    /// Since when it could use more authority and did not get any.
+    waiting_since: Option<Instant>,
     /// Last time it was seen further on, or its mission given.
     moved: Instant,
     is_counted_stuck: bool,
@@ -105,7 +107,7 @@ impl SafeRules {
             round_trip: RoundTrip::default(),
             speed_mps: 0.0,
             header_id: 0,
-            served: Instant::ZERO,
+            waiting_since: None,
             moved: Instant::ZERO,
             is_counted_stuck: false,
             held_up_count: 0,
@@ -130,6 +132,7 @@ impl SafeRules {
             lease: LeaseWatch::new(&parameters.safe, parameters.clock_is_shared),
             counts: SafeCounts::default(),
             order: Vec::with_capacity(starts.len()),
+            places: vec![None; starts.len()],
             world: Arc::clone(world),
         }
     }
@@ -142,7 +145,7 @@ impl SafeRules {
         view.is_admitted = false;
         view.round_trip.forget_question();
         view.speed_mps = 0.0;
-        view.served = now;
+        view.waiting_since = None;
         view.moved = now;
         view.is_counted_stuck = false;
         self.plan.finish(robot);
@@ -158,7 +161,8 @@ impl SafeRules {
         let upper = if bound == 0 && lower == 0 {
             0
         } else {
-            self.margin.upper(bound, last).max(lower)
+            // One that went too far is at least between its last pose and the next.
+            self.margin.upper(bound, last).max((lower + 1).min(last))
         };
         self.traffic.reserve(robot, Span { lower, upper });
     }
@@ -271,7 +275,7 @@ impl Rules for SafeRules {
             view.is_counted_stuck = false;
         }
         let (lower, bound) = (view.ledger.lower(), view.ledger.bound());
-        if lower > bound + self.margin.above {
+        if lower >= bound + self.margin.above && lower < self.traffic.last(robot) {
             self.counts.margins_exceeded += 1;
         }
         let is_done = view.ledger.is_done();
