@@ -12,7 +12,7 @@ use crate::fleet::experiment::post::{Letter, Post, Rank};
 use crate::fleet::experiment::setup::{Setup, StatusPath};
 use crate::fleet::experiment::tally::FleetTally;
 use crate::fleet::messages::{State, ToRobot, Truth};
-use crate::fleet::referee::{Referee, SCAN_PERIOD};
+use crate::fleet::referee::{Incident, Referee, SCAN_PERIOD};
 use crate::fleet::robot::{Robot, RobotParameters};
 use crate::fleet::robots::robot_stream;
 use crate::fleet::scenario::Scene;
@@ -273,6 +273,11 @@ impl Experiment {
     /// What came of the run so far.
     pub fn tally(&self) -> FleetTally {
         FleetTally::of(self)
+    }
+
+    /// What must not have happened, in order of time.
+    pub fn incidents(&self) -> &[Incident] {
+        self.referee.incidents()
     }
 
     pub(crate) fn coordinator(&self) -> &Coordinator {

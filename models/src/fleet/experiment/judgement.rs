@@ -21,7 +21,8 @@ pub(crate) fn demand_text(demand: Demand) -> String {
         Demand::None => "reported only".to_owned(),
         Demand::Below(high) => format!("95 % < {high}"),
         Demand::Within(low, high) => format!("> 0 and {low} to {high}"),
-        Demand::NoneAtAll => "none".to_owned(),
+        Demand::NoneSeen => "none".to_owned(),
+        Demand::NoneAtAll => "none by any checker".to_owned(),
     }
 }
 
@@ -44,8 +45,11 @@ pub(crate) fn verdict_of(demand: Demand, tally: &FleetTally) -> Option<bool> {
         }
         Demand::Within(least, most) if high < least || low > most => Some(false),
         Demand::Within(least, most) => (low >= least && high <= most).then_some(true),
+        Demand::NoneSeen if tally.collision_count() > 0 => Some(false),
         Demand::NoneAtAll if tally.any_collision_count() > 0 => Some(false),
-        Demand::NoneAtAll => (tally.section_count() >= TELLING_COUNT).then_some(true),
+        Demand::NoneSeen | Demand::NoneAtAll => {
+            (tally.section_count() >= TELLING_COUNT).then_some(true)
+        }
     }
 }
 
@@ -254,6 +258,7 @@ mod tests {
         assert_eq!(verdict(tally(1, 100)), Some(false));
         let mut overlap = tally(0, 1_000_000);
         overlap.referee.overlaps_count = 1;
+        assert_eq!(verdict_of(Demand::NoneSeen, &overlap), Some(true));
         assert_eq!(verdict(overlap), Some(false));
         let mut early = tally(0, 0);
         early.referee.overlaps_count = 1;

@@ -164,6 +164,9 @@ fn published_table(scenario: Scenario, results: &Results<'_>) -> Table {
             "rows measured with hardware in the loop are printed as published; they depend on \
              hosts and radio"
                 .to_owned(),
+            "an overlap outside every section is a graze between two path poses, which a list of \
+             sections at the poses cannot hold; the safe coordinator's guarded sections do"
+                .to_owned(),
         ],
     }
 }

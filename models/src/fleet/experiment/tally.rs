@@ -59,7 +59,7 @@ impl FleetTally {
             robots.add(robot.counters());
         }
         let run_s = experiment.now().seconds_since(Instant::ZERO);
-        let first_at = experiment.referee().incidents().first();
+        let first_at = experiment.incidents().first();
         Self {
             referee: *experiment.referee().tally(),
             coordinator: experiment.coordinator().counters().counts,
