@@ -173,7 +173,6 @@ impl ClosedLoop {
     }
 }
 
-#[cfg(test)]
 mod tests {
     use super::*;
     use crate::fleet::mission::MissionMode;
@@ -211,8 +210,26 @@ mod tests {
             assert_eq!(tally.overlaps_count, 0, "{scenario:?}");
             assert_eq!(counts.resets, 0, "{scenario:?}: {counts:?}");
             assert!(counts.missions_done > 150, "{scenario:?}: {counts:?}");
-            println!("{scenario:?} {counts:?} {tally:?}");
         }
+    }
+
+    #[test]
+    fn lost_commands_collide_and_lost_states_do_not() {
+        let collisions = |channel| {
+            let mut fleet = shuttle(Scenario::ThreeCycle, channel, 11);
+            fleet.run_until(Instant::from_ns(4 * 3_600_000_000_000));
+            fleet.referee.tally().overlaps_count
+        };
+        let lossy = Channel {
+            command_loss_ratio: 0.3,
+            ..Channel::default()
+        };
+        assert!(collisions(lossy) > 0);
+        let blind = Channel {
+            status_loss_ratio: 0.3,
+            ..Channel::default()
+        };
+        assert_eq!(collisions(blind), 0);
     }
 
     #[test]

@@ -8,14 +8,12 @@ use std::sync::Arc;
 
 use crate::fleet::coordinator::counters::CoordinatorCounts;
 use crate::fleet::coordinator::parameters::{CoordinatorParameters, MessageOrder};
-use crate::fleet::coordinator::policy::Contender;
 use crate::fleet::coordinator::sections::SectionBook;
 pub use crate::fleet::coordinator::view::{ActiveMission, RobotView};
 use crate::fleet::messages::{Header, State, ToRobot};
 use crate::fleet::mission::MissionSource;
 use crate::fleet::path::Path;
 use crate::fleet::scenario::Scene;
-use crate::fleet::section::Side;
 use crate::fleet::world::{BayIndex, Route, SectionLibrary, World};
 use crate::time::Instant;
 
@@ -353,13 +351,6 @@ impl Roster {
         counts.mission_messages += 1;
         self.next_reset = now + RESET_PAUSE;
         send(view.mission_message(now, self.fleet_id, robot_id));
-    }
-
-    /// The robot on `side` of the section in `slot` as an ordering policy sees it.
-    pub fn contender(&self, slot: usize, side: Side) -> Option<Contender> {
-        let active = self.sections.get(slot)?;
-        let robot = active.robot(side);
-        Some(self.robots[robot].contender(robot, active.start(side)))
     }
 }
 

@@ -4,6 +4,10 @@
 //! It looks every [`SCAN_PERIOD`], as often as the original's checker. What begins and ends between
 //! two looks it does not see: at most an overlap shorter than 30 ms, which two robots crossing at
 //! 6 m/s can make 0.2 m deep.
+//!
+//! A collision, once counted, is over when the two are apart by more than two pose spacings. Less
+//! would count one collision many times: at the last poses passed, where the original's checker
+//! looks, robots that follow each other closely overlap and part with each pose.
 
 mod pairs;
 mod sections;
@@ -43,6 +47,8 @@ pub struct Referee {
     tracks: Vec<Track>,
     finder: PairFinder,
     sections: ActiveSections,
+    /// Robots this far apart have separated.
+    separated_m: f64,
     overlapping: Vec<[u32; 2]>,
     tally: Tally,
     incidents: Vec<Incident>,
@@ -60,12 +66,14 @@ impl Referee {
             .map(|path| path.spacing_m())
             .fold(0.0, f64::max);
         // The original's checker looks where each robot was up to a pose spacing before.
-        let reach_m = 2.0 * world.vehicle.footprint.radius_m() + 2.0 * spacing_m;
+        let separated_m = 2.0 * spacing_m;
+        let reach_m = 2.0 * world.vehicle.footprint.radius_m() + separated_m;
         Self {
             per_fleet,
             tracks: fleet.into_iter().cycle().take(count).collect(),
             finder: PairFinder::new(reach_m, per_fleet),
             sections: ActiveSections::new(count),
+            separated_m,
             overlapping: Vec::with_capacity(4 * count),
             tally: Tally::default(),
             incidents: Vec::with_capacity(INCIDENTS_MAX.min(64)),
@@ -216,8 +224,16 @@ impl Referee {
     fn judge(&mut self, now: Instant, pair: [u32; 2]) {
         let [one, other] = pair.map(|robot| &self.tracks[robot as usize]);
         let vehicle = &self.world.vehicle;
+        let covered = [one, other].map(|track| track.covered(vehicle));
+        let gap_m = axis_gap_m(&covered[0], &covered[1]);
+        let least_m = self.tally.separation_min_m.unwrap_or(f64::INFINITY);
+        if gap_m < least_m {
+            let distance_m = covered[0].distance_m(&covered[1]);
+            self.tally.separation_min_m = Some(least_m.min(distance_m));
+        }
+        let is_separated = gap_m > self.separated_m;
         if one.is_driving && other.is_driving {
-            let begun_count = self.sections.judge(pair, || {
+            let begun_count = self.sections.judge(pair, is_separated, || {
                 let at_index = [one, other].map(|track| track.covered_at_index(vehicle));
                 at_index[0].overlaps(&at_index[1])
             });
@@ -226,21 +242,13 @@ impl Referee {
                 self.add_incident(now, pair, IncidentKind::Section);
             }
         }
-        let [one, other] = pair.map(|robot| &self.tracks[robot as usize]);
-        let covered = [one, other].map(|track| track.covered(&self.world.vehicle));
-        let gap_m = axis_gap_m(&covered[0], &covered[1]);
-        let least_m = self.tally.separation_min_m.unwrap_or(f64::INFINITY);
-        if gap_m < least_m {
-            let distance_m = covered[0].distance_m(&covered[1]);
-            self.tally.separation_min_m = Some(least_m.min(distance_m));
-        }
         let known = self.overlapping.iter().position(|known| *known == pair);
-        match (gap_m < 0.0, known) {
-            (true, None) => {
+        match known {
+            None if gap_m < 0.0 => {
                 self.overlapping.push(pair);
                 self.count_overlap(now, pair);
             }
-            (false, Some(position)) => {
+            Some(position) if is_separated => {
                 self.overlapping.swap_remove(position);
             }
             _ => {}
@@ -271,6 +279,7 @@ impl Referee {
             fleet_id: pair[0] / per_fleet,
             robots: pair.map(|robot| robot % per_fleet),
             mission_ids: [one.mission_id, other.mission_id],
+            is_under_way: [one.is_driving, other.is_driving],
             position_m: [0, 1].map(|axis| 0.5 * (one.position[axis] + other.position[axis])),
             causes: [one.cause, other.cause],
         });

@@ -8,6 +8,9 @@ const ALL_PAIRS_MAX: usize = 16;
 
 const NONE: u32 = u32::MAX;
 
+/// A cell and half of its neighbours: the other half looks this way itself.
+const FORWARD_CELLS: [[i32; 2]; 5] = [[0, 0], [1, -1], [1, 0], [1, 1], [0, 1]];
+
 /// Finds the pairs of robots of one fleet within a reach of each other.
 #[derive(Debug, Clone)]
 pub(crate) struct PairFinder {
@@ -80,15 +83,18 @@ impl PairFinder {
         }
         for (member, track) in members.iter().enumerate() {
             let [column, row] = self.cells[member];
-            for neighbour in (-1..=1).flat_map(|dx| (-1..=1).map(move |dy| [column + dx, row + dy]))
-            {
+            for [right, up] in FORWARD_CELLS {
+                let neighbour = [column + right, row + up];
+                let is_own = neighbour == [column, row];
                 let mut other = self.heads[self.slot(neighbour)];
                 while other != NONE {
                     let index = other as usize;
                     other = self.links[index];
-                    let is_candidate = index > member && self.cells[index] == neighbour;
+                    let is_candidate =
+                        self.cells[index] == neighbour && (!is_own || index > member);
                     if is_candidate && is_near(track, &members[index], self.reach_m) {
-                        self.near.push(pair(offset + member, offset + index));
+                        let (low, high) = (member.min(index), member.max(index));
+                        self.near.push(pair(offset + low, offset + high));
                     }
                 }
             }

@@ -116,8 +116,14 @@ impl ActiveSections {
     }
 
     /// Goes through the sections of a pair that both are in; `is_overlapping` says whether they
-    /// overlap at the last poses passed. Gives the number of collisions that began.
-    pub(crate) fn judge(&mut self, pair: [u32; 2], is_overlapping: impl Fn() -> bool) -> u32 {
+    /// overlap at the last poses passed, `is_separated` whether a collision is over. Gives the
+    /// number of collisions that began.
+    pub(crate) fn judge(
+        &mut self,
+        pair: [u32; 2],
+        is_separated: bool,
+        is_overlapping: impl Fn() -> bool,
+    ) -> u32 {
         let mut overlap = None;
         let mut begun_count = 0;
         for &id in &self.of_robot[pair[0] as usize] {
@@ -125,9 +131,12 @@ impl ActiveSections {
             if !section.robots.contains(&pair[1]) || section.is_inside != [true; 2] {
                 continue;
             }
-            let is_overlapping = *overlap.get_or_insert_with(&is_overlapping);
-            begun_count += u32::from(is_overlapping && !section.is_collision);
-            section.is_collision = is_overlapping;
+            if is_separated {
+                section.is_collision = false;
+            } else if !section.is_collision && *overlap.get_or_insert_with(&is_overlapping) {
+                section.is_collision = true;
+                begun_count += 1;
+            }
         }
         begun_count
     }

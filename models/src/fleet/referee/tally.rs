@@ -17,7 +17,8 @@ pub struct Tally {
     /// Of those, the ones both robots were in at the same time.
     pub encounters_count: u64,
     /// Sections with a collision by the original's checker: both robots in the section, and
-    /// footprints overlapping at the last path poses passed. One count until they separate.
+    /// footprints overlapping at the last path poses passed. One count per section until they
+    /// separate.
     pub section_collisions_count: u64,
     /// Times two robots of a fleet overlapped where they truly were, until they separated.
     pub overlaps_count: u64,
@@ -98,8 +99,10 @@ pub struct Incident {
     pub fleet_id: u32,
     /// The two robots, the smaller number first.
     pub robots: [u32; 2],
-    /// Their missions; 0 if none.
+    /// Their missions, also when done; 0 before the first.
     pub mission_ids: [u32; 2],
+    /// Whether each was on its mission, and not parked.
+    pub is_under_way: [bool; 2],
     /// Half way between the two, map frame, metres.
     pub position_m: [f64; 2],
     /// Per robot, what became of its last authority.

@@ -3,7 +3,7 @@
 
 use std::sync::Arc;
 
-use crate::fleet::geometry::{OrientedBox, Pose};
+use crate::fleet::geometry::{OrientedBox, Pose, floor_index};
 use crate::fleet::messages::Truth;
 use crate::fleet::path::{Path, PathId};
 use crate::fleet::referee::tally::Cause;
@@ -106,10 +106,12 @@ impl Track {
             self.position = [self.stand.x_m, self.stand.y_m];
             return false;
         };
-        let index = path.index_at(way_m);
+        let position = way_m / path.spacing_m();
+        // As the path's own rule for an index, without dividing once more.
+        let index = floor_index(position + 1e-9).min(path.last_index());
         let here = &path.poses()[index];
         let next = &path.poses()[(index + 1).min(path.last_index())];
-        let ratio = (way_m / path.spacing_m() - index as f64).clamp(0.0, 1.0);
+        let ratio = (position - index as f64).clamp(0.0, 1.0);
         self.position = [
             here.x_m + ratio * (next.x_m - here.x_m),
             here.y_m + ratio * (next.y_m - here.y_m),

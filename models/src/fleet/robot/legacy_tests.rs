@@ -69,10 +69,16 @@ fn the_overshoot_of_isolated_stops_is_that_of_the_original() {
 fn no_stop_exceeds_the_bound() {
     for (limits, inflation_s) in [(HARBOR, 0.1), (HARBOR, 0.05), (WAREHOUSE, 0.1)] {
         let bound_m = limits.speed_max_mps * (2.0 * (TICK_S + inflation_s) + 0.5 * TICK_S);
-        for seed in 0..5 {
-            let worst_m = *overshoots_m(limits, inflation_s, seed).last().unwrap();
+        let mut beyond_count = 0;
+        for seed in 0..10 {
+            let overshoots = overshoots_m(limits, inflation_s, seed);
+            beyond_count += overshoots.iter().filter(|past_m| **past_m > 0.9).count();
+            let worst_m = *overshoots.last().unwrap();
             assert!(worst_m < bound_m, "{worst_m} of {bound_m}");
         }
+        println!("{limits:?} {inflation_s}: {beyond_count} of 20000 beyond 0.9 m");
+        let is_harbor_at_100_ms = limits.speed_max_mps > 5.0 && inflation_s > 0.06;
+        assert_eq!(beyond_count > 0, is_harbor_at_100_ms);
     }
 }
 
