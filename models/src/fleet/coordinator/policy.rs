@@ -6,7 +6,7 @@ use core::fmt::Debug;
 
 use serde::{Deserialize, Serialize};
 
-use crate::fleet::section::Section;
+use crate::fleet::section::{Section, Side};
 use crate::time::Instant;
 
 /// One of two robots that both need a section.
@@ -74,8 +74,8 @@ pub enum PolicyName {
     FirstCome,
     /// [`LongestQueue`].
     LongestQueue,
-    /// [`FirstOut`].
-    FirstOut,
+    /// [`QuickestThrough`].
+    QuickestThrough,
 }
 
 impl PolicyName {
@@ -85,7 +85,7 @@ impl PolicyName {
             Self::ClosestFirst => Box::new(ClosestFirst),
             Self::FirstCome => Box::new(FirstCome),
             Self::LongestQueue => Box::new(LongestQueue),
-            Self::FirstOut => Box::new(FirstOut),
+            Self::QuickestThrough => Box::new(QuickestThrough),
         }
     }
 }
@@ -112,15 +112,17 @@ impl OrderingPolicy for LongestQueue {
     }
 }
 
-/// The robot that has less way left goes first: what leaves the ground soonest is in nobody's
-/// way afterwards.
+/// The robot that is out of the section after fewer poses goes first: the other waits less for it
+/// than it would have to wait for the other (shortest job first, Smith 1956).
 #[derive(Debug, Clone, Copy)]
-pub struct FirstOut;
+pub struct QuickestThrough;
 
-impl OrderingPolicy for FirstOut {
+impl OrderingPolicy for QuickestThrough {
     fn compare(&self, contest: &Contest<'_>) -> Ordering {
-        let (first, second) = (&contest.first, &contest.second);
-        first.path_poses_left.cmp(&second.path_poses_left)
+        let to_end =
+            |contender: &Contender, side| contest.section.end(side).saturating_sub(contender.index);
+        let first = to_end(&contest.first, Side::First);
+        first.cmp(&to_end(&contest.second, Side::Second))
     }
 }
 
@@ -132,5 +134,62 @@ impl OrderingPolicy for FirstCome {
     fn compare(&self, contest: &Contest<'_>) -> Ordering {
         let (first, second) = (&contest.first, &contest.second);
         first.mission_started.cmp(&second.mission_started)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fleet::geometry::{Footprint, Pose};
+    use crate::fleet::path::Path;
+    use crate::fleet::section::{MergePolicy, sections_between};
+
+    fn contender(robot: usize, index: usize, to_start: usize) -> Contender {
+        Contender {
+            robot,
+            index,
+            speed_mps: 1.0,
+            to_start,
+            path_poses_left: 100,
+            mission_started: Instant::from_ns(i64::try_from(robot).unwrap()),
+            waiting_since: None,
+            held_up_count: 0,
+        }
+    }
+
+    #[test]
+    fn each_policy_prefers_what_its_name_says() {
+        let line = |ends: [(f64, f64); 2], heading| {
+            let ends = ends.map(|(x, y)| Pose::new(x, y, heading));
+            Path::new(&ends, 0.1).unwrap()
+        };
+        let east = line([(-10.0, 0.0), (10.0, 0.0)], 0.0);
+        let north = line([(0.0, -10.0), (0.0, 10.0)], core::f64::consts::FRAC_PI_2);
+        let cart = Footprint {
+            length_m: 2.0,
+            width_m: 1.0,
+        };
+        let sections = sections_between(&east, &north, &cart, MergePolicy::Never);
+        let section = &sections[0];
+        let check = |policy: PolicyName, first: Contender, second: Contender, expected| {
+            let contest = Contest {
+                section,
+                first,
+                second,
+            };
+            assert_eq!(policy.policy().compare(&contest), expected, "{policy:?}");
+        };
+        let start = section.start(Side::First);
+        let (near, far) = (contender(1, start - 5, 5), contender(0, start - 20, 20));
+        check(PolicyName::ClosestFirst, near, far, Ordering::Less);
+        check(PolicyName::FirstCome, near, far, Ordering::Greater);
+        check(PolicyName::QuickestThrough, near, far, Ordering::Less);
+        check(PolicyName::LongestQueue, near, far, Ordering::Less);
+        let leading = Contender {
+            held_up_count: 2,
+            ..far
+        };
+        check(PolicyName::LongestQueue, near, leading, Ordering::Greater);
+        check(PolicyName::ClosestFirst, near, near, Ordering::Equal);
     }
 }

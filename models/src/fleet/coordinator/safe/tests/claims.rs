@@ -1,6 +1,7 @@
 use super::rig::{CONDITIONS, Chaos, Rig, RigSetup, safe_parameters};
 use super::world::random_scene;
 use crate::fleet::coordinator::parameters::CoordinatorParameters;
+use crate::fleet::coordinator::policy::PolicyName;
 use crate::fleet::coordinator::safe::parameters::{SafeParameters, stop_error_max_m};
 use crate::fleet::mission::MissionMode;
 use crate::fleet::robot::{RobotParameters, TrackerKind};
@@ -53,7 +54,7 @@ fn check_run(scene: &crate::fleet::scenario::Scene, setup: &RigSetup, seed: u64)
 fn every_mission_ends_without_overlap_in_random_worlds_over_any_channel() {
     for (name, chaos) in CONDITIONS {
         let (mut time_s, mut sections) = (0.0, 0);
-        for seed in 0..6_u64 {
+        for seed in 0..12_u64 {
             let mut random = RandomStream::new(seed, "world");
             let count = 2 + usize::try_from(seed % 5).unwrap();
             let scene = random_scene(count, &mut random);
@@ -208,4 +209,51 @@ fn equal_seeds_give_equal_runs() {
         )
     };
     assert_eq!(run(), run());
+}
+
+#[test]
+fn three_that_would_block_each_other_are_kept_from_it() {
+    let world = WorldParameters {
+        scenario: Scenario::ThreeCycle,
+        ..WorldParameters::default()
+    };
+    let scene = world.build().unwrap();
+    let setup = RigSetup {
+        coordinator: CoordinatorParameters {
+            missions_per_cycle: 3,
+            ..safe_parameters()
+        },
+        missions_per_robot: 1,
+        mode: MissionMode::Once,
+        ..setup(Chaos::default())
+    };
+    let mut rig = Rig::new(&scene, &setup, 1);
+    rig.run(seconds(300), |rig| {
+        rig.coordinator.counters().counts.missions_done == 3
+    });
+    let counters = rig.coordinator.counters();
+    assert_eq!(counters.counts.missions_done, 3);
+    assert!(counters.safe.grants_withheld > 0, "{:?}", counters.safe);
+    assert_eq!(rig.referee.tally().overlaps_count, 0);
+}
+
+#[test]
+fn every_policy_lets_every_mission_end() {
+    for policy in [
+        PolicyName::ClosestFirst,
+        PolicyName::FirstCome,
+        PolicyName::LongestQueue,
+        PolicyName::QuickestThrough,
+    ] {
+        let scene = random_scene(8, &mut RandomStream::new(2, "world"));
+        let setup = RigSetup {
+            coordinator: CoordinatorParameters {
+                policy,
+                ..safe_parameters()
+            },
+            missions_per_robot: 4,
+            ..setup(CONDITIONS[5].1)
+        };
+        check_run(&scene, &setup, 7);
+    }
 }
