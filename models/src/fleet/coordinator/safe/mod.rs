@@ -44,7 +44,7 @@ use crate::time::Instant;
 
 /// The rules of the safe mode.
 #[derive(Debug)]
-pub struct SafeRules {
+pub(crate) struct SafeRules {
     world: Arc<World>,
     fleet_id: u32,
     control_period: Duration,
