@@ -92,7 +92,9 @@ fn the_tables_are_printed_and_written_with_what_they_are_held_against() {
 #[test]
 fn an_interrupted_study_prints_what_is_complete() {
     let mut child = ChildGuard::spawn(&mut command(&["--sections", "100000000"])).unwrap();
-    child.wait_for_output("harbor, loss 0, 0 ms", LIMIT).unwrap();
+    child
+        .wait_for_output("harbor, loss 0, 0 ms", LIMIT)
+        .unwrap();
     child.signal(Signal::SIGINT).unwrap();
     let finished = child.wait_within(LIMIT).unwrap();
     assert_eq!(finished.status.code(), Some(130), "{finished:?}");
@@ -113,7 +115,12 @@ fn what_cannot_be_computed_is_named() {
     );
     refused(&["--sections", "0"], "tables.sections");
     refused(
-        &["--set", "case.name='shuttle'", "--set", "case.parameters={}"],
+        &[
+            "--set",
+            "case.name='shuttle'",
+            "--set",
+            "case.parameters={}",
+        ],
         "case shuttle has no tables",
     );
 }

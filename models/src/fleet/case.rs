@@ -63,6 +63,7 @@ impl CaseStudy for Fleet {
     fn new(parameters: Self::Parameters, seed: u64) -> Result<Self, ParameterError> {
         parameters.check()?;
         let scene = parameters.world.build()?;
+        parameters.check_stop_error(&scene.world.vehicle)?;
         Ok(Self {
             parameters,
             scene,

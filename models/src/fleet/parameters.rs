@@ -4,11 +4,12 @@
 use serde::{Deserialize, Serialize};
 
 use crate::case_study::ParameterError;
-use crate::fleet::coordinator::parameters::CoordinatorParameters;
+use crate::fleet::coordinator::parameters::{CoordinatorMode, CoordinatorParameters};
 use crate::fleet::experiment::TableParameters;
 use crate::fleet::mission::MissionParameters;
 use crate::fleet::robot::RobotParameters;
 use crate::fleet::scenario::WorldParameters;
+use crate::fleet::world::Vehicle;
 
 /// `[case.parameters]` of the fleet case. The defaults are the seed paper's figures where it
 /// gives them (section III.B, Table I) and the original implementation's otherwise.
@@ -54,5 +55,24 @@ impl FleetParameters {
         self.coordinator.check()?;
         self.missions.check()?;
         self.tables.check()
+    }
+
+    /// Checks that the safe coordinator leaves at least the room that the robots may overshoot.
+    ///
+    /// # Errors
+    /// Names the stop error that the tracker may have.
+    pub(crate) fn check_stop_error(&self, vehicle: &Vehicle) -> Result<(), ParameterError> {
+        let bound_m = self.robot.stop_error_bound_m(vehicle);
+        let given_m = self.coordinator.safe.stop_error_m;
+        if self.coordinator.mode == CoordinatorMode::Safe && given_m < bound_m {
+            return Err(ParameterError::new(
+                "coordinator.safe.stop_error_m",
+                format!(
+                    "{given_m} is below {bound_m:.3} m, which robots with this tracker may go past \
+                     their authority"
+                ),
+            ));
+        }
+        Ok(())
     }
 }

@@ -293,7 +293,7 @@ fn motion_table(results: &Results<'_>) -> Table {
         columns: MOTION_COLUMNS.to_vec(),
         rows: rows.collect(),
         notes: vec![
-            "past point: farthest stop beyond an order that came in time; bound: 2 v (TT + D) + v \
+            "past point: farthest stop beyond an order that came in time; bound: 3 v (TT + D) + v \
              TT / 2 for the stepped tracker, 0 for the exact one; late: orders too late to stop at"
                 .to_owned(),
         ],

@@ -96,16 +96,18 @@ impl RobotParameters {
 
     /// How far past an authority that came in time a robot can come to rest, at most.
     ///
-    /// The exact tracker: 0. The legacy tracker: `2 v T + v TT / 2` with `v` the largest speed,
+    /// The exact tracker: 0. The legacy tracker: `3 v T + v TT / 2` with `v` the largest speed,
     /// `T` the longest tick and `TT` the tracking period: it brakes up to a tick late, it may have
-    /// gone past `v` by what a tick adds, and its braking table has steps of half a period.
+    /// gone past `v` by what a tick adds, its braking table has steps of half a period, and it
+    /// judges whether an order comes in time by where its last tick left it. Without the last of
+    /// these the bound is `2 v T + v TT / 2`, which orders of the last moment do pass.
     pub fn stop_error_bound_m(&self, vehicle: &Vehicle) -> f64 {
         match self.tracker {
             TrackerKind::Exact => 0.0,
             TrackerKind::LegacyRk4 => {
                 let period_s = 1e-3 * self.tracking_period_ms;
                 let longest_s = period_s + 1e-3 * self.inflation_ms();
-                vehicle.speed_max_mps * (2.0 * longest_s + 0.5 * period_s)
+                vehicle.speed_max_mps * (3.0 * longest_s + 0.5 * period_s)
             }
         }
     }
@@ -161,9 +163,9 @@ mod tests {
             inflation_delay_ms: 100.0,
             ..RobotParameters::default()
         };
-        assert!((parameters.stop_error_bound_m(&vehicle) - 1.65).abs() < 1e-12);
+        assert!((parameters.stop_error_bound_m(&vehicle) - 2.43).abs() < 1e-12);
         parameters.step_inflation = false;
-        assert!((parameters.stop_error_bound_m(&vehicle) - 0.45).abs() < 1e-12);
+        assert!((parameters.stop_error_bound_m(&vehicle) - 0.63).abs() < 1e-12);
         parameters.tracker = TrackerKind::Exact;
         assert!(parameters.stop_error_bound_m(&vehicle).abs() < f64::EPSILON);
     }

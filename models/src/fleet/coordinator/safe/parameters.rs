@@ -15,7 +15,7 @@ use crate::fleet::world::World;
 #[serde(deny_unknown_fields, default)]
 pub struct SafeParameters {
     /// How far robots may stop from the end of their authority, 0..=1000 m; 0 for the exact
-    /// tracker, [`stop_error_max_m`] for the stepped one.
+    /// tracker, [`RobotParameters::stop_error_bound_m`](crate::fleet::robot::RobotParameters::stop_error_bound_m) for the stepped one.
     pub stop_error_m: f64,
     /// Authority beyond what a robot needs in order not to brake before the next one comes, as
     /// time at its speed, 0..=60000 ms.
@@ -90,11 +90,4 @@ impl SafeParameters {
             above: poses,
         }
     }
-}
-
-/// Largest stop error of the stepped tracker whose steps are up to `step_max_s` long and whose
-/// nominal step is `step_s`: braking begins up to a step late, the speed overshoots by a step's
-/// acceleration, and the table of braking ways is half a nominal step coarse.
-pub fn stop_error_max_m(speed_max_mps: f64, step_max_s: f64, step_s: f64) -> f64 {
-    2.0 * speed_max_mps * step_max_s + 0.5 * speed_max_mps * step_s
 }

@@ -4,7 +4,7 @@ use super::rig::{CONDITIONS, Chaos, Rig, RigSetup, safe_parameters};
 use super::world::random_scene;
 use crate::fleet::coordinator::parameters::CoordinatorParameters;
 use crate::fleet::coordinator::policy::PolicyName;
-use crate::fleet::coordinator::safe::parameters::{SafeParameters, stop_error_max_m};
+use crate::fleet::coordinator::safe::parameters::SafeParameters;
 use crate::fleet::mission::MissionMode;
 use crate::fleet::robot::{RobotParameters, TrackerKind};
 use crate::fleet::scenario::{Scenario, WorldParameters};
@@ -99,19 +99,13 @@ fn small_scenarios_end_without_overlap_over_any_channel() {
 
 #[test]
 fn a_coarse_tracker_keeps_within_the_margin_of_its_stop_error() {
-    let inflation_ms = 100.0;
     let robot = RobotParameters {
         tracker: TrackerKind::LegacyRk4,
         step_inflation: true,
-        inflation_delay_ms: inflation_ms,
+        inflation_delay_ms: 100.0,
         ..RobotParameters::default()
     };
-    let step_s = 1e-3 * robot.tracking_period_ms;
-    let stop_error_m = stop_error_max_m(
-        super::world::CART.speed_max_mps,
-        step_s + 1e-3 * inflation_ms,
-        step_s,
-    );
+    let stop_error_m = robot.stop_error_bound_m(&super::world::CART);
     for (name, chaos) in CONDITIONS {
         for seed in 0..3_u64 {
             let scene = random_scene(5, &mut RandomStream::new(seed, "world"));
