@@ -35,7 +35,7 @@ pub struct Contender {
 pub struct Contest<'a> {
     /// The section.
     pub section: &'a Section,
-    /// The robot on [`Side::First`](crate::fleet::section::Side::First) of the section.
+    /// The robot on [`Side::First`] of the section.
     pub first: Contender,
     /// The robot on the other side.
     pub second: Contender,

@@ -103,8 +103,8 @@ impl SafeRules {
         let way_m = path.way_to_m(ledger.lower() + 1)
             + reach_m(&self.world.vehicle, view.speed_mps, time_s);
         // One that came to stand short of the end of its authority still needs more to go on.
-        let least = ledger.lower() + self.margin.below + 2;
-        let want = (path.index_at(way_m) + 1).max(least).min(last);
+        let needed = ledger.lower() + self.margin.below + 2;
+        let want = (path.index_at(way_m) + 1).max(needed).min(last);
         (want > ledger.bound()).then_some(Candidate {
             robot,
             want,

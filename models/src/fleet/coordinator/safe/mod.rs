@@ -2,18 +2,18 @@
 //! robot may be on, whatever messages are lost, late, repeated or overtaken, and only as long as
 //! every robot can still finish. It needs no clock but its own.
 //!
-//! - [`ledger`]: what a robot may hold, proved from its states.
-//! - [`reservation`]: which poses each robot has to itself; the safety invariant.
-//! - [`liveness`]: why every mission ends.
-//! - [`grants`]: who gets how much in a control cycle.
-//! - [`horizon`]: how much a robot needs so as not to brake for want of a message.
-//! - [`lease`]: authorities that end by themselves, where delays have a measured bound.
+//! - `ledger`: what a robot may hold, proved from its states.
+//! - `reservation`: which poses each robot has to itself; the safety invariant.
+//! - `liveness`: why every mission ends.
+//! - `grants`: who gets how much in a control cycle.
+//! - `horizon`: how much a robot needs so as not to brake for want of a message.
+//! - `lease`: authorities that end by themselves, where delays have a measured bound.
 //!
 //! **Safety.** Let `G` be the ledger's bound of a robot and `l` the furthest pose it is known to
 //! have passed. The robot never passes its authority by more than the stop margin `m`, so it is
 //! within the poses `l..=G + m` now and until more is sent. The coordinator sends more only when
 //! the poses added are apart from every other robot's `l..=G + m`, and lowers `G` only on proof.
-//! So these ranges are apart at all times, and with them the robots (see [`reservation`]). For
+//! So these ranges are apart at all times, and with them the robots (see `reservation`). For
 //! each pair of overlapping poses at most one is ever granted.
 
 mod grants;
@@ -44,7 +44,7 @@ use crate::time::Instant;
 
 /// The rules of the safe mode.
 #[derive(Debug)]
-pub struct SafeRules {
+pub(crate) struct SafeRules {
     world: Arc<World>,
     fleet_id: u32,
     control_period: Duration,

@@ -1,3 +1,5 @@
+//! The claims themselves: no overlap, every mission ends, equal seeds give equal runs.
+
 use super::rig::{CONDITIONS, Chaos, Rig, RigSetup, safe_parameters};
 use super::world::random_scene;
 use crate::fleet::coordinator::parameters::CoordinatorParameters;
