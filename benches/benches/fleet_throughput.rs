@@ -196,11 +196,12 @@ fn main() {
     let rounds = arguments
         .nth(1)
         .map_or(ROUNDS, |text| text.parse().unwrap());
-    let pinning = match pin_to_cpu(0) {
+    // Read first: a pinned process may use one processor only.
+    let mut host = HostFacts::read("");
+    host.pinning = match pin_to_cpu(0) {
         Ok(()) => "one thread on cpu 0".to_owned(),
         Err(error) => format!("one thread, not pinned: {error}"),
     };
-    let host = HostFacts::read(&pinning);
     println!(
         "{}",
         serde_json::json!({"bench": "fleet_throughput", "host": host.to_json()})

@@ -100,7 +100,7 @@ pub enum Command {
         after_help = "Example:\n  hil-runtime tables --topology deploy/topologies/tables.toml --sections 100000\n\nEqual seeds give equal tables, whatever the number of threads. Ctrl-C prints what is\ncomplete. Exit code 1 when a criterion is missed."
     )]
     Tables {
-        /// The topology file (TOML); [case] and [run] are enough.
+        /// The topology file (TOML); `[case]` and `[run]` are enough.
         #[arg(long, short, value_name = "FILE")]
         topology: PathBuf,
         /// Change one value of the file; may be repeated.

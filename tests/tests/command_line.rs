@@ -24,10 +24,8 @@ fn run_in(folder: &Path, arguments: &[&str]) -> Finished {
     let mut command = Command::new(hil_runtime_binary());
     command.args(arguments).current_dir(folder);
     command.env_remove("COLUMNS").env_remove("HIL_HOST");
-    ChildGuard::spawn(&mut command)
-        .unwrap()
-        .wait_within(LIMIT)
-        .unwrap()
+    let mut child = ChildGuard::spawn(&mut command).unwrap();
+    child.wait_within(LIMIT).unwrap()
 }
 
 fn run(arguments: &[&str]) -> Finished {
@@ -86,8 +84,7 @@ fn the_help_of_every_command_has_an_example() {
 #[test]
 fn every_shipped_topology_is_fit_and_so_are_the_commands_it_tells_of() {
     let folder = workspace_folder().join("deploy/topologies");
-    let mut topology_count = 0;
-    let mut command_count = 0;
+    let (mut topology_count, mut command_count) = (0, 0);
     for entry in fs::read_dir(&folder).unwrap() {
         let path = entry.unwrap().path();
         if path.extension().is_none_or(|extension| extension != "toml") {
@@ -95,7 +92,7 @@ fn every_shipped_topology_is_fit_and_so_are_the_commands_it_tells_of() {
         }
         let name = path.file_name().unwrap().to_str().unwrap();
         let text = fs::read_to_string(&path).unwrap();
-        // A file for the tables alone runs no process; the tests of the tables run it.
+        // `tables.rs` runs these.
         if text.contains("hil-runtime tables ") && !text.contains("[processes") {
             continue;
         }

@@ -12,6 +12,7 @@ use hil_tests::run_folder::RunFolder;
 use nix::sys::signal::Signal;
 use serde_json::Value;
 
+const SHIPPED: &str = "deploy/topologies/tables.toml";
 const LIMIT: Duration = Duration::from_mins(5);
 
 /// Two cells of the published tables and four of the mechanisms', small.
@@ -23,19 +24,23 @@ const SMALL: [&str; 4] = [
     "case.parameters.tables.sections_per_task=100",
 ];
 
-fn command(arguments: &[&str]) -> Command {
+fn command(topology: &str, arguments: &[&str]) -> Command {
     let mut command = Command::new(hil_runtime_binary());
     command
-        .args(["tables", "--topology", "deploy/topologies/tables.toml"])
+        .args(["tables", "--topology", topology])
         .args(arguments)
         .current_dir(workspace_folder())
         .env_remove("COLUMNS");
     command
 }
 
-fn run(arguments: &[&str]) -> Finished {
-    let mut child = ChildGuard::spawn(&mut command(arguments)).unwrap();
+fn run_on(topology: &str, arguments: &[&str]) -> Finished {
+    let mut child = ChildGuard::spawn(&mut command(topology, arguments)).unwrap();
     child.wait_within(LIMIT).unwrap()
+}
+
+fn run(arguments: &[&str]) -> Finished {
+    run_on(SHIPPED, arguments)
 }
 
 #[test]
@@ -91,7 +96,7 @@ fn the_tables_are_printed_and_written_with_what_they_are_held_against() {
 
 #[test]
 fn an_interrupted_study_prints_what_is_complete() {
-    let mut child = ChildGuard::spawn(&mut command(&["--sections", "100000000"])).unwrap();
+    let mut child = ChildGuard::spawn(&mut command(SHIPPED, &["--sections", "100000000"])).unwrap();
     child
         .wait_for_output("harbor, loss 0, 0 ms", LIMIT)
         .unwrap();
@@ -104,23 +109,14 @@ fn an_interrupted_study_prints_what_is_complete() {
 
 #[test]
 fn what_cannot_be_computed_is_named() {
-    let refused = |arguments: &[&str], words: &str| {
-        let finished = run(arguments);
+    let refused = |topology: &str, arguments: &[&str], words: &str| {
+        let finished = run_on(topology, arguments);
         assert_eq!(finished.status.code(), Some(2), "{finished:?}");
         assert!(finished.stderr.contains(words), "{words}: {finished:?}");
     };
-    refused(
-        &["--set", "case.parameters.tables.cells=['no such row']"],
-        "no such row",
-    );
-    refused(&["--sections", "0"], "tables.sections");
-    refused(
-        &[
-            "--set",
-            "case.name='shuttle'",
-            "--set",
-            "case.parameters={}",
-        ],
-        "case shuttle has no tables",
-    );
+    let unknown_row = ["--set", "case.parameters.tables.cells=['no such row']"];
+    refused(SHIPPED, &unknown_row, "no such row");
+    refused(SHIPPED, &["--sections", "0"], "tables.sections");
+    let shuttle = "deploy/topologies/shuttle-local.toml";
+    refused(shuttle, &[], "case shuttle has no tables");
 }

@@ -47,10 +47,6 @@ fn the_overshoot_of_isolated_stops_is_that_of_the_original() {
     let check = |limits, inflation_s, (least_m, most_m): (f64, f64)| {
         let overshoots = overshoots_m(limits, inflation_s, 1);
         let max_m = *overshoots.last().unwrap();
-        println!(
-            "a {} D {inflation_s}: max {max_m:.3} m, median {:.3} m",
-            limits.acceleration_mps2, overshoots[1000]
-        );
         assert!((least_m..=most_m).contains(&max_m), "{max_m}");
         overshoots
     };
@@ -58,7 +54,6 @@ fn the_overshoot_of_isolated_stops_is_that_of_the_original() {
     check(HARBOR, 0.05, (0.50, 0.75));
     let harbor = check(HARBOR, 0.1, (0.85, 1.25));
     let beyond_ratio = harbor.iter().filter(|past_m| **past_m > 0.9).count() as f64 / 2000.0;
-    println!("beyond 0.9 m: {:.2} %", 100.0 * beyond_ratio);
     assert!((0.0005..=0.012).contains(&beyond_ratio), "{beyond_ratio}");
     check(WAREHOUSE, 0.1, (0.25, 0.45));
     // Without the lengthened ticks the margin of three poses, 0.9 m, is never used up.
@@ -76,7 +71,6 @@ fn no_stop_exceeds_the_bound() {
             let worst_m = *overshoots.last().unwrap();
             assert!(worst_m < bound_m, "{worst_m} of {bound_m}");
         }
-        println!("{limits:?} {inflation_s}: {beyond_count} of 20000 beyond 0.9 m");
         let is_harbor_at_100_ms = limits.speed_max_mps > 5.0 && inflation_s > 0.06;
         assert_eq!(beyond_count > 0, is_harbor_at_100_ms);
     }

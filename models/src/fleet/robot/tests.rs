@@ -366,7 +366,6 @@ fn no_storm_of_acknowledged_authorities_drives_a_robot_past_its_authority() {
             assert!(counters.stop_error_max_m <= margin_m);
             sum.add(&counters);
         }
-        println!("{tracker:?} {inflation_ms}: {:.3} m", sum.stop_error_max_m);
     }
     assert!(sum.refused_count > 500 && sum.stale_count > 500, "{sum:?}");
     assert!(
