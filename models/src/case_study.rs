@@ -28,6 +28,9 @@ pub trait CaseStudy: Sized + Debug + 'static {
     const ROLES: &'static [&'static str];
     /// The channels between the roles; a role's ports follow the order of this list.
     const CHANNELS: &'static [ChannelSpec];
+    /// False when a role keeps what the others rely on, so that one started anew in the midst of
+    /// a run would be wrong about the world: a topology may not ask for its restart then.
+    const MAY_RESTART: bool = true;
     /// `[case.parameters]`; use `#[serde(deny_unknown_fields, default)]`.
     type Parameters: DeserializeOwned + Serialize + Default;
 

@@ -94,6 +94,35 @@ fn the_tables_are_printed_and_written_with_what_they_are_held_against() {
     assert!(lines[4].contains(",10018,5,"), "{}", lines[4]);
 }
 
+/// The gate's share of the claim: every impairment in both maps. A million sections take minutes
+/// in a release build: `hil-runtime tables --sections 40000` with the same two settings.
+#[test]
+fn the_safe_coordinator_collides_under_no_impairment() {
+    let finished = run(&[
+        "--quiet",
+        "--json",
+        "--sections",
+        "1500",
+        "--set",
+        "case.parameters.tables.parts=['mechanisms']",
+        "--set",
+        "case.parameters.tables.cells=[', safe']",
+        "--set",
+        "case.parameters.tables.sections_per_task=750",
+    ]);
+    finished.assert_success();
+    let document: Value = serde_json::from_str(&finished.stdout).unwrap();
+    let criteria = document["criteria"].as_array().unwrap();
+    let verdict = |words: &str| {
+        let has_words = |criterion: &&Value| criterion["text"].as_str().unwrap().contains(words);
+        let found = criteria.iter().find(has_words);
+        found.unwrap_or_else(|| panic!("{words}: {document:#}"))["is_met"].clone()
+    };
+    assert_eq!(verdict("no collision by any checker"), true, "{document:#}");
+    assert_eq!(verdict("no robot stuck"), true, "{document:#}");
+    assert_eq!(verdict("proof rules out"), true, "{document:#}");
+}
+
 #[test]
 fn an_interrupted_study_prints_what_is_complete() {
     let mut child = ChildGuard::spawn(&mut command(SHIPPED, &["--sections", "100000000"])).unwrap();

@@ -58,6 +58,9 @@ impl CaseStudy for Fleet {
         ChannelSpec::of::<State>(FLEET_STATE, "robots", "controller"),
         ChannelSpec::recorded::<Truth>(FLEET_TRUTH, "robots"),
     ];
+    /// A coordinator started anew would believe all robots in their first bays, and robots
+    /// started anew would be there while the coordinator believes them under way.
+    const MAY_RESTART: bool = false;
     type Parameters = FleetParameters;
 
     fn new(parameters: Self::Parameters, seed: u64) -> Result<Self, ParameterError> {

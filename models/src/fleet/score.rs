@@ -7,10 +7,10 @@ use std::collections::BTreeMap;
 use crate::case_study::{Metric, Score};
 use crate::fleet::case::{FLEET_AUTHORITY, FLEET_STATE, FLEET_TRUTH, Fleet};
 use crate::fleet::events::events;
+use crate::fleet::experiment::collision_interval;
 use crate::fleet::messages::{Authority, State, Truth};
 use crate::fleet::referee::{Referee, SCAN_PERIOD, Tally};
 use crate::measure::histogram::{LatencyHistogram, LatencySummary};
-use crate::measure::statistics::{CONFIDENCE, clopper_pearson};
 use crate::run_log::RunLog;
 use crate::time::Instant;
 
@@ -84,12 +84,7 @@ fn collisions(tally: &Tally) -> Vec<Metric> {
         let method = "section checker over sections passed; interval of Clopper and Pearson";
         metric(label, collided as f64 / passed as f64, "1", method)
     };
-    // Two collisions in one section are no proportion any more.
-    let trials = passed.max(collided);
-    let interval = clopper_pearson(collided, trials, CONFIDENCE);
-    ratio.interval = interval
-        .filter(|_| ratio.value.is_some())
-        .map(|interval| (interval.low, interval.high));
+    ratio.interval = collision_interval(collided, passed).filter(|_| ratio.value.is_some());
     vec![
         count(
             COLLISIONS,

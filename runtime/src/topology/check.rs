@@ -260,6 +260,14 @@ fn check_role(
         });
         return None;
     }
+    if !case.may_restart && entry.on_exit != OnExit::EndRun {
+        let problem = format!(
+            "a role of case {} started anew would be wrong about the world; use \"end-run\"",
+            case.name
+        );
+        let key = join(&entry.path, "on_exit");
+        faults.add(key, Some(role.place), Fault::Inconsistent(problem));
+    }
     let same = |process: &&Process| process.role() == Some(&role.value);
     if let Some(other) = earlier.iter().find(same) {
         let (role, other) = (&role.value, &other.name);

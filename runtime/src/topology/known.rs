@@ -21,6 +21,8 @@ pub struct KnownCase {
     pub roles: &'static [&'static str],
     /// Its channels, in port order.
     pub channels: &'static [ChannelSpec],
+    /// False when no role of it may be started anew in the midst of a run.
+    pub may_restart: bool,
     /// Checks `[case.parameters]` with a seed and gives them back with every default filled in.
     pub check_parameters: ParameterCheck,
 }
@@ -78,6 +80,7 @@ impl KnownCase {
             name: C::NAME,
             roles: C::ROLES,
             channels: C::CHANNELS,
+            may_restart: C::MAY_RESTART,
             check_parameters: check_parameters::<C>,
         }
     }

@@ -175,7 +175,7 @@ impl Experiment {
         let is_bypassed = network.status_path == StatusPath::Bypass;
         if is_bypassed {
             for robot in robots.iter() {
-                coordinator.on_state(now, &robot.state(now));
+                coordinator.observe(now, &robot.state(now));
             }
         }
         coordinator.on_cycle(now, &mut |message| match message {

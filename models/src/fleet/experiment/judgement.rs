@@ -1,6 +1,7 @@
 //! What the figures are held against: per cell, and over the table of mechanisms. A verdict that
 //! the number of critical sections does not allow is not given.
 
+use crate::fleet::coordinator::counters::SafeCounts;
 use crate::fleet::coordinator::parameters::CoordinatorMode;
 use crate::fleet::experiment::cells::{Cell, Demand, Place, SCENARIOS, mode_name, scenario_name};
 use crate::fleet::experiment::report::Results;
@@ -12,6 +13,8 @@ use crate::study::Criterion;
 const DECISIVE_COUNT: u64 = 100_000;
 /// Critical sections from which "none at all" is said to be met.
 const TELLING_COUNT: u64 = 10_000;
+/// Critical sections from which a rate of missions is compared.
+const RATE_SECTIONS_MIN: u64 = 1000;
 /// What the safe coordinator must keep of the legacy one's throughput on a clean channel.
 const THROUGHPUT_RATIO_MIN: f64 = 0.9;
 
@@ -21,7 +24,7 @@ pub(crate) fn demand_text(demand: Demand) -> String {
         Demand::None => "reported only".to_owned(),
         Demand::Below(high) => format!("95 % < {high}"),
         Demand::Within(low, high) => format!("> 0 and {low} to {high}"),
-        Demand::NoneSeen => "none".to_owned(),
+        Demand::NoneSeen => "none by the original's checker".to_owned(),
         Demand::NoneAtAll => "none by any checker".to_owned(),
     }
 }
@@ -118,19 +121,22 @@ fn collisions_text(tally: &FleetTally) -> String {
     )
 }
 
-/// The safe coordinator: no collision by any checker, no reset, no fleet at a stand.
-fn safe_criteria(results: &Results<'_>) -> [Criterion; 2] {
+/// The safe coordinator: no collision by any checker; no robot that stands for ever, and nothing
+/// seen that its proof rules out.
+fn safe_criteria(results: &Results<'_>) -> [Criterion; 3] {
     let is_safe = |cell: &Cell| matches!(cell.place, Place::Mechanism { mode, .. } if mode == CoordinatorMode::Safe);
-    let (mut sections, mut collisions, mut resets, mut stands) = (0, 0, 0, 0);
-    let (mut seen_again, mut ended_count) = (Vec::new(), 0);
+    let (mut sections, mut collisions, mut stands) = (0, 0, 0);
+    let (mut safe, mut seen_again) = (SafeCounts::default(), Vec::new());
+    let (mut cell_count, mut ended_count) = (0, 0);
     for (cell, tally) in results.all().filter(|(cell, _)| is_safe(cell)) {
+        cell_count += 1;
         let Some(tally) = tally else {
             continue;
         };
         ended_count += 1;
+        safe.merge(&tally.safe);
         sections += tally.section_count();
         collisions += tally.any_collision_count();
-        resets += tally.coordinator.resets;
         stands += tally.stand_count;
         seen_again.extend(tally.collided.iter().map(|run| {
             format!(
@@ -142,24 +148,38 @@ fn safe_criteria(results: &Results<'_>) -> [Criterion; 2] {
             )
         }));
     }
-    let judged = |is_met| (ended_count > 0).then_some(is_met);
-    let mut finding = format!("{collisions} in {sections} CS of {ended_count} cells");
+    // One is enough to miss a demand; to meet it takes all cells, and something to see in them.
+    let is_telling = ended_count == cell_count && sections >= TELLING_COUNT;
+    let judged = |is_met| (!is_met || is_telling).then_some(is_met);
+    let mut finding =
+        format!("{collisions} in {sections} CS of {ended_count} of {cell_count} cells");
     if !seen_again.is_empty() {
         finding.push_str("; ");
         finding.push_str(&seen_again.join("; "));
     }
-    let safe = mode_name(CoordinatorMode::Safe);
+    let mode = mode_name(CoordinatorMode::Safe);
+    let impossible = safe.states_impossible + safe.authorities_exceeded + safe.margins_exceeded;
     [
         Criterion {
-            text: format!("{safe}: no collision by any checker, in any row"),
-            // One collision is enough; that there is none is said of what was run.
+            text: format!("{mode}: no collision by any checker, in any row run"),
             is_met: judged(collisions == 0),
             finding,
         },
         Criterion {
-            text: format!("{safe}: no deadlock reset, no fleet at a stand"),
-            is_met: judged(resets == 0 && stands == 0),
-            finding: format!("{resets} resets, {stands} runs that came to a stand"),
+            text: format!("{mode}: no robot stuck, no fleet at a stand"),
+            is_met: judged(safe.stuck == 0 && stands == 0),
+            finding: format!(
+                "{} robots made no way for too long, {stands} runs came to a stand",
+                safe.stuck
+            ),
+        },
+        Criterion {
+            text: format!("{mode}: nothing that its proof rules out"),
+            is_met: judged(impossible == 0),
+            finding: format!(
+                "{} impossible states, {} beyond their authority, {} beyond the stop margin",
+                safe.states_impossible, safe.authorities_exceeded, safe.margins_exceeded
+            ),
         },
     ]
 }
@@ -168,15 +188,17 @@ fn throughput(
     scenario: &str,
     (legacy, safe): (Option<&FleetTally>, Option<&FleetTally>),
 ) -> Criterion {
-    let rates = legacy
-        .and_then(FleetTally::missions_per_hour)
-        .zip(safe.and_then(FleetTally::missions_per_hour));
+    let rate = |tally: Option<&FleetTally>| {
+        let is_telling = |tally: &&FleetTally| tally.section_count() >= RATE_SECTIONS_MIN;
+        tally.filter(is_telling)?.missions_per_hour()
+    };
+    let rates = rate(legacy).zip(rate(safe));
     let text = format!("{scenario}: safe keeps 90 % of legacy's missions per hour when clean");
     let Some((legacy, safe)) = rates else {
         return Criterion {
             text,
             is_met: None,
-            finding: "not run to its end".to_owned(),
+            finding: format!("not run to its end, or with fewer than {RATE_SECTIONS_MIN} CS"),
         };
     };
     let ratio = safe / legacy;

@@ -21,3 +21,4 @@ pub use study::{TableParameters, TablePart};
 pub use tally::FleetTally;
 
 pub(crate) use study::FleetStudy;
+pub(crate) use tally::collision_interval;

@@ -334,7 +334,7 @@ const MECHANISM_COLUMNS: [Column; 12] = [
     column("safe_sections", "Safe: CS"),
     column("safe_collisions", "Collisions"),
     column("safe_per_1000_high", "P x 1000 below"),
-    column("safe_resets", "Resets"),
+    column("safe_stuck", "Stuck"),
     column("safe_missions_per_hour", "Missions/h"),
 ];
 
@@ -357,7 +357,7 @@ fn mechanism_table(scenario: Scenario, results: &Results<'_>) -> Table {
                 sections,
                 collisions,
                 Cell::number(high, 3),
-                Cell::Count(tally.coordinator.resets),
+                Cell::Count(tally.safe.stuck),
                 Cell::number(tally.missions_per_hour(), 0),
             ]
         });

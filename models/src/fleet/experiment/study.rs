@@ -62,6 +62,10 @@ impl TableParameters {
     /// # Errors
     /// The first key outside its range.
     pub fn check(&self) -> Result<(), ParameterError> {
+        if self.parts.is_empty() {
+            let problem = "[] leaves nothing to compute; name published, mechanisms or both";
+            return Err(ParameterError::new("tables.parts", problem));
+        }
         ParameterError::check(
             "tables.sections",
             self.sections as f64,

@@ -1,6 +1,6 @@
 //! What came of a run, and of several runs of one cell together.
 
-use crate::fleet::coordinator::counters::CoordinatorCounts;
+use crate::fleet::coordinator::counters::{CoordinatorCounts, SafeCounts};
 use crate::fleet::experiment::cells::Cell;
 use crate::fleet::experiment::driver::Experiment;
 use crate::fleet::referee::Tally;
@@ -17,6 +17,8 @@ pub struct FleetTally {
     pub referee: Tally,
     /// What the coordinators counted.
     pub coordinator: CoordinatorCounts,
+    /// What the safe mode's rules counted; zeros in the legacy mode.
+    pub safe: SafeCounts,
     /// What the robots counted.
     pub robots: RobotCounters,
     /// What became of authorities and missions on their way.
@@ -63,6 +65,7 @@ impl FleetTally {
         Self {
             referee: *experiment.referee().tally(),
             coordinator: experiment.coordinator().counters().counts,
+            safe: experiment.coordinator().counters().safe,
             robots,
             commands,
             status,
@@ -94,6 +97,7 @@ impl FleetTally {
     pub fn merge(&mut self, other: &Self) {
         merge_referee(&mut self.referee, &other.referee);
         self.coordinator.merge(&other.coordinator);
+        self.safe.merge(&other.safe);
         self.robots.add(&other.robots);
         merge_link(&mut self.commands, &other.commands);
         merge_link(&mut self.status, &other.status);

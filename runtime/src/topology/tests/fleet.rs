@@ -32,6 +32,12 @@ struct Faulty(&'static str, &'static str, &'static str, &'static str);
 
 const FAULTY: &[Faulty] = &[
     Faulty(
+        "processes.controller.role = \"controller\"",
+        "processes.controller.role = \"controller\" #!\nprocesses.controller.on_exit = \"restart\"",
+        "processes.controller.on_exit",
+        "started anew",
+    ),
+    Faulty(
         "robots = 1",
         "robot = 1 #!",
         "case.parameters.world.robot",

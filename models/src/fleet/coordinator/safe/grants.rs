@@ -41,7 +41,7 @@ impl SafeRules {
         }
         let may_reorder = !self.is_anyone_starving(cycle.now);
         self.counts.cycles_in_order += u64::from(!may_reorder);
-        self.admit_all(may_reorder);
+        self.admit_all(cycle.now, may_reorder);
         let mut order = core::mem::take(&mut self.order);
         order.clear();
         order.extend((0..self.robots.len()).filter_map(|robot| self.candidate(robot)));
@@ -50,9 +50,8 @@ impl SafeRules {
             view.stopped_by = None;
         }
         for candidate in &order {
-            if self.extend(candidate, may_reorder) {
-                self.robots[candidate.robot].waiting_since = None;
-            } else {
+            // A grant alone ends no waiting: it may be taken back. Coming further does.
+            if !self.extend(candidate, may_reorder) {
                 let since = &mut self.robots[candidate.robot].waiting_since;
                 *since = since.or(Some(cycle.now));
             }
@@ -71,14 +70,18 @@ impl SafeRules {
         waits.any(|since| now > since + self.patience)
     }
 
-    fn admit_all(&mut self, may_reorder: bool) {
+    fn admit_all(&mut self, now: Instant, may_reorder: bool) {
         for robot in 0..self.robots.len() {
             let view = &self.robots[robot];
             if view.is_admitted || view.ledger.mission_id() == 0 || view.ledger.is_done() {
                 continue;
             }
             let is_admitted = self.plan.admit(&self.traffic, robot, may_reorder);
-            self.robots[robot].is_admitted = is_admitted;
+            let view = &mut self.robots[robot];
+            view.is_admitted = is_admitted;
+            if !is_admitted {
+                view.waiting_since = view.waiting_since.or(Some(now));
+            }
             self.counts.admissions_deferred += u64::from(!is_admitted);
         }
     }

@@ -9,7 +9,9 @@
 //! will not come; so after `t + D + L + v/a` that is the bound on its authority.
 //!
 //! The bound is an assumption about the network. Where both ends share a clock each state's age
-//! checks it; one above the bound freezes all grants for as long as a lease may run on it.
+//! checks it; one above the bound freezes all grants for as long as a lease may run on it. Only
+//! states are watched: a command that takes longer than the bound while states do not is not seen,
+//! and the lease is then no safer than the assumption. Without a lease nothing rests on it.
 
 use crate::fleet::coordinator::counters::SafeCounts;
 use crate::fleet::coordinator::safe::SafeRules;

@@ -18,11 +18,12 @@
 //! is free of all reservations, and giving it keeps this very plan valid. With eventual delivery
 //! it gets there, the move is dropped, and the same holds for the next.
 //!
-//! **No starvation.** A robot *waits* while it could use more way and gets none; a path being
-//! finite, one that does not wait for ever arrives. Plans may be reordered only while no robot has
-//! waited beyond its patience.
-//! From then on the present plan is kept and new missions are added at its end; it has finitely
-//! many moves, the waiting robot's last one among them, so its mission ends.
+//! **No starvation.** A robot *waits* from when it is not admitted, or could use more way and gets
+//! none, until it has come further; a grant that is taken back again ends no waiting. A path being
+//! finite, a robot that does not wait for ever arrives. Plans may be reordered, and way taken back,
+//! only while no robot has waited beyond its patience. From then on the present plan is kept and
+//! new missions are added at its end; it has finitely many moves, the waiting robot's last one
+//! among them, so its mission ends.
 //!
 //! The search is a heuristic, as the question itself is NP-hard: failing to find a plan withholds
 //! an extension that might have been harmless, and costs time but neither safety nor liveness.

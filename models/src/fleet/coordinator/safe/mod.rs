@@ -61,7 +61,8 @@ pub(crate) struct SafeRules {
     order: Vec<grants::Candidate>,
     /// Per robot its place in `order`.
     places: Vec<Option<usize>>,
-    /// The robots were parked apart; where not, nothing is granted to those that are not.
+    /// The robots were parked apart at their guarded footprints. Where not, no plan holds for a
+    /// mission of theirs, and none is admitted.
     starts_apart: bool,
 }
 
@@ -75,7 +76,8 @@ struct SafeRobot {
     round_trip: RoundTrip,
     speed_mps: f64,
     header_id: u32,
-    /// Since when it could use more authority and did not get any.
+    /// Since when it has not come further, although it could have used more authority than it
+    /// got or was not admitted.
     waiting_since: Option<Instant>,
     /// Last time it was seen further on, or its mission given.
     moved: Instant,
@@ -247,13 +249,15 @@ impl Rules for SafeRules {
         let view = &mut self.robots[robot];
         let was_shrinking = view.ledger.is_shrinking();
         let was_lower = view.ledger.lower();
-        if state.path_index >= i32::try_from(was_lower).unwrap_or(i32::MAX)
-            && header.mission_id == view.ledger.mission_id()
-        {
+        let tells_place = state.path_index >= i32::try_from(was_lower).unwrap_or(i32::MAX)
+            && header.mission_id == view.ledger.mission_id();
+        let is_newest = header.header_id >= view.ledger.newest_header_id();
+        let effect = view.ledger.on_state(state);
+        // An impossible state raises no lower end, so it must not make the robot look nearer.
+        if tells_place && effect != StateEffect::Impossible {
             view.heard = now;
         }
-        let is_newest = header.header_id >= view.ledger.newest_header_id();
-        match view.ledger.on_state(state) {
+        match effect {
             StateEffect::Nothing => return,
             StateEffect::Impossible => {
                 self.counts.states_impossible += 1;
@@ -272,6 +276,7 @@ impl Rules for SafeRules {
         }
         if view.ledger.lower() > was_lower {
             view.moved = now;
+            view.waiting_since = None;
             view.is_counted_stuck = false;
         }
         let (lower, bound) = (view.ledger.lower(), view.ledger.bound());
