@@ -71,8 +71,16 @@ pub(crate) enum Demand {
 }
 
 impl Cell {
-    /// What the cell is called, also in seeds: it must not depend on its position.
+    /// What the cell is called, whatever its position among the others.
     pub(crate) fn name(&self) -> String {
+        match self.place {
+            Place::Published { copies: 1, .. } => self.seed_name().replace("1 copies", "1 copy"),
+            _ => self.seed_name(),
+        }
+    }
+
+    /// What the seeds of its runs are drawn from: equal as long as equal tables are wanted.
+    pub(crate) fn seed_name(&self) -> String {
         let scenario = scenario_name(self.scenario);
         match &self.place {
             Place::Published { row, copies } => match row.condition {

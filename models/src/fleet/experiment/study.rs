@@ -199,7 +199,8 @@ impl FleetStudy {
 
     /// The seed of a task depends on what it is about, not on its place among the others.
     fn seed_of(&self, task: Task) -> u64 {
-        let name = format!("{}, run {}", self.cells[task.cell].name(), task.replica);
+        let cell = self.cells[task.cell].seed_name();
+        let name = format!("{cell}, run {}", task.replica);
         RandomStream::new(self.seed, &name).next_u64()
     }
 }
