@@ -6,7 +6,7 @@ use super::errors::{Fault, Faults, Place};
 use super::file::{CaseEntry, File, HostEntry, ProcessEntry};
 use super::known::{KnownCase, KnownCases, ParameterFault};
 use super::limits;
-use super::model::{Case, Host, Process, Program, Topology};
+use super::model::{Case, Host, OnExit, Process, Program, Topology};
 use super::reader::At;
 use super::tree::{Node, Table, Value, join, to_plain_table};
 

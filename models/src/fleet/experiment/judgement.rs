@@ -150,7 +150,7 @@ fn safe_criteria(results: &Results<'_>) -> [Criterion; 3] {
     }
     // One is enough to miss a demand; to meet it takes all cells, and something to see in them.
     let is_telling = ended_count == cell_count && sections >= TELLING_COUNT;
-    let judged = |is_met| (!is_met || is_telling).then_some(is_met);
+    let judged = |is_met: bool| (!is_met || is_telling).then_some(is_met);
     let mut finding =
         format!("{collisions} in {sections} CS of {ended_count} of {cell_count} cells");
     if !seen_again.is_empty() {
