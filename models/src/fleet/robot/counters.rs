@@ -29,7 +29,8 @@ pub struct RobotCounters {
     pub refused_count: u64,
     /// Authorities passed over: older, repeated, or for a mission that is over.
     pub stale_count: u64,
-    /// Authorities passed over because their mission had not arrived yet.
+    /// Authorities that came before their mission: passed over by the original's rules, kept for
+    /// it by the acknowledged ones.
     pub early_count: u64,
     /// Authorities with an index that means nothing.
     pub invalid_count: u64,

@@ -23,7 +23,7 @@ pub use self::counters::RobotCounters;
 pub use self::parameters::{MessageOrder, RobotParameters, TrackerKind};
 
 use crate::fleet::geometry::{Pose, floor_index};
-use crate::fleet::messages::{Header, Phase, State, Truth, TruthKind};
+use crate::fleet::messages::{Authority, Header, Phase, State, Truth, TruthKind};
 use crate::fleet::path::{Path, PathId};
 use crate::fleet::robot::authority::Grant;
 use crate::fleet::robot::tracker::{Limits, Tracker};
@@ -55,6 +55,8 @@ pub struct Robot {
     grant: Grant,
     /// Where the robot last stood or was accounted for, metres along its path.
     accounted_m: f64,
+    /// An authority that overtook its mission.
+    early: Option<Authority>,
     newest_authority_header: Option<u32>,
     newest_mission_header: Option<u32>,
     header_id: u32,
@@ -101,6 +103,7 @@ impl Robot {
             tracker,
             grant: Grant::NONE,
             accounted_m: way_m,
+            early: None,
             newest_authority_header: None,
             newest_mission_header: None,
             header_id: 0,

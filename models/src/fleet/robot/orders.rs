@@ -48,6 +48,11 @@ impl Robot {
         self.hasten(now);
         self.counters.missions_started_count += 1;
         truth(self.record(now, TruthKind::MissionStarted, 0));
+        let mission_id = self.mission_id;
+        let kept = self.early.take();
+        if let Some(authority) = kept.filter(|kept| kept.header.mission_id == mission_id) {
+            self.judge(now, &authority, truth);
+        }
     }
 
     /// Judges an authority by the rules its flag names and does as they say.
@@ -68,12 +73,36 @@ impl Robot {
             let is_early = is_newer(authority.header.mission_id, self.mission_id);
             if is_early && !is_passed_over {
                 self.counters.early_count += 1;
+                if self.keep_early(authority) {
+                    return;
+                }
             } else {
                 self.counters.stale_count += 1;
             }
             truth(self.record(now, TruthKind::MessageStale, authority.sequence));
             return;
         }
+        self.judge(now, authority, truth);
+    }
+
+    /// Keeps an acknowledged authority that overtook its mission, which goes another way: the
+    /// coordinator counts it as in force from the moment it was sent. One with a lease is not
+    /// kept, as its time would begin too late. False when it is passed over.
+    fn keep_early(&mut self, authority: &Authority) -> bool {
+        let is_lasting = authority.flags & Authority::ACKNOWLEDGED != 0 && authority.lease_ns == 0;
+        let is_newest = self.early.is_none_or(|kept| {
+            let (new, old) = (&authority.header, &kept.header);
+            is_newer(new.mission_id, old.mission_id)
+                || (new.mission_id == old.mission_id && is_newer(authority.sequence, kept.sequence))
+        });
+        if is_lasting && is_newest {
+            self.early = Some(*authority);
+        }
+        is_lasting && is_newest
+    }
+
+    /// Judges an authority of the mission under way.
+    fn judge(&mut self, now: Instant, authority: &Authority, truth: &mut dyn FnMut(Truth)) {
         let Some(proposal) = self.proposal(now, authority) else {
             self.counters.invalid_count += 1;
             truth(self.record(now, TruthKind::MessageStale, authority.sequence));

@@ -226,6 +226,25 @@ fn an_acknowledged_authority_is_refused_rather_than_overrun() {
 }
 
 #[test]
+fn an_acknowledged_authority_that_overtakes_its_mission_is_kept_for_it() {
+    let scene = scene(Scenario::Crossing);
+    let mut robot = robot(&scene, 0, &parameters(TrackerKind::Exact, 0.0));
+    let flags = Authority::ACKNOWLEDGED;
+    for (sequence, index) in [(2, 60), (1, 30)] {
+        robot.on_authority(at(0.1), &authority(1, sequence, index, flags), &mut |_| {});
+    }
+    robot.on_mission(at(0.2), &mission(&scene, 0, 1, 0), &mut |_| {});
+    let state = robot.state(at(0.2));
+    assert_eq!((state.authority_index, state.applied_sequence), (60, 2));
+    // Nothing is kept for a mission that never comes, nor what ends by itself.
+    let mut leased = authority(2, 1, 40, flags);
+    leased.lease_ns = 1;
+    robot.on_authority(at(0.3), &leased, &mut |_| {});
+    run(&mut robot, at(60.0), &mut |_| {});
+    assert_eq!(robot.state(at(60.0)).authority_index, 60);
+}
+
+#[test]
 fn a_robot_brakes_when_its_lease_ends_and_goes_on_with_a_newer_one() {
     let scene = scene(Scenario::Crossing);
     for tracker in [TrackerKind::Exact, TrackerKind::LegacyRk4] {
