@@ -25,7 +25,7 @@ Exit codes:
   1  the run failed, or its report    78  doctor --strict: host not fit
      has gaps                         130 interrupted; the report is
   2  wrong arguments or topology          complete
-  69 a peer host was not reachable";
+  69 a peer host was not reachable    131 interrupted twice: no report";
 
 /// Runs a robot's controller and its model as separate processes, over shared memory or a real
 /// network, and accounts for every microsecond in between.

@@ -311,7 +311,8 @@ fn compute_tables(
     match study::run(batch.as_ref(), options, &signals, console) {
         Ok(StudyEnd::Passed) => exit::RAN,
         Ok(StudyEnd::Missed) => {
-            console.error("a criterion is missed; see the end of the tables");
+            console
+                .error("a criterion is missed: the lines marked MISSED at the end of the tables");
             exit::FAILED
         }
         Ok(StudyEnd::Interrupted) => interrupted(),

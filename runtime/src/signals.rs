@@ -9,6 +9,8 @@ use signal_hook::flag;
 
 /// Exit code of an interrupted run.
 pub const EXIT_INTERRUPTED: i32 = 130;
+/// Exit code when a second signal ended the program before its report.
+const EXIT_DROPPED: i32 = 131;
 
 /// The user's wish to end.
 #[derive(Debug, Clone)]
@@ -29,7 +31,7 @@ impl Signals {
         for signal in [SIGINT, SIGTERM, SIGHUP] {
             let armed = Arc::new(AtomicBool::new(false));
             // Order matters: the first signal finds the flag unset and then sets it.
-            flag::register_conditional_shutdown(signal, EXIT_INTERRUPTED, Arc::clone(&armed))?;
+            flag::register_conditional_shutdown(signal, EXIT_DROPPED, Arc::clone(&armed))?;
             flag::register(signal, armed)?;
             let number = usize::try_from(signal).expect("signal numbers are positive");
             flag::register_usize(signal, Arc::clone(&which), number)?;

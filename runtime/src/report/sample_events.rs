@@ -193,7 +193,9 @@ fn the_page_shows_the_gravest_events_and_counts_the_rest() {
     assert!(text.contains("1 incident, 0 hazards, 20 notices"), "{text}");
     assert!(text.contains("met (clock of robot-pc)"), "{text}");
     assert_eq!(text.matches("braked (clock of robot-pc)").count(), 11);
-    assert!(text.contains("9 more events are in summary.json; 17 found no room in the score"));
+    assert!(text.contains(
+        "9 more events are in summary.json, or printed by --json; 17 found no room in the score"
+    ));
     assert!(text.contains("Clocks are not aligned"));
     assert!(text.contains("and 3 more messages"));
 }

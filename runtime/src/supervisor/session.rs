@@ -296,6 +296,9 @@ impl Session<'_> {
             self.greeted = WallInstant::now();
         }
         if let Some(signal) = self.signals.received() {
+            self.console.say(&format!(
+                "{signal}: ending the run and writing its report; a second one drops the report"
+            ));
             return Some(Outcome::Interrupted(signal.to_owned()));
         }
         let known = self.crew.events().len();

@@ -7,8 +7,10 @@ use super::*;
 use crate::case_study::CaseStudy;
 use crate::fleet::messages::Truth;
 use crate::fleet::mission::{MissionMode, MissionParameters};
+use crate::fleet::path::PathId;
 use crate::fleet::robot::{RobotParameters, TrackerKind};
 use crate::fleet::scenario::{Scenario, Scene, WorldParameters};
+use crate::fleet::section::Side;
 use crate::fleet::{FLEET_TRUTH, Fleet, FleetParameters};
 use crate::simulation::{Carrier, Simulation};
 use crate::time::Instant;
@@ -157,4 +159,60 @@ fn a_bypassed_status_path_sends_no_state() {
     assert_eq!(tally.status.offered_count, 0);
     assert!(tally.referee.missions_done_count > 10);
     assert!(tally.section_count() > 5);
+}
+
+/// Robot 1 gives way at the crossing: where it stops, from when to when it waits and when it
+/// enters the section follow from the vehicle, the section and the control period alone.
+#[test]
+fn the_robot_that_yields_stops_waits_and_enters_when_the_closed_form_says() {
+    let mut parameters = parameters(Scenario::Crossing, TrackerKind::Exact);
+    parameters.missions.mode = MissionMode::Once;
+    let links = Links {
+        status_path: StatusPath::Bypass,
+        ..Links::default()
+    };
+    let (truth, tally) = fast(&parameters, links, 1, 60);
+    let scene = scene_of(&parameters);
+    let (speed, acceleration) = (2.0, 1.0);
+    let of = |robot| {
+        let records = truth.iter().filter(|record| record.mission_id > 0);
+        records.filter(move |record| record.robot_id == robot)
+    };
+    let seconds = |record: &Truth| record.at_ns as f64 * 1e-9;
+    let departs = |robot| {
+        seconds(
+            of(robot)
+                .find(|record| record.acceleration_mps2 > 0.0)
+                .unwrap(),
+        )
+    };
+    let paths = [0, 1]
+        .map(|robot| of(robot).last().unwrap().path_id)
+        .map(PathId);
+    let section = &scene.world.sections.between(paths[0], paths[1])[0];
+    let way = |robot: usize, index| scene.world.path(paths[robot]).way_to_m(index);
+
+    // From rest to rest over s: s / v + v / a. From rest to s at full speed: s / v + v / 2a.
+    let stop_m = way(1, section.start(Side::Second) - 3);
+    let arrives_s = departs(1) + stop_m / speed + speed / acceleration;
+    let cleared_m = way(0, section.end(Side::First) + 1);
+    let cleared_s = departs(0) + cleared_m / speed + 0.5 * speed / acceleration;
+    let stands = |record: &&Truth| record.travelled_m > 1.0 && record.speed_mps.abs() < 1e-9;
+    let stop = of(1).find(stands).unwrap();
+    assert!((stop.travelled_m - stop_m).abs() < 1e-6, "{stop:?}");
+    assert!(
+        (seconds(stop) - arrives_s).abs() < 1e-6,
+        "{stop:?} {arrives_s}"
+    );
+
+    // The next control cycle after the other has cleared the section lets it go.
+    let goes = of(1).find(|record| seconds(record) > arrives_s && record.acceleration_mps2 > 0.0);
+    let (goes_s, waited_s) = (seconds(goes.unwrap()), cleared_s.ceil() - arrives_s);
+    assert!(waited_s > 0.0);
+    assert!(
+        (goes_s - arrives_s - waited_s).abs() < 1e-6,
+        "{goes_s} {cleared_s}"
+    );
+    assert_eq!(tally.referee.sections_passed_count, 1);
+    assert_eq!(tally.any_collision_count(), 0);
 }

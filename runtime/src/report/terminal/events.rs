@@ -48,7 +48,7 @@ pub(super) fn score_events(canvas: &mut Canvas, all: &ScoreEvents) {
     let mut more = Vec::new();
     if hidden > 0 {
         more.push(format!(
-            "{} more events are in summary.json",
+            "{} more events are in summary.json, or printed by --json",
             grouped(hidden)
         ));
     }
