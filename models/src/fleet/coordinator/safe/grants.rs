@@ -50,10 +50,12 @@ impl SafeRules {
             view.stopped_by = None;
         }
         for candidate in &order {
-            // A grant alone ends no waiting: it may be taken back. Coming further does.
-            if !self.extend(candidate, may_reorder) {
-                let since = &mut self.robots[candidate.robot].waiting_since;
-                *since = since.or(Some(cycle.now));
+            let is_given = self.extend(candidate, may_reorder);
+            let view = &mut self.robots[candidate.robot];
+            if is_given {
+                view.waited_since = view.waiting_since.take().or(view.waited_since);
+            } else {
+                view.waiting_since = view.waiting_since.or(Some(cycle.now));
             }
         }
         if self.takes_back && may_reorder {
@@ -98,7 +100,7 @@ impl SafeRules {
         }
         let path = self.world.path(self.traffic.path(robot)?);
         let time_s = lookahead_s(
-            self.control_period,
+            self.cycles.expected_s(self.control_period),
             view.round_trip.estimate_s(),
             self.reserve_ms,
         );
@@ -257,6 +259,7 @@ impl SafeRules {
         let view = &mut self.robots[holder];
         if view.ledger.send(end).is_some() {
             view.spared_until = cycle.now + SPARED;
+            view.waiting_since = view.waited_since.or(view.waiting_since);
             view.retracted = cycle.now;
             self.counts.shrinks += 1;
         }

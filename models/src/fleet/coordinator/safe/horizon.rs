@@ -37,7 +37,7 @@ impl RoundTrip {
         }
         self.asked = None;
         let sample_s = now.seconds_since(at).clamp(0.0, ROUND_TRIP_MAX_S);
-        self.estimate_s = sample_s.max(self.estimate_s + DECAY * (sample_s - self.estimate_s));
+        self.estimate_s = follow(self.estimate_s, sample_s);
     }
 
     /// A new mission numbers its authorities anew; the estimate is kept.
@@ -48,6 +48,34 @@ impl RoundTrip {
     pub(crate) fn estimate_s(&self) -> f64 {
         self.estimate_s
     }
+}
+
+/// Time from one control cycle to the next as it really is: a host that overruns its period gives
+/// authority less often, so robots need more of it at once.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct CycleTime {
+    estimate_s: f64,
+    last: Option<Instant>,
+}
+
+impl CycleTime {
+    /// A cycle begins.
+    pub(crate) fn begin(&mut self, now: Instant) {
+        if let Some(last) = self.last.replace(now) {
+            let sample_s = now.seconds_since(last).clamp(0.0, ROUND_TRIP_MAX_S);
+            self.estimate_s = follow(self.estimate_s, sample_s);
+        }
+    }
+
+    /// What to expect, at least the nominal period.
+    pub(crate) fn expected_s(&self, nominal: Duration) -> f64 {
+        self.estimate_s.max(nominal.as_secs_f64())
+    }
+}
+
+/// Follows a larger sample at once and a smaller one slowly.
+fn follow(estimate_s: f64, sample_s: f64) -> f64 {
+    sample_s.max(estimate_s + DECAY * (sample_s - estimate_s))
 }
 
 /// Way a robot at `speed_mps` makes at most in `time_s`, and then needs to stop.
@@ -61,10 +89,10 @@ pub(crate) fn reach_m(vehicle: &Vehicle, speed_mps: f64, time_s: f64) -> f64 {
         + end_mps * end_mps / (2.0 * acceleration_mps2)
 }
 
-/// Seconds until an authority sent a control period from now is sure to be at the robot, counted
+/// Seconds until an authority sent a control cycle from now is sure to be at the robot, counted
 /// from when the state known now was sampled.
-pub(crate) fn lookahead_s(control_period: Duration, round_trip_s: f64, reserve_ms: f64) -> f64 {
-    control_period.as_secs_f64() + round_trip_s + 1e-3 * reserve_ms
+pub(crate) fn lookahead_s(cycle_s: f64, round_trip_s: f64, reserve_ms: f64) -> f64 {
+    cycle_s + round_trip_s + 1e-3 * reserve_ms
 }
 
 #[cfg(test)]
@@ -91,6 +119,20 @@ mod tests {
         check(2.0, 1.5, 5.0);
         check(0.0, 1.0, 1.0);
         check(0.0, 3.0, 2.0 + 2.0 + 2.0);
+    }
+
+    #[test]
+    fn cycles_that_overrun_count_as_long_as_they_are() {
+        let mut cycles = CycleTime::default();
+        let nominal = Duration::from_secs(1);
+        for s in [0, 1, 2, 6] {
+            cycles.begin(Instant::from_ns(s * 1_000_000_000));
+        }
+        assert!((cycles.expected_s(nominal) - 4.0).abs() < 1e-12);
+        for s in 7..100 {
+            cycles.begin(Instant::from_ns(s * 1_000_000_000));
+        }
+        assert!((cycles.expected_s(nominal) - 1.0).abs() < 1e-3);
     }
 
     #[test]

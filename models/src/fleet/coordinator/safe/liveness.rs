@@ -19,8 +19,8 @@
 //! it gets there, the move is dropped, and the same holds for the next.
 //!
 //! **No starvation.** A robot *waits* from when it is not admitted, or could use more way and gets
-//! none, until it has come further; a grant that is taken back again ends no waiting. A path being
-//! finite, a robot that does not wait for ever arrives. Plans may be reordered, and way taken back,
+//! none, until it gets some; way that is taken back before the robot came further ends no waiting.
+//! A path being finite, a robot that does not wait for ever arrives. Plans may be reordered, and way taken back,
 //! only while no robot has waited beyond its patience. From then on the present plan is kept and
 //! new missions are added at its end; it has finitely many moves, the waiting robot's last one
 //! among them, so its mission ends.

@@ -31,7 +31,7 @@ use std::sync::Arc;
 
 use crate::fleet::coordinator::counters::SafeCounts;
 use crate::fleet::coordinator::parameters::CoordinatorParameters;
-use crate::fleet::coordinator::safe::horizon::RoundTrip;
+use crate::fleet::coordinator::safe::horizon::{CycleTime, RoundTrip};
 use crate::fleet::coordinator::safe::lease::LeaseWatch;
 use crate::fleet::coordinator::safe::ledger::{Ledger, StateEffect};
 use crate::fleet::coordinator::safe::liveness::{Plan, StopMargin};
@@ -48,6 +48,7 @@ pub(crate) struct SafeRules {
     world: Arc<World>,
     fleet_id: u32,
     control_period: Duration,
+    cycles: CycleTime,
     patience: Duration,
     stuck_after: Duration,
     reserve_ms: f64,
@@ -76,9 +77,11 @@ struct SafeRobot {
     round_trip: RoundTrip,
     speed_mps: f64,
     header_id: u32,
-    /// Since when it has not come further, although it could have used more authority than it
-    /// got or was not admitted.
+    /// Since when it could use more authority and gets none, or is not admitted.
     waiting_since: Option<Instant>,
+    /// Since when it had waited for the way it got last; `None` once it has come further. Should
+    /// that way be taken back, it has waited since then.
+    waited_since: Option<Instant>,
     /// Last time it was seen further on, or its mission given.
     moved: Instant,
     is_counted_stuck: bool,
@@ -110,6 +113,7 @@ impl SafeRules {
             speed_mps: 0.0,
             header_id: 0,
             waiting_since: None,
+            waited_since: None,
             moved: Instant::ZERO,
             is_counted_stuck: false,
             held_up_count: 0,
@@ -123,6 +127,7 @@ impl SafeRules {
             fleet_id,
             starts_apart: traffic.first_overlap().is_none(),
             control_period: parameters.control_period(),
+            cycles: CycleTime::default(),
             patience: parameters.safe.patience(),
             stuck_after: parameters.stuck_after(),
             reserve_ms: parameters.safe.reserve_ms,
@@ -147,7 +152,7 @@ impl SafeRules {
         view.is_admitted = false;
         view.round_trip.forget_question();
         view.speed_mps = 0.0;
-        view.waiting_since = None;
+        (view.waiting_since, view.waited_since) = (None, None);
         view.moved = now;
         view.is_counted_stuck = false;
         self.plan.finish(robot);
@@ -276,7 +281,7 @@ impl Rules for SafeRules {
         }
         if view.ledger.lower() > was_lower {
             view.moved = now;
-            view.waiting_since = None;
+            view.waited_since = None;
             view.is_counted_stuck = false;
         }
         let (lower, bound) = (view.ledger.lower(), view.ledger.bound());
@@ -291,6 +296,7 @@ impl Rules for SafeRules {
     }
 
     fn decide(&mut self, cycle: &mut Cycle<'_>) {
+        self.cycles.begin(cycle.now);
         self.follow_roster(cycle);
         self.expire_leases(cycle.now);
         self.grant_all(cycle);
