@@ -187,7 +187,7 @@ fn the_robot_that_yields_stops_waits_and_enters_when_the_closed_form_says() {
         )
     };
     let paths = [0, 1]
-        .map(|robot| of(robot).last().unwrap().path_id)
+        .map(|robot| of(robot).next_back().unwrap().path_id)
         .map(PathId);
     let section = &scene.world.sections.between(paths[0], paths[1])[0];
     let way = |robot: usize, index| scene.world.path(paths[robot]).way_to_m(index);
