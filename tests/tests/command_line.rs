@@ -286,7 +286,7 @@ fn a_second_ctrl_c_ends_the_program_at_once_and_its_processes_with_it() {
     assert!(child.is_running());
     child.signal(Signal::SIGINT).unwrap();
     let finished = child.wait_within(LIMIT).unwrap();
-    assert_code(&finished, 130);
+    assert_code(&finished, 131);
     assert!(!files.has_report(), "the report would have taken time");
     wait_until(LIMIT, "the end of the own program", || {
         own_processes().is_empty()

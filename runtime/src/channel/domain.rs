@@ -120,6 +120,9 @@ pub struct Cleanup {
     pub freed_count: u64,
     /// Dead processes another process is cleaning up, or whose files refuse.
     pub failed_count: u64,
+    /// Nothing was done, because a file has no length yet: ask again soon. Such a file is either
+    /// being made, or of a process killed while making it.
+    pub is_postponed: bool,
 }
 
 impl Domain {
@@ -220,11 +223,30 @@ impl Domain {
     /// restarted process finds its slot, only after somebody called this or joined anew: the
     /// launcher calls it about ten times a second.
     pub fn cleanup_dead_nodes(&self) -> Cleanup {
+        // iceoryx2 0.10 waits without end for a file to get a length.
+        if !is_clear_of_lengthless_files(&self.address.prefix) {
+            return Cleanup {
+                is_postponed: true,
+                ..Cleanup::default()
+            };
+        }
         let node = self.node();
         let done = node_of(node.as_ref()).try_cleanup_dead_nodes();
         Cleanup {
             freed_count: done.cleanups,
             failed_count: done.failed_cleanups,
+            is_postponed: false,
+        }
+    }
+
+    /// As [`Domain::cleanup_dead_nodes`], but waits, half a second at most, rather than postpone.
+    pub fn cleanup_dead_nodes_now(&self) -> Cleanup {
+        loop {
+            let cleanup = self.cleanup_dead_nodes();
+            if !cleanup.is_postponed {
+                return cleanup;
+            }
+            std::thread::sleep(LENGTHLESS_MAX / 20);
         }
     }
 
@@ -404,6 +426,22 @@ fn shared_memory_files(prefix: &str) -> Vec<PathBuf> {
         name.as_encoded_bytes().starts_with(prefix.as_bytes())
     });
     names.map(|entry| entry.path()).collect()
+}
+
+/// A living process gives a file its length within microseconds of making it.
+const LENGTHLESS_MAX: Duration = Duration::from_millis(500);
+
+/// Deletes files that a process was killed over before it could give them a length; false while
+/// one is young enough that its maker may live.
+fn is_clear_of_lengthless_files(prefix: &str) -> bool {
+    shared_memory_files(prefix).iter().all(|file| {
+        let Ok(metadata) = fs::metadata(file) else {
+            return true;
+        };
+        let age = metadata.modified().ok().and_then(|at| at.elapsed().ok());
+        metadata.len() > 0
+            || (age.is_some_and(|age| age > LENGTHLESS_MAX) && fs::remove_file(file).is_ok())
+    })
 }
 
 /// Deletes a run's shared memory, then all below its root path. What refuses is found by looking.

@@ -98,7 +98,7 @@ impl Domains {
         {
             drop(holders);
             // Members that were killed a moment ago must not count as alive.
-            domain.cleanup_dead_nodes();
+            domain.cleanup_dead_nodes_now();
             let removal = domain.remove();
             left.extend(
                 removal

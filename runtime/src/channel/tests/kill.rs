@@ -102,6 +102,19 @@ fn assert_usable(domain: &Domain, witness: &mut ShmInput, seed: u64) {
     }
 }
 
+#[test]
+fn a_file_whose_maker_was_killed_before_it_had_a_length_holds_nothing_up() {
+    let domain = Domain::create(&root_path("lengthless")).unwrap();
+    let name = format!("{}_0_1.connection", domain.address().prefix());
+    let file = Path::new("/dev/shm").join(name);
+    fs::write(&file, []).unwrap();
+    assert!(domain.cleanup_dead_nodes().is_postponed);
+    assert!(file.exists());
+    assert!(!domain.cleanup_dead_nodes_now().is_postponed);
+    assert!(!file.exists());
+    assert_nothing_left(domain);
+}
+
 fn kill_at_random_moments(seed: u64) {
     const KILLS: usize = 4;
     // About three times what a start-up takes on an idle machine, so that most kills fall into it
@@ -133,7 +146,7 @@ fn kill_at_random_moments(seed: u64) {
         for child in &mut children {
             child.wait().unwrap();
         }
-        domain.cleanup_dead_nodes();
+        domain.cleanup_dead_nodes_now();
         while witness
             .receive(MonotonicClock::now(), &mut |_, _| {})
             .unwrap()
