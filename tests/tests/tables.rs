@@ -112,7 +112,7 @@ fn the_safe_coordinator_collides_under_no_impairment() {
     ]);
     finished.assert_success();
     let document: Value = serde_json::from_str(&finished.stdout).unwrap();
-    let criteria = document["criteria"].as_array().unwrap();
+    let criteria = document["report"]["criteria"].as_array().unwrap();
     let verdict = |words: &str| {
         let has_words = |criterion: &&Value| criterion["text"].as_str().unwrap().contains(words);
         let found = criteria.iter().find(has_words);
