@@ -14,8 +14,9 @@
 )]
 
 use hil_benches::{HostFacts, pin_to_cpu};
-use hil_models::fleet::coordinator::parameters::{CoordinatorMode, MessageOrder};
+use hil_models::fleet::coordinator::parameters::CoordinatorMode;
 use hil_models::fleet::experiment::{Experiment, Links, Setup, StatusPath};
+use hil_models::fleet::messages::MessageOrder;
 use hil_models::fleet::robot::TrackerKind;
 use hil_models::fleet::scenario::{Scenario, Scene, WorldParameters};
 use hil_models::time::Instant;

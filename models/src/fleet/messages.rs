@@ -3,6 +3,7 @@
 //! our own fixed-size one. Nothing here decides anything.
 
 use bytemuck::{Pod, Zeroable};
+use serde::{Deserialize, Serialize};
 
 use crate::message::Message;
 
@@ -20,6 +21,17 @@ pub struct Header {
     pub mission_id: u32,
     /// When the sender gave the message, nanoseconds on its own clock.
     pub sent_ns: i64,
+}
+
+/// What a receiver does with messages that arrive out of order or twice.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum MessageOrder {
+    /// Takes them as they come, as from a raw UDP socket; only the rules of each message decide.
+    #[default]
+    Legacy,
+    /// Passes over each whose `header_id` is not newer than the newest of its kind.
+    Strict,
 }
 
 /// What a robot is about.

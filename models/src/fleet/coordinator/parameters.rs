@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::case_study::ParameterError;
 use crate::fleet::coordinator::policy::PolicyName;
 use crate::fleet::coordinator::safe::parameters::SafeParameters;
+use crate::fleet::messages::MessageOrder;
 
 /// Which rules give robots their way.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -17,17 +18,6 @@ pub enum CoordinatorMode {
     Legacy,
     /// Acknowledged movement authority.
     Safe,
-}
-
-/// What to do with a message that arrives after a newer one.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum MessageOrder {
-    /// Take it as the newest: order of arrival, as raw datagrams give it.
-    #[default]
-    Legacy,
-    /// Drop it, and a repeat of the newest as well.
-    Strict,
 }
 
 /// `[case.parameters.coordinator]`.

@@ -7,9 +7,10 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 use crate::fleet::coordinator::counters::CoordinatorCounts;
-use crate::fleet::coordinator::parameters::{CoordinatorParameters, MessageOrder};
+use crate::fleet::coordinator::parameters::CoordinatorParameters;
 use crate::fleet::coordinator::sections::SectionBook;
 pub use crate::fleet::coordinator::view::{ActiveMission, RobotView};
+use crate::fleet::messages::MessageOrder;
 use crate::fleet::messages::{Header, State, ToRobot};
 use crate::fleet::mission::MissionSource;
 use crate::fleet::path::Path;

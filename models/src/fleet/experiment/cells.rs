@@ -1,9 +1,10 @@
 //! The cells of the tables: which experiments there are, and what each is held against. It runs
 //! none of them.
 
-use crate::fleet::coordinator::parameters::{CoordinatorMode, MessageOrder};
+use crate::fleet::coordinator::parameters::CoordinatorMode;
 use crate::fleet::experiment::published::{Condition, HARBOR, PublishedRow, WAREHOUSE};
 use crate::fleet::experiment::setup::{Links, Setup, StatusPath};
+use crate::fleet::messages::MessageOrder;
 use crate::fleet::robot::TrackerKind;
 use crate::fleet::scenario::Scenario;
 use crate::link::impaired::{DelayLaw, Impairments};

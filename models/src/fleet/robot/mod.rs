@@ -20,10 +20,10 @@ pub(crate) mod tests;
 use std::sync::Arc;
 
 pub use self::counters::RobotCounters;
-pub use self::parameters::{MessageOrder, RobotParameters, TrackerKind};
+pub use self::parameters::{RobotParameters, TrackerKind};
 
 use crate::fleet::geometry::{Pose, floor_index};
-use crate::fleet::messages::{Authority, Header, Phase, State, Truth, TruthKind};
+use crate::fleet::messages::{Authority, Header, MessageOrder, Phase, State, Truth, TruthKind};
 use crate::fleet::path::{Path, PathId};
 use crate::fleet::robot::authority::Grant;
 use crate::fleet::robot::tracker::{Limits, Tracker};

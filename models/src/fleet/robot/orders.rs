@@ -3,10 +3,10 @@
 
 use std::sync::Arc;
 
-use crate::fleet::messages::{Authority, Header, Mission, Phase, Truth, TruthKind};
+use crate::fleet::messages::{Authority, Header, MessageOrder, Mission, Phase, Truth, TruthKind};
 use crate::fleet::path::{Path, PathId};
+use crate::fleet::robot::Robot;
 use crate::fleet::robot::authority::{self, Grant, Proposal, Verdict, is_newer, reach_of};
-use crate::fleet::robot::{MessageOrder, Robot};
 use crate::time::Instant;
 
 impl Robot {

@@ -6,6 +6,7 @@ use core::time::Duration;
 use serde::{Deserialize, Serialize};
 
 use crate::case_study::ParameterError;
+use crate::fleet::messages::MessageOrder;
 use crate::fleet::world::Vehicle;
 
 /// How a robot follows its path.
@@ -17,17 +18,6 @@ pub enum TrackerKind {
     Exact,
     /// The original's: a numerical integration whose decisions fall on its ticks.
     LegacyRk4,
-}
-
-/// What a receiver does with messages that arrive out of order or twice.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum MessageOrder {
-    /// Takes them as they come, as from a raw UDP socket; only the rules of each message decide.
-    #[default]
-    Legacy,
-    /// Passes over each whose `header_id` is not newer than the newest of its kind.
-    Strict,
 }
 
 /// `[case.parameters.robot]`.
