@@ -8,6 +8,8 @@ use serde::de::DeserializeOwned;
 
 use crate::component::Role;
 use crate::message::{Message, MessageType};
+use crate::plot::PlotSeries;
+use crate::replay::Replay;
 use crate::run_log::RunLog;
 use crate::study::Batch;
 
@@ -57,6 +59,30 @@ pub trait CaseStudy: Sized + Debug + 'static {
 
     /// What the robot did, from the messages of a finished run.
     fn score(&self, log: &RunLog) -> Score;
+
+    /// What a plot of the finished run shows, for the run's folder; nothing by default.
+    fn series(&self, _log: &RunLog) -> Vec<PlotSeries> {
+        Vec::new()
+    }
+
+    /// Runs the robot's side again in virtual time, from what it heard in the finished run, and
+    /// holds its messages against the recorded ones; `None` for a case that cannot.
+    fn replay(&self, _log: &RunLog) -> Option<Replay> {
+        None
+    }
+
+    /// What finds the link parameters under which the figure called `figure` comes out as
+    /// `value`; `None` for a case, or a figure, without such a search.
+    ///
+    /// # Errors
+    /// When the value is outside what the figure can take.
+    fn calibration(
+        &self,
+        _figure: &str,
+        _value: f64,
+    ) -> Result<Option<Box<dyn Batch>>, ParameterError> {
+        Ok(None)
+    }
 
     /// The tables this case can compute in virtual time, of the size its parameters ask for;
     /// `None` for a case without any.

@@ -4,14 +4,13 @@
 use nalgebra::Isometry3;
 
 use crate::component::{Component, Outbox};
-use crate::teleoperation::arm::{Arm, JointVector};
-use crate::teleoperation::inverse::{Reach, Tracker};
 use crate::teleoperation::mapping::{Clutch, MappingSettings};
-use crate::teleoperation::messages::{
-    ArmCommand, HumanFrame, JOINT_COUNT, JointCommand, JointStatus, Joints,
-};
+use crate::teleoperation::messages::{ArmCommand, HumanFrame, JointCommand, JointStatus};
 use crate::teleoperation::parameters::{LeftArm, TeleoperationParameters};
 use crate::time::Instant;
+use crate::yumi::arm::{Arm, JointVector};
+use crate::yumi::inverse::{Reach, Tracker};
+use crate::yumi::{JOINT_COUNT, Joints};
 
 crate::message_set! {
     /// What the controller hears, in channel order.

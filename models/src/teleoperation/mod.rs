@@ -11,7 +11,7 @@
 //!
 //! 1. [`messages`]: what the roles tell each other.
 //! 2. [`motion`] with [`swing`], [`bvh`], [`skeleton`]: where the hand is.
-//! 3. [`mapping`], [`arm`], [`inverse`]: from the hand to the joints.
+//! 3. [`mapping`] with [`crate::yumi`]: from the hand to the joints.
 //! 4. [`servo`]: from the command to the motion.
 //! 5. `score`: what the robot made of it.
 //!
@@ -35,11 +35,9 @@
 //! This first form has no guided-motion session: no time-out, no re-activation, no message queue
 //! on the robot's side. A silent network makes the robot hold; it never stops the motion for good.
 
-pub mod arm;
 pub mod bvh;
 mod controller;
 mod human;
-pub mod inverse;
 pub mod mapping;
 pub mod messages;
 pub mod motion;

@@ -7,11 +7,11 @@
 use core::time::Duration;
 
 use crate::component::{Component, Outbox};
-use crate::teleoperation::arm::{Arm, LEFT_START_RAD, RIGHT_START_RAD};
 use crate::teleoperation::messages::{ArmCommand, ArmStatus, JointCommand, JointStatus};
 use crate::teleoperation::parameters::TeleoperationParameters;
 use crate::teleoperation::servo::Servo;
 use crate::time::{Instant, PeriodicTimer, duration_ns};
+use crate::yumi::arm::{Arm, LEFT_START_RAD, RIGHT_START_RAD};
 
 /// The reference counts as held once it is older than this many command periods.
 const HOLD_AFTER_PERIODS: u32 = 5;

@@ -6,13 +6,14 @@
 
 use crate::case_study::{Metric, Score};
 use crate::run_log::RunLog;
-use crate::teleoperation::arm::Arm;
-use crate::teleoperation::messages::{JOINT_COUNT, JointCommand, JointStatus, Joints};
+use crate::teleoperation::messages::{JointCommand, JointStatus};
 use crate::teleoperation::series::{
     Estimate, Sample, lag_s, peak_to_peak, peaks, poisson_interval,
 };
 use crate::teleoperation::{ARM_COMMAND, ARM_STATUS, Teleoperation};
 use crate::time::Instant;
+use crate::yumi::arm::Arm;
+use crate::yumi::{JOINT_COUNT, Joints};
 
 /// A motion loop counts when the tool falls back by this share of the nominal peak-to-peak.
 const PROMINENCE_RATIO: f64 = 0.5;

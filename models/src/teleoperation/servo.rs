@@ -8,9 +8,10 @@
 
 use core::time::Duration;
 
-use crate::teleoperation::arm::{JointVector, speed_ratio, within_limits};
-use crate::teleoperation::messages::{ArmCommand, JOINT_COUNT, Joints};
+use crate::teleoperation::messages::ArmCommand;
 use crate::time::{Instant, duration_ns};
+use crate::yumi::arm::{JointVector, speed_ratio, within_limits};
+use crate::yumi::{JOINT_COUNT, Joints};
 
 /// The maker's adjustable parameters.
 #[derive(Debug, Clone, Copy, PartialEq)]

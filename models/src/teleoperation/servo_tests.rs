@@ -1,7 +1,7 @@
 //! Tests of [`super`].
 
 use super::*;
-use crate::teleoperation::arm::{POSITION_MAX_RAD, RIGHT_START_RAD, SPEED_MAX_RAD_PER_S};
+use crate::yumi::arm::{POSITION_MAX_RAD, RIGHT_START_RAD, SPEED_MAX_RAD_PER_S};
 
 const CYCLE: Duration = Duration::from_millis(4);
 const PERIOD_S: f64 = 4.033;

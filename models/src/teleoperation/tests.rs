@@ -11,11 +11,11 @@ use crate::link::bernoulli::BernoulliLink;
 use crate::link::{Fate, LinkModel};
 use crate::message::Message;
 use crate::simulation::{Carrier, Simulation, SimulationResult};
-use crate::teleoperation::arm::{Arm, RIGHT_START_RAD};
 use crate::teleoperation::controller::Follower;
-use crate::teleoperation::inverse::Reach;
-use crate::teleoperation::messages::Joints;
 use crate::time::Instant;
+use crate::yumi::Joints;
+use crate::yumi::arm::{Arm, RIGHT_START_RAD};
+use crate::yumi::inverse::Reach;
 
 fn case(change: impl FnOnce(&mut TeleoperationParameters)) -> Teleoperation {
     let mut parameters = TeleoperationParameters::default();

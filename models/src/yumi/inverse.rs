@@ -8,11 +8,11 @@
 use nalgebra::{Isometry3, Matrix6, Vector6};
 
 use crate::random::RandomStream;
-use crate::teleoperation::arm::{
+use crate::yumi::Joints;
+use crate::yumi::arm::{
     Chain, ChainState, Jacobian, JointVector, POSITION_MAX_RAD, POSITION_MIN_RAD,
     SPEED_MAX_RAD_PER_S, stacked, within_limits,
 };
-use crate::teleoperation::messages::Joints;
 
 /// A target counts as reached within this distance, metres.
 pub const TOLERANCE_M: f64 = 1e-5;

@@ -10,7 +10,7 @@ use nalgebra::{
     Vector6,
 };
 
-use crate::teleoperation::messages::{JOINT_COUNT, Joints};
+use crate::yumi::{JOINT_COUNT, Joints};
 
 /// [`Joints`] to compute with.
 pub type JointVector = SVector<f64, JOINT_COUNT>;

@@ -3,7 +3,7 @@
 use nalgebra::Translation3;
 
 use super::*;
-use crate::teleoperation::arm::{MOUNT_TO_FIRST_JOINT_M, RIGHT_START_RAD};
+use crate::yumi::arm::{MOUNT_TO_FIRST_JOINT_M, RIGHT_START_RAD};
 
 const CHAIN: Chain = Chain::new(MOUNT_TO_FIRST_JOINT_M);
 
