@@ -44,7 +44,7 @@ pub mod motion;
 mod parameters;
 mod robot;
 mod score;
-mod series;
+pub(crate) mod series;
 pub mod servo;
 pub mod skeleton;
 pub mod swing;
