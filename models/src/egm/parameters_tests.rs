@@ -10,18 +10,15 @@ struct Key {
     read: fn(&ControllerSettings) -> f64,
 }
 
-const fn key(
-    name: &'static str,
-    range: [f64; 2],
-    set: fn(&mut EgmParameters, f64),
-    read: fn(&ControllerSettings) -> f64,
-) -> Key {
-    Key {
-        name,
-        range,
-        set,
-        read,
-    }
+macro_rules! key {
+    ($name:ident, $min:literal, $max:literal, $number:ident => $as_written:expr, $read:expr) => {
+        Key {
+            name: stringify!($name),
+            range: [$min, $max],
+            set: |keys, $number| keys.$name = Some($as_written),
+            read: $read,
+        }
+    };
 }
 
 #[allow(
@@ -29,98 +26,26 @@ const fn key(
     clippy::cast_sign_loss,
     reason = "small counts of a test; what is below zero becomes zero"
 )]
+#[rustfmt::skip]
 fn keys() -> [Key; 15] {
     [
-        key(
-            "cycle_us",
-            [1000.0, 100_000.0],
-            |keys, value| keys.cycle_us = Some(value),
-            |settings| settings.cycle.as_secs_f64() * 1e6,
-        ),
-        key(
-            "queue_capacity",
-            [1.0, 100_000.0],
-            |keys, value| keys.queue_capacity = Some(value as u32),
-            |settings| settings.queue_capacity as f64,
-        ),
-        key(
-            "position_gain_per_s",
-            [0.0, 20.0],
-            |keys, value| keys.position_gain_per_s = Some(value),
-            |settings| settings.position_gain_per_s,
-        ),
-        key(
-            "low_pass_hz",
-            [0.0, 100.0],
-            |keys, value| keys.low_pass_hz = Some(value),
-            |settings| settings.low_pass_hz,
-        ),
-        key(
-            "position_correction_ratio",
-            [0.0, 1.0],
-            |keys, value| keys.position_correction_ratio = Some(value),
-            |settings| settings.position_correction_ratio,
-        ),
-        key(
-            "ramp_in_s",
-            [0.0, 10.0],
-            |keys, value| keys.ramp_in_s = Some(value),
-            |settings| settings.ramp_in_s,
-        ),
-        key(
-            "ramp_out_s",
-            [0.0, 10.0],
-            |keys, value| keys.ramp_out_s = Some(value),
-            |settings| settings.ramp_out_s,
-        ),
-        key(
-            "max_speed_deviation_deg_per_s",
-            [0.01, 1000.0],
-            |keys, value| keys.max_speed_deviation_deg_per_s = Some(value),
-            |settings| settings.max_speed_deviation_rad_per_s.to_degrees(),
-        ),
-        key(
-            "max_position_deviation_deg",
-            [0.1, 1000.0],
-            |keys, value| keys.max_position_deviation_deg = Some(value),
-            |settings| settings.max_position_deviation_rad.to_degrees(),
-        ),
-        key(
-            "convergence_deg",
-            [0.001, 100.0],
-            |keys, value| keys.convergence_deg = Some(value),
-            |settings| settings.convergence_rad.to_degrees(),
-        ),
-        key(
-            "condition_time_s",
-            [0.0, 1e6],
-            |keys, value| keys.condition_time_s = Some(value),
-            |settings| settings.condition_time_s,
-        ),
-        key(
-            "comm_timeout_s",
-            [0.004, 1e6],
-            |keys, value| keys.comm_timeout_s = Some(value),
-            |settings| settings.comm_timeout_s,
-        ),
-        key(
-            "restart_wait_s",
-            [0.0, 60.0],
-            |keys, value| keys.restart_wait_s = Some(value),
-            |settings| settings.restart_wait_s,
-        ),
-        key(
-            "activation_s",
-            [0.0, 60.0],
-            |keys, value| keys.activation_s = Some(value),
-            |settings| settings.activation_s,
-        ),
-        key(
-            "control_delay_cycles",
-            [0.0, 16.0],
-            |keys, value| keys.control_delay_cycles = Some(value as u32),
-            |settings| settings.control_delay_cycles as f64,
-        ),
+        key!(cycle_us, 1000.0, 100_000.0, x => x, |s| s.cycle.as_secs_f64() * 1e6),
+        key!(queue_capacity, 1.0, 100_000.0, x => x as u32, |s| s.queue_capacity as f64),
+        key!(position_gain_per_s, 0.0, 20.0, x => x, |s| s.position_gain_per_s),
+        key!(low_pass_hz, 0.0, 100.0, x => x, |s| s.low_pass_hz),
+        key!(position_correction_ratio, 0.0, 1.0, x => x, |s| s.position_correction_ratio),
+        key!(ramp_in_s, 0.0, 10.0, x => x, |s| s.ramp_in_s),
+        key!(ramp_out_s, 0.0, 10.0, x => x, |s| s.ramp_out_s),
+        key!(max_speed_deviation_deg_per_s, 0.01, 1000.0, x => x,
+            |s| s.max_speed_deviation_rad_per_s.to_degrees()),
+        key!(max_position_deviation_deg, 0.1, 1000.0, x => x,
+            |s| s.max_position_deviation_rad.to_degrees()),
+        key!(convergence_deg, 0.001, 100.0, x => x, |s| s.convergence_rad.to_degrees()),
+        key!(condition_time_s, 0.0, 1e6, x => x, |s| s.condition_time_s),
+        key!(comm_timeout_s, 0.004, 1e6, x => x, |s| s.comm_timeout_s),
+        key!(restart_wait_s, 0.0, 60.0, x => x, |s| s.restart_wait_s),
+        key!(activation_s, 0.0, 60.0, x => x, |s| s.activation_s),
+        key!(control_delay_cycles, 0.0, 16.0, x => x as u32, |s| s.control_delay_cycles as f64),
     ]
 }
 

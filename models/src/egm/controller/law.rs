@@ -146,13 +146,13 @@ impl Plan {
     /// One cycle towards `reference`, with `ramp` of the correction.
     #[inline]
     pub(super) fn follow(&mut self, law: &Law, reference: &Reference, ramp: f64) -> Binding {
-        let mut wanted = [0.0; JOINT_COUNT];
-        let mut excess_ratio = 0.0_f64;
-        for joint in 0..JOINT_COUNT {
+        let mut wanted: Joints = core::array::from_fn(|joint| {
             let error = reference.position_rad[joint] - self.q_rad[joint];
-            let speed = ramp * (law.gain_per_s * error + reference.speed_rad_per_s[joint]);
-            wanted[joint] = speed;
-            let of_limit = speed.abs() * law.inverse_speed_max[joint];
+            ramp * (law.gain_per_s * error + reference.speed_rad_per_s[joint])
+        });
+        let mut excess_ratio = 0.0_f64;
+        for (speed, inverse_max) in wanted.iter().zip(&law.inverse_speed_max) {
+            let of_limit = speed.abs() * inverse_max;
             if of_limit > excess_ratio {
                 excess_ratio = of_limit;
             }
@@ -187,7 +187,7 @@ impl Plan {
             let (min, max) = (POSITION_MIN_RAD[joint], POSITION_MAX_RAD[joint]);
             let above = if q < min { min } else { q };
             let within = if above > max { max } else { above };
-            is_at_limit |= (q < min) | (q > max);
+            is_at_limit |= within.to_bits() != q.to_bits();
             self.speed_rad_per_s[joint] = speed;
             self.q_rad[joint] = within;
         }

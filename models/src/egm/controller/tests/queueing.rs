@@ -23,7 +23,7 @@ fn ages_after_a_stall(rig: &mut Rig, every: u64) -> Vec<(f64, f64)> {
     while rig.next_s() < 16.0 {
         let feedback = rig.step();
         let sent_s = rig.next_s() - CYCLE_S + 0.001;
-        if feedback.cycle_index % every == 0 {
+        if feedback.cycle_index.is_multiple_of(every) {
             let mut command = swing(sent_s, false);
             command.source_time_ns = at_s(sent_s).as_ns();
             buffered.push(command);

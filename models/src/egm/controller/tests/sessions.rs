@@ -7,7 +7,6 @@ use crate::egm::messages::{
     SessionState, Side,
 };
 use crate::egm::parameters::{ControllerSettings, Preset, RestartPolicy, StartMode, StopMode};
-use crate::yumi::JOINT_COUNT;
 use crate::yumi::arm::{RIGHT_START_RAD, SPEED_MAX_RAD_PER_S};
 
 /// The paper's preset with a power-on start.
@@ -102,18 +101,16 @@ fn going_home_first_activates_at_home_and_the_reference_calls_the_arm_back() {
         .iter()
         .find(|f| f.session == 2 && f.session_state() == Some(SessionState::Running));
     let at_start = at_start.unwrap();
-    for joint in 0..JOINT_COUNT {
-        assert!((at_start.measured_rad[joint] - home[joint]).abs() < 1e-9);
-    }
+    assert!(is_still(&at_start.measured_rad, &home));
     for pair in silent
         .iter()
         .chain(&feedback)
         .collect::<Vec<_>>()
         .windows(2)
     {
-        for joint in 0..JOINT_COUNT {
+        for (joint, speed_max) in SPEED_MAX_RAD_PER_S.iter().enumerate() {
             let speed = (pair[1].planned_rad[joint] - pair[0].planned_rad[joint]).abs() / 0.004;
-            assert!(speed <= SPEED_MAX_RAD_PER_S[joint] * (1.0 + 1e-9));
+            assert!(speed <= speed_max * (1.0 + 1e-9));
         }
     }
     let error = feedback.last().unwrap().measured_rad[1] - RIGHT_START_RAD[1];
