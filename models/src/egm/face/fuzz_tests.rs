@@ -230,7 +230,6 @@ fn no_mutated_sensor_datagram_panics_or_passes_unjudged() {
             }
         }
         let counts = face.received();
-        println!("{axes:?}: {counts:?}");
         assert_eq!(counts.total(), (MUTANT_COUNT / 4) as u64);
         assert_eq!(counts.accepted(), accepted_count);
         let share = accepted_count as f64 / counts.total() as f64;
@@ -274,7 +273,6 @@ fn no_mutated_robot_datagram_panics_or_passes_unjudged() {
             }
         }
         let counts = face.received();
-        println!("{axes:?}: {counts:?} {:?}", face.transmit());
         assert_eq!(counts.total(), (MUTANT_COUNT / 4) as u64);
         assert_eq!(
             (counts.accepted(), answer_count),
