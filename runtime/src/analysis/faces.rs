@@ -56,7 +56,10 @@ fn face_summary(
         host: process.host.clone(),
         kind: face.kind.to_string(),
         arm: side.word().to_owned(),
-        address: face.address(side).map(|one| one.to_string()).unwrap_or_default(),
+        address: face
+            .address(side)
+            .map(|one| one.to_string())
+            .unwrap_or_default(),
         peer_state: report.map_or_else(
             || "unavailable: the face left no report".to_owned(),
             |report| report.peer_state.clone(),

@@ -130,9 +130,19 @@ impl RunRecords {
     }
 
     /// What a face recorded that sends the messages of `out` and publishes on `back`.
-    pub(super) fn of_face(&self, out: &str, back: &str) -> (&[FaceSentRecord], &[FaceReceivedRecord]) {
-        let sent = self.channels.get(out).map(|files| files.face_sent.as_slice());
-        let received = self.channels.get(back).map(|files| files.face_received.as_slice());
+    pub(super) fn of_face(
+        &self,
+        out: &str,
+        back: &str,
+    ) -> (&[FaceSentRecord], &[FaceReceivedRecord]) {
+        let sent = self
+            .channels
+            .get(out)
+            .map(|files| files.face_sent.as_slice());
+        let received = self
+            .channels
+            .get(back)
+            .map(|files| files.face_received.as_slice());
         (sent.unwrap_or_default(), received.unwrap_or_default())
     }
 

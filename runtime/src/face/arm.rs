@@ -64,11 +64,7 @@ impl Arm {
     ///
     /// # Errors
     /// When a channel or the socket itself breaks.
-    pub(super) fn run(
-        &mut self,
-        work: &mut dyn Work,
-        stop: &AtomicBool,
-    ) -> Result<(), FaceError> {
+    pub(super) fn run(&mut self, work: &mut dyn Work, stop: &AtomicBool) -> Result<(), FaceError> {
         while !stop.load(Ordering::Acquire) {
             let has_moved = self.turn(work)?;
             if !has_moved {

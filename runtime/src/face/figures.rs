@@ -22,7 +22,11 @@ pub(crate) fn figures(
     sent: &[FaceSentRecord],
     received: &[FaceReceivedRecord],
 ) -> FaceFigures {
-    let left = sorted(sent.iter().filter(|one| has_left(one)).map(FaceSentRecord::left_ns));
+    let left = sorted(
+        sent.iter()
+            .filter(|one| has_left(one))
+            .map(FaceSentRecord::left_ns),
+    );
     let came = sorted(received.iter().map(FaceReceivedRecord::came_ns));
     let (robot, sensor) = match kind {
         FaceKind::Robot => (&left, &came),
@@ -108,7 +112,11 @@ fn sent_segments(what: &str, sent: &[FaceSentRecord]) -> Vec<FaceSegment> {
     ];
     // A message that went out before says nothing about the way of a new one.
     let is_new = |one: &&FaceSentRecord| one.flags & FaceSentRecord::REPEATED == 0;
-    let new: Vec<&FaceSentRecord> = sent.iter().filter(|one| has_left(one)).filter(is_new).collect();
+    let new: Vec<&FaceSentRecord> = sent
+        .iter()
+        .filter(|one| has_left(one))
+        .filter(is_new)
+        .collect();
     segments(what, &stages, &new)
 }
 
@@ -216,7 +224,10 @@ mod tests {
         near("feedback in all: published → TX stamp", 30_000);
         near("command: RX stamp → received by face", 12_000);
         near("command in all: RX stamp → published", 17_000);
-        near("answer of the foreign program: TX stamp → RX stamp", 500_000);
+        near(
+            "answer of the foreign program: TX stamp → RX stamp",
+            500_000,
+        );
     }
 
     #[test]
@@ -253,7 +264,11 @@ mod tests {
         let robot: Vec<_> = (0..10).map(|cycle| received(cycle * CYCLE)).collect();
         let ours: Vec<_> = (0..10)
             .map(|cycle| FaceSentRecord {
-                flags: if cycle % 2 == 1 { FaceSentRecord::REPEATED } else { 0 },
+                flags: if cycle % 2 == 1 {
+                    FaceSentRecord::REPEATED
+                } else {
+                    0
+                },
                 ..sent(cycle)
             })
             .collect();

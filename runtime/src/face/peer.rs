@@ -75,6 +75,10 @@ mod tests {
         peer.spoken_to(now);
         assert_eq!(peer.state(), "never answered");
         peer.heard(Instant::from_ns(now.as_ns() - 2_000_000_000));
-        assert!(peer.state().starts_with("silent for 2."), "{}", peer.state());
+        assert!(
+            peer.state().starts_with("silent for 2."),
+            "{}",
+            peer.state()
+        );
     }
 }

@@ -5,7 +5,7 @@
 use std::net::SocketAddr;
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
@@ -25,9 +25,7 @@ use crate::gateway::GatewayError;
 use crate::gateway::direction::timestamp_mode;
 use crate::gateway::process::{PROBE_BOUND, arm_and_describe};
 use crate::process::launch::read;
-use crate::process::pipe::{
-    ChannelProgress, FaceReport, FromProcess, Orders, ProcessReport, say,
-};
+use crate::process::pipe::{ChannelProgress, FaceReport, FromProcess, Orders, ProcessReport, say};
 use crate::process::usage::add_usage;
 use crate::realtime::{self, RealtimeGrant, SpinAdvice};
 use crate::record::Recorder;
@@ -64,7 +62,10 @@ fn prepare_and_live(path: &Path) -> Result<(), FaceError> {
     }
     let spare = Spare::open(&launch.face.spare, &mut recorder)?;
     recorder.start().map_err(GatewayError::Thread)?;
-    let counters: Vec<Counter> = opened.iter().flat_map(|(arm, one)| counters(arm, one)).collect();
+    let counters: Vec<Counter> = opened
+        .iter()
+        .flat_map(|(arm, one)| counters(arm, one))
+        .collect();
     let (sender, ready) = channel();
     let mut threads = Vec::new();
     for (arm, one) in opened {
@@ -83,7 +84,7 @@ fn prepare_and_live(path: &Path) -> Result<(), FaceError> {
     }
     gate.close();
     let spare_report = spare.join().map_err(|_panic| GatewayError::Panicked)?;
-    finish(threads, recorder, stamp_facts).and(spare_report)
+    finish(threads, recorder, &stamp_facts).and(spare_report)
 }
 
 fn probe_settings(launch: &FaceLaunch) -> Option<ProbeSettings> {
@@ -108,11 +109,13 @@ fn watch(orders: &Orders, threads: &[JoinHandle<Lived>], counters: &[Counter]) {
         let now = MonotonicClock::now();
         if now.saturating_duration_since(told) >= PROGRESS_PERIOD {
             told = now;
-            let progress = counters.iter().map(|(channel, what, count)| ChannelProgress {
-                channel: channel.clone(),
-                what: (*what).to_owned(),
-                count: count.load(Ordering::Relaxed),
-            });
+            let progress = counters
+                .iter()
+                .map(|(channel, what, count)| ChannelProgress {
+                    channel: channel.clone(),
+                    what: (*what).to_owned(),
+                    count: count.load(Ordering::Relaxed),
+                });
             say(&FromProcess::Progress(progress.collect()));
         }
         thread::sleep(WATCH_PERIOD);
@@ -178,7 +181,9 @@ fn live(arm: &ArmLaunch, opened: OpenedArm, around: &Around, ready: &Sender<bool
         report.peer_state = work.peer_state();
         report.counters = work.counters();
         let socket = joined.line.counters();
-        let named = socket.iter().map(|(name, count)| (format!("socket: {name}"), count));
+        let named = socket
+            .iter()
+            .map(|(name, count)| (format!("socket: {name}"), count));
         report.counters.extend(named);
         let steps = joined.line.clock_step_count();
         report.counters.push(("clock_step_count".to_owned(), steps));
@@ -202,7 +207,7 @@ fn wait_until_open(ready: &Receiver<bool>, count: usize) -> bool {
 fn finish(
     threads: Vec<JoinHandle<Lived>>,
     recorder: Recorder,
-    stamp_facts: Vec<(String, String)>,
+    stamp_facts: &[(String, String)],
 ) -> Result<(), FaceError> {
     let mut report = ProcessReport::default();
     let mut outcome = Ok(());
@@ -211,7 +216,7 @@ fn finish(
         match thread.join() {
             Ok(mut lived) => {
                 report.realtime.push((name, lived.grant));
-                lived.report.facts.extend_from_slice(&stamp_facts);
+                lived.report.facts.extend_from_slice(stamp_facts);
                 report.faces.push(lived.report);
                 outcome = outcome.and(lived.outcome);
             }

@@ -131,7 +131,8 @@ impl SensorWork {
 
     fn is_stale(&self, now: Instant) -> bool {
         let age = |newest: Taken| now.saturating_duration_since(newest.at);
-        self.newest.is_none_or(|newest| age(newest) > COMMAND_AGE_MAX)
+        self.newest
+            .is_none_or(|newest| age(newest) > COMMAND_AGE_MAX)
     }
 
     /// Takes the oldest waiting command of our controller; false when none waits.
@@ -205,20 +206,35 @@ impl Work for SensorWork {
             ("feedbacks published", received.accepted()),
             ("sessions seen", self.session_count),
             ("changes of the robot's address", self.address_change_count),
-            ("refused: another address than the robot's", self.foreign_count),
+            (
+                "refused: another address than the robot's",
+                self.foreign_count,
+            ),
             ("commands taken", commands.total()),
-            ("commands overtaken before they were sent", transmit.superseded_count),
+            (
+                "commands overtaken before they were sent",
+                transmit.superseded_count,
+            ),
             ("datagrams encoded", transmit.sent_count),
             ("datagrams that repeat a command", transmit.repeated_count),
-            ("robot's messages without an answer", transmit.unanswered_count),
-            ("answers withheld, no command for 50 ms", self.withheld_count),
+            (
+                "robot's messages without an answer",
+                transmit.unanswered_count,
+            ),
+            (
+                "answers withheld, no command for 50 ms",
+                self.withheld_count,
+            ),
             ("grid points without a datagram", transmit.skipped_count),
             ("malformed commands", self.malformed_count),
         ];
         let not_sent = commands.causes();
-        let not_sent = not_sent
-            .map(|(cause, count)| (format!("commands not sent: {}", cause.label()), count));
-        named(own).chain(refusals(received)).chain(not_sent).collect()
+        let not_sent =
+            not_sent.map(|(cause, count)| (format!("commands not sent: {}", cause.label()), count));
+        named(own)
+            .chain(refusals(received))
+            .chain(not_sent)
+            .collect()
     }
 
     fn peer_state(&self) -> String {

@@ -63,7 +63,11 @@ impl Spare {
         if self.channels.is_empty() {
             return Ok(());
         }
-        let names: Vec<&str> = self.channels.iter().map(|(one, _)| one.name.as_str()).collect();
+        let names: Vec<&str> = self
+            .channels
+            .iter()
+            .map(|(one, _)| one.name.as_str())
+            .collect();
         let mut waiter = Waiter::open(domain, &names)?;
         let mut inputs = Vec::new();
         for (channel, _) in &self.channels {

@@ -14,8 +14,8 @@ use crate::face::launch::{ArmLaunch, FaceSettings};
 use crate::process::launch::{DirectionLaunch, EmulationLaunch, Side, SocketLaunch};
 use crate::realtime::{RealtimeRequest, SchedulingPolicy};
 use crate::topology::{
-    CardChannel, Channel, Crossing, EgmFace, Execution, FaceKind, Host, OnExit, Process, ProcessCard, Program,
-    Scheduling, Topology, Wait, command_channel, feedback_channel,
+    CardChannel, Channel, Crossing, EgmFace, Execution, FaceKind, Host, OnExit, Process,
+    ProcessCard, Program, Scheduling, Topology, Wait, command_channel, feedback_channel,
 };
 use crate::wait::WaitMode;
 
@@ -167,10 +167,14 @@ fn face_settings(
             FaceKind::Sensor => (command_channel(side), feedback_channel(side)),
         };
         let named = |channels: &[CardChannel], name: &str| {
-            channels.iter().find(|channel| channel.name == name).cloned()
+            channels
+                .iter()
+                .find(|channel| channel.name == name)
+                .cloned()
         };
         // A channel whose other role nobody plays is not there; the topology saw to the rest.
-        let (Some(input), Some(output)) = (named(&card.inputs, input), named(&card.outputs, output))
+        let (Some(input), Some(output)) =
+            (named(&card.inputs, input), named(&card.outputs, output))
         else {
             continue;
         };
@@ -195,7 +199,12 @@ fn face_settings(
         timestamps: face.timestamps,
         dscp: face.dscp,
         interface,
-        spare: card.inputs.iter().filter(|one| !is_used(one)).cloned().collect(),
+        spare: card
+            .inputs
+            .iter()
+            .filter(|one| !is_used(one))
+            .cloned()
+            .collect(),
         arms,
     }
 }
@@ -204,7 +213,9 @@ fn face_settings(
 /// case's `egm` table says, or its default.
 fn robot_cycle(card: &ProcessCard) -> (Duration, u64) {
     let table = card.parameters.get("egm").cloned();
-    let parameters: EgmParameters = table.and_then(|egm| egm.try_into().ok()).unwrap_or_default();
+    let parameters: EgmParameters = table
+        .and_then(|egm| egm.try_into().ok())
+        .unwrap_or_default();
     let settings = parameters.settings();
     let settings = settings.unwrap_or_else(|_checked| ControllerSettings::of(parameters.preset));
     (settings.cycle, settings.control_delay_cycles as u64)

@@ -36,7 +36,10 @@ pub(super) fn check_face(
     faults: &Faults,
 ) -> Option<EgmFace> {
     let Some(kind) = kind_of(role, case) else {
-        let roles = case.roles.iter().filter(|role| kind_of(role, case).is_some());
+        let roles = case
+            .roles
+            .iter()
+            .filter(|role| kind_of(role, case).is_some());
         let roles: Vec<_> = roles.map(|role| format!("`{role}`")).collect();
         let allowed = if roles.is_empty() {
             format!("case `{}` has none that does", case.name)

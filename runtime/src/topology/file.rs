@@ -254,7 +254,8 @@ fn read_process(name: String, mut reader: Reader<'_>) -> ProcessEntry {
     }
     let egm = reader.table("egm").map(FaceEntry::read);
     if egm.is_some() {
-        let why = "does not go with `egm`: a foreign program that is not started here plays the role";
+        let why =
+            "does not go with `egm`: a foreign program that is not started here plays the role";
         reader.refuse_present(&["run"], why);
     }
     let execution = read_execution(&mut reader);

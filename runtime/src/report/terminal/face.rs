@@ -33,7 +33,9 @@ pub(super) fn face(canvas: &mut Canvas, face: &FaceSummary) {
         .collect();
     canvas.field("counted", Tone::Faint, &words.join(" · "));
     let facts = face.facts.iter();
-    let words: Vec<_> = facts.map(|fact| format!("{}: {}", fact.label, fact.value)).collect();
+    let words: Vec<_> = facts
+        .map(|fact| format!("{}: {}", fact.label, fact.value))
+        .collect();
     canvas.field("found", Tone::Faint, &words.join(" · "));
 }
 
