@@ -152,138 +152,149 @@ fn a_face_may_be_started_again_although_the_case_remembers() {
     );
 }
 
+/// A good file, what of it is replaced by what, the key of the error, and words of it.
+struct Faulty(
+    &'static str,
+    &'static str,
+    &'static str,
+    &'static str,
+    &'static str,
+);
+
+const FAULTY: &[Faulty] = &[
+    Faulty(
+        CLIENT,
+        "127.0.0.1:6510",
+        "localhost:6510",
+        "egm.right",
+        "no address of the form",
+    ),
+    Faulty(
+        CLIENT,
+        "127.0.0.1:6510",
+        "127.0.0.1:80",
+        "egm.right",
+        "1024..=65535",
+    ),
+    Faulty(
+        CLIENT,
+        "127.0.0.1:6510",
+        "0.0.0.0:6510",
+        "egm.right",
+        "no address to send to",
+    ),
+    Faulty(
+        CLIENT,
+        "right = \"127.0.0.1:6510\"",
+        "",
+        "egm.right",
+        "missing: write right =",
+    ),
+    Faulty(
+        CLIENT,
+        "right =",
+        "axes = 8, right =",
+        "egm.axes",
+        "8 is outside 6..=7",
+    ),
+    Faulty(
+        CLIENT,
+        "right =",
+        "robotware = 5, right =",
+        "egm.robotware",
+        "5 is outside 6..=7",
+    ),
+    Faulty(
+        CLIENT,
+        "right =",
+        "send = \"free\", right =",
+        "egm.send",
+        "does not apply to a robot face",
+    ),
+    Faulty(
+        CLIENT,
+        "right =",
+        "timestamps = \"hardware\", right =",
+        "egm.timestamps",
+        "allowed: off, software",
+    ),
+    Faulty(
+        CLIENT,
+        "right =",
+        "rihgt =",
+        "egm.rihgt",
+        "did you mean `right`?",
+    ),
+    Faulty(
+        CLIENT,
+        "\"power-on\"",
+        "\"request\"",
+        "case.parameters.egm.start",
+        "allowed beside a robot face: \"power-on\"",
+    ),
+    Faulty(
+        CLIENT,
+        "parameters.egm.start = \"power-on\"",
+        "",
+        "case.parameters.egm.start",
+        "is \"request\"",
+    ),
+    Faulty(
+        CLIENT,
+        "role = \"controller\"",
+        "role = \"human\"",
+        "processes.client.egm",
+        "only `controller` or `robot` does",
+    ),
+    Faulty(
+        CLIENT,
+        "role = \"controller\"",
+        "role = \"controller\"\nrun = [\"x\"]",
+        "processes.client.run",
+        "does not go with `egm`",
+    ),
+    Faulty(
+        CLIENT,
+        "[processes.robot]",
+        "[channels.\"human/frame\"]\ndepth = 4\n[processes.robot]",
+        "channels.\"human/frame\"",
+        "no process of this file plays role `human`",
+    ),
+    Faulty(
+        ROBOT,
+        "0.0.0.0:6511",
+        "0.0.0.0:6510",
+        "egm.left",
+        "address of the right arm too",
+    ),
+    Faulty(
+        ROBOT,
+        "send_hz = 125",
+        "send_hz = 0.5",
+        "egm.send_hz",
+        "0.5 is outside 1..=1000",
+    ),
+    Faulty(
+        ROBOT,
+        "send = \"free\", ",
+        "",
+        "egm.send_hz",
+        "needs send = \"free\"",
+    ),
+    Faulty(
+        ROBOT,
+        "[processes.human]\nrole = \"human\"\n",
+        "",
+        "processes",
+        "no process plays role `human`",
+    ),
+];
+
 #[test]
 fn what_a_face_may_not_say_is_named_with_what_it_may() {
-    for (text, from, to, key, words) in [
-        (
-            CLIENT,
-            "127.0.0.1:6510",
-            "localhost:6510",
-            "egm.right",
-            "no address of the form",
-        ),
-        (
-            CLIENT,
-            "127.0.0.1:6510",
-            "127.0.0.1:80",
-            "egm.right",
-            "1024..=65535",
-        ),
-        (
-            CLIENT,
-            "127.0.0.1:6510",
-            "0.0.0.0:6510",
-            "egm.right",
-            "no address to send to",
-        ),
-        (
-            CLIENT,
-            "right = \"127.0.0.1:6510\"",
-            "",
-            "egm.right",
-            "missing: write right =",
-        ),
-        (
-            CLIENT,
-            "right =",
-            "axes = 8, right =",
-            "egm.axes",
-            "8 is outside 6..=7",
-        ),
-        (
-            CLIENT,
-            "right =",
-            "robotware = 5, right =",
-            "egm.robotware",
-            "5 is outside 6..=7",
-        ),
-        (
-            CLIENT,
-            "right =",
-            "send = \"free\", right =",
-            "egm.send",
-            "does not apply to a robot face",
-        ),
-        (
-            CLIENT,
-            "right =",
-            "timestamps = \"hardware\", right =",
-            "egm.timestamps",
-            "allowed: off, software",
-        ),
-        (
-            CLIENT,
-            "right =",
-            "rihgt =",
-            "egm.rihgt",
-            "did you mean `right`?",
-        ),
-        (
-            CLIENT,
-            "\"power-on\"",
-            "\"request\"",
-            "case.parameters.egm.start",
-            "allowed beside a robot face: \"power-on\"",
-        ),
-        (
-            CLIENT,
-            "parameters.egm.start = \"power-on\"",
-            "",
-            "case.parameters.egm.start",
-            "is \"request\"",
-        ),
-        (
-            CLIENT,
-            "role = \"controller\"",
-            "role = \"human\"",
-            "processes.client.egm",
-            "only `controller` or `robot` does",
-        ),
-        (
-            CLIENT,
-            "role = \"controller\"",
-            "role = \"controller\"\nrun = [\"x\"]",
-            "processes.client.run",
-            "does not go with `egm`",
-        ),
-        (
-            CLIENT,
-            "[processes.robot]",
-            "[channels.\"human/frame\"]\ndepth = 4\n[processes.robot]",
-            "channels.\"human/frame\"",
-            "no process of this file plays role `human`",
-        ),
-        (
-            ROBOT,
-            "0.0.0.0:6511",
-            "0.0.0.0:6510",
-            "egm.left",
-            "address of the right arm too",
-        ),
-        (
-            ROBOT,
-            "send_hz = 125",
-            "send_hz = 0.5",
-            "egm.send_hz",
-            "0.5 is outside 1..=1000",
-        ),
-        (
-            ROBOT,
-            "send = \"free\", ",
-            "",
-            "egm.send_hz",
-            "needs send = \"free\"",
-        ),
-        (
-            ROBOT,
-            "[processes.human]\nrole = \"human\"\n",
-            "",
-            "processes",
-            "no process plays role `human`",
-        ),
-    ] {
+    for Faulty(text, from, to, key, words) in FAULTY {
         let faulty = text.replace(from, to);
-        assert_ne!(faulty, text, "{from} is not there");
+        assert_ne!(faulty, *text, "{from} is not there");
         let errors = match parse_guided(&faulty) {
             Ok(topology) => panic!("{to} passed as {topology:?}"),
             Err(errors) => errors,
