@@ -1,6 +1,7 @@
 //! One arm's thread: looks in turn at shared memory and at the socket, and waits for either. What
 //! is sent and what is made of what came is the business of `robot` and `sensor`.
 
+use core::fmt::Debug;
 use core::time::Duration;
 use std::os::fd::BorrowedFd;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -45,7 +46,7 @@ pub(super) struct Attention {
 }
 
 /// What one of the two faces does.
-pub(super) trait Work {
+pub(super) trait Work: Debug {
     /// Moves what waits at both ends, at most one message each way; false when nothing waited.
     fn turn(&mut self, arm: &mut Arm) -> Result<bool, FaceError>;
 

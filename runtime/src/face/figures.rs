@@ -10,14 +10,17 @@ use crate::topology::FaceKind;
 
 /// What the records of one arm come to.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct FaceFigures {
-    pub(crate) cycle_ns: Option<i64>,
-    pub(crate) answers: Answers,
-    pub(crate) segments: Vec<FaceSegment>,
+pub struct FaceFigures {
+    /// Median interval of the robot's messages; `None` for fewer than two.
+    pub cycle_ns: Option<i64>,
+    /// How the robot's messages were answered.
+    pub answers: Answers,
+    /// Where time went.
+    pub segments: Vec<FaceSegment>,
 }
 
 /// The figures of one arm; records in the order they were written.
-pub(crate) fn figures(
+pub fn figures(
     kind: FaceKind,
     sent: &[FaceSentRecord],
     received: &[FaceReceivedRecord],

@@ -14,7 +14,7 @@
 //! message, six or seven doubles each.
 
 mod arm;
-pub(crate) mod figures;
+pub mod figures;
 pub mod launch;
 mod line;
 mod opening;
@@ -36,6 +36,8 @@ use crate::channel::{ChannelError, DomainError};
 use crate::gateway::GatewayError;
 use crate::process::launch::LaunchError;
 use crate::record::RecordFileError;
+
+pub use opening::{JoinedArm, OpenedArm};
 
 /// Why a face cannot go on.
 #[derive(Debug, thiserror::Error)]

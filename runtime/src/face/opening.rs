@@ -3,7 +3,7 @@
 
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::sync::Arc;
-use std::sync::atomic::AtomicU64;
+use std::sync::atomic::{AtomicBool, AtomicU64};
 
 use hil_gateways::transport::timestamping::TimestampMode;
 use hil_gateways::transport::udp::{GrantedOptions, UdpSender, UdpSettings};
@@ -13,13 +13,16 @@ use hil_models::measure::record::{PublishedRecord, TakenRecord};
 use hil_models::message::{Envelope, MessageType};
 
 use super::FaceError;
-use super::arm::{Arm, Attention, DATAGRAM_BYTES_MAX};
+use super::arm::{Arm, Attention, DATAGRAM_BYTES_MAX, Work};
 use super::launch::{ArmLaunch, FaceLaunch};
 use super::line::{Line, Socket};
 use super::record::{FaceReceivedRecord, FaceSentRecord};
+use super::robot::RobotWork;
+use super::sensor::SensorWork;
 use crate::channel::{Domain, OutputSettings, ShmInput, ShmOutput, Waiter};
 use crate::clock::MonotonicClock;
 use crate::gateway::direction::timestamp_mode;
+use crate::process::pipe::FaceReport;
 use crate::process::recording::{Destination, RecordedInput, RecordedOutput};
 use crate::record::{RecordKind, RecordSink, Recorder};
 use crate::topology::FaceKind;
@@ -30,7 +33,7 @@ const RING_RECORDS: usize = 16_384;
 
 /// An arm whose socket and files are open and whose ports are not.
 #[derive(Debug)]
-pub(super) struct OpenedArm {
+pub struct OpenedArm {
     line: Line,
     taken: RecordSink,
     published: RecordSink,
@@ -42,11 +45,12 @@ pub(super) struct OpenedArm {
 }
 
 impl OpenedArm {
-    /// Opens the socket and the record files of `arm`.
+    /// Opens the socket and the record files of `arm`; call it from a thread of normal priority,
+    /// as kernel stamps are switched on by a worker.
     ///
     /// # Errors
     /// When the kernel refuses a socket option or a file cannot be made.
-    pub(super) fn open(
+    pub fn open(
         launch: &FaceLaunch,
         arm: &ArmLaunch,
         recorder: &mut Recorder,
@@ -88,7 +92,31 @@ impl OpenedArm {
     ///
     /// # Errors
     /// When a channel does not appear or is of another type.
-    pub(super) fn connect(
+    pub fn connect(
+        self,
+        launch: &FaceLaunch,
+        arm: &ArmLaunch,
+        domain: &Domain,
+    ) -> Result<JoinedArm, FaceError> {
+        let report = FaceReport {
+            arm: arm.arm.clone(),
+            kind: launch.face.kind.to_string(),
+            outgoing: arm.input.name.clone(),
+            incoming: arm.output.name.clone(),
+            facts: self.facts.clone(),
+            ..FaceReport::default()
+        };
+        Ok(JoinedArm {
+            arm: self.join(launch, arm, domain)?,
+            work: match launch.face.kind {
+                FaceKind::Robot => Box::new(RobotWork::new(&launch.face, arm.side())),
+                FaceKind::Sensor => Box::new(SensorWork::new(&launch.face, arm.side())),
+            },
+            report,
+        })
+    }
+
+    fn join(
         self,
         launch: &FaceLaunch,
         arm: &ArmLaunch,
@@ -137,6 +165,39 @@ impl OpenedArm {
             buffer: Box::new([0; DATAGRAM_BYTES_MAX]),
             attention: Attention::default(),
         })
+    }
+}
+
+/// An arm at work.
+#[derive(Debug)]
+pub struct JoinedArm {
+    arm: Arm,
+    work: Box<dyn Work>,
+    report: FaceReport,
+}
+
+impl JoinedArm {
+    /// Carries messages until `stop` is set, then what still waits.
+    ///
+    /// # Errors
+    /// When a channel or the socket itself breaks.
+    pub fn run(&mut self, stop: &AtomicBool) -> Result<(), FaceError> {
+        self.arm.run(self.work.as_mut(), stop)
+    }
+
+    /// Everything it counted so far.
+    pub fn report(&self) -> FaceReport {
+        let mut counters = self.work.counters();
+        let socket = self.arm.line.counters();
+        let named = socket.iter();
+        counters.extend(named.map(|(name, count)| (format!("socket: {name}"), count)));
+        let steps = self.arm.line.clock_step_count();
+        counters.push(("clock_step_count".to_owned(), steps));
+        FaceReport {
+            peer_state: self.work.peer_state(),
+            counters,
+            ..self.report.clone()
+        }
     }
 }
 

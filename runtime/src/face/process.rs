@@ -12,11 +12,8 @@ use std::time::Duration;
 
 use hil_gateways::transport::probe::{DISCARD_PORT, ProbeSettings};
 
-use super::arm::Work;
 use super::launch::{ArmLaunch, FaceLaunch};
 use super::opening::OpenedArm;
-use super::robot::RobotWork;
-use super::sensor::SensorWork;
 use super::spare::Spare;
 use super::{FaceError, Gate};
 use crate::channel::Domain;
@@ -157,36 +154,16 @@ fn spawn(
 fn live(arm: &ArmLaunch, opened: OpenedArm, around: &Around, ready: &Sender<bool>) -> Lived {
     let (launch, domain, gate) = around;
     let grant = realtime::apply(&arm.realtime);
-    let facts = opened.facts.clone();
-    let mut report = FaceReport {
-        arm: arm.arm.clone(),
-        kind: launch.face.kind.to_string(),
-        outgoing: arm.input.name.clone(),
-        incoming: arm.output.name.clone(),
-        facts,
-        ..FaceReport::default()
-    };
+    let mut report = FaceReport::default();
     let outcome = opened.connect(launch, arm, domain).and_then(|mut joined| {
-        let mut work: Box<dyn Work> = match launch.face.kind {
-            FaceKind::Robot => Box::new(RobotWork::new(&launch.face, arm.side())),
-            FaceKind::Sensor => Box::new(SensorWork::new(&launch.face, arm.side())),
-        };
         // The process waits for this word; it cannot have left.
         let _left = ready.send(true).is_err();
         let outcome = if gate.wait_until_open() {
-            joined.run(work.as_mut(), gate.stop_flag())
+            joined.run(gate.stop_flag())
         } else {
             Ok(())
         };
-        report.peer_state = work.peer_state();
-        report.counters = work.counters();
-        let socket = joined.line.counters();
-        let named = socket
-            .iter()
-            .map(|(name, count)| (format!("socket: {name}"), count));
-        report.counters.extend(named);
-        let steps = joined.line.clock_step_count();
-        report.counters.push(("clock_step_count".to_owned(), steps));
+        report = joined.report();
         outcome
     });
     if outcome.is_err() {

@@ -216,7 +216,7 @@ const FAULTY: &[Faulty] = &[
         "right =",
         "timestamps = \"hardware\", right =",
         "egm.timestamps",
-        "allowed: off, software",
+        "allowed: `off`, `software`",
     ),
     Faulty(
         CLIENT,
