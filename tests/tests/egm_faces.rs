@@ -5,8 +5,8 @@
 use std::time::Duration;
 
 use hil_models::egm::messages::{EgmEventKind, Side};
-use hil_models::yumi::arm::Arm;
 use hil_models::yumi::Joints;
+use hil_models::yumi::arm::Arm;
 use hil_runtime::report::face::FaceSummary;
 use hil_runtime::report::summary::{Outcome, RunSummary};
 use hil_tests::account::assert_accounts_close;
@@ -51,14 +51,19 @@ fn face<'a>(summary: &'a RunSummary, arm: &str) -> &'a FaceSummary {
 fn count(face: &FaceSummary, name: &str) -> u64 {
     let mut counters = face.counters.iter();
     let found = counters.find(|counter| counter.name == name);
-    found.unwrap_or_else(|| panic!("{name} is not counted")).count
+    found
+        .unwrap_or_else(|| panic!("{name} is not counted"))
+        .count
 }
 
 fn p99_us(face: &FaceSummary, name: &str) -> f64 {
     let mut segments = face.segments.iter();
     let found = segments.find(|segment| segment.name == name);
     let figures = found.and_then(|segment| segment.distribution.measured());
-    figures.unwrap_or_else(|| panic!("{name} is unavailable")).p99_ns as f64 * 1e-3
+    figures
+        .unwrap_or_else(|| panic!("{name} is unavailable"))
+        .p99_ns as f64
+        * 1e-3
 }
 
 #[test]
@@ -84,7 +89,11 @@ fn our_controller_drives_our_robot_over_nothing_but_the_makers_datagrams() {
     for run in [&mut robot_run, &mut sensor_run] {
         run.wait_within(LIMIT).unwrap().assert_success();
     }
-    println!("{}\n{}", sensor_files.read("report.txt"), robot_files.read("report.txt"));
+    println!(
+        "{}\n{}",
+        sensor_files.read("report.txt"),
+        robot_files.read("report.txt")
+    );
 
     let arms = Arms::of(&sensor_files);
     let robots = Arms::of(&robot_files);
@@ -96,22 +105,40 @@ fn our_controller_drives_our_robot_over_nothing_but_the_makers_datagrams() {
         let (first, last) = (arrivals[0], *arrivals.last().unwrap());
         let events = robots.events(side);
         let mut ended = of_kind(&events, EgmEventKind::Ended);
-        assert!(!ended.any(|event| (first..last).contains(&event.at_ns)), "{story}");
+        assert!(
+            !ended.any(|event| (first..last).contains(&event.at_ns)),
+            "{story}"
+        );
 
         // Both hosts read one clock here.
         let window = (first + 5 * SECOND_NS, last);
         let is_inside = |at: &i64| (window.0..window.1).contains(at);
-        let commanded = arms.commands(side).into_iter().filter(|(at, _)| is_inside(at));
+        let commanded = arms
+            .commands(side)
+            .into_iter()
+            .filter(|(at, _)| is_inside(at));
         let commanded = loops(&arm, commanded.map(|(_, one)| one.position_rad));
-        let moved = arms.feedbacks(side).into_iter().filter(|(at, _)| is_inside(at));
+        let moved = arms
+            .feedbacks(side)
+            .into_iter()
+            .filter(|(at, _)| is_inside(at));
         let moved = loops(&arm, moved.map(|(_, one)| one.measured_rad));
         println!("{} arm: {moved} of {commanded} loops", side.word());
         assert!(commanded >= 3, "{commanded} loops were asked for");
-        assert_eq!(moved, commanded, "{} arm; load {}", side.word(), load_average());
+        assert_eq!(
+            moved,
+            commanded,
+            "{} arm; load {}",
+            side.word(),
+            load_average()
+        );
         for (place, follow) in arms.follow(side, window, LAG_NS).iter().enumerate() {
             println!("{} arm, chain place {place}: {follow:?}", side.word());
             if follow.commanded_deg >= SWING_DEG_MIN {
-                assert!((follow.gain - 1.0).abs() < 0.05, "place {place}: {follow:?}");
+                assert!(
+                    (follow.gain - 1.0).abs() < 0.05,
+                    "place {place}: {follow:?}"
+                );
             }
         }
     }
@@ -132,17 +159,28 @@ fn judge([sensor, robot]: [&RunSummary; 2]) {
             let face = face(summary, arm);
             assert_eq!(face.kind, kind);
             let ratio = face.answers.ratio().unwrap();
-            assert!(ratio >= 0.95, "{arm}: {ratio} answered; load {}", load_average());
+            assert!(
+                ratio >= 0.95,
+                "{arm}: {ratio} answered; load {}",
+                load_average()
+            );
             let [back, out] = way;
             let inward = p99_us(face, &format!("{back} in all: RX stamp → published"));
             let outward = p99_us(face, &format!("{out} in all: published → TX stamp"));
             println!("{kind}, {arm} arm: p99 {inward:.0} us in, {outward:.0} us out");
-            assert!(face.cycle_ns.is_some_and(|cycle_ns| (3_900_000..4_100_000).contains(&cycle_ns)));
+            assert!(
+                face.cycle_ns
+                    .is_some_and(|cycle_ns| (3_900_000..4_100_000).contains(&cycle_ns))
+            );
             assert_eq!(face.refusals, [], "{arm}");
             assert_eq!(count(face, "socket: kernel_drop_count"), 0);
         }
     }
     let right = face(sensor, "right");
     assert_eq!(count(right, "changes of the robot's address"), 0);
-    assert!(right.peer_state.contains(&ADDRESSES[1].to_string()), "{}", right.peer_state);
+    assert!(
+        right.peer_state.contains(&ADDRESSES[1].to_string()),
+        "{}",
+        right.peer_state
+    );
 }

@@ -116,12 +116,7 @@ impl OpenedArm {
         })
     }
 
-    fn join(
-        self,
-        launch: &FaceLaunch,
-        arm: &ArmLaunch,
-        domain: &Domain,
-    ) -> Result<Arm, FaceError> {
+    fn join(self, launch: &FaceLaunch, arm: &ArmLaunch, domain: &Domain) -> Result<Arm, FaceError> {
         let command = MessageType::of::<EgmCommand>();
         let feedback = MessageType::of::<EgmFeedback>();
         let (outgoing, incoming) = match launch.face.kind {
