@@ -2,6 +2,7 @@
 //! it. They know no datagram layout; that is [`crate::protocol`].
 //!
 //! - [`udp`]: the real network, with separate sockets for sending and receiving.
+//! - [`udp_server`]: one socket that hears anyone and answers, for foreign protocols.
 //! - [`queue`]: an in-process pair, for tests.
 //! - [`emulated`]: any receiver behind a link model.
 //! - [`timestamping`] and [`probe`]: what the kernel and the network card can stamp, and whether
@@ -17,6 +18,7 @@ pub mod probe;
 pub mod queue;
 pub mod timestamping;
 pub mod udp;
+pub mod udp_server;
 mod udp_socket;
 
 #[cfg(test)]
@@ -184,6 +186,9 @@ pub struct SenderCounters {
     pub undecodable_report_count: u64,
     /// Replies received from the peer.
     pub reply_count: u64,
+    /// Replies the kernel dropped because the receive buffer was full (`SO_RXQ_OVFL`). Known as
+    /// of the newest reply received.
+    pub kernel_drop_count: u64,
     /// What the newest network or local report said.
     pub newest_report: Option<SendRefusal>,
 }
@@ -205,6 +210,7 @@ impl SenderCounters {
             ("local_report_count", self.local_report_count),
             ("undecodable_report_count", self.undecodable_report_count),
             ("reply_count", self.reply_count),
+            ("kernel_drop_count", self.kernel_drop_count),
         ]
         .into_iter()
     }

@@ -2,6 +2,7 @@
 //! account of each channel, and lets the case score what the robot did.
 
 mod events;
+mod faces;
 mod figures;
 mod records;
 
@@ -85,6 +86,7 @@ pub(crate) fn conclude(
         .iter()
         .map(|channel| channel_summary(topology, result, channel, &records))
         .collect();
+    summary.faces = faces::face_summaries(topology, result, &records);
     let score = score(topology, registry, records.log())?;
     summary.score = ScoreMetric::all_of(&score);
     summary.score_events =

@@ -33,7 +33,7 @@ const PROGRESS_PERIOD: Duration = Duration::from_millis(250);
 /// How often orders and threads are looked at.
 const WATCH_PERIOD: Duration = Duration::from_millis(5);
 /// How long each half of the stamp probe may take; a restart must not wait long for it.
-const PROBE_BOUND: Duration = Duration::from_millis(300);
+pub(crate) const PROBE_BOUND: Duration = Duration::from_millis(300);
 
 /// Runs the gateway described by the launch file until told to stop.
 ///
@@ -256,23 +256,27 @@ fn warn_of_shared_cpus(launch: &GatewayLaunch) {
 
 /// Switches kernel stamps on and finds out whether they really come.
 fn arm_stamps(launch: &GatewayLaunch) -> (Option<Sentinel>, Vec<(String, String)>) {
-    let fact = |text: String| vec![("kernel stamps".to_owned(), text)];
-    let Some(direction) = launch
-        .directions
-        .iter()
-        .find(|one| one.socket.timestamps != Timestamps::Off)
-    else {
-        return (None, fact("switched off in the topology".to_owned()));
-    };
-    let settings = ProbeSettings {
+    let mut directions = launch.directions.iter();
+    let stamped = directions.find(|one| one.socket.timestamps != Timestamps::Off);
+    arm_and_describe(stamped.map(|direction| ProbeSettings {
         timestamps: direction::timestamp_mode(direction.socket.timestamps),
         interface: direction.socket.interface.clone(),
         transmit_target: Some(direction::probe_target(direction)),
         proof_count: 5,
         bound: PROBE_BOUND,
+    }))
+}
+
+/// As [`arm_stamps`], of what is to be probed; `None` where no stamps are asked for.
+pub(crate) fn arm_and_describe(
+    settings: Option<ProbeSettings>,
+) -> (Option<Sentinel>, Vec<(String, String)>) {
+    let fact = |text: String| vec![("kernel stamps".to_owned(), text)];
+    let Some(settings) = settings else {
+        return (None, fact("switched off in the topology".to_owned()));
     };
     let card = (settings.timestamps == TimestampMode::Hardware)
-        .then(|| switch_card_on(direction.socket.interface.as_deref()));
+        .then(|| switch_card_on(settings.interface.as_deref()));
     match arm_and_probe(&settings) {
         Ok((report, sentinel)) => {
             let mut facts = fact(describe_probe(&report));

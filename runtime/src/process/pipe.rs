@@ -79,6 +79,28 @@ pub struct ProcessReport {
     pub involuntary_switches: u64,
     /// Named counters of each channel direction a gateway carries.
     pub directions: Vec<DirectionReport>,
+    /// The arms of a face that speaks with a foreign program.
+    #[serde(default)]
+    pub faces: Vec<FaceReport>,
+}
+
+/// One arm of a face.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct FaceReport {
+    /// `right` or `left`.
+    pub arm: String,
+    /// `EGM robot face` or `EGM sensor face`.
+    pub kind: String,
+    /// The channel whose messages went out.
+    pub outgoing: String,
+    /// The channel that what came in went to.
+    pub incoming: String,
+    /// How the foreign program stood to it at the end, in words.
+    pub peer_state: String,
+    /// Counters by name.
+    pub counters: Vec<(String, u64)>,
+    /// Facts in words: addresses, granted buffers, stamp probe.
+    pub facts: Vec<(String, String)>,
 }
 
 /// One direction of one channel through a gateway.

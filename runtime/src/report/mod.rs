@@ -2,6 +2,7 @@
 //! rendering for a terminal. It measures nothing and prints nothing; the caller writes the text.
 
 pub mod assessment;
+pub mod face;
 pub mod score_event;
 pub mod summary;
 pub mod terminal;

@@ -16,6 +16,7 @@ use super::child::{Child, Word, describe_exit};
 use super::event::{Event, Interruption};
 use super::plan::{ProcessKind, ProcessPlan};
 use crate::clock::MonotonicClock;
+use crate::face::launch::FaceLaunch;
 use crate::process::launch::{ComponentLaunch, GatewayLaunch, LaunchError, write};
 use crate::process::own_program;
 use crate::process::pipe::{ChannelProgress, FromProcess, ProcessReport, ToProcess};
@@ -432,6 +433,18 @@ fn write_launch(
             };
             write(path, &launch)?;
             Ok("gateway")
+        }
+        ProcessKind::Face(face) => {
+            let launch = FaceLaunch {
+                process,
+                instance,
+                domain,
+                records: folder.records(),
+                wait: plan.wait,
+                face: face.clone(),
+            };
+            write(path, &launch)?;
+            Ok("face")
         }
         ProcessKind::Foreign { .. } => Ok("foreign"),
     }

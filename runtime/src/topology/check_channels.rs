@@ -3,6 +3,7 @@
 
 use hil_models::case_study::ChannelSpec;
 
+use super::check_face::is_played_by_face;
 use super::errors::{Fault, Faults, Place};
 use super::file::{ChannelEntry, ProcessEntry};
 use super::file_links::LinkEntry;
@@ -89,9 +90,12 @@ fn case_channels(
                 .iter()
                 .find(|process| process.role() == Some(role))
         };
-        // An unplayed role is a fault already.
+        // An unplayed role is a fault already, or nobody misses it.
         let (from, to) = (player(spec.from), spec.to.and_then(player));
-        let Some(from) = from.filter(|_| to.is_some() || spec.is_recorded_only()) else {
+        // A foreign program leaves nothing in our record.
+        let is_recorded_here = spec.is_recorded_only() && !from.is_some_and(is_played_by_face);
+        let Some(from) = from.filter(|_| to.is_some() || is_recorded_here) else {
+            refuse_unplayed(spec, entry, faults);
             continue;
         };
         channels.push(Channel {
@@ -115,6 +119,22 @@ fn case_channels(
         });
     }
     channels
+}
+
+/// A setting of a channel that is not there would be ignored in silence.
+fn refuse_unplayed(spec: &ChannelSpec, entry: Option<&ChannelEntry>, faults: &Faults) {
+    let Some(entry) = entry.filter(|_| faults.is_empty()) else {
+        return;
+    };
+    let fault = format!(
+        "has nothing to set: no process of this file plays role `{}`, so the channel is not there",
+        spec.from
+    );
+    faults.add(
+        entry.path.clone(),
+        Some(entry.place),
+        Fault::Inconsistent(fault),
+    );
 }
 
 /// What the file may say of a channel that the case declares.

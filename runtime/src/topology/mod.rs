@@ -13,7 +13,9 @@
 mod card;
 mod check;
 mod check_channels;
+mod check_face;
 mod errors;
+mod face;
 mod file;
 mod file_links;
 mod host;
@@ -30,7 +32,9 @@ mod units;
 use std::path::Path;
 
 pub use card::{CardChannel, ProcessCard};
+pub(crate) use check_face::{command_channel, feedback_channel};
 pub use errors::{Fault, Location, TopologyError, TopologyErrors};
+pub use face::{EgmFace, FaceKind, FaceSend};
 pub use host::{HOST_VARIABLE, HostChoice, HostError, MachineIdentity, which_host};
 pub use known::{
     KnownCase, KnownCases, ParameterCheck, ParameterFault, check_parameters_with, parameters_of,

@@ -9,6 +9,8 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use hil_models::message::type_hash;
 use serde::{Deserialize, Serialize};
 
+use super::face::EgmFace;
+
 /// A topology file after every check. Only [`load`](super::load) and [`parse`](super::parse)
 /// make one.
 #[derive(Debug, Clone, PartialEq)]
@@ -91,14 +93,14 @@ impl Process {
     /// The role of the case it plays, if any.
     pub fn role(&self) -> Option<&str> {
         match &self.program {
-            Program::BuiltIn { role } => Some(role),
+            Program::BuiltIn { role } | Program::Egm { role, .. } => Some(role),
             Program::Command { role, .. } => role.as_deref(),
         }
     }
 }
 
 /// What a process executes.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub enum Program {
     /// A role of the case study, shipped in this binary.
     BuiltIn {
@@ -113,6 +115,13 @@ pub enum Program {
         command: Vec<String>,
         /// Variables added to its environment.
         environment: BTreeMap<String, String>,
+    },
+    /// Nothing of the role: a foreign EGM program plays it, and this process speaks with it.
+    Egm {
+        /// Name of the role.
+        role: String,
+        /// How to speak with the program.
+        face: EgmFace,
     },
 }
 

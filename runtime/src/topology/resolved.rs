@@ -133,6 +133,9 @@ fn resolved_process(process: &Process) -> Table {
             .collect();
         put(&mut table, "env", variables);
     }
+    if let Program::Egm { face, .. } = &process.program {
+        put(&mut table, "egm", face.resolved());
+    }
     put_execution(&mut table, &process.execution);
     put_on_exit(&mut table, process.on_exit);
     table

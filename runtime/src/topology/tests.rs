@@ -1,6 +1,7 @@
 //! Good topologies: what they become, how they are written back, and what a process is told.
 //! Faulty ones are in `tests/faulty.rs`.
 
+mod face;
 mod faulty;
 mod fleet;
 mod hosts;
