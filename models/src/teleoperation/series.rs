@@ -155,8 +155,8 @@ pub(crate) fn lag_s(leading: &[Sample], delayed: &[Sample], lag_max_s: f64) -> O
     if count < block_min {
         return None;
     }
-    let leading = resampled(leading, start, count);
-    let delayed = resampled(delayed, start, count);
+    let leading = resampled(leading, start, GRID_NS, count);
+    let delayed = resampled(delayed, start, GRID_NS, count);
     let step_s = GRID_NS as f64 * 1e-9;
     let value = best_lag(&leading, &delayed, lag_max)? * step_s;
     let block_length = block_min.max(count.div_ceil(30));
@@ -174,8 +174,13 @@ const LEAD_MAX: usize = 62;
 /// Coarse search step, in grid steps.
 const STRIDE: usize = 8;
 
-/// Straight lines between samples, at `start + index * GRID_NS`.
-fn resampled(samples: &[Sample], start: i64, count: usize) -> Vec<f64> {
+/// Straight lines between samples, at `start + index * step_ns`.
+pub(crate) fn resampled(
+    samples: &[Sample],
+    start: i64,
+    step_ns: i64,
+    count: usize,
+) -> Vec<f64> {
     let mut next = 0;
     let mut at = start;
     let mut values = Vec::with_capacity(count);
@@ -191,7 +196,7 @@ fn resampled(samples: &[Sample], start: i64, count: usize) -> Vec<f64> {
             1.0
         };
         values.push(from + share * (to - from));
-        at += GRID_NS;
+        at += step_ns;
     }
     values
 }
