@@ -1,6 +1,8 @@
 //! Messages of guided motion as they lie in shared memory. Layout only; SI units and radians; joints
 //! in chain order, see [`crate::yumi`]. The maker's own datagrams are in [`crate::egm::wire`].
 
+mod numbers;
+
 use bytemuck::{Pod, Zeroable};
 
 use crate::message::Message;
