@@ -29,6 +29,14 @@ impl Side {
         }
     }
 
+    /// As [`Side::index`], as messages carry it.
+    pub const fn number(self) -> u32 {
+        match self {
+            Self::Right => 0,
+            Self::Left => 1,
+        }
+    }
+
     /// `right` or `left`.
     pub const fn word(self) -> &'static str {
         match self {
