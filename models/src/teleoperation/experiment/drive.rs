@@ -5,9 +5,7 @@
 use std::collections::VecDeque;
 
 use crate::egm::controller::Controller;
-use crate::egm::messages::{
-    EgmEvent, EgmEventKind, EgmStartParameters, EndCause, SessionState,
-};
+use crate::egm::messages::{EgmEvent, EgmEventKind, EgmStartParameters, EndCause, SessionState};
 use crate::egm::parameters::ControllerSettings;
 use crate::link::bernoulli::BernoulliLink;
 use crate::link::outages::{OutageLink, Outages};
@@ -120,7 +118,10 @@ pub(crate) fn drive(
         .counter
         .count_peaks(&trajectory.sent_peaks_ns, &moved)
         .expect("a trajectory is as long as its loops");
-    Some(run.happened.tally(trajectory, &loops, (cycle.unsigned_abs(), end_ns)))
+    Some(
+        run.happened
+            .tally(trajectory, &loops, (cycle.unsigned_abs(), end_ns)),
+    )
 }
 
 /// A run under way.
@@ -311,7 +312,9 @@ impl Happened {
     ) -> Tally {
         let mut lost_counts = [0; LossCause::KIND_COUNT];
         for lost in &loops.lost {
-            let cause = self.evidence.cause_of(lost.due_ns, trajectory.counter.period_ns);
+            let cause = self
+                .evidence
+                .cause_of(lost.due_ns, trajectory.counter.period_ns);
             lost_counts[cause.kind()] += 1;
         }
         let holds = self.evidence.holds.iter();

@@ -8,9 +8,9 @@ mod drive;
 mod parameters;
 mod report;
 mod study;
-mod trajectory;
 #[cfg(test)]
 mod tests;
+mod trajectory;
 
 pub use parameters::TableParameters;
 

@@ -12,8 +12,14 @@ pub(crate) type Row<'a> = (&'a Condition, Vec<&'a Tally>);
 
 /// The whole report.
 pub(crate) fn report(study: &MotionLossStudy, rows: &[Row<'_>]) -> StudyReport {
-    let cycles = rows.iter().flat_map(|(_, runs)| runs).map(|run| run.cycle_count as f64);
-    let loops = rows.iter().flat_map(|(_, runs)| runs).map(|run| run.sent_count as f64);
+    let cycles = rows
+        .iter()
+        .flat_map(|(_, runs)| runs)
+        .map(|run| run.cycle_count as f64);
+    let loops = rows
+        .iter()
+        .flat_map(|(_, runs)| runs)
+        .map(|run| run.sent_count as f64);
     StudyReport {
         title: "Case study 2: motion loss rate (MLR) by condition, in virtual time".to_owned(),
         notes: notes(study),
@@ -119,7 +125,12 @@ fn cells((condition, runs): &Row<'_>) -> Vec<Cell> {
         Cell::Count(sum(|run| run.executed_count)),
         Cell::number(mean(Tally::loss_ratio), 5),
         Cell::number(deviation(&rates), 5),
-        Cell::interval(estimate.and_then(|known| known.interval), 5),
+        Cell::interval(
+            estimate
+                .and_then(|known| known.interval)
+                .map(|(low, high)| (low.max(0.0), high)),
+            5,
+        ),
         Cell::interval(
             (sent > 0).then(|| (of_sent(missing.low), of_sent(missing.high))),
             5,
@@ -162,7 +173,11 @@ fn nothing_lost(condition: &Condition, runs: &[&Tally], nor_tripped: bool) -> Cr
     let unanswered: u64 = runs.iter().flat_map(|run| run.lost_counts).sum();
     let extra: u64 = runs.iter().map(|run| run.extra_count).sum();
     let trips: u64 = runs.iter().map(|run| run.trip_count).sum();
-    let trips_text = if nor_tripped { " and no session ends" } else { "" };
+    let trips_text = if nor_tripped {
+        " and no session ends"
+    } else {
+        ""
+    };
     let is_met = lost + unanswered + extra == 0 && (!nor_tripped || trips == 0);
     Criterion {
         text: format!("{}: MLR is 0 exactly{trips_text}", condition.name),
@@ -187,7 +202,10 @@ fn mean_in_range(
     let mean = rates.iter().sum::<f64>() / rates.len().max(1) as f64;
     let is_judged = is_fitted && runs.len() >= RUNS_MIN;
     Criterion {
-        text: format!("{}: mean MLR of at least {RUNS_MIN} runs in {low}..={high}", condition.name),
+        text: format!(
+            "{}: mean MLR of at least {RUNS_MIN} runs in {low}..={high}",
+            condition.name
+        ),
         is_met: is_judged.then(|| (low..=high).contains(&mean)),
         finding: if runs.is_empty() {
             "no run".to_owned()
@@ -214,7 +232,9 @@ fn runs_in_interval(
     // A short run's count has another scatter than the published one's.
     let is_judged = is_fitted
         && !runs.is_empty()
-        && runs.iter().all(|run| run.sent_count == u64::from(PUBLISHED_LOOPS));
+        && runs
+            .iter()
+            .all(|run| run.sent_count == u64::from(PUBLISHED_LOOPS));
     Criterion {
         text: format!(
             "{}: single runs of {PUBLISHED_LOOPS} loops in the Poisson interval of {lost} lost, \

@@ -2,6 +2,7 @@
 //! What the table looks like is in `report`.
 
 use crate::case_study::ParameterError;
+use crate::egm::parameters::{ControllerSettings, Preset};
 use crate::random::RandomStream;
 use crate::study::{Study, StudyReport, Watch};
 use crate::teleoperation::Teleoperation;
@@ -10,7 +11,6 @@ use crate::teleoperation::experiment::drive::{Tally, drive};
 use crate::teleoperation::experiment::parameters::TableParameters;
 use crate::teleoperation::experiment::report;
 use crate::teleoperation::experiment::trajectory::Trajectory;
-use crate::egm::parameters::{ControllerSettings, Preset};
 
 /// The study.
 #[derive(Debug)]
@@ -56,7 +56,10 @@ impl MotionLossStudy {
     /// meet the same outages.
     fn task(&self, task: usize) -> (&Condition, u64) {
         let seeds = self.parameters.seeds as usize;
-        (&self.conditions[task / seeds], seed_of(self.seed, task % seeds))
+        (
+            &self.conditions[task / seeds],
+            seed_of(self.seed, task % seeds),
+        )
     }
 }
 

@@ -129,7 +129,12 @@ fn commands(case: &Teleoperation, first_frame: i64, frame_count: i64) -> Vec<Egm
     let mut player = case.player();
     let frame_ns = duration_ns(case.parameters.frame_period());
     let mut commands = Vec::with_capacity(usize::try_from(frame_count).unwrap_or(0));
-    hear(controller.as_mut(), FEEDBACK_PORT, &running_feedback(), &mut commands);
+    hear(
+        controller.as_mut(),
+        FEEDBACK_PORT,
+        &running_feedback(),
+        &mut commands,
+    );
     for frame in first_frame..first_frame + frame_count {
         let source_time_ns = frame * frame_ns;
         let pose = player.at(source_time_ns as f64 * 1e-9);

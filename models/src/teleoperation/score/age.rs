@@ -33,9 +33,21 @@ pub(crate) fn metrics(record: &Record) -> [Metric; 4] {
     let [median, tail, greatest] = [0.5, 0.99, 1.0].map(&mut quantile);
     let slope = slope_ms_per_s(with_age().filter(|known| !known.has(EgmFeedback::HOLDING)));
     [
-        age("reference_age_ms_p50", "age of the reference in use, median", median),
-        age("reference_age_ms_p99", "age of the reference in use, 99 %", tail),
-        age("reference_age_ms_max", "age of the reference in use, greatest", greatest),
+        age(
+            "reference_age_ms_p50",
+            "age of the reference in use, median",
+            median,
+        ),
+        age(
+            "reference_age_ms_p99",
+            "age of the reference in use, 99 %",
+            tail,
+        ),
+        age(
+            "reference_age_ms_max",
+            "age of the reference in use, greatest",
+            greatest,
+        ),
         figure(
             (
                 "reference_age_ms_per_s",
@@ -64,7 +76,10 @@ fn slope_ms_per_s<'a>(feedback: impl Iterator<Item = &'a Feedback>) -> Option<f6
         }
     };
     for known in feedback {
-        if session.as_ref().is_none_or(|line| line.session != known.session) {
+        if session
+            .as_ref()
+            .is_none_or(|line| line.session != known.session)
+        {
             close(session.take());
             session = Some(Line {
                 session: known.session,

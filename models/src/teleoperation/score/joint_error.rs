@@ -276,7 +276,9 @@ impl Ideal<core::iter::Empty<(Instant, EgmCommand)>> {
         let mut controller = Controller::new(Side::Right, settings, at_rest.measured_rad);
         controller
             .start_guided_motion(&asked_for(log, set_up.at_ns))
-            .map_err(|_| "the recorded request for guided motion is not one the controller takes")?;
+            .map_err(
+                |_| "the recorded request for guided motion is not one the controller takes",
+            )?;
         Ok(Ideal {
             controller,
             commands: log.messages::<EgmCommand>(EGM_RIGHT_COMMAND).peekable(),

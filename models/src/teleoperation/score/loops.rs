@@ -234,7 +234,10 @@ impl Evidence {
         };
         let enough_ns = EXPLAINS_RATIO * period_ns;
         let pauses = within(&self.pauses, window, |pause| pause.span);
-        let paused_ns: i64 = pauses.iter().map(|pause| pause.span.overlap_ns(window)).sum();
+        let paused_ns: i64 = pauses
+            .iter()
+            .map(|pause| pause.span.overlap_ns(window))
+            .sum();
         if paused_ns as f64 >= enough_ns {
             let longest = pauses.iter().max_by_key(|p| p.span.overlap_ns(window));
             return LossCause::Trip(longest.and_then(|pause| pause.cause));
@@ -365,7 +368,11 @@ mod tests {
                 // Too short to explain anything.
                 pause(60.0, 60.1, Some(EndCause::Requested)),
             ],
-            holds: vec![seconds(19.0, 20.0), seconds(59.0, 61.0), seconds(80.0, 84.0)],
+            holds: vec![
+                seconds(19.0, 20.0),
+                seconds(59.0, 61.0),
+                seconds(80.0, 84.0),
+            ],
             clipped: vec![seconds(79.0, 85.0), seconds(100.0, 101.0)],
         };
         let cause = |due: i64| evidence.cause_of(due * 1_000_000_000, 4e9);

@@ -4,18 +4,23 @@
 use crate::egm::messages::{EgmEvent, EgmEventKind, EndCause};
 use crate::run_log::RunLog;
 use crate::score::{EVENTS_MAX, MessageRef, Score, ScoreEvent, Severity};
+use crate::teleoperation::EGM_RIGHT_FEEDBACK;
 use crate::teleoperation::score::Run;
 use crate::teleoperation::score::loops::{Loops, LossCause, Span, within};
 use crate::teleoperation::score::record::Command;
 use crate::teleoperation::score::sessions::{cause_of, events, is_right};
-use crate::teleoperation::EGM_RIGHT_FEEDBACK;
 use crate::time::Instant;
 
 /// Adds all events in order of time.
 pub(crate) fn add_events(score: &mut Score, run: &Run, loops: Option<&Loops>, log: &RunLog) {
     let mut found: Vec<ScoreEvent> = loops
         .into_iter()
-        .flat_map(|loops| loops.lost.iter().map(|lost| run.lost_loop(loops, lost.index, lost.due_ns)))
+        .flat_map(|loops| {
+            loops
+                .lost
+                .iter()
+                .map(|lost| run.lost_loop(loops, lost.index, lost.due_ns))
+        })
         .collect();
     found.extend(run.holds());
     found.extend(events(log).map(|event| run.session_event(&event)));
@@ -39,7 +44,9 @@ fn event(severity: Severity, at_ns: i64, what: String) -> ScoreEvent {
 
 fn naming(event: ScoreEvent, commands: &[Command]) -> ScoreEvent {
     let messages = commands.iter().map(|command| command.message);
-    messages.fold(event, |event: ScoreEvent, message: MessageRef| event.naming(message))
+    messages.fold(event, |event: ScoreEvent, message: MessageRef| {
+        event.naming(message)
+    })
 }
 
 impl Run {
@@ -60,11 +67,16 @@ impl Run {
             LossCause::Trip(_) => within(&evidence.pauses, window, |pause| pause.span)
                 .first()
                 .map(|pause| self.silence_before(pause.span)),
-            LossCause::Held => within(&evidence.holds, window, |span| *span).first().copied(),
+            LossCause::Held => within(&evidence.holds, window, |span| *span)
+                .first()
+                .copied(),
             LossCause::Clipped | LossCause::Merged => None,
         };
         match silence {
-            Some(span) => naming(named, self.record.commands_between(span.begin_ns, span.end_ns)),
+            Some(span) => naming(
+                named,
+                self.record.commands_between(span.begin_ns, span.end_ns),
+            ),
             None => named,
         }
     }
@@ -94,8 +106,12 @@ impl Run {
 
     /// Highest minus lowest measured y.
     fn moved_m(&self, window: Span) -> f64 {
-        let begin = self.moved.partition_point(|sample| sample.0 < window.begin_ns);
-        let end = self.moved.partition_point(|sample| sample.0 < window.end_ns);
+        let begin = self
+            .moved
+            .partition_point(|sample| sample.0 < window.begin_ns);
+        let end = self
+            .moved
+            .partition_point(|sample| sample.0 < window.end_ns);
         let values = self.moved[begin..end].iter().map(|sample| sample.1);
         let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| {
             (low.min(value), high.max(value))
@@ -110,7 +126,10 @@ impl Run {
                 let held_s = (hold.end_ns - hold.begin_ns) as f64 * 1e-9;
                 let what = format!("right arm held for {held_s:.3} s for want of commands");
                 let named = event(Severity::Hazard, hold.begin_ns, what);
-                naming(named, self.record.commands_between(hold.begin_ns, hold.end_ns))
+                naming(
+                    named,
+                    self.record.commands_between(hold.begin_ns, hold.end_ns),
+                )
             })
             .collect()
     }
@@ -127,7 +146,11 @@ impl Run {
             end_ns: told.at_ns,
         };
         let silence = self.silence_before(pause);
-        naming(named, self.record.commands_between(silence.begin_ns, silence.end_ns))
+        naming(
+            named,
+            self.record
+                .commands_between(silence.begin_ns, silence.end_ns),
+        )
     }
 }
 

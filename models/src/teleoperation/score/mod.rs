@@ -7,12 +7,12 @@
 mod age;
 mod figure;
 mod joint_error;
-mod lost;
 pub(crate) mod loops;
+mod lost;
 mod path;
 mod plots;
-mod record;
-mod sessions;
+pub(crate) mod record;
+pub(crate) mod sessions;
 #[cfg(test)]
 mod tests;
 
@@ -34,7 +34,10 @@ pub(crate) use crate::teleoperation::score::plots::series;
 pub(crate) fn score(case: &Teleoperation, log: &RunLog) -> Score {
     let record = Record::read(log);
     let run = Run {
-        counter: LoopCounter::new(case.nominal_peak_to_peak_m(), case.parameters.motion_period_s),
+        counter: LoopCounter::new(
+            case.nominal_peak_to_peak_m(),
+            case.parameters.motion_period_s,
+        ),
         period_s: case.parameters.motion_period_s,
         has_one_clock: log.has_one_clock(),
         sent: Sent::read(case, log, &record),
@@ -44,11 +47,16 @@ pub(crate) fn score(case: &Teleoperation, log: &RunLog) -> Score {
     };
     let loops = run.counter.count(&run.sent.samples, &run.moved);
     let mut metrics = run.motion_loops(loops.as_ref());
-    metrics.extend(JointError::read(log, &case.settings(), run.period_s).metrics());
+    metrics.extend(JointError::read(log, &case.settings, run.period_s).metrics());
     metrics.push(run.tracking_lag());
     metrics.push(run.tool_travel());
     let commanded = run.record.sent_y();
-    metrics.extend(path::metrics(&run.record, &commanded, &run.moved, run.period_s));
+    metrics.extend(path::metrics(
+        &run.record,
+        &commanded,
+        &run.moved,
+        run.period_s,
+    ));
     metrics.extend(age::metrics(&run.record));
     metrics.extend(run.sessions.metrics(&run.record));
     metrics.extend(run.inverse_kinematics());
@@ -97,7 +105,12 @@ impl Sent {
         let begin_ns = followed.map_or(0, |command| command.at_ns);
         let hand = log.messages::<HumanFrame>(HUMAN_FRAME);
         let samples: Vec<_> = hand
-            .map(|(at, frame)| (at.as_ns() + record.shift_ns, scale * frame.right_hand.position_m[0]))
+            .map(|(at, frame)| {
+                (
+                    at.as_ns() + record.shift_ns,
+                    scale * frame.right_hand.position_m[0],
+                )
+            })
             .filter(|(at, y_m)| *at >= begin_ns && y_m.is_finite())
             .collect();
         if samples.is_empty() {
@@ -154,7 +167,10 @@ impl Run {
     fn causes(&self, loops: Option<&Loops>, missing: &str) -> [Metric; 5] {
         let mut kinds = [0_u64; LossCause::KIND_COUNT];
         for lost in loops.map_or(&[][..], |loops| &loops.lost) {
-            let cause = self.sessions.evidence.cause_of(lost.due_ns, self.counter.period_ns);
+            let cause = self
+                .sessions
+                .evidence
+                .cause_of(lost.due_ns, self.counter.period_ns);
             kinds[cause.kind()] += 1;
         }
         let by = |names: (&'static str, &'static str), kind: usize, what: &str| {
@@ -173,12 +189,18 @@ impl Run {
                 "of the others, those with a hold in their loop",
             ),
             by(
-                ("loops_lost_by_clipping_count", "loops lost to inverse kinematics"),
+                (
+                    "loops_lost_by_clipping_count",
+                    "loops lost to inverse kinematics",
+                ),
                 2,
                 "of the others, those with limited or unreachable commands in their loop",
             ),
             by(
-                ("loops_lost_by_merging_count", "loops merged with a neighbour"),
+                (
+                    "loops_lost_by_merging_count",
+                    "loops merged with a neighbour",
+                ),
                 3,
                 "the others: too little motion between two peaks",
             ),

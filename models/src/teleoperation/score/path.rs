@@ -7,7 +7,12 @@ use crate::teleoperation::score::record::Record;
 use crate::teleoperation::series::{Sample, resampled};
 
 /// Warping and distances, as far as both signals are there.
-pub(crate) fn metrics(record: &Record, sent: &[Sample], moved: &[Sample], period_s: f64) -> [Metric; 4] {
+pub(crate) fn metrics(
+    record: &Record,
+    sent: &[Sample],
+    moved: &[Sample],
+    period_s: f64,
+) -> [Metric; 4] {
     let warped = warping_m(sent, moved, period_s);
     let distance = path_distance(record, period_s);
     let missing = "commands and feedback with a tool position overlap for less than a loop";
@@ -22,13 +27,21 @@ pub(crate) fn metrics(record: &Record, sent: &[Sample], moved: &[Sample], period
             missing,
         ),
         figure(
-            ("tool_path_m_rms", "distance of the tool from its path, RMS", "m"),
+            (
+                "tool_path_m_rms",
+                "distance of the tool from its path, RMS",
+                "m",
+            ),
             distance.map(|(rms, _)| rms),
             path_method,
             missing,
         ),
         figure(
-            ("tool_path_m_max", "distance of the tool from its path, greatest", "m"),
+            (
+                "tool_path_m_max",
+                "distance of the tool from its path, greatest",
+                "m",
+            ),
             distance.map(|(_, max)| max),
             path_method,
             missing,
@@ -115,8 +128,14 @@ type Point = [f64; 3];
 
 /// RMS and greatest distance of the measured tool from the commanded path nearby.
 fn path_distance(record: &Record, period_s: f64) -> Option<(f64, f64)> {
-    let commands = record.commands.iter().map(|known| (known.at_ns, known.tool_m));
-    let feedback = record.feedback.iter().map(|known| (known.at_ns, known.tool_m));
+    let commands = record
+        .commands
+        .iter()
+        .map(|known| (known.at_ns, known.tool_m));
+    let feedback = record
+        .feedback
+        .iter()
+        .map(|known| (known.at_ns, known.tool_m));
     let (sent, moved) = (thinned(commands), thinned(feedback));
     let reach_ns = steps(0.5 * period_s, 1) as i64;
     let (begin, end) = (sent.first()?.0, sent.last()?.0);
@@ -148,7 +167,10 @@ fn path_distance(record: &Record, period_s: f64) -> Option<(f64, f64)> {
 fn thinned(points: impl Iterator<Item = (i64, Point)>) -> Vec<(i64, Point)> {
     let mut kept: Vec<(i64, Point)> = Vec::new();
     for (at, point) in points.filter(|(_, point)| point.iter().all(|value| value.is_finite())) {
-        if kept.last().is_none_or(|(newest, _)| at - newest >= PATH_STEP_NS) {
+        if kept
+            .last()
+            .is_none_or(|(newest, _)| at - newest >= PATH_STEP_NS)
+        {
             kept.push((at, point));
         }
     }
@@ -164,7 +186,11 @@ fn square_to_segment(point: &Point, from: &Point, to: &Point) -> f64 {
         along += step * (point[axis] - from[axis]);
         length += step * step;
     }
-    let share = if length > 0.0 { (along / length).clamp(0.0, 1.0) } else { 0.0 };
+    let share = if length > 0.0 {
+        (along / length).clamp(0.0, 1.0)
+    } else {
+        0.0
+    };
     let apart = |axis: usize| point[axis] - from[axis] - share * (to[axis] - from[axis]);
     (0..3).map(|axis| apart(axis).powi(2)).sum()
 }
@@ -197,7 +223,9 @@ mod tests {
             let time_s = at as f64 * 1e-9 - lag_s;
             scale * (core::f64::consts::TAU * time_s / PERIOD_S).sin()
         };
-        (0..end_s * 125).map(|step| (at(step), value(at(step)))).collect()
+        (0..end_s * 125)
+            .map(|step| (at(step), value(at(step))))
+            .collect()
     }
 
     #[test]

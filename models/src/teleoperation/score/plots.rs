@@ -73,7 +73,11 @@ fn input(log: &RunLog, origin_ns: i64) -> Option<PlotSeries> {
         notes: thinned.note().into_iter().collect(),
         columns: vec![
             TIME,
-            column("hand_lateral_m", "right hand, towards the person's left", "m"),
+            column(
+                "hand_lateral_m",
+                "right hand, towards the person's left",
+                "m",
+            ),
         ],
         values,
     })
@@ -107,10 +111,16 @@ fn notes(rows: &Thinned, shift: Option<i64>) -> Vec<String> {
     rows.note().into_iter().chain(shifted).collect()
 }
 
-fn tool_y(log: &RunLog, rows: &Thinned, (origin_ns, shift): (i64, Option<i64>)) -> Option<PlotSeries> {
+fn tool_y(
+    log: &RunLog,
+    rows: &Thinned,
+    (origin_ns, shift): (i64, Option<i64>),
+) -> Option<PlotSeries> {
     let arm = Arm::right();
     let commanded_m = |command: Option<EgmCommand>| {
-        command.map_or(f64::NAN, |known| arm.tool(&known.position_rad).translation.y)
+        command.map_or(f64::NAN, |known| {
+            arm.tool(&known.position_rad).translation.y
+        })
     };
     let values: Vec<f64> = paired(log, shift)
         .step_by(rows.every)
@@ -169,7 +179,11 @@ fn desired_rad(command: Option<EgmCommand>) -> Joints {
     command.map_or([f64::NAN; JOINT_COUNT], |known| known.position_rad)
 }
 
-fn joints(log: &RunLog, rows: &Thinned, (origin_ns, shift): (i64, Option<i64>)) -> Option<PlotSeries> {
+fn joints(
+    log: &RunLog,
+    rows: &Thinned,
+    (origin_ns, shift): (i64, Option<i64>),
+) -> Option<PlotSeries> {
     let mut values = Vec::new();
     for (at, feedback, command) in paired(log, shift).step_by(rows.every) {
         values.push(seconds(at, origin_ns));
@@ -180,7 +194,10 @@ fn joints(log: &RunLog, rows: &Thinned, (origin_ns, shift): (i64, Option<i64>)) 
     (!values.is_empty()).then(|| PlotSeries {
         name: "fig10-joints".to_owned(),
         title: "Desired and measured joint positions".to_owned(),
-        notes: [JOINT_NOTE.to_owned()].into_iter().chain(notes(rows, shift)).collect(),
+        notes: [JOINT_NOTE.to_owned()]
+            .into_iter()
+            .chain(notes(rows, shift))
+            .collect(),
         columns: columns.collect(),
         values,
     })
@@ -200,7 +217,10 @@ fn joint_error(
     (!values.is_empty()).then(|| PlotSeries {
         name: "fig11-joint-error".to_owned(),
         title: "Joint position error: desired minus measured".to_owned(),
-        notes: [JOINT_NOTE.to_owned()].into_iter().chain(notes(rows, shift)).collect(),
+        notes: [JOINT_NOTE.to_owned()]
+            .into_iter()
+            .chain(notes(rows, shift))
+            .collect(),
         columns: [TIME].into_iter().chain(ERROR).collect(),
         values,
     })

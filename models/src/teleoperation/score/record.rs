@@ -70,7 +70,9 @@ impl Record {
             shift_ns: 0,
         };
         if !log.has_one_clock() {
-            record.shift_ns = record.fastest_answer_ns().unwrap_or_else(|| record.start_ns());
+            record.shift_ns = record
+                .fastest_answer_ns()
+                .unwrap_or_else(|| record.start_ns());
             for command in &mut record.commands {
                 command.at_ns += record.shift_ns;
             }
@@ -178,10 +180,7 @@ fn feedback(log: &RunLog) -> Vec<Feedback> {
 }
 
 /// The messages of `channel` with their envelopes.
-fn logged<'a>(
-    log: &'a RunLog,
-    channel: &str,
-) -> impl Iterator<Item = (Envelope, EgmCommand)> + 'a {
+fn logged<'a>(log: &'a RunLog, channel: &str) -> impl Iterator<Item = (Envelope, EgmCommand)> + 'a {
     log.raw(channel).iter().filter_map(|logged| {
         let message = bytemuck::try_pod_read_unaligned(&logged.payload).ok()?;
         Some((logged.envelope, message))

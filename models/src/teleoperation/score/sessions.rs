@@ -80,11 +80,18 @@ impl Sessions {
                 ("hold_time_ratio", "share of time held", "1"),
                 (self.running_count > 0)
                     .then(|| self.holding_count as f64 / self.running_count as f64),
-                format!("feedback flagged as holding, of {} in running sessions", self.running_count),
+                format!(
+                    "feedback flagged as holding, of {} in running sessions",
+                    self.running_count
+                ),
                 "no feedback of a running session",
             ),
             figure(
-                ("resume_saturation_ratio", "speed-limited share of the time after a resume", "1"),
+                (
+                    "resume_saturation_ratio",
+                    "speed-limited share of the time after a resume",
+                    "1",
+                ),
                 (self.catching_up_count > 0)
                     .then(|| self.saturated_count as f64 / self.catching_up_count as f64),
                 format!(
@@ -111,7 +118,10 @@ impl Sessions {
         lengths.sort_unstable();
         let seconds = |length: Option<&i64>| length.map(|length| *length as f64 * 1e-9);
         let missing = "no session ended by itself and was followed by another";
-        let method = format!("from the end of a session to the next one, {} times", lengths.len());
+        let method = format!(
+            "from the end of a session to the next one, {} times",
+            lengths.len()
+        );
         [
             figure(
                 ("reactivation_s_median", "time to re-activate, median", "s"),
@@ -168,7 +178,10 @@ impl Reading {
             self.end_hold(at_ns);
             self.resumed_ns = Some(at_ns);
         }
-        if self.resumed_ns.is_some_and(|resumed_ns| at_ns - resumed_ns < CATCH_UP_NS) {
+        if self
+            .resumed_ns
+            .is_some_and(|resumed_ns| at_ns - resumed_ns < CATCH_UP_NS)
+        {
             const LIMITED: u32 = EgmFeedback::SPEED_LIMITED | EgmFeedback::SPEED_DEVIATION_LIMITED;
             self.sessions.catching_up_count += 1;
             self.sessions.saturated_count += u64::from(feedback.has(LIMITED));
