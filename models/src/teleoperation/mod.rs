@@ -61,6 +61,8 @@ mod replay;
 mod robot;
 mod score;
 mod series;
+#[cfg(test)]
+mod session_tests;
 pub mod skeleton;
 pub mod swing;
 #[cfg(test)]
@@ -136,6 +138,7 @@ impl Teleoperation {
             self.parameters.loop_variation_ratio,
             RandomStream::new(self.seed, "teleoperation human"),
         )
+        .starting_at(self.parameters.motion_start_s)
     }
 }
 

@@ -209,9 +209,10 @@ impl MotionServer {
                 .collect(),
         };
         let mut orders: Vec<_> = sides.into_iter().zip(orders).collect();
-        // An arm may still refuse, e.g. because it is not yet at rest. So that the first does not
-        // move without the second, the second is asked on a copy before.
-        for (side, order) in orders.iter().skip(1) {
+        // An arm may still refuse, e.g. because it is not yet at rest. So that one does not move
+        // without the other, both are asked on copies before.
+        let is_together = orders.len() > 1;
+        for (side, order) in orders.iter().filter(|_| is_together) {
             let mut trial = controllers[side.index()].clone();
             give(&mut trial, order.clone()).map_err(|why| Refusal { why, side: *side })?;
         }

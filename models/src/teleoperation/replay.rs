@@ -231,3 +231,7 @@ fn difference(recorded: &EgmFeedback, replayed: &EgmFeedback) -> Option<String> 
         )
     })
 }
+
+#[cfg(test)]
+#[path = "replay_tests.rs"]
+mod tests;
