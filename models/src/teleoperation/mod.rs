@@ -18,6 +18,7 @@
 //! 3. [`mapping`] with [`crate::yumi`]: from the hand to the joints.
 //! 4. [`crate::egm::controller`]: from the commands to the motion.
 //! 5. `score`: what the robot made of it.
+//! 6. [`experiment`]: thousands of loops over channels that a table names, in virtual time.
 //!
 //! ```
 //! use std::collections::BTreeMap;

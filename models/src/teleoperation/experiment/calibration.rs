@@ -4,13 +4,13 @@
 use crate::case_study::ParameterError;
 use crate::egm::parameters::ControllerSettings;
 use crate::link::outages::Outages;
+use crate::measure::statistics::{CONFIDENCE, poisson};
 use crate::study::{Cell, Column, Criterion, Study, StudyReport, Table, Watch, Work};
 use crate::teleoperation::Teleoperation;
 use crate::teleoperation::experiment::conditions::{back_after, base, changed, without_time_out};
 use crate::teleoperation::experiment::drive::{Channel, Setup, drive};
 use crate::teleoperation::experiment::study::seed_of;
 use crate::teleoperation::experiment::trajectory::Trajectory;
-use crate::teleoperation::series::Estimate;
 
 /// Mean lengths of outages on the curve.
 const MEANS_S: [f64; 4] = [0.3, 0.5, 1.0, 2.0];
@@ -21,9 +21,11 @@ const RATIO_MIN: f64 = 0.001;
 const RATIO_MAX: f64 = 0.3;
 
 /// Runs per rate that is tried, each of the loops the tables have.
-const SEED_COUNT: usize = 6;
+const SEED_COUNT: usize = 10;
 /// Rates tried at most.
-const TRIES_MAX: usize = 7;
+const TRIES_MAX: usize = 5;
+/// A try this near to the aim ends the search: the count of lost loops scatters more than that.
+const NEAR_RATIO: f64 = 0.05;
 /// Highest rate tried, but for the share of time the outages would take up.
 const PER_HOUR_MAX: f64 = 3000.0;
 /// Highest share of time that outages take up in a try.
@@ -87,7 +89,7 @@ enum Found {
     /// Outages per hour with their interval, and what came out at that rate.
     Rate {
         per_hour: f64,
-        interval: Option<(f64, f64)>,
+        interval: (f64, f64),
         ratio: f64,
     },
     /// Up to this rate fewer loops are lost.
@@ -125,8 +127,14 @@ impl Calibration {
 #[derive(Debug, Clone, Copy)]
 struct Try {
     per_hour: f64,
-    ratio: f64,
-    half_width: f64,
+    missing_count: u64,
+    sent_count: u64,
+}
+
+impl Try {
+    fn ratio(&self) -> f64 {
+        self.missing_count as f64 / self.sent_count as f64
+    }
 }
 
 /// A search under way: what it tries, and how far it has come.
@@ -135,8 +143,7 @@ struct Search<'a, 'w> {
     setup: Setup,
     mean_s: f64,
     watch: &'a mut (dyn FnMut(f64) -> bool + 'w),
-    try_count: usize,
-    loop_count: u64,
+    tries: Vec<Try>,
 }
 
 impl Search<'_, '_> {
@@ -149,26 +156,23 @@ impl Search<'_, '_> {
             buffered: false,
         };
         self.setup.channel = Channel::Outages(outages);
-        let mut ratios = [0.0; SEED_COUNT];
-        for (replica, ratio) in ratios.iter_mut().enumerate() {
-            let done = (self.try_count * SEED_COUNT + replica) as f64;
+        let mut tried = Try {
+            per_hour,
+            missing_count: 0,
+            sent_count: 0,
+        };
+        for replica in 0..SEED_COUNT {
+            let done = (self.tries.len() * SEED_COUNT + replica) as f64;
             let step = 1.0 / (TRIES_MAX * SEED_COUNT) as f64;
             let watch = &mut *self.watch;
             let mut look = |share: f64| watch((done + share) * step);
             let seed = seed_of(self.calibration.seed, replica);
             let tally = drive(&self.calibration.trajectory, &self.setup, seed, &mut look)?;
-            *ratio = tally.loss_ratio();
-            self.loop_count += tally.sent_count;
+            tried.missing_count += tally.missing_count();
+            tried.sent_count += tally.sent_count;
         }
-        self.try_count += 1;
-        let estimate = Estimate::of_mean(&ratios)?;
-        Some(Try {
-            per_hour,
-            ratio: estimate.value,
-            half_width: estimate
-                .interval
-                .map_or(f64::INFINITY, |(_, high)| high - estimate.value),
-        })
+        self.tries.push(tried);
+        Some(tried)
     }
 
     fn run(&mut self) -> Option<Point> {
@@ -176,18 +180,11 @@ impl Search<'_, '_> {
         let highest = PER_HOUR_MAX.min(DOWN_RATIO_MAX * 3600.0 / self.mean_s);
         // One lost loop per outage is the most that short outages cost.
         let loops_per_hour = 3600.0 / (self.calibration.trajectory.counter.period_ns * 1e-9);
-        let mut low: Option<Try> = None;
-        let mut high: Option<Try> = None;
         let mut next = (2.0 * target * loops_per_hour).clamp(1.0, highest);
-        let mut best: Option<Try> = None;
-        while self.try_count < TRIES_MAX {
+        let (mut low, mut high) = (None, None);
+        while self.tries.len() < TRIES_MAX {
             let tried = self.try_rate(next)?;
-            let is_nearer =
-                |known: Try| (tried.ratio - target).abs() < (known.ratio - target).abs();
-            if best.is_none_or(is_nearer) {
-                best = Some(tried);
-            }
-            if tried.ratio < target {
+            if tried.ratio() < target {
                 if tried.per_hour >= highest {
                     return Some(self.none_up_to(tried));
                 }
@@ -195,59 +192,79 @@ impl Search<'_, '_> {
             } else {
                 high = Some(tried);
             }
-            if (tried.ratio - target).abs() < 0.02 * target {
+            if (tried.ratio() - target).abs() < NEAR_RATIO * target {
                 break;
             }
             next = between(low, high, (target, highest));
         }
-        let best = best?;
-        if high.is_none() {
+        let nearest = |a: &&Try, b: &&Try| {
+            let apart = |tried: &Try| (tried.ratio() - target).abs();
+            apart(a).total_cmp(&apart(b))
+        };
+        let best = *self.tries.iter().min_by(nearest)?;
+        // A search that only climbed, and is still far below, has not found its rate.
+        if high.is_none() && best.ratio() < 0.5 * target {
             return Some(self.none_up_to(best));
         }
-        Some(self.rate(best, (low, high)))
+        Some(self.rate(best))
     }
 
     fn none_up_to(&self, tried: Try) -> Point {
         self.point(Found::NoneUpTo {
             per_hour: tried.per_hour,
-            ratio: tried.ratio,
+            ratio: tried.ratio(),
         })
     }
 
-    /// The rate by a straight line between the tries on both sides, and as far from it to either
-    /// side as the scatter of the runs reaches along that line.
-    fn rate(&self, best: Try, (low, high): (Option<Try>, Option<Try>)) -> Point {
-        let target = self.calibration.ratio;
-        let slope = match (low, high) {
-            (Some(low), Some(high)) if high.ratio > low.ratio => {
-                (high.ratio - low.ratio) / (high.per_hour - low.per_hour)
-            }
-            // Few loops are lost: their number grows as the rate does.
-            _ => best.ratio / best.per_hour,
-        };
-        // Tries close to each other have little but noise between them.
-        let slope = slope.clamp(
-            0.5 * best.ratio / best.per_hour,
-            4.0 * best.ratio / best.per_hour,
-        );
-        let per_hour = best.per_hour + (target - best.ratio) / slope;
-        let reach = best.half_width / slope;
+    /// The rate at which a power law through all tries meets the aim. Its interval is that of the
+    /// count of lost loops at the nearest try, carried over by the same law.
+    fn rate(&self, best: Try) -> Point {
+        let (exponent, at_one) = power_law(&self.tries);
+        let per_hour = ((self.calibration.ratio.ln() - at_one) / exponent).exp();
+        let count = best.missing_count.max(1);
+        let lost = poisson(count, CONFIDENCE);
+        // Fewer lost than the true mean: the true rate for the aim is lower, and the other way.
+        let end = |bound: f64| per_hour * (count as f64 / bound).powf(1.0 / exponent);
         self.point(Found::Rate {
             per_hour,
-            interval: reach
-                .is_finite()
-                .then_some(((per_hour - reach).max(0.0), per_hour + reach)),
-            ratio: best.ratio,
+            interval: (end(lost.high), end(lost.low)),
+            ratio: best.ratio(),
         })
     }
 
     fn point(&self, found: Found) -> Point {
         Point {
             found,
-            tries: self.try_count,
-            loop_count: self.loop_count,
+            tries: self.tries.len(),
+            loop_count: self.tries.iter().map(|tried| tried.sent_count).sum(),
         }
     }
+}
+
+/// Exponents of a loss rate over a rate of outages: 1 while each outage stands alone, more where
+/// several must come together.
+const EXPONENTS: (f64, f64) = (0.8, 3.0);
+
+/// Exponent, and logarithm of the ratio at one outage an hour, of the power law through `tries`:
+/// least squares of logarithms, each try weighted by its count.
+fn power_law(tries: &[Try]) -> (f64, f64) {
+    let points = tries.iter().filter(|tried| tried.missing_count > 0);
+    let points = points.map(|tried| {
+        let weight = tried.missing_count as f64;
+        (weight, tried.per_hour.ln(), tried.ratio().ln())
+    });
+    let (mut weights, mut x_mean, mut y_mean, mut square, mut product) = (0.0, 0.0, 0.0, 0.0, 0.0);
+    for (weight, x, y) in points {
+        weights += weight;
+        let (x_off, y_off) = (x - x_mean, y - y_mean);
+        x_mean += x_off * weight / weights;
+        y_mean += y_off * weight / weights;
+        square += weight * x_off * (x - x_mean);
+        product += weight * x_off * (y - y_mean);
+    }
+    let exponent = if square > 0.0 { product / square } else { 1.0 };
+    let exponent = exponent.clamp(EXPONENTS.0, EXPONENTS.1);
+    (exponent, y_mean - exponent * x_mean)
 }
 
 /// The next rate to try: on the line between both sides in logarithms, kept off its ends; without
@@ -255,7 +272,7 @@ impl Search<'_, '_> {
 fn between(low: Option<Try>, high: Option<Try>, (target, highest): (f64, f64)) -> f64 {
     match (low, high) {
         (Some(low), Some(high)) => {
-            let log = |tried: Try| tried.ratio.max(1e-5).ln();
+            let log = |tried: Try| tried.ratio().max(1e-5).ln();
             let span = log(high) - log(low);
             let share = if span > 0.0 {
                 (target.ln() - log(low)) / span
@@ -290,8 +307,7 @@ impl Study for Calibration {
             setup,
             mean_s,
             watch,
-            try_count: 0,
-            loop_count: 0,
+            tries: Vec::with_capacity(TRIES_MAX),
         };
         search.run()
     }
@@ -350,8 +366,9 @@ impl Calibration {
             "one loss rate fixes a curve, not a point: measure how long outages last on the real \
              link, then read off their rate"
                 .to_owned(),
-            "interval: from the scatter of the runs at the nearest try, along the line between \
-             the tries; outages are exponential in length and in the time between them"
+            "the rate is where a power law through all tries meets the aim; interval: of the \
+             Poisson count of lost loops at the nearest try, carried over by that law; outages \
+             are exponential in length and in the time between them"
                 .to_owned(),
         ]
     }
@@ -381,7 +398,12 @@ impl Calibration {
                 per_hour,
                 interval,
                 ratio,
-            }) => (Some(*per_hour), *interval, Some(*ratio), String::new()),
+            }) => (
+                Some(*per_hour),
+                Some(*interval),
+                Some(*ratio),
+                String::new(),
+            ),
             Some(Found::NoneUpTo { per_hour, ratio }) => (
                 None,
                 None,

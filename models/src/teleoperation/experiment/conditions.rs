@@ -69,12 +69,16 @@ pub(crate) fn back_after(settings: &mut ControllerSettings, reactivation_s: f64)
     settings.restart_wait_s = reactivation_s - settings.activation_s;
 }
 
-/// What all rows start from.
+/// What all rows start from: the robot of the case, with what the controller asks for.
 pub(crate) fn base(case: &Teleoperation) -> Setup {
     let parameters = &case.parameters;
+    let asked_for = parameters.egm_start.message();
     let nanoseconds = |duration| crate::time::duration_ns(duration);
     Setup {
-        settings: case.settings,
+        settings: case
+            .settings
+            .with(&asked_for)
+            .expect("what is asked for was checked with the parameters"),
         channel: Channel::Perfect,
         sending: match parameters.send {
             SendPolicy::Frame => Sending::Frame,

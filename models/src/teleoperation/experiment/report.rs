@@ -45,8 +45,8 @@ fn notes(study: &MotionLossStudy) -> Vec<String> {
     let settings = if study.is_fitted {
         "robot: preset paper; its settings are fitted, the paper states none of them"
     } else {
-        "robot: as the parameters say, not the preset the outages were fitted with; published \
-         rows are not judged"
+        "motion and robot: as the parameters say, not those the outages were fitted with; \
+         published rows are not judged"
     };
     vec![
         format!(

@@ -5,12 +5,12 @@ use crate::case_study::ParameterError;
 use crate::egm::parameters::{ControllerSettings, Preset};
 use crate::random::RandomStream;
 use crate::study::{Study, StudyReport, Watch};
-use crate::teleoperation::Teleoperation;
 use crate::teleoperation::experiment::conditions::{Condition, base, conditions};
 use crate::teleoperation::experiment::drive::{Tally, drive};
 use crate::teleoperation::experiment::parameters::TableParameters;
 use crate::teleoperation::experiment::report;
 use crate::teleoperation::experiment::trajectory::Trajectory;
+use crate::teleoperation::{Teleoperation, TeleoperationParameters};
 
 /// The study.
 #[derive(Debug)]
@@ -19,7 +19,7 @@ pub(crate) struct MotionLossStudy {
     pub(crate) seed: u64,
     pub(crate) trajectory: Trajectory,
     pub(crate) conditions: Vec<Condition>,
-    /// True when the robot has the settings with which outages were fitted to the paper.
+    /// True when motion and robot are those with which outages were fitted to the paper.
     pub(crate) is_fitted: bool,
 }
 
@@ -46,7 +46,7 @@ impl MotionLossStudy {
         Ok(Self {
             trajectory: Trajectory::new(case, parameters.loops)?,
             seed: case.seed,
-            is_fitted: case.settings == ControllerSettings::of(Preset::Paper),
+            is_fitted: is_fitted(case),
             conditions,
             parameters,
         })
@@ -61,6 +61,22 @@ impl MotionLossStudy {
             seed_of(self.seed, task % seeds),
         )
     }
+}
+
+/// True when nothing but the size of the tables, and what starts the first session, differs from
+/// the parameters that the published rows were fitted with.
+fn is_fitted(case: &Teleoperation) -> bool {
+    let default = TeleoperationParameters::default();
+    let but_for_robot = TeleoperationParameters {
+        egm: default.egm.clone(),
+        tables: default.tables.clone(),
+        ..case.parameters.clone()
+    };
+    let fitted = ControllerSettings {
+        start: case.settings.start,
+        ..ControllerSettings::of(Preset::Paper)
+    };
+    but_for_robot == default && case.settings == fitted
 }
 
 /// The seed of the `replica`-th run of a condition.

@@ -60,7 +60,7 @@ fn the_bare_loop_loses_the_loops_that_the_whole_case_loses() {
         buffered: false,
     };
     let setup = changed(&base(&case), |setup| {
-        setup.channel = Channel::Outages(outages)
+        setup.channel = Channel::Outages(outages);
     });
     let mut lost_count = 0;
     for seed in [1, 2] {
@@ -112,7 +112,7 @@ fn the_outages_of_both_ranges_reproduce_the_published_rates() {
     let trajectory = Trajectory::new(&case, 148).unwrap();
     let mean = |outages| {
         let setup = changed(&base(&case), |setup| {
-            setup.channel = Channel::Outages(outages)
+            setup.channel = Channel::Outages(outages);
         });
         let runs = (0..36).map(|replica| {
             let run = drive(&trajectory, &setup, seed_of(5, replica), &mut |_| true);

@@ -111,12 +111,12 @@ struct Line {
 impl Line {
     fn add(&mut self, at_ns: i64, age_ns: i64) {
         self.newest_ns = at_ns - self.begin_ns;
-        let (time_s, age_ms) = (self.newest_ns as f64 * 1e-9, age_ns as f64 * 1e-6);
+        let (time_s, age) = (self.newest_ns as f64 * 1e-9, age_ns as f64 * 1e-6);
         self.count += 1.0;
         let time_off = time_s - self.time_mean_s;
         self.time_mean_s += time_off / self.count;
-        self.age_mean_ms += (age_ms - self.age_mean_ms) / self.count;
-        self.moment += time_off * (age_ms - self.age_mean_ms);
+        self.age_mean_ms += (age - self.age_mean_ms) / self.count;
+        self.moment += time_off * (age - self.age_mean_ms);
         self.square += time_off * (time_s - self.time_mean_s);
     }
 }

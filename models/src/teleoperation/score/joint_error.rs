@@ -88,8 +88,7 @@ impl JointError {
         };
         let (total, square) = (&self.total, self.desired_square);
         let ratio = (square > 0.0).then(|| (total.square / square).sqrt());
-        let unsplit = self.unsplit.unwrap_or(missing);
-        vec![
+        let mut metrics = vec![
             total.rms(
                 ("joint_error_rad_rms", "joint error, RMS", "rad"),
                 "newest command sent by then minus measured",
@@ -117,41 +116,50 @@ impl JointError {
                     missing
                 },
             ),
-            self.controller.rms(
+        ];
+        metrics.extend(self.split(self.unsplit.unwrap_or(missing)));
+        metrics
+    }
+
+    /// Both parts; without them, for the reason `missing`.
+    fn split(&self, missing: &str) -> [Metric; 4] {
+        let (controller, network) = (&self.controller, &self.network);
+        [
+            controller.rms(
                 (
                     "joint_error_controller_rad_rms",
                     "joint error of the controller alone, RMS",
                     "rad",
                 ),
                 CONTROLLER_PART,
-                unsplit,
+                missing,
             ),
-            self.controller.greatest(
+            controller.greatest(
                 (
                     "joint_error_controller_rad_max",
                     "joint error of the controller alone, largest",
                     "rad",
                 ),
                 CONTROLLER_PART,
-                unsplit,
+                missing,
             ),
-            self.network.rms(
+            network.rms(
                 (
                     "joint_error_network_rad_rms",
                     "joint error the network adds, RMS",
                     "rad",
                 ),
                 NETWORK_PART,
-                unsplit,
+                missing,
             ),
-            self.network.greatest(
+            network.greatest(
                 (
                     "joint_error_network_rad_max",
                     "joint error the network adds, largest",
                     "rad",
                 ),
                 NETWORK_PART,
-                unsplit,
+                missing,
             ),
         ]
     }
@@ -277,7 +285,7 @@ impl Ideal<core::iter::Empty<(Instant, EgmCommand)>> {
         controller
             .start_guided_motion(&asked_for(log, set_up.at_ns))
             .map_err(
-                |_| "the recorded request for guided motion is not one the controller takes",
+                |_refusal| "the recorded request for guided motion is not one the controller takes",
             )?;
         Ok(Ideal {
             controller,

@@ -47,11 +47,11 @@ impl LoopCounter {
         let in_time = |at: &i64| *at >= begin && (*at as f64) <= until;
         let sent: Vec<i64> = sent.iter().copied().filter(in_time).collect();
         let last = *sent.last()? as f64;
-        let executed = peaks(moved, self.prominence_m)
+        let executed: Vec<i64> = peaks(moved, self.prominence_m)
             .into_iter()
             .filter(|at| (*at as f64) <= last + 0.75 * self.period_ns)
             .collect();
-        Some(Loops::matched(sent, executed, self.period_ns))
+        Some(Loops::matched(sent, &executed, self.period_ns))
     }
 }
 
@@ -80,11 +80,11 @@ pub(crate) struct LostLoop {
 impl Loops {
     /// Gives every executed peak the sent one it lies nearest to, allowing for the delay the
     /// peaks before it had: a queue that never drains shifts all that follows.
-    fn matched(sent_ns: Vec<i64>, executed_ns: Vec<i64>, period_ns: f64) -> Self {
+    fn matched(sent_ns: Vec<i64>, executed_ns: &[i64], period_ns: f64) -> Self {
         const DELAY_SHARE: f64 = 0.25;
         let (mut delay_ns, mut next, mut extra_count) = (0.0, 0, 0);
         let mut lost = Vec::new();
-        for executed in &executed_ns {
+        for executed in executed_ns {
             let due = |index: usize| sent_ns[index] as f64 + delay_ns;
             let apart = |index: usize| (*executed as f64 - due(index)).abs();
             let mut best = next;

@@ -18,6 +18,7 @@ mod tests;
 
 use crate::case_study::{Metric, Score};
 use crate::egm::messages::EgmCommand;
+use crate::measure::statistics::{CONFIDENCE, poisson};
 use crate::run_log::RunLog;
 use crate::teleoperation::messages::HumanFrame;
 use crate::teleoperation::score::figure::{count, estimated, figure};
@@ -25,7 +26,7 @@ use crate::teleoperation::score::joint_error::JointError;
 use crate::teleoperation::score::loops::{LoopCounter, Loops, LossCause};
 use crate::teleoperation::score::record::Record;
 use crate::teleoperation::score::sessions::Sessions;
-use crate::teleoperation::series::{Estimate, Sample, lag_s, peak_to_peak, poisson_interval};
+use crate::teleoperation::series::{Estimate, Sample, lag_s, peak_to_peak};
 use crate::teleoperation::{HUMAN_FRAME, Teleoperation};
 
 pub(crate) use crate::teleoperation::score::plots::series;
@@ -140,10 +141,9 @@ impl Run {
             missing,
         );
         let interval = loops.and_then(|loops| {
-            let lost = u32::try_from(loops.missing_count()?).ok()?;
-            let (low, high) = poisson_interval(lost);
+            let lost = poisson(loops.missing_count()?, CONFIDENCE);
             let sent = loops.sent_count() as f64;
-            Some((low / sent, (high / sent).min(1.0)))
+            Some((lost.low / sent, (lost.high / sent).min(1.0)))
         });
         let mut metrics = vec![
             figure(

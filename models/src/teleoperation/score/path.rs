@@ -121,6 +121,14 @@ fn steps(time_s: f64, step_ns: i64) -> usize {
     (time_s * 1e9 / step_ns as f64).ceil() as usize
 }
 
+#[allow(
+    clippy::cast_possible_truncation,
+    reason = "a period of at most a minute"
+)]
+fn half_ns(period_s: f64) -> i64 {
+    (0.5e9 * period_s) as i64
+}
+
 /// From point to point of both paths.
 const PATH_STEP_NS: i64 = 40_000_000;
 
@@ -137,7 +145,7 @@ fn path_distance(record: &Record, period_s: f64) -> Option<(f64, f64)> {
         .iter()
         .map(|known| (known.at_ns, known.tool_m));
     let (sent, moved) = (thinned(commands), thinned(feedback));
-    let reach_ns = steps(0.5 * period_s, 1) as i64;
+    let reach_ns = half_ns(period_s);
     let (begin, end) = (sent.first()?.0, sent.last()?.0);
     let (mut low, mut high, mut count, mut square, mut max) = (0, 0, 0.0, 0.0, 0.0_f64);
     for (at, point) in &moved {

@@ -31,9 +31,9 @@ pub(crate) fn series(log: &RunLog) -> Vec<PlotSeries> {
     let rows = Thinned::of(log.raw(EGM_RIGHT_FEEDBACK).len());
     let all = [
         input(log, human),
-        tool_y(log, &rows, (robot, shift)),
-        joints(log, &rows, (robot, shift)),
-        joint_error(log, &rows, (robot, shift)),
+        tool_y(log, rows, (robot, shift)),
+        joints(log, rows, (robot, shift)),
+        joint_error(log, rows, (robot, shift)),
     ];
     all.into_iter().flatten().collect()
 }
@@ -101,7 +101,7 @@ fn paired(
         })
 }
 
-fn notes(rows: &Thinned, shift: Option<i64>) -> Vec<String> {
+fn notes(rows: Thinned, shift: Option<i64>) -> Vec<String> {
     let shifted = shift.map(|shift_ns| {
         format!(
             "commands and feedback were stamped by two clocks; {shift_ns} ns were added to the \
@@ -113,7 +113,7 @@ fn notes(rows: &Thinned, shift: Option<i64>) -> Vec<String> {
 
 fn tool_y(
     log: &RunLog,
-    rows: &Thinned,
+    rows: Thinned,
     (origin_ns, shift): (i64, Option<i64>),
 ) -> Option<PlotSeries> {
     let arm = Arm::right();
@@ -181,7 +181,7 @@ fn desired_rad(command: Option<EgmCommand>) -> Joints {
 
 fn joints(
     log: &RunLog,
-    rows: &Thinned,
+    rows: Thinned,
     (origin_ns, shift): (i64, Option<i64>),
 ) -> Option<PlotSeries> {
     let mut values = Vec::new();
@@ -205,7 +205,7 @@ fn joints(
 
 fn joint_error(
     log: &RunLog,
-    rows: &Thinned,
+    rows: Thinned,
     (origin_ns, shift): (i64, Option<i64>),
 ) -> Option<PlotSeries> {
     let mut values = Vec::new();

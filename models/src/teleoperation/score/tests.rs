@@ -70,12 +70,12 @@ fn value(score: &Score, name: &str) -> f64 {
     metric.value.unwrap_or_else(|| panic!("{metric:?}"))
 }
 
-fn silence(from_s: f64, until_s: f64) -> Option<Silence> {
-    Some(Silence {
+fn silence(from_s: f64, until_s: f64) -> Silence {
+    Silence {
         from_s,
         until_s,
         is_buffered: false,
-    })
+    }
 }
 
 const PERIOD_S: f64 = 4.033;
@@ -127,7 +127,7 @@ fn a_perfect_channel_loses_nothing_and_adds_no_error() {
 #[test]
 fn a_loop_lost_to_a_time_out_is_told_with_its_cause_and_the_commands_that_were_lost() {
     let case = case(|_| {});
-    let log = run(&case, silence(12.0, 14.5), 8.0 * PERIOD_S);
+    let log = run(&case, Some(silence(12.0, 14.5)), 8.0 * PERIOD_S);
     let score = case.score(&log);
     assert!((value(&score, "egm_trip_count") - 1.0).abs() < 0.1);
     assert!((value(&score, "loops_lost_by_trip_count") - 1.0).abs() < 0.1);
@@ -169,7 +169,7 @@ fn a_loop_lost_in_a_hold_is_told_as_held() {
     let case = case(|parameters| {
         parameters.egm.comm_timeout_s = Some(60.0);
     });
-    let log = run(&case, silence(12.0, 12.0 + PERIOD_S), 8.0 * PERIOD_S);
+    let log = run(&case, Some(silence(12.0, 12.0 + PERIOD_S)), 8.0 * PERIOD_S);
     let score = case.score(&log);
     assert!(value(&score, "egm_trip_count").abs() < 0.1);
     assert!((value(&score, "hold_count") - 1.0).abs() < 0.1);
@@ -203,7 +203,7 @@ fn a_buffered_second_makes_the_reference_older_for_good() {
 #[test]
 fn two_clocks_withdraw_error_and_lag_but_not_the_loops() {
     let case = case(|_| {});
-    let whole = run(&case, silence(12.0, 14.5), 8.0 * PERIOD_S);
+    let whole = run(&case, Some(silence(12.0, 14.5)), 8.0 * PERIOD_S);
     let mut log = RunLog::default();
     for (channel, offset_ns) in [
         (EGM_RIGHT_COMMAND, 0),
