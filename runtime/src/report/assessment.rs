@@ -86,7 +86,10 @@ fn verdict(summary: &RunSummary, overruns: Vec<Overrun>) -> NetworkVerdict {
     let has_ticks = |process: &ProcessSummary| process.tick_count.is_some();
     if summary.run.outcome == Outcome::Failed {
         NetworkVerdict::RunFailed
-    } else if !has(LinkKind::Udp) && !has(LinkKind::Emulated) {
+    } else if ![LinkKind::Udp, LinkKind::Tcp, LinkKind::Emulated]
+        .into_iter()
+        .any(has)
+    {
         NetworkVerdict::NoNetwork
     } else if !overruns.is_empty() {
         NetworkVerdict::HostOverran {

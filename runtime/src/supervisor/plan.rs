@@ -7,11 +7,11 @@ use std::path::PathBuf;
 
 use nix::unistd::{AccessFlags, Uid, access};
 
-use crate::process::launch::{DirectionLaunch, EmulationLaunch, Side, SocketLaunch};
+use crate::process::launch::{DirectionLaunch, EmulationLaunch, Side, SocketLaunch, Transport};
 use crate::realtime::{RealtimeRequest, SchedulingPolicy};
 use crate::topology::{
     Channel, Crossing, Execution, Host, OnExit, Process, ProcessCard, Program, Scheduling,
-    Topology, Wait,
+    Topology, Via, Wait,
 };
 use crate::wait::WaitMode;
 
@@ -197,6 +197,10 @@ fn direction(crossing: &Crossing<'_>, side: Side, index: usize, seed: u64) -> Di
             priority: hop.socket_priority,
             send_buffer_bytes: hop.send_buffer_bytes,
             receive_buffer_bytes: hop.receive_buffer_bytes,
+            transport: match crossing.link.via {
+                Via::Tcp(_) => Transport::Tcp,
+                Via::SharedMemory | Via::Udp(_) | Via::Emulated(..) => Transport::Udp,
+            },
             path_mtu_bytes: hop.path_mtu_bytes,
             timestamps: hop.timestamps,
         },
@@ -205,6 +209,8 @@ fn direction(crossing: &Crossing<'_>, side: Side, index: usize, seed: u64) -> Di
         emulation: emulation.map(|impairment| EmulationLaunch {
             delay: impairment.delay,
             loss_ratio: impairment.loss_ratio,
+            outages: crossing.outages.unwrap_or_default(),
+            link: crossing.link.name.clone(),
             seed,
         }),
     }

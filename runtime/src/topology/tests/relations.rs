@@ -11,7 +11,7 @@ fn all_faults_of_a_file_are_reported_at_once() {
             "role = \"robot\"",
             "role = \"robto\"\nwiat = \"block\"\ncpu = 5000",
         )
-        .replace("via = \"udp\"", "via = \"tcp\"\ndscp = 64");
+        .replace("via = \"udp\"", "via = \"quic\"\ndscp = 64");
     let errors = parse("faulty.toml", &text, &[], &known()).unwrap_err();
     let keys: Vec<_> = errors
         .errors()
