@@ -127,7 +127,7 @@ fn a_run_over_tcp_accounts_for_every_message_and_loses_none() {
             assert_eq!(count(egress, "stream: connection_count"), 1);
             assert_eq!(count(egress, "stream: reconnect_count"), 0);
             assert!(fact(egress, "kernel stamps").starts_with("unavailable over TCP"));
-            assert!(fact(egress, "stalls").contains("twice the smallest round trip and 40 ms"));
+            assert!(fact(egress, "stalls").contains("twice the smallest round trip and 50 ms"));
             println!("{name}: {:?}", egress.facts);
             let ingress = direction(summary, name, "ingress");
             assert_eq!(count(ingress, "stream: bad_frame_count"), 0);
@@ -179,7 +179,7 @@ fn a_link_that_stands_still_shows_as_a_stall_and_loses_nothing() {
             );
         }
         let egress = direction(summary, CHANNELS[0], "egress");
-        assert!(count(egress, "stream: retransmitted_segment_count") >= 1);
+        assert!(count(egress, "stream: waiting_bytes_max") > 1_000);
         let end_to_end = account(summary, CHANNELS[0])
             .end_to_end
             .distribution

@@ -63,7 +63,7 @@ fn connections(figures: &StreamFigures) -> String {
 fn stalls(figures: &StreamFigures) -> String {
     let threshold = milliseconds(figures.stall_threshold);
     let rule = format!(
-        "oldest unacknowledged byte older than {threshold}, twice the smallest round trip and 40 ms"
+        "oldest unacknowledged byte older than {threshold}, twice the smallest round trip and 50 ms"
     );
     if figures.stall_count == 0 {
         return format!("none ({rule})");

@@ -60,8 +60,8 @@ pub struct StreamFigures {
     pub backlogged: Duration,
     /// Most bytes seen waiting for an acknowledgement, in our buffer or in the kernel's.
     pub waiting_bytes_max: u64,
-    /// A byte that waits longer than this is stalled: twice the smallest round trip and 40 ms,
-    /// for which a receiver may keep an acknowledgement back.
+    /// A byte that waits longer than this is stalled: twice the smallest round trip and 50 ms,
+    /// the longest that a receiver in good health keeps an acknowledgement back.
     pub stall_threshold: Duration,
     /// Stalls: spans in which the oldest unacknowledged byte was stalled.
     pub stall_count: u64,

@@ -1,5 +1,6 @@
 //! The end that listens: takes the peer's newest connection and turns everyone else away.
 
+use core::time::Duration;
 use std::io;
 use std::net::SocketAddr;
 use std::os::fd::{AsFd, BorrowedFd};
@@ -21,6 +22,9 @@ use crate::transport::{DatagramReceiver, KernelStamps, Received, ReceiverCounter
 /// waiting.
 const ACCEPT_COUNT_MAX: u32 = 4;
 
+/// To look at the door costs system calls, and a thread that spins would look all the time.
+const ATTEND_PERIOD: Duration = Duration::from_micros(200);
+
 /// The receiving end.
 #[derive(Debug)]
 pub struct TcpReceiver {
@@ -32,6 +36,7 @@ pub struct TcpReceiver {
     interest: EpollFlags,
     counters: ReceiverCounters,
     granted: GrantedOptions,
+    attended: Instant,
 }
 
 impl TcpReceiver {
@@ -52,6 +57,7 @@ impl TcpReceiver {
             epoll,
             interest: EpollFlags::empty(),
             counters: ReceiverCounters::default(),
+            attended: Instant::from_ns(i64::MIN),
             settings,
         })
     }
@@ -159,6 +165,11 @@ impl DatagramReceiver for TcpReceiver {
     }
 
     fn attend(&mut self, now: Instant) {
+        let since_look = now.saturating_duration_since(self.attended);
+        if since_look < ATTEND_PERIOD && !self.stream.has_backlog() {
+            return;
+        }
+        self.attended = now;
         self.stream.look(now);
         self.accept(now);
         self.update_interest();

@@ -7,9 +7,9 @@ use std::collections::VecDeque;
 use hil_models::time::Instant;
 
 /// A receiver may keep an acknowledgement back for 40 ms (`TCP_DELACK_MIN` of Linux) or for one
-/// round trip, whichever is longer, and both it and the data are under way. What waits longer
-/// than that is not waiting for politeness.
-const DELAYED_ACKNOWLEDGEMENT: Duration = Duration::from_millis(40);
+/// round trip, whichever is longer, and both it and the data are under way; its timer may be a
+/// tick late, 10 ms at the slowest. What waits longer than that is not waiting for politeness.
+const DELAYED_ACKNOWLEDGEMENT: Duration = Duration::from_millis(40 + 10);
 /// Between looks while a stall lasts: the resolution of its length.
 pub(super) const LOOK_PERIOD: Duration = Duration::from_millis(5);
 /// Sends remembered one by one; further ones count as old as the last of these.
@@ -61,7 +61,7 @@ impl StallWatch {
         }
     }
 
-    /// Twice the smallest round trip and 40 ms.
+    /// Twice the smallest round trip and 50 ms.
     pub(super) fn threshold(&self) -> Duration {
         2 * self.rtt_min + DELAYED_ACKNOWLEDGEMENT
     }
@@ -153,7 +153,7 @@ mod tests {
     fn watch() -> StallWatch {
         let mut watch = StallWatch::new();
         watch.set_rtt_min(Duration::from_millis(5));
-        assert_eq!(watch.threshold(), Duration::from_millis(50));
+        assert_eq!(watch.threshold(), Duration::from_millis(60));
         watch
     }
 
@@ -162,11 +162,11 @@ mod tests {
         let mut watch = watch();
         watch.on_accepted(100, at(0));
         watch.on_accepted(100, at(10));
-        watch.on_look(200, at(50));
-        assert_eq!(watch.figures(at(50)).count, 0, "50 ms are no stall yet");
-        assert_eq!(watch.next_look(at(50)), Some(at(55)));
-        watch.on_look(200, at(55));
-        assert_eq!(watch.figures(at(55)).longest, Duration::from_millis(55));
+        watch.on_look(200, at(60));
+        assert_eq!(watch.figures(at(60)).count, 0, "60 ms are no stall yet");
+        assert_eq!(watch.next_look(at(60)), Some(at(65)));
+        watch.on_look(200, at(65));
+        assert_eq!(watch.figures(at(65)).longest, Duration::from_millis(65));
         // The first is acknowledged, the second is overdue as well: it is one stall.
         watch.on_look(100, at(80));
         watch.on_look(0, at(90));
