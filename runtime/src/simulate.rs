@@ -5,10 +5,9 @@ use core::fmt::Write;
 use std::collections::BTreeMap;
 
 use hil_models::case_study::Score;
-use hil_models::link::bernoulli::BernoulliLink;
-use hil_models::random::RandomStream;
 use hil_models::simulation::{Carrier, Simulation, SimulationResult};
 
+use crate::process::launch::EmulationLaunch;
 use crate::registry::Registry;
 use crate::report::score_event::ScoreEvents;
 use crate::report::summary::ScoreMetric;
@@ -47,14 +46,20 @@ pub(crate) fn simulate(
         let name = &crossing.channel.name;
         let impairment = crossing.impairment.ok_or_else(|| {
             format!(
-                "channel {name} crosses link {} via udp, whose delay only a real run shows; \
-                 use via = \"emulated\" to simulate it",
+                "channel {name} crosses link {}, a real network whose delay only a real run \
+                 shows; use via = \"emulated\" to simulate it",
                 crossing.link.name
             )
         })?;
-        let stream = RandomStream::new(seed, name);
-        let link = BernoulliLink::new(impairment.delay, impairment.loss_ratio, stream)
-            .map_err(|error| error.to_string())?;
+        let emulation = EmulationLaunch {
+            delay: impairment.delay,
+            loss_ratio: impairment.loss_ratio,
+            outages: crossing.outages.unwrap_or_default(),
+            link: crossing.link.name.clone(),
+            seed,
+        };
+        // Virtual time begins with the run.
+        let link = emulation.model(name).map_err(|error| error.to_string())?;
         carriers.insert(name.clone(), Box::new(link));
     }
     let roles = entry

@@ -2,6 +2,7 @@
 //! it. They know no datagram layout; that is [`crate::protocol`].
 //!
 //! - [`udp`]: the real network, with separate sockets for sending and receiving.
+//! - [`tcp`]: the real network as a stream, with what it costs in waiting.
 //! - [`udp_server`]: one socket that hears anyone and answers, for foreign protocols.
 //! - [`queue`]: an in-process pair, for tests.
 //! - [`emulated`]: any receiver behind a link model.
@@ -11,11 +12,13 @@
 //!
 //! A refused send or a report of the network is a state the caller sees, never an exit.
 
+mod boxed;
 pub mod clock_pair;
 mod control;
 pub mod emulated;
 pub mod probe;
 pub mod queue;
+pub mod tcp;
 pub mod timestamping;
 pub mod udp;
 pub mod udp_server;
@@ -35,6 +38,8 @@ use std::os::fd::BorrowedFd;
 
 use hil_models::time::Instant;
 use thiserror::Error;
+
+use tcp::StreamFigures;
 
 /// The stamps the kernel attached to one datagram.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -122,6 +127,9 @@ pub enum SendRefusal {
         /// Its length; 0 when the refusal came later, as a report.
         length_bytes: usize,
     },
+    /// A transport with connections has none to the peer just now.
+    #[error("there is no connection to the peer")]
+    NotConnected,
     /// Anything else the kernel answered.
     #[error("send was refused (errno {errno})")]
     Other {
@@ -168,6 +176,8 @@ pub struct SenderCounters {
     pub queue_full_count: u64,
     /// Sends refused with [`SendRefusal::TooLong`].
     pub too_long_count: u64,
+    /// Sends refused with [`SendRefusal::NotConnected`].
+    pub not_connected_count: u64,
     /// Sends refused with [`SendRefusal::Other`].
     pub other_refusal_count: u64,
     /// Transmit stamps handed out.
@@ -202,6 +212,7 @@ impl SenderCounters {
             ("unreachable_count", self.unreachable_count),
             ("queue_full_count", self.queue_full_count),
             ("too_long_count", self.too_long_count),
+            ("not_connected_count", self.not_connected_count),
             ("other_refusal_count", self.other_refusal_count),
             ("stamp_count", self.stamp_count),
             ("unmatched_stamp_count", self.unmatched_stamp_count),
@@ -223,6 +234,7 @@ impl SenderCounters {
             SendRefusal::Unreachable { .. } => &mut self.unreachable_count,
             SendRefusal::QueueFull { .. } => &mut self.queue_full_count,
             SendRefusal::TooLong { .. } => &mut self.too_long_count,
+            SendRefusal::NotConnected => &mut self.not_connected_count,
             SendRefusal::Other { .. } => &mut self.other_refusal_count,
         };
         *counter += 1;
@@ -234,6 +246,7 @@ impl SenderCounters {
             + self.unreachable_count
             + self.queue_full_count
             + self.too_long_count
+            + self.not_connected_count
             + self.other_refusal_count
     }
 }
@@ -336,6 +349,25 @@ pub trait DatagramSender: Debug + Send {
 
     /// What was counted since the start.
     fn counters(&self) -> SenderCounters;
+
+    /// Does what is due beside sending, such as connecting: call it at
+    /// [`DatagramSender::next_due`] and whenever the descriptor has something.
+    fn attend(&mut self, _now: Instant) {}
+
+    /// When [`DatagramSender::attend`] is due without a word from the descriptor.
+    fn next_due(&self) -> Option<Instant> {
+        None
+    }
+
+    /// True while bytes of a datagram it took have not been given to the kernel.
+    fn has_unsent(&self) -> bool {
+        false
+    }
+
+    /// What a transport with connections saw until `now`; `None` for one without.
+    fn stream_figures(&self, _now: Instant) -> Option<StreamFigures> {
+        None
+    }
 }
 
 /// The receiving end of a transport. Nothing here blocks. See [`DatagramSender`] for an example.
@@ -362,49 +394,14 @@ pub trait DatagramReceiver: Debug + Send {
 
     /// What was counted since the start.
     fn counters(&self) -> ReceiverCounters;
-}
 
-impl<S: DatagramSender + ?Sized> DatagramSender for Box<S> {
-    fn send(&mut self, datagram: &[u8]) -> Result<TxToken, SendRefusal> {
-        (**self).send(datagram)
-    }
+    /// Does what is due beside receiving, such as taking connections: call it whenever the
+    /// descriptor has something and [`DatagramReceiver::receive`] gave nothing.
+    fn attend(&mut self, _now: Instant) {}
 
-    fn next_stamp(&mut self) -> Option<TransmitStamp> {
-        (**self).next_stamp()
-    }
-
-    fn receive(&mut self, buffer: &mut [u8]) -> io::Result<Option<Received>> {
-        (**self).receive(buffer)
-    }
-
-    fn poll_fd(&self) -> Option<BorrowedFd<'_>> {
-        (**self).poll_fd()
-    }
-
-    fn counters(&self) -> SenderCounters {
-        (**self).counters()
-    }
-}
-
-impl<R: DatagramReceiver + ?Sized> DatagramReceiver for Box<R> {
-    fn receive(&mut self, now: Instant, buffer: &mut [u8]) -> io::Result<Option<Received>> {
-        (**self).receive(now, buffer)
-    }
-
-    fn reply(&mut self, datagram: &[u8], to: SocketAddr) -> Result<(), SendRefusal> {
-        (**self).reply(datagram, to)
-    }
-
-    fn next_due(&self) -> Option<Instant> {
-        (**self).next_due()
-    }
-
-    fn poll_fd(&self) -> Option<BorrowedFd<'_>> {
-        (**self).poll_fd()
-    }
-
-    fn counters(&self) -> ReceiverCounters {
-        (**self).counters()
+    /// What a transport with connections saw until `now`; `None` for one without.
+    fn stream_figures(&self, _now: Instant) -> Option<StreamFigures> {
+        None
     }
 }
 

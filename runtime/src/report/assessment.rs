@@ -91,7 +91,11 @@ fn verdict(summary: &RunSummary, overruns: Vec<Overrun>) -> NetworkVerdict {
     let has_ticks = |process: &ProcessSummary| process.tick_count.is_some();
     if summary.run.outcome == Outcome::Failed {
         NetworkVerdict::RunFailed
-    } else if !has(LinkKind::Udp) && !has(LinkKind::Emulated) && !has_face {
+    } else if ![LinkKind::Udp, LinkKind::Tcp, LinkKind::Emulated]
+        .into_iter()
+        .any(has)
+        && !has_face
+    {
         NetworkVerdict::NoNetwork
     } else if !overruns.is_empty() {
         NetworkVerdict::HostOverran {

@@ -270,6 +270,8 @@ pub enum LinkKind {
     SharedMemory,
     /// A gateway pair over UDP.
     Udp,
+    /// A gateway pair over TCP.
+    Tcp,
     /// A gateway pair over an emulated link.
     Emulated,
     /// Nothing: its messages go to the run's record only.
@@ -282,6 +284,7 @@ impl LinkKind {
         match self {
             Self::SharedMemory => "shared memory",
             Self::Udp => "UDP",
+            Self::Tcp => "TCP",
             Self::Emulated => "emulated link",
             Self::RecordOnly => "recorded only",
         }

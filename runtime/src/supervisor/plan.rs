@@ -11,11 +11,11 @@ use hil_models::egm::parameters::{ControllerSettings, EgmParameters};
 use nix::unistd::{AccessFlags, Uid, access};
 
 use crate::face::launch::{ArmLaunch, FaceSettings};
-use crate::process::launch::{DirectionLaunch, EmulationLaunch, Side, SocketLaunch};
+use crate::process::launch::{DirectionLaunch, EmulationLaunch, Side, SocketLaunch, Transport};
 use crate::realtime::{RealtimeRequest, SchedulingPolicy};
 use crate::topology::{
     CardChannel, Channel, Crossing, EgmFace, Execution, FaceKind, Host, OnExit, Process,
-    ProcessCard, Program, Scheduling, Topology, Wait, command_channel, feedback_channel,
+    ProcessCard, Program, Scheduling, Topology, Via, Wait, command_channel, feedback_channel,
 };
 use crate::wait::WaitMode;
 
@@ -289,6 +289,10 @@ fn direction(crossing: &Crossing<'_>, side: Side, index: usize, seed: u64) -> Di
             priority: hop.socket_priority,
             send_buffer_bytes: hop.send_buffer_bytes,
             receive_buffer_bytes: hop.receive_buffer_bytes,
+            transport: match crossing.link.via {
+                Via::Tcp(_) => Transport::Tcp,
+                Via::SharedMemory | Via::Udp(_) | Via::Emulated(..) => Transport::Udp,
+            },
             path_mtu_bytes: hop.path_mtu_bytes,
             timestamps: hop.timestamps,
         },
@@ -297,6 +301,8 @@ fn direction(crossing: &Crossing<'_>, side: Side, index: usize, seed: u64) -> Di
         emulation: emulation.map(|impairment| EmulationLaunch {
             delay: impairment.delay,
             loss_ratio: impairment.loss_ratio,
+            outages: crossing.outages.unwrap_or_default(),
+            link: crossing.link.name.clone(),
             seed,
         }),
     }

@@ -8,7 +8,8 @@ use super::errors::{Fault, Faults, Place};
 use super::file::{ChannelEntry, ProcessEntry};
 use super::file_links::LinkEntry;
 use super::known::KnownCase;
-use super::model::{Channel, ChannelPorts, Link, MessageLayout, Process, Program, Topology, Via};
+use super::model::{Channel, ChannelPorts, MessageLayout, Process, Program, Topology};
+use super::model_links::{Link, Via};
 use super::reader::At;
 use super::tree::join;
 
@@ -315,7 +316,7 @@ impl Routes<'_> {
             return;
         }
         self.between[index] = Some(hosts);
-        let Some(Via::Udp(hop) | Via::Emulated(hop, _)) = &link.via else {
+        let Some(hop) = link.via.as_ref().and_then(Via::hop) else {
             return;
         };
         channel.ports = ChannelPorts::of(hop.port, self.carried_counts[index]);
@@ -355,7 +356,8 @@ impl Routes<'_> {
             "`{}` on host `{from}` and `{consumer}` on host `{to}`",
             channel.from
         );
-        let hint = format!("the channel joins {ends}: name a link via \"udp\" or \"emulated\"");
+        let hint =
+            format!("the channel joins {ends}: name a link via \"udp\", \"tcp\" or \"emulated\"");
         let fault = match &channel.link {
             None => Fault::Missing(hint),
             Some(link) => {
@@ -406,7 +408,7 @@ fn place_of(value: Option<&At<String>>, table: Place) -> Place {
 fn check_port_ranges(links: &[LinkEntry], carried_counts: &[usize], faults: &Faults) {
     let mut taken: Vec<(&str, core::ops::Range<usize>)> = Vec::new();
     for (link, count) in links.iter().zip(carried_counts) {
-        let Some(Via::Udp(hop) | Via::Emulated(hop, _)) = &link.via else {
+        let Some(hop) = link.via.as_ref().and_then(Via::hop) else {
             continue;
         };
         let base = usize::from(hop.port);

@@ -23,6 +23,7 @@ mod known;
 mod layers;
 mod limits;
 mod model;
+mod model_links;
 mod reader;
 mod resolved;
 mod suggest;
@@ -40,10 +41,10 @@ pub use known::{
     KnownCase, KnownCases, ParameterCheck, ParameterFault, check_parameters_with, parameters_of,
 };
 pub use model::{
-    Case, Channel, ChannelPorts, Crossing, Direction, Emulation, Execution, Gateway, Hop, Host,
-    Impairment, Link, MessageLayout, OnExit, Process, Program, Run, Scheduling, Timestamps,
-    Topology, Via, Wait,
+    Case, Channel, ChannelPorts, Crossing, Direction, Execution, Host, MessageLayout, OnExit,
+    Process, Program, Run, Scheduling, Topology, Wait,
 };
+pub use model_links::{Emulation, Gateway, Hop, Impairment, Link, Timestamps, Via};
 
 use check::Needs;
 use errors::Place;

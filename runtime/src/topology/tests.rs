@@ -114,6 +114,7 @@ const SHIPPED: &[&str] = &[
     "emulated.toml",
     "shuttle-local.toml",
     "shuttle-split.toml",
+    "shuttle-tcp.toml",
 ];
 
 /// Uses every key there is.
@@ -178,6 +179,7 @@ timestamps = "hardware"
 path_mtu_bytes = 1400
 delay = "50 ms"
 loss_ratio = 0.1
+outages = { mean = "1.5 s", per_hour = 12.5, buffered = true }
 [links.hop.backward]
 loss_ratio = 0
 [links.hop.gateway]
