@@ -101,7 +101,7 @@ pub(crate) fn simulate(
         topology_name: topology.name().to_owned(),
         duration_s: duration.as_secs_f64(),
         seed: topology.run().seed,
-        events: events::explained(&score, entry.channels, &outages),
+        events: events::explained(&score, entry.channels, &outages, &result.log),
         case,
         result,
         score,

@@ -4,7 +4,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use hil_models::case_study::{ChannelSpec, MessageRef, Score, ScoreEvent};
-use hil_models::measure::account::{MessageFate, MessageStory, Side};
+use hil_models::measure::account::{Happening, MessageFate, MessageStory, Side};
 use hil_models::time::Instant;
 
 use super::outages::OutageStory;
@@ -48,7 +48,7 @@ pub(super) fn explained(
     ScoreEvents {
         events: events
             .map(|event| ExplainedEvent {
-                outages: outages_before(event, run, specs, outages),
+                outages: outages_before(event, run, (specs, outages), &ways),
                 ..explain(event, run, &ways)
             })
             .collect(),
@@ -100,12 +100,12 @@ fn explain(
     }
 }
 
-/// The outages that went before `event` on the channels it concerns.
+/// What the channels that `event` concerns went through when it happened.
 fn outages_before(
     event: &ScoreEvent,
     (topology, result): (&Topology, &RunResult),
-    specs: &[ChannelSpec],
-    stories: &[OutageStory],
+    (specs, stories): (&[ChannelSpec], &[OutageStory]),
+    ways: &BTreeMap<&str, Way<'_>>,
 ) -> Vec<EventOutage> {
     let host_of = |process: &str| topology.process(process).map(|one| &one.host);
     let teller = topology.channel(event.clock_of);
@@ -118,13 +118,21 @@ fn outages_before(
         let is_here = |process: &str| host_of(process) == Some(here);
         let is_consumers = channel.to.as_deref().is_some_and(is_here);
         let is_producers = result.has_one_clock || is_here(&channel.from);
-        let sides = [
-            (is_consumers, Side::Consumer),
-            (is_producers, Side::Producer),
-        ];
+        let lost_published_ns = ways
+            .get(spec.name)
+            .map_or_else(Vec::new, |way| way.lost_published_ns(event));
         // A time compares only with times of its own clock.
-        let mut sides = sides.into_iter().filter(|(compares, _)| *compares);
-        sides.find_map(|(_, side)| story.before(event.at, side))
+        let sides = [
+            is_consumers.then_some(Side::Consumer),
+            is_producers.then_some(Side::Producer),
+        ];
+        let mut sides = sides.into_iter().flatten().map(Some).chain([None]);
+        sides.find_map(|side| {
+            story.before(&Happening {
+                at: side.map(|side| (event.at, side)),
+                lost_published_ns: &lost_published_ns,
+            })
+        })
     };
     let concerned = event.concerned_channels(specs);
     concerned.into_iter().filter_map(before).collect()
@@ -168,6 +176,16 @@ impl Way<'_> {
             words: self.words(story),
             ..unavailable(message, "")
         }
+    }
+
+    /// Publications of the messages that `event` names and that were lost on this channel.
+    fn lost_published_ns(&self, event: &ScoreEvent) -> Vec<i64> {
+        let messages = event.messages.iter();
+        let named = messages.filter(|message| message.channel == self.channel.name);
+        let stories =
+            named.filter_map(|message| self.stories.get(&(message.epoch, message.sequence)));
+        let lost = stories.filter(|story| story.fate.is_loss());
+        lost.filter_map(|story| story.published_ns).collect()
     }
 
     fn words(&self, story: &MessageStory) -> String {

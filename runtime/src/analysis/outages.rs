@@ -1,7 +1,7 @@
 //! The outages of each channel of a finished run, and which of them went before an event. They are
 //! found in the records of the messages alone; no link is asked what it did.
 
-use hil_models::measure::account::{Outage, OutageFigures, Side, foregoing};
+use hil_models::measure::account::{Happening, Outage, OutageFigures, Standing, foregoing};
 use hil_models::time::Instant;
 
 use super::events::start_of;
@@ -57,9 +57,9 @@ impl OutageStory {
         (!is_unknown).then(|| OutageFigures::of(&self.outages, self.start, self.end))
     }
 
-    /// What had gone before something happened `at` a time on the clock of `side`'s host.
-    pub(crate) fn before(&self, at: Instant, side: Side) -> Option<EventOutage> {
-        let found = foregoing(&self.outages, at, side)?;
+    /// What has most to do with something that happened.
+    pub(crate) fn before(&self, happening: &Happening<'_>) -> Option<EventOutage> {
+        let found = foregoing(&self.outages, happening)?;
         let outage = found.outage;
         let since_start_s = |ns: i64| Some(Instant::from_ns(ns).seconds_since(self.start?));
         let mut event_outage = EventOutage {
@@ -68,9 +68,8 @@ impl OutageStory {
             until_s: outage.until_ns.and_then(since_start_s),
             length_s: outage.length_ns(self.end).map(|ns| ns as f64 * 1e-9),
             lost_count: outage.lost_count,
-            is_under_way: found.is_under_way,
-            since_end_s: found.since_end_ns as f64 * 1e-9,
-            shorter_count: found.shorter_count,
+            standing: found.standing,
+            other_count: found.other_count,
             words: String::new(),
         };
         let interrupted = outage
@@ -101,15 +100,18 @@ fn words(outage: &EventOutage, interrupted: Option<&str>) -> String {
     if let Some(process) = interrupted {
         text.push_str(&[", while ", process, " was down"].concat());
     }
-    if outage.is_under_way {
-        text.push_str(", under way");
-    } else {
-        text.push_str(&[", over for ", &duration_s(outage.since_end_s)].concat());
+    match outage.standing {
+        Standing::UnderWay => text.push_str(", under way"),
+        Standing::OverFor(ns) => {
+            let over = duration_s(ns as f64 * 1e-9);
+            text.push_str(&[", over for ", &over].concat());
+        }
+        Standing::BegunLater | Standing::Unknown => {}
     }
-    if outage.shorter_count > 0 {
-        let plural = if outage.shorter_count == 1 { "" } else { "s" };
-        let count = grouped(outage.shorter_count);
-        text.push_str(&["; ", &count, " shorter one", plural, " beside it"].concat());
+    if outage.other_count > 0 {
+        let plural = if outage.other_count == 1 { "" } else { "s" };
+        let count = grouped(outage.other_count);
+        text.push_str(&["; ", &count, " other", plural, " about then"].concat());
     }
     text
 }
@@ -118,6 +120,7 @@ fn words(outage: &EventOutage, interrupted: Option<&str>) -> String {
 mod tests {
     use super::*;
     use crate::report::terminal::JOINT;
+    use hil_models::measure::account::Side;
 
     const MS: i64 = 1_000_000;
 
@@ -145,7 +148,10 @@ mod tests {
     }
 
     fn words_at(story: &OutageStory, at_ms: i64) -> Option<String> {
-        let found = story.before(Instant::from_ns(at_ms * MS), Side::Producer)?;
+        let found = story.before(&Happening {
+            at: Some((Instant::from_ns(at_ms * MS), Side::Producer)),
+            lost_published_ns: &[],
+        })?;
         Some(found.words.replace(JOINT, " "))
     }
 
@@ -171,7 +177,7 @@ mod tests {
                 44_540,
                 Some(
                     "outage of 1.84 s on egm/right/command, 41.200 s to 43.040 s, 230 messages \
-                     lost, over for 500 ms; 1 shorter one beside it",
+                     lost, over for 500 ms; 1 other about then",
                 ),
             ),
             (

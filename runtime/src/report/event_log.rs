@@ -61,6 +61,7 @@ fn one_line(text: &str) -> String {
 mod tests {
     use super::*;
     use crate::report::score_event::EventOutage;
+    use hil_models::measure::account::Standing;
 
     fn event(at_s: Option<f64>, severity: Severity, what: &str) -> ExplainedEvent {
         ExplainedEvent {
@@ -87,9 +88,8 @@ mod tests {
             until_s: None,
             length_s: None,
             lost_count: 230,
-            is_under_way: true,
-            since_end_s: 0.0,
-            shorter_count: 0,
+            standing: Standing::UnderWay,
+            other_count: 0,
             words: format!("outage of 1.84{JOINT}s on egm/right/command"),
         });
         let mut all = ScoreEvents {

@@ -2,7 +2,7 @@
 //! heard, for the reports that are checked in.
 
 use hil_models::case_study::Severity;
-use hil_models::measure::account::MessageFate;
+use hil_models::measure::account::{MessageFate, Standing};
 
 use super::assessment::{Assessment, NetworkVerdict};
 use super::score_event::{EventOutage, ExplainedEvent, ExplainedMessage, ScoreEvents};
@@ -55,11 +55,10 @@ pub(super) fn few_events() -> ScoreEvents {
         until_s: Some(4.4),
         length_s: Some(0.8),
         lost_count: 20,
-        is_under_way: false,
-        since_end_s: 0.521,
-        shorter_count: 3,
+        standing: Standing::OverFor(521_000_000),
+        other_count: 3,
         words: "outage of 800 ms on fleet/authority, 3.600 s to 4.400 s, 20 messages lost, over \
-                for 521 ms; 3 shorter ones beside it"
+                for 521 ms; 3 others about then"
             .to_owned(),
     };
     let collision = "robots 3 and 5 of fleet 0 met in their section, 0.41 m into each other";

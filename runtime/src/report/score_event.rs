@@ -2,7 +2,7 @@
 //! the messages it names. Fates are found elsewhere, in the analysis.
 
 use hil_models::case_study::Severity;
-use hil_models::measure::account::MessageFate;
+use hil_models::measure::account::{MessageFate, Standing};
 use serde::{Deserialize, Serialize};
 
 /// The events of a run's score.
@@ -29,8 +29,8 @@ pub struct ExplainedEvent {
     pub severity: Severity,
     /// What happened, in words.
     pub what: String,
-    /// Outages that were under way or had ended shortly before, on the channels of the messages
-    /// concerned and on those that the process heard.
+    /// What the channels that the event concerns went through about then, where there was an
+    /// outage.
     #[serde(default)]
     pub outages: Vec<EventOutage>,
     /// The messages concerned.
@@ -39,7 +39,7 @@ pub struct ExplainedEvent {
     pub messages_dropped_count: u64,
 }
 
-/// What a channel went through before an event: the outage that had lasted longest by then.
+/// What a channel went through when an event happened: the outage that has most to do with it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct EventOutage {
     /// The channel.
@@ -53,12 +53,11 @@ pub struct EventOutage {
     pub length_s: Option<f64>,
     /// Messages lost in it.
     pub lost_count: u64,
-    /// True when it was not over at the event.
-    pub is_under_way: bool,
-    /// From its end to the event, seconds; 0 when it was not over.
-    pub since_end_s: f64,
-    /// Outages on the channel beside it that had lasted less.
-    pub shorter_count: u64,
+    /// How it stands to the event in time, as far as the process that tells of it could see;
+    /// nanoseconds.
+    pub standing: Standing,
+    /// Other outages of the channel about then.
+    pub other_count: u64,
     /// All of it in words.
     pub words: String,
 }

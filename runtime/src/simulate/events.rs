@@ -2,9 +2,11 @@
 //! record of single messages, so their fates are not known here.
 
 use core::time::Duration;
+use std::collections::BTreeSet;
 
 use hil_models::case_study::{ChannelSpec, Score, ScoreEvent};
-use hil_models::measure::account::{Outage, Side};
+use hil_models::measure::account::{Happening, Outage, Side};
+use hil_models::run_log::{LoggedMessage, RunLog};
 use hil_models::time::Instant;
 
 use crate::analysis::outages::OutageStory;
@@ -27,6 +29,7 @@ pub(super) fn explained(
     score: &Score,
     channels: &[ChannelSpec],
     stories: &[OutageStory],
+    log: &RunLog,
 ) -> ScoreEvents {
     let events = score.events.iter().map(|event| {
         let messages = event.messages.iter().map(|message| ExplainedMessage {
@@ -43,7 +46,7 @@ pub(super) fn explained(
             clock: "virtual time".to_owned(),
             severity: event.severity,
             what: event.what.clone(),
-            outages: outages_before(event, channels, stories),
+            outages: outages_before(event, channels, stories, log),
             messages: messages.collect(),
             messages_dropped_count: event.messages_dropped_count,
         }
@@ -59,19 +62,45 @@ fn outages_before(
     event: &ScoreEvent,
     channels: &[ChannelSpec],
     stories: &[OutageStory],
+    log: &RunLog,
 ) -> Vec<EventOutage> {
     let before = |spec: &ChannelSpec| {
         let story = stories.iter().find(|one| one.channel == spec.name)?;
-        story.before(event.at, Side::Consumer)
+        let lost_published_ns = published_ns(event, spec.name, log);
+        story.before(&Happening {
+            at: Some((event.at, Side::Consumer)),
+            lost_published_ns: &lost_published_ns,
+        })
     };
     let concerned = event.concerned_channels(channels);
     concerned.into_iter().filter_map(before).collect()
 }
 
+/// Publications of the messages of `channel` that `event` names. A delivered one lies in no outage,
+/// so it does no harm among the lost ones.
+fn published_ns(event: &ScoreEvent, channel: &str, log: &RunLog) -> Vec<i64> {
+    let named: BTreeSet<(u32, u64)> = event
+        .messages
+        .iter()
+        .filter(|message| message.channel == channel)
+        .map(|message| (message.epoch, message.sequence))
+        .collect();
+    // A producer numbers its messages in order, and in virtual time it never starts anew.
+    let messages = log.raw(channel);
+    let key = |message: &LoggedMessage| (message.envelope.epoch, message.envelope.sequence);
+    let find = |wanted: &(u32, u64)| messages.binary_search_by_key(wanted, key).ok();
+    let found = named.iter().filter_map(find);
+    found
+        .map(|index| messages[index].envelope.published_ns)
+        .collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use hil_models::case_study::{CaseStudy, Severity};
+    use hil_models::case_study::{CaseStudy, MessageRef, Severity};
+    use hil_models::measure::account::Standing;
+    use hil_models::message::Envelope;
     use hil_models::shuttle::Shuttle;
 
     #[test]
@@ -87,6 +116,20 @@ mod tests {
                 "stood still",
             ));
         }
+        // Told of its beginning, it names a message that was lost after it.
+        let mut log = RunLog::default();
+        for sequence in 0..2_000_u64 {
+            let envelope = Envelope {
+                sequence,
+                published_ns: i64::try_from(sequence).unwrap() * 10_000_000,
+                ..Envelope::default()
+            };
+            log.push("shuttle/command", envelope, &[]);
+        }
+        let named = log.raw("shuttle/command")[1_005].envelope;
+        let early = Instant::from_ns(9_900_000_000);
+        let early = ScoreEvent::new(Severity::Hazard, early, "shuttle/status", "held");
+        score.add_event(early.naming(MessageRef::of("shuttle/command", &named)));
         let outage = Outage {
             lost_count: 90,
             first_sequence: 1_000,
@@ -98,11 +141,12 @@ mod tests {
         };
         let name = "shuttle/command".to_owned();
         let stories = [story(name, vec![outage], Duration::from_secs(20))];
-        let events = explained(&score, Shuttle::CHANNELS, &stories).events;
+        let events = explained(&score, Shuttle::CHANNELS, &stories, &log).events;
         assert!(events[0].outages.is_empty());
         let found = &events[1].outages[0];
         assert_eq!((found.from_s, found.until_s), (Some(10.0), Some(10.9)));
-        assert!((found.since_end_s - 1.05).abs() < 1e-9);
-        assert!(!found.is_under_way && found.lost_count == 90);
+        assert_eq!(found.standing, Standing::OverFor(1_050_000_000));
+        assert_eq!(found.lost_count, 90);
+        assert_eq!(events[2].outages[0].standing, Standing::BegunLater);
     }
 }

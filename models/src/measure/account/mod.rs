@@ -31,8 +31,8 @@ pub use figures::{
     InterruptionFigures, SegmentFigures, StampCoverage,
 };
 pub use outage::{
-    Foregoing, LongestOutage, OUTAGE_EFFECT_MAX, Outage, OutageClass, OutageFigures, OutageFinder,
-    foregoing, outages,
+    Foregoing, Happening, LongestOutage, OUTAGE_EFFECT_MAX, Outage, OutageClass, OutageFigures,
+    OutageFinder, Standing, foregoing, outages,
 };
 pub use stage::{MessageFate, Side, Stage};
 pub use story::{MessageStory, stories};

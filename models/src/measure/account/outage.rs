@@ -255,52 +255,125 @@ fn empty_classes() -> Vec<OutageClass> {
     begins.zip(ends).map(class).collect()
 }
 
-/// What a channel went through before something happened.
+/// What a channel went through when something happened.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Foregoing {
-    /// The outage that had lasted longest by then.
+    /// The outage that has most to do with it.
     pub outage: Outage,
-    /// Outages beside it that had lasted less.
-    pub shorter_count: u64,
-    /// True when it was not over yet.
-    pub is_under_way: bool,
-    /// From its end to the event, nanoseconds; 0 when it was not over yet.
-    pub since_end_ns: i64,
+    /// How the two stand to each other in time.
+    pub standing: Standing,
+    /// Other outages of the channel about then.
+    pub other_count: u64,
 }
 
-/// Of `outages`, what was under way at `at` or had ended at most [`OUTAGE_EFFECT_MAX`] before;
-/// `at` is on the clock of `side`'s host. What came after an event cannot have led to it, so an
-/// outage counts with what had passed of it by then.
-pub fn foregoing(outages: &[Outage], at: Instant, side: Side) -> Option<Foregoing> {
-    let at_ns = at.as_ns();
-    let earliest_ns = at_ns.saturating_sub(duration_ns(OUTAGE_EFFECT_MAX));
-    let mut candidates = 0_u64;
-    let mut longest: Option<(i64, Foregoing)> = None;
+/// How an outage stands to an event in time.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Standing {
+    /// It was under way.
+    UnderWay,
+    /// It was over, since so many nanoseconds.
+    OverFor(i64),
+    /// It began only then, although the event names a message that was lost in it: an event may
+    /// be told of its beginning.
+    BegunLater,
+    /// Their clocks do not compare.
+    Unknown,
+}
+
+/// An event, as an outage may be held against it.
+#[derive(Debug, Clone, Copy)]
+pub struct Happening<'a> {
+    /// When it happened, on the clock of a host on this side of the channel; `None` when there is
+    /// no such time.
+    pub at: Option<(Instant, Side)>,
+    /// When messages of the channel that it names and that were lost were published, on the
+    /// producer's clock.
+    pub lost_published_ns: &'a [i64],
+}
+
+/// Of `outages`, the one that has most to do with what happened: one in which a named message was
+/// lost; else one that was under way, or over for at most [`OUTAGE_EFFECT_MAX`]. Among several it
+/// is the one that had lasted longest by then, for what came after an event cannot have led to
+/// it.
+pub fn foregoing(outages: &[Outage], happening: &Happening<'_>) -> Option<Foregoing> {
+    let mut candidate_count = 0_u64;
+    let mut best: Option<((bool, i64), Foregoing)> = None;
+    let named = happening.lost_published_ns;
+    let first_ns = named.iter().min().copied();
+    let last_ns = named.iter().max().copied();
     for outage in outages {
-        let (Some(from_ns), until_ns) = outage.span_ns(side) else {
-            continue;
+        // Of many outages, few are near the named messages.
+        let is_far =
+            outage.until_ns < first_ns && outage.until_ns.is_some() || outage.from_ns > last_ns;
+        let names_one = !is_far && named.iter().any(|ns| outage.contains(*ns));
+        let timely = happening
+            .at
+            .and_then(|(at, side)| outage.standing(at, side));
+        let (standing, passed_ns) = match timely {
+            Some(timely) => timely,
+            None if names_one => outage.standing_anyway(happening.at),
+            None => continue,
         };
-        let until_ns = until_ns.unwrap_or(i64::MAX);
-        if from_ns > at_ns || until_ns < earliest_ns {
-            continue;
-        }
-        candidates += 1;
-        let passed_ns = until_ns.min(at_ns).saturating_sub(from_ns);
-        if longest.is_none_or(|(length_ns, _)| length_ns < passed_ns) {
+        candidate_count += 1;
+        let rank = (names_one, passed_ns);
+        if best.is_none_or(|(highest, _)| highest < rank) {
             let foregoing = Foregoing {
                 outage: *outage,
-                shorter_count: 0,
-                is_under_way: until_ns > at_ns,
-                since_end_ns: at_ns.saturating_sub(until_ns).max(0),
+                standing,
+                other_count: 0,
             };
-            longest = Some((passed_ns, foregoing));
+            best = Some((rank, foregoing));
         }
     }
-    let (_, found) = longest?;
+    let (_, found) = best?;
     Some(Foregoing {
-        shorter_count: candidates - 1,
+        other_count: candidate_count - 1,
         ..found
     })
+}
+
+impl Outage {
+    /// True for a message that was published in it.
+    fn contains(&self, published_ns: i64) -> bool {
+        let is_before_end = self.until_ns.is_none_or(|until_ns| published_ns < until_ns);
+        self.from_ns.is_some_and(|from_ns| from_ns <= published_ns) && is_before_end
+    }
+
+    /// How it stands to an event that it may have led to, and how long it had lasted by then,
+    /// nanoseconds.
+    fn standing(&self, at: Instant, side: Side) -> Option<(Standing, i64)> {
+        let at_ns = at.as_ns();
+        let (from_ns, until_ns) = self.span_ns(side);
+        let (from_ns, until_ns) = (from_ns?, until_ns.unwrap_or(i64::MAX));
+        let over_ns = at_ns.saturating_sub(until_ns);
+        if from_ns > at_ns || over_ns > duration_ns(OUTAGE_EFFECT_MAX) {
+            return None;
+        }
+        let passed_ns = until_ns.min(at_ns).saturating_sub(from_ns);
+        let standing = if over_ns < 0 {
+            Standing::UnderWay
+        } else {
+            Standing::OverFor(over_ns)
+        };
+        Some((standing, passed_ns))
+    }
+
+    /// The same for an event that it has to do with at any rate.
+    fn standing_anyway(&self, at: Option<(Instant, Side)>) -> (Standing, i64) {
+        let Some((at, side)) = at else {
+            let length_ns = self.length_ns(None);
+            return (Standing::Unknown, length_ns.unwrap_or(i64::MAX));
+        };
+        match self.span_ns(side) {
+            (None, _) => (Standing::Unknown, 0),
+            (Some(from_ns), _) if from_ns > at.as_ns() => (Standing::BegunLater, 0),
+            (_, until_ns) => {
+                let over_ns = at.as_ns().saturating_sub(until_ns.unwrap_or(at.as_ns()));
+                (Standing::OverFor(over_ns), 0)
+            }
+        }
+    }
 }
 
 #[cfg(test)]
@@ -419,8 +492,14 @@ mod tests {
         assert_eq!(OutageFigures::of(&[], None, None).longest, None);
     }
 
-    #[test]
-    fn an_event_finds_the_outage_that_had_lasted_longest_by_then() {
+    fn happening(at_ms: i64, side: Side) -> Happening<'static> {
+        Happening {
+            at: Some((Instant::from_ns(at_ms * PERIOD_NS), side)),
+            lost_published_ns: &[],
+        }
+    }
+
+    fn some_outages() -> Vec<Outage> {
         let lost = |sequence: u64| matches!(sequence, 1_000..=1_009 | 2_000..=2_999 | 3_500..=3_599 | 9_000..=9_999);
         let files = files(20_000, |sequence| {
             if lost(sequence) {
@@ -429,11 +508,17 @@ mod tests {
                 Fate::Taken
             }
         });
-        let found = outages(&files.records(), &same_clock(20_000 * PERIOD_NS));
+        outages(&files.records(), &same_clock(20_000 * PERIOD_NS))
+    }
+
+    #[test]
+    fn an_event_finds_the_outage_that_had_lasted_longest_by_then() {
+        let found = some_outages();
         let before = |ms: i64, side| {
-            let found = foregoing(&found, Instant::from_ns(ms * PERIOD_NS), side)?;
+            let found = foregoing(&found, &happening(ms, side))?;
             let Outage { first_sequence, .. } = found.outage;
-            Some((first_sequence, found.shorter_count, found.is_under_way))
+            let is_under_way = found.standing == Standing::UnderWay;
+            Some((first_sequence, found.other_count, is_under_way))
         };
         for side in [Side::Producer, Side::Consumer] {
             assert_eq!(before(900, side), None);
@@ -446,9 +531,39 @@ mod tests {
             assert_eq!(before(8_900, side), None);
             assert_eq!(before(15_100, side), None);
         }
-        let at = Instant::from_ns(10_400 * PERIOD_NS);
-        let ended = foregoing(&found, at, Side::Producer).unwrap();
-        assert_eq!(ended.since_end_ns, 400 * PERIOD_NS);
+        let ended = foregoing(&found, &happening(10_400, Side::Producer)).unwrap();
+        assert_eq!(ended.standing, Standing::OverFor(400 * PERIOD_NS));
+    }
+
+    #[test]
+    fn a_lost_message_that_an_event_names_points_at_its_outage() {
+        let found = some_outages();
+        let named = |at, ms: i64| {
+            let lost_published_ns = &[ms * PERIOD_NS];
+            let happening = Happening {
+                at,
+                lost_published_ns,
+            };
+            let found = foregoing(&found, &happening)?;
+            Some((
+                found.outage.first_sequence,
+                found.standing,
+                found.other_count,
+            ))
+        };
+        let at = |ms| happening(ms, Side::Consumer).at;
+        let short = named(at(3_100), 1_004).unwrap();
+        assert_eq!((short.0, short.2), (1_000, 1), "a longer one is beside it");
+        assert!(matches!(short.1, Standing::OverFor(_)));
+        // Told of its beginning, or long after, or on a clock of its own.
+        assert_eq!(
+            named(at(900), 1_004),
+            Some((1_000, Standing::BegunLater, 0))
+        );
+        let late = named(at(19_000), 9_500).unwrap();
+        assert!(matches!(late, (9_000, Standing::OverFor(_), 0)), "{late:?}");
+        assert_eq!(named(None, 9_500), Some((9_000, Standing::Unknown, 0)));
+        assert_eq!(named(None, 8_000), None);
     }
 
     #[test]
@@ -464,9 +579,9 @@ mod tests {
         let context = AccountContext::new(ChannelPath::Gateway { alignment: None });
         let found = outages(&files.records(), &context);
         assert_eq!(burst(&found[0]), (100, 100, Some(100), Some(200)));
-        let here = Instant::from_ns(150 * PERIOD_NS + ahead_ns);
-        assert!(foregoing(&found, here, Side::Consumer).is_some());
-        assert!(foregoing(&found, here, Side::Producer).is_none());
+        let here_ms = 150 + ahead_ns / PERIOD_NS;
+        assert!(foregoing(&found, &happening(here_ms, Side::Consumer)).is_some());
+        assert!(foregoing(&found, &happening(here_ms, Side::Producer)).is_none());
         let mut records = files.records();
         records.taken = None;
         let unseen = outages(&records, &context);
