@@ -37,7 +37,7 @@ pub(super) fn run_facts(
         ),
         (
             "records/",
-            "one record per message and stage; layout in the runtime's docs",
+            "one record per message and stage; layout in docs/run-folder.md",
         ),
         ("logs/", "what each process said on standard error"),
         (
