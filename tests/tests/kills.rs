@@ -51,8 +51,8 @@ impl Split {
     /// Waits until both ends have taken half a second's messages from now on.
     fn wait_for_messages(&self, after: &str) {
         let taken = || {
-            let commands = self.files[1].record_bytes("arm.command.taken.");
-            let statuses = self.files[0].record_bytes("arm.status.taken.");
+            let commands = self.files[1].record_bytes("egm.right.command.taken.");
+            let statuses = self.files[0].record_bytes("egm.right.feedback.taken.");
             [commands, statuses]
         };
         let before = taken();
@@ -151,7 +151,7 @@ fn check_recovery(summary: &RunSummary, process: &str) {
     );
     let mut known = summary.processes.iter().filter(|one| one.name == process);
     assert_eq!(known.next().map(|one| one.restart_count), Some(1));
-    for channel in ["arm/command", "arm/status"] {
+    for channel in ["egm/right/command", "egm/right/feedback"] {
         let figures = interruption(summary, channel, process);
         let silence_ns = figures.gap.map(|gap| gap.length_ns);
         println!(
@@ -177,8 +177,8 @@ fn check_recovery(summary: &RunSummary, process: &str) {
     }
     // Whatever carries or takes messages loses some; a producer that is not there publishes none.
     let loses = match process {
-        "controller" => "arm/status",
-        _ => "arm/command",
+        "controller" => "egm/right/feedback",
+        _ => "egm/right/command",
     };
     let figures = interruption(summary, loses, process);
     assert!(figures.lost_count > 0, "{loses}: {figures:?}");
@@ -272,7 +272,7 @@ fn kill_supervisor(lab: Lab, victim: usize) -> Lab {
         let said = account.map(|account| describe(&channel.name, account));
         println!("{} alone: {said:?}", HOSTS[other]);
     }
-    assert!(account(&summary, "arm/command").published_count > 0);
+    assert!(account(&summary, "egm/right/command").published_count > 0);
     split.lab
 }
 

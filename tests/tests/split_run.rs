@@ -19,7 +19,13 @@ use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::{RunFiles, Trial, wait_until};
 
 const HOSTS: [&str; 2] = ["control-pc", "robot-pc"];
-const CROSSING: [&str; 2] = ["arm/command", "arm/status"];
+/// The channels with a message per frame or cycle; the motion server's have a few per run.
+const CROSSING: [&str; 4] = [
+    "egm/right/command",
+    "egm/left/command",
+    "egm/right/feedback",
+    "egm/left/feedback",
+];
 const START_LIMIT: Duration = Duration::from_mins(1);
 const RUN_LIMIT: Duration = Duration::from_mins(2);
 

@@ -1,6 +1,8 @@
 //! Messages of guided motion as they lie in shared memory. Layout only; SI units and radians; joints
 //! in chain order, see [`crate::yumi`]. The maker's own datagrams are in [`crate::egm::wire`].
 
+mod numbers;
+
 use bytemuck::{Pod, Zeroable};
 
 use crate::message::Message;
@@ -21,6 +23,14 @@ impl Side {
 
     /// 0 for right, 1 for left: its number in messages.
     pub const fn index(self) -> usize {
+        match self {
+            Self::Right => 0,
+            Self::Left => 1,
+        }
+    }
+
+    /// As [`Side::index`], as messages carry it.
+    pub const fn number(self) -> u32 {
         match self {
             Self::Right => 0,
             Self::Left => 1,

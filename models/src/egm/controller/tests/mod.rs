@@ -1,0 +1,4 @@
+//! Tests of [`super`]: what the maker documents and what was measured elsewhere, each as a claim.
+
+mod following;
+mod rig;
