@@ -125,7 +125,8 @@ pub(crate) fn replay(folder: &RunFolder, registry: &Registry) -> Result<Replayed
     let Some(mut replay) = case.replay(&records.log) else {
         return Err(ReplayError::NoReplay { name });
     };
-    replay.gaps.extend(gaps(entry, &records));
+    let also = gaps(entry, &records, &replay.gaps);
+    replay.gaps.extend(also);
     Ok(Replayed {
         run: folder.name(),
         case: name,
@@ -141,22 +142,28 @@ fn has_one_clock(folder: &RunFolder) -> bool {
     summary.is_some_and(|summary| !summary.score_events.clocks_differ)
 }
 
-/// What is missing of the records. A replay hears what only the record heard, so that must be
-/// whole; of other channels a missing message is one comparison less.
-fn gaps(entry: &CaseEntry, records: &MessageRecords) -> Vec<String> {
+/// What is missing of the records and not told by the case already. A role that tells the record
+/// more than the other roles is the one that runs again: what it said must be there, and what only
+/// the record heard must be whole.
+fn gaps(entry: &CaseEntry, records: &MessageRecords, told: &[String]) -> Vec<String> {
     let mut gaps = records.problems.clone();
-    let recorded = entry.channels.iter().filter(|one| one.is_recorded_only());
-    for channel in recorded {
-        if !records.files.contains(channel.name) {
-            gaps.push(format!("{}: no record is at hand", channel.name));
+    let channels = entry.channels.iter();
+    let tells_more = |role: &str| {
+        let mut recorded = channels.clone().filter(|one| one.is_recorded_only());
+        recorded.any(|one| one.from == role)
+    };
+    for channel in channels.clone().filter(|one| tells_more(one.from)) {
+        let name = channel.name;
+        if told.iter().any(|gap| gap.contains(name)) {
+            continue;
         }
-        let missing = missing_count(records.log.raw(channel.name));
-        if missing > 0 {
+        if !records.files.contains(name) {
+            gaps.push(format!("{name}: no record is at hand"));
+        }
+        let missing = missing_count(records.log.raw(name));
+        if channel.is_recorded_only() && missing > 0 {
             let count = grouped(missing);
-            let name = channel.name;
-            gaps.push(format!(
-                "{name}: {count} messages are missing in its record"
-            ));
+            gaps.push(format!("{name}: {count} missing in its record"));
         }
     }
     gaps

@@ -172,7 +172,7 @@ fn a_missing_record_is_a_gap_and_no_proof() {
     assert!(!replayed.is_identical());
     let text = replayed.text();
     assert!(text.contains(": records are missing\n"), "{text}");
-    let gap = "  gaps              heard: 1 messages are missing in its record\n";
+    let gap = "  gaps              heard: 1 missing in its record\n";
     assert!(text.contains(gap), "{text}");
 
     let deaf = Run::of("doubler");

@@ -194,3 +194,6 @@ fn write_files(folder: &Path, report: &StudyReport, cost: &Cost) -> Result<(), S
     write("report.json".to_owned(), render::json(report, cost))?;
     write("report.txt".to_owned(), render::text(report, cost))
 }
+
+#[cfg(test)]
+mod tests;
