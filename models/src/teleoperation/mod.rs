@@ -59,7 +59,7 @@ mod parameters;
 mod replay;
 mod robot;
 mod score;
-mod series;
+pub(crate) mod series;
 #[cfg(test)]
 mod session_tests;
 pub mod skeleton;
