@@ -33,6 +33,10 @@ pub trait CaseStudy: Sized + Debug + 'static {
     /// False when a role keeps what the others rely on, so that one started anew in the midst of
     /// a run would be wrong about the world: a topology may not ask for its restart then.
     const MAY_RESTART: bool = true;
+    /// The series that [`CaseStudy::series`] can give, by name.
+    const SERIES: &'static [&'static str] = &[];
+    /// The figures that [`CaseStudy::calibration`] knows, by name.
+    const CALIBRATED_FIGURES: &'static [&'static str] = &[];
     /// `[case.parameters]`; use `#[serde(deny_unknown_fields, default)]`.
     type Parameters: DeserializeOwned + Serialize + Default;
 
@@ -66,7 +70,8 @@ pub trait CaseStudy: Sized + Debug + 'static {
     }
 
     /// Runs the robot's side again in virtual time, from what it heard in the finished run, and
-    /// holds its messages against the recorded ones; `None` for a case that cannot.
+    /// holds its messages against the recorded ones; `None`, whatever the log, for a case that
+    /// cannot.
     fn replay(&self, _log: &RunLog) -> Option<Replay> {
         None
     }

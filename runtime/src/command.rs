@@ -1,5 +1,7 @@
 //! What each command of the command line does, and the exit code it ends with.
 
+mod case_work;
+
 use std::env;
 use std::fs;
 use std::io::IsTerminal;
@@ -24,8 +26,6 @@ use crate::report::summary::RunSummary;
 use crate::report::terminal::{self, Style};
 use crate::run_folder::RunFolder;
 use crate::signals::{EXIT_INTERRUPTED, Signals};
-use crate::simulate;
-use crate::study::{self, StudyEnd, StudyOptions};
 use crate::supervisor::{self, Outcome, PeerError, RunError, RunOptions, RunResult};
 use crate::topology::{self, HOST_VARIABLE, HostChoice, MachineIdentity, Topology, which_host};
 
@@ -63,26 +63,23 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
             topology,
             overrides,
             json,
-        } => simulate(&topology, &overrides, registry, (json, console)),
+            output,
+        } => {
+            let file = (topology.as_path(), overrides.as_slice());
+            case_work::simulate(file, json, output.as_deref(), registry, console)
+        }
         Command::Tables {
             topology,
             mut overrides,
             sections,
-            jobs,
-            json,
-            output,
-            quiet,
+            batch,
         } => {
             overrides
                 .extend(sections.map(|count| format!("case.parameters.tables.sections={count}")));
-            let options = StudyOptions {
-                jobs,
-                is_json: json,
-                output,
-            };
-            let mut console = Console::new(quiet);
-            compute_tables((&topology, &overrides), &options, registry, &mut console)
+            case_work::tables(&topology, &overrides, batch, registry)
         }
+        Command::Calibrate(args) => case_work::calibrate(args, registry),
+        Command::Replay { run, json } => case_work::replay(&run, json, registry, console),
         Command::Report { run, json } => show_report(&run, json, console),
         Command::Doctor { strict, json } => {
             let worst = examine(json, console);
@@ -254,74 +251,6 @@ fn hosts_here(topology: &Topology, requested: Option<&str>) -> Result<Vec<String
             .map(|host| host.name.clone())
             .collect()),
         Err(error) => Err(error.to_string()),
-    }
-}
-
-fn simulate(
-    path: &Path,
-    overrides: &[String],
-    registry: &Registry,
-    (json, console): (bool, &mut Console),
-) -> u8 {
-    let Some(topology) = load(path, overrides, registry, console) else {
-        return exit::USAGE;
-    };
-    let form = if json {
-        simulate::Form::Json
-    } else {
-        simulate::Form::Page(columns())
-    };
-    match simulate::simulate(&topology, registry, form) {
-        Ok(text) => {
-            console.result(&text);
-            exit::RAN
-        }
-        Err(text) => {
-            console.error(&text);
-            exit::USAGE
-        }
-    }
-}
-
-fn compute_tables(
-    (path, overrides): (&Path, &[String]),
-    options: &StudyOptions,
-    registry: &Registry,
-    console: &mut Console,
-) -> u8 {
-    let topology = match topology::load_case(path, overrides, registry.known()) {
-        Ok(topology) => topology,
-        Err(errors) => {
-            console.rendered(&errors.render(std::io::stderr().is_terminal()));
-            return exit::USAGE;
-        }
-    };
-    let batch = match study::batch_of(&topology, registry) {
-        Ok(batch) => batch,
-        Err(error) => {
-            console.error(&error.to_string());
-            return exit::USAGE;
-        }
-    };
-    let signals = match Signals::install() {
-        Ok(signals) => signals,
-        Err(error) => {
-            console.error(&format!("cannot handle signals: {error}"));
-            return exit::INTERNAL;
-        }
-    };
-    match study::run(batch.as_ref(), options, &signals, console) {
-        Ok(StudyEnd::Passed) => exit::RAN,
-        Ok(StudyEnd::Missed) => {
-            console
-                .error("a criterion is missed: the lines marked MISSED at the end of the tables");
-            exit::FAILED
-        }
-        Ok(StudyEnd::Interrupted) => interrupted(),
-        Err(error) => {
-            console.error(&error.to_string());
-            exit::FAILED
-        }
     }
 }
 

@@ -37,9 +37,13 @@ pub(super) fn run_facts(
         ),
         (
             "records/",
-            "one record per message and stage; layout in the runtime's docs",
+            "one record per message and stage; layout in docs/run-folder.md",
         ),
         ("logs/", "what each process said on standard error"),
+        (
+            "events.log",
+            "what happened to the robot, one line each, with the outage before it",
+        ),
     ];
     RunFacts {
         name: result.folder.name(),
@@ -187,6 +191,7 @@ pub(super) fn channel_summary(
         },
         account: (records.has(&channel.name) && !channel.is_recorded_only())
             .then(|| records.account(topology, result, channel)),
+        outages: None,
         recorded: channel
             .is_recorded_only()
             .then(|| records.recorded(&channel.name))

@@ -21,7 +21,7 @@ use super::robot::RobotWork;
 use super::sensor::SensorWork;
 use crate::channel::{Domain, OutputSettings, ShmInput, ShmOutput, Waiter};
 use crate::clock::MonotonicClock;
-use crate::gateway::direction::timestamp_mode;
+use crate::gateway::socket::timestamp_mode;
 use crate::process::pipe::FaceReport;
 use crate::process::recording::{Destination, RecordedInput, RecordedOutput};
 use crate::record::{RecordKind, RecordSink, Recorder};

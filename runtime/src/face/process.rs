@@ -19,7 +19,7 @@ use super::{FaceError, Gate};
 use crate::channel::Domain;
 use crate::clock::MonotonicClock;
 use crate::gateway::GatewayError;
-use crate::gateway::direction::timestamp_mode;
+use crate::gateway::socket::timestamp_mode;
 use crate::gateway::process::{PROBE_BOUND, arm_and_describe};
 use crate::process::launch::read;
 use crate::process::pipe::{ChannelProgress, FaceReport, FromProcess, Orders, ProcessReport, say};

@@ -13,7 +13,7 @@ pub(crate) mod egress;
 pub(crate) mod ingress;
 pub(crate) mod kernel_clock;
 pub(crate) mod process;
-mod socket;
+pub(crate) mod socket;
 mod stream;
 
 use std::fs::File;

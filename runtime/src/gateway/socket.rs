@@ -144,10 +144,18 @@ fn udp_settings(launch: &DirectionLaunch) -> UdpSettings {
 
 /// The kernel stamps to ask for: none of a stream, whose bytes have no stamp of their own.
 pub(super) const fn stamps_of(socket: &SocketLaunch) -> TimestampMode {
-    match (socket.transport, socket.timestamps) {
-        (Transport::Tcp, _) | (_, Timestamps::Off) => TimestampMode::Off,
-        (Transport::Udp, Timestamps::Software) => TimestampMode::Software,
-        (Transport::Udp, Timestamps::Hardware) => TimestampMode::Hardware,
+    match socket.transport {
+        Transport::Tcp => TimestampMode::Off,
+        Transport::Udp => timestamp_mode(socket.timestamps),
+    }
+}
+
+/// What a topology's word asks of the kernel.
+pub(crate) const fn timestamp_mode(asked: Timestamps) -> TimestampMode {
+    match asked {
+        Timestamps::Off => TimestampMode::Off,
+        Timestamps::Software => TimestampMode::Software,
+        Timestamps::Hardware => TimestampMode::Hardware,
     }
 }
 

@@ -2,6 +2,7 @@
 //! rendering for a terminal. It measures nothing and prints nothing; the caller writes the text.
 
 pub mod assessment;
+pub(crate) mod event_log;
 pub mod face;
 pub mod score_event;
 pub mod summary;
@@ -11,3 +12,5 @@ pub mod terminal;
 mod sample;
 #[cfg(test)]
 mod sample_events;
+#[cfg(test)]
+mod sample_records;

@@ -9,7 +9,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use hil_models::case_study::{Metric, Score};
-use hil_models::measure::account::ChannelAccount;
+use hil_models::measure::account::{ChannelAccount, OutageFigures};
 use serde::{Deserialize, Serialize};
 
 use super::assessment::Assessment;
@@ -304,6 +304,10 @@ pub struct ChannelSummary {
     pub link: LinkKind,
     /// Its latency account; `None` when no records were found or it is only recorded.
     pub account: Option<ChannelAccount>,
+    /// Its outages: messages lost in a row, by length; `None` when they are unknown or it is only
+    /// recorded.
+    #[serde(default)]
+    pub outages: Option<OutageFigures>,
     /// What was recorded of a channel that is only recorded; `None` when nothing was.
     #[serde(default)]
     pub recorded: Option<RecordedFigures>,

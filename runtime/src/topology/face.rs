@@ -11,7 +11,7 @@ use toml::Table;
 
 use super::errors::{Fault, Place};
 use super::limits;
-use super::model::Timestamps;
+use super::model_links::Timestamps;
 use super::reader::Reader;
 
 /// A role played by a foreign EGM program.

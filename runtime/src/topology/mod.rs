@@ -75,6 +75,20 @@ pub fn load_case(
     read_and_check(path, None, overrides, (known, Needs::Case))
 }
 
+/// Like [`load_case`], without any file: the case called `name` as it is by default, with the
+/// `overrides` laid over it.
+///
+/// # Errors
+/// As [`load`].
+pub fn case_by_name(
+    name: &str,
+    overrides: &[String],
+    known: &KnownCases,
+) -> Result<Topology, TopologyErrors> {
+    let text = format!("version = 1\nname = \"{name}\"\ncase.name = \"{name}\"\n");
+    read_and_check(Path::new(name), Some(text), overrides, (known, Needs::Case))
+}
+
 /// Like [`load`], but from a text; `name` stands in error messages, and what the text extends is
 /// looked for beside it.
 ///

@@ -41,6 +41,9 @@ pub(super) fn channel(canvas: &mut Canvas, channel: &ChannelSummary) {
         round_trip(canvas, &account.round_trip);
         losses(canvas, account);
     }
+    if let Some(figures) = &channel.outages {
+        super::outages::outages(canvas, figures);
+    }
     let list = |counts: &[CountByName]| {
         let words = counts
             .iter()

@@ -4,11 +4,14 @@ mod canvas;
 mod channel;
 mod events;
 mod face;
+mod outages;
 mod tables;
 mod units;
 
 pub use canvas::Style;
-pub(crate) use units::{JOINT, duration_s, grouped, percent};
+pub(crate) use units::{JOINT, duration_s, grouped, percent, seconds};
+
+use hil_models::measure::account::OutageFigures;
 
 use canvas::{Canvas, INDENT, Tone};
 
@@ -53,6 +56,21 @@ pub fn render_score(
     canvas.finish()
 }
 
+/// The outages of one channel alone, as [`render`] shows them; nothing where there were none.
+pub fn render_outages(
+    channel: &str,
+    figures: &OutageFigures,
+    width_columns: usize,
+    style: Style,
+) -> String {
+    let mut canvas = Canvas::new(width_columns, style);
+    if figures.outage_count > 0 {
+        canvas.heading(&format!("Channel {channel}"), "");
+        outages::outages(&mut canvas, figures);
+    }
+    canvas.finish()
+}
+
 fn title(canvas: &mut Canvas, summary: &RunSummary) {
     let run = &summary.run;
     canvas.rule(Tone::Faint);
@@ -62,7 +80,7 @@ fn title(canvas: &mut Canvas, summary: &RunSummary) {
     let facts = format!(
         "{} · {} long · seed {} · host {} · topology {} ({})",
         run.started,
-        units::seconds(run.duration_s),
+        seconds(run.duration_s),
         run.seed,
         run.host,
         run.topology_file,

@@ -1,0 +1,609 @@
+//! Outages: the times in which a channel delivered nothing of what was published. It finds them
+//! in the records of messages, whatever lost these, sorts them by length, and says which of them
+//! went before something that happened. What caused an event is not decided here.
+
+use core::time::Duration;
+
+use serde::{Deserialize, Serialize};
+
+use super::fate::Judge;
+use super::join::{Join, Joined, stamp};
+use super::stage::{MessageFate, Side};
+use super::story::published_ns;
+use super::{AccountContext, ChannelRecords};
+use crate::time::{Instant, duration_ns};
+
+/// How long after its end an outage may still show in what a robot does: a session that it ended
+/// takes seconds to come back.
+pub const OUTAGE_EFFECT_MAX: Duration = Duration::from_secs(5);
+
+/// Where the classes of [`OutageFigures::classes`] border on each other, milliseconds.
+const BORDERS_MS: [i64; 6] = [20, 100, 500, 1_000, 2_000, 5_000];
+
+/// One outage: messages lost in a row, up to the next one that arrived.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Outage {
+    /// Messages lost in it. One that was replaced by a newer one before it was sent, or whose
+    /// fate is unknown, says nothing about the way: it neither counts nor ends an outage.
+    pub lost_count: u64,
+    /// Sequence number of the first of them.
+    pub first_sequence: u64,
+    /// When the first of them was published, on the producer's clock, nanoseconds; `None` when
+    /// no record of any of them is at hand.
+    pub from_ns: Option<i64>,
+    /// When the next message that arrived was published, on the producer's clock; `None` when
+    /// none did.
+    pub until_ns: Option<i64>,
+    /// When the consumer had taken its last message before, on the consumer's clock, or the run's
+    /// beginning there; `None` when the consumer's records are not at hand.
+    pub silent_from_ns: Option<i64>,
+    /// When the consumer took its next message; `None` when it never did.
+    pub silent_until_ns: Option<i64>,
+    /// Index of the interruption that cost the first of the messages, when it was lost in one.
+    pub interruption_index: Option<usize>,
+}
+
+impl Outage {
+    /// From the first lost publication to the next one that arrived, or to `end` when none did,
+    /// nanoseconds; both on the producer's clock.
+    pub fn length_ns(&self, end: Option<Instant>) -> Option<i64> {
+        let until_ns = self.until_ns.or_else(|| end.map(Instant::as_ns))?;
+        Some(until_ns.saturating_sub(self.from_ns?).max(0))
+    }
+
+    /// Beginning and end as one side's clock has them.
+    const fn span_ns(&self, side: Side) -> (Option<i64>, Option<i64>) {
+        match side {
+            Side::Producer => (self.from_ns, self.until_ns),
+            Side::Consumer => (self.silent_from_ns, self.silent_until_ns),
+        }
+    }
+}
+
+/// Finds outages in messages that are told in the order of their sequence numbers.
+#[derive(Debug, Default)]
+pub struct OutageFinder {
+    found: Vec<Outage>,
+    is_open: bool,
+    /// From here on, the consumer has taken nothing since.
+    silent_index: usize,
+    last_taken_ns: Option<i64>,
+}
+
+impl OutageFinder {
+    /// A finder for a consumer that began at `start` on its clock; `None` when its records are not
+    /// at hand.
+    pub fn new(start: Option<Instant>) -> Self {
+        Self {
+            last_taken_ns: start.map(Instant::as_ns),
+            ..Self::default()
+        }
+    }
+
+    /// `count` messages from `sequence` on were lost; the first was published at `published_ns`,
+    /// where that is known.
+    pub fn lost(&mut self, sequence: u64, count: u64, published_ns: Option<i64>) {
+        if !self.is_open {
+            self.is_open = true;
+            self.found.push(Outage {
+                lost_count: 0,
+                first_sequence: sequence,
+                from_ns: None,
+                until_ns: None,
+                silent_from_ns: self.last_taken_ns,
+                silent_until_ns: None,
+                interruption_index: None,
+            });
+        }
+        if let Some(outage) = self.found.last_mut() {
+            outage.lost_count = outage.lost_count.saturating_add(count);
+            outage.from_ns = outage.from_ns.or(published_ns);
+        }
+    }
+
+    /// A message that was published at `published_ns` got through; at `taken_ns` the consumer
+    /// took it, if it did.
+    pub fn arrived(&mut self, published_ns: Option<i64>, taken_ns: Option<i64>) {
+        if core::mem::take(&mut self.is_open)
+            && let Some(outage) = self.found.last_mut()
+        {
+            outage.until_ns = published_ns;
+        }
+        if let Some(taken_ns) = taken_ns {
+            for outage in &mut self.found[self.silent_index..] {
+                outage.silent_until_ns = Some(taken_ns);
+            }
+            self.silent_index = self.found.len();
+            self.last_taken_ns = self.last_taken_ns.max(Some(taken_ns));
+        }
+    }
+
+    /// The outages, in order.
+    pub fn finish(self) -> Vec<Outage> {
+        self.found
+    }
+
+    fn see(&mut self, joined: &Joined<'_>, fate: MessageFate, interruption: Option<usize>) {
+        let published_ns = published_ns(joined);
+        match fate {
+            MessageFate::Taken | MessageFate::SupersededAtConsumer => {
+                let taken_ns = joined.taken.and_then(|record| stamp(record.taken_ns));
+                self.arrived(published_ns, taken_ns);
+            }
+            fate if fate.is_loss() => {
+                let is_first = !self.is_open;
+                self.lost(joined.key.sequence, joined.count, published_ns);
+                if let Some(outage) = self.found.last_mut().filter(|_| is_first) {
+                    outage.interruption_index = interruption;
+                }
+            }
+            _ => {}
+        }
+    }
+}
+
+/// Every outage of a channel, in the order of its messages. Time and memory grow with the number
+/// of records.
+pub fn outages(records: &ChannelRecords<'_>, context: &AccountContext<'_>) -> Vec<Outage> {
+    let records = records.on(context.path);
+    let join = Join::new(&records);
+    let mut judge = Judge::new(&records, context, &join);
+    let start = context.consumer_run.map(|run| run.start);
+    let mut finder = OutageFinder::new(start.filter(|_| records.taken.is_some()));
+    for joined in join {
+        let fate = judge.judge(&joined);
+        finder.see(&joined, fate, judge.last_interruption());
+    }
+    finder.finish()
+}
+
+/// The outages of a channel in figures.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct OutageFigures {
+    /// How many.
+    pub outage_count: u64,
+    /// Messages lost in all of them.
+    pub lost_count: u64,
+    /// Their lengths added up, nanoseconds.
+    pub total_ns: i64,
+    /// How many of each length, from the shortest class to the longest.
+    pub classes: Vec<OutageClass>,
+    /// Those whose length is unknown: no record tells when they began, or when the run ended.
+    pub unknown_length_count: u64,
+    /// The longest.
+    pub longest: Option<LongestOutage>,
+}
+
+/// Outages of about one length.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct OutageClass {
+    /// Shortest length that belongs here, nanoseconds.
+    pub from_ns: i64,
+    /// Shortest length that does not belong here any more; `None` for the last class.
+    pub until_ns: Option<i64>,
+    /// Outages.
+    pub outage_count: u64,
+    /// Messages lost in them.
+    pub lost_count: u64,
+}
+
+/// The longest outage of a channel.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct LongestOutage {
+    /// Publication of its first lost message, nanoseconds after the start of the run, or on the
+    /// producer's clock when that start is unknown.
+    pub start_ns: i64,
+    /// Length, nanoseconds.
+    pub length_ns: i64,
+    /// Messages lost in it.
+    pub lost_count: u64,
+    /// Sequence number of the first of them.
+    pub first_sequence: u64,
+    /// True when it lasted to the end of the run.
+    pub is_open: bool,
+}
+
+impl OutageFigures {
+    /// The figures of `outages`; `start` and `end` of the run are on the producer's clock.
+    pub fn of(outages: &[Outage], start: Option<Instant>, end: Option<Instant>) -> Self {
+        let mut figures = Self {
+            outage_count: outages.len() as u64,
+            lost_count: 0,
+            total_ns: 0,
+            classes: empty_classes(),
+            unknown_length_count: 0,
+            longest: None,
+        };
+        for outage in outages {
+            figures.lost_count = figures.lost_count.saturating_add(outage.lost_count);
+            let known = outage.from_ns.zip(outage.length_ns(end));
+            let Some((from_ns, length_ns)) = known else {
+                figures.unknown_length_count += 1;
+                continue;
+            };
+            figures.total_ns = figures.total_ns.saturating_add(length_ns);
+            let mut classes = figures.classes.iter_mut().rev();
+            if let Some(class) = classes.find(|class| class.from_ns <= length_ns) {
+                class.outage_count += 1;
+                class.lost_count = class.lost_count.saturating_add(outage.lost_count);
+            }
+            let is_longest = figures.longest.is_none_or(|one| one.length_ns < length_ns);
+            if is_longest {
+                figures.longest = Some(LongestOutage {
+                    start_ns: from_ns.saturating_sub(start.map_or(0, Instant::as_ns)),
+                    length_ns,
+                    lost_count: outage.lost_count,
+                    first_sequence: outage.first_sequence,
+                    is_open: outage.until_ns.is_none(),
+                });
+            }
+        }
+        figures
+    }
+}
+
+fn empty_classes() -> Vec<OutageClass> {
+    let borders_ns = BORDERS_MS.map(|border_ms| border_ms * 1_000_000);
+    let begins = core::iter::once(0).chain(borders_ns);
+    let ends = borders_ns.into_iter().map(Some).chain([None]);
+    let class = |(from_ns, until_ns)| OutageClass {
+        from_ns,
+        until_ns,
+        outage_count: 0,
+        lost_count: 0,
+    };
+    begins.zip(ends).map(class).collect()
+}
+
+/// What a channel went through when something happened.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Foregoing {
+    /// The outage that has most to do with it.
+    pub outage: Outage,
+    /// How the two stand to each other in time.
+    pub standing: Standing,
+    /// Other outages of the channel about then.
+    pub other_count: u64,
+}
+
+/// How an outage stands to an event in time.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Standing {
+    /// It was under way.
+    UnderWay,
+    /// It was over, since so many nanoseconds.
+    OverFor(i64),
+    /// It began only then, although the event names a message that was lost in it: an event may
+    /// be told of its beginning.
+    BegunLater,
+    /// Their clocks do not compare.
+    Unknown,
+}
+
+/// An event, as an outage may be held against it.
+#[derive(Debug, Clone, Copy)]
+pub struct Happening<'a> {
+    /// When it happened, on the clock of a host on this side of the channel; `None` when there is
+    /// no such time.
+    pub at: Option<(Instant, Side)>,
+    /// When messages of the channel that it names and that were lost were published, on the
+    /// producer's clock.
+    pub lost_published_ns: &'a [i64],
+}
+
+/// Of `outages`, the one that has most to do with what happened: one in which a named message was
+/// lost; else one that was under way, or over for at most [`OUTAGE_EFFECT_MAX`]. Among several it
+/// is the one that had lasted longest by then, for what came after an event cannot have led to
+/// it.
+pub fn foregoing(outages: &[Outage], happening: &Happening<'_>) -> Option<Foregoing> {
+    let mut candidate_count = 0_u64;
+    let mut best: Option<((bool, i64), Foregoing)> = None;
+    let named = happening.lost_published_ns;
+    let first_ns = named.iter().min().copied();
+    let last_ns = named.iter().max().copied();
+    for outage in outages {
+        // Of many outages, few are near the named messages.
+        let is_far =
+            outage.until_ns < first_ns && outage.until_ns.is_some() || outage.from_ns > last_ns;
+        let names_one = !is_far && named.iter().any(|ns| outage.contains(*ns));
+        let timely = happening
+            .at
+            .and_then(|(at, side)| outage.standing(at, side));
+        let (standing, passed_ns) = match timely {
+            Some(timely) => timely,
+            None if names_one => outage.standing_anyway(happening.at),
+            None => continue,
+        };
+        candidate_count += 1;
+        let rank = (names_one, passed_ns);
+        if best.is_none_or(|(highest, _)| highest < rank) {
+            let foregoing = Foregoing {
+                outage: *outage,
+                standing,
+                other_count: 0,
+            };
+            best = Some((rank, foregoing));
+        }
+    }
+    let (_, found) = best?;
+    Some(Foregoing {
+        other_count: candidate_count - 1,
+        ..found
+    })
+}
+
+impl Outage {
+    /// True for a message that was published in it.
+    fn contains(&self, published_ns: i64) -> bool {
+        let is_before_end = self.until_ns.is_none_or(|until_ns| published_ns < until_ns);
+        self.from_ns.is_some_and(|from_ns| from_ns <= published_ns) && is_before_end
+    }
+
+    /// How it stands to an event that it may have led to, and how long it had lasted by then,
+    /// nanoseconds.
+    fn standing(&self, at: Instant, side: Side) -> Option<(Standing, i64)> {
+        let at_ns = at.as_ns();
+        let (from_ns, until_ns) = self.span_ns(side);
+        let (from_ns, until_ns) = (from_ns?, until_ns.unwrap_or(i64::MAX));
+        let over_ns = at_ns.saturating_sub(until_ns);
+        if from_ns > at_ns || over_ns > duration_ns(OUTAGE_EFFECT_MAX) {
+            return None;
+        }
+        let passed_ns = until_ns.min(at_ns).saturating_sub(from_ns);
+        let standing = if over_ns < 0 {
+            Standing::UnderWay
+        } else {
+            Standing::OverFor(over_ns)
+        };
+        Some((standing, passed_ns))
+    }
+
+    /// The same for an event that it has to do with at any rate.
+    fn standing_anyway(&self, at: Option<(Instant, Side)>) -> (Standing, i64) {
+        let Some((at, side)) = at else {
+            let length_ns = self.length_ns(None);
+            return (Standing::Unknown, length_ns.unwrap_or(i64::MAX));
+        };
+        match self.span_ns(side) {
+            (None, _) => (Standing::Unknown, 0),
+            (Some(from_ns), _) if from_ns > at.as_ns() => (Standing::BegunLater, 0),
+            (_, until_ns) => {
+                let over_ns = at.as_ns().saturating_sub(until_ns.unwrap_or(at.as_ns()));
+                (Standing::OverFor(over_ns), 0)
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::measure::account::synthetic::{Files, PERIOD_NS, TAKEN_NS, at, same_clock};
+    use crate::measure::account::{ChannelPath, Interruption, PathProcess, account};
+    use MessageFate as Fate;
+
+    /// One message per millisecond; `fate` says what becomes of each.
+    fn files(count: u64, fate: impl Fn(u64) -> Fate) -> Files {
+        let mut files = Files::default();
+        for sequence in 0..count {
+            files.write(at(7, sequence), fate(sequence));
+        }
+        files
+    }
+
+    fn burst(outage: &Outage) -> (u64, u64, Option<i64>, Option<i64>) {
+        let ms = |ns: i64| ns / PERIOD_NS;
+        let Outage {
+            first_sequence,
+            lost_count,
+            ..
+        } = *outage;
+        let ends = (outage.from_ns.map(ms), outage.until_ns.map(ms));
+        (first_sequence, lost_count, ends.0, ends.1)
+    }
+
+    #[test]
+    fn an_outage_lasts_from_the_first_lost_to_the_next_delivered_publication() {
+        let files = files(1_000, |sequence| match sequence {
+            100..=149 | 300 => Fate::LostOnWire,
+            // Replaced before it was sent: no word on the way, so the outage goes on.
+            500 | 502 => Fate::LostOnWire,
+            501 => Fate::SupersededAtInput,
+            // Not taken, but it got through.
+            700 | 702 => Fate::Late,
+            701 => Fate::SupersededAtConsumer,
+            _ => Fate::Taken,
+        });
+        let context = same_clock(1_000 * PERIOD_NS);
+        let found = outages(&files.records(), &context);
+        let bursts: Vec<_> = found.iter().map(burst).collect();
+        assert_eq!(
+            bursts,
+            [
+                (100, 50, Some(100), Some(150)),
+                (300, 1, Some(300), Some(301)),
+                (500, 2, Some(500), Some(503)),
+                (700, 1, Some(700), Some(701)),
+                (702, 1, Some(702), Some(703)),
+            ]
+        );
+        assert_eq!(found[0].silent_from_ns, Some(99 * PERIOD_NS + TAKEN_NS));
+        assert_eq!(found[0].silent_until_ns, Some(150 * PERIOD_NS + TAKEN_NS));
+        // What got through but was not taken leaves the consumer in silence.
+        for outage in &found[3..] {
+            assert_eq!(outage.silent_from_ns, Some(699 * PERIOD_NS + TAKEN_NS));
+            assert_eq!(outage.silent_until_ns, Some(703 * PERIOD_NS + TAKEN_NS));
+        }
+        let total = found.iter().map(|outage| outage.lost_count).sum::<u64>();
+        let fates = account(&files.records(), &context).fates;
+        assert_eq!(total, fates.lost_count());
+    }
+
+    #[test]
+    fn an_outage_at_the_end_lasts_as_long_as_the_run() {
+        let files = files(400, |sequence| match sequence {
+            100.. => Fate::LostOnWire,
+            _ => Fate::Taken,
+        });
+        let context = same_clock(500 * PERIOD_NS);
+        let end = context.producer_run.map(|run| run.end);
+        let found = outages(&files.records(), &context);
+        assert_eq!(burst(&found[0]), (100, 300, Some(100), None));
+        assert_eq!(found[0].silent_until_ns, None);
+        assert_eq!(found[0].length_ns(end), Some(400 * PERIOD_NS));
+        assert_eq!(found[0].length_ns(None), None);
+        let figures = OutageFigures::of(&found, None, end);
+        assert!(figures.longest.unwrap().is_open);
+        assert_eq!(
+            OutageFigures::of(&found, None, None).unknown_length_count,
+            1
+        );
+    }
+
+    #[test]
+    fn outages_are_sorted_by_length_and_their_borders_belong_to_the_longer_class() {
+        let outage = |from_ms: i64, length_ms: i64| Outage {
+            lost_count: 2,
+            first_sequence: 0,
+            from_ns: Some(from_ms * PERIOD_NS),
+            until_ns: Some((from_ms + length_ms) * PERIOD_NS),
+            silent_from_ns: None,
+            silent_until_ns: None,
+            interruption_index: None,
+        };
+        let lengths_ms = [
+            8, 19, 20, 99, 100, 499, 500, 999, 1_000, 1_999, 2_000, 5_000,
+        ];
+        let found: Vec<_> = lengths_ms.map(|ms| outage(10_000, ms)).to_vec();
+        let start = Instant::from_ns(4_000 * PERIOD_NS);
+        let figures = OutageFigures::of(&found, Some(start), None);
+        let counts: Vec<_> = figures.classes.iter().map(|one| one.outage_count).collect();
+        assert_eq!(counts, [2, 2, 2, 2, 2, 1, 1]);
+        assert_eq!((figures.outage_count, figures.lost_count), (12, 24));
+        assert_eq!(figures.total_ns, lengths_ms.iter().sum::<i64>() * PERIOD_NS);
+        assert_eq!(figures.classes[6].until_ns, None);
+        for pair in figures.classes.windows(2) {
+            assert_eq!(pair[0].until_ns, Some(pair[1].from_ns));
+        }
+        let longest = figures.longest.unwrap();
+        assert_eq!(longest.start_ns, 6_000 * PERIOD_NS);
+        assert_eq!(longest.length_ns, 5_000 * PERIOD_NS);
+        assert_eq!(OutageFigures::of(&[], None, None).longest, None);
+    }
+
+    fn happening(at_ms: i64, side: Side) -> Happening<'static> {
+        Happening {
+            at: Some((Instant::from_ns(at_ms * PERIOD_NS), side)),
+            lost_published_ns: &[],
+        }
+    }
+
+    fn some_outages() -> Vec<Outage> {
+        let lost = |sequence: u64| matches!(sequence, 1_000..=1_009 | 2_000..=2_999 | 3_500..=3_599 | 9_000..=9_999);
+        let files = files(20_000, |sequence| {
+            if lost(sequence) {
+                Fate::LostOnWire
+            } else {
+                Fate::Taken
+            }
+        });
+        outages(&files.records(), &same_clock(20_000 * PERIOD_NS))
+    }
+
+    #[test]
+    fn an_event_finds_the_outage_that_had_lasted_longest_by_then() {
+        let found = some_outages();
+        let before = |ms: i64, side| {
+            let found = foregoing(&found, &happening(ms, side))?;
+            let Outage { first_sequence, .. } = found.outage;
+            let is_under_way = found.standing == Standing::UnderWay;
+            Some((first_sequence, found.other_count, is_under_way))
+        };
+        for side in [Side::Producer, Side::Consumer] {
+            assert_eq!(before(900, side), None);
+            assert_eq!(before(1_005, side), Some((1_000, 0, true)));
+            // It has only just begun: what came before weighs more.
+            assert_eq!(before(2_003, side), Some((1_000, 1, false)));
+            assert_eq!(before(2_500, side), Some((2_000, 1, true)));
+            assert_eq!(before(5_000, side), Some((2_000, 2, false)));
+            assert_eq!(before(8_500, side), Some((3_500, 0, false)));
+            assert_eq!(before(8_900, side), None);
+            assert_eq!(before(15_100, side), None);
+        }
+        let ended = foregoing(&found, &happening(10_400, Side::Producer)).unwrap();
+        assert_eq!(ended.standing, Standing::OverFor(400 * PERIOD_NS));
+    }
+
+    #[test]
+    fn a_lost_message_that_an_event_names_points_at_its_outage() {
+        let found = some_outages();
+        let named = |at, ms: i64| {
+            let lost_published_ns = &[ms * PERIOD_NS];
+            let happening = Happening {
+                at,
+                lost_published_ns,
+            };
+            let found = foregoing(&found, &happening)?;
+            Some((
+                found.outage.first_sequence,
+                found.standing,
+                found.other_count,
+            ))
+        };
+        let at = |ms| happening(ms, Side::Consumer).at;
+        let short = named(at(3_100), 1_004).unwrap();
+        assert_eq!((short.0, short.2), (1_000, 1), "a longer one is beside it");
+        assert!(matches!(short.1, Standing::OverFor(_)));
+        // Told of its beginning, or long after, or on a clock of its own.
+        assert_eq!(
+            named(at(900), 1_004),
+            Some((1_000, Standing::BegunLater, 0))
+        );
+        let late = named(at(19_000), 9_500).unwrap();
+        assert!(matches!(late, (9_000, Standing::OverFor(_), 0)), "{late:?}");
+        assert_eq!(named(None, 9_500), Some((9_000, Standing::Unknown, 0)));
+        assert_eq!(named(None, 8_000), None);
+    }
+
+    #[test]
+    fn unaligned_clocks_leave_each_side_its_own_times() {
+        let mut files = files(300, |sequence| match sequence {
+            100..=199 => Fate::LostOnWire,
+            _ => Fate::Taken,
+        });
+        let ahead_ns = 7_000_000_000_000;
+        for record in &mut files.taken {
+            record.taken_ns += ahead_ns;
+        }
+        let context = AccountContext::new(ChannelPath::Gateway { alignment: None });
+        let found = outages(&files.records(), &context);
+        assert_eq!(burst(&found[0]), (100, 100, Some(100), Some(200)));
+        let here_ms = 150 + ahead_ns / PERIOD_NS;
+        assert!(foregoing(&found, &happening(here_ms, Side::Consumer)).is_some());
+        assert!(foregoing(&found, &happening(here_ms, Side::Producer)).is_none());
+        let mut records = files.records();
+        records.taken = None;
+        let unseen = outages(&records, &context);
+        assert!(unseen.iter().all(|outage| outage.silent_from_ns.is_none()));
+    }
+
+    #[test]
+    fn an_outage_that_an_interruption_caused_names_it() {
+        let files = files(300, |sequence| match sequence {
+            100..=199 => Fate::LostOnWire,
+            _ => Fate::Taken,
+        });
+        let interruptions = [Interruption {
+            process: "gateway".to_owned(),
+            place: PathProcess::ReceivingGateway,
+            from: Instant::from_ns(100 * PERIOD_NS),
+            until: Instant::from_ns(200 * PERIOD_NS),
+            cause: "killed by signal 9".to_owned(),
+        }];
+        let context = same_clock(300 * PERIOD_NS).with_interruptions(&interruptions);
+        let found = outages(&files.records(), &context);
+        assert_eq!(found.len(), 1);
+        assert_eq!(found[0].interruption_index, Some(0));
+    }
+}
