@@ -96,6 +96,21 @@ impl Arms {
         messages.map(|(at, one)| (at.as_ns(), one)).collect()
     }
 
+    /// Which way each joint of `side` was commanded to go while the first one went up: its
+    /// correlation with it, between -1 and 1.
+    pub fn sense(&self, side: Side, (from_ns, until_ns): (i64, i64)) -> [f64; JOINT_COUNT] {
+        let commands = self.commands(side);
+        let inside = commands
+            .iter()
+            .filter(|(at, _)| (from_ns..until_ns).contains(at));
+        let joints: Vec<_> = inside.map(|(_, command)| command.position_rad).collect();
+        core::array::from_fn(|joint| {
+            let pairs = |a: usize, b: usize| joints.iter().map(|q| (q[a], q[b])).collect();
+            let (there, back) = (follow_of(pairs(0, joint)), follow_of(pairs(joint, 0)));
+            there.gain.signum() * (there.gain * back.gain).sqrt()
+        })
+    }
+
     /// How each joint of `side` followed between `from_ns` and `until_ns`, chain order. A joint
     /// is compared with its command `lag_ns` before.
     pub fn follow(

@@ -17,7 +17,7 @@ use std::time::Duration;
 
 use hil_models::egm::messages::{EgmEvent, EgmEventKind, EndCause, MotionKind, Side};
 use hil_models::measure::account::MessageFate;
-use hil_tests::account::{account, assert_accounts_close};
+use hil_tests::account::{account, assert_account_closes};
 use hil_tests::arms::{Arms, of_kind};
 use hil_tests::binary::workspace_folder;
 use hil_tests::child::ChildGuard;
@@ -184,9 +184,13 @@ fn assert_driven(arms: &Arms, (first, last): (i64, i64)) {
 
     // The ramps of client and robot are over by then.
     let follows = arms.follow(Side::Right, (first + 3 * SECOND_NS, last), LAG_NS);
+    let senses = arms.sense(Side::Right, (first + 3 * SECOND_NS, last));
     for (place, follow) in follows.iter().enumerate() {
-        let amplitude_deg = AMPLITUDES_DEG[CHAIN_TO_WIRE[place]].abs();
-        println!("J at chain place {place}: {follow:?}, {amplitude_deg} deg asked");
+        let asked_deg = AMPLITUDES_DEG[CHAIN_TO_WIRE[place]];
+        println!("chain place {place}: {follow:?}, {asked_deg} deg asked");
+        let sense = senses[place] * asked_deg.signum();
+        assert!(sense > 0.99, "place {place} goes the wrong way: {sense}");
+        let amplitude_deg = asked_deg.abs();
         let error_deg = (follow.commanded_deg - amplitude_deg).abs();
         assert!(
             error_deg < 0.02 * amplitude_deg,
@@ -256,8 +260,8 @@ fn driven_twice(script: &str, restart: &str, span: Duration) -> Option<(Arms, Eg
     assert_eq!(during.next(), None, "{}", arms.story(Side::Right));
 
     let summary = files.summary();
-    assert_accounts_close(&summary);
     for channel in ["egm/right/command", "egm/right/feedback"] {
+        assert_account_closes(&summary, channel);
         let account = account(&summary, channel);
         assert_eq!(account.fates.of(MessageFate::Unexplained), 0, "{channel}");
     }

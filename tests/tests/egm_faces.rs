@@ -9,7 +9,7 @@ use hil_models::yumi::Joints;
 use hil_models::yumi::arm::Arm;
 use hil_runtime::report::face::FaceSummary;
 use hil_runtime::report::summary::{Outcome, RunSummary};
-use hil_tests::account::assert_accounts_close;
+use hil_tests::account::assert_account_closes;
 use hil_tests::arms::{Arms, of_kind};
 use hil_tests::lab::{ADDRESSES, Lab};
 use hil_tests::run_folder::RunFolder;
@@ -154,8 +154,10 @@ fn judge([sensor, robot]: [&RunSummary; 2]) {
         (robot, "EGM robot face", ["command", "feedback"]),
     ] {
         assert_eq!(summary.run.outcome, Outcome::Completed);
-        assert_accounts_close(summary);
         for arm in ["right", "left"] {
+            for what in ["command", "feedback"] {
+                assert_account_closes(summary, &format!("egm/{arm}/{what}"));
+            }
             let face = face(summary, arm);
             assert_eq!(face.kind, kind);
             let ratio = face.answers.ratio().unwrap();

@@ -78,7 +78,8 @@ impl Arm {
         Ok(())
     }
 
-    fn turn(&mut self, work: &mut dyn Work) -> Result<bool, FaceError> {
+    /// One look at both ends and, now and then, at the socket's reports.
+    pub(super) fn turn(&mut self, work: &mut dyn Work) -> Result<bool, FaceError> {
         let has_moved = work.turn(self)?;
         let now = MonotonicClock::now();
         let since_look = now.ns_since(self.attention.looked);

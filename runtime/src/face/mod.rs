@@ -24,6 +24,8 @@ pub mod record;
 mod robot;
 mod sensor;
 mod spare;
+#[cfg(test)]
+mod tests;
 
 use std::io;
 use std::sync::atomic::{AtomicBool, Ordering};

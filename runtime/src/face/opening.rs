@@ -180,6 +180,14 @@ impl JoinedArm {
         self.arm.run(self.work.as_mut(), stop)
     }
 
+    /// Moves what waits, without waiting for more; false when nothing waited.
+    ///
+    /// # Errors
+    /// As [`JoinedArm::run`].
+    pub fn turn(&mut self) -> Result<bool, FaceError> {
+        self.arm.turn(self.work.as_mut())
+    }
+
     /// Everything it counted so far.
     pub fn report(&self) -> FaceReport {
         let mut counters = self.work.counters();
