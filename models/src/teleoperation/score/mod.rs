@@ -17,7 +17,7 @@ pub(crate) mod sessions;
 mod tests;
 
 use crate::case_study::{Metric, Score};
-use crate::egm::messages::EgmCommand;
+use crate::egm::messages::{EgmCommand, EgmFeedback};
 use crate::measure::statistics::{CONFIDENCE, poisson};
 use crate::run_log::RunLog;
 use crate::teleoperation::messages::HumanFrame;
@@ -239,7 +239,7 @@ impl Run {
             clippy::cast_possible_truncation,
             reason = "a period of at most a minute in nanoseconds"
         )]
-        let travel = peak_to_peak(&self.moved, (self.period_s * 1e9) as i64);
+        let travel = peak_to_peak(self.followed(), (self.period_s * 1e9) as i64);
         estimated(
             (
                 "tool_y_m_peak_to_peak",
@@ -247,9 +247,20 @@ impl Run {
                 "m",
             ),
             travel,
-            "mean over whole motion periods of highest minus lowest measured y",
-            "no whole motion period of feedback",
+            "mean over whole motion periods since the first command in use of highest minus lowest \
+             measured y",
+            "no whole motion period of feedback since a first command in use",
         )
+    }
+
+    /// The measured tool y from when the robot first had a command to use.
+    fn followed(&self) -> &[Sample] {
+        let mut feedback = self.record.feedback.iter();
+        let first = feedback.find(|known| known.has(EgmFeedback::HAS_REFERENCE));
+        let begin = first.map_or(self.moved.len(), |first| {
+            self.moved.partition_point(|sample| sample.0 < first.at_ns)
+        });
+        &self.moved[begin..]
     }
 
     fn inverse_kinematics(&self) -> [Metric; 2] {
