@@ -232,17 +232,17 @@ impl MotionServer {
         let mut motions = Vec::new();
         for side in asked(request.arms) {
             let refused = |why| Refusal { why, side };
-            let target_rad = &targets_rad[side.index()];
-            if !target_rad.iter().all(|q| q.is_finite()) {
+            let goal_rad = &targets_rad[side.index()];
+            if !goal_rad.iter().all(|q| q.is_finite()) {
                 return Err(refused(MotionRefusal::BadNumber));
             }
-            if within_limits(&(*target_rad).into()).1 {
+            if within_limits(&(*goal_rad).into()).1 {
                 return Err(refused(MotionRefusal::OutsideLimits));
             }
             let speed_ratio = chosen(request.speed, SPEED_RATIO_DEFAULT, 0.01..=1.0)
                 .ok_or(refused(MotionRefusal::BadNumber))?;
             let from_rad = controllers[side.index()].planned_rad();
-            motions.push(JointMotion::new(from_rad, target_rad, speed_ratio));
+            motions.push(JointMotion::new(from_rad, goal_rad, speed_ratio));
         }
         let longest_s = motions
             .iter()

@@ -308,7 +308,7 @@ fn a_live_run_on_a_busy_machine_replays_to_the_last_bit() {
     let (log, skipped_count) = live(&case, &heard, begin, end);
     assert!(skipped_count > 500, "{skipped_count} cycles skipped");
     let cycle_count = duration_ns(Duration::from_secs(31)) / duration_ns(case.settings.cycle);
-    let reported_count = log.raw(EGM_RIGHT_FEEDBACK).len() as i64;
+    let reported_count = i64::try_from(log.raw(EGM_RIGHT_FEEDBACK).len()).unwrap();
     assert!(reported_count < cycle_count - 500);
     assert!(count(&log, EgmEventKind::Running) >= 2);
     let sent_count = heard.raw(EGM_RIGHT_COMMAND).len() + heard.raw(EGM_LEFT_COMMAND).len();
