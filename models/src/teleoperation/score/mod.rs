@@ -40,6 +40,7 @@ pub(crate) fn score(case: &Teleoperation, log: &RunLog) -> Score {
             case.parameters.motion_period_s,
         ),
         period_s: case.parameters.motion_period_s,
+        rest_s: case.parameters.motion_start_s,
         has_one_clock: log.has_one_clock(),
         sent: Sent::read(case, log, &record),
         moved: record.moved_y(),
@@ -74,6 +75,8 @@ pub(crate) fn score(case: &Teleoperation, log: &RunLog) -> Score {
 struct Run {
     counter: LoopCounter,
     period_s: f64,
+    /// How long the human rests first.
+    rest_s: f64,
     has_one_clock: bool,
     record: Record,
     sent: Sent,
@@ -247,20 +250,24 @@ impl Run {
                 "m",
             ),
             travel,
-            "mean over whole motion periods since the first command in use of highest minus lowest \
+            "mean over whole motion periods of following the human of highest minus lowest \
              measured y",
-            "no whole motion period of feedback since a first command in use",
+            "no whole motion period of feedback that follows the human",
         )
     }
 
-    /// The measured tool y from when the robot first had a command to use.
+    /// The measured tool y from when the robot first had a command to use and the human no longer
+    /// rested; hosts start together within milliseconds.
     fn followed(&self) -> &[Sample] {
         let mut feedback = self.record.feedback.iter();
         let first = feedback.find(|known| known.has(EgmFeedback::HAS_REFERENCE));
-        let begin = first.map_or(self.moved.len(), |first| {
-            self.moved.partition_point(|sample| sample.0 < first.at_ns)
-        });
-        &self.moved[begin..]
+        let (Some(first), Some(start)) = (first, self.moved.first()) else {
+            return &[];
+        };
+        let is_before = |sample: &Sample| {
+            sample.0 < first.at_ns || ((sample.0 - start.0) as f64) < self.rest_s * 1e9
+        };
+        &self.moved[self.moved.partition_point(is_before)..]
     }
 
     fn inverse_kinematics(&self) -> [Metric; 2] {

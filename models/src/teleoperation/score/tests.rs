@@ -19,7 +19,10 @@ use crate::time::Instant;
 use crate::yumi::arm::RIGHT_START_RAD;
 
 fn case(change: impl FnOnce(&mut TeleoperationParameters)) -> Teleoperation {
-    let mut parameters = TeleoperationParameters::default();
+    let mut parameters = TeleoperationParameters {
+        motion_start_s: 0.0,
+        ..TeleoperationParameters::default()
+    };
     change(&mut parameters);
     Teleoperation::new(parameters, 3).unwrap()
 }
