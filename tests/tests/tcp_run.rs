@@ -141,7 +141,7 @@ fn a_run_over_tcp_accounts_for_every_message_and_loses_none() {
     }
     let report = page.read("report.txt");
     assert!(report.contains("controller → robot · TCP"), "{report}");
-    assert!(report.contains("stalls: "), "{report}");
+    assert!(report.contains("\n  stalls "), "{report}");
 }
 
 fn traffic_control(host: &LabHost, words: &str) {
