@@ -2,7 +2,7 @@
 //! spans when their seeds are equal.
 #![allow(clippy::unwrap_used, clippy::print_stdout, reason = "tests")]
 
-use std::collections::BTreeMap;
+use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
 use std::process::Command;
@@ -77,11 +77,11 @@ fn records<T: bytemuck::Pod>(root: &Path, channel: &str, kind: &str) -> Vec<T> {
 fn lived(files: &RunFiles, channel: &str) -> Vec<(i64, bool)> {
     let published: Vec<PublishedRecord> = records(files.root(), channel, "published");
     let received: Vec<IngressRecord> = records(files.root(), channel, "ingress");
-    let came: BTreeMap<u64, ()> = received.iter().map(|one| (one.sequence, ())).collect();
+    let came: BTreeSet<u64> = received.iter().map(|one| one.sequence).collect();
     let first_ns = published.iter().map(|one| one.published_ns).min().unwrap();
     let at = |one: &PublishedRecord| one.published_ns - first_ns;
     let all = published.iter();
-    all.map(|one| (at(one), came.contains_key(&one.sequence)))
+    all.map(|one| (at(one), came.contains(&one.sequence)))
         .collect()
 }
 

@@ -39,18 +39,15 @@ pub(super) fn facts(figures: &StreamFigures, side: Side) -> Vec<(String, String)
 fn connections(figures: &StreamFigures) -> String {
     let (count, reconnect_count) = (figures.connection_count, figures.reconnect_count());
     let mut words = vec![format!("{count}, {reconnect_count} of them reconnects")];
-    for (count, what) in [
-        (figures.connect_failed_count, "attempts failed"),
-        (figures.foreign_connection_count, "of strangers turned away"),
-        (figures.bad_frame_count, "closed for a bad frame length"),
-        (figures.cut_frame_count, "ended within a frame"),
-        (
-            figures.abandoned_bytes,
-            "bytes unacknowledged when one ended",
-        ),
+    for (what, count) in [
+        ("failed attempts", figures.connect_failed_count),
+        ("strangers turned away", figures.foreign_connection_count),
+        ("closed for a bad frame length", figures.bad_frame_count),
+        ("ended within a frame", figures.cut_frame_count),
+        ("bytes given up with one", figures.abandoned_bytes),
     ] {
         if count > 0 {
-            words.push(format!("{count} {what}"));
+            words.push(format!("{what} {count}"));
         }
     }
     if let Some(errno) = figures.newest_errno.filter(|errno| *errno != 0) {
@@ -63,13 +60,13 @@ fn connections(figures: &StreamFigures) -> String {
 fn stalls(figures: &StreamFigures) -> String {
     let threshold = milliseconds(figures.stall_threshold);
     let rule = format!(
-        "oldest unacknowledged byte older than {threshold}, twice the smallest round trip and 50 ms"
+        "a byte unacknowledged for over {threshold}: twice the smallest round trip and 50 ms"
     );
     if figures.stall_count == 0 {
         return format!("none ({rule})");
     }
     format!(
-        "{}, {} together, the longest {} ({rule})",
+        "{}, {} together, longest {} ({rule})",
         figures.stall_count,
         milliseconds(figures.stalled),
         milliseconds(figures.stall_longest)
@@ -77,17 +74,21 @@ fn stalls(figures: &StreamFigures) -> String {
 }
 
 fn waiting(figures: &StreamFigures) -> String {
-    let optional = |time: Option<Duration>| time.map_or("unavailable".to_owned(), milliseconds);
-    format!(
-        "at most {} bytes seen; kernel: busy {}, of that {} for a closed window and {} for a full \
-         send buffer; own buffer: at most {} bytes, {}",
-        figures.waiting_bytes_max,
-        optional(figures.busy),
-        optional(figures.window_limited),
-        optional(figures.buffer_limited),
-        figures.backlog_bytes_max,
-        milliseconds(figures.backlogged)
-    )
+    let busy = figures.busy.map_or("unavailable".to_owned(), milliseconds);
+    let seen = figures.waiting_bytes_max;
+    let mut words = vec![format!(
+        "at most {seen} bytes seen, {busy} by the kernel's count"
+    )];
+    for (what, time) in [
+        ("for a closed window", figures.window_limited),
+        ("for a full send buffer", figures.buffer_limited),
+        ("in the gateway's own buffer", Some(figures.backlogged)),
+    ] {
+        if let Some(time) = time.filter(|time| !time.is_zero()) {
+            words.push(format!("{} {what}", milliseconds(time)));
+        }
+    }
+    words.join(", ")
 }
 
 fn round_trip(figures: &StreamFigures) -> String {
@@ -139,8 +140,8 @@ mod tests {
             "{}",
             of("connections")
         );
-        assert!(of("stalls").starts_with("1, 300.0 ms together, the longest 300.0 ms"));
-        assert!(of("stalls").contains("older than 44.0 ms"));
+        assert!(of("stalls").starts_with("1, 300.0 ms together, longest 300.0 ms"));
+        assert!(of("stalls").contains("over 44.0 ms"));
         assert!(of("TCP round trip").starts_with("unavailable smoothed"));
         assert_eq!(of("segments"), "unavailable sent again");
     }

@@ -60,7 +60,12 @@ impl LinkEntry {
             let hint = format!("write one of {}", words.join(", "));
             reader.refuse("via", Fault::Missing(hint));
         }
-        let hop = read_hop(&mut reader);
+        // A stream has no stamps; whoever asks for them all the same is told in the report.
+        let timestamps = match kind {
+            Some(Kind::Tcp) => Timestamps::Off,
+            _ => Timestamps::Software,
+        };
+        let hop = read_hop(&mut reader, timestamps);
         let emulation = read_emulation(&mut reader);
         let via = kind.map(|kind| match kind {
             Kind::SharedMemory => {
@@ -110,7 +115,7 @@ where
     read.expect("the default of a limit fits the type of its key")
 }
 
-fn read_hop(reader: &mut Reader<'_>) -> Hop {
+fn read_hop(reader: &mut Reader<'_>, timestamps: Timestamps) -> Hop {
     Hop {
         port: integer(reader, "port", &limits::LINK_PORT),
         dscp: integer(reader, "dscp", &limits::LINK_DSCP),
@@ -119,7 +124,7 @@ fn read_hop(reader: &mut Reader<'_>) -> Hop {
         receive_buffer_bytes: integer(reader, "receive_buffer_bytes", &limits::LINK_BUFFER_BYTES),
         timestamps: reader
             .word("timestamps", Timestamps::WORDS)
-            .unwrap_or(Timestamps::Software),
+            .unwrap_or(timestamps),
         path_mtu_bytes: integer(reader, "path_mtu_bytes", &limits::LINK_PATH_MTU_BYTES),
         gateway: read_gateway(reader.table("gateway")),
     }

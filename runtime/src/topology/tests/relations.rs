@@ -166,7 +166,7 @@ fn one_link_joins_one_pair_of_hosts() {
 
 #[test]
 fn a_link_over_tcp_has_ports_and_a_hop_and_no_model() {
-    let text = EVERYTHING.replace("via = \"udp\"", "via = \"tcp\"\ntimestamps = \"off\"");
+    let text = EVERYTHING.replace("via = \"udp\"", "via = \"tcp\"");
     let topology = parse("tcp.toml", &text, &[], &known()).unwrap();
     let mut crossings = topology.crossings();
     let image = crossings
@@ -175,6 +175,7 @@ fn a_link_over_tcp_has_ports_and_a_hop_and_no_model() {
     assert!(matches!(image.link.via, Via::Tcp(_)));
     assert_eq!((image.ports.sender, image.ports.receiver), (9000, 9001));
     assert_eq!((image.impairment, image.outages), (None, None));
+    assert_eq!(image.hop.timestamps, Timestamps::Off);
     let written = topology.to_toml();
     let again = parse("again.toml", &written, &[], &known()).unwrap();
     assert_eq!(again, topology);
