@@ -184,7 +184,7 @@ impl ControllerSettings {
     pub fn of(preset: Preset) -> Self {
         // The maker's defaults; `RampInTime` and the set-up time have none in its manual.
         let abb = Self {
-            cycle: Duration::from_micros(4000),
+            cycle: Duration::from_millis(4),
             queue: QueuePolicy::Fifo1,
             queue_capacity: 1000,
             position_gain_per_s: 5.0,

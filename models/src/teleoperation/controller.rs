@@ -56,7 +56,7 @@ pub(crate) fn is_newer(feedback: &EgmFeedback, newest: &EgmFeedback) -> bool {
         .cast_signed();
     match later_ms {
         0 => feedback.cycle_index > newest.cycle_index,
-        _ => later_ms > 0 || later_ms < -CLOCK_RESTART_MS,
+        _ => !(-CLOCK_RESTART_MS..=0).contains(&later_ms),
     }
 }
 
@@ -144,7 +144,9 @@ impl ArmSender {
                 [0.0; JOINT_COUNT]
             },
             seqno: 0,
-            flags: flags(&followed, parameters.feed_forward, is_parked),
+            flags: flag(parameters.feed_forward, EgmCommand::HAS_SPEED)
+                | flag(is_parked, EgmCommand::PARKED)
+                | reach_flags(&followed),
         });
     }
 
@@ -183,36 +185,35 @@ impl ArmSender {
         self.engaged = Some(Engaged { session, follower });
     }
 
-    /// The newest command, ready to go.
-    fn next_command(&mut self) -> Option<ControllerOutput> {
-        let mut command = self.command?;
+    /// Sends the newest command, if there is one.
+    fn send(&mut self, out: &mut Outbox<ControllerOutput>) {
+        let Some(mut command) = self.command else {
+            return;
+        };
         if let Some(newest) = &self.newest {
             command.answered_cycle = newest.cycle_index;
             command.flags |= EgmCommand::ANSWERS;
         }
         command.seqno = self.next_seqno;
         self.next_seqno = self.next_seqno.wrapping_add(1);
-        Some(match self.side {
+        out.send(match self.side {
             Side::Right => ControllerOutput::RightCommand(command),
             Side::Left => ControllerOutput::LeftCommand(command),
-        })
+        });
     }
 }
 
-fn flags(followed: &Followed, has_speed: bool, is_parked: bool) -> u32 {
-    [
-        (has_speed, EgmCommand::HAS_SPEED),
-        (
-            followed.reach == Reach::Unreachable,
-            EgmCommand::UNREACHABLE,
-        ),
-        (followed.reach == Reach::Approaching, EgmCommand::LIMITED),
-        (followed.is_jump_limited, EgmCommand::JUMP_LIMITED),
-        (is_parked, EgmCommand::PARKED),
-    ]
-    .into_iter()
-    .filter_map(|(is_set, bit)| is_set.then_some(bit))
-    .sum()
+const fn flag(is_set: bool, bit: u32) -> u32 {
+    if is_set { bit } else { 0 }
+}
+
+fn reach_flags(followed: &Followed) -> u32 {
+    let reach = match followed.reach {
+        Reach::Reached => 0,
+        Reach::Approaching => EgmCommand::LIMITED,
+        Reach::Unreachable => EgmCommand::UNREACHABLE,
+    };
+    reach | flag(followed.is_jump_limited, EgmCommand::JUMP_LIMITED)
 }
 
 impl Controller {
@@ -246,7 +247,7 @@ impl Controller {
         for arm in &mut self.arms {
             arm.on_frame(&self.parameters, &seen);
             if self.parameters.send == SendPolicy::Frame {
-                give(arm.next_command(), out);
+                arm.send(out);
             }
         }
     }
@@ -261,14 +262,8 @@ impl Controller {
         let arm = &mut self.arms[side.index()];
         arm.on_feedback(feedback);
         if self.parameters.send == SendPolicy::Coupled {
-            give(arm.next_command(), out);
+            arm.send(out);
         }
-    }
-}
-
-fn give(command: Option<ControllerOutput>, out: &mut Outbox<ControllerOutput>) {
-    if let Some(command) = command {
-        out.send(command);
     }
 }
 
@@ -307,7 +302,7 @@ impl Component for Controller {
         let is_due = |timer: &mut PeriodicTimer| timer.poll(now).is_some();
         if self.send_timer.as_mut().is_some_and(is_due) {
             for arm in &mut self.arms {
-                give(arm.next_command(), out);
+                arm.send(out);
             }
         }
     }

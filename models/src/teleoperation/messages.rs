@@ -14,7 +14,7 @@ use crate::yumi::Pose;
 pub struct HumanFrame {
     /// Grid point of the capture, counted from its start; a skipped point leaves a gap.
     pub frame_index: u64,
-    /// Time of this frame since the motion's start, on the motion's own time axis: the same on
+    /// Time of this frame since the capture's start, on the motion's own time axis: the same on
     /// every host.
     pub source_time_ns: i64,
     /// Pelvis.

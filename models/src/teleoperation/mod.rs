@@ -59,7 +59,9 @@ mod parameters;
 mod replay;
 mod robot;
 mod score;
-mod series;
+pub(crate) mod series;
+#[cfg(test)]
+mod session_tests;
 pub mod skeleton;
 pub mod swing;
 #[cfg(test)]
@@ -132,6 +134,7 @@ impl Teleoperation {
             self.parameters.loop_variation_ratio,
             RandomStream::new(self.seed, "teleoperation human"),
         )
+        .starting_at(self.parameters.motion_start_s)
     }
 }
 

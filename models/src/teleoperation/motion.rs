@@ -182,6 +182,7 @@ impl Motion {
 #[derive(Debug, Clone)]
 pub struct Player {
     motion: Motion,
+    start_s: f64,
     period_s: f64,
     variation_ratio: f64,
     random: RandomStream,
@@ -204,6 +205,7 @@ impl Player {
         let resting = motion.at(0.0, period_s);
         let mut player = Self {
             motion,
+            start_s: 0.0,
             period_s,
             variation_ratio,
             random,
@@ -218,8 +220,15 @@ impl Player {
         player
     }
 
-    /// The pose `time_s` after the motion's start. Calls come in non-decreasing time.
+    /// Rests where the motion begins until `start_s`.
+    #[must_use]
+    pub fn starting_at(self, start_s: f64) -> Self {
+        Self { start_s, ..self }
+    }
+
+    /// The pose at `time_s`. Calls come in non-decreasing time.
     pub fn at(&mut self, time_s: f64) -> HumanPose {
+        let time_s = (time_s - self.start_s).max(0.0);
         while time_s >= self.loop_start_s + self.loop_period_s {
             self.next_loop();
         }
@@ -338,6 +347,14 @@ mod tests {
         let (a, b, c) = (a.at(50.0), b.at(50.0), c.at(50.0));
         assert_eq!(a, b);
         assert_ne!(a, c);
+    }
+
+    #[test]
+    fn before_its_start_the_human_rests() {
+        let (mut late, mut prompt) = (player(0.01, 3).starting_at(2.0), player(0.01, 3));
+        assert_eq!(late.at(0.0), late.resting);
+        assert_eq!(late.at(1.999), late.resting);
+        assert_eq!(late.at(9.5), prompt.at(7.5));
     }
 
     #[test]

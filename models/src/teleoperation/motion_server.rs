@@ -209,9 +209,10 @@ impl MotionServer {
                 .collect(),
         };
         let mut orders: Vec<_> = sides.into_iter().zip(orders).collect();
-        // An arm may still refuse, e.g. because it is not yet at rest. So that the first does not
-        // move without the second, the second is asked on a copy before.
-        for (side, order) in orders.iter().skip(1) {
+        // An arm may still refuse, e.g. because it is not yet at rest. So that one does not move
+        // without the other, both are asked on copies before.
+        let is_together = orders.len() > 1;
+        for (side, order) in orders.iter().filter(|_| is_together) {
             let mut trial = controllers[side.index()].clone();
             give(&mut trial, order.clone()).map_err(|why| Refusal { why, side: *side })?;
         }
@@ -231,17 +232,17 @@ impl MotionServer {
         let mut motions = Vec::new();
         for side in asked(request.arms) {
             let refused = |why| Refusal { why, side };
-            let target_rad = &targets_rad[side.index()];
-            if !target_rad.iter().all(|q| q.is_finite()) {
+            let goal_rad = &targets_rad[side.index()];
+            if !goal_rad.iter().all(|q| q.is_finite()) {
                 return Err(refused(MotionRefusal::BadNumber));
             }
-            if within_limits(&(*target_rad).into()).1 {
+            if within_limits(&(*goal_rad).into()).1 {
                 return Err(refused(MotionRefusal::OutsideLimits));
             }
             let speed_ratio = chosen(request.speed, SPEED_RATIO_DEFAULT, 0.01..=1.0)
                 .ok_or(refused(MotionRefusal::BadNumber))?;
             let from_rad = controllers[side.index()].planned_rad();
-            motions.push(JointMotion::new(from_rad, target_rad, speed_ratio));
+            motions.push(JointMotion::new(from_rad, goal_rad, speed_ratio));
         }
         let longest_s = motions
             .iter()

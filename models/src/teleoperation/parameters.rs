@@ -130,6 +130,9 @@ impl EgmStartRequest {
 pub struct TeleoperationParameters {
     /// Length of one motion loop, 0.5..=60 s.
     pub motion_period_s: f64,
+    /// How long the human rests before the motion begins, 0..=60 s: nobody swings before guided
+    /// motion runs, and an arm that engages in the midst of a swing works off its centre.
+    pub motion_start_s: f64,
     /// Frame rate of the motion capture, 10..=1000 Hz.
     pub rate_hz: f64,
     /// How far the synthetic human swings the hand to either side, 0.01..=0.4 m. Without effect
@@ -176,6 +179,7 @@ impl Default for TeleoperationParameters {
     fn default() -> Self {
         Self {
             motion_period_s: 4.033,
+            motion_start_s: 2.0,
             rate_hz: 125.0,
             amplitude_m: 0.1875,
             loop_variation_ratio: 0.0,
@@ -229,6 +233,7 @@ impl TeleoperationParameters {
                 0.5..=60.0,
                 "0.5..=60",
             ),
+            ("motion_start_s", self.motion_start_s, 0.0..=60.0, "0..=60"),
             ("rate_hz", self.rate_hz, 10.0..=1000.0, "10..=1000"),
             ("amplitude_m", self.amplitude_m, 0.01..=0.4, "0.01..=0.4"),
             (
@@ -328,6 +333,7 @@ mod tests {
     #[test]
     fn each_number_outside_its_range_is_refused_by_name() {
         check_refused("motion_period_s", |p| p.motion_period_s = 0.0);
+        check_refused("motion_start_s", |p| p.motion_start_s = 61.0);
         check_refused("rate_hz", |p| p.rate_hz = f64::NAN);
         check_refused("amplitude_m", |p| p.amplitude_m = 0.5);
         check_refused("loop_variation_ratio", |p| p.loop_variation_ratio = -0.1);

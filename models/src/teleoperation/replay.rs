@@ -52,13 +52,13 @@ fn run_until(
     robot: &mut Robot,
     until: Instant,
     out: &mut Outbox<RobotOutput>,
-    mut hear: impl FnMut(RobotOutput),
+    mut hear: impl FnMut(&RobotOutput),
 ) {
     while let Some(due) = robot.next_tick().filter(|due| *due <= until) {
         robot.on_tick(due, out);
-        out.drain().for_each(&mut hear);
+        out.drain().for_each(|said| hear(&said));
     }
-    out.drain().for_each(hear);
+    out.drain().for_each(|said| hear(&said));
 }
 
 /// When the robot started; more than one if its process was started anew.
@@ -162,7 +162,7 @@ impl Recorded {
         last.map(|(at, _)| *at).max()
     }
 
-    fn compare(&mut self, said: RobotOutput, replay: &mut Replay) {
+    fn compare(&mut self, said: &RobotOutput, replay: &mut Replay) {
         let (side, replayed) = match said {
             RobotOutput::RightFeedback(feedback) => (Side::Right, feedback),
             RobotOutput::LeftFeedback(feedback) => (Side::Left, feedback),
@@ -176,7 +176,7 @@ impl Recorded {
         let is_due = |next: &mut (Instant, EgmFeedback)| next.1.cycle_index <= replayed.cycle_index;
         while let Some((_, recorded)) = queue.pop_front_if(is_due) {
             replay.compared_count += 1;
-            if let Some(difference) = difference(&recorded, &replayed) {
+            if let Some(difference) = difference(&recorded, replayed) {
                 note(replay, side, recorded.cycle_index, &difference);
             }
         }
@@ -231,3 +231,7 @@ fn difference(recorded: &EgmFeedback, replayed: &EgmFeedback) -> Option<String> 
         )
     })
 }
+
+#[cfg(test)]
+#[path = "replay_tests.rs"]
+mod tests;

@@ -138,9 +138,9 @@ impl Component for Robot {
             RobotInput::LeftCommand(command) => self.receive(now, Side::Left, command),
             RobotInput::Request(request) => {
                 let refused = self.server.receive(request, &self.controllers);
-                refused.into_iter().for_each(|response| {
+                if let Some(response) = refused {
                     out.send(RobotOutput::Response(response));
-                });
+                }
                 RobotOutput::RequestArrived(MotionArrival {
                     at_ns: now.as_ns(),
                     request: *request,

@@ -63,8 +63,8 @@ impl Bench {
         }
     }
 
-    fn hear(&mut self, input: RobotInput) {
-        self.robot.on_message(self.now, &input, &mut self.out);
+    fn hear(&mut self, input: &RobotInput) {
+        self.robot.on_message(self.now, input, &mut self.out);
         self.listen();
     }
 
@@ -79,9 +79,9 @@ impl Bench {
     }
 
     /// The outcome of a request: at once, and, when it began something, within `seconds`.
-    fn ask(&mut self, request: MotionRequest, seconds: f64) -> Vec<MotionResponse> {
+    fn ask(&mut self, request: &MotionRequest, seconds: f64) -> Vec<MotionResponse> {
         self.responses.clear();
-        self.hear(RobotInput::Request(request));
+        self.hear(&RobotInput::Request(*request));
         self.run(seconds);
         let mut answers = self.responses.clone();
         answers.retain(|answer| answer.request_id == request.request_id);
@@ -105,6 +105,10 @@ fn request(kind: MotionKind, arms: &[Side]) -> MotionRequest {
     }
 }
 
+fn is_same(a: &Joints, b: &Joints) -> bool {
+    a.iter().zip(b).all(|(a, b)| a.to_bits() == b.to_bits())
+}
+
 fn outcomes(answers: &[MotionResponse]) -> Vec<u32> {
     answers.iter().map(|answer| answer.outcome).collect()
 }
@@ -115,14 +119,17 @@ const REFUSED: u32 = MotionOutcome::Refused as u32;
 const INTERRUPTED: u32 = MotionOutcome::Interrupted as u32;
 
 #[track_caller]
-fn check_refused(bench: &mut Bench, request: MotionRequest, why: MotionRefusal, side: Side) {
+fn check_refused(bench: &mut Bench, request: &MotionRequest, why: MotionRefusal, side: Side) {
     let before = Side::BOTH.map(|side| bench.newest(side).planned_rad);
     let answers = bench.ask(request, 0.5);
     assert_eq!(outcomes(&answers), [REFUSED]);
     assert_eq!(answers[0].refusal, why as u32, "{:?}", answers[0]);
     assert_eq!(answers[0].refused_side, side.number());
     for side in Side::BOTH {
-        assert_eq!(bench.newest(side).planned_rad, before[side.index()]);
+        assert!(is_same(
+            &bench.newest(side).planned_rad,
+            &before[side.index()]
+        ));
         assert_eq!(bench.newest(side).state, SessionState::Idle as u32);
     }
 }
@@ -131,10 +138,12 @@ fn check_refused(bench: &mut Bench, request: MotionRequest, why: MotionRefusal, 
 fn the_state_is_told_at_once_and_only_once() {
     let mut bench = Bench::new();
     bench.run(0.1);
-    let answers = bench.ask(request(MotionKind::GetState, &[]), 0.1);
+    let answers = bench.ask(&request(MotionKind::GetState, &[]), 0.1);
     assert_eq!(outcomes(&answers), [DONE]);
     assert_eq!(answers[0].states, [SessionState::Idle as u32; 2]);
-    assert_eq!(answers[0].measured_rad, START_RAD);
+    for (measured_rad, start_rad) in answers[0].measured_rad.iter().zip(&START_RAD) {
+        assert!(is_same(measured_rad, start_rad));
+    }
 }
 
 #[test]
@@ -144,7 +153,7 @@ fn both_arms_reach_their_joints_together() {
     let mut both = request(MotionKind::MoveJoints, &Side::BOTH);
     both.joints_rad[0][0] += 0.4;
     both.joints_rad[1][6] -= 0.1;
-    let answers = bench.ask(both, 5.0);
+    let answers = bench.ask(&both, 5.0);
     assert_eq!(outcomes(&answers), [ACCEPTED, DONE]);
     assert_eq!(answers[0].states, [SessionState::Moving as u32; 2]);
     assert_eq!(answers[1].states, [SessionState::Idle as u32; 2]);
@@ -177,7 +186,7 @@ fn the_tool_goes_straight_to_its_pose() {
     let tool = arms()[0].tool(&START_RAD[0]);
     let target = nalgebra::Isometry3::translation(0.0, 0.15, 0.05) * tool;
     line.poses[0] = target.into();
-    let answers = bench.ask(line, 3.0);
+    let answers = bench.ask(&line, 3.0);
     assert_eq!(outcomes(&answers), [ACCEPTED, DONE]);
     let reached = nalgebra::Vector3::from(bench.newest(Side::Right).tool.position_m);
     assert!((reached - target.translation.vector).norm() < 1e-4);
@@ -186,7 +195,10 @@ fn the_tool_goes_straight_to_its_pose() {
         let moved = nalgebra::Vector3::from(feedback.tool.position_m) - tool.translation.vector;
         assert!((moved - moved.dot(&way) * way).norm() < 2e-5);
     }
-    assert_eq!(bench.newest(Side::Left).measured_rad, START_RAD[1]);
+    assert!(is_same(
+        &bench.newest(Side::Left).measured_rad,
+        &START_RAD[1]
+    ));
 }
 
 #[test]
@@ -196,38 +208,53 @@ fn what_cannot_be_done_is_refused_with_its_reason_and_moves_no_arm() {
     let both = |kind| request(kind, &Side::BOTH);
     let mut unknown = both(MotionKind::Home);
     unknown.kind = 99;
-    check_refused(&mut bench, unknown, MotionRefusal::UnknownKind, Side::Right);
+    check_refused(
+        &mut bench,
+        &unknown,
+        MotionRefusal::UnknownKind,
+        Side::Right,
+    );
     let nobody = request(MotionKind::Home, &[]);
-    check_refused(&mut bench, nobody, MotionRefusal::NoArm, Side::Right);
+    check_refused(&mut bench, &nobody, MotionRefusal::NoArm, Side::Right);
     let mut third = both(MotionKind::Home);
     third.arms |= 4;
-    check_refused(&mut bench, third, MotionRefusal::NoArm, Side::Right);
+    check_refused(&mut bench, &third, MotionRefusal::NoArm, Side::Right);
     let mut nonsense = both(MotionKind::MoveJoints);
     nonsense.joints_rad[1][3] = f64::NAN;
-    check_refused(&mut bench, nonsense, MotionRefusal::BadNumber, Side::Left);
+    check_refused(&mut bench, &nonsense, MotionRefusal::BadNumber, Side::Left);
     let mut beyond = both(MotionKind::MoveJoints);
     beyond.joints_rad[0][0] += 0.2;
     beyond.joints_rad[1][2] = POSITION_MAX_RAD[2] + 0.01;
-    check_refused(&mut bench, beyond, MotionRefusal::OutsideLimits, Side::Left);
+    check_refused(
+        &mut bench,
+        &beyond,
+        MotionRefusal::OutsideLimits,
+        Side::Left,
+    );
     for speed in [-0.1, 1.1, f64::NAN] {
         let mut fast = both(MotionKind::Home);
         fast.speed = speed;
-        check_refused(&mut bench, fast, MotionRefusal::BadNumber, Side::Right);
+        check_refused(&mut bench, &fast, MotionRefusal::BadNumber, Side::Right);
     }
     // A pose of zeros is none.
     let no_pose = both(MotionKind::MoveLinear);
-    check_refused(&mut bench, no_pose, MotionRefusal::BadNumber, Side::Right);
+    check_refused(&mut bench, &no_pose, MotionRefusal::BadNumber, Side::Right);
     let mut far = both(MotionKind::MoveLinear);
     let [right, left] = arms();
     far.poses[0] = right.tool(&START_RAD[0]).into();
     far.poses[1] =
         (nalgebra::Isometry3::translation(0.5, 0.0, 0.0) * left.tool(&START_RAD[1])).into();
-    check_refused(&mut bench, far, MotionRefusal::Unreachable, Side::Left);
+    check_refused(&mut bench, &far, MotionRefusal::Unreachable, Side::Left);
     far.poses[1].position_m[0] = 1e5;
-    check_refused(&mut bench, far, MotionRefusal::Unreachable, Side::Left);
+    check_refused(&mut bench, &far, MotionRefusal::Unreachable, Side::Left);
     let mut bad_start = both(MotionKind::EgmStart);
     bad_start.egm.comm_timeout_s = -1.0;
-    check_refused(&mut bench, bad_start, MotionRefusal::BadNumber, Side::Right);
+    check_refused(
+        &mut bench,
+        &bad_start,
+        MotionRefusal::BadNumber,
+        Side::Right,
+    );
 }
 
 #[test]
@@ -235,20 +262,20 @@ fn guided_motion_starts_and_stops_by_request() {
     let mut bench = Bench::new();
     bench.run(0.1);
     let start = request(MotionKind::EgmStart, &Side::BOTH);
-    let answers = bench.ask(start, 0.5);
+    let answers = bench.ask(&start, 0.5);
     assert_eq!(outcomes(&answers), [ACCEPTED, DONE]);
     assert_eq!(answers[0].states, [SessionState::Activating as u32; 2]);
     assert_eq!(answers[1].states, [SessionState::Running as u32; 2]);
 
-    let refused = bench.ask(request(MotionKind::Home, &[Side::Left]), 0.1);
+    let refused = bench.ask(&request(MotionKind::Home, &[Side::Left]), 0.1);
     assert_eq!(outcomes(&refused), [REFUSED]);
     assert_eq!(refused[0].refusal, MotionRefusal::GuidedMotionRuns as u32);
-    let again = bench.ask(start, 0.1);
+    let again = bench.ask(&start, 0.1);
     assert_eq!(outcomes(&again), [REFUSED]);
     assert_eq!(again[0].refusal, MotionRefusal::GuidedMotionRuns as u32);
 
     let stop = request(MotionKind::EgmStop, &[Side::Left]);
-    let stopped = bench.ask(stop, 1.0);
+    let stopped = bench.ask(&stop, 1.0);
     assert_eq!(outcomes(&stopped), [ACCEPTED, DONE]);
     assert_eq!(stopped[1].states[1], SessionState::Idle as u32);
     assert_ne!(stopped[1].states[0], SessionState::Idle as u32);
@@ -260,10 +287,10 @@ fn a_stop_interrupts_a_start() {
     bench.run(0.1);
     let mut start = request(MotionKind::EgmStart, &[Side::Right]);
     start.request_id = 1;
-    bench.hear(RobotInput::Request(start));
+    bench.hear(&RobotInput::Request(start));
     bench.run(0.02);
     let stop = request(MotionKind::EgmStop, &[Side::Right]);
-    bench.hear(RobotInput::Request(stop));
+    bench.hear(&RobotInput::Request(stop));
     bench.run(0.5);
     let of_start: Vec<_> = bench
         .responses
@@ -280,9 +307,9 @@ fn requests_of_one_instant_are_carried_out_one_per_cycle_and_a_flood_is_refused(
     bench.run(0.1);
     let mut away = request(MotionKind::MoveJoints, &[Side::Right]);
     away.joints_rad[0][0] += 0.3;
-    bench.hear(RobotInput::Request(away));
+    bench.hear(&RobotInput::Request(away));
     for _ in 0..200 {
-        bench.hear(RobotInput::Request(request(MotionKind::Home, &Side::BOTH)));
+        bench.hear(&RobotInput::Request(request(MotionKind::Home, &Side::BOTH)));
     }
     bench.run(0.5);
     assert_eq!(bench.arrival_count, 201);
@@ -297,7 +324,10 @@ fn requests_of_one_instant_are_carried_out_one_per_cycle_and_a_flood_is_refused(
             .all(|answer| answer.refusal == MotionRefusal::Busy as u32)
     );
     // The home of the left arm was not begun while the right was on its way.
-    assert_eq!(bench.newest(Side::Left).measured_rad, START_RAD[1]);
+    assert!(is_same(
+        &bench.newest(Side::Left).measured_rad,
+        &START_RAD[1]
+    ));
 }
 
 #[test]
@@ -317,7 +347,7 @@ fn a_late_robot_moves_as_a_punctual_one_and_reports_its_newest_cycle_only() {
             }
             bench.now = Instant::from_ns(at_ns);
             let Some(index) = index else {
-                bench.hear(RobotInput::Request(request(
+                bench.hear(&RobotInput::Request(request(
                     MotionKind::EgmStart,
                     &Side::BOTH,
                 )));
@@ -326,7 +356,7 @@ fn a_late_robot_moves_as_a_punctual_one_and_reports_its_newest_cycle_only() {
             let mut command = EgmCommand::zeroed();
             command.position_rad = START_RAD[0];
             command.position_rad[0] += 1e-3 * index as f64;
-            bench.hear(RobotInput::RightCommand(command));
+            bench.hear(&RobotInput::RightCommand(command));
         }
         for tick_ns in ticks {
             bench
@@ -382,7 +412,7 @@ fn a_command_acts_only_from_the_first_grid_point_later_than_its_arrival() {
     // On the very grid point of cycle 50, and a nanosecond before it.
     let first_taken = |arrived_ns: i64| {
         let mut bench = Bench::new();
-        bench.ask(request(MotionKind::EgmStart, &[Side::Right]), 0.199);
+        bench.ask(&request(MotionKind::EgmStart, &[Side::Right]), 0.199);
         let tick = Instant::from_ns(arrived_ns);
         while let Some(due) = bench.robot.next_tick().filter(|due| *due < tick) {
             bench.robot.on_tick(due, &mut bench.out);
@@ -390,7 +420,7 @@ fn a_command_acts_only_from_the_first_grid_point_later_than_its_arrival() {
         bench.now = tick;
         let mut command = EgmCommand::zeroed();
         command.position_rad = START_RAD[0];
-        bench.hear(RobotInput::RightCommand(command));
+        bench.hear(&RobotInput::RightCommand(command));
         bench.run(0.1);
         let took = |feedback: &&EgmFeedback| feedback.has(EgmFeedback::HAS_REFERENCE);
         bench.feedback[0].iter().find(took).unwrap().cycle_index

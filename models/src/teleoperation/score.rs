@@ -35,7 +35,8 @@ pub(crate) fn score(case: &Teleoperation, log: &RunLog) -> Score {
     let mut metrics = Vec::from(motion_loops(case, &sent.tool_y, &moved.tool_y));
     metrics.extend(moved.joint_error());
     metrics.push(tracking_lag(&sent.tool_y, &moved.tool_y, period_s));
-    metrics.push(tool_travel(&moved.tool_y, period_s));
+    let swung = after_rest(&moved.tool_y, case.parameters.motion_start_s);
+    metrics.push(tool_travel(swung, period_s));
     metrics.extend(events(&sent, &moved));
     if !log.has_one_clock() {
         for metric in &mut metrics {
@@ -317,6 +318,13 @@ fn tracking_lag(sent: &[Sample], moved: &[Sample], period_s: f64) -> Metric {
                 .to_owned()
         },
     }
+}
+
+/// `moved` without the time in which the human rested; hosts start together within milliseconds.
+fn after_rest(moved: &[Sample], motion_start_s: f64) -> &[Sample] {
+    let begin = moved.first().map_or(0, |(at, _)| *at);
+    let is_rest = |(at, _): &Sample| ((at - begin) as f64) < motion_start_s * 1e9;
+    &moved[moved.partition_point(is_rest)..]
 }
 
 fn tool_travel(moved: &[Sample], period_s: f64) -> Metric {

@@ -49,7 +49,10 @@ struct Tracked {
 }
 
 fn track(frame_count: u64, rate_hz: f64) -> Tracked {
-    let case = case(|parameters| parameters.rate_hz = rate_hz);
+    let case = case(|parameters| {
+        parameters.rate_hz = rate_hz;
+        parameters.motion_start_s = 0.0;
+    });
     let mut player = case.player();
     let (arm, frame_s) = (Arm::right(), 1.0 / rate_hz);
     let mut hand = player.at(0.0).right_hand;
@@ -108,7 +111,7 @@ fn the_same_holds_at_250_hz() {
 #[test]
 fn at_the_default_gain_the_robot_lags_195_ms_and_executes_every_loop() {
     let case = case(|_| {});
-    let result = run(&case, None, 6.0 * 4.033);
+    let result = run(&case, None, 2.0 + 6.0 * 4.033);
     let figure = figures(&case, &result);
     assert!((figure("tracking_lag_ms") - 195.0).abs() <= 8.0);
     assert!((figure("joint_error_ratio") - 0.299).abs() <= 0.015);
@@ -155,15 +158,22 @@ fn scoring_twice_the_loops_takes_twice_the_work() {
 
 #[test]
 fn the_highest_gain_and_feed_forward_follow_as_the_control_law_says() {
+    let duration_s = 2.0 + 5.0 * 4.033;
     let steep = case(|parameters| parameters.egm.position_gain_per_s = Some(20.0));
-    let figure = figures(&steep, &run(&steep, None, 20.0));
+    let figure = figures(&steep, &run(&steep, None, duration_s));
     assert!((figure("tracking_lag_ms") - 50.0).abs() <= 8.0);
-    assert!((figure("joint_error_ratio") - 0.078).abs() <= 0.005);
+    // The law alone misses by 7.8 %. In virtual time every second command arrives on a grid point
+    // exactly and so waits a whole cycle for the next: 4 ms more of a period of 4.033 s.
+    let ratio = figure("joint_error_ratio");
+    assert!((ratio - 0.084).abs() <= 0.005, "{ratio}");
 
     let fed = case(|parameters| parameters.feed_forward = true);
-    let figure = figures(&fed, &run(&fed, None, 20.0));
+    let figure = figures(&fed, &run(&fed, None, duration_s));
     assert!(figure("tracking_lag_ms").abs() <= 8.0);
-    assert!(figure("joint_error_ratio") < 0.01);
+    // The law alone would stay below 1 %; what is left is the age of the newest command, 4 to 12
+    // ms between frame and cycle.
+    let ratio = figure("joint_error_ratio");
+    assert!(ratio < 0.02, "{ratio}");
     assert!(
         (figure("tool_y_m_peak_to_peak") / case(|_| {}).nominal_peak_to_peak_m() - 1.0).abs()
             < 0.02
@@ -174,7 +184,7 @@ fn the_highest_gain_and_feed_forward_follow_as_the_control_law_says() {
 fn bernoulli_loss_of_half_the_commands_loses_no_loop() {
     let case = case(|_| {});
     let link = BernoulliLink::new(Duration::ZERO, 0.5, RandomStream::new(1, "link")).unwrap();
-    let figure = figures(&case, &run(&case, Some(Box::new(link)), 8.0 * 4.033));
+    let figure = figures(&case, &run(&case, Some(Box::new(link)), 2.0 + 8.0 * 4.033));
     assert!((figure("motion_loops_sent_count") - 8.0).abs() < 0.5);
     assert!(figure("motion_loss_ratio").abs() < 1e-12);
 }
@@ -197,19 +207,19 @@ impl LinkModel for Outage {
 }
 
 #[test]
-fn an_outage_of_one_period_is_one_hold_and_one_lost_loop() {
-    let case = case(|_| {});
+fn an_outage_of_one_period_within_a_session_is_one_hold_and_one_lost_loop() {
+    let case = case(|parameters| parameters.egm.comm_timeout_s = Some(60.0));
     let outage = Outage {
-        from: Instant::from_ns(12_000_000_000),
-        until: Instant::from_ns(16_033_000_000),
+        from: Instant::from_ns(14_000_000_000),
+        until: Instant::from_ns(18_033_000_000),
     };
-    let figure = figures(&case, &run(&case, Some(Box::new(outage)), 8.0 * 4.033));
+    let duration_s = 2.0 + 8.0 * 4.033;
+    let figure = figures(&case, &run(&case, Some(Box::new(outage)), duration_s));
     assert!((figure("hold_count") - 1.0).abs() < 0.1);
     assert!((figure("motion_loops_executed_count") - 7.0).abs() < 0.1);
     assert!((figure("motion_loss_ratio") - 0.125).abs() < 1e-12);
-    // The hold begins five command periods after the last command.
-    let held_s = figure("hold_time_ratio") * 8.0 * 4.033;
-    assert!((held_s - (4.033 - 0.04)).abs() < 0.02, "{held_s}");
+    let held_s = figure("hold_time_ratio") * duration_s;
+    assert!((held_s - 4.033).abs() < 0.1, "{held_s}");
 }
 
 #[test]

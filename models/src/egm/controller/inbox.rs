@@ -56,6 +56,7 @@ impl Fault {
     };
 
     /// The first fault of `command`, whatever the session.
+    #[cold]
     fn of(command: &EgmCommand) -> Option<Self> {
         let fault = |refusal, value, limit, joint| {
             Some(Self {
@@ -87,12 +88,39 @@ impl Fault {
     }
 }
 
+/// Whether [`Fault::of`] finds nothing, without saying what.
+#[inline]
+fn is_faultless(command: &EgmCommand) -> bool {
+    let mut is_faultless = true;
+    for joint in 0..JOINT_COUNT {
+        let q = command.position_rad[joint];
+        is_faultless &= q >= POSITION_MIN_RAD[joint] - LIMIT_TOLERANCE_RAD;
+        is_faultless &= q <= POSITION_MAX_RAD[joint] + LIMIT_TOLERANCE_RAD;
+    }
+    if command.flags & EgmCommand::HAS_SPEED != 0 {
+        for speed in &command.speed_rad_per_s {
+            is_faultless &= speed.is_finite();
+        }
+    }
+    is_faultless
+}
+
 /// A command with its arrival.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Arrival {
     pub(super) at: Instant,
     pub(super) command: EgmCommand,
-    fault: Option<Fault>,
+    is_faultless: bool,
+}
+
+impl Arrival {
+    fn fault(&self) -> Option<Fault> {
+        if self.is_faultless {
+            None
+        } else {
+            Fault::of(&self.command)
+        }
+    }
 }
 
 /// What became of one arrival at its grid point.
@@ -120,7 +148,7 @@ impl Inbox {
         let blank = Arrival {
             at: Instant::ZERO,
             command: EgmCommand::zeroed(),
-            fault: None,
+            is_faultless: false,
         };
         Self {
             policy,
@@ -137,18 +165,17 @@ impl Inbox {
         at: Instant,
         command: &EgmCommand,
     ) -> Result<(), CommandRefusal> {
-        let fault = Fault::of(command);
         self.counters.received += 1;
         let arrival = Arrival {
             at,
             command: *command,
-            fault,
+            is_faultless: is_faultless(command),
         };
-        if !self.pending.push(arrival) {
+        if !self.pending.push(&arrival) {
             self.counters.dropped += 1;
             self.has_pending_overflow = true;
         }
-        fault.map_or(Ok(()), |fault| Err(fault.refusal))
+        arrival.fault().map_or(Ok(()), |fault| Err(fault.refusal))
     }
 
     /// Settles the next command that arrived before `at`: when it came and what became of it.
@@ -157,16 +184,16 @@ impl Inbox {
         let arrival = self.pending.front().filter(|arrival| arrival.at < at)?;
         let arrived = arrival.at;
         let fault = if is_running {
-            arrival.fault
+            arrival.fault()
         } else {
-            arrival.fault.or(Some(Fault::NO_SESSION))
+            arrival.fault().or(Some(Fault::NO_SESSION))
         };
         let fate = match fault {
             Some(fault) => {
                 *self.refused_count(fault.refusal) += 1;
                 Fate::Refused(fault)
             }
-            None if self.queue.push(*arrival) => Fate::Queued,
+            None if self.queue.push(arrival) => Fate::Queued,
             None => {
                 self.counters.dropped += 1;
                 Fate::Dropped

@@ -38,11 +38,11 @@ impl<T: Copy> Ring<T> {
 
     /// Appends `value`; false when it does not fit.
     #[must_use]
-    pub(super) fn push(&mut self, value: T) -> bool {
+    pub(super) fn push(&mut self, value: &T) -> bool {
         if self.len == self.slots.len() {
             return false;
         }
-        self.slots[self.slot(self.len)] = value;
+        self.slots[self.slot(self.len)] = *value;
         self.len += 1;
         true
     }
@@ -83,7 +83,7 @@ mod tests {
         for step in 0..100 {
             for _ in 0..step % 5 {
                 let fits = ring.len() < 3;
-                assert_eq!(ring.push(next_in), fits);
+                assert_eq!(ring.push(&next_in), fits);
                 next_in += i32::from(fits);
             }
             assert_eq!(ring.back().copied(), (ring.len() > 0).then(|| next_in - 1));

@@ -328,16 +328,15 @@ impl Controller {
             return;
         };
         let step_s = self.law.step_s();
-        match motion
+        let next = motion
             .track
             .as_mut()
-            .and_then(|track| track.advance(step_s))
-        {
-            Some(q_rad) => self.plan.place(&q_rad),
-            None => {
-                self.own_motion = None;
-                self.end_as_requested(since, tell);
-            }
+            .and_then(|track| track.advance(step_s));
+        if let Some(q_rad) = next {
+            self.plan.place(&q_rad);
+        } else {
+            self.own_motion = None;
+            self.end_as_requested(since, tell);
         }
     }
 

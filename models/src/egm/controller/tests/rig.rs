@@ -111,10 +111,9 @@ impl Rig {
         let mut feedback = Vec::new();
         while self.next_s() < until_s {
             let sent_ns = self.next_ns - self.cycle_ns / 2;
-            if sent_ns > 0 && (self.next_ns / self.cycle_ns) % every == 0 {
-                if let Some(command) = source(sent_ns as f64 * 1e-9) {
-                    self.receive_at(sent_ns, &command);
-                }
+            let is_due = sent_ns > 0 && (self.next_ns / self.cycle_ns) % every == 0;
+            if let Some(command) = is_due.then(|| source(sent_ns as f64 * 1e-9)).flatten() {
+                self.receive_at(sent_ns, &command);
             }
             feedback.push(self.step());
         }
