@@ -99,3 +99,5 @@ pub enum RobotWare {
 mod face_tests;
 #[cfg(test)]
 mod fuzz_tests;
+#[cfg(test)]
+mod sensor_tests;

@@ -1,5 +1,7 @@
 //! Our codec against the bytes of programs nobody here wrote; see `testdata/README.md`.
 
+#![allow(clippy::float_cmp, reason = "what was sent must come out unchanged")]
+
 use super::messages::EgmSensorPathCorr;
 use super::robot::{ForceForm, MciState, MotorState, RapidState};
 use super::*;

@@ -128,7 +128,8 @@ pub struct EgmCartesianSpeed {
     pub value: Vec<f64>,
 }
 
-/// Joints of the robot (up to six) or of external axes, degrees or degrees/s.
+/// Joints of the robot (up to six) or of external axes, degrees or degrees/s. The maker also defines
+/// `EgmExternalJoints`, laid out alike, and uses it nowhere.
 #[derive(Clone, PartialEq, prost::Message)]
 pub struct EgmJoints {
     /// One value per joint; see [`crate::egm::wire::joints`] for which is which.

@@ -141,4 +141,4 @@ pub fn encode(message: &impl Message, buffer: &mut Vec<u8>) {
 }
 
 #[cfg(test)]
-mod golden_tests;
+pub(crate) mod golden_tests;
