@@ -74,7 +74,7 @@ struct Robot {
     run: ChildGuard,
     files: RunFiles,
     client: Command,
-    _folder: RunFolder,
+    folder: RunFolder,
 }
 
 impl Robot {
@@ -105,7 +105,7 @@ impl Robot {
             run,
             files,
             client,
-            _folder: folder,
+            folder,
         };
         let has_begun = || robot.files.record_bytes("egm.right.feedback.published.") > 10_000;
         wait_until(LIMIT, "the robot's first cycles", has_begun);
@@ -132,8 +132,8 @@ impl Robot {
         self.run.signal(Signal::SIGINT).unwrap();
         let finished = self.run.wait_within(LIMIT).unwrap();
         assert_eq!(finished.status.code(), Some(130), "{}", finished.stderr);
-        let Self { files, _folder, .. } = self;
-        (files, _folder)
+        let Self { files, folder, .. } = self;
+        (files, folder)
     }
 }
 

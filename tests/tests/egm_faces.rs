@@ -177,7 +177,10 @@ fn judge([sensor, robot]: [&RunSummary; 2]) {
     let right = face(sensor, "right");
     let sent = count(right, "datagrams encoded") as f64;
     let attended = right.answers.attended_count as f64;
-    assert!(sent >= 0.95 * attended, "{sent} answers to {attended} messages");
+    assert!(
+        sent >= 0.95 * attended,
+        "{sent} answers to {attended} messages"
+    );
     assert_eq!(count(right, "changes of the robot's address"), 0);
     assert!(
         right.peer_state.contains(&ADDRESSES[1].to_string()),
