@@ -99,7 +99,7 @@ pub struct Pair {
     recorders: Vec<Recorder>,
     folder: PathBuf,
     holders: Vec<ChannelHolder>,
-    _domains: [Domain; 2],
+    domains: [Domain; 2],
     hosts: Hosts,
 }
 
@@ -183,7 +183,7 @@ impl Pair {
             recorders,
             folder,
             holders,
-            _domains: domains,
+            domains,
             hosts,
         })
     }
@@ -230,7 +230,7 @@ impl Pair {
         let mut taken = None;
         while taken.is_none() {
             port.input.receive(Instant::ZERO, &mut |_, _| {
-                taken = Some(MonotonicClock::now())
+                taken = Some(MonotonicClock::now());
             })?;
             if taken.is_none() {
                 self.waiters[way].wait_until(Some(deadline))?;
@@ -241,7 +241,7 @@ impl Pair {
         }
         let far_taken = self.far.taken_ns[way].load(Ordering::Acquire);
         let far_published = self.far.published_ns[way].load(Ordering::Acquire);
-        let back_ns = taken.map_or(0, |at| at.as_ns()) - far_published;
+        let back_ns = taken.map_or(0, Instant::as_ns) - far_published;
         Ok(Exchange {
             out_ns: u64::try_from(far_taken - published.as_ns())?,
             back_ns: u64::try_from(back_ns)?,
@@ -276,14 +276,15 @@ impl Pair {
             let received: Vec<_> = file(back, "face-received")?.records().collect();
             each.push(figures(kind, &sent, &received));
         }
-        drop((self.ways, self.waiters, self.holders, self._domains));
+        drop((self.ways, self.waiters, self.holders, self.domains));
         let mut hosts = self.hosts;
         hosts.finish_recording();
         let mut left = hosts.remove();
         if let Err(error) = fs::remove_dir_all(&self.folder) {
             left.push(format!("{}: {error}", self.folder.display()));
         }
-        let figures = <[FaceFigures; 2]>::try_from(each).map_err(|_| "two faces were noted")?;
+        let figures =
+            <[FaceFigures; 2]>::try_from(each).map_err(|_other_count| "two faces were noted")?;
         Ok(Finished {
             figures,
             refusals,
@@ -452,7 +453,7 @@ fn controller(
             for (index, way) in ways.iter_mut().enumerate() {
                 let mut taken = None;
                 way.input.receive(Instant::ZERO, &mut |_, _| {
-                    taken = Some(MonotonicClock::now())
+                    taken = Some(MonotonicClock::now());
                 })?;
                 let Some(taken) = taken else { continue };
                 times.taken_ns[index].store(taken.as_ns(), Ordering::Release);

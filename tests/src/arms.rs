@@ -63,15 +63,12 @@ impl Arms {
 
     /// The events of `side` as a log says them, for the output of a test.
     pub fn story(&self, side: Side) -> String {
-        let mut text = String::new();
-        for event in self.events(side) {
-            text.push_str(&format!(
-                "{:.3} s  {}\n",
-                event.at_ns as f64 * 1e-9,
-                event.describe()
-            ));
-        }
-        text
+        let events = self.events(side);
+        let lines = events.iter().map(|event| {
+            let at_s = event.at_ns as f64 * 1e-9;
+            format!("{at_s:.3} s  {}\n", event.describe())
+        });
+        lines.collect()
     }
 
     /// When commands for `side` arrived at the robot, nanoseconds of its clock.
