@@ -157,7 +157,39 @@ fn a_run_in_virtual_time_leaves_the_same_files_but_no_records() {
     let command = &document["outages"]["egm/right/command"];
     assert!(command["outage_count"].as_u64().unwrap() > 20, "{document}");
     assert!(output.join("events.log").is_file());
+    assert_series_are_those_that_the_case_lists(&output.join("series"));
     assert_code(&replay(&output), 2);
+}
+
+fn assert_series_are_those_that_the_case_lists(folder: &Path) {
+    let cases = run(&["cases"]).stdout;
+    let case = cases.split("\nteleoperation: ").nth(1).unwrap();
+    let line = case.lines().find_map(|line| line.strip_prefix("  series "));
+    let names = line.unwrap().split(';').next().unwrap().split(',');
+    let mut listed: Vec<_> = names.map(|name| format!("{}.csv", name.trim())).collect();
+    let files = fs::read_dir(folder).unwrap();
+    let mut found: Vec<_> = files
+        .map(|file| file.unwrap().file_name().into_string().unwrap())
+        .collect();
+    listed.push("README.md".to_owned());
+    listed.sort();
+    found.sort();
+    assert_eq!(found, listed);
+    let readme = fs::read_to_string(folder.join("README.md")).unwrap();
+    for name in listed.iter().filter(|name| name.ends_with(".csv")) {
+        let table = fs::read_to_string(folder.join(name)).unwrap();
+        let mut lines = table.lines();
+        let columns: Vec<_> = lines.next().unwrap().split(',').collect();
+        let rows: Vec<_> = lines.map(|line| line.split(',').count()).collect();
+        assert!(rows.len() > 1_000 && rows.iter().all(|count| *count == columns.len()));
+        assert!(readme.contains(&format!("\n## {name}\n")), "{readme}");
+        for column in columns {
+            assert!(
+                readme.contains(&format!("\n| `{column}` | ")),
+                "{column}: {readme}"
+            );
+        }
+    }
 }
 
 #[test]
@@ -172,6 +204,13 @@ fn mistakes_in_a_calibration_are_named_with_what_would_do() {
             &["case shuttle cannot be calibrated for mlr"],
         ),
         (&["calibrate", "teleop"], &["--mlr", "--figure"]),
+        (
+            &["calibrate", "teleop", "--mlr", "1.5"],
+            &[
+                "\"teleop\" is taken for case teleoperation",
+                "mlr 1.5 is outside 0.001..=0.3",
+            ],
+        ),
         (
             &["calibrate", "shuttle", "--figure", "mlr"],
             &["mlr is not NAME=VALUE"],
