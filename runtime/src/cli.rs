@@ -3,7 +3,7 @@
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
-use clap::{Args, Parser, Subcommand};
+use clap::{ArgGroup, Args, Parser, Subcommand};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -120,19 +120,15 @@ pub struct BatchArgs {
 
 /// Arguments of a calibration.
 #[derive(Debug, Args)]
+#[command(group = ArgGroup::new("wanted").required(true).args(["mlr", "figure"]))]
 pub struct CalibrateArgs {
     /// The case; as much of its name as no other case has is enough.
     pub case: String,
-    /// The motion loss rate to come out, 0..=1; short for --figure mlr=RATIO.
-    #[arg(
-        long,
-        value_name = "RATIO",
-        allow_negative_numbers = true,
-        required_unless_present = "figure"
-    )]
+    /// The motion loss rate to come out; short for --figure mlr=RATIO.
+    #[arg(long, value_name = "RATIO", allow_negative_numbers = true)]
     pub mlr: Option<f64>,
     /// The figure and the value to come out; `hil-runtime cases` lists the figures of each case.
-    #[arg(long, value_name = "NAME=VALUE", conflicts_with = "mlr")]
+    #[arg(long, value_name = "NAME=VALUE")]
     pub figure: Option<String>,
     /// A topology file with the case's parameters; without it they have their defaults.
     #[arg(long, short, value_name = "FILE")]

@@ -159,6 +159,13 @@ impl CaseStudy for Teleoperation {
         ChannelSpec::recorded::<EgmArrival>(EGM_RECEIVED, "robot"),
         ChannelSpec::recorded::<MotionArrival>(MOTION_RECEIVED, "robot"),
     ];
+    const SERIES: &'static [&'static str] = &[
+        "fig6-input",
+        "fig7-9-tool-y",
+        "fig10-joints",
+        "fig11-joint-error",
+    ];
+    const CALIBRATED_FIGURES: &'static [&'static str] = &["mlr"];
     type Parameters = TeleoperationParameters;
 
     fn read_files(

@@ -67,9 +67,13 @@ fn outages_before(
     let before = |spec: &ChannelSpec| {
         let story = stories.iter().find(|one| one.channel == spec.name)?;
         let lost_published_ns = published_ns(event, spec.name, log);
-        story.before(&Happening {
-            at: Some((event.at, Side::Consumer)),
-            lost_published_ns: &lost_published_ns,
+        // A channel that never delivered anything has no consumer's view of its outage.
+        let mut sides = [Side::Consumer, Side::Producer].into_iter();
+        sides.find_map(|side| {
+            story.before(&Happening {
+                at: Some((event.at, side)),
+                lost_published_ns: &lost_published_ns,
+            })
         })
     };
     let concerned = event.concerned_channels(channels);

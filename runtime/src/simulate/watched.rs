@@ -16,9 +16,7 @@ pub(super) struct Watch(Rc<RefCell<OutageFinder>>);
 impl Watch {
     /// `carrier`, which will carry as before, and the watch over it.
     pub(super) fn over(carrier: Box<dyn Carrier>) -> (Box<dyn Carrier>, Self) {
-        let watch = Self(Rc::new(RefCell::new(OutageFinder::new(Some(
-            Instant::ZERO,
-        )))));
+        let watch = Self(Rc::default());
         let watched = Watched {
             carrier,
             watch: watch.clone(),
@@ -108,7 +106,7 @@ mod tests {
         assert_eq!((found.lost_count, found.first_sequence), (10, 10));
         assert_eq!(found.from_ns, Some(10_000_000));
         assert_eq!(found.until_ns, Some(20_000_000));
-        assert_eq!(found.silent_from_ns, Some(12_000_000));
+        assert_eq!(found.silent_from_ns, Some(13_000_000));
         assert_eq!(found.silent_until_ns, Some(23_000_000));
     }
 }

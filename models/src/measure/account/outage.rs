@@ -34,8 +34,9 @@ pub struct Outage {
     /// When the next message that arrived was published, on the producer's clock; `None` when
     /// none did.
     pub until_ns: Option<i64>,
-    /// When the consumer had taken its last message before, on the consumer's clock, or the run's
-    /// beginning there; `None` when the consumer's records are not at hand.
+    /// When the consumer would have taken the first of them, on the consumer's clock: as fast as
+    /// the last message it took before, or else the next one after; no alignment of clocks is
+    /// needed for that. `None` when it took neither, or its records are not at hand.
     pub silent_from_ns: Option<i64>,
     /// When the consumer took its next message; `None` when it never did.
     pub silent_until_ns: Option<i64>,
@@ -67,19 +68,25 @@ pub struct OutageFinder {
     is_open: bool,
     /// From here on, the consumer has taken nothing since.
     silent_index: usize,
-    last_taken_ns: Option<i64>,
+    last_taken: Option<TakenAt>,
+}
+
+/// One message that was taken, on both clocks.
+#[derive(Debug, Clone, Copy)]
+struct TakenAt {
+    published_ns: i64,
+    taken_ns: i64,
+}
+
+impl TakenAt {
+    /// When a message published at `published_ns` would have been taken, had it been as fast.
+    const fn would_take_ns(self, published_ns: i64) -> i64 {
+        let later_ns = published_ns.saturating_sub(self.published_ns);
+        self.taken_ns.saturating_add(later_ns)
+    }
 }
 
 impl OutageFinder {
-    /// A finder for a consumer that began at `start` on its clock; `None` when its records are not
-    /// at hand.
-    pub fn new(start: Option<Instant>) -> Self {
-        Self {
-            last_taken_ns: start.map(Instant::as_ns),
-            ..Self::default()
-        }
-    }
-
     /// `count` messages from `sequence` on were lost; the first was published at `published_ns`,
     /// where that is known.
     pub fn lost(&mut self, sequence: u64, count: u64, published_ns: Option<i64>) {
@@ -90,14 +97,17 @@ impl OutageFinder {
                 first_sequence: sequence,
                 from_ns: None,
                 until_ns: None,
-                silent_from_ns: self.last_taken_ns,
+                silent_from_ns: None,
                 silent_until_ns: None,
                 interruption_index: None,
             });
         }
+        let last_taken = self.last_taken;
         if let Some(outage) = self.found.last_mut() {
             outage.lost_count = outage.lost_count.saturating_add(count);
             outage.from_ns = outage.from_ns.or(published_ns);
+            let would_take_ns = || Some(last_taken?.would_take_ns(outage.from_ns?));
+            outage.silent_from_ns = outage.silent_from_ns.or_else(would_take_ns);
         }
     }
 
@@ -109,13 +119,20 @@ impl OutageFinder {
         {
             outage.until_ns = published_ns;
         }
-        if let Some(taken_ns) = taken_ns {
-            for outage in &mut self.found[self.silent_index..] {
-                outage.silent_until_ns = Some(taken_ns);
-            }
-            self.silent_index = self.found.len();
-            self.last_taken_ns = self.last_taken_ns.max(Some(taken_ns));
+        let (Some(published_ns), Some(taken_ns)) = (published_ns, taken_ns) else {
+            return;
+        };
+        let taken = TakenAt {
+            published_ns,
+            taken_ns,
+        };
+        for outage in &mut self.found[self.silent_index..] {
+            outage.silent_until_ns = Some(taken_ns);
+            let would_take_ns = || Some(taken.would_take_ns(outage.from_ns?));
+            outage.silent_from_ns = outage.silent_from_ns.or_else(would_take_ns);
         }
+        self.silent_index = self.found.len();
+        self.last_taken = Some(taken);
     }
 
     /// The outages, in order.
@@ -148,8 +165,7 @@ pub fn outages(records: &ChannelRecords<'_>, context: &AccountContext<'_>) -> Ve
     let records = records.on(context.path);
     let join = Join::new(&records);
     let mut judge = Judge::new(&records, context, &join);
-    let start = context.consumer_run.map(|run| run.start);
-    let mut finder = OutageFinder::new(start.filter(|_| records.taken.is_some()));
+    let mut finder = OutageFinder::default();
     for joined in join {
         let fate = judge.judge(&joined);
         finder.see(&joined, fate, judge.last_interruption());
@@ -428,11 +444,11 @@ mod tests {
                 (702, 1, Some(702), Some(703)),
             ]
         );
-        assert_eq!(found[0].silent_from_ns, Some(99 * PERIOD_NS + TAKEN_NS));
+        assert_eq!(found[0].silent_from_ns, Some(100 * PERIOD_NS + TAKEN_NS));
         assert_eq!(found[0].silent_until_ns, Some(150 * PERIOD_NS + TAKEN_NS));
         // What got through but was not taken leaves the consumer in silence.
-        for outage in &found[3..] {
-            assert_eq!(outage.silent_from_ns, Some(699 * PERIOD_NS + TAKEN_NS));
+        for (outage, from) in found[3..].iter().zip([700, 702]) {
+            assert_eq!(outage.silent_from_ns, Some(from * PERIOD_NS + TAKEN_NS));
             assert_eq!(outage.silent_until_ns, Some(703 * PERIOD_NS + TAKEN_NS));
         }
         let total = found.iter().map(|outage| outage.lost_count).sum::<u64>();
@@ -564,6 +580,36 @@ mod tests {
         assert!(matches!(late, (9_000, Standing::OverFor(_), 0)), "{late:?}");
         assert_eq!(named(None, 9_500), Some((9_000, Standing::Unknown, 0)));
         assert_eq!(named(None, 8_000), None);
+    }
+
+    #[test]
+    fn before_an_outage_a_consumer_that_is_sent_nothing_misses_nothing() {
+        let ns = |ms: i64| ms * PERIOD_NS;
+        let happened = |outages: &[Outage], ms| {
+            let found = foregoing(outages, &happening(ms, Side::Consumer));
+            found.map(|found| found.standing)
+        };
+        // One message a minute, each taken after 50 ms.
+        let mut finder = OutageFinder::default();
+        finder.arrived(Some(0), Some(ns(50)));
+        finder.lost(1, 1, Some(ns(60_000)));
+        let open = finder.finish();
+        assert_eq!(open[0].silent_from_ns, Some(ns(60_050)));
+        assert_eq!(happened(&open, 60_049), None);
+        assert_eq!(happened(&open, 60_050), Some(Standing::UnderWay));
+        // Without a message before, the one after tells how long they take.
+        let mut finder = OutageFinder::default();
+        finder.lost(0, 1, Some(ns(1_000)));
+        finder.arrived(Some(ns(2_000)), Some(ns(2_070)));
+        let first = finder.finish();
+        assert_eq!(first[0].silent_from_ns, Some(ns(1_070)));
+        assert_eq!(first[0].silent_until_ns, Some(ns(2_070)));
+        // With none at all, nobody knows.
+        let mut finder = OutageFinder::default();
+        finder.lost(0, 1, Some(ns(1_000)));
+        let silent = finder.finish();
+        assert_eq!(silent[0].silent_from_ns, None);
+        assert_eq!(happened(&silent, 1_000), None);
     }
 
     #[test]
