@@ -97,7 +97,7 @@ pub trait CaseStudy: Sized + Debug + 'static {
 /// One channel of a case study: who publishes what to whom, or only to the record.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ChannelSpec {
-    /// Name, also of the shared-memory service, e.g. `arm/command`.
+    /// Name, also of the shared-memory service, e.g. `egm/right/command`.
     pub name: &'static str,
     /// What it carries.
     pub message: MessageType,

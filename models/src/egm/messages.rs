@@ -1,6 +1,8 @@
 //! Messages of guided motion as they lie in shared memory. Layout only; SI units and radians; joints
 //! in chain order, see [`crate::yumi`]. The maker's own datagrams are in [`crate::egm::wire`].
 
+mod numbers;
+
 use bytemuck::{Pod, Zeroable};
 
 use crate::message::Message;
@@ -21,6 +23,14 @@ impl Side {
 
     /// 0 for right, 1 for left: its number in messages.
     pub const fn index(self) -> usize {
+        match self {
+            Self::Right => 0,
+            Self::Left => 1,
+        }
+    }
+
+    /// As [`Side::index`], as messages carry it.
+    pub const fn number(self) -> u32 {
         match self {
             Self::Right => 0,
             Self::Left => 1,
@@ -88,7 +98,7 @@ pub struct EgmFeedback {
     /// [`EgmFeedback::HAS_REFERENCE`].
     pub reference_frame_index: u64,
     /// Time since the reference in use arrived at the robot, queueing included; without
-    /// [`EgmFeedback::HAS_REFERENCE`], since the session's start.
+    /// [`EgmFeedback::HAS_REFERENCE`], since its session began to be set up or to run.
     pub reference_age_ns: i64,
     /// Joint positions as measured.
     pub measured_rad: Joints,
@@ -99,7 +109,8 @@ pub struct EgmFeedback {
     pub tool: Pose,
     /// The controller's clock in milliseconds, wrapping; the protocol's `tm`.
     pub clock_ms: u32,
-    /// Counts the feedback of this session from 0; the protocol's `seqno`.
+    /// Counts the cycles since guided motion last began to run, from 0; the protocol's `seqno`. A
+    /// skipped cycle leaves a gap.
     pub seqno: u32,
     /// Counts the sessions (activations) since the robot's start, from 1; 0 before the first.
     pub session: u32,
@@ -227,25 +238,26 @@ const _: () = assert!(size_of::<EgmEvent>() == 56);
 pub enum EgmEventKind {
     /// The controller's first cycle: the origin of its grid.
     Started = 0,
-    /// A session is being set up.
+    /// A session is being set up; `value`: seconds that takes.
     Activating = 1,
     /// Guided motion runs; `value`: seconds since the last session ended (or since the start).
     Running = 2,
     /// A session ended; `cause`: [`EndCause`]; `value` against `limit`: what tripped it, in the
-    /// cause's unit.
+    /// cause's unit. Holding and throttling end with it untold.
     Ended = 3,
     /// `MaxSpeedDeviation` began to bind; `value`: deg/s asked, `limit`: deg/s allowed.
     SpeedThrottled = 4,
-    /// It binds no more; `value`: seconds it did.
+    /// It has not bound for half a second; `value`: seconds it did, `limit`: deg/s allowed.
     SpeedFree = 5,
-    /// Commands stopped coming: the last one goes on acting.
+    /// Commands stopped coming: the last one goes on acting; `value`: seconds since it was taken.
     HoldBegan = 6,
     /// Commands are back; `value`: seconds without.
     HoldEnded = 7,
     /// A command was refused; `cause`: [`CommandRefusal`]; `value` against `limit`: joint value
     /// (rad); `count`: joint, chain order from 0. Told for the first of a row of equal refusals.
     CommandRefused = 8,
-    /// The queue was full: `count` commands were dropped so far.
+    /// The queue of `limit` commands was full: `count` were dropped so far. Told again only after
+    /// it was half empty.
     QueueOverflow = 9,
     /// A motion of its own began; `cause`: the request's kind.
     MotionBegan = 10,
@@ -261,9 +273,10 @@ pub enum EndCause {
     CommTimeout = 1,
     /// All joints stayed within the convergence window for `CondTime`; unit: s.
     ConditionTime = 2,
-    /// A joint went farther from the start than `MaxPosDeviation`; unit: deg.
+    /// A joint went farther from the start than `MaxPosDeviation`; unit: deg; `count`: joint,
+    /// chain order from 0.
     PositionDeviation = 3,
-    /// A request asked for it.
+    /// A request asked for it; unit: s from there to the end.
     Requested = 4,
 }
 
@@ -275,7 +288,7 @@ pub enum CommandRefusal {
     NotFinite = 1,
     /// A position is outside the joint's limits.
     OutsideLimits = 2,
-    /// No session is set up: nobody takes commands.
+    /// Guided motion does not run: nobody takes commands.
     NoSession = 3,
 }
 

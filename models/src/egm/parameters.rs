@@ -1,11 +1,14 @@
 //! `[case.parameters.egm]`: every setting of the simulated controller, presets of them, and their
 //! ranges. Names follow the maker's where it has one.
 
+use core::ops::RangeInclusive;
 use core::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
 use crate::case_study::ParameterError;
+use crate::egm::controller::DELAY_CYCLES_MAX;
+use crate::egm::messages::{EgmStartParameters, MotionRefusal};
 
 /// A named set of settings that single keys may then change.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -181,7 +184,7 @@ impl ControllerSettings {
     pub fn of(preset: Preset) -> Self {
         // The maker's defaults; `RampInTime` and the set-up time have none in its manual.
         let abb = Self {
-            cycle: Duration::from_micros(4000),
+            cycle: Duration::from_millis(4),
             queue: QueuePolicy::Fifo1,
             queue_capacity: 1000,
             position_gain_per_s: 5.0,
@@ -233,11 +236,180 @@ impl ControllerSettings {
 }
 
 impl EgmParameters {
-    /// The settings in force.
+    /// The settings in force: the preset's, where no key changes them.
     ///
     /// # Errors
     /// The first key outside its range, as `egm.<key>`.
     pub fn settings(&self) -> Result<ControllerSettings, ParameterError> {
-        todo!()
+        let preset = ControllerSettings::of(self.preset);
+        let (speed_deg, position_deg) = (
+            MAX_SPEED_DEVIATION_DEG_PER_S.key(self.max_speed_deviation_deg_per_s)?,
+            MAX_POSITION_DEVIATION_DEG.key(self.max_position_deviation_deg)?,
+        );
+        let cycle = CYCLE_US.key(self.cycle_us)?;
+        let capacity = QUEUE_CAPACITY.key(self.queue_capacity.map(f64::from))?;
+        let delay = CONTROL_DELAY_CYCLES.key(self.control_delay_cycles.map(f64::from))?;
+        let convergence = CONVERGENCE_DEG.key(self.convergence_deg)?;
+        let restart_wait = RESTART_WAIT_S.key(self.restart_wait_s)?;
+        Ok(ControllerSettings {
+            cycle: cycle.map_or(preset.cycle, |us| Duration::from_secs_f64(us * 1e-6)),
+            queue: self.queue.unwrap_or(preset.queue),
+            queue_capacity: capacity.map_or(preset.queue_capacity, whole),
+            position_gain_per_s: POSITION_GAIN_PER_S
+                .key(self.position_gain_per_s)?
+                .unwrap_or(preset.position_gain_per_s),
+            low_pass_hz: LOW_PASS_HZ
+                .key(self.low_pass_hz)?
+                .unwrap_or(preset.low_pass_hz),
+            position_correction_ratio: POSITION_CORRECTION_RATIO
+                .key(self.position_correction_ratio)?
+                .unwrap_or(preset.position_correction_ratio),
+            ramp_in_s: RAMP_IN_S.key(self.ramp_in_s)?.unwrap_or(preset.ramp_in_s),
+            ramp_out_s: RAMP_OUT_S
+                .key(self.ramp_out_s)?
+                .unwrap_or(preset.ramp_out_s),
+            max_speed_deviation_rad_per_s: speed_deg
+                .map_or(preset.max_speed_deviation_rad_per_s, f64::to_radians),
+            max_position_deviation_rad: position_deg
+                .map_or(preset.max_position_deviation_rad, f64::to_radians),
+            convergence_rad: convergence.map_or(preset.convergence_rad, f64::to_radians),
+            condition_time_s: CONDITION_TIME_S
+                .key(self.condition_time_s)?
+                .unwrap_or(preset.condition_time_s),
+            comm_timeout_s: COMM_TIMEOUT_S
+                .key(self.comm_timeout_s)?
+                .unwrap_or(preset.comm_timeout_s),
+            stop_mode: self.stop_mode.unwrap_or(preset.stop_mode),
+            start: self.start.unwrap_or(preset.start),
+            restart: self.restart.unwrap_or(preset.restart),
+            restart_wait_s: restart_wait.unwrap_or(preset.restart_wait_s),
+            activation_s: ACTIVATION_S
+                .key(self.activation_s)?
+                .unwrap_or(preset.activation_s),
+            control_delay_cycles: delay.map_or(preset.control_delay_cycles, whole),
+        })
     }
 }
+
+impl ControllerSettings {
+    /// These settings with what `parameters` ask for.
+    ///
+    /// # Errors
+    /// [`MotionRefusal::BadNumber`] when one is outside the range of its key in
+    /// [`EgmParameters`]; NaN asks for nothing.
+    pub fn with(&self, parameters: &EgmStartParameters) -> Result<Self, MotionRefusal> {
+        let degrees = |range: &Range, asked: f64, kept: f64| {
+            // Within a millionth: the bound itself comes back from radians with changed digits.
+            let asked_deg = asked.to_degrees();
+            let (min, max) = (*range.allowed.start(), *range.allowed.end());
+            let within = asked_deg.clamp(min, max);
+            let is_rounded = (asked_deg - within).abs() <= 1e-6 * within;
+            range.or_kept(
+                if is_rounded { within } else { asked_deg },
+                kept.to_degrees(),
+            )?;
+            Ok(if asked.is_nan() { kept } else { asked })
+        };
+        Ok(Self {
+            comm_timeout_s: COMM_TIMEOUT_S
+                .or_kept(parameters.comm_timeout_s, self.comm_timeout_s)?,
+            condition_time_s: CONDITION_TIME_S
+                .or_kept(parameters.condition_time_s, self.condition_time_s)?,
+            max_speed_deviation_rad_per_s: degrees(
+                &MAX_SPEED_DEVIATION_DEG_PER_S,
+                parameters.max_speed_deviation_rad_per_s,
+                self.max_speed_deviation_rad_per_s,
+            )?,
+            max_position_deviation_rad: degrees(
+                &MAX_POSITION_DEVIATION_DEG,
+                parameters.max_position_deviation_rad,
+                self.max_position_deviation_rad,
+            )?,
+            ramp_in_s: RAMP_IN_S.or_kept(parameters.ramp_in_s, self.ramp_in_s)?,
+            position_correction_ratio: POSITION_CORRECTION_RATIO.or_kept(
+                parameters.position_correction_ratio,
+                self.position_correction_ratio,
+            )?,
+            position_gain_per_s: POSITION_GAIN_PER_S
+                .or_kept(parameters.position_gain_per_s, self.position_gain_per_s)?,
+            low_pass_hz: LOW_PASS_HZ.or_kept(parameters.low_pass_hz, self.low_pass_hz)?,
+            ..*self
+        })
+    }
+}
+
+/// A number that passed its range, as a count.
+#[allow(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "whole and within a range of small counts"
+)]
+fn whole(number: f64) -> usize {
+    number as usize
+}
+
+/// What a key may be.
+struct Range {
+    key: &'static str,
+    allowed: RangeInclusive<f64>,
+    text: &'static str,
+}
+
+impl Range {
+    const fn new(key: &'static str, min: f64, max: f64, text: &'static str) -> Self {
+        Self {
+            key,
+            allowed: min..=max,
+            text,
+        }
+    }
+
+    fn key(&self, value: Option<f64>) -> Result<Option<f64>, ParameterError> {
+        if let Some(value) = value {
+            ParameterError::check(self.key, value, self.allowed.clone(), self.text)?;
+        }
+        Ok(value)
+    }
+
+    fn or_kept(&self, asked: f64, kept: f64) -> Result<f64, MotionRefusal> {
+        if asked.is_nan() {
+            Ok(kept)
+        } else if self.allowed.contains(&asked) {
+            Ok(asked)
+        } else {
+            Err(MotionRefusal::BadNumber)
+        }
+    }
+}
+
+const CYCLE_US: Range = Range::new("egm.cycle_us", 1000.0, 100_000.0, "1000..=100000");
+const QUEUE_CAPACITY: Range = Range::new("egm.queue_capacity", 1.0, 100_000.0, "1..=100000");
+const POSITION_GAIN_PER_S: Range = Range::new("egm.position_gain_per_s", 0.0, 20.0, "0..=20");
+const LOW_PASS_HZ: Range = Range::new("egm.low_pass_hz", 0.0, 100.0, "0..=100");
+const POSITION_CORRECTION_RATIO: Range =
+    Range::new("egm.position_correction_ratio", 0.0, 1.0, "0..=1");
+const RAMP_IN_S: Range = Range::new("egm.ramp_in_s", 0.0, 10.0, "0..=10");
+const RAMP_OUT_S: Range = Range::new("egm.ramp_out_s", 0.0, 10.0, "0..=10");
+const MAX_SPEED_DEVIATION_DEG_PER_S: Range = Range::new(
+    "egm.max_speed_deviation_deg_per_s",
+    0.01,
+    1000.0,
+    "0.01..=1000",
+);
+const MAX_POSITION_DEVIATION_DEG: Range =
+    Range::new("egm.max_position_deviation_deg", 0.1, 1000.0, "0.1..=1000");
+const CONVERGENCE_DEG: Range = Range::new("egm.convergence_deg", 0.001, 100.0, "0.001..=100");
+const CONDITION_TIME_S: Range = Range::new("egm.condition_time_s", 0.0, 1e6, "0..=1000000");
+const COMM_TIMEOUT_S: Range = Range::new("egm.comm_timeout_s", 0.004, 1e6, "0.004..=1000000");
+const RESTART_WAIT_S: Range = Range::new("egm.restart_wait_s", 0.0, 60.0, "0..=60");
+const ACTIVATION_S: Range = Range::new("egm.activation_s", 0.0, 60.0, "0..=60");
+const CONTROL_DELAY_CYCLES: Range = Range::new(
+    "egm.control_delay_cycles",
+    0.0,
+    DELAY_CYCLES_MAX as f64,
+    "0..=16",
+);
+
+#[cfg(test)]
+#[path = "parameters_tests.rs"]
+mod tests;

@@ -5,12 +5,12 @@
 //! both must have read one clock. Where they did not, joint error and lag are unavailable.
 
 use crate::case_study::{Metric, Score};
+use crate::egm::messages::{EgmCommand, EgmFeedback};
 use crate::run_log::RunLog;
-use crate::teleoperation::messages::{JointCommand, JointStatus};
 use crate::teleoperation::series::{
     Estimate, Sample, lag_s, peak_to_peak, peaks, poisson_interval,
 };
-use crate::teleoperation::{ARM_COMMAND, ARM_STATUS, Teleoperation};
+use crate::teleoperation::{EGM_RIGHT_COMMAND, EGM_RIGHT_FEEDBACK, Teleoperation};
 use crate::time::Instant;
 use crate::yumi::arm::Arm;
 use crate::yumi::{JOINT_COUNT, Joints};
@@ -35,7 +35,8 @@ pub(crate) fn score(case: &Teleoperation, log: &RunLog) -> Score {
     let mut metrics = Vec::from(motion_loops(case, &sent.tool_y, &moved.tool_y));
     metrics.extend(moved.joint_error());
     metrics.push(tracking_lag(&sent.tool_y, &moved.tool_y, period_s));
-    metrics.push(tool_travel(&moved.tool_y, period_s));
+    let swung = after_rest(&moved.tool_y, case.parameters.motion_start_s);
+    metrics.push(tool_travel(swung, period_s));
     metrics.extend(events(&sent, &moved));
     if !log.has_one_clock() {
         for metric in &mut metrics {
@@ -69,14 +70,13 @@ struct Sent {
 
 impl Sent {
     fn read(log: &RunLog) -> Self {
-        const LIMITED: u32 =
-            JointCommand::RIGHT_LIMITED | JointCommand::LEFT_LIMITED | JointCommand::JUMP_LIMITED;
+        const LIMITED: u32 = EgmCommand::LIMITED | EgmCommand::JUMP_LIMITED;
         let arm = Arm::right();
         let mut sent = Self::default();
-        for (at, command) in log.messages::<JointCommand>(ARM_COMMAND) {
-            let tool_y_m = arm.tool(&command.right.position_rad).translation.y;
+        for (at, command) in log.messages::<EgmCommand>(EGM_RIGHT_COMMAND) {
+            let tool_y_m = arm.tool(&command.position_rad).translation.y;
             sent.tool_y.push((at.as_ns(), tool_y_m));
-            sent.failure_count += u64::from(command.is_unreachable());
+            sent.failure_count += u64::from(command.flags & EgmCommand::UNREACHABLE != 0);
             sent.limited_count += u64::from(command.flags & LIMITED != 0);
         }
         sent
@@ -107,24 +107,22 @@ struct ErrorSums {
 impl Moved {
     fn read(log: &RunLog, period_s: f64) -> Self {
         let mut moved = Self::default();
-        let mut commands = log.messages::<JointCommand>(ARM_COMMAND).peekable();
-        let mut desired: Option<(Instant, JointCommand)> = None;
+        let mut commands = log.messages::<EgmCommand>(EGM_RIGHT_COMMAND).peekable();
+        let mut desired: Option<(Instant, EgmCommand)> = None;
         let mut block = Block::default();
         let mut was_holding = false;
-        for (at, status) in log.messages::<JointStatus>(ARM_STATUS) {
+        for (at, status) in log.messages::<EgmFeedback>(EGM_RIGHT_FEEDBACK) {
             while let Some((sent_at, command)) = commands.next_if(|next| next.0 <= at) {
                 let first_at = desired.map_or(sent_at, |(first_at, _)| first_at);
                 desired = Some((first_at, command));
             }
-            moved
-                .tool_y
-                .push((at.as_ns(), status.right.tool.position_m[1]));
-            moved.hold_count += u64::from(status.is_holding() && !was_holding);
-            moved.holding_count += u64::from(status.is_holding());
-            was_holding = status.is_holding();
+            moved.tool_y.push((at.as_ns(), status.tool.position_m[1]));
+            moved.hold_count += u64::from(status.has(EgmFeedback::HOLDING) && !was_holding);
+            moved.holding_count += u64::from(status.has(EgmFeedback::HOLDING));
+            was_holding = status.has(EgmFeedback::HOLDING);
             if let Some((first_at, command)) = &desired {
-                let desired_rad = &command.right.position_rad;
-                let square = moved.error.add(desired_rad, &status.right.measured_rad);
+                let desired_rad = &command.position_rad;
+                let square = moved.error.add(desired_rad, &status.measured_rad);
                 let index = (at.seconds_since(*first_at) / period_s).floor();
                 block.add(index, square, &mut moved.error.blocks);
             }
@@ -322,6 +320,13 @@ fn tracking_lag(sent: &[Sample], moved: &[Sample], period_s: f64) -> Metric {
     }
 }
 
+/// `moved` without the time in which the human rested; hosts start together within milliseconds.
+fn after_rest(moved: &[Sample], motion_start_s: f64) -> &[Sample] {
+    let begin = moved.first().map_or(0, |(at, _)| *at);
+    let is_rest = |(at, _): &Sample| ((at - begin) as f64) < motion_start_s * 1e9;
+    &moved[moved.partition_point(is_rest)..]
+}
+
 fn tool_travel(moved: &[Sample], period_s: f64) -> Metric {
     #[allow(
         clippy::cast_possible_truncation,
@@ -415,7 +420,7 @@ mod tests {
         let simulation = Simulation::new(&case, BTreeMap::new()).unwrap();
         let whole = simulation.run(Duration::from_secs(20)).unwrap().log;
         let mut log = RunLog::default();
-        for (channel, offset_ns) in [(ARM_COMMAND, 0), (ARM_STATUS, 77_000_000_000)] {
+        for (channel, offset_ns) in [(EGM_RIGHT_COMMAND, 0), (EGM_RIGHT_FEEDBACK, 77_000_000_000)] {
             for logged in whole.raw(channel) {
                 let mut envelope = logged.envelope;
                 envelope.published_ns += offset_ns;

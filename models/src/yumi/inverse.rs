@@ -60,6 +60,11 @@ impl Tracker {
         }
     }
 
+    /// Goes on from `q_rad`; the posture the redundant joint is pulled to stays.
+    pub fn restart_at(&mut self, q_rad: Joints) {
+        self.q_rad = q_rad.into();
+    }
+
     /// The joint positions of the last call.
     pub fn q_rad(&self) -> &Joints {
         self.q_rad.as_ref()

@@ -169,7 +169,7 @@ pub enum OnExit {
 /// Identity of a channel's messages; owned, because foreign channels name theirs in the file.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct MessageLayout {
-    /// Name and version, e.g. `hil.JointCommand.v1`.
+    /// Name and version, e.g. `hil.EgmCommand.v1`.
     pub name: String,
     /// Size of one message.
     pub size_bytes: usize,
