@@ -1,0 +1,430 @@
+//! The score of constructed logs and of short runs in virtual time.
+
+use core::time::Duration;
+use std::collections::BTreeMap;
+
+use bytemuck::Zeroable;
+
+use super::*;
+use crate::case_study::CaseStudy;
+use crate::egm::messages::{EgmEvent, EgmEventKind, EndCause, SessionState, Side};
+use crate::link::{Fate, LinkModel};
+use crate::message::{Envelope, Message};
+use crate::score::Severity;
+use crate::simulation::{Carrier, Simulation};
+use crate::teleoperation::{
+    EGM_EVENT, EGM_RIGHT_COMMAND, EGM_RIGHT_FEEDBACK, TeleoperationParameters,
+};
+use crate::time::Instant;
+use crate::yumi::arm::RIGHT_START_RAD;
+
+fn case(change: impl FnOnce(&mut TeleoperationParameters)) -> Teleoperation {
+    let mut parameters = TeleoperationParameters {
+        motion_start_s: 0.0,
+        ..TeleoperationParameters::default()
+    };
+    change(&mut parameters);
+    Teleoperation::new(parameters, 3).unwrap()
+}
+
+/// Loses, or holds until the end, everything offered in a stretch of time.
+#[derive(Debug, Clone, Copy)]
+struct Silence {
+    from_s: f64,
+    until_s: f64,
+    is_buffered: bool,
+}
+
+fn at_s(seconds: f64) -> Instant {
+    Instant::ZERO + Duration::from_secs_f64(seconds)
+}
+
+impl LinkModel for Silence {
+    fn offer(&mut self, now: Instant, _length_bytes: usize) -> Fate {
+        if now < at_s(self.from_s) || now >= at_s(self.until_s) {
+            Fate::Delivered(now)
+        } else if self.is_buffered {
+            Fate::Delivered(at_s(self.until_s))
+        } else {
+            Fate::Lost
+        }
+    }
+}
+
+fn run(case: &Teleoperation, silence: Option<Silence>, duration_s: f64) -> RunLog {
+    let carriers: BTreeMap<String, Box<dyn Carrier>> = silence
+        .map(|silence| {
+            let carrier: Box<dyn Carrier> = Box::new(silence);
+            (EGM_RIGHT_COMMAND.to_owned(), carrier)
+        })
+        .into_iter()
+        .collect();
+    let simulation = Simulation::new(case, carriers).unwrap();
+    simulation
+        .run(Duration::from_secs_f64(duration_s))
+        .unwrap()
+        .log
+}
+
+fn value(score: &Score, name: &str) -> f64 {
+    let metric = score
+        .get(name)
+        .unwrap_or_else(|| panic!("no metric {name}"));
+    metric.value.unwrap_or_else(|| panic!("{metric:?}"))
+}
+
+fn silence(from_s: f64, until_s: f64) -> Silence {
+    Silence {
+        from_s,
+        until_s,
+        is_buffered: false,
+    }
+}
+
+const PERIOD_S: f64 = 4.033;
+
+#[test]
+fn an_empty_log_gives_no_figure_but_a_reason_for_each() {
+    let case = case(|_| {});
+    let score = case.score(&RunLog::default());
+    assert_eq!(score.metrics.len(), 35);
+    for metric in &score.metrics {
+        assert_eq!(metric.value, None, "{metric:?}");
+        assert_eq!(metric.interval, None, "{metric:?}");
+        assert!(!metric.method.is_empty());
+    }
+    assert_eq!(score.events, []);
+    assert_eq!(case.series(&RunLog::default()), []);
+}
+
+#[test]
+fn a_perfect_channel_loses_nothing_and_adds_no_error() {
+    let case = case(|_| {});
+    let score = case.score(&run(&case, None, 6.0 * PERIOD_S));
+    for name in [
+        "motion_loss_ratio",
+        "egm_trip_count",
+        "hold_count",
+        "hold_time_ratio",
+        "joint_error_network_rad_rms",
+        "joint_error_network_rad_max",
+        "loops_extra_count",
+        "ik_failure_count",
+        "ik_limited_count",
+    ] {
+        assert!(value(&score, name).abs() < 1e-12, "{name}");
+    }
+    let total = value(&score, "joint_error_rad_rms");
+    let controller = value(&score, "joint_error_controller_rad_rms");
+    assert!((total - controller).abs() < 1e-12, "{total} {controller}");
+    assert!((value(&score, "egm_session_count") - 1.0).abs() < 0.1);
+    // A command every second cycle: its age is one or two cycles when feedback tells it.
+    assert!((0.0..=12.0).contains(&value(&score, "reference_age_ms_max")));
+    assert!(value(&score, "reference_age_ms_per_s").abs() < 0.05);
+    let names: Vec<_> = score.metrics.iter().map(|metric| metric.name).collect();
+    for (index, name) in names.iter().enumerate() {
+        assert!(!names[..index].contains(name), "{name} twice");
+    }
+}
+
+#[test]
+fn a_loop_lost_to_a_time_out_is_told_with_its_cause_and_the_commands_that_were_lost() {
+    let case = case(|_| {});
+    let log = run(&case, Some(silence(12.0, 14.5)), 8.0 * PERIOD_S);
+    let score = case.score(&log);
+    assert!((value(&score, "egm_trip_count") - 1.0).abs() < 0.1);
+    assert!((value(&score, "loops_lost_by_trip_count") - 1.0).abs() < 0.1);
+    assert!((value(&score, "reactivation_s_max") - 2.0).abs() < 0.01);
+    assert!(value(&score, "joint_error_network_rad_rms") > 0.01);
+    let lost: Vec<_> = score
+        .events
+        .iter()
+        .filter(|event| event.severity == Severity::Incident)
+        .collect();
+    assert_eq!(lost.len(), 1);
+    assert!(
+        lost[0].what.contains("ended by CommTimeout"),
+        "{}",
+        lost[0].what
+    );
+    assert_eq!(lost[0].messages.len(), 16);
+    // The first of them was the first to be lost.
+    let first = log.raw(EGM_RIGHT_COMMAND).iter();
+    let first = first
+        .clone()
+        .find(|logged| Instant::from_ns(logged.envelope.published_ns) >= at_s(12.0));
+    assert_eq!(
+        lost[0].messages[0].sequence,
+        first.unwrap().envelope.sequence
+    );
+    let ended = score
+        .events
+        .iter()
+        .find(|event| event.what.contains("CommTimeout ="));
+    let ended = ended.unwrap();
+    assert_eq!(ended.severity, Severity::Hazard);
+    assert_eq!(ended.messages[0], lost[0].messages[0]);
+    assert!(score.events.is_sorted_by_key(|event| event.at));
+}
+
+#[test]
+fn a_loop_lost_in_a_hold_is_told_as_held() {
+    let case = case(|parameters| {
+        parameters.egm.comm_timeout_s = Some(60.0);
+    });
+    let log = run(&case, Some(silence(12.0, 12.0 + PERIOD_S)), 8.0 * PERIOD_S);
+    let score = case.score(&log);
+    assert!(value(&score, "egm_trip_count").abs() < 0.1);
+    assert!((value(&score, "hold_count") - 1.0).abs() < 0.1);
+    assert!((value(&score, "loops_lost_by_hold_count") - 1.0).abs() < 0.1);
+    let incident = score
+        .events
+        .iter()
+        .find(|event| event.severity == Severity::Incident);
+    assert!(incident.unwrap().what.contains("held through"));
+    assert_eq!(incident.unwrap().messages.len(), 16);
+}
+
+#[test]
+fn a_buffered_second_makes_the_reference_older_for_good() {
+    let case = case(|parameters| {
+        parameters.send = crate::teleoperation::SendPolicy::Coupled;
+        parameters.egm.comm_timeout_s = Some(60.0);
+    });
+    let buffered = Silence {
+        from_s: 8.0,
+        until_s: 9.0,
+        is_buffered: true,
+    };
+    let log = run(&case, Some(buffered), 30.0);
+    let score = case.score(&log);
+    let median_ms = value(&score, "reference_age_ms_p50");
+    // A second of commands stands in the queue, and one comes for each that is taken.
+    assert!((median_ms - 1000.0).abs() < 20.0, "{median_ms}");
+}
+
+#[test]
+fn two_clocks_withdraw_error_and_lag_but_not_the_loops() {
+    let case = case(|_| {});
+    let whole = run(&case, Some(silence(12.0, 14.5)), 8.0 * PERIOD_S);
+    let mut log = RunLog::default();
+    for (channel, offset_ns) in [
+        (EGM_RIGHT_COMMAND, 0),
+        (EGM_RIGHT_FEEDBACK, 77_000_000_000),
+        (EGM_EVENT, 77_000_000_000),
+    ] {
+        for logged in whole.raw(channel) {
+            let mut envelope = logged.envelope;
+            envelope.published_ns += offset_ns;
+            log.push(channel, envelope, &logged.payload);
+        }
+    }
+    log.set_clocks_differ();
+    let (exact, apart) = (case.score(&whole), case.score(&log));
+    for name in [
+        "motion_loops_sent_count",
+        "motion_loops_executed_count",
+        "loops_lost_by_trip_count",
+        "hold_count",
+        "egm_trip_count",
+    ] {
+        assert_eq!(
+            apart.get(name).unwrap().value,
+            exact.get(name).unwrap().value,
+            "{name}"
+        );
+    }
+    for name in [
+        "joint_error_rad_rms",
+        "joint_error_ratio",
+        "joint_error_network_rad_rms",
+        "tracking_lag_ms",
+    ] {
+        assert!(exact.get(name).unwrap().value.is_some(), "{name}");
+        assert_eq!(apart.get(name).unwrap().value, None);
+        assert!(apart.get(name).unwrap().method.contains("not aligned"));
+    }
+}
+
+/// A log of one channel each for commands and feedback of a foreign pair: no events, no human.
+struct Foreign {
+    log: RunLog,
+    sequences: BTreeMap<&'static str, u64>,
+}
+
+impl Foreign {
+    fn new() -> Self {
+        Self {
+            log: RunLog::default(),
+            sequences: BTreeMap::new(),
+        }
+    }
+
+    fn push<M: Message>(&mut self, channel: &'static str, at_ns: i64, message: &M) {
+        let sequence = self.sequences.entry(channel).or_default();
+        let envelope = Envelope {
+            sequence: *sequence,
+            published_ns: at_ns,
+            ..Envelope::default()
+        };
+        *sequence += 1;
+        self.log
+            .push(channel, envelope, bytemuck::bytes_of(message));
+    }
+}
+
+/// Ten loops in which the tool follows the first joint's swing, but for `is_down` at a time in
+/// seconds: then no session runs and the tool stands.
+fn foreign(is_down: impl Fn(f64) -> bool, flags: impl Fn(f64) -> u32) -> Foreign {
+    let mut foreign = Foreign::new();
+    let arm = crate::yumi::arm::Arm::right();
+    let mut standing = EgmFeedback::zeroed();
+    let mut session = 1;
+    let mut was_down = false;
+    for step in 0..10_082_u32 {
+        let time_s = f64::from(step) * 0.004;
+        let at_ns = i64::from(step) * 4_000_000;
+        let mut position_rad = RIGHT_START_RAD;
+        position_rad[0] += 0.4 * (core::f64::consts::TAU * time_s / PERIOD_S).sin();
+        let command = EgmCommand {
+            frame_index: u64::from(step),
+            position_rad,
+            flags: flags(time_s),
+            ..EgmCommand::zeroed()
+        };
+        foreign.push(EGM_RIGHT_COMMAND, at_ns, &command);
+        let down = is_down(time_s);
+        if !down {
+            session += u32::from(was_down);
+            standing = EgmFeedback {
+                measured_rad: position_rad,
+                tool: arm.tool(&position_rad).into(),
+                reference_frame_index: u64::from(step),
+                session,
+                state: SessionState::Running as u32,
+                flags: EgmFeedback::HAS_REFERENCE | EgmFeedback::TOOK_COMMAND,
+                ..EgmFeedback::zeroed()
+            };
+        }
+        was_down = down;
+        let feedback = EgmFeedback {
+            cycle_index: u64::from(step),
+            state: if down {
+                SessionState::Waiting as u32
+            } else {
+                standing.state
+            },
+            ..standing
+        };
+        foreign.push(EGM_RIGHT_FEEDBACK, at_ns + 1_000_000, &feedback);
+    }
+    foreign
+}
+
+#[test]
+fn a_run_of_foreign_programs_is_scored_without_events() {
+    let case = case(|_| {});
+    let foreign = foreign(|time_s| (14.0..18.5).contains(&time_s), |_| 0);
+    let score = case.score(&foreign.log);
+    assert!((value(&score, "egm_trip_count") - 1.0).abs() < 0.1);
+    assert!((value(&score, "loops_lost_by_trip_count") - 1.0).abs() < 0.1);
+    let incident = score
+        .events
+        .iter()
+        .find(|event| event.severity == Severity::Incident);
+    assert!(incident.unwrap().what.contains("not recorded"));
+    assert_eq!(score.get("commands_refused_count").unwrap().value, None);
+    let split = score.get("joint_error_network_rad_rms").unwrap();
+    assert_eq!(split.value, None);
+    assert!(split.method.contains("no beginning"), "{}", split.method);
+    assert!(value(&score, "tool_path_m_rms") < 1e-3);
+}
+
+#[test]
+fn the_recorded_end_cause_is_named() {
+    let case = case(|_| {});
+    let mut foreign = foreign(|time_s| (14.0..18.5).contains(&time_s), |_| 0);
+    let ended = EgmEvent {
+        at_ns: 14_000_000_000,
+        kind: EgmEventKind::Ended as u32,
+        cause: EndCause::ConditionTime as u32,
+        side: u32::try_from(Side::Right.index()).unwrap(),
+        session: 1,
+        ..EgmEvent::zeroed()
+    };
+    foreign.push(EGM_EVENT, 14_000_000_000, &ended);
+    let score = case.score(&foreign.log);
+    let incident = score
+        .events
+        .iter()
+        .find(|event| event.severity == Severity::Incident);
+    assert!(incident.unwrap().what.contains("CondTime"));
+    assert!(value(&score, "commands_refused_count").abs() < 0.1);
+}
+
+#[test]
+fn clipped_commands_explain_a_loop_that_nothing_else_does() {
+    let case = case(|_| {});
+    let window = |time_s: f64| (14.0..18.5).contains(&time_s);
+    let clipped = |time_s| {
+        if window(time_s) {
+            EgmCommand::UNREACHABLE
+        } else {
+            0
+        }
+    };
+    // The session runs on, but the tool stands: as in a hold that nobody flags.
+    let mut foreign = Foreign::new();
+    let source = self::foreign(window, clipped).log;
+    for (at, command) in source.messages::<EgmCommand>(EGM_RIGHT_COMMAND) {
+        foreign.push(EGM_RIGHT_COMMAND, at.as_ns(), &command);
+    }
+    for (at, feedback) in source.messages::<EgmFeedback>(EGM_RIGHT_FEEDBACK) {
+        let running = EgmFeedback {
+            state: SessionState::Running as u32,
+            session: 1,
+            ..feedback
+        };
+        foreign.push(EGM_RIGHT_FEEDBACK, at.as_ns(), &running);
+    }
+    let score = case.score(&foreign.log);
+    assert!((value(&score, "loops_lost_by_clipping_count") - 1.0).abs() < 0.1);
+    assert!(value(&score, "ik_failure_count") > 1000.0);
+}
+
+#[test]
+fn the_figures_have_their_columns_and_a_row_per_message() {
+    let case = case(|_| {});
+    let log = run(&case, None, 2.0 * PERIOD_S);
+    let series = case.series(&log);
+    let names: Vec<_> = series.iter().map(|known| known.name.as_str()).collect();
+    assert_eq!(
+        names,
+        [
+            "fig6-input",
+            "fig7-9-tool-y",
+            "fig10-joints",
+            "fig11-joint-error"
+        ]
+    );
+    for known in &series {
+        assert_eq!(
+            known.values.len() % known.columns.len(),
+            0,
+            "{}",
+            known.name
+        );
+        assert_eq!(known.notes.len(), usize::from(known.name.contains("joint")));
+    }
+    assert_eq!(series[0].rows().count(), log.raw(HUMAN_FRAME).len());
+    assert_eq!(series[2].rows().count(), log.raw(EGM_RIGHT_FEEDBACK).len());
+    assert!(
+        series[1].values[2].is_nan(),
+        "no command before guided motion runs"
+    );
+    let last = series[3].rows().last().unwrap();
+    let joints = series[2].rows().last().unwrap();
+    for joint in 1..=7 {
+        assert!((joints[joint] - joints[joint + 7] - last[joint]).abs() < 1e-12);
+    }
+}
