@@ -18,6 +18,7 @@
 //! 3. [`mapping`] with [`crate::yumi`]: from the hand to the joints.
 //! 4. [`crate::egm::controller`]: from the commands to the motion.
 //! 5. `score`: what the robot made of it.
+//! 6. [`experiment`]: thousands of loops over channels that a table names, in virtual time.
 //!
 //! ```
 //! use std::collections::BTreeMap;
@@ -47,6 +48,7 @@
 
 pub mod bvh;
 mod controller;
+pub mod experiment;
 mod follower;
 mod human;
 pub mod mapping;
@@ -73,10 +75,13 @@ use crate::egm::messages::{
     EgmArrival, EgmCommand, EgmEvent, EgmFeedback, MotionArrival, MotionRequest, MotionResponse,
 };
 use crate::egm::parameters::ControllerSettings;
+use crate::plot::PlotSeries;
 use crate::random::RandomStream;
 use crate::replay::Replay;
 use crate::run_log::RunLog;
+use crate::study::{Batch, into_batch};
 use crate::teleoperation::controller::Controller;
+use crate::teleoperation::experiment::{Calibration, MotionLossStudy};
 use crate::teleoperation::human::Human;
 use crate::teleoperation::messages::HumanFrame;
 use crate::teleoperation::motion::{Motion, Player};
@@ -191,7 +196,26 @@ impl CaseStudy for Teleoperation {
         score::score(self, log)
     }
 
+    fn series(&self, log: &RunLog) -> Vec<PlotSeries> {
+        score::series(log)
+    }
+
     fn replay(&self, log: &RunLog) -> Option<Replay> {
         Some(replay::replay(self.settings, log))
+    }
+
+    fn calibration(
+        &self,
+        figure: &str,
+        value: f64,
+    ) -> Result<Option<Box<dyn Batch>>, ParameterError> {
+        if figure != "mlr" {
+            return Ok(None);
+        }
+        Ok(Some(into_batch(Calibration::new(self, value)?)))
+    }
+
+    fn study(&self) -> Result<Option<Box<dyn Batch>>, ParameterError> {
+        Ok(Some(into_batch(MotionLossStudy::new(self)?)))
     }
 }

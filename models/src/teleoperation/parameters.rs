@@ -10,6 +10,7 @@ use crate::case_study::ParameterError;
 use crate::egm::messages::EgmStartParameters;
 use crate::egm::parameters::{ControllerSettings, EgmParameters};
 use crate::teleoperation::bvh::Bvh;
+use crate::teleoperation::experiment::TableParameters;
 use crate::teleoperation::mapping::MappingSettings;
 use crate::teleoperation::motion::{Motion, Recording};
 use crate::teleoperation::swing::Swing;
@@ -170,6 +171,8 @@ pub struct TeleoperationParameters {
     pub egm: EgmParameters,
     /// What the controller asks for instead of them.
     pub egm_start: EgmStartRequest,
+    /// What `hil-runtime tables` and `calibrate` compute.
+    pub tables: TableParameters,
     /// Text of `motion_file`; never in a topology file.
     #[serde(skip)]
     pub motion_text: Option<String>,
@@ -196,6 +199,7 @@ impl Default for TeleoperationParameters {
             motion_unit_m: 0.01,
             egm: EgmParameters::default(),
             egm_start: EgmStartRequest::default(),
+            tables: TableParameters::default(),
             motion_text: None,
         }
     }
@@ -267,7 +271,8 @@ impl TeleoperationParameters {
         for (key, value, allowed, allowed_text) in ranges {
             ParameterError::check(key, value, allowed, allowed_text)?;
         }
-        self.egm_start.check()
+        self.egm_start.check()?;
+        self.tables.check()
     }
 
     /// The motion to play.
