@@ -46,9 +46,10 @@ pub(crate) fn simulate(
         let name = &crossing.channel.name;
         let impairment = crossing.impairment.ok_or_else(|| {
             format!(
-                "channel {name} crosses link {}, a real network whose delay only a real run \
-                 shows; use via = \"emulated\" to simulate it",
-                crossing.link.name
+                "channel {name} crosses link {} via {}, whose delay only a real run shows; use \
+                 via = \"emulated\" to simulate it",
+                crossing.link.name,
+                crossing.link.via.word()
             )
         })?;
         let emulation = EmulationLaunch {
