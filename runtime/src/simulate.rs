@@ -118,9 +118,10 @@ fn link_models(topology: &Topology) -> Result<Vec<NamedCarrier>, String> {
         let name = &crossing.channel.name;
         let impairment = crossing.impairment.ok_or_else(|| {
             format!(
-                "channel {name} crosses link {}, a real network whose delay only a real run \
-                 shows; use via = \"emulated\" to simulate it",
-                crossing.link.name
+                "channel {name} crosses link {} via {}, whose delay only a real run shows; use \
+                 via = \"emulated\" to simulate it",
+                crossing.link.name,
+                crossing.link.via.word()
             )
         })?;
         let emulation = EmulationLaunch {

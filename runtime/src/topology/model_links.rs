@@ -50,6 +50,16 @@ pub enum Via {
 }
 
 impl Via {
+    /// The word in the file.
+    pub const fn word(&self) -> &'static str {
+        match self {
+            Self::SharedMemory => "shared-memory",
+            Self::Udp(_) => "udp",
+            Self::Tcp(_) => "tcp",
+            Self::Emulated(..) => "emulated",
+        }
+    }
+
     /// Socket and gateway settings; `None` for shared memory.
     pub fn hop(&self) -> Option<&Hop> {
         match self {

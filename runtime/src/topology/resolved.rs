@@ -198,18 +198,11 @@ fn resolved_link(link: &Link) -> Table {
     if let Some(between) = &link.between {
         put(&mut table, "between", between.to_vec());
     }
+    put(&mut table, "via", link.via.word());
     match &link.via {
-        Via::SharedMemory => put(&mut table, "via", "shared-memory"),
-        Via::Udp(hop) => {
-            put(&mut table, "via", "udp");
-            put_hop(&mut table, hop);
-        }
-        Via::Tcp(hop) => {
-            put(&mut table, "via", "tcp");
-            put_hop(&mut table, hop);
-        }
+        Via::SharedMemory => {}
+        Via::Udp(hop) | Via::Tcp(hop) => put_hop(&mut table, hop),
         Via::Emulated(hop, emulation) => {
-            put(&mut table, "via", "emulated");
             put_hop(&mut table, hop);
             put(
                 &mut table,
