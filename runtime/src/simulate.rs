@@ -13,7 +13,7 @@ use crate::registry::Registry;
 use crate::report::score_event::ScoreEvents;
 use crate::report::summary::ScoreMetric;
 use crate::report::terminal::{self, Style};
-use crate::topology::Topology;
+use crate::topology::{Program, Topology};
 
 /// What the outcome is rendered as.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -36,6 +36,13 @@ pub(crate) fn simulate(
     let case = topology
         .case()
         .ok_or("the topology names no case; only a case can be simulated")?;
+    let mut processes = topology.processes().iter();
+    if let Some(face) = processes.find(|one| matches!(one.program, Program::Egm { .. })) {
+        let name = &face.name;
+        return Err(format!(
+            "process `{name}` speaks with a foreign program, which knows no virtual time"
+        ));
+    }
     let entry = registry.find(&case.name).ok_or("the case is unknown")?;
     let seed = topology.run().seed;
     let parameters = serde_json::to_value(&case.parameters).map_err(|error| error.to_string())?;
