@@ -22,7 +22,7 @@ use crate::report::summary::ScoreMetric;
 use crate::report::terminal::{self, Style};
 use crate::run_folder::RunFolder;
 use crate::series;
-use crate::topology::Topology;
+use crate::topology::{Program, Topology};
 
 use self::watched::Watch;
 
@@ -74,6 +74,13 @@ pub(crate) fn simulate(
         .map_err(|error| refused(error.to_string()))?;
     let no_case = "the topology names no case; only a case can be simulated";
     let (entry, case) = made.ok_or_else(|| refused(no_case.to_owned()))?;
+    let mut processes = topology.processes().iter();
+    if let Some(face) = processes.find(|one| matches!(one.program, Program::Egm { .. })) {
+        let name = &face.name;
+        return Err(refused(format!(
+            "process `{name}` speaks with a foreign program, which knows no virtual time"
+        )));
+    }
     let mut watches = Vec::new();
     let mut carriers: BTreeMap<String, Box<dyn Carrier>> = BTreeMap::new();
     for (name, carrier) in link_models(topology).map_err(refused)? {

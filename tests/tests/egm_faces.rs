@@ -66,6 +66,53 @@ fn p99_us(face: &FaceSummary, name: &str) -> f64 {
         * 1e-3
 }
 
+/// What the controller's host and the robot's host must have recorded of one arm.
+fn assert_driven((here, there): (&Arms, &Arms), side: Side, arm: &Arm) {
+    let story = there.story(side);
+    println!("{story}");
+    // The robot may time out before its sensor is there, and surely when it has gone.
+    let arrivals = there.arrivals_ns(side);
+    let (first, last) = (arrivals[0], *arrivals.last().unwrap());
+    let events = there.events(side);
+    let mut ended = of_kind(&events, EgmEventKind::Ended);
+    assert!(
+        !ended.any(|event| (first..last).contains(&event.at_ns)),
+        "{story}"
+    );
+
+    // Both hosts read one clock here.
+    let window = (first + 5 * SECOND_NS, last);
+    let is_inside = |at: &i64| (window.0..window.1).contains(at);
+    let commanded = here
+        .commands(side)
+        .into_iter()
+        .filter(|(at, _)| is_inside(at));
+    let commanded = loops(arm, commanded.map(|(_, one)| one.position_rad));
+    let moved = here
+        .feedbacks(side)
+        .into_iter()
+        .filter(|(at, _)| is_inside(&(at - LAG_NS)));
+    let moved = loops(arm, moved.map(|(_, one)| one.measured_rad));
+    println!("{} arm: {moved} of {commanded} loops", side.word());
+    assert!(commanded >= 3, "{commanded} loops were asked for");
+    assert_eq!(
+        moved,
+        commanded,
+        "{} arm; load {}",
+        side.word(),
+        load_average()
+    );
+    for (place, follow) in here.follow(side, window, LAG_NS).iter().enumerate() {
+        println!("{} arm, chain place {place}: {follow:?}", side.word());
+        if follow.commanded_deg >= SWING_DEG_MIN {
+            assert!(
+                (follow.gain - 1.0).abs() < 0.05,
+                "place {place}: {follow:?}"
+            );
+        }
+    }
+}
+
 #[test]
 fn our_controller_drives_our_robot_over_nothing_but_the_makers_datagrams() {
     let Some(lab) = Lab::two_hosts_or_skip() else {
@@ -95,52 +142,9 @@ fn our_controller_drives_our_robot_over_nothing_but_the_makers_datagrams() {
         robot_files.read("report.txt")
     );
 
-    let arms = Arms::of(&sensor_files);
-    let robots = Arms::of(&robot_files);
+    let (here, there) = (Arms::of(&sensor_files), Arms::of(&robot_files));
     for (side, arm) in [(Side::Right, Arm::right()), (Side::Left, Arm::left())] {
-        let story = robots.story(side);
-        println!("{story}");
-        // The robot may time out before its sensor is there, and surely when it has gone.
-        let arrivals = robots.arrivals_ns(side);
-        let (first, last) = (arrivals[0], *arrivals.last().unwrap());
-        let events = robots.events(side);
-        let mut ended = of_kind(&events, EgmEventKind::Ended);
-        assert!(
-            !ended.any(|event| (first..last).contains(&event.at_ns)),
-            "{story}"
-        );
-
-        // Both hosts read one clock here.
-        let window = (first + 5 * SECOND_NS, last);
-        let is_inside = |at: &i64| (window.0..window.1).contains(at);
-        let commanded = arms
-            .commands(side)
-            .into_iter()
-            .filter(|(at, _)| is_inside(at));
-        let commanded = loops(&arm, commanded.map(|(_, one)| one.position_rad));
-        let moved = arms
-            .feedbacks(side)
-            .into_iter()
-            .filter(|(at, _)| is_inside(at));
-        let moved = loops(&arm, moved.map(|(_, one)| one.measured_rad));
-        println!("{} arm: {moved} of {commanded} loops", side.word());
-        assert!(commanded >= 3, "{commanded} loops were asked for");
-        assert_eq!(
-            moved,
-            commanded,
-            "{} arm; load {}",
-            side.word(),
-            load_average()
-        );
-        for (place, follow) in arms.follow(side, window, LAG_NS).iter().enumerate() {
-            println!("{} arm, chain place {place}: {follow:?}", side.word());
-            if follow.commanded_deg >= SWING_DEG_MIN {
-                assert!(
-                    (follow.gain - 1.0).abs() < 0.05,
-                    "place {place}: {follow:?}"
-                );
-            }
-        }
+        assert_driven((&here, &there), side, &arm);
     }
     judge([&sensor_files.summary(), &robot_files.summary()]);
     sensor_files.assert_nothing_left_on(lab.host(0));

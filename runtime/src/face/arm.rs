@@ -35,6 +35,8 @@ pub(super) struct Arm {
     pub(super) wait: WaitStrategy,
     pub(super) buffer: Box<[u8; DATAGRAM_BYTES_MAX]>,
     pub(super) attention: Attention,
+    /// Datagrams that came before the run began, dropped.
+    pub(super) early_count: u64,
 }
 
 /// What waiting found.
@@ -66,6 +68,10 @@ impl Arm {
     /// # Errors
     /// When a channel or the socket itself breaks.
     pub(super) fn run(&mut self, work: &mut dyn Work, stop: &AtomicBool) -> Result<(), FaceError> {
+        // A robot that was there before us has filled the socket with what is old news by now.
+        while self.line.receive(self.buffer.as_mut_slice())?.is_some() {
+            self.early_count += 1;
+        }
         while !stop.load(Ordering::Acquire) {
             let has_moved = self.turn(work)?;
             if !has_moved {

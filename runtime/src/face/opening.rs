@@ -159,6 +159,7 @@ impl OpenedArm {
             wait: WaitStrategy::new(launch.wait),
             buffer: Box::new([0; DATAGRAM_BYTES_MAX]),
             attention: Attention::default(),
+            early_count: 0,
         })
     }
 }
@@ -194,6 +195,8 @@ impl JoinedArm {
         let socket = self.arm.line.counters();
         let named = socket.iter();
         counters.extend(named.map(|(name, count)| (format!("socket: {name}"), count)));
+        let early = self.arm.early_count;
+        counters.push(("datagrams before the run, dropped".to_owned(), early));
         let steps = self.arm.line.clock_step_count();
         counters.push(("clock_step_count".to_owned(), steps));
         FaceReport {

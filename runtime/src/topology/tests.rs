@@ -116,6 +116,8 @@ const SHIPPED: &[&str] = &[
     "local.toml",
     "split.toml",
     "emulated.toml",
+    "egm-client.toml",
+    "egm-robot.toml",
     "shuttle-local.toml",
     "shuttle-split.toml",
     "shuttle-tcp.toml",

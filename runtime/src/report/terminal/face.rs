@@ -113,3 +113,68 @@ fn segment_line(
     };
     canvas.line(&line);
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::report::face::Answers;
+    use crate::report::summary::{CountByName, Fact};
+    use crate::report::terminal::Style;
+    use hil_models::measure::histogram::LatencyHistogram;
+
+    fn summary() -> FaceSummary {
+        let mut histogram = LatencyHistogram::default();
+        (0..100).for_each(|index| histogram.record(20_000 + index));
+        FaceSummary {
+            process: "client".to_owned(),
+            host: "local".to_owned(),
+            kind: "EGM robot face".to_owned(),
+            arm: "right".to_owned(),
+            address: "127.0.0.1:6510".to_owned(),
+            peer_state: "never answered".to_owned(),
+            cycle_ns: Some(4_000_000),
+            answers: Answers {
+                robot_message_count: 1234,
+                ..Answers::default()
+            },
+            segments: vec![
+                FaceSegment {
+                    name: "feedback in all: published → TX stamp".to_owned(),
+                    distribution: histogram.distribution("nothing passed"),
+                },
+                FaceSegment {
+                    name: "command in all: RX stamp → published".to_owned(),
+                    distribution: Distribution::unavailable("nothing passed"),
+                },
+            ],
+            refusals: vec![CountByName {
+                name: "not protobuf".to_owned(),
+                count: 3,
+            }],
+            counters: Vec::new(),
+            facts: vec![Fact::new("socket", "from port 1 to 127.0.0.1:6510")],
+        }
+    }
+
+    #[test]
+    fn an_arm_shows_its_answers_its_segments_and_what_is_unavailable() {
+        for width in [80, 120] {
+            let mut canvas = Canvas::new(width, Style::Plain);
+            face(&mut canvas, &summary());
+            let text = canvas.finish();
+            assert!(
+                text.lines().all(|line| line.chars().count() <= width),
+                "{text}"
+            );
+            for words in [
+                "EGM robot face of client, right arm",
+                "none of the robot's 1,234 messages was answered",
+                "0.50",
+                "unavailable: nothing passed",
+                "not protobuf 3",
+            ] {
+                assert!(text.contains(words), "{words} is not in\n{text}");
+            }
+        }
+    }
+}
