@@ -243,7 +243,7 @@ fn an_interrupted_run_leaves_a_complete_report_and_nothing_else() {
         let trial = Trial::shipped("local.toml", record.path()).set("run.duration=\"10 min\"");
         let mut child = trial.start_here();
         let files = trial.folder("", LIMIT);
-        wait_for_messages(&files, "arm.command");
+        wait_for_messages(&files, "egm.right.command");
         child.signal(signal).unwrap();
         let finished = child.wait_within(LIMIT).unwrap();
         assert_code(&finished, 130);

@@ -8,7 +8,8 @@ use hil_models::measure::account::{ChannelAccount, MessageFate, Stage};
 use hil_models::measure::statistics::clopper_pearson;
 use hil_runtime::report::summary::{ChannelSummary, LinkKind, Outcome};
 use hil_tests::account::{
-    account, assert_accounts_close, assert_every_message_is_accounted_for, channel, describe,
+    account, assert_accounts_close, assert_every_message_is_accounted_for, carried, channel,
+    describe,
 };
 use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::Trial;
@@ -35,7 +36,7 @@ fn an_emulated_link_loses_and_delays_what_it_was_told_to() {
     files.assert_nothing_left_here();
     let summary = files.summary();
     assert_eq!(summary.run.outcome, Outcome::Completed);
-    for channel in &summary.channels {
+    for channel in carried(&summary) {
         println!(
             "{}",
             describe(&channel.name, account(&summary, &channel.name))

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use hil_models::measure::account::InterruptionFigures;
 use hil_runtime::report::summary::{Outcome, RunSummary};
-use hil_tests::account::{account, assert_every_message_is_accounted_for, describe};
+use hil_tests::account::{account, assert_every_message_is_accounted_for, carried, describe};
 use hil_tests::child::{ChildGuard, Finished};
 use hil_tests::lab::Lab;
 use hil_tests::run_folder::RunFolder;
@@ -213,7 +213,7 @@ fn a_killed_robot_ends_the_run_on_both_hosts_with_a_complete_report() {
             event(&summary, "robot"),
             "robot: was killed by SIGKILL; policy: end the run"
         );
-        for channel in &summary.channels {
+        for channel in carried(&summary) {
             let account = account(&summary, &channel.name);
             println!("{}", describe(&channel.name, account));
             assert!(account.end_to_end.distribution.measured().is_some());
@@ -267,7 +267,7 @@ fn kill_supervisor(lab: Lab, victim: usize) -> Lab {
     assert!(split.files[other].has_report());
     let warnings = summary.warnings.join("\n");
     assert!(warnings.contains(HOSTS[victim]), "{warnings}");
-    for channel in &summary.channels {
+    for channel in carried(&summary) {
         let account = channel.account.as_ref();
         let said = account.map(|account| describe(&channel.name, account));
         println!("{} alone: {said:?}", HOSTS[other]);

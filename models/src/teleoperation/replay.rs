@@ -176,7 +176,7 @@ impl Recorded {
         let is_due = |next: &mut (Instant, EgmFeedback)| next.1.cycle_index <= replayed.cycle_index;
         while let Some((_, recorded)) = queue.pop_front_if(is_due) {
             replay.compared_count += 1;
-            if let Some(difference) = difference(&recorded, &replayed) {
+            if let Some(difference) = difference(&recorded, replayed) {
                 note(replay, side, recorded.cycle_index, &difference);
             }
         }
