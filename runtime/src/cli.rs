@@ -252,6 +252,13 @@ pub enum Command {
         #[arg(last = true, required = true)]
         program: Vec<String>,
     },
+    /// Speak with a foreign EGM program; started by a run, not by hand.
+    #[command(hide = true)]
+    Face {
+        /// Launch file written by the supervisor.
+        #[arg(long)]
+        launch: PathBuf,
+    },
     /// Run the gateway of one link; started by a run, not by hand.
     #[command(hide = true)]
     Gateway {

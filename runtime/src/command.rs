@@ -18,6 +18,7 @@ use crate::cases;
 use crate::cli::{Cli, Command, RunArgs};
 use crate::console::Console;
 use crate::doctor::{self, DoctorRequest, StampCapabilities};
+use crate::face;
 use crate::gateway;
 use crate::process::{component, own_program};
 use crate::registry::Registry;
@@ -56,6 +57,7 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
             supervisor,
             program,
         } => code_of(own_program::become_program(supervisor, &program), console),
+        Command::Face { launch } => code_of(face::process::run(&launch), console),
         Command::Gateway { launch } => code_of(gateway::process::run(&launch), console),
         Command::Simulate {
             topology,

@@ -10,12 +10,11 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use hil_models::case_study::Score;
-use hil_models::link::bernoulli::BernoulliLink;
 use hil_models::measure::account::OutageFigures;
-use hil_models::random::RandomStream;
 use hil_models::simulation::{Carrier, Simulation, SimulationResult};
 
 use crate::analysis::outages::OutageStory;
+use crate::process::launch::EmulationLaunch;
 use crate::registry::{Case, Registry};
 use crate::report::event_log;
 use crate::report::score_event::ScoreEvents;
@@ -119,14 +118,20 @@ fn link_models(topology: &Topology) -> Result<Vec<NamedCarrier>, String> {
         let name = &crossing.channel.name;
         let impairment = crossing.impairment.ok_or_else(|| {
             format!(
-                "channel {name} crosses link {} via udp, whose delay only a real run shows; \
-                 use via = \"emulated\" to simulate it",
+                "channel {name} crosses link {}, a real network whose delay only a real run \
+                 shows; use via = \"emulated\" to simulate it",
                 crossing.link.name
             )
         })?;
-        let stream = RandomStream::new(topology.run().seed, name);
-        let link = BernoulliLink::new(impairment.delay, impairment.loss_ratio, stream)
-            .map_err(|error| error.to_string())?;
+        let emulation = EmulationLaunch {
+            delay: impairment.delay,
+            loss_ratio: impairment.loss_ratio,
+            outages: crossing.outages.unwrap_or_default(),
+            link: crossing.link.name.clone(),
+            seed: topology.run().seed,
+        };
+        // Virtual time begins with the run.
+        let link = emulation.model(name).map_err(|error| error.to_string())?;
         carriers.push((name.clone(), Box::new(link)));
     }
     Ok(carriers)

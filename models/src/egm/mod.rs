@@ -5,6 +5,8 @@
 //! 1. [`messages`]: what crosses shared memory and our own gateways.
 //! 2. [`parameters`]: every setting of the controller, and presets of them.
 //! 3. [`controller`]: one arm's motion task as a state machine that is told the time.
+//! 4. [`wire`]: the maker's datagrams, encoded and decoded; of use by itself.
+//! 5. [`face`]: between those datagrams and our messages, as robot or as sensor.
 //!
 //! A client one millisecond away drives one arm for three seconds, then falls silent, all in
 //! virtual time:
@@ -46,5 +48,7 @@
 //! is silent, the item says what was assumed.
 
 pub mod controller;
+pub mod face;
 pub mod messages;
 pub mod parameters;
+pub mod wire;

@@ -2,6 +2,7 @@
 //! account of each channel, and lets the case score what the robot did.
 
 mod events;
+mod faces;
 mod figures;
 pub(crate) mod outages;
 pub(crate) mod records;
@@ -73,6 +74,7 @@ pub(crate) fn conclude(
         .iter()
         .map(|channel| channel_summary(topology, result, channel, &records))
         .collect();
+    summary.faces = faces::face_summaries(topology, result, &records);
     let outages = add_outages(&mut summary, (topology, result), &records);
     let case = registry.make_case(topology)?;
     let (specs, score) = match &case {

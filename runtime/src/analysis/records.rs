@@ -17,6 +17,7 @@ use hil_models::run_log::{LoggedMessage, RunLog};
 use hil_models::time::{Alignment, Instant};
 
 use super::AnalysisError;
+use crate::face::record::{FaceReceivedRecord, FaceSentRecord};
 use crate::record::{RecordFile, RecordFileError, RecordKind};
 use crate::report::summary::RecordedFigures;
 use crate::supervisor::RunResult;
@@ -32,6 +33,8 @@ pub(crate) struct ChannelFiles {
     follow_up: Option<Vec<FollowUpRecord>>,
     taken: Option<Vec<TakenRecord>>,
     round_trips_ns: Vec<i64>,
+    face_sent: Vec<FaceSentRecord>,
+    face_received: Vec<FaceReceivedRecord>,
 }
 
 /// Every record file of a run.
@@ -67,6 +70,11 @@ impl RunRecords {
                     .round_trips_ns
                     .extend(file.records::<[i64; 2]>().map(|[rtt, _]| rtt));
             }
+            RecordKind::FaceSent => channel.face_sent.extend(file.records::<FaceSentRecord>()),
+            RecordKind::FaceReceived => {
+                let records = file.records::<FaceReceivedRecord>();
+                channel.face_received.extend(records);
+            }
             RecordKind::Message => file.append_messages(&mut self.log),
         }
     }
@@ -93,6 +101,23 @@ impl RunRecords {
             message_count: messages.len() as u64,
             missing_count: missing_count(messages),
         })
+    }
+
+    /// What a face recorded that sends the messages of `out` and publishes on `back`.
+    pub(super) fn of_face(
+        &self,
+        out: &str,
+        back: &str,
+    ) -> (&[FaceSentRecord], &[FaceReceivedRecord]) {
+        let sent = self
+            .channels
+            .get(out)
+            .map(|files| files.face_sent.as_slice());
+        let received = self
+            .channels
+            .get(back)
+            .map(|files| files.face_received.as_slice());
+        (sent.unwrap_or_default(), received.unwrap_or_default())
     }
 
     /// The account of `channel`.

@@ -24,6 +24,8 @@ pub enum NetworkVerdict {
     RunFailed,
     /// No channel went over a network.
     NoNetwork,
+    /// No link of ours was a network, but a foreign program took part through a face.
+    ForeignProgram,
     /// A channel went over an emulated link, whatever carried the others.
     EmulatedLink,
     /// The host kept its ticks: what remains is the network's.
@@ -79,14 +81,21 @@ impl Assessment {
 
 fn verdict(summary: &RunSummary, overruns: Vec<Overrun>) -> NetworkVerdict {
     let has = |link: LinkKind| summary.channels.iter().any(|channel| channel.link == link);
-    // A gateway keeps no ticks; a component that was killed took its count with it.
+    let has_face = !summary.faces.is_empty();
+    let is_face = |name: &str| summary.faces.iter().any(|face| face.process == name);
+    // A gateway or face keeps no ticks; a component that was killed took its count with it.
     let is_silent = |process: &ProcessSummary| {
-        process.role != "gateway" && process.role != "own program" && process.cpu_time_s.is_none()
+        let keeps_ticks = process.role != "gateway" && process.role != "own program";
+        keeps_ticks && !is_face(&process.name) && process.cpu_time_s.is_none()
     };
     let has_ticks = |process: &ProcessSummary| process.tick_count.is_some();
     if summary.run.outcome == Outcome::Failed {
         NetworkVerdict::RunFailed
-    } else if !has(LinkKind::Udp) && !has(LinkKind::Emulated) {
+    } else if ![LinkKind::Udp, LinkKind::Tcp, LinkKind::Emulated]
+        .into_iter()
+        .any(has)
+        && !has_face
+    {
         NetworkVerdict::NoNetwork
     } else if !overruns.is_empty() {
         NetworkVerdict::HostOverran {
@@ -96,6 +105,8 @@ fn verdict(summary: &RunSummary, overruns: Vec<Overrun>) -> NetworkVerdict {
         NetworkVerdict::TicksUnknown
     } else if has(LinkKind::Emulated) {
         NetworkVerdict::EmulatedLink
+    } else if !has(LinkKind::Udp) {
+        NetworkVerdict::ForeignProgram
     } else {
         NetworkVerdict::NetworkResult
     }

@@ -3,6 +3,7 @@
 
 pub mod assessment;
 pub(crate) mod event_log;
+pub mod face;
 pub mod score_event;
 pub mod summary;
 pub mod terminal;

@@ -172,7 +172,7 @@ fn a_recorded_channel_needs_no_account_but_every_message() {
 #[test]
 fn one_emulated_link_among_real_ones_makes_no_network_result() {
     let mut run = summary(recorded_channel());
-    for link in [LinkKind::Udp, LinkKind::Emulated] {
+    for link in [LinkKind::Udp, LinkKind::Tcp, LinkKind::Emulated] {
         run.channels.push(ChannelSummary {
             link,
             ..recorded_channel()

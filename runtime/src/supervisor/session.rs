@@ -386,14 +386,14 @@ impl Session<'_> {
         let reason = outcome.text();
         let meaning = outcome.meaning();
         self.say_to_all(&PeerMessage::Stop { reason, meaning });
-        self.crew.stop(STOP_PATIENCE, |plan| !plan.is_gateway());
+        self.crew.stop(STOP_PATIENCE, |plan| !plan.is_carrier());
         self.say_to_all(&PeerMessage::Quiet);
         if !matches!(outcome, Outcome::PeerLost(_)) {
             self.wait_for_quiet();
         }
         thread::sleep(DRAIN);
         self.crew
-            .stop(STOP_PATIENCE, super::plan::ProcessPlan::is_gateway);
+            .stop(STOP_PATIENCE, super::plan::ProcessPlan::is_carrier);
     }
 
     fn wait_for_quiet(&mut self) {

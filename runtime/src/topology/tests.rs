@@ -1,6 +1,7 @@
 //! Good topologies: what they become, how they are written back, and what a process is told.
 //! Faulty ones are in `tests/faulty.rs`.
 
+mod face;
 mod faulty;
 mod fleet;
 mod hosts;
@@ -117,6 +118,7 @@ const SHIPPED: &[&str] = &[
     "emulated.toml",
     "shuttle-local.toml",
     "shuttle-split.toml",
+    "shuttle-tcp.toml",
 ];
 
 /// Uses every key there is.
@@ -181,6 +183,7 @@ timestamps = "hardware"
 path_mtu_bytes = 1400
 delay = "50 ms"
 loss_ratio = 0.1
+outages = { mean = "1.5 s", per_hour = 12.5, buffered = true }
 [links.hop.backward]
 loss_ratio = 0
 [links.hop.gateway]

@@ -46,7 +46,8 @@ impl Trajectory {
         let counter = LoopCounter::new(case.nominal_peak_to_peak_m(), period_s);
         let frame_ns = duration_ns(case.parameters.frame_period());
         let first_frame = running_from(&case.settings).as_ns() / frame_ns + 1;
-        let frame_count = whole((f64::from(loops) + 2.0) * period_s * 1e9 / frame_ns as f64);
+        let length_s = case.parameters.motion_start_s + (f64::from(loops) + 2.0) * period_s;
+        let frame_count = whole(length_s * 1e9 / frame_ns as f64);
         let commands = commands(&case, first_frame, frame_count);
         let sent = tool_y(&commands, first_frame, frame_ns);
         let mut sent_peaks_ns = peaks(&sent, counter.prominence_m);

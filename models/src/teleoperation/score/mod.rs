@@ -17,7 +17,7 @@ pub(crate) mod sessions;
 mod tests;
 
 use crate::case_study::{Metric, Score};
-use crate::egm::messages::EgmCommand;
+use crate::egm::messages::{EgmCommand, EgmFeedback};
 use crate::measure::statistics::{CONFIDENCE, poisson};
 use crate::run_log::RunLog;
 use crate::teleoperation::messages::HumanFrame;
@@ -40,6 +40,7 @@ pub(crate) fn score(case: &Teleoperation, log: &RunLog) -> Score {
             case.parameters.motion_period_s,
         ),
         period_s: case.parameters.motion_period_s,
+        rest_s: case.parameters.motion_start_s,
         has_one_clock: log.has_one_clock(),
         sent: Sent::read(case, log, &record),
         moved: record.moved_y(),
@@ -74,6 +75,8 @@ pub(crate) fn score(case: &Teleoperation, log: &RunLog) -> Score {
 struct Run {
     counter: LoopCounter,
     period_s: f64,
+    /// How long the human rests first.
+    rest_s: f64,
     has_one_clock: bool,
     record: Record,
     sent: Sent,
@@ -239,7 +242,7 @@ impl Run {
             clippy::cast_possible_truncation,
             reason = "a period of at most a minute in nanoseconds"
         )]
-        let travel = peak_to_peak(&self.moved, (self.period_s * 1e9) as i64);
+        let travel = peak_to_peak(self.followed(), (self.period_s * 1e9) as i64);
         estimated(
             (
                 "tool_y_m_peak_to_peak",
@@ -247,9 +250,24 @@ impl Run {
                 "m",
             ),
             travel,
-            "mean over whole motion periods of highest minus lowest measured y",
-            "no whole motion period of feedback",
+            "mean over whole motion periods of following the human of highest minus lowest \
+             measured y",
+            "no whole motion period of feedback that follows the human",
         )
+    }
+
+    /// The measured tool y from when the robot first had a command to use and the human no longer
+    /// rested; hosts start together within milliseconds.
+    fn followed(&self) -> &[Sample] {
+        let mut feedback = self.record.feedback.iter();
+        let first = feedback.find(|known| known.has(EgmFeedback::HAS_REFERENCE));
+        let (Some(first), Some(start)) = (first, self.moved.first()) else {
+            return &[];
+        };
+        let is_before = |sample: &Sample| {
+            sample.0 < first.at_ns || ((sample.0 - start.0) as f64) < self.rest_s * 1e9
+        };
+        &self.moved[self.moved.partition_point(is_before)..]
     }
 
     fn inverse_kinematics(&self) -> [Metric; 2] {

@@ -7,7 +7,7 @@ use bytemuck::Zeroable;
 
 use super::*;
 use crate::case_study::CaseStudy;
-use crate::egm::messages::{EgmEvent, EgmEventKind, EgmFeedback, EndCause, SessionState, Side};
+use crate::egm::messages::{EgmEvent, EgmEventKind, EndCause, SessionState, Side};
 use crate::link::{Fate, LinkModel};
 use crate::message::{Envelope, Message};
 use crate::score::Severity;
@@ -19,7 +19,10 @@ use crate::time::Instant;
 use crate::yumi::arm::RIGHT_START_RAD;
 
 fn case(change: impl FnOnce(&mut TeleoperationParameters)) -> Teleoperation {
-    let mut parameters = TeleoperationParameters::default();
+    let mut parameters = TeleoperationParameters {
+        motion_start_s: 0.0,
+        ..TeleoperationParameters::default()
+    };
     change(&mut parameters);
     Teleoperation::new(parameters, 3).unwrap()
 }

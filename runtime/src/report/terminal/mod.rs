@@ -3,6 +3,7 @@
 mod canvas;
 mod channel;
 mod events;
+mod face;
 mod outages;
 mod tables;
 mod units;
@@ -28,6 +29,9 @@ pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> Strin
     events::score_events(&mut canvas, &summary.score_events);
     for channel in &summary.channels {
         channel::channel(&mut canvas, channel);
+    }
+    for face in &summary.faces {
+        face::face(&mut canvas, face);
     }
     tables::processes(&mut canvas, &summary.processes);
     tables::events(&mut canvas, &summary.events);
@@ -123,6 +127,13 @@ fn network_words(verdict: &NetworkVerdict) -> (Tone, String) {
         NetworkVerdict::NoNetwork => {
             let text = "no channel went over a network; nothing here says anything about one";
             (Tone::Plain, text.to_owned())
+        }
+        NetworkVerdict::ForeignProgram => {
+            let text = format!(
+                "a foreign program took part over its own protocol: its answers are its and its \
+                 network's; no process of ours skipped more than {limit} of its ticks"
+            );
+            (Tone::Plain, text)
         }
         NetworkVerdict::NetworkResult => {
             let text =
