@@ -1,11 +1,10 @@
-//! What happened to the robot in virtual time, with the outages before it. Virtual time keeps no
-//! record of single messages, so their fates are not known here.
+//! What happened to the robot in virtual time, with the outages before it and what the link's
+//! model did to the messages concerned. When a message was taken is not known here.
 
 use core::time::Duration;
-use std::collections::BTreeSet;
 
-use hil_models::case_study::{ChannelSpec, Score, ScoreEvent};
-use hil_models::measure::account::{Happening, Outage, Side};
+use hil_models::case_study::{ChannelSpec, MessageRef, Score, ScoreEvent};
+use hil_models::measure::account::{Happening, MessageFate, Outage, Side};
 use hil_models::run_log::{LoggedMessage, RunLog};
 use hil_models::time::Instant;
 
@@ -32,15 +31,8 @@ pub(super) fn explained(
     log: &RunLog,
 ) -> ScoreEvents {
     let events = score.events.iter().map(|event| {
-        let messages = event.messages.iter().map(|message| ExplainedMessage {
-            channel: message.channel.to_owned(),
-            epoch: message.epoch,
-            sequence: message.sequence,
-            published_at_s: None,
-            fate: None,
-            delay_s: None,
-            words: "unavailable: virtual time keeps no record of single messages".to_owned(),
-        });
+        let messages = event.messages.iter();
+        let messages = messages.map(|message| explain(message, stories, log));
         ExplainedEvent {
             at_s: Some(event.at.as_ns() as f64 * 1e-9),
             clock: "virtual time".to_owned(),
@@ -66,7 +58,12 @@ fn outages_before(
 ) -> Vec<EventOutage> {
     let before = |spec: &ChannelSpec| {
         let story = stories.iter().find(|one| one.channel == spec.name)?;
-        let lost_published_ns = published_ns(event, spec.name, log);
+        let messages = event.messages.iter();
+        let named = messages.filter(|message| message.channel == spec.name);
+        let lost_published_ns: Vec<i64> = named
+            .filter_map(|message| published_ns(message, log))
+            .filter(|ns| is_lost(*ns, &story.outages))
+            .collect();
         // A channel that never delivered anything has no consumer's view of its outage.
         let mut sides = [Side::Consumer, Side::Producer].into_iter();
         sides.find_map(|side| {
@@ -80,29 +77,51 @@ fn outages_before(
     concerned.into_iter().filter_map(before).collect()
 }
 
-/// Publications of the messages of `channel` that `event` names. A delivered one lies in no outage,
-/// so it does no harm among the lost ones.
-fn published_ns(event: &ScoreEvent, channel: &str, log: &RunLog) -> Vec<i64> {
-    let named: BTreeSet<(u32, u64)> = event
-        .messages
-        .iter()
-        .filter(|message| message.channel == channel)
-        .map(|message| (message.epoch, message.sequence))
-        .collect();
-    // A producer numbers its messages in order, and in virtual time it never starts anew.
-    let messages = log.raw(channel);
-    let key = |message: &LoggedMessage| (message.envelope.epoch, message.envelope.sequence);
-    let find = |wanted: &(u32, u64)| messages.binary_search_by_key(wanted, key).ok();
-    let found = named.iter().filter_map(find);
-    found
-        .map(|index| messages[index].envelope.published_ns)
-        .collect()
+/// What the link's model did to `message`.
+fn explain(message: &MessageRef, stories: &[OutageStory], log: &RunLog) -> ExplainedMessage {
+    let published_ns = published_ns(message, log);
+    let story = stories.iter().find(|one| one.channel == message.channel);
+    let is_lost = published_ns
+        .zip(story)
+        .map(|(ns, story)| is_lost(ns, &story.outages));
+    let words = match (published_ns, is_lost) {
+        (None, _) => "unavailable: the log has no such message",
+        (Some(_), None) => "carried by no link",
+        (Some(_), Some(true)) => "lost by the link's model",
+        (Some(_), Some(false)) => "not lost by the link's model",
+    };
+    ExplainedMessage {
+        channel: message.channel.to_owned(),
+        epoch: message.epoch,
+        sequence: message.sequence,
+        published_at_s: published_ns.map(|ns| ns as f64 * 1e-9),
+        fate: is_lost.unwrap_or(false).then_some(MessageFate::LostOnWire),
+        delay_s: None,
+        words: words.to_owned(),
+    }
+}
+
+/// In virtual time every message of an outage is lost, and outages are in order of time.
+fn is_lost(published_ns: i64, outages: &[Outage]) -> bool {
+    let next = outages.partition_point(|one| one.from_ns <= Some(published_ns));
+    let before = next.checked_sub(1).map(|index| outages[index]);
+    before.is_some_and(|outage| outage.contains(published_ns))
+}
+
+/// When `message` was published. A producer numbers its messages in order, and in virtual time it
+/// never starts anew.
+fn published_ns(message: &MessageRef, log: &RunLog) -> Option<i64> {
+    let messages = log.raw(message.channel);
+    let key = |logged: &LoggedMessage| (logged.envelope.epoch, logged.envelope.sequence);
+    let wanted = (message.epoch, message.sequence);
+    let index = messages.binary_search_by_key(&wanted, key).ok()?;
+    Some(messages[index].envelope.published_ns)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use hil_models::case_study::{CaseStudy, MessageRef, Severity};
+    use hil_models::case_study::{CaseStudy, Severity};
     use hil_models::measure::account::Standing;
     use hil_models::message::Envelope;
     use hil_models::shuttle::Shuttle;
@@ -152,5 +171,9 @@ mod tests {
         assert_eq!(found.standing, Standing::OverFor(1_050_000_000));
         assert_eq!(found.lost_count, 90);
         assert_eq!(events[2].outages[0].standing, Standing::BegunLater);
+        let lost = &events[2].messages[0];
+        assert_eq!(lost.fate, Some(MessageFate::LostOnWire));
+        assert_eq!(lost.words, "lost by the link's model");
+        assert!((lost.published_at_s.unwrap() - 10.05).abs() < 1e-9);
     }
 }
