@@ -113,8 +113,8 @@ impl Loops {
             lost.push(LostLoop::of(index, *sent as f64 + delay_ns));
         }
         Self {
-            executed_count,
             sent_ns,
+            executed_count,
             lost,
             extra_count,
         }
