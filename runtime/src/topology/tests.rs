@@ -116,6 +116,7 @@ const SHIPPED: &[&str] = &[
     "local.toml",
     "split.toml",
     "emulated.toml",
+    "outages.toml",
     "egm-client.toml",
     "egm-robot.toml",
     "shuttle-local.toml",

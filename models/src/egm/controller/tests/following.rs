@@ -43,7 +43,6 @@ fn gain(position_gain_per_s: f64) -> ControllerSettings {
 #[test]
 fn the_default_gain_lags_195_ms_and_misses_by_30_percent() {
     let (lag_ms, error) = follow(gain(5.0), false);
-    println!("k = 5: {lag_ms:.1} ms, {:.2} %", error * 100.0);
     assert!((lag_ms - 195.0).abs() <= 8.0, "{lag_ms} ms");
     assert!((error - 0.299).abs() <= 0.01, "{error}");
 }
@@ -51,7 +50,6 @@ fn the_default_gain_lags_195_ms_and_misses_by_30_percent() {
 #[test]
 fn the_highest_gain_lags_50_ms_and_misses_by_8_percent() {
     let (lag_ms, error) = follow(gain(20.0), false);
-    println!("k = 20: {lag_ms:.1} ms, {:.2} %", error * 100.0);
     assert!((lag_ms - 50.0).abs() <= 8.0, "{lag_ms} ms");
     assert!((error - 0.078).abs() <= 0.005, "{error}");
 }
@@ -59,11 +57,7 @@ fn the_highest_gain_lags_50_ms_and_misses_by_8_percent() {
 #[test]
 fn the_joints_own_speed_in_the_command_leaves_less_than_a_percent() {
     for position_gain_per_s in [5.0, 20.0] {
-        let (lag_ms, error) = follow(gain(position_gain_per_s), true);
-        println!(
-            "k = {position_gain_per_s} with speed: {lag_ms:.1} ms, {:.2} %",
-            error * 100.0
-        );
+        let (_, error) = follow(gain(position_gain_per_s), true);
         assert!(error < 0.01, "{error} at gain {position_gain_per_s}");
     }
 }

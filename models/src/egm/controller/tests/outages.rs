@@ -60,7 +60,6 @@ fn a_hold_costs_loops_by_its_length_alone() {
         (8.0, 2.0, 0.02),
     ] {
         let (lost, rig) = lost_per_outage(open_settings(), 60, |_| hold_s);
-        println!("hold of {hold_s} s: {lost:.3} loops");
         assert!(
             (lost - expected).abs() <= tolerance + 1e-9,
             "{lost} for {hold_s} s"
@@ -85,7 +84,6 @@ fn a_time_out_costs_loops_by_the_time_to_the_next_session() {
         // Gaps spread evenly over 1.05..2 s, in an order that is not the phases'.
         let gap_s = |share: f64| 1.05 + 0.95 * (share * 17.3).fract();
         let (lost, rig) = lost_per_outage(settings, 60, gap_s);
-        println!("time-out, next session after {restart_s} s: {lost:.3} loops per trip");
         assert!(
             (lost - expected).abs() <= tolerance,
             "{lost} for {restart_s} s"

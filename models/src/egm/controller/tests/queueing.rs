@@ -49,7 +49,6 @@ fn a_buffered_stall_lags_a_coupled_client_for_ever_until_the_next_session() {
     assert!(age_at(&ages, 4.9) < 2.0 * CYCLE_S);
     for time_s in [7.1, 10.0, 15.9] {
         let age = age_at(&ages, time_s);
-        println!("fifo1: age {age:.3} s at {time_s} s");
         assert!((age - 1.0).abs() <= 0.02, "{age} at {time_s} s");
     }
     let waiting = rig.feedback().queue_count;
@@ -75,7 +74,6 @@ fn taking_the_newest_forgets_a_stall_at_once() {
     let ages = ages_after_a_stall(&mut rig, 1);
     let highest = ages.iter().filter(|(at_s, _)| *at_s >= 6.008);
     let highest = highest.map(|(_, age)| *age).fold(0.0, f64::max);
-    println!("latest: highest age after the stall {highest:.3} s");
     assert!(highest <= 2.0 * CYCLE_S, "{highest}");
     let counters = rig.controller.command_counters();
     assert!((245..=250).contains(&counters.overtaken), "{counters:?}");
@@ -87,7 +85,6 @@ fn a_sender_at_half_the_rate_drains_a_stall_by_itself() {
     let ages = ages_after_a_stall(&mut rig, 2);
     let is_late = |(_, age): &&(f64, f64)| *age > 3.0 * CYCLE_S;
     let recovered_s = ages.iter().rfind(is_late).unwrap().0 - 6.0;
-    println!("125 Hz sender: recovered {recovered_s:.2} s after the stall");
     assert!((0.8..=1.2).contains(&recovered_s), "{recovered_s}");
 }
 
@@ -109,7 +106,6 @@ fn a_sender_of_250_hz_outruns_the_real_controllers_cycle_by_8_ms_each_second() {
         ages.push((at_s, rig.step().reference_age_ns as f64 * 1e-9));
     }
     let slope = (age_at(&ages, 59.0) - age_at(&ages, 9.0)) / 50.0;
-    println!("lag slope {:.2} ms/s", slope * 1e3);
     assert!((slope - 0.008).abs() <= 0.0005, "{slope}");
 }
 

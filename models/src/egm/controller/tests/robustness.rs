@@ -51,7 +51,6 @@ fn what_lies_outside_the_limits_is_refused_with_joint_value_and_limit() {
     let (answer, told, rig) = refused(&command);
     assert_eq!(answer, Err(CommandRefusal::OutsideLimits));
     let text = told[0].describe();
-    println!("{text}");
     assert!(
         text.contains("174.23 deg for joint 7 is beyond its limit of 168.5 deg"),
         "{text}"

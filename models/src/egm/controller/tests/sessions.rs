@@ -35,7 +35,6 @@ fn a_killed_client_ends_the_session_after_the_time_out_and_the_robot_stands() {
     let (cause, ended) = rig.ends()[0];
     assert_eq!(cause, EndCause::CommTimeout);
     let after_s = ended.at_ns as f64 * 1e-9 - heard_s;
-    println!("time-out after {after_s:.4} s");
     assert!((after_s - 1.0).abs() <= 0.004, "{after_s}");
     assert!((ended.value - 1.0).abs() <= 0.004, "{ended:?}");
     let text = ended.describe();
@@ -70,7 +69,6 @@ fn dead_time_s(rig: &mut Rig, until_s: f64) -> f64 {
 fn each_restart_policy_has_its_dead_time() {
     let retry = dead_time_s(&mut killed(RestartPolicy::AutoRetry), 12.0);
     let wait = dead_time_s(&mut killed(RestartPolicy::WaitThenRestart), 12.0);
-    println!("dead time: auto_retry {retry:.3} s, wait_then_restart {wait:.3} s");
     assert!((retry - 0.5).abs() <= 0.004, "{retry}");
     assert!((wait - 2.0).abs() <= 0.004, "{wait}");
 
@@ -83,8 +81,6 @@ fn each_restart_policy_has_its_dead_time() {
     rig.silence(9.2);
     assert_eq!(rig.state(), SessionState::Activating);
     rig.drive(12.0, 2, |time_s| Some(swing(time_s, false)));
-    let running = rig.of_kind(EgmEventKind::Running)[1];
-    println!("external_trigger, asked 3 s later: {:.3} s", running.value);
     assert!((running.at_ns as f64 * 1e-9 - 9.5).abs() <= 0.008);
 }
 
@@ -94,8 +90,6 @@ fn going_home_first_activates_at_home_and_the_reference_calls_the_arm_back() {
     let silent = rig.silence(6.2);
     assert_eq!(rig.state(), SessionState::Moving);
     let feedback = rig.drive(20.0, 2, |time_s| Some(swing(time_s, false)));
-    let running = rig.of_kind(EgmEventKind::Running)[1];
-    println!("go_home_first: {:.3} s", running.value);
     let home = home_rad(Side::Right);
     let at_start = feedback
         .iter()
@@ -151,7 +145,6 @@ fn condition_time_ends_a_session_that_holds_still_and_is_named() {
     let (cause, ended) = rig.ends()[0];
     assert_eq!(cause, EndCause::ConditionTime);
     let text = ended.describe();
-    println!("{text}");
     assert!(text.contains("(CondTime = 1 s)"), "{text}");
     assert!((ended.at_ns as f64 * 1e-9 - 1.5).abs() < 0.03, "{ended:?}");
 
@@ -167,7 +160,6 @@ fn condition_time_ends_a_session_that_holds_still_and_is_named() {
     let (cause, ended) = rig.ends()[0];
     assert_eq!(cause, EndCause::ConditionTime);
     let silent_s = ended.at_ns as f64 * 1e-9 - 5.0;
-    println!("CondTime ends a silent session after {silent_s:.2} s");
     assert!((1.0..2.0).contains(&silent_s), "{silent_s}");
 }
 
@@ -194,7 +186,6 @@ fn max_speed_deviation_throttles_visibly_and_is_named_once() {
     let told = rig.of_kind(EgmEventKind::SpeedThrottled);
     assert_eq!(told.len(), 1);
     let text = told[0].describe();
-    println!("{text}");
     assert!(text.ends_with("(MaxSpeedDeviation = 1 deg/s)"), "{text}");
 
     // Standing still ends the episode.
@@ -220,7 +211,6 @@ fn max_position_deviation_ends_a_session_and_names_the_joint() {
     let (cause, ended) = rig.ends()[0];
     assert_eq!(cause, EndCause::PositionDeviation);
     let text = ended.describe();
-    println!("{text}");
     // The third joint of the chain is the maker's seventh.
     assert!(text.contains("joint 7 is 10."), "{text}");
     assert!(text.ends_with("(MaxPosDeviation = 10 deg)"), "{text}");
