@@ -20,8 +20,6 @@ const MEANS_S: [f64; 4] = [0.3, 0.5, 1.0, 2.0];
 const RATIO_MIN: f64 = 0.001;
 const RATIO_MAX: f64 = 0.3;
 
-/// Runs per rate that is tried, each of the loops the tables have.
-const SEED_COUNT: usize = 10;
 /// Rates tried at most.
 const TRIES_MAX: usize = 5;
 /// A try this near to the aim ends the search: the count of lost loops scatters more than that.
@@ -72,6 +70,8 @@ pub(crate) struct Calibration {
     ratio: f64,
     seed: u64,
     loops: u32,
+    /// Runs per rate that is tried, each of these loops.
+    seeds: u32,
     trajectory: Trajectory,
     base: Setup,
 }
@@ -110,6 +110,7 @@ impl Calibration {
             ratio,
             seed: case.seed,
             loops,
+            seeds: case.parameters.tables.seeds,
             trajectory: Trajectory::new(case, loops)?,
             base: base(case),
         })
@@ -161,9 +162,10 @@ impl Search<'_, '_> {
             missing_count: 0,
             sent_count: 0,
         };
-        for replica in 0..SEED_COUNT {
-            let done = (self.tries.len() * SEED_COUNT + replica) as f64;
-            let step = 1.0 / (TRIES_MAX * SEED_COUNT) as f64;
+        let seeds = self.calibration.seeds as usize;
+        for replica in 0..seeds {
+            let done = (self.tries.len() * seeds + replica) as f64;
+            let step = 1.0 / (TRIES_MAX * seeds) as f64;
             let watch = &mut *self.watch;
             let mut look = |share: f64| watch((done + share) * step);
             let seed = seed_of(self.calibration.seed, replica);
@@ -358,9 +360,8 @@ impl Calibration {
     fn notes(&self) -> Vec<String> {
         vec![
             format!(
-                "seed {}; each rate is tried in {SEED_COUNT} runs of {} loops that share their \
-                 random numbers",
-                self.seed, self.loops
+                "seed {}; each rate is tried in {} runs of {} loops that share their random numbers",
+                self.seed, self.seeds, self.loops
             ),
             format!("a loop counts by {}", self.trajectory.counter.text()),
             "one loss rate fixes a curve, not a point: measure how long outages last on the real \
