@@ -118,12 +118,12 @@ fn a_lost_loop_stands_beside_the_outage_that_made_it() {
         let lost = lost.next().expect("an event for the lost loop");
         assert!(lost.what.contains("CommTimeout"), "{}", lost.what);
         let mut outages = lost.outages.iter();
-        let seen = outages.find(|one| one.channel == COMMAND);
-        let seen = seen.unwrap_or_else(|| panic!("{lost:?}"));
+        let found = outages.find(|one| one.channel == COMMAND);
+        let found = found.unwrap_or_else(|| panic!("{lost:?}"));
         // Seen from the messages alone: to a command period or two at each end, and the two
         // processes' starts.
-        let seen_s = seen.length_s.unwrap();
-        assert!((seen_s - length_s).abs() < 0.1, "{seen_s} for {length_s}");
-        assert!(seen.lost_count > 400, "{seen:?}");
+        let found_s = found.length_s.unwrap();
+        assert!((found_s - length_s).abs() < 0.1, "{found_s} for {length_s}");
+        assert!(found.lost_count > 400, "{found:?}");
     }
 }

@@ -81,6 +81,7 @@ fn each_restart_policy_has_its_dead_time() {
     rig.silence(9.2);
     assert_eq!(rig.state(), SessionState::Activating);
     rig.drive(12.0, 2, |time_s| Some(swing(time_s, false)));
+    let running = rig.of_kind(EgmEventKind::Running)[1];
     assert!((running.at_ns as f64 * 1e-9 - 9.5).abs() <= 0.008);
 }
 
