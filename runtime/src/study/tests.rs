@@ -70,7 +70,7 @@ impl Study for Curve {
     }
 
     fn report(&self, outcomes: &[Option<&f64>]) -> StudyReport {
-        let cell = |outcome: &Option<&f64>| vec![Cell::number(outcome.copied(), 3)];
+        let cell = |value: Option<f64>| vec![Cell::number(value, 3)];
         StudyReport {
             tables: vec![Table {
                 name: "curve".to_owned(),
@@ -78,7 +78,7 @@ impl Study for Curve {
                     name: "outages_per_h",
                     label: "Outages per hour",
                 }],
-                rows: outcomes.iter().map(cell).collect(),
+                rows: outcomes.iter().map(|one| cell(one.copied())).collect(),
                 ..Table::default()
             }],
             ..StudyReport::default()
