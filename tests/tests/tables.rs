@@ -149,3 +149,28 @@ fn what_cannot_be_computed_is_named() {
     let shuttle = "deploy/topologies/shuttle-local.toml";
     refused(shuttle, &[], "case shuttle has no tables");
 }
+
+/// The shipped file of case study 2, small: Bernoulli losses cost no loop, whatever the threads.
+#[test]
+fn the_motion_loss_table_is_the_same_on_any_number_of_threads() {
+    let report = |jobs: &str| {
+        let arguments = [
+            "--json",
+            "--quiet",
+            "--jobs",
+            jobs,
+            "--set",
+            "case.parameters.tables={ loops = 60, seeds = 3, conditions = ['loss-', 'short'] }",
+        ];
+        let finished = run_on("deploy/topologies/teleop-tables.toml", &arguments);
+        finished.assert_success();
+        let document: Value = serde_json::from_str(&finished.stdout).unwrap();
+        assert_eq!(document["is_passed"], true, "{}", finished.stdout);
+        // Four ratios of loss and the short range, three runs each.
+        assert_eq!(document["cost"]["ended_count"], 15);
+        document["report"].clone()
+    };
+    let (one, two) = (report("1"), report("2"));
+    assert!(one["tables"].is_array(), "{one}");
+    assert_eq!(one, two);
+}

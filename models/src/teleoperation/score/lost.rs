@@ -54,14 +54,18 @@ impl Run {
         let (evidence, period_ns) = (&self.sessions.evidence, self.counter.period_ns);
         let cause = evidence.cause_of(due_ns, period_ns);
         let window = self.window(due_ns);
-        let what = format!(
-            "motion loop {} of {} lost: {}; the tool moved {:.3} m in it, {:.3} m are needed",
+        let mut what = format!(
+            "motion loop {} of {} lost: {}",
             index + 1,
             loops.sent_count(),
             cause.text(),
-            self.moved_m(window),
-            self.counter.prominence_m
         );
+        let (moved_m, needed_m) = (self.moved_m(window), self.counter.prominence_m);
+        // More than that and still no peak of its own: the distance explains nothing.
+        if moved_m < needed_m {
+            let said = format!("; the tool moved {moved_m:.3} m in it, {needed_m:.3} m are needed");
+            what.push_str(&said);
+        }
         let named = event(Severity::Incident, due_ns, what);
         let silence = match cause {
             LossCause::Trip(_) => within(&evidence.pauses, window, |pause| pause.span)
