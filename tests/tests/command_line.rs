@@ -107,8 +107,7 @@ fn every_shipped_topology_is_fit_and_so_are_the_commands_it_tells_of() {
             command_count += 1;
             let mut arguments: Vec<&str> = command.split_whitespace().collect();
             // Virtual time is over in a moment; a real run is only checked.
-            let checks = (arguments[0] != "simulate").then_some("--check");
-            arguments.extend(checks);
+            arguments.extend((arguments[0] != "simulate").then_some("--check"));
             assert_code(&run_in(&folder, &arguments), 0);
         }
     }
