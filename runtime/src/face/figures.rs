@@ -41,7 +41,7 @@ pub fn figures(
         FaceKind::Sensor => ("command", "feedback"),
     };
     let reply = match kind {
-        FaceKind::Robot => "answer of the foreign program: TX stamp → RX stamp",
+        FaceKind::Robot => "robot's newest message, TX stamp → next answer, RX stamp",
         FaceKind::Sensor => "our answer to the robot: RX stamp → TX stamp",
     };
     let mut segments = sent_segments(out, sent);
@@ -228,7 +228,7 @@ mod tests {
         near("command: RX stamp → received by face", 12_000);
         near("command in all: RX stamp → published", 17_000);
         near(
-            "answer of the foreign program: TX stamp → RX stamp",
+            "robot's newest message, TX stamp → next answer, RX stamp",
             500_000,
         );
     }
@@ -255,7 +255,7 @@ mod tests {
                 "command: RX stamp → received by face",
                 "command: received by face → published",
                 "command in all: RX stamp → published",
-                "answer of the foreign program: TX stamp → RX stamp",
+                "robot's newest message, TX stamp → next answer, RX stamp",
             ]
         );
         assert_eq!(figures.cycle_ns, Some(CYCLE));

@@ -14,7 +14,9 @@ use crate::run_log::RunLog;
 use crate::teleoperation::score::figure::figure;
 use crate::teleoperation::score::sessions::{events, is_right};
 use crate::teleoperation::series::Estimate;
-use crate::teleoperation::{EGM_RIGHT_COMMAND, EGM_RIGHT_FEEDBACK, MOTION_RECEIVED};
+use crate::teleoperation::{
+    EGM_RIGHT_COMMAND, EGM_RIGHT_FEEDBACK, HUMAN_FRAME, MOTION_RECEIVED, SendPolicy, Teleoperation,
+};
 use crate::time::{Instant, duration_ns};
 use crate::yumi::{JOINT_COUNT, Joints};
 
@@ -32,7 +34,7 @@ pub(crate) struct JointError {
 }
 
 impl JointError {
-    pub(crate) fn read(log: &RunLog, settings: &ControllerSettings, period_s: f64) -> Self {
+    pub(crate) fn read(case: &Teleoperation, log: &RunLog, period_s: f64) -> Self {
         let mut error = Self {
             has_one_clock: log.has_one_clock(),
             ..Self::default()
@@ -41,7 +43,10 @@ impl JointError {
             error.unsplit = Some(TWO_CLOCKS);
             return error;
         }
-        let mut ideal = Ideal::of(log, settings);
+        let mut ideal = match why_unsplit(case, log) {
+            Some(why) => Err(why),
+            None => Ideal::of(log, &case.settings),
+        };
         error.unsplit = ideal.as_ref().err().copied();
         let mut commands = log.messages::<EgmCommand>(EGM_RIGHT_COMMAND).peekable();
         let mut desired: Option<(Instant, Joints)> = None;
@@ -245,7 +250,31 @@ impl ErrorSums {
     }
 }
 
-/// The same controller with the same commands, each arriving as it was published.
+/// Longer than any run, and a time the controller takes.
+const NEVER_S: f64 = 1e6;
+
+/// Why nobody can tell what the robot would have done over a perfect channel.
+fn why_unsplit(case: &Teleoperation, log: &RunLog) -> Option<&'static str> {
+    let is_asked_otherwise = |arrival: MotionArrival| {
+        let harmless = [MotionKind::EgmStart, MotionKind::GetState];
+        !harmless
+            .map(|kind| kind as u32)
+            .contains(&arrival.request.kind)
+    };
+    let mut requests = log.messages::<MotionArrival>(MOTION_RECEIVED);
+    if log.raw(HUMAN_FRAME).is_empty() {
+        Some("the commands were recorded behind the network: what it lost is not among them")
+    } else if case.parameters.send == SendPolicy::Coupled {
+        Some("commands that answer feedback would be others over another channel")
+    } else if requests.any(|(_, arrival)| is_asked_otherwise(arrival)) {
+        Some("the robot was asked for motions of its own, or to stop")
+    } else {
+        None
+    }
+}
+
+/// The same controller with the same commands, each arriving as it was published. It never ends its
+/// session: commands that a real one would miss are the network's part.
 struct Ideal<C: Iterator<Item = (Instant, EgmCommand)>> {
     controller: Controller,
     commands: Peekable<C>,
@@ -282,11 +311,14 @@ impl Ideal<core::iter::Empty<(Instant, EgmCommand)>> {
             ..*settings
         };
         let mut controller = Controller::new(Side::Right, settings, at_rest.measured_rad);
-        controller
-            .start_guided_motion(&asked_for(log, set_up.at_ns))
-            .map_err(
-                |_refusal| "the recorded request for guided motion is not one the controller takes",
-            )?;
+        let asked = EgmStartParameters {
+            comm_timeout_s: NEVER_S,
+            condition_time_s: NEVER_S,
+            ..asked_for(log, set_up.at_ns)
+        };
+        controller.start_guided_motion(&asked).map_err(
+            |_refusal| "the recorded request for guided motion is not one the controller takes",
+        )?;
         Ok(Ideal {
             controller,
             commands: log.messages::<EgmCommand>(EGM_RIGHT_COMMAND).peekable(),

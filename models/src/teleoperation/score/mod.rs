@@ -49,7 +49,7 @@ pub(crate) fn score(case: &Teleoperation, log: &RunLog) -> Score {
     };
     let loops = run.counter.count(&run.sent.samples, &run.moved);
     let mut metrics = run.motion_loops(loops.as_ref());
-    metrics.extend(JointError::read(log, &case.settings, run.period_s).metrics());
+    metrics.extend(JointError::read(case, log, run.period_s).metrics());
     metrics.push(run.tracking_lag());
     metrics.push(run.tool_travel());
     let commanded = run.record.sent_y();
@@ -69,6 +69,9 @@ pub(crate) fn score(case: &Teleoperation, log: &RunLog) -> Score {
     lost::add_events(&mut score, &run, loops.as_ref(), log);
     score
 }
+
+/// A sender silent for longer than this share of a loop may have left one out.
+const SILENCE_PERIODS: f64 = 0.25;
 
 /// A log made ready.
 #[derive(Debug)]
@@ -92,17 +95,30 @@ struct Sent {
 }
 
 impl Sent {
-    /// The commanded tool y. A sender that parks the arm now and then sends fewer loops than the
-    /// human makes: then the human's hand is what was asked for.
+    /// The commanded tool y. A sender that parks the arm or falls silent now and then sends fewer
+    /// loops than the human makes: then the human's hand is what was asked for.
     fn read(case: &Teleoperation, log: &RunLog, record: &Record) -> Self {
         let is_parked = |flags: u32| flags & EgmCommand::PARKED != 0;
         let mut commands = record.commands.iter();
         // What comes before the first command that follows the hand is no loop left out.
         let followed = commands.find(|command| !is_parked(command.flags));
-        if followed.is_none() || !commands.any(|command| is_parked(command.flags)) {
+        let silence_ns = SILENCE_PERIODS * case.parameters.motion_period_s * 1e9;
+        let mut heard_ns = followed.map_or(0, |command| command.at_ns);
+        let has_left_out = commands.any(|command| {
+            let gap_ns = command.at_ns - core::mem::replace(&mut heard_ns, command.at_ns);
+            is_parked(command.flags) || gap_ns as f64 > silence_ns
+        });
+        let is_behind_the_network = log.raw(HUMAN_FRAME).is_empty();
+        if followed.is_none() || (!has_left_out && !is_behind_the_network) {
             return Self {
                 samples: record.sent_y(),
                 what: "as commanded",
+            };
+        }
+        if is_behind_the_network {
+            return Self {
+                samples: record.sent_y(),
+                what: "as the commands arrived: what was lost on their way is not counted",
             };
         }
         let scale = case.parameters.mapping_scale_ratio;
@@ -120,12 +136,12 @@ impl Sent {
         if samples.is_empty() {
             return Self {
                 samples: record.sent_y(),
-                what: "as commanded, without the loops in which the sender parked the arm",
+                what: "as commanded, without the loops in which the sender was silent",
             };
         }
         Self {
             samples,
-            what: "as the human's hand made them, because the sender parked the arm at times",
+            what: "as the human's hand made them, because the sender was silent at times",
         }
     }
 }

@@ -125,7 +125,7 @@ fn tool_y(
     let values: Vec<f64> = paired(log, shift)
         .step_by(rows.every)
         .flat_map(|(at, feedback, command)| {
-            let measured_m = feedback.tool.position_m[1];
+            let measured_m = arm.tool(&feedback.measured_rad).translation.y;
             [seconds(at, origin_ns), measured_m, commanded_m(command)]
         })
         .collect();

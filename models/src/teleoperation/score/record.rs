@@ -167,6 +167,8 @@ fn commands(log: &RunLog) -> Vec<Command> {
 }
 
 fn feedback(log: &RunLog) -> Vec<Feedback> {
+    // Not the tool the robot names: a foreign one may say it in a frame of its own.
+    let arm = Arm::right();
     let feedback = |(at, message): (Instant, EgmFeedback)| Feedback {
         at_ns: at.as_ns(),
         reference_frame_index: message.reference_frame_index,
@@ -174,7 +176,7 @@ fn feedback(log: &RunLog) -> Vec<Feedback> {
         session: message.session,
         state: message.session_state(),
         flags: message.flags,
-        tool_m: message.tool.position_m,
+        tool_m: arm.tool(&message.measured_rad).translation.vector.into(),
     };
     log.messages(EGM_RIGHT_FEEDBACK).map(feedback).collect()
 }

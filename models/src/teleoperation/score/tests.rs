@@ -13,7 +13,7 @@ use crate::message::{Envelope, Message};
 use crate::score::Severity;
 use crate::simulation::{Carrier, Simulation};
 use crate::teleoperation::{
-    EGM_EVENT, EGM_RIGHT_COMMAND, EGM_RIGHT_FEEDBACK, TeleoperationParameters,
+    EGM_EVENT, EGM_RIGHT_COMMAND, EGM_RIGHT_FEEDBACK, SendPolicy, TeleoperationParameters,
 };
 use crate::time::Instant;
 use crate::yumi::arm::RIGHT_START_RAD;
@@ -336,8 +336,28 @@ fn a_run_of_foreign_programs_is_scored_without_events() {
     assert_eq!(score.get("commands_refused_count").unwrap().value, None);
     let split = score.get("joint_error_network_rad_rms").unwrap();
     assert_eq!(split.value, None);
-    assert!(split.method.contains("no beginning"), "{}", split.method);
+    assert!(split.method.contains("behind the network"), "{split:?}");
+    let sent = score.get("motion_loops_sent_count").unwrap();
+    assert!(sent.method.contains("as the commands arrived"), "{sent:?}");
     assert!(value(&score, "tool_path_m_rms") < 1e-3);
+}
+
+#[test]
+fn loops_that_a_coupled_sender_could_not_send_are_lost_all_the_same() {
+    // Without feedback a coupled sender has nothing to answer: two and a half loops are never sent.
+    let case = case(|parameters| parameters.send = SendPolicy::Coupled);
+    let carrier: Box<dyn Carrier> = Box::new(silence(9.0, 19.0));
+    let carriers = BTreeMap::from([(EGM_RIGHT_FEEDBACK.to_owned(), carrier)]);
+    let simulation = Simulation::new(&case, carriers).unwrap();
+    let run = simulation.run(Duration::from_secs_f64(10.0 * PERIOD_S));
+    let score = case.score(&run.unwrap().log);
+    let sent = score.get("motion_loops_sent_count").unwrap();
+    assert!(sent.method.contains("human's hand"), "{sent:?}");
+    assert!((value(&score, "motion_loops_sent_count") - 10.0).abs() <= 1.0);
+    assert!(value(&score, "motion_loss_ratio") > 0.15);
+    let split = score.get("joint_error_network_rad_rms").unwrap();
+    assert_eq!(split.value, None);
+    assert!(split.method.contains("answer feedback"), "{split:?}");
 }
 
 #[test]

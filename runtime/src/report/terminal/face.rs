@@ -54,8 +54,8 @@ fn answers(canvas: &mut Canvas, face: &FaceSummary) {
                 Tone::Plain
             };
             let text = format!(
-                "{} of the {} messages between first and last answer were answered before the \
-                 robot's next ({total} in the whole run)",
+                "after {} of the {} messages between first and last answer one came before the \
+                 robot's next ({total} in the whole run); which message it answers EGM does not say",
                 percent(ratio),
                 grouped(answers.attended_count)
             );
