@@ -391,7 +391,7 @@ pub enum MotionKind {
     GetState = 0,
     /// A joint motion (`MoveAbsJ`).
     MoveJoints = 1,
-    /// A straight line of the tool (`MoveL`).
+    /// A straight line of the tool (`MoveL`) of at most 5000 cycles, i.e. 20 s at 4 ms.
     MoveLinear = 2,
     /// Start guided motion.
     EgmStart = 3,
@@ -450,7 +450,8 @@ pub enum MotionRefusal {
     UnknownKind = 1,
     /// No arm, or one that does not exist.
     NoArm = 2,
-    /// A number is not finite or outside its range.
+    /// A number is not finite or outside its range, or a linear motion is so slow that it would
+    /// last more than 5000 cycles.
     BadNumber = 3,
     /// The target is outside a joint's limits.
     OutsideLimits = 4,

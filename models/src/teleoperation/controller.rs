@@ -43,21 +43,23 @@ crate::message_set! {
 /// get the whole gap's worth of speed at once.
 const ELAPSED_MAX_S: f64 = 0.1;
 
-/// Feedback stamped so much earlier than the newest is of a clock that started anew; less, it only
-/// came late.
+/// Feedback of a lower cycle stamped so much earlier than the newest is of a clock that started
+/// anew; less, it only came late.
 const CLOCK_RESTART_MS: i32 = 10_000;
 
 /// True when `feedback` takes the place of `newest`.
 pub(crate) fn is_newer(feedback: &EgmFeedback, newest: &EgmFeedback) -> bool {
-    // The clock wraps. Unlike the cycles it goes on when the robot's process starts anew.
+    // The cycles of a foreign robot never fall (the face counts them), though its clock does when
+    // it starts anew.
+    if feedback.cycle_index > newest.cycle_index {
+        return true;
+    }
+    // Those of our robot fall when its process starts anew, and its clock goes on. It wraps.
     let later_ms = feedback
         .clock_ms
         .wrapping_sub(newest.clock_ms)
         .cast_signed();
-    match later_ms {
-        0 => feedback.cycle_index > newest.cycle_index,
-        _ => !(-CLOCK_RESTART_MS..=0).contains(&later_ms),
-    }
+    !(-CLOCK_RESTART_MS..=0).contains(&later_ms)
 }
 
 /// The role. Each arm engages on the first sound human frame after its own guided motion runs,
@@ -316,5 +318,54 @@ impl Component for Controller {
         self.send_timer
             .as_ref()
             .map_or(0, PeriodicTimer::skipped_total)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use bytemuck::Zeroable;
+
+    use super::*;
+
+    fn feedback(cycle_index: u64, clock_ms: u32) -> EgmFeedback {
+        EgmFeedback {
+            cycle_index,
+            clock_ms,
+            ..EgmFeedback::zeroed()
+        }
+    }
+
+    #[test]
+    fn feedback_after_a_restart_is_newer_and_late_feedback_is_not() {
+        let newest = feedback(2000, 8000);
+        let is_newer = |cycle_index, clock_ms| is_newer(&feedback(cycle_index, clock_ms), &newest);
+        assert!(is_newer(2001, 8004));
+        for clock_ms in [0, 4, 4000, 7999] {
+            assert!(
+                is_newer(2001, clock_ms),
+                "a foreign robot's clock restarted"
+            );
+        }
+        assert!(is_newer(0, 9000), "our robot's process restarted");
+        assert!(is_newer(0, 8000_u32.wrapping_sub(10_001)), "and its host");
+        assert!(!is_newer(2000, 8000), "repeated");
+        assert!(!is_newer(1999, 7996), "late");
+        assert!(!is_newer(1999, 8000), "late, both within one millisecond");
+    }
+
+    #[test]
+    fn an_arm_whose_foreign_robot_restarted_leaves_its_old_session_at_once() {
+        let mut arm = ArmSender::new(Side::Right);
+        let old = EgmFeedback {
+            session: 1,
+            ..feedback(2000, 8000)
+        };
+        arm.on_feedback(&old);
+        let new = EgmFeedback {
+            session: 2,
+            ..feedback(2001, 0)
+        };
+        arm.on_feedback(&new);
+        assert_eq!(arm.newest.map(|newest| newest.session), Some(2));
     }
 }

@@ -61,7 +61,6 @@ mod parameters;
 mod replay;
 mod robot;
 mod score;
-pub(crate) mod series;
 #[cfg(test)]
 mod session_tests;
 pub mod skeleton;

@@ -26,6 +26,11 @@ const JOBS_MAX: usize = 16;
 /// Speed of a linear motion that names none, metres per second.
 const LINEAR_SPEED_M_PER_S: f64 = 0.1;
 
+/// Points of the longest linear motion, 20 s in cycles of 4 ms: all are computed in the cycle that
+/// takes the request, which a longer one would hold up for too long. It is refused as a bad number,
+/// as its speed is too low for its way.
+const LINEAR_POINTS_MAX: f64 = 5000.0;
+
 /// The server.
 #[derive(Debug)]
 pub(crate) struct MotionServer {
@@ -60,7 +65,7 @@ struct Refusal {
 }
 
 /// What an arm is told.
-#[derive(Debug, Clone)]
+#[derive(Debug)]
 enum Order {
     Start(EgmStartParameters),
     Stop,
@@ -208,15 +213,14 @@ impl MotionServer {
                 .map(|path| Order::Move(kind, path))
                 .collect(),
         };
-        let mut orders: Vec<_> = sides.into_iter().zip(orders).collect();
+        let orders: Vec<_> = sides.into_iter().zip(orders).collect();
         // An arm may still refuse, e.g. because it is not yet at rest. So that one does not move
-        // without the other, both are asked on copies before.
-        let is_together = orders.len() > 1;
-        for (side, order) in orders.iter().filter(|_| is_together) {
-            let mut trial = controllers[side.index()].clone();
-            give(&mut trial, order.clone()).map_err(|why| Refusal { why, side: *side })?;
+        // without the other, all are asked before any is told.
+        for (side, order) in &orders {
+            would_take(&controllers[side.index()], order)
+                .map_err(|why| Refusal { why, side: *side })?;
         }
-        for (side, order) in orders.drain(..) {
+        for (side, order) in orders {
             give(&mut controllers[side.index()], order).map_err(|why| Refusal { why, side })?;
         }
         Ok(())
@@ -271,6 +275,9 @@ impl MotionServer {
             let arm = &self.arms[side.index()];
             let own_s = linear_duration_s(arm, &from_rad, &target, speed_m_per_s)
                 .ok_or(refused(MotionRefusal::Unreachable))?;
+            if own_s > LINEAR_POINTS_MAX * self.cycle_s {
+                return Err(refused(MotionRefusal::BadNumber));
+            }
             duration_s = duration_s.max(own_s);
             lines.push((side, from_rad, target));
         }
@@ -336,6 +343,14 @@ impl Job {
                 .all(|state| state != SessionState::Moving)
                 .then_some(MotionOutcome::Done),
         }
+    }
+}
+
+fn would_take(controller: &Controller, order: &Order) -> Result<(), MotionRefusal> {
+    match order {
+        Order::Start(parameters) => controller.can_start(parameters),
+        Order::Stop => Ok(()),
+        Order::Move(_, path) => controller.can_move(path),
     }
 }
 

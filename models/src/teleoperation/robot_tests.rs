@@ -247,6 +247,13 @@ fn what_cannot_be_done_is_refused_with_its_reason_and_moves_no_arm() {
     check_refused(&mut bench, &far, MotionRefusal::Unreachable, Side::Left);
     far.poses[1].position_m[0] = 1e5;
     check_refused(&mut bench, &far, MotionRefusal::Unreachable, Side::Left);
+    // 0.21 m at 0.01 m/s is 21 s, more than 5000 cycles.
+    let mut slow = both(MotionKind::MoveLinear);
+    slow.speed = 0.01;
+    slow.poses[0] = right.tool(&START_RAD[0]).into();
+    slow.poses[1] =
+        (nalgebra::Isometry3::translation(0.0, 0.0, 0.21) * left.tool(&START_RAD[1])).into();
+    check_refused(&mut bench, &slow, MotionRefusal::BadNumber, Side::Left);
     let mut bad_start = both(MotionKind::EgmStart);
     bad_start.egm.comm_timeout_s = -1.0;
     check_refused(

@@ -8,6 +8,7 @@ use nalgebra::Vector3;
 use super::*;
 use crate::link::bernoulli::BernoulliLink;
 use crate::link::{Fate, LinkModel};
+use crate::measure::series;
 use crate::simulation::{Carrier, Simulation, SimulationResult};
 use crate::teleoperation::follower::Follower;
 use crate::time::Instant;

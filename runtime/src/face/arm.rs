@@ -22,6 +22,9 @@ use crate::wait::{Pause, WaitStrategy};
 pub(super) const DATAGRAM_BYTES_MAX: usize = 2048;
 /// A busy or spinning thread looks after its socket's error queue this often.
 const LOOK_PERIOD_NS: i64 = 500_000;
+/// So many looks at most clear what waits before and after the run: more than a socket's buffer
+/// and a channel hold, so that only a peer that goes on sending meets this end.
+const CLEARING_TURNS_MAX: usize = 65_536;
 /// Patience for a stamp that is under way; see `line`.
 const STAMP_WAIT_NS: i64 = 20_000_000;
 
@@ -69,7 +72,10 @@ impl Arm {
     /// When a channel or the socket itself breaks.
     pub(super) fn run(&mut self, work: &mut dyn Work, stop: &AtomicBool) -> Result<(), FaceError> {
         // A robot that was there before us has filled the socket with what is old news by now.
-        while self.line.receive(self.buffer.as_mut_slice())?.is_some() {
+        for _ in 0..CLEARING_TURNS_MAX {
+            if self.line.receive(self.buffer.as_mut_slice())?.is_none() {
+                break;
+            }
             self.early_count += 1;
         }
         while !stop.load(Ordering::Acquire) {
@@ -78,8 +84,12 @@ impl Arm {
                 self.rest(work.next_due())?;
             }
         }
-        // Nobody publishes any more, so this ends.
-        while self.turn(work)? {}
+        // None of ours publishes any more, but the foreign program may go on sending.
+        for _ in 0..CLEARING_TURNS_MAX {
+            if !self.turn(work)? {
+                break;
+            }
+        }
         self.line.look_after(Instant::from_ns(i64::MAX));
         Ok(())
     }

@@ -27,8 +27,6 @@ pub(super) struct RobotWork {
     silent_count: u64,
     /// Feedbacks that were no message of their channel.
     malformed_count: u64,
-    session: u32,
-    session_count: u64,
 }
 
 impl RobotWork {
@@ -46,8 +44,6 @@ impl RobotWork {
             peer: Peer::default(),
             silent_count: 0,
             malformed_count: 0,
-            session: 0,
-            session_count: 0,
         }
     }
 
@@ -64,10 +60,6 @@ impl RobotWork {
             if !self.face.encode(&feedback, at, &mut self.datagram) {
                 self.silent_count += 1;
                 return;
-            }
-            if feedback.session != self.session {
-                self.session = feedback.session;
-                self.session_count += 1;
             }
             let handed = MonotonicClock::now();
             self.peer.spoken_to(handed);
@@ -117,7 +109,7 @@ impl Work for RobotWork {
         let own = [
             ("datagrams encoded", self.face.sent_count()),
             ("cycles without a session", self.silent_count),
-            ("sessions started", self.session_count),
+            ("sessions started", self.face.session_count()),
             ("datagrams received", received.total()),
             ("commands published", received.accepted()),
             ("malformed feedbacks", self.malformed_count),

@@ -63,6 +63,16 @@ pub(super) fn check_face(
             Fault::Inconsistent(fault.to_owned()),
         );
     }
+    if kind == FaceKind::Sensor && entry.axes == 6 {
+        let fault = "is 6, but our controller moves seven joints: a robot of six axes would not \
+                     follow J7 and does not measure it; allowed in a sensor face: 7";
+        let key = join(&entry.path, "axes");
+        faults.add(
+            key,
+            Some(entry.place),
+            Fault::Inconsistent(fault.to_owned()),
+        );
+    }
     if kind == FaceKind::Robot
         && let Some((side, address)) = entry
             .addresses()

@@ -108,7 +108,7 @@ impl EgmFace {
 pub(super) struct FaceEntry {
     right: Option<SocketAddr>,
     left: Option<SocketAddr>,
-    axes: u8,
+    pub axes: u8,
     robotware: u8,
     send: FaceSend,
     timestamps: Timestamps,

@@ -120,6 +120,23 @@ impl Controller {
         &mut self,
         parameters: &EgmStartParameters,
     ) -> Result<(), MotionRefusal> {
+        let settings = self.start_settings(parameters)?;
+        self.request = Some(Request::Start(Box::new(settings)));
+        Ok(())
+    }
+
+    /// Whether [`Controller::start_guided_motion`] would be taken now.
+    ///
+    /// # Errors
+    /// What that would refuse it with.
+    pub fn can_start(&self, parameters: &EgmStartParameters) -> Result<(), MotionRefusal> {
+        self.start_settings(parameters).map(|_| ())
+    }
+
+    fn start_settings(
+        &self,
+        parameters: &EgmStartParameters,
+    ) -> Result<ControllerSettings, MotionRefusal> {
         match self.state() {
             SessionState::Idle if self.request.is_none() => {}
             SessionState::Activating | SessionState::Running => {
@@ -127,9 +144,7 @@ impl Controller {
             }
             _ => return Err(MotionRefusal::Busy),
         }
-        let settings = self.settings.with(parameters)?;
-        self.request = Some(Request::Start(Box::new(settings)));
-        Ok(())
+        self.settings.with(parameters)
     }
 
     /// Stops guided motion by the stop mode, from the next cycle on, and what a restart policy
@@ -149,6 +164,16 @@ impl Controller {
     /// When the arm is busy or not yet at rest, or a point is no number or outside the joints'
     /// limits.
     pub fn move_along(&mut self, kind: MotionKind, path: Vec<Joints>) -> Result<(), MotionRefusal> {
+        self.can_move(&path)?;
+        self.request = Some(Request::Move { kind, points: path });
+        Ok(())
+    }
+
+    /// Whether [`Controller::move_along`] would be taken now.
+    ///
+    /// # Errors
+    /// What that would refuse it with.
+    pub fn can_move(&self, path: &[Joints]) -> Result<(), MotionRefusal> {
         match self.state() {
             SessionState::Idle if self.request.is_none() && self.plan.is_at_rest() => {}
             SessionState::Activating | SessionState::Running => {
@@ -168,7 +193,6 @@ impl Controller {
         if !path.iter().all(is_inside) {
             return Err(MotionRefusal::OutsideLimits);
         }
-        self.request = Some(Request::Move { kind, points: path });
         Ok(())
     }
 

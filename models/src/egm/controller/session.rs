@@ -55,7 +55,7 @@ pub(super) struct Session {
     pub(super) start_rad: Joints,
     /// Cycles since guided motion last began.
     pub(super) cycle_count: u64,
-    /// When the last message arrived.
+    /// When the last message arrived that was not refused, or guided motion began.
     pub(super) heard_at: Instant,
     pub(super) converged_since: Option<Instant>,
 }

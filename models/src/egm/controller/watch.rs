@@ -79,17 +79,23 @@ impl HoldWatch {
 impl Controller {
     /// Decides about everything that arrived before this cycle, by the state the cycle before
     /// left.
+    ///
+    /// `CommTimeout` counts from the last command that could have moved the arm: one that was
+    /// queued, or found the queue full. A refused one does not postpone it, as it does not where a
+    /// face refuses it before it comes here.
     pub(super) fn settle_arrivals(&mut self, tell: &mut dyn FnMut(EgmEvent)) {
         let is_running = self.session.phase == Phase::Running;
         while let Some((arrived_at, fate)) = self.inbox.settle(self.at, is_running) {
-            if is_running {
-                self.session.heard_at = arrived_at;
-            }
             match fate {
+                Fate::Refused(fault) => {
+                    self.note_refusal(&fault, tell);
+                    continue;
+                }
                 Fate::Queued => self.last_refusal = None,
-                Fate::Refused(fault) => self.note_refusal(&fault, tell),
                 Fate::Dropped => self.note_overflow(tell),
             }
+            // Without a session everything is refused.
+            self.session.heard_at = arrived_at;
         }
         if self.inbox.take_pending_overflow() {
             self.note_overflow(tell);

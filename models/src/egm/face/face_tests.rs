@@ -235,6 +235,35 @@ fn a_six_axis_session_leaves_the_seventh_joint_where_it_found_it() {
 }
 
 #[test]
+fn a_robot_that_started_anew_opens_a_session_although_it_counts_like_the_first() {
+    let mut face = opened(Axes::Six);
+    let mut datagram = Vec::new();
+    let mut see = |cycle_index: u64, clock_ms: u32, moved_rad: f64| {
+        let mut seen = EgmFeedback {
+            cycle_index,
+            clock_ms,
+            ..feedback(0)
+        };
+        seen.planned_rad[2] += moved_rad;
+        assert!(face.encode(&seen, AT, &mut datagram));
+        let header = wire::decode_robot(&datagram).unwrap().header.unwrap();
+        let joints = all().find(|(name, _)| *name == "sensor_joints").unwrap().1;
+        let held_rad = face.decode(&joints).unwrap().position_rad[2];
+        (header.seqno.unwrap(), held_rad, face.session_count())
+    };
+    let first_rad = RIGHT_START_RAD[2];
+    assert_eq!(see(500, 2000, 0.1), (1, first_rad, 1));
+    assert_eq!(
+        see(499, 1996, 0.1),
+        (2, first_rad, 1),
+        "late, not restarted"
+    );
+    assert_eq!(see(500, 2000, 0.1), (3, first_rad, 1));
+    assert_eq!(see(130, 4000, 0.2), (0, first_rad + 0.2, 2));
+    assert_eq!(see(131, 4004, 0.3), (1, first_rad + 0.2, 2));
+}
+
+#[test]
 fn limits_bind_exactly_and_survive_the_conversion_to_degrees() {
     let mut robot = opened(Axes::Seven);
     let mut sensor = sensor_face(Axes::Seven, AT_ONCE);

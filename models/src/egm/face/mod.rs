@@ -63,7 +63,7 @@ pub use crate::egm::face::checks::{
 };
 pub use crate::egm::face::robot::{RobotFace, RobotFaceSettings};
 pub use crate::egm::face::sensor::{
-    QUEUE_COUNT_UNKNOWN, REORDERING_MAX_MS, SensorFace, SensorFaceSettings,
+    AHEAD_MAX_MS, QUEUE_COUNT_UNKNOWN, REORDERING_MAX_MS, SensorFace, SensorFaceSettings,
 };
 pub use crate::egm::face::transmit::{SendPolicy, TransmitCounts};
 

@@ -7,7 +7,7 @@ use bytemuck::Zeroable;
 use prost::Message;
 
 use crate::egm::face::checks::{self, Sender};
-use crate::egm::face::{Axes, RobotWare};
+use crate::egm::face::{Axes, REORDERING_MAX_MS, RobotWare};
 use crate::egm::messages::{EgmCommand, EgmFeedback, SessionState, Side};
 use crate::egm::wire::joints::{EXTERNAL_PLACE, WireJoints};
 use crate::egm::wire::messages::{
@@ -50,6 +50,7 @@ pub struct RobotFace {
     session: Option<OpenSession>,
     /// J7 where the newest session found it; `None` before the first.
     held_rad: Option<f64>,
+    session_count: u64,
     received: DatagramCounts,
     sent_count: u64,
 }
@@ -60,7 +61,19 @@ struct OpenSession {
     next_seqno: u32,
     /// What the utilisation is computed from.
     previous_cycle_index: u64,
+    previous_clock_ms: u32,
     previous_planned_rad: Joints,
+}
+
+impl OpenSession {
+    /// Whether `feedback` is of this session. A robot's process that starts anew counts sessions
+    /// and cycles from the start, while its clock goes on; a late feedback has the older clock.
+    fn holds(&self, feedback: &EgmFeedback) -> bool {
+        let behind_ms = self.previous_clock_ms.wrapping_sub(feedback.clock_ms);
+        let is_late = (0..=REORDERING_MAX_MS).contains(&behind_ms.cast_signed());
+        let has_restarted = feedback.cycle_index < self.previous_cycle_index && !is_late;
+        self.number == feedback.session && !has_restarted
+    }
 }
 
 impl RobotFace {
@@ -77,6 +90,7 @@ impl RobotFace {
             sensor: EgmSensor::default(),
             session: None,
             held_rad: None,
+            session_count: 0,
             received: DatagramCounts::default(),
             sent_count: 0,
         }
@@ -141,10 +155,9 @@ impl RobotFace {
 
     /// Number and utilisation, percent, of this cycle's message.
     fn advance(&mut self, feedback: &EgmFeedback) -> (u32, f64) {
-        let known = self
-            .session
-            .filter(|session| session.number == feedback.session);
+        let known = self.session.filter(|session| session.holds(feedback));
         if known.is_none() {
+            self.session_count += 1;
             self.held_rad = Some(feedback.planned_rad[EXTERNAL_PLACE]);
         }
         // A session starts from standstill.
@@ -154,6 +167,7 @@ impl RobotFace {
             number: feedback.session,
             next_seqno: seqno.wrapping_add(1),
             previous_cycle_index: feedback.cycle_index,
+            previous_clock_ms: feedback.clock_ms,
             previous_planned_rad: feedback.planned_rad,
         });
         (seqno, utilization)
@@ -223,6 +237,11 @@ impl RobotFace {
     /// What became of the datagrams that came.
     pub fn received(&self) -> &DatagramCounts {
         &self.received
+    }
+
+    /// Sessions that sensors saw begin.
+    pub fn session_count(&self) -> u64 {
+        self.session_count
     }
 
     /// Datagrams encoded.

@@ -22,6 +22,14 @@ pub const QUEUE_COUNT_UNKNOWN: u32 = u32::MAX;
 /// by the network; farther back, the robot has restarted. Milliseconds.
 pub const REORDERING_MAX_MS: i32 = 1000;
 
+/// By how much a robot's clock may run ahead of its numbers within one session, milliseconds: the
+/// robot's own late cycles. Farther ahead, a session ended and another began behind an outage.
+pub const AHEAD_MAX_MS: u32 = 100;
+
+/// Numbers are taken to come at least so often, milliseconds, and farther apart where the session
+/// has shown that they do: ABB's cycle is 4.032 ms, and the clock counts whole milliseconds.
+const CYCLE_MIN_MS: f64 = 4.2;
+
 /// What a [`SensorFace`] is told once.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SensorFaceSettings {
@@ -46,6 +54,8 @@ pub struct SensorFace {
     /// Lists of the speed part while a command has none.
     spare_speed: EgmSpeedRef,
     session: Option<Session>,
+    /// Of the last datagram taken.
+    release: Option<wire::Release>,
     session_count: u32,
     command: Option<EgmCommand>,
     command_is_fresh: bool,
@@ -72,6 +82,24 @@ impl Session {
         let since_first = self.newest_seqno.saturating_sub(self.first_seqno);
         self.first_cycle_index + u64::from(since_first)
     }
+
+    /// Whether a datagram of this number and clock is of a later session.
+    fn is_over(&self, seqno: u32, tm: u32) -> bool {
+        let behind_ms = self.newest_tm.wrapping_sub(tm).cast_signed();
+        if seqno <= self.newest_seqno {
+            return !(0..=REORDERING_MAX_MS).contains(&behind_ms);
+        }
+        let ahead_ms = -f64::from(behind_ms);
+        behind_ms > REORDERING_MAX_MS || ahead_ms > self.ahead_max_ms(seqno)
+    }
+
+    /// How far the clock may have run when `seqno` follows in the same session.
+    fn ahead_max_ms(&self, seqno: u32) -> f64 {
+        let seen_ms = f64::from(self.newest_tm.wrapping_sub(self.start_tm));
+        let seen_count = f64::from(self.newest_seqno - self.first_seqno);
+        let cycle_ms = (seen_ms / seen_count.max(1.0)).max(CYCLE_MIN_MS);
+        f64::from(seqno - self.newest_seqno) * cycle_ms + f64::from(AHEAD_MAX_MS)
+    }
 }
 
 impl SensorFace {
@@ -86,6 +114,7 @@ impl SensorFace {
             sensor: EgmSensor::default(),
             spare_speed: EgmSpeedRef::default(),
             session: None,
+            release: None,
             session_count: 0,
             command: None,
             command_is_fresh: false,
@@ -100,8 +129,10 @@ impl SensorFace {
     /// The feedback in a robot's datagram that came at `now`.
     ///
     /// A session is told by the robot's number: it begins where the number does not grow although
-    /// the robot's clock does, or where that clock has stepped back by more than
-    /// [`REORDERING_MAX_MS`]. Commands of the last session are forgotten then: their positions
+    /// the robot's clock does, where that clock has stepped back by more than
+    /// [`REORDERING_MAX_MS`], or where it has run on for more than [`AHEAD_MAX_MS`] longer than the
+    /// numbers since the last datagram last: behind an outage the numbers of the next session may
+    /// have outgrown those of the last. Commands of the last session are forgotten then: their positions
     /// belong to where that one was.
     ///
     /// What the protocol does not carry: the reference in use
@@ -152,16 +183,14 @@ impl SensorFace {
         checks::within_limits(&measured_rad, FEEDBACK_SLACK_RAD)?;
         checks::within_limits(&planned_rad, FEEDBACK_SLACK_RAD)?;
         let session = self.follow(seqno, tm)?;
+        self.release = Some(self.robot.release());
         Ok(self.feedback(&session, [measured_rad, planned_rad], tool))
     }
 
     /// The session this number and clock belong to, brought up to date.
     fn follow(&mut self, seqno: u32, tm: u32) -> Result<Session, Refusal> {
         let known = self.session;
-        let is_new = known.is_none_or(|session| {
-            let behind_ms = session.newest_tm.wrapping_sub(tm).cast_signed();
-            seqno <= session.newest_seqno && !(0..=REORDERING_MAX_MS).contains(&behind_ms)
-        });
+        let is_new = known.is_none_or(|session| session.is_over(seqno, tm));
         let mut session = match known {
             Some(session) if !is_new => {
                 let behind_ms = session.newest_tm.wrapping_sub(tm).cast_signed();
@@ -328,9 +357,9 @@ impl SensorFace {
         &self.transmit
     }
 
-    /// The robot's release as its newest datagram tells it; `None` before the first.
+    /// The robot's release as the last datagram that was taken tells it; `None` before the first.
     pub fn release(&self) -> Option<wire::Release> {
-        self.session.map(|_| self.robot.release())
+        self.release
     }
 }
 

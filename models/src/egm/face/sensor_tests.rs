@@ -81,6 +81,10 @@ fn our_own_robot_is_seen_as_it_is() {
         assert_eq!(seen.queue_count, QUEUE_COUNT_UNKNOWN);
     }
     assert_eq!(sensor.release(), Some(Release::RobotWare7));
+    for refused in [&datagram[..], &datagram[..20], &bytes(&from_robot(0, 396))] {
+        assert!(sensor.decode(ms(20), refused).is_err());
+        assert_eq!(sensor.release(), Some(Release::RobotWare7));
+    }
 }
 
 #[test]
@@ -108,6 +112,42 @@ fn a_new_session_is_told_from_a_lost_and_from_a_late_datagram() {
     assert_eq!(see(1, u32::MAX - 40), overtaken(1, 0));
     assert_eq!(face.received().refused(Cause::Overtaken), 4);
     assert_eq!(face.received().total(), 11);
+}
+
+#[test]
+fn a_new_session_behind_an_outage_is_told_by_the_robots_clock() {
+    // Numbers, and milliseconds of the clock, that an outage of 8 s hides; the sessions after it.
+    for (lost, outage_ms, sessions) in [
+        (2000, 8000, 1), // the same session, 4 ms a cycle
+        (1984, 8000, 1), // 4.032 ms a cycle
+        (1980, 8000, 1), // the robot itself lost 80 ms
+        (1000, 8000, 2), // it ended after 1 s and the next one counted to beyond the last
+        (1, 8000, 2),
+        (1, 104, 1), // one late cycle of the robot
+        (1, 105, 2),
+        (500, -5000, 2), // the controller has restarted
+    ] {
+        let mut face = sensor_face(Axes::Seven, AT_ONCE);
+        let mut see = |seqno: u32, tm: i64| {
+            let tm = u32::try_from(tm).unwrap();
+            let outcome = face.decode(Instant::ZERO, &bytes(&from_robot(seqno, tm)));
+            outcome.unwrap().session
+        };
+        for seqno in 0..=1500 {
+            assert_eq!(see(seqno, 4 * i64::from(seqno)), 1);
+        }
+        let seen = see(1500 + lost, 6000 + outage_ms);
+        assert_eq!(seen, sessions, "{lost} in {outage_ms} ms");
+    }
+}
+
+#[test]
+fn a_robot_of_long_cycles_keeps_its_session() {
+    let mut face = sensor_face(Axes::Seven, AT_ONCE);
+    for seqno in (0..20).chain([500, 501]) {
+        let seen = face.decode(Instant::ZERO, &bytes(&from_robot(seqno, 24 * seqno)));
+        assert_eq!(seen.unwrap().session, 1);
+    }
 }
 
 #[test]

@@ -10,12 +10,12 @@ use crate::egm::parameters::ControllerSettings;
 use crate::link::bernoulli::BernoulliLink;
 use crate::link::outages::{OutageLink, Outages};
 use crate::link::{Fate, LinkModel, PerfectLink};
+use crate::measure::series::Sample;
 use crate::random::RandomStream;
 use crate::study::Watch;
 use crate::teleoperation::experiment::trajectory::{Trajectory, requested};
 use crate::teleoperation::score::loops::{Evidence, Loops, LossCause, Pause, Span};
 use crate::teleoperation::score::sessions::cause_of;
-use crate::teleoperation::series::Sample;
 use crate::time::{Instant, duration_ns};
 use crate::yumi::arm::Arm;
 

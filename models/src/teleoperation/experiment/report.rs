@@ -1,11 +1,11 @@
 //! The motion-loss table and what it is held against. It computes means and intervals, nothing else.
 
+use crate::measure::series::Estimate;
 use crate::measure::statistics::{CONFIDENCE, poisson};
 use crate::study::{Cell, Column, Criterion, StudyReport, Table, Work};
 use crate::teleoperation::experiment::conditions::{Condition, Expected, PUBLISHED_LOOPS};
 use crate::teleoperation::experiment::drive::Tally;
 use crate::teleoperation::experiment::study::MotionLossStudy;
-use crate::teleoperation::series::Estimate;
 
 /// A condition with the runs of it that ended.
 pub(crate) type Row<'a> = (&'a Condition, Vec<&'a Tally>);

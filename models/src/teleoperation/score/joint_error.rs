@@ -10,10 +10,10 @@ use crate::egm::messages::{
     MotionRequest, Side,
 };
 use crate::egm::parameters::{ControllerSettings, StartMode};
+use crate::measure::series::Estimate;
 use crate::run_log::RunLog;
 use crate::teleoperation::score::figure::figure;
 use crate::teleoperation::score::sessions::{events, is_right};
-use crate::teleoperation::series::Estimate;
 use crate::teleoperation::{
     EGM_RIGHT_COMMAND, EGM_RIGHT_FEEDBACK, HUMAN_FRAME, MOTION_RECEIVED, SendPolicy, Teleoperation,
 };

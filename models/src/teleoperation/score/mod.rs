@@ -18,6 +18,7 @@ mod tests;
 
 use crate::case_study::{Metric, Score};
 use crate::egm::messages::{EgmCommand, EgmFeedback};
+use crate::measure::series::{Estimate, Sample, lag_s, peak_to_peak};
 use crate::measure::statistics::{CONFIDENCE, poisson};
 use crate::run_log::RunLog;
 use crate::teleoperation::messages::HumanFrame;
@@ -26,7 +27,6 @@ use crate::teleoperation::score::joint_error::JointError;
 use crate::teleoperation::score::loops::{LoopCounter, Loops, LossCause};
 use crate::teleoperation::score::record::Record;
 use crate::teleoperation::score::sessions::Sessions;
-use crate::teleoperation::series::{Estimate, Sample, lag_s, peak_to_peak};
 use crate::teleoperation::{HUMAN_FRAME, Teleoperation};
 
 pub(crate) use crate::teleoperation::score::plots::series;

@@ -1,10 +1,10 @@
 //! Where the tool went against where it was sent: dynamic time warping, distance from the path and
 //! jerk. Time linear in the log's length: both searches look no farther than half a loop.
 
+use crate::measure::series::{Sample, resampled};
 use crate::score::Metric;
 use crate::teleoperation::score::figure::figure;
 use crate::teleoperation::score::record::Record;
-use crate::teleoperation::series::{Sample, resampled};
 
 /// Warping and distances, as far as both signals are there.
 pub(crate) fn metrics(

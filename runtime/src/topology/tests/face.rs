@@ -198,6 +198,13 @@ const FAULTY: &[Faulty] = &[
         "8 is outside 6..=7",
     ),
     Faulty(
+        ROBOT,
+        "right =",
+        "axes = 6, right =",
+        "egm.axes",
+        "would not follow J7",
+    ),
+    Faulty(
         CLIENT,
         "right =",
         "robotware = 5, right =",

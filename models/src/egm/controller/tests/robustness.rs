@@ -111,23 +111,43 @@ fn without_a_session_nobody_takes_commands() {
 }
 
 #[test]
-fn refused_messages_still_show_that_the_client_lives() {
+fn a_client_whose_every_message_is_refused_times_out_like_a_silent_one() {
     let patient = ControllerSettings {
         comm_timeout_s: 0.2,
         restart: RestartPolicy::ExternalTrigger,
         ..open_settings()
     };
     let mut rig = Rig::new(patient);
+    let mut silent = rig.clone();
     let mut bad = standing();
     bad.position_rad[0] = f64::NAN;
     for _ in 0..250 {
         let at = Instant::from_ns(rig.next_at().as_ns() - 1);
         assert!(rig.controller.receive(at, &bad).is_err());
         rig.step();
+        silent.step();
     }
-    assert_eq!(rig.state(), SessionState::Running);
-    rig.silence(2.0);
     assert_eq!(rig.ends()[0].0, EndCause::CommTimeout);
+    assert_eq!(rig.ends()[0].1.at_ns, silent.ends()[0].1.at_ns);
+}
+
+#[test]
+fn messages_that_find_the_queue_full_still_show_that_the_client_lives() {
+    let narrow = ControllerSettings {
+        comm_timeout_s: 0.2,
+        queue_capacity: 1,
+        ..open_settings()
+    };
+    let mut rig = Rig::new(narrow);
+    for _ in 0..250 {
+        let at = Instant::from_ns(rig.next_at().as_ns() - 1);
+        for _ in 0..2 {
+            assert_eq!(rig.controller.receive(at, &standing()), Ok(()));
+        }
+        rig.step();
+    }
+    assert!(rig.controller.command_counters().dropped > 200);
+    assert_eq!(rig.state(), SessionState::Running);
 }
 
 /// Arrivals of a client behind a bad network, good and bad ones, in bursts and with gaps.

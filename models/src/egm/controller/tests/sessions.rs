@@ -401,6 +401,17 @@ fn a_motion_of_its_own_goes_through_its_points_and_is_not_interrupted() {
         .controller
         .move_along(MotionKind::MoveJoints, vec![outside]);
     assert_eq!(refused, Err(MotionRefusal::BadNumber));
+
+    // Asking changes nothing.
+    let controller = &mut rig.controller;
+    let start = EgmStartParameters::KEEP;
+    let rest = *controller.planned_rad();
+    assert_eq!(controller.can_move(&[rest]), Ok(()));
+    assert_eq!(controller.can_move(&[outside]), refused);
+    assert_eq!(controller.can_start(&start), Ok(()));
+    assert_eq!(controller.start_guided_motion(&start), Ok(()));
+    assert_eq!(controller.can_move(&[rest]), Err(MotionRefusal::Busy));
+    assert_eq!(controller.can_start(&start), Err(MotionRefusal::Busy));
 }
 
 #[test]
