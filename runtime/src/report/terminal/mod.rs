@@ -135,6 +135,11 @@ fn network_words(verdict: &NetworkVerdict) -> (Tone, String) {
             );
             (Tone::Plain, text)
         }
+        NetworkVerdict::NoForeignProgram => {
+            let text = "no foreign program answered, and no link of ours was a network; nothing \
+                        here says anything about one";
+            (Tone::Caution, text.to_owned())
+        }
         NetworkVerdict::NetworkResult => {
             let text =
                 format!("a network result: no process skipped more than {limit} of its ticks");
