@@ -309,22 +309,3 @@ fn after_a_time_out_the_robot_goes_home_before_it_takes_the_next_client() {
         assert!(waited_s <= 0.1, "{waited_s} s");
     }
 }
-
-#[test]
-fn a_robot_that_waits_for_a_trigger_stays_idle_after_a_time_out() {
-    let Some(python) = python_or_skip() else {
-        return;
-    };
-    // Nobody could start a second session, so the first one must wait for the client.
-    let patient = "case.parameters.egm.activation_s=10.0";
-    let script = "abb_robot_egm_client.py";
-    let mut robot = Robot::start(&python, script, "external_trigger", &[patient]);
-    robot.drive(Duration::from_secs(14));
-    thread::sleep(Duration::from_secs(4));
-    let (files, _folder) = robot.finish();
-    let arms = Arms::of(&files);
-    println!("external_trigger:\n{}", arms.story(Side::Right));
-    let last = *arms.arrivals_ns(Side::Right).last().unwrap();
-    let ended = assert_timed_out(&arms, last);
-    assert_eq!(after(&arms, EgmEventKind::Activating, ended.at_ns), None);
-}
