@@ -9,6 +9,7 @@ mod tables;
 mod units;
 
 pub use canvas::Style;
+pub(crate) use canvas::{shortened, wrapped};
 pub(crate) use units::{JOINT, duration_s, grouped, percent, seconds};
 
 use hil_models::measure::account::OutageFigures;
@@ -74,7 +75,7 @@ pub fn render_outages(
 fn title(canvas: &mut Canvas, summary: &RunSummary) {
     let run = &summary.run;
     canvas.rule(Tone::Faint);
-    let title = canvas::shortened(&format!("{} · {}", run.case, run.name), canvas.width());
+    let title = shortened(&format!("{} · {}", run.case, run.name), canvas.width());
     let line = canvas.paint(Tone::Strong, &title);
     canvas.line(&line);
     let facts = format!(
