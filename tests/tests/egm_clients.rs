@@ -79,7 +79,7 @@ struct Robot {
 
 impl Robot {
     /// Starts the robot, as ought to be done first; then names the client that may come.
-    fn start(python: &str, script: &str, restart: &str, settings: &[&str]) -> Self {
+    fn start(python: &str, script: &str, restart: &str) -> Self {
         let socket = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
         let port = socket.local_addr().unwrap().port();
         drop(socket);
@@ -89,9 +89,6 @@ impl Robot {
             .set(&format!("case.parameters.egm.restart=\"{restart}\""))
             .set("case.parameters.egm.preset=\"paper\"")
             .set("run.duration=\"10 min\"");
-        let trial = settings
-            .iter()
-            .fold(trial, |trial, setting| trial.set(setting));
         let run = trial.start_here();
         let files = trial.folder("", LIMIT);
         let amplitudes: Vec<_> = AMPLITUDES_DEG.iter().map(ToString::to_string).collect();
@@ -248,7 +245,7 @@ fn after(arms: &Arms, kind: EgmEventKind, at: i64) -> Option<(EgmEvent, f64)> {
 /// long the robot takes to go on.
 fn driven_twice(script: &str, restart: &str, span: Duration) -> Option<(Arms, EgmEvent)> {
     let python = python_or_skip()?;
-    let mut robot = Robot::start(&python, script, restart, &[]);
+    let mut robot = Robot::start(&python, script, restart);
     robot.drive(span);
     thread::sleep(Duration::from_millis(1_500));
     robot.drive(Duration::from_secs(6));
