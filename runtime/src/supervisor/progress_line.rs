@@ -58,7 +58,7 @@ mod tests {
         let text = "version = 1\nname = \"x\"\n[case]\nname = \"teleoperation\"\n[processes]\n\
                     human.role = \"human\"\ncontroller.role = \"controller\"\n\
                     robot.role = \"robot\"\n";
-        let topology = topology::parse("x.toml", &text, &[], registry.known()).unwrap();
+        let topology = topology::parse("x.toml", text, &[], registry.known()).unwrap();
         let told = |channel: &str, what: &str, count| ChannelProgress {
             channel: channel.to_owned(),
             what: what.to_owned(),
