@@ -38,7 +38,9 @@ impl EgmEvent {
                 "all joints are slowed: {value} deg/s asked (MaxSpeedDeviation = {limit} deg/s)"
             ),
             EgmEventKind::SpeedFree => format!(
-                "joints are slowed no more, after {value} s (MaxSpeedDeviation = {limit} deg/s)"
+                "joints are slowed no more, after {} s with up to {value} deg/s asked \
+                 (MaxSpeedDeviation = {limit} deg/s)",
+                Number(self.count as f64 * 1e-9)
             ),
             EgmEventKind::HoldBegan => {
                 format!("no command for {value} s: the last one goes on acting")

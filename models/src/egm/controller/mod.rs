@@ -235,6 +235,11 @@ impl Controller {
         }
     }
 
+    /// True when `MaxSpeedDeviation` bound in the last cycle.
+    pub(crate) fn is_throttled(&self) -> bool {
+        self.cycle_flags & EgmFeedback::SPEED_DEVIATION_LIMITED != 0
+    }
+
     /// Joint positions as measured in the last cycle.
     pub fn measured_rad(&self) -> &Joints {
         self.delay.measured_rad()

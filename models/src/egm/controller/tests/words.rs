@@ -49,8 +49,9 @@ fn every_kind_of_event_says_what_happened() {
     check(
         Kind::SpeedFree,
         0,
-        (12.0, 400.0, 0),
-        "left arm: session 3: joints are slowed no more, after 12 s (MaxSpeedDeviation = 400 deg/s)",
+        (31.25, 1.0, 12_000_000_000),
+        "left arm: session 3: joints are slowed no more, after 12 s with up to 31.25 deg/s asked \
+         (MaxSpeedDeviation = 1 deg/s)",
     );
     check(
         Kind::HoldBegan,
