@@ -27,7 +27,7 @@ impl EgmEvent {
     fn what(&self, kind: EgmEventKind) -> String {
         let (value, limit) = (Number(self.value), Number(self.limit));
         match kind {
-            EgmEventKind::Started => "controller started".to_owned(),
+            EgmEventKind::Started => "robot started".to_owned(),
             EgmEventKind::Activating => format!("guided motion is being set up for {value} s"),
             EgmEventKind::Running if self.session > 1 => {
                 format!("guided motion runs, {value} s after the last session ended")

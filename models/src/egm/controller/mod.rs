@@ -203,7 +203,9 @@ impl Controller {
         self.has_begun = true;
         self.session.ended_at = self.at;
         tell(self.event(EgmEventKind::Started));
-        if self.settings.start == StartMode::PowerOn && self.request.is_none() {
+        let is_own_start =
+            self.settings.start == StartMode::PowerOn && self.settings.arms.include(self.side);
+        if is_own_start && self.request.is_none() {
             self.request = Some(Request::Start(Box::new(self.settings)));
         }
     }

@@ -22,12 +22,7 @@ fn check(kind: EgmEventKind, cause: u32, numbers: (f64, f64, u64), expected: &st
 #[test]
 fn every_kind_of_event_says_what_happened() {
     use EgmEventKind as Kind;
-    check(
-        Kind::Started,
-        0,
-        (0.0, 0.0, 0),
-        "left arm: controller started",
-    );
+    check(Kind::Started, 0, (0.0, 0.0, 0), "left arm: robot started");
     check(
         Kind::Activating,
         0,
