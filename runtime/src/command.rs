@@ -262,6 +262,9 @@ fn show_report(run: &Path, json: bool, console: &mut Console) -> u8 {
             let path = folder.summary();
             let text = if folder.manifest().is_file() {
                 "this run never began or was killed outright, so it left no summary".to_owned()
+            } else if folder.virtual_report().is_file() {
+                "this is a folder of `simulate` or `tables`, not of a run; read its report.txt, or                  report.json for every figure"
+                    .to_owned()
             } else {
                 format!("not a run's folder: {error}")
             };

@@ -13,8 +13,12 @@ use crate::analysis::AnalysisError;
 use crate::analysis::records::{MessageRecords, missing_count};
 use crate::registry::{CaseEntry, CaseError, Registry};
 use crate::report::summary::RunSummary;
-use crate::report::terminal::grouped;
+use crate::report::terminal::{grouped, wrapped};
 use crate::run_folder::RunFolder;
+
+/// Columns of the outcome, and those before its texts.
+const PAGE_WIDTH: usize = 100;
+const LABEL_END: usize = 20;
 
 /// Why a run cannot be replayed at all.
 #[derive(Debug, thiserror::Error)]
@@ -193,7 +197,10 @@ impl Replayed {
         let replay = &self.replay;
         let mut text = format!("{} · {}: {}\n", self.case, self.run, self.verdict());
         let mut field = |label: &str, words: &str| {
-            let _infallible = writeln!(text, "  {label:<18}{words}");
+            for (index, row) in wrapped(words, PAGE_WIDTH - LABEL_END).iter().enumerate() {
+                let label = if index == 0 { label } else { "" };
+                let _infallible = writeln!(text, "  {label:<18}{row}");
+            }
         };
         field("method", &replay.method);
         let went_in = grouped(replay.input_count);

@@ -7,6 +7,7 @@ mod watched;
 use core::fmt::Write;
 use std::collections::BTreeMap;
 use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
 
 use hil_models::case_study::Score;
@@ -44,6 +45,9 @@ pub(crate) enum SimulateError {
     /// A file could not be written.
     #[error("{0}")]
     Output(String),
+    /// What is in the folder would be overwritten, or left beside what it does not belong to.
+    #[error("{}: the folder is not empty; name another one, or empty it", .0.display())]
+    Occupied(PathBuf),
 }
 
 /// A run in virtual time that is over.
@@ -145,6 +149,25 @@ fn link_models(topology: &Topology) -> Result<Vec<NamedCarrier>, String> {
     Ok(carriers)
 }
 
+/// Makes sure that nothing is in the way of the files in `folder`, before anything is computed.
+///
+/// # Errors
+/// When the folder has anything in it, or cannot be read.
+pub(crate) fn check_output(folder: &Path) -> Result<(), SimulateError> {
+    let is_occupied = match fs::read_dir(folder) {
+        Ok(mut entries) => entries.next().is_some(),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => false,
+        Err(error) => {
+            let text = format!("{}: {error}", folder.display());
+            return Err(SimulateError::Output(text));
+        }
+    };
+    if is_occupied {
+        return Err(SimulateError::Occupied(folder.to_owned()));
+    }
+    Ok(())
+}
+
 impl Simulated {
     /// Counts, outages and score.
     pub(crate) fn render(&self, form: Form) -> String {
@@ -159,7 +182,7 @@ impl Simulated {
     /// # Errors
     /// Names the file that cannot be written.
     pub(crate) fn write(&self, folder: &Path) -> Result<Vec<String>, SimulateError> {
-        let failed = |path: PathBuf, error: std::io::Error| {
+        let failed = |path: PathBuf, error: io::Error| {
             SimulateError::Output(format!("{}: {error}", path.display()))
         };
         fs::create_dir_all(folder).map_err(|error| failed(folder.to_owned(), error))?;
@@ -168,7 +191,7 @@ impl Simulated {
         let events = event_log::text(&self.topology_name, &self.events);
         for (path, text) in [
             (files.report(), page),
-            (folder.join("report.json"), self.json()),
+            (files.virtual_report(), self.json()),
             (files.events(), events),
         ] {
             fs::write(&path, text).map_err(|error| failed(path, error))?;

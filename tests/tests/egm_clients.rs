@@ -79,7 +79,7 @@ struct Robot {
 
 impl Robot {
     /// Starts the robot, as ought to be done first; then names the client that may come.
-    fn start(python: &str, script: &str, restart: &str, settings: &[&str]) -> Self {
+    fn start(python: &str, script: &str, restart: &str) -> Self {
         let socket = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
         let port = socket.local_addr().unwrap().port();
         drop(socket);
@@ -89,9 +89,6 @@ impl Robot {
             .set(&format!("case.parameters.egm.restart=\"{restart}\""))
             .set("case.parameters.egm.preset=\"paper\"")
             .set("run.duration=\"10 min\"");
-        let trial = settings
-            .iter()
-            .fold(trial, |trial, setting| trial.set(setting));
         let run = trial.start_here();
         let files = trial.folder("", LIMIT);
         let amplitudes: Vec<_> = AMPLITUDES_DEG.iter().map(ToString::to_string).collect();
@@ -248,7 +245,7 @@ fn after(arms: &Arms, kind: EgmEventKind, at: i64) -> Option<(EgmEvent, f64)> {
 /// long the robot takes to go on.
 fn driven_twice(script: &str, restart: &str, span: Duration) -> Option<(Arms, EgmEvent)> {
     let python = python_or_skip()?;
-    let mut robot = Robot::start(&python, script, restart, &[]);
+    let mut robot = Robot::start(&python, script, restart);
     robot.drive(span);
     thread::sleep(Duration::from_millis(1_500));
     robot.drive(Duration::from_secs(6));
@@ -308,23 +305,4 @@ fn after_a_time_out_the_robot_goes_home_before_it_takes_the_next_client() {
         let (_, waited_s) = after(&arms, EgmEventKind::Activating, home.at_ns).unwrap();
         assert!(waited_s <= 0.1, "{waited_s} s");
     }
-}
-
-#[test]
-fn a_robot_that_waits_for_a_trigger_stays_idle_after_a_time_out() {
-    let Some(python) = python_or_skip() else {
-        return;
-    };
-    // Nobody could start a second session, so the first one must wait for the client.
-    let patient = "case.parameters.egm.activation_s=10.0";
-    let script = "abb_robot_egm_client.py";
-    let mut robot = Robot::start(&python, script, "external_trigger", &[patient]);
-    robot.drive(Duration::from_secs(14));
-    thread::sleep(Duration::from_secs(4));
-    let (files, _folder) = robot.finish();
-    let arms = Arms::of(&files);
-    println!("external_trigger:\n{}", arms.story(Side::Right));
-    let last = *arms.arrivals_ns(Side::Right).last().unwrap();
-    let ended = assert_timed_out(&arms, last);
-    assert_eq!(after(&arms, EgmEventKind::Activating, ended.at_ns), None);
 }

@@ -133,7 +133,7 @@ fn assert_outages_and_events_are_kept(files: &RunFiles) {
 fn a_run_in_virtual_time_leaves_the_same_files_but_no_records() {
     let folder = RunFolder::new("virtual");
     let output = folder.join("out");
-    let simulated = run(&[
+    let arguments = [
         "simulate",
         "--topology",
         "deploy/topologies/emulated.toml",
@@ -141,8 +141,20 @@ fn a_run_in_virtual_time_leaves_the_same_files_but_no_records() {
         "run.duration=\"10 s\"",
         "--output",
         output.to_str().unwrap(),
-    ]);
+    ];
+    let simulated = run(&arguments);
     assert_code(&simulated, 0);
+    let wrote = "report.txt, report.json, events.log and the series";
+    assert!(simulated.stderr.contains(wrote), "{simulated:?}");
+    let again = run(&arguments);
+    assert_code(&again, 2);
+    assert!(
+        again.stderr.contains("out: the folder is not empty"),
+        "{again:?}"
+    );
+    let report = run(&["report", output.to_str().unwrap()]);
+    assert_code(&report, 2);
+    assert!(report.stderr.contains("folder of `simulate`"), "{report:?}");
     assert!(
         simulated.stdout.contains("Channel egm/right/command"),
         "{simulated:?}"

@@ -243,11 +243,12 @@ pub enum EgmEventKind {
     /// Guided motion runs; `value`: seconds since the last session ended (or since the start).
     Running = 2,
     /// A session ended; `cause`: [`EndCause`]; `value` against `limit`: what tripped it, in the
-    /// cause's unit. Holding and throttling end with it untold.
+    /// cause's unit. Holding ends with it untold, throttling just before.
     Ended = 3,
     /// `MaxSpeedDeviation` began to bind; `value`: deg/s asked, `limit`: deg/s allowed.
     SpeedThrottled = 4,
-    /// It has not bound for half a second; `value`: seconds it did, `limit`: deg/s allowed.
+    /// It has not bound for half a second, or the session ends; `value`: highest deg/s asked since
+    /// it began to bind, `limit`: deg/s allowed, `count`: nanoseconds from there to when it last did.
     SpeedFree = 5,
     /// Commands stopped coming: the last one goes on acting; `value`: seconds since it was taken.
     HoldBegan = 6,

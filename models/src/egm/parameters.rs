@@ -4,11 +4,11 @@
 use core::ops::RangeInclusive;
 use core::time::Duration;
 
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::case_study::ParameterError;
 use crate::egm::controller::DELAY_CYCLES_MAX;
-use crate::egm::messages::{EgmStartParameters, MotionRefusal};
+use crate::egm::messages::{EgmStartParameters, MotionRefusal, Side};
 
 /// A named set of settings that single keys may then change.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -70,9 +70,34 @@ pub enum RestartPolicy {
     GoHomeFirst,
 }
 
-/// `[case.parameters.egm]`. A key left out takes the preset's value.
+/// Whose program starts guided motion by itself with [`StartMode::PowerOn`]. The other arm stands
+/// still until a request moves it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum GuidedArms {
+    /// Both arms'.
+    Both,
+    /// The right arm's.
+    Right,
+    /// The left arm's.
+    Left,
+}
+
+impl GuidedArms {
+    /// True when `side` is one of them.
+    pub const fn include(self, side: Side) -> bool {
+        match self {
+            Self::Both => true,
+            Self::Right => matches!(side, Side::Right),
+            Self::Left => matches!(side, Side::Left),
+        }
+    }
+}
+
+/// `[case.parameters.egm]`. A key left out takes the preset's value; written out again, every key
+/// in force is there, see [`EgmParameters::spelled_out`].
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
+#[serde(deny_unknown_fields, default, remote = "Self")]
 pub struct EgmParameters {
     /// Where the other keys come from.
     pub preset: Preset,
@@ -121,10 +146,13 @@ pub struct EgmParameters {
     /// What starts the first session.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub start: Option<StartMode>,
+    /// Whose program does so with `start = "power-on"`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub arms: Option<GuidedArms>,
     /// What follows a session that ended by itself.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub restart: Option<RestartPolicy>,
-    /// Wait of `wait_then_restart`, 0..=60 s.
+    /// Wait of `wait_then_restart`, 0..=60 s; refused with a policy that never waits.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub restart_wait_s: Option<f64>,
     /// How long setting a session up takes (fine point, synchronisation, set-up), 0..=60 s.
@@ -169,6 +197,8 @@ pub struct ControllerSettings {
     pub stop_mode: StopMode,
     /// See [`EgmParameters::start`].
     pub start: StartMode,
+    /// See [`EgmParameters::arms`].
+    pub arms: GuidedArms,
     /// See [`EgmParameters::restart`].
     pub restart: RestartPolicy,
     /// See [`EgmParameters::restart_wait_s`].
@@ -199,6 +229,7 @@ impl ControllerSettings {
             comm_timeout_s: 1.0,
             stop_mode: StopMode::Hold,
             start: StartMode::Request,
+            arms: GuidedArms::Both,
             restart: RestartPolicy::AutoRetry,
             restart_wait_s: 1.0,
             activation_s: 0.5,
@@ -236,6 +267,49 @@ impl ControllerSettings {
 }
 
 impl EgmParameters {
+    /// The same settings with every key in force written out: those left out have the preset's
+    /// values. `restart_wait_s` is not in force with a policy that never waits.
+    #[must_use]
+    pub fn spelled_out(&self) -> Self {
+        let preset = ControllerSettings::of(self.preset);
+        let restart = self.restart.unwrap_or(preset.restart);
+        let waits = restart == RestartPolicy::WaitThenRestart;
+        let cycle_us = preset.cycle.as_nanos() as f64 / 1e3;
+        let speed_deg = in_degrees(preset.max_speed_deviation_rad_per_s);
+        let position_deg = in_degrees(preset.max_position_deviation_rad);
+        let convergence_deg = in_degrees(preset.convergence_rad);
+        let wait_s = waits.then_some(preset.restart_wait_s);
+        Self {
+            preset: self.preset,
+            cycle_us: self.cycle_us.or(Some(cycle_us)),
+            queue: self.queue.or(Some(preset.queue)),
+            queue_capacity: self.queue_capacity.or(Some(count(preset.queue_capacity))),
+            position_gain_per_s: self
+                .position_gain_per_s
+                .or(Some(preset.position_gain_per_s)),
+            low_pass_hz: self.low_pass_hz.or(Some(preset.low_pass_hz)),
+            position_correction_ratio: self
+                .position_correction_ratio
+                .or(Some(preset.position_correction_ratio)),
+            ramp_in_s: self.ramp_in_s.or(Some(preset.ramp_in_s)),
+            ramp_out_s: self.ramp_out_s.or(Some(preset.ramp_out_s)),
+            max_speed_deviation_deg_per_s: self.max_speed_deviation_deg_per_s.or(Some(speed_deg)),
+            max_position_deviation_deg: self.max_position_deviation_deg.or(Some(position_deg)),
+            convergence_deg: self.convergence_deg.or(Some(convergence_deg)),
+            condition_time_s: self.condition_time_s.or(Some(preset.condition_time_s)),
+            comm_timeout_s: self.comm_timeout_s.or(Some(preset.comm_timeout_s)),
+            stop_mode: self.stop_mode.or(Some(preset.stop_mode)),
+            start: self.start.or(Some(preset.start)),
+            arms: self.arms.or(Some(preset.arms)),
+            restart: Some(restart),
+            restart_wait_s: self.restart_wait_s.or(wait_s),
+            activation_s: self.activation_s.or(Some(preset.activation_s)),
+            control_delay_cycles: self
+                .control_delay_cycles
+                .or(Some(count(preset.control_delay_cycles))),
+        }
+    }
+
     /// The settings in force: the preset's, where no key changes them.
     ///
     /// # Errors
@@ -251,6 +325,14 @@ impl EgmParameters {
         let delay = CONTROL_DELAY_CYCLES.key(self.control_delay_cycles.map(f64::from))?;
         let convergence = CONVERGENCE_DEG.key(self.convergence_deg)?;
         let restart_wait = RESTART_WAIT_S.key(self.restart_wait_s)?;
+        let restart = self.restart.unwrap_or(preset.restart);
+        if let Some(wait_s) = restart_wait
+            && restart != RestartPolicy::WaitThenRestart
+        {
+            let problem =
+                format!("{wait_s} has no effect: it needs egm.restart = \"wait_then_restart\"");
+            return Err(ParameterError::new(RESTART_WAIT_S.key, problem));
+        }
         Ok(ControllerSettings {
             cycle: cycle.map_or(preset.cycle, |us| Duration::from_secs_f64(us * 1e-6)),
             queue: self.queue.unwrap_or(preset.queue),
@@ -281,7 +363,8 @@ impl EgmParameters {
                 .unwrap_or(preset.comm_timeout_s),
             stop_mode: self.stop_mode.unwrap_or(preset.stop_mode),
             start: self.start.unwrap_or(preset.start),
-            restart: self.restart.unwrap_or(preset.restart),
+            arms: self.arms.unwrap_or(preset.arms),
+            restart,
             restart_wait_s: restart_wait.unwrap_or(preset.restart_wait_s),
             activation_s: ACTIVATION_S
                 .key(self.activation_s)?
@@ -336,6 +419,31 @@ impl ControllerSettings {
             ..*self
         })
     }
+}
+
+/// Writes every key in force, so that a record of a run needs no table of presets to be read.
+impl Serialize for EgmParameters {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        // The derived function, which a type's own name finds before the trait's.
+        Self::serialize(&self.spelled_out(), serializer)
+    }
+}
+
+impl<'de> Deserialize<'de> for EgmParameters {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        Self::deserialize(deserializer)
+    }
+}
+
+/// Degrees as a preset states them: on the way through radians they lose their last digits, and
+/// come back to the same radians only without that.
+fn in_degrees(rad: f64) -> f64 {
+    (rad.to_degrees() * 1e9).round() / 1e9
+}
+
+/// A small count of a preset.
+fn count(number: usize) -> u32 {
+    u32::try_from(number).unwrap_or(u32::MAX)
 }
 
 /// A number that passed its range, as a count.

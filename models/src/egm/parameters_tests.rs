@@ -193,3 +193,77 @@ fn a_session_may_ask_for_what_a_key_may_be_and_no_more() {
         }
     }
 }
+
+const PRESETS: [Preset; 4] = [
+    Preset::AbbDefault,
+    Preset::Raw,
+    Preset::KthYumi,
+    Preset::Paper,
+];
+
+#[test]
+fn a_preset_spelled_out_is_the_same_to_the_last_bit() {
+    for preset in PRESETS {
+        let parameters = EgmParameters {
+            preset,
+            comm_timeout_s: Some(0.3),
+            ..EgmParameters::default()
+        };
+        let spelled_out = parameters.spelled_out();
+        assert_eq!(spelled_out.settings(), parameters.settings());
+        assert_eq!(spelled_out.spelled_out(), spelled_out);
+        assert_eq!(spelled_out.comm_timeout_s, Some(0.3));
+        // No longer the preset's doing.
+        let elsewhere = EgmParameters {
+            preset: Preset::Paper,
+            ..spelled_out.clone()
+        };
+        let cycle_us = elsewhere.cycle_us.unwrap();
+        assert!((cycle_us - 4000.0).abs() < 1e-12, "{cycle_us}");
+        let speed_deg = spelled_out.max_speed_deviation_deg_per_s.unwrap();
+        assert!((speed_deg - speed_deg.round()).abs() < 1e-12, "{speed_deg}");
+    }
+}
+
+#[test]
+fn every_key_in_force_is_spelled_out_and_unknown_ones_are_refused() {
+    let parameters = EgmParameters::default();
+    let written = format!("{:?}", parameters.spelled_out());
+    assert!(!written.contains("None"), "{written}");
+    let never_waits = EgmParameters {
+        restart: Some(RestartPolicy::AutoRetry),
+        ..EgmParameters::default()
+    };
+    let never_waits = never_waits.spelled_out();
+    assert_eq!(never_waits.restart_wait_s, None);
+    assert!(never_waits.settings().is_ok());
+
+    type Read<'a> = serde::de::value::MapDeserializer<'a, Pairs, serde::de::value::Error>;
+    type Pairs = std::vec::IntoIter<(&'static str, f64)>;
+    let read = |key| {
+        let read: Read<'_> = Read::new(vec![(key, 0.25)].into_iter());
+        EgmParameters::deserialize(read)
+    };
+    let known = read("comm_timeout_s").unwrap();
+    assert_eq!(known.comm_timeout_s, Some(0.25));
+    assert_eq!(known.cycle_us, None);
+    assert!(read("comm_timeout").is_err());
+}
+
+#[test]
+fn a_wait_is_refused_where_nothing_waits() {
+    for restart in [
+        RestartPolicy::AutoRetry,
+        RestartPolicy::ExternalTrigger,
+        RestartPolicy::GoHomeFirst,
+    ] {
+        let parameters = EgmParameters {
+            restart: Some(restart),
+            restart_wait_s: Some(1.0),
+            ..EgmParameters::default()
+        };
+        let error = parameters.settings().unwrap_err();
+        assert_eq!(error.key, "egm.restart_wait_s");
+        assert!(error.problem.contains("wait_then_restart"), "{error}");
+    }
+}

@@ -223,8 +223,8 @@ impl Controller {
         let trigger_after = Duration::from_secs_f64(parameters.trigger_after_s);
         let client = MotionClient::new(parameters.egm_start.message(), trigger_after);
         let is_free = parameters.send == SendPolicy::Free;
-        let send_timer =
-            is_free.then(|| PeriodicTimer::new(Duration::from_secs_f64(1.0 / parameters.send_hz)));
+        let send_timer = is_free
+            .then(|| PeriodicTimer::new(Duration::from_secs_f64(1.0 / parameters.send_hz())));
         Self {
             parameters,
             client,

@@ -152,8 +152,10 @@ pub struct TeleoperationParameters {
     pub feed_forward: bool,
     /// When commands are sent.
     pub send: SendPolicy,
-    /// Commands per second and arm with `send = "free"`, 1..=1000 Hz.
-    pub send_hz: f64,
+    /// Commands per second and arm with `send = "free"`, 1..=1000 Hz; 250 when left out. Refused
+    /// with any other `send`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub send_hz: Option<f64>,
     /// Where an arm goes when guided motion is back.
     pub resume: ResumePolicy,
     /// How long the way of `resume = "blend"` takes, 0.1..=10 s.
@@ -191,7 +193,7 @@ impl Default for TeleoperationParameters {
             left_arm: LeftArm::Hold,
             feed_forward: false,
             send: SendPolicy::Frame,
-            send_hz: 250.0,
+            send_hz: None,
             resume: ResumePolicy::Jump,
             blend_s: 1.0,
             trigger_after_s: 3.0,
@@ -204,6 +206,9 @@ impl Default for TeleoperationParameters {
         }
     }
 }
+
+/// Commands per second and arm where nothing is said: as many as the robot has cycles.
+const SEND_HZ_DEFAULT: f64 = 250.0;
 
 /// Farthest a target may turn between two frames. At the default rate that is 12 rad/s, twice
 /// what a hand does.
@@ -253,7 +258,7 @@ impl TeleoperationParameters {
                 "0.1..=2",
             ),
             ("jump_max_m", self.jump_max_m, 0.001..=1.0, "0.001..=1"),
-            ("send_hz", self.send_hz, 1.0..=1000.0, "1..=1000"),
+            ("send_hz", self.send_hz(), 1.0..=1000.0, "1..=1000"),
             ("blend_s", self.blend_s, 0.1..=10.0, "0.1..=10"),
             (
                 "trigger_after_s",
@@ -270,6 +275,12 @@ impl TeleoperationParameters {
         ];
         for (key, value, allowed, allowed_text) in ranges {
             ParameterError::check(key, value, allowed, allowed_text)?;
+        }
+        if let Some(send_hz) = self.send_hz
+            && self.send != SendPolicy::Free
+        {
+            let problem = format!("{send_hz} has no effect: it needs send = \"free\"");
+            return Err(ParameterError::new("send_hz", problem));
         }
         self.egm_start.check()?;
         self.tables.check()
@@ -290,6 +301,11 @@ impl TeleoperationParameters {
         Recording::new(&bvh, self.motion_period_s, self.motion_unit_m)
             .map(Motion::Recorded)
             .map_err(|error| motion_file_error(path, &error))
+    }
+
+    /// Commands per second and arm with [`SendPolicy::Free`].
+    pub(crate) fn send_hz(&self) -> f64 {
+        self.send_hz.unwrap_or(SEND_HZ_DEFAULT)
     }
 
     /// From frame to frame.
@@ -344,7 +360,11 @@ mod tests {
         check_refused("loop_variation_ratio", |p| p.loop_variation_ratio = -0.1);
         check_refused("mapping_scale_ratio", |p| p.mapping_scale_ratio = 3.0);
         check_refused("jump_max_m", |p| p.jump_max_m = 0.0);
-        check_refused("send_hz", |p| p.send_hz = 0.0);
+        check_refused("send_hz", |p| {
+            p.send = SendPolicy::Free;
+            p.send_hz = Some(0.0);
+        });
+        check_refused("send_hz", |p| p.send_hz = Some(250.0));
         check_refused("blend_s", |p| p.blend_s = 11.0);
         check_refused("trigger_after_s", |p| p.trigger_after_s = -1.0);
         check_refused("egm_start.comm_timeout_s", |p| {

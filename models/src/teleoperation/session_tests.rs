@@ -301,7 +301,7 @@ fn commands_go_out_per_frame_per_feedback_or_by_the_clock() {
     let count = |send: SendPolicy, send_hz: f64| {
         let case = case(|parameters| {
             parameters.send = send;
-            parameters.send_hz = send_hz;
+            parameters.send_hz = (send == SendPolicy::Free).then_some(send_hz);
         });
         let result = run(&case, Vec::new(), 4.5);
         let all = result.log.messages::<EgmCommand>(EGM_LEFT_COMMAND);

@@ -135,7 +135,9 @@ fn outages_before(
         })
     };
     let concerned = event.concerned_channels(specs);
-    concerned.into_iter().filter_map(before).collect()
+    let mut outages: Vec<_> = concerned.into_iter().filter_map(before).collect();
+    EventOutage::put_own_channels_first(&mut outages, &event.what);
+    outages
 }
 
 fn unavailable(message: &MessageRef, why: &str) -> ExplainedMessage {

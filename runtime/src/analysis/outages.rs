@@ -1,7 +1,7 @@
 //! The outages of each channel of a finished run, and which of them went before an event. They are
 //! found in the records of the messages alone; no link is asked what it did.
 
-use hil_models::measure::account::{Happening, Outage, OutageFigures, Standing, foregoing};
+use hil_models::measure::account::{Happening, Outage, OutageFigures, Side, Standing, foregoing};
 use hil_models::time::Instant;
 
 use super::events::start_of;
@@ -75,12 +75,21 @@ impl OutageStory {
         let interrupted = outage
             .interruption_index
             .and_then(|index| self.interrupted.get(index));
-        event_outage.words = words(&event_outage, interrupted.map(String::as_str));
+        let later_ns = happening.at.and_then(|(at, side)| {
+            let from_ns = match side {
+                Side::Producer => outage.from_ns,
+                Side::Consumer => outage.silent_from_ns,
+            };
+            Some(from_ns?.saturating_sub(at.as_ns()))
+        });
+        let interrupted = interrupted.map(String::as_str);
+        event_outage.words = words(&event_outage, interrupted, later_ns);
         Some(event_outage)
     }
 }
 
-fn words(outage: &EventOutage, interrupted: Option<&str>) -> String {
+/// An outage that began after the event did so `later_ns` later.
+fn words(outage: &EventOutage, interrupted: Option<&str>, later_ns: Option<i64>) -> String {
     let length = match outage.length_s {
         Some(length_s) => format!("outage of {}", duration_s(length_s)),
         None => "outage of unknown length".to_owned(),
@@ -106,12 +115,18 @@ fn words(outage: &EventOutage, interrupted: Option<&str>) -> String {
             let over = duration_s(ns as f64 * 1e-9);
             text.push_str(&[", over for ", &over].concat());
         }
-        Standing::BegunLater | Standing::Unknown => {}
+        Standing::BegunLater => {
+            let later = later_ns.map_or_else(String::new, |ns| {
+                [duration_s(ns as f64 * 1e-9).as_str(), " "].concat()
+            });
+            text.push_str(&[", begins ", &later, "later"].concat());
+        }
+        Standing::Unknown => {}
     }
     if outage.other_count > 0 {
         let plural = if outage.other_count == 1 { "" } else { "s" };
         let count = grouped(outage.other_count);
-        text.push_str(&["; ", &count, " other", plural, " about then"].concat());
+        text.push_str(&[" (", &count, " other", plural, " about then)"].concat());
     }
     text
 }
@@ -120,7 +135,6 @@ fn words(outage: &EventOutage, interrupted: Option<&str>) -> String {
 mod tests {
     use super::*;
     use crate::report::terminal::JOINT;
-    use hil_models::measure::account::Side;
 
     const MS: i64 = 1_000_000;
 
@@ -177,7 +191,7 @@ mod tests {
                 44_540,
                 Some(
                     "outage of 1.84 s on egm/right/command, 41.200 s to 43.040 s, 230 messages \
-                     lost, over for 500 ms; 1 other about then",
+                     lost, over for 500 ms (1 other about then)",
                 ),
             ),
             (
@@ -198,6 +212,20 @@ mod tests {
         ] {
             assert_eq!(words_at(&story, at_ms).as_deref(), expected, "{at_ms} ms");
         }
+    }
+
+    #[test]
+    fn an_outage_that_begins_after_the_event_says_so() {
+        let story = story(vec![outage(42_500, Some(43_000), 62)]);
+        let found = story.before(&Happening {
+            at: Some((Instant::from_ns(42_000 * MS), Side::Producer)),
+            lost_published_ns: &[42_600 * MS],
+        });
+        let words = found.unwrap().words.replace(JOINT, " ");
+        assert!(
+            words.ends_with("62 messages lost, begins 500 ms later"),
+            "{words}"
+        );
     }
 
     #[test]

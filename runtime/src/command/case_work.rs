@@ -24,10 +24,20 @@ pub(super) fn simulate(
     registry: &Registry,
     console: &mut Console,
 ) -> u8 {
+    let signals = match signals(console) {
+        Ok(signals) => signals,
+        Err(code) => return code,
+    };
+    // Virtual time does not look at signals.
+    let watch =
+        signals.end_program_unless_over("a run in virtual time is shown whole or not at all");
     let Some(topology) = load(path, overrides, registry, console) else {
         return exit::USAGE;
     };
-    let simulated = match simulate::simulate(&topology, registry) {
+    let outcome = output
+        .map_or(Ok(()), simulate::check_output)
+        .and_then(|()| simulate::simulate(&topology, registry));
+    let simulated = match outcome {
         Ok(simulated) => simulated,
         Err(error) => {
             console.error(&error.to_string());
@@ -39,7 +49,9 @@ pub(super) fn simulate(
     } else {
         simulate::Form::Page(columns())
     };
-    console.result(&simulated.render(form));
+    let text = simulated.render(form);
+    drop(watch);
+    console.result(&text);
     let Some(folder) = output else {
         return exit::RAN;
     };
@@ -48,9 +60,12 @@ pub(super) fn simulate(
             let also = if series.is_empty() {
                 "; the case has no series".to_owned()
             } else {
-                format!(" with the series {}", series.join(", "))
+                format!(" and the series {}", series.join(", "))
             };
-            console.say(&format!("wrote the report to {}{also}", folder.display()));
+            let folder = folder.display();
+            console.say(&format!(
+                "wrote to {folder}: report.txt, report.json, events.log{also}"
+            ));
             exit::RAN
         }
         Err(error) => {
@@ -58,6 +73,13 @@ pub(super) fn simulate(
             exit::FAILED
         }
     }
+}
+
+fn signals(console: &mut Console) -> Result<Signals, u8> {
+    Signals::install().map_err(|error| {
+        console.error(&format!("cannot handle signals: {error}"));
+        exit::INTERNAL
+    })
 }
 
 /// `tables`.
@@ -68,16 +90,26 @@ pub(super) fn tables(
     registry: &Registry,
 ) -> u8 {
     let mut console = Console::new(batch.quiet);
+    // Before the preparation, which takes its time and must not end without a word.
+    let signals = match signals(&mut console) {
+        Ok(signals) => signals,
+        Err(code) => return code,
+    };
     let topology = topology::load_case(path, overrides, registry.known());
     let Some(topology) = loaded(topology, &mut console) else {
         return exit::USAGE;
     };
-    compute(&topology, Wanted::Tables, batch, (registry, &mut console))
+    let work = (&topology, Wanted::Tables);
+    compute(work, batch, (registry, &signals, &mut console))
 }
 
 /// `calibrate`.
 pub(super) fn calibrate(args: CalibrateArgs, registry: &Registry) -> u8 {
     let mut console = Console::new(args.batch.quiet);
+    let signals = match signals(&mut console) {
+        Ok(signals) => signals,
+        Err(code) => return code,
+    };
     let (figure, value) = match wanted_figure(args.mlr, args.figure.as_deref()) {
         Ok(wanted) => wanted,
         Err(text) => {
@@ -115,7 +147,11 @@ pub(super) fn calibrate(args: CalibrateArgs, registry: &Registry) -> u8 {
         return exit::USAGE;
     }
     let wanted = Wanted::Calibration { figure, value };
-    compute(&topology, wanted, args.batch, (registry, &mut console))
+    compute(
+        (&topology, wanted),
+        args.batch,
+        (registry, &signals, &mut console),
+    )
 }
 
 /// The figure asked for, and its value.
@@ -152,10 +188,9 @@ fn loaded(topology: Result<Topology, TopologyErrors>, console: &mut Console) -> 
 }
 
 fn compute(
-    topology: &Topology,
-    wanted: Wanted<'_>,
+    (topology, wanted): (&Topology, Wanted<'_>),
     batch: BatchArgs,
-    (registry, console): (&Registry, &mut Console),
+    (registry, signals, console): (&Registry, &Signals, &mut Console),
 ) -> u8 {
     let options = StudyOptions {
         jobs: batch.jobs,
@@ -169,14 +204,7 @@ fn compute(
             return exit::USAGE;
         }
     };
-    let signals = match Signals::install() {
-        Ok(signals) => signals,
-        Err(error) => {
-            console.error(&format!("cannot handle signals: {error}"));
-            return exit::INTERNAL;
-        }
-    };
-    match study::run(batch.as_ref(), &options, &signals, console) {
+    match study::run(batch.as_ref(), &options, signals, console) {
         Ok(StudyEnd::Passed) => exit::RAN,
         Ok(StudyEnd::Missed) => {
             console

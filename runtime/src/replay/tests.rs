@@ -201,3 +201,23 @@ fn what_cannot_be_replayed_is_said_to_be_so() {
         "the run is of no case; only a case can be replayed"
     );
 }
+
+#[test]
+fn a_long_method_wraps_within_the_page() {
+    let replay = Replay {
+        method: "twice of each and nothing but that ".repeat(8),
+        ..Replay::default()
+    };
+    let replayed = Replayed {
+        run: "run".to_owned(),
+        case: "doubler".to_owned(),
+        replay,
+    };
+    let text = replayed.text();
+    let widths = text.lines().map(|line| line.chars().count());
+    assert!(
+        widths.max().is_some_and(|width| width <= PAGE_WIDTH),
+        "{text}"
+    );
+    assert!(text.lines().count() > 4, "{text}");
+}

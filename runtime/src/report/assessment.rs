@@ -4,6 +4,8 @@
 use hil_models::measure::account::{ChannelAccount, ClosingFigures, Coverage, MessageFate};
 use serde::{Deserialize, Serialize};
 
+use super::face::FaceSummary;
+use super::face_warnings;
 use super::summary::{ChannelSummary, Fact, LinkKind, Outcome, ProcessSummary, RunSummary};
 use super::terminal::{JOINT, grouped, percent};
 
@@ -26,6 +28,8 @@ pub enum NetworkVerdict {
     NoNetwork,
     /// No link of ours was a network, but a foreign program took part through a face.
     ForeignProgram,
+    /// No link of ours was a network, and nothing came to any face from a foreign program.
+    NoForeignProgram,
     /// A channel went over an emulated link, whatever carried the others.
     EmulatedLink,
     /// The host kept its ticks: what remains is the network's.
@@ -67,6 +71,7 @@ impl Assessment {
         let overruns: Vec<Overrun> = summary.processes.iter().filter_map(overrun).collect();
         let mut warnings: Vec<String> = overruns.iter().map(overrun_warning).collect();
         warnings.extend(summary.warnings.iter().cloned());
+        warnings.extend(summary.faces.iter().flat_map(face_warnings::face_warnings));
         warnings.extend(summary.processes.iter().flat_map(process_warnings));
         warnings.extend(summary.channels.iter().flat_map(channel_warnings));
         warnings.extend(summary.realtime.refused.iter().map(refused_warning));
@@ -105,10 +110,12 @@ fn verdict(summary: &RunSummary, overruns: Vec<Overrun>) -> NetworkVerdict {
         NetworkVerdict::TicksUnknown
     } else if has(LinkKind::Emulated) {
         NetworkVerdict::EmulatedLink
-    } else if !has(LinkKind::Udp) {
-        NetworkVerdict::ForeignProgram
-    } else {
+    } else if has(LinkKind::Udp) || has(LinkKind::Tcp) {
         NetworkVerdict::NetworkResult
+    } else if summary.faces.iter().all(FaceSummary::is_unanswered) {
+        NetworkVerdict::NoForeignProgram
+    } else {
+        NetworkVerdict::ForeignProgram
     }
 }
 
@@ -187,7 +194,10 @@ fn channel_warnings(channel: &ChannelSummary) -> Vec<String> {
             "{name}: the account closes for {ratio} of messages, less than {least}"
         ));
     }
-    warnings.extend(stamp_warnings(name, account));
+    // A stream has no stamps, by design: nobody can do anything about it.
+    if channel.link != LinkKind::Tcp {
+        warnings.extend(stamp_warnings(name, account));
+    }
     warnings
 }
 

@@ -12,7 +12,7 @@ use super::terminal::JOINT;
 pub(crate) fn text(name: &str, all: &ScoreEvents) -> String {
     let mut text = format!("# {}\n", one_line(name));
     text.push_str(
-        "# seconds since the start of the run, severity, what happened; outages before\n",
+        "# seconds since the start of the run, severity, what happened | outages beside it\n",
     );
     if all.clocks_differ {
         text.push_str("# clocks are not aligned: times of different hosts do not compare\n");
@@ -40,12 +40,12 @@ fn line(event: &ExplainedEvent, clocks_differ: bool) -> String {
         Severity::Hazard => "hazard",
         Severity::Incident => "incident",
     };
-    let mut line = format!("{time:>14} {severity:<8} {}", event.what);
+    let mut line = format!("{time:>14} {severity:<8} {}", event.what.replace('|', "/"));
     if clocks_differ {
         line.push_str(&[" (clock of ", &event.clock, ")"].concat());
     }
     for outage in &event.outages {
-        line.push_str("; ");
+        line.push_str(" | ");
         line.push_str(&outage.words);
     }
     one_line(&line)
@@ -97,9 +97,10 @@ mod tests {
             dropped_count: 7,
             clocks_differ: false,
         };
-        let lines = "# seconds since the start of the run, severity, what happened; outages before
+        let lines =
+            "# seconds since the start of the run, severity, what happened | outages beside it
              - notice   hold began
-     42.204000 incident session 3 ended by itself; outage of 1.84 s on egm/right/command
+     42.204000 incident session 3 ended by itself | outage of 1.84 s on egm/right/command
 # 7 more events found no room in the score
 ";
         assert_eq!(text("run", &all), format!("# run\n{lines}"));

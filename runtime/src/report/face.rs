@@ -5,6 +5,7 @@ use hil_models::measure::histogram::Distribution;
 use serde::{Deserialize, Serialize};
 
 use super::summary::{CountByName, Fact};
+use crate::topology::FaceKind;
 
 /// One arm of a face.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -34,6 +35,23 @@ pub struct FaceSummary {
     pub counters: Vec<CountByName>,
     /// What was granted and found: socket, buffers, stamp probe.
     pub facts: Vec<Fact>,
+}
+
+impl FaceSummary {
+    /// True when nothing came from the foreign program, not even what was refused.
+    pub fn is_unanswered(&self) -> bool {
+        !self.has_usable_messages() && self.refusals.is_empty()
+    }
+
+    /// True when something that the protocol allows came from the foreign program.
+    pub fn has_usable_messages(&self) -> bool {
+        if self.kind == FaceKind::Sensor.to_string() {
+            self.answers.robot_message_count > 0
+        } else {
+            // From the first answer to the last there is at least the message it follows.
+            self.answers.attended_count > 0
+        }
+    }
 }
 
 /// How many of the robot's messages were answered.

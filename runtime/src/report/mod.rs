@@ -4,6 +4,7 @@
 pub mod assessment;
 pub(crate) mod event_log;
 pub mod face;
+mod face_warnings;
 pub mod score_event;
 pub mod summary;
 pub mod terminal;

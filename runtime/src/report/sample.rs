@@ -3,11 +3,12 @@
 //! difference.
 
 use hil_models::measure::account::{
-    AccountContext, ChannelAccount, ChannelPath, ChannelRecords, account,
+    AccountContext, ChannelAccount, ChannelPath, ChannelRecords, Coverage, account,
 };
 use hil_models::time::Alignment;
 
 use super::assessment::{Assessment, NetworkVerdict};
+use super::face::{Answers, FaceSummary};
 use super::sample_events::{few_events, many_events, recorded_channel};
 use super::sample_records::Files;
 use super::summary::{
@@ -346,6 +347,61 @@ fn a_host_that_overran_is_not_a_network_result() {
     );
     summary.channels.truncate(0);
     assert_eq!(Assessment::of(&summary).network, NetworkVerdict::NoNetwork);
+}
+
+#[test]
+fn a_run_whose_face_nobody_answered_does_not_claim_a_foreign_program() {
+    let mut summary = full();
+    summary.channels.truncate(0);
+    summary.faces.push(FaceSummary {
+        process: "client".to_owned(),
+        host: "local".to_owned(),
+        kind: "EGM robot face".to_owned(),
+        arm: "right".to_owned(),
+        address: "127.0.0.1:6510".to_owned(),
+        peer_state: "never answered".to_owned(),
+        cycle_ns: Some(4_000_000),
+        answers: Answers::default(),
+        segments: Vec::new(),
+        refusals: Vec::new(),
+        counters: Vec::new(),
+        facts: Vec::new(),
+    });
+    let assessment = Assessment::of(&summary);
+    assert_eq!(assessment.network, NetworkVerdict::NoForeignProgram);
+    let told = |words: &str| assessment.warnings.iter().any(|one| one.contains(words));
+    assert!(told("no foreign program answered"), "{assessment:?}");
+    let text = render(&summary, 120, Style::Plain);
+    assert!(!text.contains("took part"), "{text}");
+    summary.faces[0].answers.attended_count = 1;
+    let network = Assessment::of(&summary).network;
+    assert_eq!(network, NetworkVerdict::ForeignProgram);
+}
+
+#[test]
+fn a_stream_is_not_blamed_for_stamps_it_cannot_have() {
+    let mut summary = full();
+    let stamped = |summary: &RunSummary| {
+        let warnings = Assessment::of(summary).warnings;
+        warnings.iter().any(|one| one.contains("kernel TX stamp"))
+    };
+    for channel in &mut summary.channels {
+        if let Some(account) = &mut channel.account {
+            account.coverage.tx_software = Some(Coverage {
+                stamped_count: 0,
+                eligible_count: 100,
+            });
+        }
+    }
+    assert!(stamped(&summary));
+    for channel in &mut summary.channels {
+        channel.link = LinkKind::Tcp;
+    }
+    assert!(!stamped(&summary));
+    assert_eq!(
+        Assessment::of(&summary).network,
+        NetworkVerdict::NetworkResult
+    );
 }
 
 #[test]

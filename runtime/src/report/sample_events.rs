@@ -58,7 +58,7 @@ pub(super) fn few_events() -> ScoreEvents {
         standing: Standing::OverFor(521_000_000),
         other_count: 3,
         words: "outage of 800 ms on fleet/authority, 3.600 s to 4.400 s, 20 messages lost, over \
-                for 521 ms; 3 others about then"
+                for 521 ms (3 others about then)"
             .to_owned(),
     };
     let collision = "robots 3 and 5 of fleet 0 met in their section, 0.41 m into each other";

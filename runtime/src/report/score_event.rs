@@ -62,6 +62,20 @@ pub struct EventOutage {
     pub words: String,
 }
 
+impl EventOutage {
+    /// Puts those first whose channel's name has most words in common with `what` happened: an
+    /// event of the right arm is about the right arm's channels before it is about the other's.
+    pub(crate) fn put_own_channels_first(outages: &mut [Self], what: &str) {
+        let words: Vec<&str> = what.split(|c: char| !c.is_alphanumeric()).collect();
+        let strangers = |outage: &Self| {
+            let parts = outage.channel.split('/');
+            let own_count = parts.filter(|part| words.contains(part)).count();
+            core::cmp::Reverse(own_count)
+        };
+        outages.sort_by_key(strangers);
+    }
+}
+
 /// One message an event names, and what became of it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ExplainedMessage {
@@ -81,4 +95,28 @@ pub struct ExplainedMessage {
     /// Its fate in words, with the link and the cause where they are known, or why it is
     /// unavailable.
     pub words: String,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_events_own_arm_comes_first() {
+        let outage = |channel: &str| EventOutage {
+            channel: channel.to_owned(),
+            from_s: None,
+            until_s: None,
+            length_s: None,
+            lost_count: 1,
+            standing: Standing::Unknown,
+            other_count: 0,
+            words: String::new(),
+        };
+        let mut outages = ["egm/right/command", "egm/left/command", "motion/request"].map(outage);
+        EventOutage::put_own_channels_first(&mut outages, "left arm: no command for 0.044 s");
+        let names = outages.map(|one| one.channel);
+        let expected = ["egm/left/command", "egm/right/command", "motion/request"];
+        assert_eq!(names, expected);
+    }
 }

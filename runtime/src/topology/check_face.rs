@@ -10,7 +10,7 @@ use super::face::{EgmFace, FaceEntry, FaceKind};
 use super::file::ProcessEntry;
 use super::known::KnownCase;
 use super::model::{Case, Process, Program};
-use super::tree::join;
+use super::tree::{Table, Value, join};
 
 /// The channel with the commands to one arm, by its name in every case.
 pub(crate) const fn command_channel(side: Side) -> &'static str {
@@ -147,11 +147,12 @@ pub(super) fn is_played_by_face(process: &Process) -> bool {
     matches!(process.program, Program::Egm { .. })
 }
 
-/// Checks the faces of all processes against each other and against the case's parameters.
+/// Checks the faces of all processes against each other and against the case's parameters: all of
+/// them, and those that the file writes, with their places.
 pub(super) fn check_faces(
     entries: &[ProcessEntry],
     processes: &[Process],
-    case: Option<&Case>,
+    case: (Option<&Case>, Option<&Table>),
     faults: &Faults,
 ) {
     let mut taken = Vec::new();
@@ -170,27 +171,35 @@ pub(super) fn check_faces(
             }
         }
         if face.kind == FaceKind::Robot {
-            check_start(table, case, faults);
+            check_sessions(table, case, faults);
         }
     }
 }
 
-/// The maker's protocol has no word for starting a session, so nobody could ask for the first one.
-fn check_start(entry: &FaceEntry, case: Option<&Case>, faults: &Faults) {
-    let Some(case) = case else { return };
-    let egm = case.parameters.get("egm");
-    let start = egm.and_then(|egm| egm.get("start")?.as_str());
-    if start == Some("power-on") {
-        return;
+/// The maker's protocol has no word for starting a session, so nobody could ask for the first one,
+/// nor for another after a session ended.
+fn check_sessions(entry: &FaceEntry, case: (Option<&Case>, Option<&Table>), faults: &Faults) {
+    let (Some(case), written) = case else { return };
+    let value = |key| case.parameters.get("egm")?.get(key)?.as_str();
+    let why = "but a foreign program cannot request a session (EGM has no word for it)";
+    let refuse = |key: &str, value: &str, allowed: &str| {
+        let node = written.and_then(|table| match &table.get("egm")?.value {
+            Value::Table(egm) => egm.get(key),
+            _ => None,
+        });
+        let place = node.map_or(entry.place, |node| node.place);
+        let by_default = if node.is_none() { " by default" } else { "" };
+        let fault =
+            format!("is \"{value}\"{by_default}, {why}; allowed beside a robot face: {allowed}");
+        let key = join("case.parameters.egm", key);
+        faults.add(key, Some(place), Fault::Inconsistent(fault));
+    };
+    let start = value("start").unwrap_or("request");
+    if start != "power-on" {
+        refuse("start", start, "\"power-on\"");
     }
-    let start = start.unwrap_or("request");
-    let fault = format!(
-        "is \"{start}\", but a foreign program cannot request a session (EGM has no word for \
-         it); allowed beside a robot face: \"power-on\""
-    );
-    faults.add(
-        "case.parameters.egm.start",
-        Some(entry.place),
-        Fault::Inconsistent(fault),
-    );
+    if value("restart") == Some("external_trigger") {
+        let allowed = "\"auto_retry\", \"wait_then_restart\", \"go_home_first\"";
+        refuse("restart", "external_trigger", allowed);
+    }
 }

@@ -60,12 +60,16 @@ impl LinkEntry {
             let hint = format!("write one of {}", words.join(", "));
             reader.refuse("via", Fault::Missing(hint));
         }
-        // A stream has no stamps; whoever asks for them all the same is told in the report.
-        let timestamps = match kind {
+        let default = match kind {
             Some(Kind::Tcp) => Timestamps::Off,
             _ => Timestamps::Software,
         };
-        let hop = read_hop(&mut reader, timestamps);
+        let hop = read_hop(&mut reader, default);
+        if matches!(kind, Some(Kind::Tcp)) && hop.timestamps != Timestamps::Off {
+            let why = "needs via = \"udp\" or \"emulated\": a TCP stream has no messages that \
+                       the kernel could stamp; leave it out, or write \"off\"";
+            reader.refuse_present(&["timestamps"], why);
+        }
         let emulation = read_emulation(&mut reader);
         let via = kind.map(|kind| match kind {
             Kind::SharedMemory => {

@@ -27,7 +27,7 @@ impl EgmEvent {
     fn what(&self, kind: EgmEventKind) -> String {
         let (value, limit) = (Number(self.value), Number(self.limit));
         match kind {
-            EgmEventKind::Started => "controller started".to_owned(),
+            EgmEventKind::Started => "robot started".to_owned(),
             EgmEventKind::Activating => format!("guided motion is being set up for {value} s"),
             EgmEventKind::Running if self.session > 1 => {
                 format!("guided motion runs, {value} s after the last session ended")
@@ -38,7 +38,9 @@ impl EgmEvent {
                 "all joints are slowed: {value} deg/s asked (MaxSpeedDeviation = {limit} deg/s)"
             ),
             EgmEventKind::SpeedFree => format!(
-                "joints are slowed no more, after {value} s (MaxSpeedDeviation = {limit} deg/s)"
+                "joints are slowed no more, after {} s with up to {value} deg/s asked \
+                 (MaxSpeedDeviation = {limit} deg/s)",
+                Number(self.count as f64 * 1e-9)
             ),
             EgmEventKind::HoldBegan => {
                 format!("no command for {value} s: the last one goes on acting")

@@ -227,7 +227,9 @@ impl Controller {
         self.has_begun = true;
         self.session.ended_at = self.at;
         tell(self.event(EgmEventKind::Started));
-        if self.settings.start == StartMode::PowerOn && self.request.is_none() {
+        let is_own_start =
+            self.settings.start == StartMode::PowerOn && self.settings.arms.include(self.side);
+        if is_own_start && self.request.is_none() {
             self.request = Some(Request::Start(Box::new(self.settings)));
         }
     }
@@ -257,6 +259,11 @@ impl Controller {
                 | flag(self.hold.is_holding(), EgmFeedback::HOLDING)
                 | flag(self.plan.is_at_limit(), EgmFeedback::AT_POSITION_LIMIT),
         }
+    }
+
+    /// True when `MaxSpeedDeviation` bound in the last cycle.
+    pub(crate) fn is_throttled(&self) -> bool {
+        self.cycle_flags & EgmFeedback::SPEED_DEVIATION_LIMITED != 0
     }
 
     /// Joint positions as measured in the last cycle.

@@ -230,6 +230,7 @@ impl Controller {
     }
 
     fn tell_ended(&mut self, trip: &Trip, tell: &mut dyn FnMut(EgmEvent)) {
+        self.end_throttling(tell);
         tell(EgmEvent {
             value: trip.value,
             limit: trip.limit,

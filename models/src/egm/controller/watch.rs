@@ -61,6 +61,8 @@ pub(super) struct Trip {
 pub(super) struct ThrottleWatch {
     began_at: Option<Instant>,
     bound_at: Instant,
+    /// Highest speed asked in the episode.
+    asked_rad_per_s: f64,
 }
 
 /// Whether commands have stopped.
@@ -169,7 +171,8 @@ impl Controller {
         self.held_cycle_count += u64::from(self.hold.is_holding);
     }
 
-    /// Tells once per episode that `MaxSpeedDeviation` slows the joints.
+    /// Tells of each episode in which `MaxSpeedDeviation` slows the joints that it began, and what
+    /// it came to.
     #[inline]
     pub(super) fn note_binding(&mut self, binding: Binding, tell: &mut dyn FnMut(EgmEvent)) {
         match binding {
@@ -177,8 +180,10 @@ impl Controller {
             Binding::Joint => self.cycle_flags |= EgmFeedback::SPEED_LIMITED,
             Binding::Deviation { asked_rad_per_s } => {
                 self.cycle_flags |= EgmFeedback::SPEED_DEVIATION_LIMITED;
-                self.throttle.bound_at = self.at;
-                if self.throttle.began_at.is_none() {
+                let throttle = &mut self.throttle;
+                throttle.bound_at = self.at;
+                throttle.asked_rad_per_s = throttle.asked_rad_per_s.max(asked_rad_per_s);
+                if throttle.began_at.is_none() {
                     self.throttle.began_at = Some(self.at);
                     let allowed = self.session.settings.max_speed_deviation_rad_per_s;
                     tell(EgmEvent {
@@ -190,19 +195,28 @@ impl Controller {
                 return;
             }
         }
-        let Some(began_at) = self.throttle.began_at else {
+        if self.throttle.began_at.is_some()
+            && self.at.ns_since(self.throttle.bound_at) > FREE_AFTER_NS
+        {
+            self.end_throttling(tell);
+        }
+    }
+
+    /// Tells what the episode under way came to, if there is one.
+    pub(super) fn end_throttling(&mut self, tell: &mut dyn FnMut(EgmEvent)) {
+        let throttle = core::mem::take(&mut self.throttle);
+        let Some(began_at) = throttle.began_at else {
             return;
         };
-        if self.at.ns_since(self.throttle.bound_at) > FREE_AFTER_NS {
-            self.throttle.began_at = None;
-            let bound_s = self.throttle.bound_at.seconds_since(began_at) + self.law.step_s();
-            let allowed = self.session.settings.max_speed_deviation_rad_per_s;
-            tell(EgmEvent {
-                value: bound_s,
-                limit: allowed.to_degrees(),
-                ..self.event(EgmEventKind::SpeedFree)
-            });
-        }
+        // The last cycle in which it bound counts in full.
+        let bound_ns = throttle.bound_at.ns_since(began_at) + ns(self.law.step_s());
+        let allowed = self.session.settings.max_speed_deviation_rad_per_s;
+        tell(EgmEvent {
+            value: throttle.asked_rad_per_s.to_degrees(),
+            limit: allowed.to_degrees(),
+            count: bound_ns.unsigned_abs(),
+            ..self.event(EgmEventKind::SpeedFree)
+        });
     }
 
     /// The first limit that ends the session in this cycle.

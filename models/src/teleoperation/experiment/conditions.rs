@@ -84,7 +84,7 @@ pub(crate) fn base(case: &Teleoperation) -> Setup {
             SendPolicy::Frame => Sending::Frame,
             SendPolicy::Coupled => Sending::Coupled,
             SendPolicy::Free => {
-                let period = Duration::from_secs_f64(1.0 / parameters.send_hz);
+                let period = Duration::from_secs_f64(1.0 / parameters.send_hz());
                 Sending::Free(nanoseconds(period))
             }
         },

@@ -5,7 +5,7 @@
 use std::collections::VecDeque;
 
 use crate::egm::controller::Controller;
-use crate::egm::messages::{EgmEvent, EgmEventKind, EgmStartParameters, EndCause, SessionState};
+use crate::egm::messages::{EgmEvent, EgmEventKind, EgmStartParameters, SessionState};
 use crate::egm::parameters::ControllerSettings;
 use crate::link::bernoulli::BernoulliLink;
 use crate::link::outages::{OutageLink, Outages};
@@ -14,7 +14,7 @@ use crate::measure::series::Sample;
 use crate::random::RandomStream;
 use crate::study::Watch;
 use crate::teleoperation::experiment::trajectory::{Trajectory, requested};
-use crate::teleoperation::score::loops::{Evidence, Loops, LossCause, Pause, Span};
+use crate::teleoperation::score::loops::{Evidence, Loops, LossCause, Pause, PauseAfter, Span};
 use crate::teleoperation::score::sessions::cause_of;
 use crate::time::{Instant, duration_ns};
 use crate::yumi::arm::Arm;
@@ -152,7 +152,10 @@ impl<'a> Run<'a> {
             answers: VecDeque::with_capacity(4096),
             in_flight: VecDeque::with_capacity(4096),
             idle_since: None,
-            happened: Happened::default(),
+            happened: Happened {
+                pause_began: Some((0, PauseAfter::Start)),
+                ..Happened::default()
+            },
             trajectory,
             setup,
         }
@@ -176,6 +179,7 @@ impl<'a> Run<'a> {
         }
         let happened = &mut self.happened;
         self.arm.cycle(at, &mut |event| happened.note(&event));
+        happened.note_throttle(at.as_ns(), self.arm.is_throttled());
         if self.setup.sending == Sending::Coupled
             && let Fate::Delivered(heard) = self.backward.offer(at, MESSAGE_BYTES)
         {
@@ -250,7 +254,8 @@ struct Happened {
     evidence: Evidence,
     trip_count: u64,
     hold_began_ns: Option<i64>,
-    pause_began: Option<(i64, Option<EndCause>)>,
+    throttle_began_ns: Option<i64>,
+    pause_began: Option<(i64, PauseAfter)>,
     running_began_ns: Option<i64>,
     running_ns: i64,
 }
@@ -271,11 +276,21 @@ impl Happened {
                 self.end_hold(event.at_ns);
                 self.trip_count += 1;
                 self.end_running(event.at_ns);
-                self.pause_began = Some((event.at_ns, cause_of(event)));
+                self.pause_began = Some((event.at_ns, PauseAfter::Session(cause_of(event))));
             }
             HOLD_BEGAN => self.hold_began_ns = Some(event.at_ns),
             HOLD_ENDED => self.end_hold(event.at_ns),
             _ => {}
+        }
+    }
+
+    #[inline]
+    fn note_throttle(&mut self, at_ns: i64, is_throttled: bool) {
+        if is_throttled {
+            self.throttle_began_ns.get_or_insert(at_ns);
+        } else if let Some(begin_ns) = self.throttle_began_ns.take() {
+            let end_ns = at_ns;
+            self.evidence.throttled.push(Span { begin_ns, end_ns });
         }
     }
 
@@ -286,9 +301,9 @@ impl Happened {
     }
 
     fn end_pause(&mut self, end_ns: i64) {
-        if let Some((begin_ns, cause)) = self.pause_began.take() {
+        if let Some((begin_ns, after)) = self.pause_began.take() {
             let span = Span { begin_ns, end_ns };
-            self.evidence.pauses.push(Pause { span, cause });
+            self.evidence.pauses.push(Pause { span, after });
         }
     }
 
@@ -299,6 +314,7 @@ impl Happened {
     }
 
     fn finish(&mut self, end_ns: i64) {
+        self.note_throttle(end_ns, false);
         self.end_hold(end_ns);
         self.end_pause(end_ns);
         self.end_running(end_ns);

@@ -12,7 +12,8 @@ pub struct TableParameters {
     pub loops: u32,
     /// Runs per condition, each with a seed of its own, 1..=1000.
     pub seeds: u32,
-    /// Only conditions whose name contains one of these; empty for all.
+    /// Only conditions whose name contains one of these, each of which must be part of one; empty
+    /// for all.
     pub conditions: Vec<String>,
 }
 

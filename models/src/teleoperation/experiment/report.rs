@@ -69,7 +69,7 @@ const fn column(name: &'static str, label: &'static str) -> Column {
     Column { name, label }
 }
 
-const COLUMNS: [Column; 17] = [
+const COLUMNS: [Column; 18] = [
     column("condition", "Condition"),
     column("setup", "Channel and robot"),
     column("run_count", "Runs"),
@@ -85,6 +85,7 @@ const COLUMNS: [Column; 17] = [
     column("lost_by_trip_count", "Lost: no session"),
     column("lost_by_hold_count", "Lost: held"),
     column("lost_by_clipping_count", "Lost: clipped"),
+    column("lost_by_throttling_count", "Lost: throttled"),
     column("lost_by_merging_count", "Lost: merged"),
     column("extra_count", "Extra"),
 ];
@@ -142,6 +143,7 @@ fn cells((condition, runs): &Row<'_>) -> Vec<Cell> {
         Cell::Count(sum(|run| run.lost_counts[1])),
         Cell::Count(sum(|run| run.lost_counts[2])),
         Cell::Count(sum(|run| run.lost_counts[3])),
+        Cell::Count(sum(|run| run.lost_counts[4])),
         Cell::Count(sum(|run| run.extra_count)),
     ]);
     cells

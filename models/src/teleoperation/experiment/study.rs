@@ -28,21 +28,11 @@ impl MotionLossStudy {
     /// otherwise.
     ///
     /// # Errors
-    /// A filter no condition meets, or a motion without loops.
+    /// An entry of the filter that no condition meets, or a motion without loops.
     pub(crate) fn new(case: &Teleoperation) -> Result<Self, ParameterError> {
         let parameters = case.parameters.tables.clone();
         let mut conditions = conditions(&base(case));
-        if !parameters.conditions.is_empty() {
-            let is_wanted = |name: &str| {
-                let mut parts = parameters.conditions.iter();
-                parts.any(|part| name.contains(part))
-            };
-            conditions.retain(|condition| is_wanted(condition.name));
-        }
-        if conditions.is_empty() {
-            let problem = format!("{:?} is part of no condition's name", parameters.conditions);
-            return Err(ParameterError::new("tables.conditions", problem));
-        }
+        keep_wanted(&mut conditions, &parameters.conditions)?;
         Ok(Self {
             trajectory: Trajectory::new(case, parameters.loops)?,
             seed: case.seed,
@@ -61,6 +51,23 @@ impl MotionLossStudy {
             seed_of(self.seed, task % seeds),
         )
     }
+}
+
+/// Keeps the conditions whose name contains one of `wanted`, or all without any.
+fn keep_wanted(conditions: &mut Vec<Condition>, wanted: &[String]) -> Result<(), ParameterError> {
+    let meets = |condition: &Condition, part: &String| condition.name.contains(part.as_str());
+    for part in wanted {
+        if part.is_empty() || !conditions.iter().any(|condition| meets(condition, part)) {
+            let names: Vec<_> = conditions.iter().map(|condition| condition.name).collect();
+            let names = names.join(", ");
+            let problem = format!("{part:?} is part of no condition's name; there are {names}");
+            return Err(ParameterError::new("tables.conditions", problem));
+        }
+    }
+    if !wanted.is_empty() {
+        conditions.retain(|condition| wanted.iter().any(|part| meets(condition, part)));
+    }
+    Ok(())
 }
 
 /// True when nothing but the size of the tables, and what starts the first session, differs from

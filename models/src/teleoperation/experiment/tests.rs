@@ -142,10 +142,18 @@ fn a_study_names_its_conditions_and_refuses_a_filter_without_any() {
     assert_eq!(named.label(0), "short-range");
     assert_eq!(named.label(23), "long-range");
     let error = MotionLossStudy::new(&case(|parameters| {
-        parameters.tables.conditions = vec!["wifi".to_owned()];
+        parameters.tables.conditions = vec!["loss".to_owned(), "short range".to_owned()];
     }))
     .unwrap_err();
     assert_eq!(error.key, "tables.conditions");
+    for said in [
+        "\"short range\"",
+        "perfect, loss-0.01",
+        "short-range",
+        "gain-5",
+    ] {
+        assert!(error.problem.contains(said), "{error}");
+    }
 }
 
 #[test]

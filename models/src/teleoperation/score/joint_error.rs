@@ -133,7 +133,7 @@ impl JointError {
             controller.rms(
                 (
                     "joint_error_controller_rad_rms",
-                    "joint error of the controller alone, RMS",
+                    "joint error of the servo alone, without the network, RMS",
                     "rad",
                 ),
                 CONTROLLER_PART,
@@ -142,7 +142,7 @@ impl JointError {
             controller.greatest(
                 (
                     "joint_error_controller_rad_max",
-                    "joint error of the controller alone, largest",
+                    "joint error of the servo alone, without the network, largest",
                     "rad",
                 ),
                 CONTROLLER_PART,

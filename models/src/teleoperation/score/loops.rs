@@ -174,26 +174,60 @@ pub(crate) struct Span {
 pub(crate) struct Pause {
     /// From the end of one session to the beginning of the next.
     pub(crate) span: Span,
-    /// Why the session before it ended, where that is recorded.
-    pub(crate) cause: Option<EndCause>,
+    pub(crate) after: PauseAfter,
+}
+
+/// What came before a pause.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum PauseAfter {
+    /// Nothing: no session had begun.
+    Start,
+    /// A session, which ended by this, where that is recorded.
+    Session(Option<EndCause>),
+}
+
+impl Pause {
+    /// When it was and what came before, in words, its times since `origin_ns`.
+    fn text(self, origin_ns: i64) -> String {
+        let since = |at_ns: i64| at_ns.saturating_sub(origin_ns) as f64 * 1e-9;
+        let why = match self.after {
+            PauseAfter::Start => {
+                return format!(
+                    "no session had begun until {:.3} s",
+                    since(self.span.end_ns)
+                );
+            }
+            PauseAfter::Session(Some(EndCause::CommTimeout)) => "the last one ended by CommTimeout",
+            PauseAfter::Session(Some(EndCause::ConditionTime)) => "the last one ended by CondTime",
+            PauseAfter::Session(Some(EndCause::PositionDeviation)) => {
+                "the last one ended by MaxPosDeviation"
+            }
+            PauseAfter::Session(Some(EndCause::Requested)) => "the last one was stopped by request",
+            PauseAfter::Session(None) => "why the last one ended is not recorded",
+        };
+        let (begin_s, end_s) = (since(self.span.begin_ns), since(self.span.end_ns));
+        format!("no session from {begin_s:.3} s to {end_s:.3} s ({why})")
+    }
 }
 
 /// Why a loop was lost.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum LossCause {
-    /// No session ran in part of its time.
-    Trip(Option<EndCause>),
+    /// No session ran in part of its time: the pause that took most of it.
+    Trip(Pause),
     /// A session ran, but no commands came: the arm held.
     Held,
     /// Commands came, but inverse kinematics could not follow the hand.
     Clipped,
+    /// `MaxSpeedDeviation` slowed the joints.
+    Throttled,
     /// None of these: too little motion between this peak and its neighbours.
     Merged,
 }
 
 impl LossCause {
     /// The kinds, in the order of lists.
-    pub(crate) const KIND_COUNT: usize = 4;
+    pub(crate) const KIND_COUNT: usize = 5;
 
     /// Its place in lists.
     pub(crate) const fn kind(self) -> usize {
@@ -201,30 +235,21 @@ impl LossCause {
             Self::Trip(_) => 0,
             Self::Held => 1,
             Self::Clipped => 2,
-            Self::Merged => 3,
+            Self::Throttled => 3,
+            Self::Merged => 4,
         }
     }
 
-    /// In words.
-    pub(crate) const fn text(self) -> &'static str {
+    /// In words; times are told since `origin_ns`.
+    pub(crate) fn text(self, origin_ns: i64) -> String {
         match self {
-            Self::Trip(Some(EndCause::CommTimeout)) => {
-                "no session ran: the last one ended by CommTimeout"
-            }
-            Self::Trip(Some(EndCause::ConditionTime)) => {
-                "no session ran: the last one ended by CondTime"
-            }
-            Self::Trip(Some(EndCause::PositionDeviation)) => {
-                "no session ran: the last one ended by MaxPosDeviation"
-            }
-            Self::Trip(Some(EndCause::Requested)) => {
-                "no session ran: the last one was stopped by request"
-            }
-            Self::Trip(None) => "no session ran; why the last one ended is not recorded",
+            Self::Trip(pause) => return pause.text(origin_ns),
             Self::Held => "held through for want of commands",
             Self::Clipped => "commands were clipped: the hand was out of the arm's reach",
+            Self::Throttled => "throttled by MaxSpeedDeviation",
             Self::Merged => "merged with its neighbour: the tool moved too little in between",
         }
+        .to_owned()
     }
 }
 
@@ -237,14 +262,19 @@ pub(crate) struct Evidence {
     pub(crate) holds: Vec<Span>,
     /// Times in which commands were limited or unreachable.
     pub(crate) clipped: Vec<Span>,
+    /// Times in which `MaxSpeedDeviation` bound.
+    pub(crate) throttled: Vec<Span>,
 }
 
 /// Something explains a lost loop when it fills at least this share of the loop's time.
 const EXPLAINS_RATIO: f64 = 0.05;
 
+/// The share for throttling: after every hold the arm hurries for a moment, which costs no loop.
+const THROTTLES_RATIO: f64 = 0.2;
+
 impl Evidence {
     /// Why the loop whose peak was due at `due_ns` was lost: what happened within half a period
-    /// of it. A pause explains it before a hold does, a hold before clipping.
+    /// of it. A pause explains it before a hold does, then clipping, then throttling.
     pub(crate) fn cause_of(&self, due_ns: i64, period_ns: f64) -> LossCause {
         #[allow(clippy::cast_possible_truncation, reason = "at most a minute")]
         let half_ns = (0.5 * period_ns) as i64;
@@ -252,27 +282,30 @@ impl Evidence {
             begin_ns: due_ns - half_ns,
             end_ns: due_ns + half_ns,
         };
-        let enough_ns = EXPLAINS_RATIO * period_ns;
         let pauses = within(&self.pauses, window, |pause| pause.span);
         let paused_ns: i64 = pauses
             .iter()
             .map(|pause| pause.span.overlap_ns(window))
             .sum();
-        if paused_ns as f64 >= enough_ns {
-            let longest = pauses.iter().max_by_key(|p| p.span.overlap_ns(window));
-            return LossCause::Trip(longest.and_then(|pause| pause.cause));
+        let longest = pauses.iter().max_by_key(|p| p.span.overlap_ns(window));
+        if let Some(longest) = longest
+            && paused_ns as f64 >= EXPLAINS_RATIO * period_ns
+        {
+            return LossCause::Trip(*longest);
         }
-        let explains = |spans: &[Span]| {
+        let explains = |spans: &[Span], share: f64| {
             let overlap_ns: i64 = within(spans, window, |span| *span)
                 .iter()
                 .map(|span| span.overlap_ns(window))
                 .sum();
-            overlap_ns as f64 >= enough_ns
+            overlap_ns as f64 >= share * period_ns
         };
-        if explains(&self.holds) {
+        if explains(&self.holds, EXPLAINS_RATIO) {
             LossCause::Held
-        } else if explains(&self.clipped) {
+        } else if explains(&self.clipped, EXPLAINS_RATIO) {
             LossCause::Clipped
+        } else if explains(&self.throttled, THROTTLES_RATIO) {
+            LossCause::Throttled
         } else {
             LossCause::Merged
         }
@@ -378,16 +411,20 @@ mod tests {
 
     #[test]
     fn each_cause_is_told_from_the_others() {
-        let pause = |begin_s, end_s, cause| Pause {
+        let pause = |begin_s, end_s, after| Pause {
             span: seconds(begin_s, end_s),
-            cause,
+            after,
         };
+        let timed_out = pause(20.0, 22.0, PauseAfter::Session(Some(EndCause::CommTimeout)));
+        let unknown = pause(40.0, 41.0, PauseAfter::Session(None));
+        let first = pause(0.0, 5.0, PauseAfter::Start);
         let evidence = Evidence {
             pauses: vec![
-                pause(20.0, 22.0, Some(EndCause::CommTimeout)),
-                pause(40.0, 41.0, None),
+                first,
+                timed_out,
+                unknown,
                 // Too short to explain anything.
-                pause(60.0, 60.1, Some(EndCause::Requested)),
+                pause(60.0, 60.1, PauseAfter::Session(Some(EndCause::Requested))),
             ],
             holds: vec![
                 seconds(19.0, 20.0),
@@ -395,13 +432,31 @@ mod tests {
                 seconds(80.0, 84.0),
             ],
             clipped: vec![seconds(79.0, 85.0), seconds(100.0, 101.0)],
+            throttled: vec![
+                seconds(99.0, 103.0),
+                seconds(119.0, 120.0),
+                seconds(140.0, 140.5),
+            ],
         };
         let cause = |due: i64| evidence.cause_of(due * 1_000_000_000, 4e9);
-        assert_eq!(cause(21), LossCause::Trip(Some(EndCause::CommTimeout)));
-        assert_eq!(cause(40), LossCause::Trip(None));
+        assert_eq!(cause(3), LossCause::Trip(first));
+        assert_eq!(
+            cause(3).text(1_000_000_000),
+            "no session had begun until 4.000 s"
+        );
+        // The loop's peak was due before the session ended: the text holds all the same.
+        assert_eq!(cause(19), LossCause::Trip(timed_out));
+        assert_eq!(
+            cause(19).text(1_000_000_000),
+            "no session from 19.000 s to 21.000 s (the last one ended by CommTimeout)"
+        );
+        assert_eq!(cause(40), LossCause::Trip(unknown));
         assert_eq!(cause(60), LossCause::Held);
         assert_eq!(cause(82), LossCause::Held);
         assert_eq!(cause(101), LossCause::Clipped);
+        assert_eq!(cause(120), LossCause::Throttled);
+        // As little as this is an arm that hurries for a moment.
+        assert_eq!(cause(140), LossCause::Merged);
         assert_eq!(cause(200), LossCause::Merged);
     }
 

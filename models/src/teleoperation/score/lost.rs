@@ -58,7 +58,7 @@ impl Run {
             "motion loop {} of {} lost: {}",
             index + 1,
             loops.sent_count(),
-            cause.text(),
+            cause.text(self.origin_ns()),
         );
         let (moved_m, needed_m) = (self.moved_m(window), self.counter.prominence_m);
         // More than that and still no peak of its own: the distance explains nothing.
@@ -68,13 +68,11 @@ impl Run {
         }
         let named = event(Severity::Incident, due_ns, what);
         let silence = match cause {
-            LossCause::Trip(_) => within(&evidence.pauses, window, |pause| pause.span)
-                .first()
-                .map(|pause| self.silence_before(pause.span)),
+            LossCause::Trip(pause) => Some(self.silence_before(pause.span)),
             LossCause::Held => within(&evidence.holds, window, |span| *span)
                 .first()
                 .copied(),
-            LossCause::Clipped | LossCause::Merged => None,
+            LossCause::Clipped | LossCause::Throttled | LossCause::Merged => None,
         };
         match silence {
             Some(span) => naming(
@@ -83,6 +81,11 @@ impl Run {
             ),
             None => named,
         }
+    }
+
+    /// The first feedback: where the times of texts begin.
+    fn origin_ns(&self) -> i64 {
+        self.record.feedback.first().map_or(0, |first| first.at_ns)
     }
 
     /// The pause with the hold that led to it.

@@ -183,7 +183,7 @@ impl Run {
         metrics
     }
 
-    fn causes(&self, loops: Option<&Loops>, missing: &str) -> [Metric; 5] {
+    fn causes(&self, loops: Option<&Loops>, missing: &str) -> [Metric; 6] {
         let mut kinds = [0_u64; LossCause::KIND_COUNT];
         for lost in loops.map_or(&[][..], |loops| &loops.lost) {
             let cause = self
@@ -217,10 +217,18 @@ impl Run {
             ),
             by(
                 (
+                    "loops_lost_by_throttling_count",
+                    "loops lost to MaxSpeedDeviation",
+                ),
+                3,
+                "of the others, those with MaxSpeedDeviation binding in a fifth of their loop",
+            ),
+            by(
+                (
                     "loops_lost_by_merging_count",
                     "loops merged with a neighbour",
                 ),
-                3,
+                4,
                 "the others: too little motion between two peaks",
             ),
             figure(

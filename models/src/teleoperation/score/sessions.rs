@@ -1,12 +1,12 @@
 //! Sessions, holds and trips of the right arm, from its feedback and the robot's events. Times are
 //! of the robot's clock.
 
-use crate::egm::messages::{EgmEvent, EgmEventKind, EgmFeedback, EndCause, Side};
+use crate::egm::messages::{EgmEvent, EgmEventKind, EgmFeedback, EndCause, SessionState, Side};
 use crate::run_log::RunLog;
 use crate::score::Metric;
 use crate::teleoperation::EGM_EVENT;
 use crate::teleoperation::score::figure::{count, figure};
-use crate::teleoperation::score::loops::{Evidence, Pause, Span};
+use crate::teleoperation::score::loops::{Evidence, Pause, PauseAfter, Span};
 use crate::teleoperation::score::record::{Feedback, Record};
 
 /// For how long after a resume the arm catches up, nanoseconds.
@@ -24,6 +24,8 @@ pub(crate) struct Sessions {
     running_count: u64,
     /// Of these, those flagged as holding.
     holding_count: u64,
+    /// Of these, those in which `MaxSpeedDeviation` bound.
+    throttled_count: u64,
     /// Feedback within [`CATCH_UP_NS`] after a hold or a new session, and those limited in speed.
     catching_up_count: u64,
     saturated_count: u64,
@@ -82,6 +84,16 @@ impl Sessions {
                     .then(|| self.holding_count as f64 / self.running_count as f64),
                 format!(
                     "feedback flagged as holding, of {} in running sessions",
+                    self.running_count
+                ),
+                "no feedback of a running session",
+            ),
+            figure(
+                ("throttled_time_ratio", "share of time throttled", "1"),
+                (self.running_count > 0)
+                    .then(|| self.throttled_count as f64 / self.running_count as f64),
+                format!(
+                    "feedback with MaxSpeedDeviation binding, of {} in running sessions",
                     self.running_count
                 ),
                 "no feedback of a running session",
@@ -149,7 +161,10 @@ struct Reading {
     running: Option<u32>,
     /// The session that ran last, and when it ended.
     ended: Option<(u32, i64)>,
+    /// The first feedback without a session, when no session ran before it.
+    unbegun: Option<(i64, PauseAfter)>,
     hold_began_ns: Option<i64>,
+    throttle_began_ns: Option<i64>,
     resumed_ns: Option<i64>,
 }
 
@@ -160,6 +175,7 @@ impl Reading {
         if session != self.running {
             if let Some(before) = self.running {
                 self.end_hold(at_ns);
+                self.end_throttle(at_ns);
                 self.ended = Some((before, at_ns));
             }
             if session.is_some() {
@@ -168,9 +184,18 @@ impl Reading {
             self.running = session;
         }
         if session.is_none() {
+            if self.sessions.count == 0 && self.unbegun.is_none() {
+                self.unbegun = Some((at_ns, before(feedback)));
+            }
             return;
         }
         self.sessions.running_count += 1;
+        if feedback.has(EgmFeedback::SPEED_DEVIATION_LIMITED) {
+            self.sessions.throttled_count += 1;
+            self.throttle_began_ns.get_or_insert(at_ns);
+        } else {
+            self.end_throttle(at_ns);
+        }
         if feedback.has(EgmFeedback::HOLDING) {
             self.sessions.holding_count += 1;
             self.hold_began_ns.get_or_insert(at_ns);
@@ -190,9 +215,24 @@ impl Reading {
 
     fn begin(&mut self, at_ns: i64) {
         self.sessions.count += 1;
+        self.end_unbegun(at_ns);
         if let Some(ended) = self.ended.take() {
             self.pause(ended, Some(at_ns), at_ns);
             self.resumed_ns = Some(at_ns);
+        }
+    }
+
+    fn end_unbegun(&mut self, end_ns: i64) {
+        if let Some((begin_ns, after)) = self.unbegun.take() {
+            let span = Span { begin_ns, end_ns };
+            self.sessions.evidence.pauses.push(Pause { span, after });
+        }
+    }
+
+    fn end_throttle(&mut self, end_ns: i64) {
+        if let Some(begin_ns) = self.throttle_began_ns.take() {
+            let throttled = &mut self.sessions.evidence.throttled;
+            throttled.push(Span { begin_ns, end_ns });
         }
     }
 
@@ -209,7 +249,8 @@ impl Reading {
         let known = self.ends.iter().rfind(|(known, _)| *known == session);
         let cause = known.and_then(|(_, cause)| *cause);
         let span = Span { begin_ns, end_ns };
-        self.sessions.evidence.pauses.push(Pause { span, cause });
+        let after = PauseAfter::Session(cause);
+        self.sessions.evidence.pauses.push(Pause { span, after });
         if cause != Some(EndCause::Requested) {
             self.sessions.trips.push(Trip {
                 at_ns: begin_ns,
@@ -221,12 +262,25 @@ impl Reading {
 
     fn finish(mut self, last: Option<&Feedback>) -> Sessions {
         if let Some(last) = last {
+            self.end_unbegun(last.at_ns);
             self.end_hold(last.at_ns);
+            self.end_throttle(last.at_ns);
             if let Some(ended) = self.ended.take() {
                 self.pause(ended, None, last.at_ns);
             }
         }
         self.sessions
+    }
+}
+
+/// What came before a log's first feedback without a session. A number counts from the session's
+/// setting up on.
+fn before(feedback: &Feedback) -> PauseAfter {
+    let is_first = feedback.session == 1 && feedback.state == Some(SessionState::Activating);
+    if feedback.session == 0 || is_first {
+        PauseAfter::Start
+    } else {
+        PauseAfter::Session(None)
     }
 }
 

@@ -87,7 +87,7 @@ const PERIOD_S: f64 = 4.033;
 fn an_empty_log_gives_no_figure_but_a_reason_for_each() {
     let case = case(|_| {});
     let score = case.score(&RunLog::default());
-    assert_eq!(score.metrics.len(), 35);
+    assert_eq!(score.metrics.len(), 37);
     for metric in &score.metrics {
         assert_eq!(metric.value, None, "{metric:?}");
         assert_eq!(metric.interval, None, "{metric:?}");
@@ -188,7 +188,7 @@ fn a_loop_lost_in_a_hold_is_told_as_held() {
 #[test]
 fn a_buffered_second_makes_the_reference_older_for_good() {
     let case = case(|parameters| {
-        parameters.send = crate::teleoperation::SendPolicy::Coupled;
+        parameters.send = SendPolicy::Coupled;
         parameters.egm.comm_timeout_s = Some(60.0);
     });
     let buffered = Silence {
@@ -410,6 +410,50 @@ fn clipped_commands_explain_a_loop_that_nothing_else_does() {
     let score = case.score(&foreign.log);
     assert!((value(&score, "loops_lost_by_clipping_count") - 1.0).abs() < 0.1);
     assert!(value(&score, "ik_failure_count") > 1000.0);
+}
+
+#[test]
+fn loops_before_the_first_session_are_lost_because_none_had_begun() {
+    let case = case(|_| {});
+    let mut foreign = Foreign::new();
+    let source = self::foreign(|time_s| time_s < 9.0, |_| 0).log;
+    for (at, command) in source.messages::<EgmCommand>(EGM_RIGHT_COMMAND) {
+        foreign.push(EGM_RIGHT_COMMAND, at.as_ns(), &command);
+    }
+    for (at, feedback) in source.messages::<EgmFeedback>(EGM_RIGHT_FEEDBACK) {
+        let is_running = feedback.state == SessionState::Running as u32;
+        let session = u32::from(is_running);
+        let feedback = EgmFeedback {
+            session,
+            ..feedback
+        };
+        foreign.push(EGM_RIGHT_FEEDBACK, at.as_ns(), &feedback);
+    }
+    let score = case.score(&foreign.log);
+    assert!(value(&score, "loops_lost_by_trip_count") > 0.5);
+    assert!(value(&score, "egm_trip_count").abs() < 0.1);
+    let lost = |event: &&crate::score::ScoreEvent| event.severity == Severity::Incident;
+    let incident = score.events.iter().find(lost).unwrap();
+    assert!(
+        incident.what.contains("no session had begun until 9.000 s"),
+        "{}",
+        incident.what
+    );
+}
+
+#[test]
+fn a_throttled_arm_loses_its_loops_to_max_speed_deviation() {
+    let case = case(|parameters| {
+        parameters.egm.max_speed_deviation_deg_per_s = Some(1.0);
+    });
+    let score = case.score(&run(&case, None, 8.0 * PERIOD_S));
+    assert!(value(&score, "loops_lost_by_throttling_count") > 3.0);
+    assert!(value(&score, "loops_lost_by_merging_count").abs() < 0.1);
+    assert!(value(&score, "throttled_time_ratio") > 0.5);
+    let throttled = |event: &&crate::score::ScoreEvent| {
+        event.what.contains("lost: throttled by MaxSpeedDeviation")
+    };
+    assert!(score.events.iter().any(|event| throttled(&event)));
 }
 
 #[test]

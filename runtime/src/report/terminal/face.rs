@@ -31,7 +31,9 @@ pub(super) fn face(canvas: &mut Canvas, face: &FaceSummary) {
         .filter(|one| !one.name.starts_with("refused: "))
         .map(|one| format!("{} {}", one.name, grouped(one.count)))
         .collect();
-    canvas.field("counted", Tone::Faint, &words.join(" · "));
+    if !words.is_empty() {
+        canvas.field("counted", Tone::Faint, &words.join(" · "));
+    }
     let facts = face.facts.iter();
     let words: Vec<_> = facts
         .map(|fact| format!("{}: {}", fact.label, fact.value))

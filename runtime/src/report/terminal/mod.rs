@@ -9,6 +9,7 @@ mod tables;
 mod units;
 
 pub use canvas::Style;
+pub(crate) use canvas::{shortened, wrapped};
 pub(crate) use units::{JOINT, duration_s, grouped, percent, seconds};
 
 use hil_models::measure::account::OutageFigures;
@@ -74,7 +75,7 @@ pub fn render_outages(
 fn title(canvas: &mut Canvas, summary: &RunSummary) {
     let run = &summary.run;
     canvas.rule(Tone::Faint);
-    let title = canvas::shortened(&format!("{} · {}", run.case, run.name), canvas.width());
+    let title = shortened(&format!("{} · {}", run.case, run.name), canvas.width());
     let line = canvas.paint(Tone::Strong, &title);
     canvas.line(&line);
     let facts = format!(
@@ -134,6 +135,11 @@ fn network_words(verdict: &NetworkVerdict) -> (Tone, String) {
                  network's; no process of ours skipped more than {limit} of its ticks"
             );
             (Tone::Plain, text)
+        }
+        NetworkVerdict::NoForeignProgram => {
+            let text = "no foreign program answered, and no link of ours was a network; nothing \
+                        here says anything about one";
+            (Tone::Caution, text.to_owned())
         }
         NetworkVerdict::NetworkResult => {
             let text =

@@ -244,7 +244,14 @@ const FAULTY: &[Faulty] = &[
         "parameters.egm.start = \"power-on\"",
         "",
         "case.parameters.egm.start",
-        "is \"request\"",
+        "is \"request\" by default",
+    ),
+    Faulty(
+        CLIENT,
+        "\"power-on\"",
+        "\"power-on\"\nparameters.egm.restart = \"external_trigger\"",
+        "case.parameters.egm.restart",
+        "allowed beside a robot face: \"auto_retry\"",
     ),
     Faulty(
         CLIENT,
@@ -312,4 +319,24 @@ fn what_a_face_may_not_say_is_named_with_what_it_may() {
             .any(|error| error.key.ends_with(key) && error.to_string().contains(words));
         assert!(found, "{key} with {words}: {errors}");
     }
+}
+
+#[test]
+fn a_session_nobody_could_ask_for_is_refused_where_it_is_written() {
+    let line_of = |text: &str| {
+        let errors = parse_guided(text).unwrap_err();
+        let location = errors.errors()[0].location.clone();
+        let line = location.map_or(0, |location| location.line);
+        text.lines().nth(line - 1).unwrap_or_default().to_owned()
+    };
+    let start = CLIENT.replace("power-on", "request");
+    assert_eq!(line_of(&start), "parameters.egm.start = \"request\"");
+    let restart = "parameters.egm.restart = \"external_trigger\"";
+    let text = CLIENT.replace(
+        "[processes.client]",
+        &[restart, "[processes.client]"].join("\n"),
+    );
+    assert_eq!(line_of(&text), restart);
+    let unwritten = CLIENT.replace("parameters.egm.start = \"power-on\"", "");
+    assert!(line_of(&unwritten).starts_with("egm = {"));
 }

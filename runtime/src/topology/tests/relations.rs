@@ -179,6 +179,11 @@ fn a_link_over_tcp_has_ports_and_a_hop_and_no_model() {
     let written = topology.to_toml();
     let again = parse("again.toml", &written, &[], &known()).unwrap();
     assert_eq!(again, topology);
+    let stamped = text.replace("via = \"tcp\"", "via = \"tcp\"\ntimestamps = \"software\"");
+    let refused = parse("tcp.toml", &stamped, &[], &known()).unwrap_err();
+    let words = refused.to_string();
+    let expected = "links.wire.timestamps needs via = \"udp\" or \"emulated\": a TCP stream";
+    assert!(words.contains(expected), "{words}");
 }
 
 #[test]

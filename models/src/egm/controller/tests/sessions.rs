@@ -196,7 +196,18 @@ fn max_speed_deviation_throttles_visibly_and_is_named_once() {
     rig.drive(20.9, 2, |_| Some(here));
     let free = rig.of_kind(EgmEventKind::SpeedFree);
     assert_eq!(free.len(), 1);
-    assert!((19.0..20.0).contains(&free[0].value), "{free:?}");
+    assert!(
+        (19_000_000_000..20_000_000_000).contains(&free[0].count),
+        "{free:?}"
+    );
+    // Far more was asked later than at the first instant.
+    assert!(free[0].value > 5.0 * told[0].value, "{free:?} {told:?}");
+
+    // A session that ends tells it first.
+    rig.drive(25.0, 2, |time_s| Some(swing(time_s, false)));
+    rig.silence(27.0);
+    assert_eq!(rig.of_kind(EgmEventKind::SpeedFree).len(), 2);
+    assert!(!rig.ends().is_empty());
 }
 
 #[test]

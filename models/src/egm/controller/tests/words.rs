@@ -22,12 +22,7 @@ fn check(kind: EgmEventKind, cause: u32, numbers: (f64, f64, u64), expected: &st
 #[test]
 fn every_kind_of_event_says_what_happened() {
     use EgmEventKind as Kind;
-    check(
-        Kind::Started,
-        0,
-        (0.0, 0.0, 0),
-        "left arm: controller started",
-    );
+    check(Kind::Started, 0, (0.0, 0.0, 0), "left arm: robot started");
     check(
         Kind::Activating,
         0,
@@ -49,8 +44,9 @@ fn every_kind_of_event_says_what_happened() {
     check(
         Kind::SpeedFree,
         0,
-        (12.0, 400.0, 0),
-        "left arm: session 3: joints are slowed no more, after 12 s (MaxSpeedDeviation = 400 deg/s)",
+        (31.25, 1.0, 12_000_000_000),
+        "left arm: session 3: joints are slowed no more, after 12 s with up to 31.25 deg/s asked \
+         (MaxSpeedDeviation = 1 deg/s)",
     );
     check(
         Kind::HoldBegan,
