@@ -61,6 +61,8 @@ impl LoopCounter {
 pub(crate) struct Loops {
     /// Times of the sent peaks.
     pub(crate) sent_ns: Vec<i64>,
+    /// Times of the executed peaks that answer them; `None` for a lost one.
+    pub(crate) answered_ns: Vec<Option<i64>>,
     /// Number of executed peaks.
     pub(crate) executed_count: usize,
     /// Which of the sent ones no executed one answers, with the time its execution was due.
@@ -87,6 +89,7 @@ impl Loops {
         let (mut delay_ns, mut next) = (0.0, 0);
         let (mut executed_count, mut extra_count) = (0, 0);
         let mut lost = Vec::new();
+        let mut answered_ns = vec![None; sent_ns.len()];
         for executed in executed_ns {
             let due = |index: usize| sent_ns[index] as f64 + delay_ns;
             let apart = |index: usize| (*executed as f64 - due(index)).abs();
@@ -107,6 +110,7 @@ impl Loops {
             }
             let late_ns = *executed as f64 - due(best);
             delay_ns = (delay_ns + DELAY_SHARE * late_ns).max(-0.1 * period_ns);
+            answered_ns[best] = Some(*executed);
             next = best + 1;
         }
         for (index, sent) in sent_ns.iter().enumerate().skip(next) {
@@ -114,6 +118,7 @@ impl Loops {
         }
         Self {
             sent_ns,
+            answered_ns,
             executed_count,
             lost,
             extra_count,
@@ -130,6 +135,7 @@ impl Loops {
             }
             self.lost.pop();
             self.sent_ns.pop();
+            self.answered_ns.pop();
         }
     }
 

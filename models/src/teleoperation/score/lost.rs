@@ -84,7 +84,7 @@ impl Run {
     }
 
     /// The first feedback: where the times of texts begin.
-    fn origin_ns(&self) -> i64 {
+    pub(crate) fn origin_ns(&self) -> i64 {
         self.record.feedback.first().map_or(0, |first| first.at_ns)
     }
 
