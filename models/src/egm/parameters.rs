@@ -310,6 +310,15 @@ impl EgmParameters {
         }
     }
 
+    /// The arms that guided motion shall move: with [`StartMode::Request`], all that are asked to.
+    pub(crate) fn guided_arms(&self) -> GuidedArms {
+        let preset = ControllerSettings::of(self.preset);
+        match self.start.unwrap_or(preset.start) {
+            StartMode::Request => GuidedArms::Both,
+            StartMode::PowerOn => self.arms.unwrap_or(preset.arms),
+        }
+    }
+
     /// The settings in force: the preset's, where no key changes them.
     ///
     /// # Errors

@@ -226,7 +226,7 @@ fn a_preset_spelled_out_is_the_same_to_the_last_bit() {
 }
 
 #[test]
-fn every_key_in_force_is_spelled_out_and_unknown_ones_are_refused() {
+fn every_key_in_force_is_spelled_out() {
     let parameters = EgmParameters::default();
     let written = format!("{:?}", parameters.spelled_out());
     assert!(!written.contains("None"), "{written}");
@@ -237,17 +237,6 @@ fn every_key_in_force_is_spelled_out_and_unknown_ones_are_refused() {
     let never_waits = never_waits.spelled_out();
     assert_eq!(never_waits.restart_wait_s, None);
     assert!(never_waits.settings().is_ok());
-
-    type Read<'a> = serde::de::value::MapDeserializer<'a, Pairs, serde::de::value::Error>;
-    type Pairs = std::vec::IntoIter<(&'static str, f64)>;
-    let read = |key| {
-        let read: Read<'_> = Read::new(vec![(key, 0.25)].into_iter());
-        EgmParameters::deserialize(read)
-    };
-    let known = read("comm_timeout_s").unwrap();
-    assert_eq!(known.comm_timeout_s, Some(0.25));
-    assert_eq!(known.cycle_us, None);
-    assert!(read("comm_timeout").is_err());
 }
 
 #[test]

@@ -8,6 +8,7 @@ use crate::component::{Component, Outbox};
 use crate::egm::messages::{
     EgmCommand, EgmFeedback, MotionRequest, MotionResponse, SessionState, Side,
 };
+use crate::egm::parameters::GuidedArms;
 use crate::teleoperation::follower::{Followed, Follower};
 use crate::teleoperation::messages::HumanFrame;
 use crate::teleoperation::motion_client::MotionClient;
@@ -68,6 +69,8 @@ pub(crate) fn is_newer(feedback: &EgmFeedback, newest: &EgmFeedback) -> bool {
 pub(crate) struct Controller {
     parameters: TeleoperationParameters,
     client: MotionClient,
+    /// Those asked to start.
+    guided: GuidedArms,
     arms: [ArmSender; 2],
     source_time_ns: Option<i64>,
     /// Ticks of `send = "free"`.
@@ -226,6 +229,7 @@ impl Controller {
         let send_timer = is_free
             .then(|| PeriodicTimer::new(Duration::from_secs_f64(1.0 / parameters.send_hz())));
         Self {
+            guided: parameters.egm.guided_arms(),
             parameters,
             client,
             arms: Side::BOTH.map(ArmSender::new),
@@ -260,7 +264,9 @@ impl Controller {
         (side, feedback): (Side, &EgmFeedback),
         out: &mut Outbox<ControllerOutput>,
     ) {
-        self.client.on_feedback(now, side, feedback);
+        if self.guided.include(side) {
+            self.client.on_feedback(now, side, feedback);
+        }
         let arm = &mut self.arms[side.index()];
         arm.on_feedback(feedback);
         if self.parameters.send == SendPolicy::Coupled {

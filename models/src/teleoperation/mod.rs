@@ -163,6 +163,7 @@ impl CaseStudy for Teleoperation {
         "fig7-9-tool-y",
         "fig10-joints",
         "fig11-joint-error",
+        "motion-loops",
     ];
     const CALIBRATED_FIGURES: &'static [&'static str] = &["mlr"];
     type Parameters = TeleoperationParameters;
@@ -203,7 +204,7 @@ impl CaseStudy for Teleoperation {
     }
 
     fn series(&self, log: &RunLog) -> Vec<PlotSeries> {
-        score::series(log)
+        score::series(self, log)
     }
 
     fn replay(&self, log: &RunLog) -> Option<Replay> {

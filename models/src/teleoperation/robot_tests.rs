@@ -6,7 +6,7 @@ use super::*;
 use crate::egm::messages::{
     EgmEventKind, EgmStartParameters, MotionKind, MotionOutcome, MotionRefusal, SessionState,
 };
-use crate::egm::parameters::{EgmParameters, Preset};
+use crate::egm::parameters::{EgmParameters, GuidedArms, Preset, StartMode};
 use crate::yumi::Pose;
 use crate::yumi::arm::POSITION_MAX_RAD;
 
@@ -36,7 +36,11 @@ struct Bench {
 
 impl Bench {
     fn new() -> Self {
-        let mut robot = Robot::new(settings());
+        Self::with(settings())
+    }
+
+    fn with(settings: ControllerSettings) -> Self {
+        let mut robot = Robot::new(settings);
         robot.on_start(Instant::ZERO);
         Self {
             robot,
@@ -144,6 +148,25 @@ fn the_state_is_told_at_once_and_only_once() {
     for (measured_rad, start_rad) in answers[0].measured_rad.iter().zip(&START_RAD) {
         assert!(is_same(measured_rad, start_rad));
     }
+}
+
+#[test]
+fn the_arm_that_does_not_start_by_itself_still_serves_requests() {
+    let mut bench = Bench::with(ControllerSettings {
+        start: StartMode::PowerOn,
+        arms: GuidedArms::Right,
+        ..settings()
+    });
+    bench.run(0.5);
+    assert_eq!(
+        bench.newest(Side::Right).state,
+        SessionState::Running as u32
+    );
+    let left = bench.newest(Side::Left);
+    assert_eq!((left.state, left.session), (SessionState::Idle as u32, 0));
+    let answers = bench.ask(&request(MotionKind::EgmStart, &[Side::Left]), 0.5);
+    assert_eq!(outcomes(&answers), [ACCEPTED, DONE]);
+    assert_eq!(bench.newest(Side::Left).state, SessionState::Running as u32);
 }
 
 #[test]

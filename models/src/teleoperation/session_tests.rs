@@ -12,7 +12,7 @@ use crate::egm::messages::{
     EgmCommand, EgmEvent, EgmEventKind, EgmFeedback, EndCause, MotionKind, MotionOutcome,
     MotionRefusal, MotionRequest, MotionResponse, SessionState, Side,
 };
-use crate::egm::parameters::{RestartPolicy, StartMode};
+use crate::egm::parameters::{GuidedArms, RestartPolicy, StartMode};
 use crate::link::bernoulli::BernoulliLink;
 use crate::link::{Fate, LinkModel};
 use crate::message::Message;
@@ -128,6 +128,25 @@ fn a_program_that_starts_by_itself_is_not_asked() {
     let result = run(&case, Vec::new(), 3.0);
     assert!(requests(&result).is_empty());
     assert_eq!(events(&result, EgmEventKind::Running, Side::Left).len(), 1);
+}
+
+#[test]
+fn an_arm_left_out_of_power_on_stands_without_a_session() {
+    for (arms, moving) in [
+        (GuidedArms::Right, Side::Right),
+        (GuidedArms::Left, Side::Left),
+    ] {
+        let case = case(|parameters| {
+            parameters.egm.start = Some(StartMode::PowerOn);
+            parameters.egm.arms = Some(arms);
+        });
+        let result = run(&case, Vec::new(), 3.0);
+        assert!(requests(&result).is_empty());
+        for side in Side::BOTH {
+            let running = events(&result, EgmEventKind::Running, side);
+            assert_eq!(running.len(), usize::from(side == moving), "{arms:?}");
+        }
+    }
 }
 
 #[test]

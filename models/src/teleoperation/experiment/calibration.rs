@@ -24,6 +24,8 @@ const RATIO_MAX: f64 = 0.3;
 const TRIES_MAX: usize = 5;
 /// A try this near to the aim ends the search: the count of lost loops scatters more than that.
 const NEAR_RATIO: f64 = 0.05;
+/// A nearest try farther than this from the aim is said to be far.
+const FAR_RATIO: f64 = 1.0 / 3.0;
 /// Highest rate tried, but for the share of time the outages would take up.
 const PER_HOUR_MAX: f64 = 3000.0;
 /// Highest share of time that outages take up in a try.
@@ -347,12 +349,12 @@ const fn column(name: &'static str, label: &'static str) -> Column {
 
 const COLUMNS: [Column; 8] = [
     column("mechanism", "Mechanism"),
-    column("outage_mean_s", "Mean outage (s)"),
+    column("outage_mean_s", "Mean (s)"),
     column("outages_per_hour", "Outages/h"),
     column("outages_per_hour_interval", "95 %"),
     column("down_ratio", "Time down"),
-    column("mlr_tried", "MLR at the nearest try"),
-    column("tries", "Rates tried"),
+    column("mlr_tried", "MLR tried"),
+    column("tries", "Tries"),
     column("remark", "Remark"),
 ];
 
@@ -388,6 +390,15 @@ impl Calibration {
         }
     }
 
+    /// What a rate rests on when no try came near the aim.
+    fn remark(&self, tried: f64) -> String {
+        if (tried - self.ratio).abs() > FAR_RATIO * self.ratio {
+            format!("interpolated, nearest try {tried:.4}")
+        } else {
+            String::new()
+        }
+    }
+
     fn row(&self, task: usize, point: Option<&Point>) -> Vec<Cell> {
         let (mechanism, mean_s, setup) = self.setup(task);
         let mut cells = vec![
@@ -403,7 +414,7 @@ impl Calibration {
                 Some(*per_hour),
                 Some(*interval),
                 Some(*ratio),
-                String::new(),
+                self.remark(*ratio),
             ),
             Some(Found::NoneUpTo { per_hour, ratio }) => (
                 None,

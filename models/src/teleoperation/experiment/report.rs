@@ -6,6 +6,7 @@ use crate::study::{Cell, Column, Criterion, StudyReport, Table, Work};
 use crate::teleoperation::experiment::conditions::{Condition, Expected, PUBLISHED_LOOPS};
 use crate::teleoperation::experiment::drive::Tally;
 use crate::teleoperation::experiment::study::MotionLossStudy;
+use crate::teleoperation::score::loops::LossCause;
 
 /// A condition with the runs of it that ended.
 pub(crate) type Row<'a> = (&'a Condition, Vec<&'a Tally>);
@@ -23,7 +24,7 @@ pub(crate) fn report(study: &MotionLossStudy, rows: &[Row<'_>]) -> StudyReport {
     StudyReport {
         title: "Case study 2: motion loss rate (MLR) by condition, in virtual time".to_owned(),
         notes: notes(study),
-        tables: vec![table(rows)],
+        tables: vec![rates(rows), counts(rows), setups(rows)],
         criteria: rows
             .iter()
             .flat_map(|row| criteria(row, study.is_fitted))
@@ -69,82 +70,122 @@ const fn column(name: &'static str, label: &'static str) -> Column {
     Column { name, label }
 }
 
-const COLUMNS: [Column; 18] = [
+const RATE_COLUMNS: [Column; 7] = [
     column("condition", "Condition"),
-    column("setup", "Channel and robot"),
-    column("run_count", "Runs"),
-    column("sent_count", "Sent"),
-    column("executed_count", "Executed"),
     column("mlr_mean", "MLR"),
-    column("mlr_sd", "sd of runs"),
-    column("mlr_runs", "95 %, of runs"),
-    column("mlr_poisson", "95 %, Poisson"),
-    column("mlr_range", "Lowest to highest"),
+    column("mlr_sd", "sd"),
+    column("mlr_runs", "95 % of runs"),
+    column("mlr_poisson", "95 % Poisson"),
     column("trips_per_hour", "Trips/h"),
     column("hold_ratio", "Held"),
-    column("lost_by_trip_count", "Lost: no session"),
-    column("lost_by_hold_count", "Lost: held"),
-    column("lost_by_clipping_count", "Lost: clipped"),
-    column("lost_by_throttling_count", "Lost: throttled"),
-    column("lost_by_merging_count", "Lost: merged"),
-    column("extra_count", "Extra"),
 ];
 
-fn table(rows: &[Row<'_>]) -> Table {
+fn rates(rows: &[Row<'_>]) -> Table {
     Table {
         name: "motion-loss".to_owned(),
-        title: "Motion loops lost by channel, mechanism and policy".to_owned(),
-        columns: COLUMNS.to_vec(),
-        rows: rows.iter().map(cells).collect(),
+        title: "Motion loss rate by condition".to_owned(),
+        columns: RATE_COLUMNS.to_vec(),
+        rows: rows.iter().map(rate_cells).collect(),
         notes: vec![
-            "lost loops are those sent ones that no executed one answers; an extra executed loop \
-             hides one of them in the rate"
-                .to_owned(),
             "95 % of runs: Student's interval of the mean; Poisson: of all runs' missing loops"
                 .to_owned(),
         ],
     }
 }
 
-fn cells((condition, runs): &Row<'_>) -> Vec<Cell> {
-    let mut cells = vec![Cell::text(condition.name), Cell::text(&condition.text)];
-    let sum = |count: fn(&Tally) -> u64| runs.iter().map(|run| count(run)).sum::<u64>();
+const COUNT_COLUMNS: [Column; 11] = [
+    column("condition", "Condition"),
+    column("run_count", "Runs"),
+    column("sent_count", "Sent"),
+    column("executed_count", "Executed"),
+    column("lost_by_trip_count", "Trip"),
+    column("lost_by_hold_count", "Held"),
+    column("lost_by_clipping_count", "Clip"),
+    column("lost_by_throttling_count", "Slow"),
+    column("lost_by_merging_count", "Merged"),
+    column("extra_count", "Extra"),
+    column("mlr_range", "Lowest to highest"),
+];
+
+fn counts(rows: &[Row<'_>]) -> Table {
+    Table {
+        name: "motion-loss-counts".to_owned(),
+        title: "Motion loops by condition: sent, executed, lost by cause".to_owned(),
+        columns: COUNT_COLUMNS.to_vec(),
+        rows: rows.iter().map(count_cells).collect(),
+        notes: vec![
+            "lost to: Trip: no session; Held: no commands; Clip: inverse kinematics; Slow: \
+             MaxSpeedDeviation; Merged: none of these"
+                .to_owned(),
+            "lost loops are those sent ones that no executed one answers; an extra executed loop \
+             hides one of them in the rate"
+                .to_owned(),
+        ],
+    }
+}
+
+fn setups(rows: &[Row<'_>]) -> Table {
+    let named = |row: &Row<'_>| vec![Cell::text(row.0.name), Cell::text(&row.0.text)];
+    Table {
+        name: "motion-loss-conditions".to_owned(),
+        title: "The conditions".to_owned(),
+        columns: vec![
+            column("condition", "Condition"),
+            column("setup", "Channel and robot"),
+        ],
+        rows: rows.iter().map(named).collect(),
+        notes: Vec::new(),
+    }
+}
+
+fn rates_of(runs: &[&Tally]) -> Vec<f64> {
+    runs.iter().map(|run| run.loss_ratio()).collect()
+}
+
+fn sum(runs: &[&Tally], count: impl Fn(&Tally) -> u64) -> u64 {
+    runs.iter().map(|run| count(run)).sum()
+}
+
+fn rate_cells((condition, runs): &Row<'_>) -> Vec<Cell> {
     let mean = |figure: fn(&Tally) -> f64| {
         let total: f64 = runs.iter().map(|run| figure(run)).sum();
         (!runs.is_empty()).then(|| total / runs.len() as f64)
     };
-    let rates: Vec<f64> = runs.iter().map(|run| run.loss_ratio()).collect();
-    let estimate = Estimate::of_mean(&rates);
-    let sent = sum(|run| run.sent_count);
-    let missing = poisson(sum(Tally::missing_count), CONFIDENCE);
+    let rates = rates_of(runs);
+    let interval = Estimate::of_mean(&rates).and_then(|known| known.interval);
+    let sent = sent(runs);
+    let missing = poisson(sum(runs, Tally::missing_count), CONFIDENCE);
     let of_sent = |value: f64| value / sent as f64;
-    let lowest = rates.iter().copied().fold(f64::INFINITY, f64::min);
-    let highest = rates.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-    cells.extend([
-        Cell::Count(runs.len() as u64),
-        Cell::Count(sent),
-        Cell::Count(sum(|run| run.executed_count)),
+    vec![
+        Cell::text(condition.name),
         Cell::number(mean(Tally::loss_ratio), 5),
         Cell::number(deviation(&rates), 5),
-        Cell::interval(
-            estimate
-                .and_then(|known| known.interval)
-                .map(|(low, high)| (low.max(0.0), high)),
-            5,
-        ),
+        Cell::interval(interval.map(|(low, high)| (low.max(0.0), high)), 5),
         Cell::interval(
             (sent > 0).then(|| (of_sent(missing.low), of_sent(missing.high))),
             5,
         ),
-        Cell::interval((!rates.is_empty()).then_some((lowest, highest)), 5),
         Cell::number(mean(|run| run.trip_count as f64 / run.hours), 1),
         Cell::number(mean(|run| run.hold_ratio), 5),
-        Cell::Count(sum(|run| run.lost_counts[0])),
-        Cell::Count(sum(|run| run.lost_counts[1])),
-        Cell::Count(sum(|run| run.lost_counts[2])),
-        Cell::Count(sum(|run| run.lost_counts[3])),
-        Cell::Count(sum(|run| run.lost_counts[4])),
-        Cell::Count(sum(|run| run.extra_count)),
+    ]
+}
+
+fn count_cells((condition, runs): &Row<'_>) -> Vec<Cell> {
+    let rates = rates_of(runs);
+    let lowest = rates.iter().copied().fold(f64::INFINITY, f64::min);
+    let highest = rates.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    let mut cells = vec![
+        Cell::text(condition.name),
+        Cell::Count(runs.len() as u64),
+        Cell::Count(sent(runs)),
+        Cell::Count(sum(runs, |run| run.executed_count)),
+    ];
+    // In virtual time feedback is never missing, so the last kind has no column.
+    let kinds = 0..LossCause::Unseen.kind();
+    cells.extend(kinds.map(|kind| Cell::Count(sum(runs, |run| run.lost_counts[kind]))));
+    cells.extend([
+        Cell::Count(sum(runs, |run| run.extra_count)),
+        Cell::interval((!rates.is_empty()).then_some((lowest, highest)), 5),
     ]);
     cells
 }

@@ -109,6 +109,37 @@ fn independent_losses_of_up_to_a_half_lose_none_of_890_loops() {
     let report = study.report(&outcomes);
     assert_eq!(report.criteria.len(), 3);
     assert!(report.criteria.iter().all(|c| c.is_met == Some(true)));
+    let outcomes = vec![None; study.task_count()];
+    assert!(
+        study
+            .report(&outcomes)
+            .criteria
+            .iter()
+            .all(|c| c.is_met.is_none())
+    );
+}
+
+#[test]
+fn each_table_of_all_conditions_fits_a_page() {
+    let study = study(|parameters| {
+        parameters.tables.seeds = 1;
+        parameters.tables.loops = 5;
+    });
+    // One run stands for all: a rate has as many digits as any other.
+    let outcome = study.run(0, &mut |_| true).unwrap();
+    let report = study.report(&vec![Some(&outcome); study.task_count()]);
+    assert_eq!(report.tables.len(), 3);
+    for table in &report.tables {
+        let widths = table.columns.iter().enumerate().map(|(index, column)| {
+            let cells = table.rows.iter().map(|row| row[index].shown().len());
+            cells.max().unwrap_or(0).max(column.label.len()) + 2
+        });
+        let width: usize = widths.sum();
+        assert!(width <= 112, "{} is {width} wide", table.name);
+        for row in &table.rows {
+            assert_eq!(row.len(), table.columns.len(), "{}", table.name);
+        }
+    }
 }
 
 #[test]
@@ -204,6 +235,10 @@ fn a_calibration_finds_the_rate_it_is_asked_for_and_says_where_there_is_none() {
     let rate: Result<f64, _> = rows[12][2].shown().parse();
     assert!(rate.is_err() || rate.is_ok_and(|rate| rate > 1000.0));
     assert_eq!(rows[0][7].shown(), "not computed");
+    // Columns 5 and 7: the nearest try's ratio, and the remark that it is far.
+    let tried: f64 = rows[10][5].shown().parse().unwrap();
+    let is_far = (tried - 0.03).abs() > 0.01;
+    assert_eq!(rows[10][7].shown().starts_with("interpolated"), is_far);
     assert_eq!(Calibration::new(&case, 0.0).unwrap_err().key, "mlr");
     assert!(case.calibration("mlr", 0.01).unwrap().is_some());
     assert!(case.calibration("age", 0.01).unwrap().is_none());

@@ -61,6 +61,8 @@ impl LoopCounter {
 pub(crate) struct Loops {
     /// Times of the sent peaks.
     pub(crate) sent_ns: Vec<i64>,
+    /// Times of the executed peaks that answer them; `None` for a lost one.
+    pub(crate) answered_ns: Vec<Option<i64>>,
     /// Number of executed peaks.
     pub(crate) executed_count: usize,
     /// Which of the sent ones no executed one answers, with the time its execution was due.
@@ -87,6 +89,7 @@ impl Loops {
         let (mut delay_ns, mut next) = (0.0, 0);
         let (mut executed_count, mut extra_count) = (0, 0);
         let mut lost = Vec::new();
+        let mut answered_ns = vec![None; sent_ns.len()];
         for executed in executed_ns {
             let due = |index: usize| sent_ns[index] as f64 + delay_ns;
             let apart = |index: usize| (*executed as f64 - due(index)).abs();
@@ -107,6 +110,7 @@ impl Loops {
             }
             let late_ns = *executed as f64 - due(best);
             delay_ns = (delay_ns + DELAY_SHARE * late_ns).max(-0.1 * period_ns);
+            answered_ns[best] = Some(*executed);
             next = best + 1;
         }
         for (index, sent) in sent_ns.iter().enumerate().skip(next) {
@@ -114,6 +118,7 @@ impl Loops {
         }
         Self {
             sent_ns,
+            answered_ns,
             executed_count,
             lost,
             extra_count,
@@ -130,6 +135,7 @@ impl Loops {
             }
             self.lost.pop();
             self.sent_ns.pop();
+            self.answered_ns.pop();
         }
     }
 
@@ -223,11 +229,13 @@ pub(crate) enum LossCause {
     Throttled,
     /// None of these: too little motion between this peak and its neighbours.
     Merged,
+    /// No feedback came in part of its time: nobody knows what the robot did.
+    Unseen,
 }
 
 impl LossCause {
     /// The kinds, in the order of lists.
-    pub(crate) const KIND_COUNT: usize = 5;
+    pub(crate) const KIND_COUNT: usize = 6;
 
     /// Its place in lists.
     pub(crate) const fn kind(self) -> usize {
@@ -237,6 +245,7 @@ impl LossCause {
             Self::Clipped => 2,
             Self::Throttled => 3,
             Self::Merged => 4,
+            Self::Unseen => 5,
         }
     }
 
@@ -248,6 +257,7 @@ impl LossCause {
             Self::Clipped => "commands were clipped: the hand was out of the arm's reach",
             Self::Throttled => "throttled by MaxSpeedDeviation",
             Self::Merged => "merged with its neighbour: the tool moved too little in between",
+            Self::Unseen => "no feedback came in part of it: what the robot did is not known",
         }
         .to_owned()
     }
@@ -264,6 +274,8 @@ pub(crate) struct Evidence {
     pub(crate) clipped: Vec<Span>,
     /// Times in which `MaxSpeedDeviation` bound.
     pub(crate) throttled: Vec<Span>,
+    /// Times without feedback.
+    pub(crate) unseen: Vec<Span>,
 }
 
 /// Something explains a lost loop when it fills at least this share of the loop's time.
@@ -274,7 +286,7 @@ const THROTTLES_RATIO: f64 = 0.2;
 
 impl Evidence {
     /// Why the loop whose peak was due at `due_ns` was lost: what happened within half a period
-    /// of it. A pause explains it before a hold does, then clipping, then throttling.
+    /// of it. A pause explains it before missing feedback does, then a hold, clipping, throttling.
     pub(crate) fn cause_of(&self, due_ns: i64, period_ns: f64) -> LossCause {
         #[allow(clippy::cast_possible_truncation, reason = "at most a minute")]
         let half_ns = (0.5 * period_ns) as i64;
@@ -300,7 +312,9 @@ impl Evidence {
                 .sum();
             overlap_ns as f64 >= share * period_ns
         };
-        if explains(&self.holds, EXPLAINS_RATIO) {
+        if explains(&self.unseen, EXPLAINS_RATIO) {
+            LossCause::Unseen
+        } else if explains(&self.holds, EXPLAINS_RATIO) {
             LossCause::Held
         } else if explains(&self.clipped, EXPLAINS_RATIO) {
             LossCause::Clipped

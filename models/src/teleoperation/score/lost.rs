@@ -60,9 +60,9 @@ impl Run {
             loops.sent_count(),
             cause.text(self.origin_ns()),
         );
-        let (moved_m, needed_m) = (self.moved_m(window), self.counter.prominence_m);
+        let needed_m = self.counter.prominence_m;
         // More than that and still no peak of its own: the distance explains nothing.
-        if moved_m < needed_m {
+        if let Some(moved_m) = self.moved_m(window).filter(|moved_m| *moved_m < needed_m) {
             let said = format!("; the tool moved {moved_m:.3} m in it, {needed_m:.3} m are needed");
             what.push_str(&said);
         }
@@ -72,7 +72,9 @@ impl Run {
             LossCause::Held => within(&evidence.holds, window, |span| *span)
                 .first()
                 .copied(),
-            LossCause::Clipped | LossCause::Throttled | LossCause::Merged => None,
+            LossCause::Unseen | LossCause::Clipped | LossCause::Throttled | LossCause::Merged => {
+                None
+            }
         };
         match silence {
             Some(span) => naming(
@@ -84,7 +86,7 @@ impl Run {
     }
 
     /// The first feedback: where the times of texts begin.
-    fn origin_ns(&self) -> i64 {
+    pub(crate) fn origin_ns(&self) -> i64 {
         self.record.feedback.first().map_or(0, |first| first.at_ns)
     }
 
@@ -111,8 +113,8 @@ impl Run {
         }
     }
 
-    /// Highest minus lowest measured y.
-    fn moved_m(&self, window: Span) -> f64 {
+    /// Highest minus lowest measured y; `None` without a measurement.
+    fn moved_m(&self, window: Span) -> Option<f64> {
         let begin = self
             .moved
             .partition_point(|sample| sample.0 < window.begin_ns);
@@ -123,7 +125,7 @@ impl Run {
         let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| {
             (low.min(value), high.max(value))
         });
-        (high - low).max(0.0)
+        (high >= low).then_some(high - low)
     }
 
     fn holds(&self) -> Vec<ScoreEvent> {

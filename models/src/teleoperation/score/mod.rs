@@ -20,6 +20,7 @@ use crate::case_study::{Metric, Score};
 use crate::egm::messages::{EgmCommand, EgmFeedback};
 use crate::measure::series::{Estimate, Sample, lag_s, peak_to_peak};
 use crate::measure::statistics::{CONFIDENCE, poisson};
+use crate::plot::PlotSeries;
 use crate::run_log::RunLog;
 use crate::teleoperation::messages::HumanFrame;
 use crate::teleoperation::score::figure::{count, estimated, figure};
@@ -29,24 +30,16 @@ use crate::teleoperation::score::record::Record;
 use crate::teleoperation::score::sessions::Sessions;
 use crate::teleoperation::{HUMAN_FRAME, Teleoperation};
 
-pub(crate) use crate::teleoperation::score::plots::series;
+/// Everything a plot of the run shows.
+pub(crate) fn series(case: &Teleoperation, log: &RunLog) -> Vec<PlotSeries> {
+    let mut series = plots::series(log);
+    series.extend(plots::motion_loops(&Run::read(case, log)));
+    series
+}
 
 /// Scores a run.
 pub(crate) fn score(case: &Teleoperation, log: &RunLog) -> Score {
-    let record = Record::read(log);
-    let run = Run {
-        counter: LoopCounter::new(
-            case.nominal_peak_to_peak_m(),
-            case.parameters.motion_period_s,
-        ),
-        period_s: case.parameters.motion_period_s,
-        rest_s: case.parameters.motion_start_s,
-        has_one_clock: log.has_one_clock(),
-        sent: Sent::read(case, log, &record),
-        moved: record.moved_y(),
-        sessions: Sessions::read(&record, log),
-        record,
-    };
+    let run = Run::read(case, log);
     let loops = run.counter.count(&run.sent.samples, &run.moved);
     let mut metrics = run.motion_loops(loops.as_ref());
     metrics.extend(JointError::read(case, log, run.period_s).metrics());
@@ -147,6 +140,23 @@ impl Sent {
 }
 
 impl Run {
+    fn read(case: &Teleoperation, log: &RunLog) -> Self {
+        let record = Record::read(log);
+        Self {
+            counter: LoopCounter::new(
+                case.nominal_peak_to_peak_m(),
+                case.parameters.motion_period_s,
+            ),
+            period_s: case.parameters.motion_period_s,
+            rest_s: case.parameters.motion_start_s,
+            has_one_clock: log.has_one_clock(),
+            sent: Sent::read(case, log, &record),
+            moved: record.moved_y(),
+            sessions: Sessions::read(&record, log),
+            record,
+        }
+    }
+
     /// Loops sent, loops executed, their loss ratio (Lv et al., equation 1), and causes.
     fn motion_loops(&self, loops: Option<&Loops>) -> Vec<Metric> {
         let missing = "no whole motion loop between the first and the last feedback";
@@ -183,7 +193,7 @@ impl Run {
         metrics
     }
 
-    fn causes(&self, loops: Option<&Loops>, missing: &str) -> [Metric; 6] {
+    fn causes(&self, loops: Option<&Loops>, missing: &str) -> [Metric; 7] {
         let mut kinds = [0_u64; LossCause::KIND_COUNT];
         for lost in loops.map_or(&[][..], |loops| &loops.lost) {
             let cause = self
@@ -230,6 +240,11 @@ impl Run {
                 ),
                 4,
                 "the others: too little motion between two peaks",
+            ),
+            by(
+                ("loops_lost_unseen_count", "loops lost without feedback"),
+                5,
+                "of those with a session, as far as is known: no feedback in part of their loop",
             ),
             figure(
                 ("loops_extra_count", "executed loops that answer none", "1"),

@@ -5,6 +5,8 @@ use crate::egm::messages::{EgmCommand, EgmFeedback};
 use crate::plot::{PlotColumn, PlotSeries};
 use crate::run_log::RunLog;
 use crate::teleoperation::messages::HumanFrame;
+use crate::teleoperation::score::Run;
+use crate::teleoperation::score::loops::LossCause;
 use crate::teleoperation::score::record::Record;
 use crate::teleoperation::{EGM_RIGHT_COMMAND, EGM_RIGHT_FEEDBACK, HUMAN_FRAME};
 use crate::time::Instant;
@@ -36,6 +38,51 @@ pub(crate) fn series(log: &RunLog) -> Vec<PlotSeries> {
         joint_error(log, rows, (robot, shift)),
     ];
     all.into_iter().flatten().collect()
+}
+
+/// What became of every motion loop; `None` without a whole one.
+pub(crate) fn motion_loops(run: &Run) -> Option<PlotSeries> {
+    let loops = run.counter.count(&run.sent.samples, &run.moved)?;
+    let since_s = |at_ns: i64| seconds(Instant::from_ns(at_ns), run.origin_ns());
+    let mut causes = vec![None; loops.sent_count()];
+    for lost in &loops.lost {
+        let evidence = &run.sessions.evidence;
+        causes[lost.index] = Some(evidence.cause_of(lost.due_ns, run.counter.period_ns));
+    }
+    let rows = loops.sent_ns.iter().zip(&loops.answered_ns).zip(&causes);
+    let values = rows
+        .enumerate()
+        .flat_map(|(index, ((sent, executed), cause))| {
+            [
+                index as f64 + 1.0,
+                since_s(*sent),
+                executed.map_or(f64::NAN, since_s),
+                f64::from(u8::from(cause.is_some())),
+                cause.map_or(0.0, |cause: LossCause| cause.kind() as f64 + 1.0),
+            ]
+        });
+    Some(PlotSeries {
+        name: "motion-loops".to_owned(),
+        title: "Motion loops: when sent, when executed, which were lost".to_owned(),
+        notes: vec![
+            format!("times are those of {}", run.counter.text()),
+            "cause: 0 not lost, 1 no session, 2 held for want of commands, 3 inverse kinematics, \
+             4 throttled by MaxSpeedDeviation, 5 merged with a neighbour"
+                .to_owned(),
+        ],
+        columns: vec![
+            column("loop_index", "motion loop, from 1 as in the events", "1"),
+            column("sent_s", "sent, since the robot's first feedback", "s"),
+            column(
+                "executed_s",
+                "executed, since the robot's first feedback",
+                "s",
+            ),
+            column("lost", "1 when no executed loop answers it", "1"),
+            column("cause", "why it was lost, by the notes' numbers", "1"),
+        ],
+        values: values.collect(),
+    })
 }
 
 /// Which rows are kept.

@@ -12,6 +12,11 @@ use crate::teleoperation::score::record::{Feedback, Record};
 /// For how long after a resume the arm catches up, nanoseconds.
 const CATCH_UP_NS: i64 = 500_000_000;
 
+/// Feedback comes every few milliseconds; a longer silence than this hides what the robot did.
+const UNSEEN_NS: i64 = 100_000_000;
+
+const NOT_TOLD: &str = "the robot recorded no events: a foreign one does not tell its holds";
+
 /// What the sessions came to.
 #[derive(Debug, Default)]
 pub(crate) struct Sessions {
@@ -59,6 +64,12 @@ impl Sessions {
 
     pub(crate) fn metrics(&self, record: &Record) -> Vec<Metric> {
         let all = record.feedback.len();
+        let tells_holds = all > 0 && self.refused_count.is_some();
+        let not_told = if all > 0 {
+            NOT_TOLD
+        } else {
+            "nothing was recorded"
+        };
         let mut metrics = vec![
             count(
                 ("egm_session_count", "guided-motion sessions"),
@@ -73,14 +84,15 @@ impl Sessions {
         ];
         metrics.extend(self.reactivation());
         metrics.extend([
-            count(
-                ("hold_count", "holds for want of commands"),
-                (all > 0).then_some(self.evidence.holds.len() as u64),
+            figure(
+                ("hold_count", "holds for want of commands", "1"),
+                tells_holds.then_some(self.evidence.holds.len() as f64),
                 "rows of feedback flagged as holding",
+                not_told,
             ),
             figure(
                 ("hold_time_ratio", "share of time held", "1"),
-                (self.running_count > 0)
+                (tells_holds && self.running_count > 0)
                     .then(|| self.holding_count as f64 / self.running_count as f64),
                 format!(
                     "feedback flagged as holding, of {} in running sessions",
@@ -104,7 +116,7 @@ impl Sessions {
                     "speed-limited share of the time after a resume",
                     "1",
                 ),
-                (self.catching_up_count > 0)
+                (tells_holds && self.catching_up_count > 0)
                     .then(|| self.saturated_count as f64 / self.catching_up_count as f64),
                 format!(
                     "feedback with a joint's speed or MaxSpeedDeviation binding, of {} within \
@@ -166,17 +178,29 @@ struct Reading {
     hold_began_ns: Option<i64>,
     throttle_began_ns: Option<i64>,
     resumed_ns: Option<i64>,
+    /// When the newest feedback came.
+    heard_ns: Option<i64>,
 }
 
 impl Reading {
     fn add(&mut self, feedback: &Feedback) {
         let at_ns = feedback.at_ns;
+        let heard_ns = self.heard_ns.replace(at_ns).unwrap_or(at_ns);
+        let is_unseen = at_ns - heard_ns > UNSEEN_NS;
+        if is_unseen {
+            self.sessions.evidence.unseen.push(Span {
+                begin_ns: heard_ns,
+                end_ns: at_ns,
+            });
+        }
         let session = feedback.is_running().then_some(feedback.session);
         if session != self.running {
             if let Some(before) = self.running {
                 self.end_hold(at_ns);
                 self.end_throttle(at_ns);
-                self.ended = Some((before, at_ns));
+                // Behind a silence it is not known when the session ended: at its beginning, at
+                // the earliest.
+                self.ended = Some((before, if is_unseen { heard_ns } else { at_ns }));
             }
             if session.is_some() {
                 self.begin(at_ns);

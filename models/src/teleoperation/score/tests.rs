@@ -87,7 +87,7 @@ const PERIOD_S: f64 = 4.033;
 fn an_empty_log_gives_no_figure_but_a_reason_for_each() {
     let case = case(|_| {});
     let score = case.score(&RunLog::default());
-    assert_eq!(score.metrics.len(), 37);
+    assert_eq!(score.metrics.len(), 38);
     for metric in &score.metrics {
         assert_eq!(metric.value, None, "{metric:?}");
         assert_eq!(metric.interval, None, "{metric:?}");
@@ -165,6 +165,25 @@ fn a_loop_lost_to_a_time_out_is_told_with_its_cause_and_the_commands_that_were_l
     assert_eq!(ended.severity, Severity::Hazard);
     assert_eq!(ended.messages[0], lost[0].messages[0]);
     assert!(score.events.is_sorted_by_key(|event| event.at));
+
+    let series = case.series(&log);
+    let loops = series
+        .iter()
+        .find(|one| one.name == "motion-loops")
+        .unwrap();
+    let missing: Vec<_> = loops.rows().filter(|row| row[3] > 0.5).collect();
+    assert_eq!(missing.len(), 1);
+    assert!(missing[0][2].is_nan());
+    assert!((missing[0][4] - 1.0).abs() < 1e-12);
+    let number = format!("motion loop {} of", missing[0][0]);
+    assert!(lost[0].what.starts_with(&number), "{number}");
+    let answered: Vec<_> = loops.rows().filter(|row| row[3] < 0.5).collect();
+    assert!(
+        answered
+            .iter()
+            .all(|row| row[2] > row[1] && row[4].abs() < 1e-12)
+    );
+    assert!(answered.len() >= 6);
 }
 
 #[test]
@@ -468,7 +487,8 @@ fn the_figures_have_their_columns_and_a_row_per_message() {
             "fig6-input",
             "fig7-9-tool-y",
             "fig10-joints",
-            "fig11-joint-error"
+            "fig11-joint-error",
+            "motion-loops"
         ]
     );
     for known in &series {
@@ -478,7 +498,11 @@ fn the_figures_have_their_columns_and_a_row_per_message() {
             "{}",
             known.name
         );
-        assert_eq!(known.notes.len(), usize::from(known.name.contains("joint")));
+        let notes = match known.name.as_str() {
+            "motion-loops" => 2,
+            name => usize::from(name.contains("joint")),
+        };
+        assert_eq!(known.notes.len(), notes);
     }
     assert_eq!(series[0].rows().count(), log.raw(HUMAN_FRAME).len());
     assert_eq!(series[2].rows().count(), log.raw(EGM_RIGHT_FEEDBACK).len());
