@@ -451,6 +451,7 @@ mod tests {
                 seconds(119.0, 120.0),
                 seconds(140.0, 140.5),
             ],
+            ..Evidence::default()
         };
         let cause = |due: i64| evidence.cause_of(due * 1_000_000_000, 4e9);
         assert_eq!(cause(3), LossCause::Trip(first));

@@ -82,6 +82,7 @@ impl Sessions {
                 "ends by CommTimeout, CondTime, MaxPosDeviation or for a reason not recorded",
             ),
         ];
+        let or_not_told = |missing| if tells_holds { missing } else { not_told };
         metrics.extend(self.reactivation());
         metrics.extend([
             figure(
@@ -98,7 +99,7 @@ impl Sessions {
                     "feedback flagged as holding, of {} in running sessions",
                     self.running_count
                 ),
-                "no feedback of a running session",
+                or_not_told("no feedback of a running session"),
             ),
             figure(
                 ("throttled_time_ratio", "share of time throttled", "1"),
@@ -123,7 +124,7 @@ impl Sessions {
                      0.5 s after a hold or a new session",
                     self.catching_up_count
                 ),
-                "no hold ended and no session followed another",
+                or_not_told("no hold ended and no session followed another"),
             ),
             count(
                 ("commands_refused_count", "commands refused"),

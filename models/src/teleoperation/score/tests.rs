@@ -362,6 +362,32 @@ fn a_run_of_foreign_programs_is_scored_without_events() {
 }
 
 #[test]
+fn what_no_feedback_tells_of_is_not_known_rather_than_made_up() {
+    let heard = foreign(|_| false, |_| 0).log;
+    let mut log = RunLog::default();
+    for channel in [EGM_RIGHT_COMMAND, EGM_RIGHT_FEEDBACK] {
+        for logged in heard.raw(channel) {
+            let is_lost = (14_000_000_000..22_000_000_000).contains(&logged.envelope.published_ns);
+            if channel == EGM_RIGHT_COMMAND || !is_lost {
+                log.push(channel, logged.envelope, &logged.payload);
+            }
+        }
+    }
+    let score = case(|_| {}).score(&log);
+    assert!(value(&score, "loops_lost_unseen_count") >= 1.0);
+    assert!(value(&score, "loops_lost_by_merging_count").abs() < 0.1);
+    let mut incidents = score.events.iter();
+    let lost = incidents.find(|event| event.severity == Severity::Incident);
+    let what = &lost.unwrap().what;
+    assert!(what.contains("no feedback came"), "{what}");
+    for name in ["hold_count", "hold_time_ratio", "resume_saturation_ratio"] {
+        let metric = score.get(name).unwrap();
+        assert_eq!(metric.value, None, "{metric:?}");
+        assert!(metric.method.contains("does not tell"), "{metric:?}");
+    }
+}
+
+#[test]
 fn loops_that_a_coupled_sender_could_not_send_are_lost_all_the_same() {
     // Without feedback a coupled sender has nothing to answer: two and a half loops are never sent.
     let case = case(|parameters| parameters.send = SendPolicy::Coupled);
