@@ -51,18 +51,21 @@ pub struct Tracker {
 }
 
 impl Tracker {
-    /// Starts at `q_rad`, which is also the posture the redundant joint is pulled to.
+    /// Starts at `q_rad`, which is also the posture the redundant joint is pulled to. A joint
+    /// beyond its limits, as a real arm may report it, counts as at its limit.
     pub fn new(chain: Chain, q_rad: Joints) -> Self {
+        let (q_rad, _) = within_limits(&q_rad.into());
         Self {
             chain,
-            posture_rad: q_rad.into(),
-            q_rad: q_rad.into(),
+            posture_rad: q_rad,
+            q_rad,
         }
     }
 
-    /// Goes on from `q_rad`; the posture the redundant joint is pulled to stays.
+    /// Goes on from `q_rad`, or the limits it is beyond; the posture the redundant joint is pulled
+    /// to stays.
     pub fn restart_at(&mut self, q_rad: Joints) {
-        self.q_rad = q_rad.into();
+        self.q_rad = within_limits(&q_rad.into()).0;
     }
 
     /// The joint positions of the last call.

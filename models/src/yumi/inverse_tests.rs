@@ -47,6 +47,24 @@ fn target_moved_by(step_m: [f64; 3]) -> Isometry3<f64> {
 }
 
 #[test]
+fn a_start_slightly_beyond_a_limit_can_be_driven() {
+    let mut beyond = RIGHT_START_RAD;
+    beyond[0] = POSITION_MAX_RAD[0] + 0.01;
+    let mut inside = RIGHT_START_RAD;
+    inside[0] = POSITION_MAX_RAD[0] - 0.05;
+    let mut restarted = Tracker::new(CHAIN, RIGHT_START_RAD);
+    restarted.restart_at(beyond);
+    let target = *CHAIN.at(&inside).tool();
+    for mut tracker in [Tracker::new(CHAIN, beyond), restarted] {
+        for _ in 0..100 {
+            assert!(!within_limits(&(*tracker.q_rad()).into()).1);
+            tracker.track(&target, 0.008);
+        }
+        assert_eq!(tracker.track(&target, 0.008), Reach::Reached);
+    }
+}
+
+#[test]
 fn a_far_target_is_approached_within_the_speed_limits_and_reached() {
     let mut tracker = Tracker::new(CHAIN, RIGHT_START_RAD);
     let target = target_moved_by([0.05, 0.03, 0.0]);
