@@ -127,6 +127,7 @@ fn our_controller_drives_our_robot_over_nothing_but_the_makers_datagrams() {
     let robot = Trial::shipped("egm-client.toml", &there)
         .set("run.duration=\"24 s\"")
         .set("case.parameters.egm.preset=\"paper\"")
+        .set("case.parameters.egm.arms=\"both\"")
         .set(&format!("processes.client.egm.right=\"{address}:6510\""))
         .set(&format!("processes.client.egm.left=\"{address}:6511\""));
     let mut sensor_run = sensor.start_on(lab.host(0));
