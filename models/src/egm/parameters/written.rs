@@ -11,12 +11,12 @@ impl EgmParameters {
     pub fn spelled_out(&self) -> Self {
         let preset = ControllerSettings::of(self.preset);
         let restart = self.restart.unwrap_or(preset.restart);
-        let waits = restart == RestartPolicy::WaitThenRestart;
+        let is_waiting = restart == RestartPolicy::WaitThenRestart;
         let cycle_us = preset.cycle.as_nanos() as f64 / 1e3;
         let speed_deg = in_degrees(preset.max_speed_deviation_rad_per_s);
         let position_deg = in_degrees(preset.max_position_deviation_rad);
         let convergence_deg = in_degrees(preset.convergence_rad);
-        let wait_s = waits.then_some(preset.restart_wait_s);
+        let wait_s = is_waiting.then_some(preset.restart_wait_s);
         Self {
             preset: self.preset,
             cycle_us: self.cycle_us.or(Some(cycle_us)),
