@@ -111,17 +111,9 @@ fn one_row(text: &str, columns: usize) -> String {
 }
 
 /// Columns of the terminal behind standard error; `None` when it does not say.
-#[allow(unsafe_code, reason = "nix has no TIOCGWINSZ")]
 fn terminal_columns() -> Option<usize> {
-    let mut size = libc::winsize {
-        ws_row: 0,
-        ws_col: 0,
-        ws_xpixel: 0,
-        ws_ypixel: 0,
-    };
-    // SAFETY: the kernel writes a `winsize` to this valid address, and nothing else.
-    let code = unsafe { libc::ioctl(libc::STDERR_FILENO, libc::TIOCGWINSZ, &raw mut size) };
-    (code == 0 && size.ws_col > 0).then(|| usize::from(size.ws_col))
+    let (width, _) = terminal_size::terminal_size_of(io::stderr())?;
+    (width.0 > 0).then(|| usize::from(width.0))
 }
 
 /// A reader that left (a closed pipe) is no reason to fail a run.

@@ -193,7 +193,10 @@ fn assert_series_are_those_that_the_case_lists(folder: &Path) {
         let mut lines = table.lines();
         let columns: Vec<_> = lines.next().unwrap().split(',').collect();
         let rows: Vec<_> = lines.map(|line| line.split(',').count()).collect();
-        assert!(rows.len() > 1_000 && rows.iter().all(|count| *count == columns.len()));
+        // Ten seconds of motion are two loops.
+        let fewest = if name == "motion-loops.csv" { 1 } else { 1_000 };
+        assert!(rows.len() >= fewest, "{name} has {} rows", rows.len());
+        assert!(rows.iter().all(|count| *count == columns.len()), "{name}");
         assert!(readme.contains(&format!("\n## {name}\n")), "{readme}");
         for column in columns {
             assert!(
