@@ -8,6 +8,8 @@ use serde::de::DeserializeOwned;
 
 use crate::component::Role;
 use crate::message::{Message, MessageType};
+use crate::plot::PlotSeries;
+use crate::replay::Replay;
 use crate::run_log::RunLog;
 use crate::study::Batch;
 
@@ -31,6 +33,10 @@ pub trait CaseStudy: Sized + Debug + 'static {
     /// False when a role keeps what the others rely on, so that one started anew in the midst of
     /// a run would be wrong about the world: a topology may not ask for its restart then.
     const MAY_RESTART: bool = true;
+    /// The series that [`CaseStudy::series`] can give, by name.
+    const SERIES: &'static [&'static str] = &[];
+    /// The figures that [`CaseStudy::calibration`] knows, by name.
+    const CALIBRATED_FIGURES: &'static [&'static str] = &[];
     /// `[case.parameters]`; use `#[serde(deny_unknown_fields, default)]`.
     type Parameters: DeserializeOwned + Serialize + Default;
 
@@ -58,6 +64,31 @@ pub trait CaseStudy: Sized + Debug + 'static {
     /// What the robot did, from the messages of a finished run.
     fn score(&self, log: &RunLog) -> Score;
 
+    /// What a plot of the finished run shows, for the run's folder; nothing by default.
+    fn series(&self, _log: &RunLog) -> Vec<PlotSeries> {
+        Vec::new()
+    }
+
+    /// Runs the robot's side again in virtual time, from what it heard in the finished run, and
+    /// holds its messages against the recorded ones; `None`, whatever the log, for a case that
+    /// cannot.
+    fn replay(&self, _log: &RunLog) -> Option<Replay> {
+        None
+    }
+
+    /// What finds the link parameters under which the figure called `figure` comes out as
+    /// `value`; `None` for a case, or a figure, without such a search.
+    ///
+    /// # Errors
+    /// When the value is outside what the figure can take.
+    fn calibration(
+        &self,
+        _figure: &str,
+        _value: f64,
+    ) -> Result<Option<Box<dyn Batch>>, ParameterError> {
+        Ok(None)
+    }
+
     /// The tables this case can compute in virtual time, of the size its parameters ask for;
     /// `None` for a case without any.
     ///
@@ -71,7 +102,7 @@ pub trait CaseStudy: Sized + Debug + 'static {
 /// One channel of a case study: who publishes what to whom, or only to the record.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ChannelSpec {
-    /// Name, also of the shared-memory service, e.g. `arm/command`.
+    /// Name, also of the shared-memory service, e.g. `egm/right/command`.
     pub name: &'static str,
     /// What it carries.
     pub message: MessageType,

@@ -8,19 +8,23 @@
 //! 3. [`endpoint`] and [`simulation`]: what drives it, in real and in virtual time.
 //! 4. [`shuttle`]: a whole case study in one short file.
 //! 5. [`link`]: what a network does to a message; [`measure`]: how that is accounted.
-//! 6. [`teleoperation`]: the dual-arm `YuMi` of the seed paper.
+//! 6. [`egm`], [`yumi`] and [`teleoperation`]: the dual-arm robot of the seed paper, its guided
+//!    motion and the person who guides it; [`fleet`]: its seven vehicles.
 //! 7. [`study`]: batches of virtual-time runs that end in tables.
 #![forbid(unsafe_code)]
 
 pub mod arrival;
 pub mod case_study;
 pub mod component;
+pub mod egm;
 pub mod endpoint;
 pub mod fleet;
 pub mod link;
 pub mod measure;
 pub mod message;
+pub mod plot;
 pub mod random;
+pub mod replay;
 pub mod run_log;
 mod score;
 pub mod shuttle;
@@ -28,3 +32,4 @@ pub mod simulation;
 pub mod study;
 pub mod teleoperation;
 pub mod time;
+pub mod yumi;

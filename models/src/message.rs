@@ -18,7 +18,7 @@ use bytemuck::{Pod, Zeroable};
 /// assert_eq!(hil_models::message::MessageType::of::<Wheels>().size_bytes, 16);
 /// ```
 pub trait Message: Pod + Debug + Send + 'static {
-    /// Name and version, e.g. `hil.JointCommand.v1`. A changed layout needs a new version.
+    /// Name and version, e.g. `hil.EgmCommand.v1`. A changed layout needs a new version.
     const NAME: &'static str;
 }
 

@@ -3,6 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::case_study::ChannelSpec;
 use crate::message::Envelope;
 use crate::time::Instant;
 
@@ -111,6 +112,24 @@ impl ScoreEvent {
         }
     }
 
+    /// The channels of a case whose outages may have led to this: those of the messages it names,
+    /// and those that the role it is told of hears, unless a message already says which of these
+    /// it is about.
+    pub fn concerned_channels<'a>(&self, channels: &'a [ChannelSpec]) -> Vec<&'a ChannelSpec> {
+        let between_roles = || channels.iter().filter(|one| !one.is_recorded_only());
+        let mut tellers = channels.iter().filter(|one| one.name == self.clock_of);
+        let teller = tellers.next().map(|one| one.from);
+        let is_named = |channel: &ChannelSpec| {
+            let mut messages = self.messages.iter();
+            messages.any(|message| message.channel == channel.name)
+        };
+        let is_heard = |channel: &ChannelSpec| channel.to.is_some() && channel.to == teller;
+        let knows_which = between_roles().any(|one| is_named(one) && is_heard(one));
+        between_roles()
+            .filter(|one| is_named(one) || (is_heard(one) && !knows_which))
+            .collect()
+    }
+
     /// The same with one more message, unless there is no room.
     #[must_use]
     pub fn naming(mut self, message: MessageRef) -> Self {
@@ -174,6 +193,35 @@ mod tests {
         }
         assert_eq!((score.events.len(), score.events_dropped_count), (1_000, 5));
         assert_eq!(score.events.last().unwrap().at, Instant::from_ns(999));
+    }
+
+    #[test]
+    fn an_event_concerns_what_its_messages_went_over_or_what_its_teller_hears() {
+        use crate::shuttle::ShuttleCommand as Any;
+        let channels = [
+            ChannelSpec::of::<Any>("right/command", "controller", "robot"),
+            ChannelSpec::of::<Any>("left/command", "controller", "robot"),
+            ChannelSpec::of::<Any>("right/feedback", "robot", "controller"),
+            ChannelSpec::recorded::<Any>("event", "robot"),
+        ];
+        let check = |clock_of, named: &[&'static str], expected: &[&str]| {
+            let mut event = ScoreEvent::new(Severity::Notice, Instant::ZERO, clock_of, "x");
+            for channel in named {
+                event = event.naming(MessageRef::of(channel, &Envelope::default()));
+            }
+            let found = event.concerned_channels(&channels);
+            let names: Vec<_> = found.iter().map(|one| one.name).collect();
+            assert_eq!(names, expected, "{clock_of} {named:?}");
+        };
+        let both = ["right/command", "left/command"];
+        check("event", &[], &both);
+        check("event", &["event"], &both);
+        check("event", &["left/command", "event"], &["left/command"]);
+        check("right/feedback", &["right/command"], &["right/command"]);
+        let all = ["right/command", "left/command", "right/feedback"];
+        check("event", &["right/feedback"], &all);
+        check("right/command", &[], &["right/feedback"]);
+        check("unknown", &[], &[]);
     }
 
     #[test]

@@ -3,6 +3,7 @@
 
 use core::fmt::Write;
 
+use hil_models::run_log::RunLog;
 use serde_json::Value;
 
 use crate::registry::{CaseEntry, Registry};
@@ -36,9 +37,59 @@ fn list_case(text: &mut String, entry: &CaseEntry) {
             ),
         );
     }
+    for (what, words) in offers(entry) {
+        line(text, format_args!("  {what:<12} {words}"));
+    }
     if let Value::Object(parameters) = entry.defaults() {
         list_table(text, "case.parameters", &parameters);
     }
+}
+
+/// What the case offers beyond a run and its score, with the command for it. Tables and replay are
+/// asked of the case as it is by default.
+fn offers(entry: &CaseEntry) -> Vec<(&'static str, String)> {
+    let name = entry.name;
+    let case = entry.make(entry.defaults(), 0).ok();
+    let has_tables = case
+        .as_ref()
+        .is_some_and(|case| matches!(case.study(), Ok(Some(_))));
+    let has_replay = case
+        .as_ref()
+        .is_some_and(|case| case.replay(&RunLog::default()).is_some());
+    let none = || "none".to_owned();
+    let listed = |names: &[&str], words: String| match names {
+        [] => none(),
+        names => format!("{}{words}", names.join(", ")),
+    };
+    vec![
+        (
+            "tables",
+            if has_tables {
+                "hil-runtime tables --topology FILE".to_owned()
+            } else {
+                none()
+            },
+        ),
+        (
+            "calibration",
+            listed(
+                entry.calibrated_figures,
+                format!("; hil-runtime calibrate {name} --figure NAME=VALUE"),
+            ),
+        ),
+        (
+            "replay",
+            if has_replay {
+                "hil-runtime replay RUN".to_owned()
+            } else {
+                none()
+            },
+        ),
+        (
+            "series",
+            listed(entry.series, "; in the folder of each run".to_owned()),
+        ),
+    ]
 }
 
 /// One table under its heading: its own keys first, then the tables in it.
@@ -67,6 +118,7 @@ fn line(text: &mut String, words: core::fmt::Arguments<'_>) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use hil_models::fleet::Fleet;
     use hil_models::shuttle::Shuttle;
     use serde_json::json;
 
@@ -80,6 +132,27 @@ mod tests {
         assert_eq!(table["gain_per_s"].as_float(), Some(5.0));
         assert!(text.starts_with("shuttle: a cart on a rail"), "{text}");
         assert!(text.contains("  shuttle/command  controller -> robot  hil.ShuttleCommand.v1 (16"));
+    }
+
+    #[test]
+    fn what_a_case_offers_is_listed_with_its_command() {
+        let mut registry = Registry::default();
+        registry.add::<Fleet>();
+        registry.add::<Shuttle>();
+        let words = |name: &str| -> Vec<_> {
+            let offers = offers(registry.find(name).unwrap());
+            offers.into_iter().map(|(_, words)| words).collect()
+        };
+        assert_eq!(words("shuttle"), ["none", "none", "none", "none"]);
+        assert_eq!(words("fleet")[0], "hil-runtime tables --topology FILE");
+        assert!(list(&registry).contains("  calibration  none\n"));
+        let mut calibrated = *registry.find("shuttle").unwrap();
+        calibrated.calibrated_figures = &["mlr", "lag"];
+        calibrated.series = &["tool"];
+        let words = offers(&calibrated);
+        let expected = "mlr, lag; hil-runtime calibrate shuttle --figure NAME=VALUE";
+        assert_eq!(words[1].1, expected);
+        assert_eq!(words[3].1, "tool; in the folder of each run");
     }
 
     #[test]

@@ -3,7 +3,7 @@
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
-use clap::{Args, Parser, Subcommand};
+use clap::{ArgGroup, Args, Parser, Subcommand};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -17,15 +17,39 @@ Examples:
       the same loop and link in virtual time, in a moment
   hil-runtime tables --topology deploy/topologies/tables.toml
       the published tables of case study 1 beside our own, in virtual time
+  hil-runtime calibrate teleoperation --mlr 0.008
+      the outages under which case study 2 loses 0.8 % of its motion loops
   hil-runtime report runs/teleop-local-20261121-101500
       print a finished run's report again
+  hil-runtime replay runs/teleop-local-20261121-101500
+      run its robot again in virtual time and compare every message
 
 Exit codes:
   0  the run ended as planned         70  internal error
-  1  the run failed, or its report    78  doctor --strict: host not fit
-     has gaps                         130 interrupted; the report is
+  1  the run failed, its report has   78  doctor --strict: host not fit
+     gaps, or a replay differs        130 interrupted; the report is
   2  wrong arguments or topology          complete
   69 a peer host was not reachable    131 interrupted twice: no report";
+
+const CALIBRATE_EXAMPLES: &str = "\
+Examples:
+  hil-runtime calibrate teleoperation --mlr 0.008
+      the outages under which the default case loses 0.8 % of its motion loops
+  hil-runtime calibrate teleop --mlr 0.027 --topology deploy/topologies/emulated.toml
+      the same with the case's parameters of a file; `teleop` names one case only
+  hil-runtime calibrate teleoperation --figure mlr=0.008 --seeds 40 --output curve
+      more runs per point, and the curve as CSV
+
+Equal seeds give equal tables, whatever the number of threads. Ctrl-C prints what is
+complete. Exit code 1 when the value cannot be reached or a criterion is missed.";
+
+const REPLAY_EXAMPLES: &str = "\
+Example:
+  hil-runtime replay runs/teleop-local-20261121-101500
+
+Reads the manifest and the records of the run, and nothing else. Exit code 0 when every
+message is the same to the last bit, 1 when one differs or records are missing, 2 when the
+folder cannot be replayed at all.";
 
 /// Runs a robot's controller and its model as separate processes, over shared memory or a real
 /// network, and accounts for every microsecond in between.
@@ -77,6 +101,49 @@ pub struct RunArgs {
     pub domain_root: Option<PathBuf>,
 }
 
+/// How a batch of virtual-time tasks is computed, and where its tables go.
+#[derive(Debug, Args)]
+pub struct BatchArgs {
+    /// Threads; all processors if left out.
+    #[arg(long, short, value_name = "N")]
+    pub jobs: Option<NonZeroUsize>,
+    /// Print JSON instead of tables.
+    #[arg(long)]
+    pub json: bool,
+    /// Also write the tables to this folder: one CSV file each, report.txt and report.json.
+    #[arg(long, short, value_name = "DIR")]
+    pub output: Option<PathBuf>,
+    /// Print no progress, only the tables.
+    #[arg(long, short)]
+    pub quiet: bool,
+}
+
+/// Arguments of a calibration.
+#[derive(Debug, Args)]
+#[command(group = ArgGroup::new("wanted").required(true).args(["mlr", "figure"]))]
+pub struct CalibrateArgs {
+    /// The case; as much of its name as no other case has is enough.
+    pub case: String,
+    /// The motion loss rate to come out; short for --figure mlr=RATIO.
+    #[arg(long, value_name = "RATIO", allow_negative_numbers = true)]
+    pub mlr: Option<f64>,
+    /// The figure and the value to come out; `hil-runtime cases` lists the figures of each case.
+    #[arg(long, value_name = "NAME=VALUE")]
+    pub figure: Option<String>,
+    /// A topology file with the case's parameters; without it they have their defaults.
+    #[arg(long, short, value_name = "FILE")]
+    pub topology: Option<PathBuf>,
+    /// Change one value of the file or of the defaults; may be repeated.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub overrides: Vec<String>,
+    /// Runs per point of the curve; short for --set case.parameters.tables.seeds=N.
+    #[arg(long, value_name = "N")]
+    pub seeds: Option<u64>,
+    /// How to compute and where to put the tables.
+    #[command(flatten)]
+    pub batch: BatchArgs,
+}
+
 /// Everything but a run.
 #[derive(Debug, Subcommand)]
 pub enum Command {
@@ -94,6 +161,9 @@ pub enum Command {
         /// Print JSON instead of a table.
         #[arg(long)]
         json: bool,
+        /// Also write report.txt, report.json, events.log and the case's series to this folder.
+        #[arg(long, short, value_name = "DIR")]
+        output: Option<PathBuf>,
     },
     /// Compute a case's tables in virtual time, on all processors.
     #[command(
@@ -109,25 +179,28 @@ pub enum Command {
         /// Critical sections per cell; short for --set case.parameters.tables.sections=N.
         #[arg(long, value_name = "N")]
         sections: Option<u64>,
-        /// Threads; all processors if left out.
-        #[arg(long, short, value_name = "N")]
-        jobs: Option<NonZeroUsize>,
-        /// Print JSON instead of tables.
-        #[arg(long)]
-        json: bool,
-        /// Also write the tables to this folder: one CSV file each, report.txt and report.json.
-        #[arg(long, short, value_name = "DIR")]
-        output: Option<PathBuf>,
-        /// Print no progress, only the tables.
-        #[arg(long, short)]
-        quiet: bool,
+        /// How to compute and where to put the tables.
+        #[command(flatten)]
+        batch: BatchArgs,
     },
+    /// Find the link parameters under which a figure comes out as given, in virtual time.
+    #[command(after_help = CALIBRATE_EXAMPLES)]
+    Calibrate(CalibrateArgs),
     /// Print the report of a finished run again.
     #[command(after_help = "Example:\n  hil-runtime report runs/teleop-local-20261121-101500")]
     Report {
         /// The run's folder.
         run: PathBuf,
         /// Print summary.json instead of the table.
+        #[arg(long)]
+        json: bool,
+    },
+    /// Run the robot of a finished run again in virtual time and compare every message.
+    #[command(after_help = REPLAY_EXAMPLES)]
+    Replay {
+        /// The run's folder, of either host.
+        run: PathBuf,
+        /// Print JSON instead of text.
         #[arg(long)]
         json: bool,
     },
@@ -178,6 +251,13 @@ pub enum Command {
         /// Program and arguments.
         #[arg(last = true, required = true)]
         program: Vec<String>,
+    },
+    /// Speak with a foreign EGM program; started by a run, not by hand.
+    #[command(hide = true)]
+    Face {
+        /// Launch file written by the supervisor.
+        #[arg(long)]
+        launch: PathBuf,
     },
     /// Run the gateway of one link; started by a run, not by hand.
     #[command(hide = true)]

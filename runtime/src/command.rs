@@ -1,5 +1,7 @@
 //! What each command of the command line does, and the exit code it ends with.
 
+mod case_work;
+
 use std::env;
 use std::fs;
 use std::io::IsTerminal;
@@ -16,6 +18,7 @@ use crate::cases;
 use crate::cli::{Cli, Command, RunArgs};
 use crate::console::Console;
 use crate::doctor::{self, DoctorRequest, StampCapabilities};
+use crate::face;
 use crate::gateway;
 use crate::process::{component, own_program};
 use crate::registry::Registry;
@@ -23,8 +26,6 @@ use crate::report::summary::RunSummary;
 use crate::report::terminal::{self, Style};
 use crate::run_folder::RunFolder;
 use crate::signals::{EXIT_INTERRUPTED, Signals};
-use crate::simulate;
-use crate::study::{self, StudyEnd, StudyOptions};
 use crate::supervisor::{self, Outcome, PeerError, RunError, RunOptions, RunResult};
 use crate::topology::{self, HOST_VARIABLE, HostChoice, MachineIdentity, Topology, which_host};
 
@@ -56,31 +57,29 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
             supervisor,
             program,
         } => code_of(own_program::become_program(supervisor, &program), console),
+        Command::Face { launch } => code_of(face::process::run(&launch), console),
         Command::Gateway { launch } => code_of(gateway::process::run(&launch), console),
         Command::Simulate {
             topology,
             overrides,
             json,
-        } => simulate(&topology, &overrides, registry, (json, console)),
+            output,
+        } => {
+            let file = (topology.as_path(), overrides.as_slice());
+            case_work::simulate(file, json, output.as_deref(), registry, console)
+        }
         Command::Tables {
             topology,
             mut overrides,
             sections,
-            jobs,
-            json,
-            output,
-            quiet,
+            batch,
         } => {
             overrides
                 .extend(sections.map(|count| format!("case.parameters.tables.sections={count}")));
-            let options = StudyOptions {
-                jobs,
-                is_json: json,
-                output,
-            };
-            let mut console = Console::new(quiet);
-            compute_tables((&topology, &overrides), &options, registry, &mut console)
+            case_work::tables(&topology, &overrides, batch, registry)
         }
+        Command::Calibrate(args) => case_work::calibrate(args, registry),
+        Command::Replay { run, json } => case_work::replay(&run, json, registry, console),
         Command::Report { run, json } => show_report(&run, json, console),
         Command::Doctor { strict, json } => {
             let worst = examine(json, console);
@@ -255,74 +254,6 @@ fn hosts_here(topology: &Topology, requested: Option<&str>) -> Result<Vec<String
     }
 }
 
-fn simulate(
-    path: &Path,
-    overrides: &[String],
-    registry: &Registry,
-    (json, console): (bool, &mut Console),
-) -> u8 {
-    let Some(topology) = load(path, overrides, registry, console) else {
-        return exit::USAGE;
-    };
-    let form = if json {
-        simulate::Form::Json
-    } else {
-        simulate::Form::Page(columns())
-    };
-    match simulate::simulate(&topology, registry, form) {
-        Ok(text) => {
-            console.result(&text);
-            exit::RAN
-        }
-        Err(text) => {
-            console.error(&text);
-            exit::USAGE
-        }
-    }
-}
-
-fn compute_tables(
-    (path, overrides): (&Path, &[String]),
-    options: &StudyOptions,
-    registry: &Registry,
-    console: &mut Console,
-) -> u8 {
-    let topology = match topology::load_case(path, overrides, registry.known()) {
-        Ok(topology) => topology,
-        Err(errors) => {
-            console.rendered(&errors.render(std::io::stderr().is_terminal()));
-            return exit::USAGE;
-        }
-    };
-    let batch = match study::batch_of(&topology, registry) {
-        Ok(batch) => batch,
-        Err(error) => {
-            console.error(&error.to_string());
-            return exit::USAGE;
-        }
-    };
-    let signals = match Signals::install() {
-        Ok(signals) => signals,
-        Err(error) => {
-            console.error(&format!("cannot handle signals: {error}"));
-            return exit::INTERNAL;
-        }
-    };
-    match study::run(batch.as_ref(), options, &signals, console) {
-        Ok(StudyEnd::Passed) => exit::RAN,
-        Ok(StudyEnd::Missed) => {
-            console
-                .error("a criterion is missed: the lines marked MISSED at the end of the tables");
-            exit::FAILED
-        }
-        Ok(StudyEnd::Interrupted) => interrupted(),
-        Err(error) => {
-            console.error(&error.to_string());
-            exit::FAILED
-        }
-    }
-}
-
 fn show_report(run: &Path, json: bool, console: &mut Console) -> u8 {
     let folder = RunFolder::existing(run);
     let text = match fs::read_to_string(folder.summary()) {
@@ -331,6 +262,9 @@ fn show_report(run: &Path, json: bool, console: &mut Console) -> u8 {
             let path = folder.summary();
             let text = if folder.manifest().is_file() {
                 "this run never began or was killed outright, so it left no summary".to_owned()
+            } else if folder.virtual_report().is_file() {
+                "this is a folder of `simulate` or `tables`, not of a run; read its report.txt, or                  report.json for every figure"
+                    .to_owned()
             } else {
                 format!("not a run's folder: {error}")
             };

@@ -6,8 +6,13 @@ use std::time::{Duration, Instant};
 
 use anstyle::{AnsiColor, Style};
 
+use crate::report::terminal::shortened;
+
 /// Progress lines where they cannot be redrawn.
 const PLAIN_PERIOD: Duration = Duration::from_secs(5);
+
+/// Columns of a terminal that does not say how many it has.
+const COLUMNS_UNKNOWN: usize = 80;
 
 /// Talks to the person (or journal) that started the run.
 #[derive(Debug)]
@@ -59,6 +64,7 @@ impl Console {
             return;
         }
         if self.is_terminal {
+            let text = one_row(text, terminal_columns().unwrap_or(COLUMNS_UNKNOWN));
             // Carriage return, text, erase to the end of the line.
             write_to(&mut io::stderr(), &format!("\r{text}\x1b[K"));
             self.has_open_line = true;
@@ -98,10 +104,36 @@ impl Console {
     }
 }
 
+/// At most one row of a terminal: a longer text would wrap and could not be redrawn. The last
+/// column stays free, because some terminals wrap once it is written.
+fn one_row(text: &str, columns: usize) -> String {
+    shortened(text, columns.saturating_sub(1))
+}
+
+/// Columns of the terminal behind standard error; `None` when it does not say.
+fn terminal_columns() -> Option<usize> {
+    let (width, _) = terminal_size::terminal_size_of(io::stderr())?;
+    (width.0 > 0).then(|| usize::from(width.0))
+}
+
 /// A reader that left (a closed pipe) is no reason to fail a run.
 fn write_to(out: &mut impl Write, text: &str) {
     let _left = out
         .write_all(text.as_bytes())
         .and_then(|()| out.flush())
         .is_err();
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_progress_line_is_never_longer_than_a_row() {
+        let long = "12.0 / 60 s  egm/right/command 3000→2999 | ".repeat(9);
+        for columns in [1, 40, 80, 200] {
+            assert!(one_row(&long, columns).chars().count() < columns);
+        }
+        assert_eq!(one_row("12.0 / 60 s", 80), "12.0 / 60 s");
+    }
 }

@@ -14,7 +14,7 @@
 //! Read in this order:
 //!
 //! 1. [`topology`]: what runs where; [`supervisor`]: starts, watches and ends it.
-//! 2. [`process`] and [`gateway`]: what runs inside each started process.
+//! 2. [`process`], [`gateway`] and [`face`]: what runs inside each started process.
 //! 3. [`channel`]: shared memory between them; [`mod@record`]: the notes they keep.
 //! 4. [`report`]: from the notes to what a person reads.
 //! 5. [`realtime`], [`clock`], [`wait`], [`host_facts`], [`doctor`]: the machine.
@@ -27,14 +27,17 @@ pub mod clock;
 mod command;
 pub mod console;
 pub mod doctor;
+pub mod face;
 pub mod gateway;
 pub mod host_facts;
 pub mod process;
 pub mod realtime;
 pub mod record;
 pub mod registry;
+mod replay;
 pub mod report;
 pub mod run_folder;
+mod series;
 pub mod signals;
 mod simulate;
 mod study;

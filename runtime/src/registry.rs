@@ -6,11 +6,13 @@ use std::fs;
 
 use hil_models::case_study::{CaseStudy, ChannelSpec, ParameterError, Score};
 use hil_models::component::Role;
+use hil_models::plot::PlotSeries;
+use hil_models::replay::Replay;
 use hil_models::run_log::RunLog;
 use hil_models::study::Batch;
 use serde_json::Value;
 
-use crate::topology::{KnownCase, KnownCases, ParameterFault, check_parameters_with};
+use crate::topology::{KnownCase, KnownCases, ParameterFault, Topology, check_parameters_with};
 
 /// A case whose type is no longer known: what `[case]` resolves to.
 pub trait Case: Debug {
@@ -19,6 +21,22 @@ pub trait Case: Debug {
 
     /// See [`CaseStudy::score`].
     fn score(&self, log: &RunLog) -> Score;
+
+    /// See [`CaseStudy::series`].
+    fn series(&self, log: &RunLog) -> Vec<PlotSeries>;
+
+    /// See [`CaseStudy::replay`].
+    fn replay(&self, log: &RunLog) -> Option<Replay>;
+
+    /// See [`CaseStudy::calibration`].
+    ///
+    /// # Errors
+    /// When the value is outside what the figure can take.
+    fn calibration(
+        &self,
+        figure: &str,
+        value: f64,
+    ) -> Result<Option<Box<dyn Batch>>, ParameterError>;
 
     /// See [`CaseStudy::study`].
     ///
@@ -39,6 +57,22 @@ impl<C: CaseStudy> Case for Erased<C> {
         self.0.score(log)
     }
 
+    fn series(&self, log: &RunLog) -> Vec<PlotSeries> {
+        self.0.series(log)
+    }
+
+    fn replay(&self, log: &RunLog) -> Option<Replay> {
+        self.0.replay(log)
+    }
+
+    fn calibration(
+        &self,
+        figure: &str,
+        value: f64,
+    ) -> Result<Option<Box<dyn Batch>>, ParameterError> {
+        self.0.calibration(figure, value)
+    }
+
     fn study(&self) -> Result<Option<Box<dyn Batch>>, ParameterError> {
         self.0.study()
     }
@@ -54,6 +88,27 @@ pub struct CaseError {
     pub message: String,
 }
 
+/// Why a word names no case.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum CaseNameError {
+    /// No case begins like that.
+    #[error("no case is called {word:?} or begins with it; there is {known}")]
+    Unknown {
+        /// The word.
+        word: String,
+        /// All cases.
+        known: String,
+    },
+    /// Several do.
+    #[error("{word:?} may be {matching}; write more of the name")]
+    Ambiguous {
+        /// The word.
+        word: String,
+        /// Those that begin with it.
+        matching: String,
+    },
+}
+
 /// One known case study.
 #[derive(Debug, Clone, Copy)]
 pub struct CaseEntry {
@@ -65,6 +120,10 @@ pub struct CaseEntry {
     pub roles: &'static [&'static str],
     /// Its channels.
     pub channels: &'static [ChannelSpec],
+    /// The series it can give, by name.
+    pub series: &'static [&'static str],
+    /// The figures it can be calibrated for, by name.
+    pub calibrated_figures: &'static [&'static str],
     make: fn(Value, u64) -> Result<Box<dyn Case>, CaseError>,
     defaults: fn() -> Value,
 }
@@ -83,6 +142,9 @@ impl CaseEntry {
         (self.defaults)()
     }
 }
+
+/// A case with its parameters, and what is known of its kind.
+pub type MadeCase<'a> = (&'a CaseEntry, Box<dyn Case>);
 
 /// The cases of a binary.
 #[derive(Debug, Clone, Default)]
@@ -107,6 +169,8 @@ impl Registry {
             summary: C::SUMMARY,
             roles: C::ROLES,
             channels: C::CHANNELS,
+            series: C::SERIES,
+            calibrated_figures: C::CALIBRATED_FIGURES,
             make: make::<C>,
             defaults: || serde_json::to_value(C::Parameters::default()).unwrap_or(Value::Null),
         });
@@ -120,6 +184,54 @@ impl Registry {
     /// The case called `name`.
     pub fn find(&self, name: &str) -> Option<&CaseEntry> {
         self.entries.iter().find(|entry| entry.name == name)
+    }
+
+    /// The case whose name begins with `word`, if only one does; a whole name is always itself.
+    ///
+    /// # Errors
+    /// When none does, or more than one: names those that come into question.
+    pub fn find_by_prefix(&self, word: &str) -> Result<&CaseEntry, CaseNameError> {
+        if let Some(entry) = self.find(word) {
+            return Ok(entry);
+        }
+        let names = |entries: &[&CaseEntry]| {
+            let names: Vec<_> = entries.iter().map(|entry| entry.name).collect();
+            names.join(", ")
+        };
+        let entries = self.entries.iter();
+        let matching: Vec<_> = entries
+            .filter(|entry| !word.is_empty() && entry.name.starts_with(word))
+            .collect();
+        match matching.as_slice() {
+            [entry] => Ok(entry),
+            [] => Err(CaseNameError::Unknown {
+                word: word.to_owned(),
+                known: names(&self.entries.iter().collect::<Vec<_>>()),
+            }),
+            several => Err(CaseNameError::Ambiguous {
+                word: word.to_owned(),
+                matching: names(several),
+            }),
+        }
+    }
+
+    /// The case of `topology` with its parameters; `None` when it names none that is known.
+    ///
+    /// # Errors
+    /// Names the parameter, its value and its allowed range.
+    pub fn make_case(&self, topology: &Topology) -> Result<Option<MadeCase<'_>>, CaseError> {
+        let Some((case, entry)) = topology
+            .case()
+            .and_then(|case| Some((case, self.find(&case.name)?)))
+        else {
+            return Ok(None);
+        };
+        let parameters = serde_json::to_value(&case.parameters).map_err(|error| CaseError {
+            key: None,
+            message: error.to_string(),
+        })?;
+        let made = entry.make(parameters, topology.run().seed)?;
+        Ok(Some((entry, made)))
     }
 
     /// The cases as the topology reader needs them.
@@ -166,7 +278,9 @@ pub(crate) fn read_text(path: &str) -> Result<String, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use hil_models::fleet::Fleet;
     use hil_models::shuttle::Shuttle;
+    use hil_models::teleoperation::Teleoperation;
     use serde_json::json;
 
     #[test]
@@ -180,5 +294,26 @@ mod tests {
         let error = entry.make(json!({ "gain": 1.0 }), 0).unwrap_err();
         assert!(error.message.contains("unknown field `gain`"), "{error}");
         assert!(entry.make(entry.defaults(), 0).is_ok());
+    }
+
+    #[test]
+    fn a_case_is_found_by_as_much_of_its_name_as_no_other_has() {
+        let mut registry = Registry::default();
+        registry.add::<Shuttle>();
+        registry.add::<Fleet>();
+        registry.add::<Teleoperation>();
+        let found = |word| registry.find_by_prefix(word).map(|entry| entry.name);
+        assert_eq!(found("teleop"), Ok("teleoperation"));
+        assert_eq!(found("shuttle"), Ok("shuttle"));
+        assert_eq!(found("f"), Ok("fleet"));
+        let error = found("teleoperations").unwrap_err().to_string();
+        let expected = "no case is called \"teleoperations\" or begins with it; there is shuttle, \
+                        fleet, teleoperation";
+        assert_eq!(error, expected);
+        assert!(matches!(found(""), Err(CaseNameError::Unknown { .. })));
+        registry.entries[1].name = "shuffle";
+        let error = registry.find_by_prefix("shu").unwrap_err().to_string();
+        let expected = "\"shu\" may be shuttle, shuffle; write more of the name";
+        assert_eq!(error, expected);
     }
 }

@@ -13,6 +13,9 @@ use std::time::{SystemTime, UNIX_EPOCH};
 /// | `manifest.json` | resolved topology, versions, host facts, seed, command line |
 /// | `summary.json` | every figure of the report |
 /// | `report.txt` | the report as printed |
+/// | `events.log` | what happened to the robot, one line each |
+/// | `series/*.csv` | what the case has to plot; `series/README.md` explains the columns |
+/// | `report.json` | of a run in virtual time, every figure |
 /// | `records/*.rec` | one fixed-size record per message and stage |
 /// | `cards/*.json` | what each component was told it is |
 /// | `launch/*.json` | how each process was started here |
@@ -108,6 +111,21 @@ impl RunFolder {
     /// Every figure.
     pub fn summary(&self) -> PathBuf {
         self.root.join("summary.json")
+    }
+
+    /// Every figure of a run in virtual time, in place of [`Self::summary`].
+    pub fn virtual_report(&self) -> PathBuf {
+        self.root.join("report.json")
+    }
+
+    /// What happened to the robot, line by line.
+    pub fn events(&self) -> PathBuf {
+        self.root.join("events.log")
+    }
+
+    /// What the case has to plot.
+    pub fn series(&self) -> PathBuf {
+        self.root.join("series")
     }
 
     /// The report as printed, without colours.

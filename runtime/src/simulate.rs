@@ -1,19 +1,31 @@
 //! `hil-runtime simulate`: a topology's case in virtual time, with the link models of its emulated
 //! links. It starts no process and opens no socket.
 
+mod events;
+mod watched;
+
 use core::fmt::Write;
 use std::collections::BTreeMap;
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
 
 use hil_models::case_study::Score;
-use hil_models::link::bernoulli::BernoulliLink;
-use hil_models::random::RandomStream;
+use hil_models::measure::account::OutageFigures;
 use hil_models::simulation::{Carrier, Simulation, SimulationResult};
 
-use crate::registry::Registry;
+use crate::analysis::outages::OutageStory;
+use crate::process::launch::EmulationLaunch;
+use crate::registry::{Case, Registry};
+use crate::report::event_log;
 use crate::report::score_event::ScoreEvents;
 use crate::report::summary::ScoreMetric;
 use crate::report::terminal::{self, Style};
-use crate::topology::Topology;
+use crate::run_folder::RunFolder;
+use crate::series;
+use crate::topology::{Program, Topology};
+
+use self::watched::Watch;
 
 /// What the outcome is rendered as.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -24,110 +36,229 @@ pub(crate) enum Form {
     Page(usize),
 }
 
-/// Runs the topology's case in virtual time and renders counts and score.
+/// Why there is no outcome, or not all of its files.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum SimulateError {
+    /// The topology cannot be simulated.
+    #[error("{0}")]
+    Topology(String),
+    /// A file could not be written.
+    #[error("{0}")]
+    Output(String),
+    /// What is in the folder would be overwritten, or left beside what it does not belong to.
+    #[error("{}: the folder is not empty; name another one, or empty it", .0.display())]
+    Occupied(PathBuf),
+}
+
+/// A run in virtual time that is over.
+#[derive(Debug)]
+pub(crate) struct Simulated {
+    topology_name: String,
+    duration_s: f64,
+    seed: u64,
+    case: Box<dyn Case>,
+    result: SimulationResult,
+    score: Score,
+    /// Of every channel that a link model carried.
+    outages: Vec<OutageStory>,
+    events: ScoreEvents,
+}
+
+/// Runs the topology's case in virtual time.
 ///
 /// # Errors
 /// When the topology has no case, or a link that only a real run shows.
 pub(crate) fn simulate(
     topology: &Topology,
     registry: &Registry,
-    form: Form,
-) -> Result<String, String> {
-    let case = topology
-        .case()
-        .ok_or("the topology names no case; only a case can be simulated")?;
-    let entry = registry.find(&case.name).ok_or("the case is unknown")?;
-    let seed = topology.run().seed;
-    let parameters = serde_json::to_value(&case.parameters).map_err(|error| error.to_string())?;
-    let made = entry
-        .make(parameters, seed)
-        .map_err(|error| error.to_string())?;
+) -> Result<Simulated, SimulateError> {
+    let refused = |text: String| SimulateError::Topology(text);
+    let made = registry
+        .make_case(topology)
+        .map_err(|error| refused(error.to_string()))?;
+    let no_case = "the topology names no case; only a case can be simulated";
+    let (entry, case) = made.ok_or_else(|| refused(no_case.to_owned()))?;
+    let mut processes = topology.processes().iter();
+    if let Some(face) = processes.find(|one| matches!(one.program, Program::Egm { .. })) {
+        let name = &face.name;
+        return Err(refused(format!(
+            "process `{name}` speaks with a foreign program, which knows no virtual time"
+        )));
+    }
+    let mut watches = Vec::new();
     let mut carriers: BTreeMap<String, Box<dyn Carrier>> = BTreeMap::new();
-    for crossing in topology.crossings() {
-        let name = &crossing.channel.name;
-        let impairment = crossing.impairment.ok_or_else(|| {
-            format!(
-                "channel {name} crosses link {} via udp, whose delay only a real run shows; \
-                 use via = \"emulated\" to simulate it",
-                crossing.link.name
-            )
-        })?;
-        let stream = RandomStream::new(seed, name);
-        let link = BernoulliLink::new(impairment.delay, impairment.loss_ratio, stream)
-            .map_err(|error| error.to_string())?;
-        carriers.insert(name.clone(), Box::new(link));
+    for (name, carrier) in link_models(topology).map_err(refused)? {
+        let (carrier, watch) = Watch::over(carrier);
+        watches.push((name.clone(), watch));
+        carriers.insert(name, carrier);
     }
     let roles = entry
         .roles
         .iter()
-        .map(|role| made.role(role).map(|made| (*role, made)))
+        .map(|role| case.role(role).map(|made| (*role, made)))
         .collect::<Option<Vec<_>>>()
-        .ok_or("the case lists a role it cannot make")?;
+        .ok_or_else(|| refused("the case lists a role it cannot make".to_owned()))?;
     let result = Simulation::of_roles(entry.name, entry.channels, roles, carriers)
         .and_then(|simulation| simulation.run(topology.run().duration))
-        .map_err(|error| error.to_string())?;
-    let score = made.score(&result.log);
-    Ok(match form {
-        Form::Json => render_json(topology, &result, &score),
-        Form::Page(columns) => render_page(topology, &result, &score, columns),
+        .map_err(|error| refused(error.to_string()))?;
+    let score = case.score(&result.log);
+    let duration = topology.run().duration;
+    let outages: Vec<_> = watches
+        .into_iter()
+        .map(|(name, watch)| events::story(name, watch.outages(), duration))
+        .collect();
+    Ok(Simulated {
+        topology_name: topology.name().to_owned(),
+        duration_s: duration.as_secs_f64(),
+        seed: topology.run().seed,
+        events: events::explained(&score, entry.channels, &outages, &result.log),
+        case,
+        result,
+        score,
+        outages,
     })
 }
 
-/// Counts and score of a run in virtual time.
-fn render_page(
-    topology: &Topology,
-    result: &SimulationResult,
-    score: &Score,
-    columns: usize,
-) -> String {
-    let mut text = format!(
-        "{} in virtual time: {} s, seed {}\n\n",
-        topology.name(),
-        topology.run().duration.as_secs_f64(),
-        topology.run().seed
-    );
-    for (name, counts) in &result.channels {
-        let lost = counts
-            .published_count
-            .saturating_sub(counts.taken_count + counts.in_flight_count);
-        let _infallible = writeln!(
-            text,
-            "  {name:<18} published {:>8}   taken {:>8}   lost {lost:>7}   in flight {:>4}",
-            counts.published_count, counts.taken_count, counts.in_flight_count
-        );
+/// A channel's name and what carries it.
+type NamedCarrier = (String, Box<dyn Carrier>);
+
+/// The link models of the channels that cross a link.
+fn link_models(topology: &Topology) -> Result<Vec<NamedCarrier>, String> {
+    let mut carriers: Vec<NamedCarrier> = Vec::new();
+    for crossing in topology.crossings() {
+        let name = &crossing.channel.name;
+        let impairment = crossing.impairment.ok_or_else(|| {
+            format!(
+                "channel {name} crosses link {} via {}, whose delay only a real run shows; use \
+                 via = \"emulated\" to simulate it",
+                crossing.link.name,
+                crossing.link.via.word()
+            )
+        })?;
+        let emulation = EmulationLaunch {
+            delay: impairment.delay,
+            loss_ratio: impairment.loss_ratio,
+            outages: crossing.outages.unwrap_or_default(),
+            link: crossing.link.name.clone(),
+            seed: topology.run().seed,
+        };
+        // Virtual time begins with the run.
+        let link = emulation.model(name).map_err(|error| error.to_string())?;
+        carriers.push((name.clone(), Box::new(link)));
     }
-    for (name, count) in &result.recorded_counts {
-        let _infallible = writeln!(text, "  {name:<18} recorded  {count:>8}");
-    }
-    text.push_str(&terminal::render_score(
-        &ScoreMetric::all_of(score),
-        &ScoreEvents::in_virtual_time(score),
-        columns,
-        Style::Coloured,
-    ));
-    text
+    Ok(carriers)
 }
 
-fn render_json(topology: &Topology, result: &SimulationResult, score: &Score) -> String {
-    let channels: serde_json::Map<String, serde_json::Value> = result
-        .channels
-        .iter()
-        .map(|(name, counts)| {
+/// Makes sure that nothing is in the way of the files in `folder`, before anything is computed.
+///
+/// # Errors
+/// When the folder has anything in it, or cannot be read.
+pub(crate) fn check_output(folder: &Path) -> Result<(), SimulateError> {
+    let is_occupied = match fs::read_dir(folder) {
+        Ok(mut entries) => entries.next().is_some(),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => false,
+        Err(error) => {
+            let text = format!("{}: {error}", folder.display());
+            return Err(SimulateError::Output(text));
+        }
+    };
+    if is_occupied {
+        return Err(SimulateError::Occupied(folder.to_owned()));
+    }
+    Ok(())
+}
+
+impl Simulated {
+    /// Counts, outages and score.
+    pub(crate) fn render(&self, form: Form) -> String {
+        match form {
+            Form::Json => self.json(),
+            Form::Page(columns) => self.page(columns, Style::Coloured),
+        }
+    }
+
+    /// Writes report, events and the case's series to `folder`; gives the names of the series.
+    ///
+    /// # Errors
+    /// Names the file that cannot be written.
+    pub(crate) fn write(&self, folder: &Path) -> Result<Vec<String>, SimulateError> {
+        let failed = |path: PathBuf, error: io::Error| {
+            SimulateError::Output(format!("{}: {error}", path.display()))
+        };
+        fs::create_dir_all(folder).map_err(|error| failed(folder.to_owned(), error))?;
+        let files = RunFolder::existing(folder);
+        let page = self.page(REPORT_FILE_WIDTH, Style::Plain);
+        let events = event_log::text(&self.topology_name, &self.events);
+        for (path, text) in [
+            (files.report(), page),
+            (files.virtual_report(), self.json()),
+            (files.events(), events),
+        ] {
+            fs::write(&path, text).map_err(|error| failed(path, error))?;
+        }
+        let made = self.case.series(&self.result.log);
+        series::write(&files.series(), made)
+            .map_err(|error| SimulateError::Output(error.to_string()))
+    }
+
+    fn page(&self, columns: usize, style: Style) -> String {
+        let mut text = format!(
+            "{} in virtual time: {} s, seed {}\n\n",
+            self.topology_name, self.duration_s, self.seed
+        );
+        for (name, counts) in &self.result.channels {
+            let lost = counts
+                .published_count
+                .saturating_sub(counts.taken_count + counts.in_flight_count);
+            let _infallible = writeln!(
+                text,
+                "  {name:<18} published {:>8}   taken {:>8}   lost {lost:>7}   in flight {:>4}",
+                counts.published_count, counts.taken_count, counts.in_flight_count
+            );
+        }
+        for (name, count) in &self.result.recorded_counts {
+            let _infallible = writeln!(text, "  {name:<18} recorded  {count:>8}");
+        }
+        for (name, figures) in self.outage_figures() {
+            text.push_str(&terminal::render_outages(name, &figures, columns, style));
+        }
+        text.push_str(&terminal::render_score(
+            &ScoreMetric::all_of(&self.score),
+            &self.events,
+            columns,
+            style,
+        ));
+        text
+    }
+
+    fn json(&self) -> String {
+        let channels = self.result.channels.iter().map(|(name, counts)| {
             let counts = serde_json::json!({
                 "published_count": counts.published_count,
                 "taken_count": counts.taken_count,
                 "in_flight_count": counts.in_flight_count,
             });
             ((*name).to_owned(), counts)
-        })
-        .collect();
-    let document = serde_json::json!({
-        "name": topology.name(),
-        "seed": topology.run().seed,
-        "duration_s": topology.run().duration.as_secs_f64(),
-        "channels": channels,
-        "recorded_counts": result.recorded_counts,
-        "score": score,
-    });
-    format!("{document:#}\n")
+        });
+        let outages: BTreeMap<&str, OutageFigures> = self.outage_figures().collect();
+        let document = serde_json::json!({
+            "name": self.topology_name,
+            "seed": self.seed,
+            "duration_s": self.duration_s,
+            "channels": channels.collect::<serde_json::Map<_, _>>(),
+            "recorded_counts": self.result.recorded_counts,
+            "outages": outages,
+            "score": self.score,
+            "score_events": self.events,
+        });
+        format!("{document:#}\n")
+    }
+
+    fn outage_figures(&self) -> impl Iterator<Item = (&str, OutageFigures)> {
+        let stories = self.outages.iter();
+        stories.filter_map(|story| Some((story.channel.as_str(), story.figures()?)))
+    }
 }
+
+/// Width of `report.txt`.
+const REPORT_FILE_WIDTH: usize = 100;

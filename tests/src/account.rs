@@ -66,16 +66,24 @@ pub fn assert_every_message_is_accounted_for(summary: &RunSummary) {
 /// With the figures when they do not.
 pub fn assert_accounts_close(summary: &RunSummary) {
     for channel in carried(summary) {
-        let account = account(summary, &channel.name);
-        let said = describe(&channel.name, account);
-        let closing = closing(&channel.name, account);
-        assert_eq!(closing.residual_limit_ns, RESIDUAL_LIMIT_NS, "{said}");
-        assert_eq!(RESIDUAL_LIMIT_NS, 1_000);
-        let taken_count = account.fates.of(MessageFate::Taken);
-        assert_eq!(closing.checked_count, taken_count, "{said}");
-        let ratio = closing.closed_ratio().map_or(0.0, |(ratio, _)| ratio);
-        assert!(ratio >= CLOSED_RATIO_MIN, "{ratio} closed in {said}");
+        assert_account_closes(summary, &channel.name);
     }
+}
+
+/// The same of the channel called `name`.
+///
+/// # Panics
+/// With the figures when it does not close.
+pub fn assert_account_closes(summary: &RunSummary, name: &str) {
+    let account = account(summary, name);
+    let said = describe(name, account);
+    let closing = closing(name, account);
+    assert_eq!(closing.residual_limit_ns, RESIDUAL_LIMIT_NS, "{said}");
+    assert_eq!(RESIDUAL_LIMIT_NS, 1_000);
+    let taken_count = account.fates.of(MessageFate::Taken);
+    assert_eq!(closing.checked_count, taken_count, "{said}");
+    let ratio = closing.closed_ratio().map_or(0.0, |(ratio, _)| ratio);
+    assert!(ratio >= CLOSED_RATIO_MIN, "{ratio} closed in {said}");
 }
 
 /// The closing check of an account on one clock.

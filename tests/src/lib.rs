@@ -3,6 +3,7 @@
 //! holds no test of the product.
 
 pub mod account;
+pub mod arms;
 pub mod binary;
 pub mod child;
 pub mod lab;

@@ -18,7 +18,9 @@ use hil_models::message::{Envelope, MessageType};
 use hil_models::shuttle::ShuttleCommand;
 use hil_models::time::Instant;
 use hil_runtime::channel::{ChannelHolder, ChannelSettings, Domain};
-use hil_runtime::process::launch::{DirectionLaunch, GatewayLaunch, Side, SocketLaunch, write};
+use hil_runtime::process::launch::{
+    DirectionLaunch, GatewayLaunch, Side, SocketLaunch, Transport, write,
+};
 use hil_runtime::realtime::RealtimeRequest;
 use hil_runtime::topology::Timestamps;
 use hil_runtime::wait::WaitMode;
@@ -141,6 +143,7 @@ fn direction(side: Side, [local, peer]: [SocketAddr; 2]) -> DirectionLaunch {
         local,
         peer,
         socket: SocketLaunch {
+            transport: Transport::Udp,
             interface: None,
             dscp: 0,
             priority: None,

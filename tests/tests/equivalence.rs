@@ -204,7 +204,9 @@ fn teleoperation(seed: u64) -> Teleoperation {
 /// The channels of `C` between two different hosts: all that begin or end at the robot.
 fn crossing<C: CaseStudy>() -> impl Iterator<Item = &'static ChannelSpec> {
     let specs = C::CHANNELS.iter();
-    specs.filter(|spec| spec.from == "robot" || spec.to == Some("robot"))
+    specs
+        .filter(|spec| !spec.is_recorded_only())
+        .filter(|spec| spec.from == "robot" || spec.to == Some("robot"))
 }
 
 fn virtual_run<C: CaseStudy>(case: &C, seed: u64, links: Links) -> SimulationResult {

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use hil_models::measure::account::InterruptionFigures;
 use hil_runtime::report::summary::{Outcome, RunSummary};
-use hil_tests::account::{account, assert_every_message_is_accounted_for, describe};
+use hil_tests::account::{account, assert_every_message_is_accounted_for, carried, describe};
 use hil_tests::child::{ChildGuard, Finished};
 use hil_tests::lab::Lab;
 use hil_tests::run_folder::RunFolder;
@@ -51,8 +51,8 @@ impl Split {
     /// Waits until both ends have taken half a second's messages from now on.
     fn wait_for_messages(&self, after: &str) {
         let taken = || {
-            let commands = self.files[1].record_bytes("arm.command.taken.");
-            let statuses = self.files[0].record_bytes("arm.status.taken.");
+            let commands = self.files[1].record_bytes("egm.right.command.taken.");
+            let statuses = self.files[0].record_bytes("egm.right.feedback.taken.");
             [commands, statuses]
         };
         let before = taken();
@@ -151,7 +151,7 @@ fn check_recovery(summary: &RunSummary, process: &str) {
     );
     let mut known = summary.processes.iter().filter(|one| one.name == process);
     assert_eq!(known.next().map(|one| one.restart_count), Some(1));
-    for channel in ["arm/command", "arm/status"] {
+    for channel in ["egm/right/command", "egm/right/feedback"] {
         let figures = interruption(summary, channel, process);
         let silence_ns = figures.gap.map(|gap| gap.length_ns);
         println!(
@@ -177,8 +177,8 @@ fn check_recovery(summary: &RunSummary, process: &str) {
     }
     // Whatever carries or takes messages loses some; a producer that is not there publishes none.
     let loses = match process {
-        "controller" => "arm/status",
-        _ => "arm/command",
+        "controller" => "egm/right/feedback",
+        _ => "egm/right/command",
     };
     let figures = interruption(summary, loses, process);
     assert!(figures.lost_count > 0, "{loses}: {figures:?}");
@@ -213,7 +213,7 @@ fn a_killed_robot_ends_the_run_on_both_hosts_with_a_complete_report() {
             event(&summary, "robot"),
             "robot: was killed by SIGKILL; policy: end the run"
         );
-        for channel in &summary.channels {
+        for channel in carried(&summary) {
             let account = account(&summary, &channel.name);
             println!("{}", describe(&channel.name, account));
             assert!(account.end_to_end.distribution.measured().is_some());
@@ -267,12 +267,12 @@ fn kill_supervisor(lab: Lab, victim: usize) -> Lab {
     assert!(split.files[other].has_report());
     let warnings = summary.warnings.join("\n");
     assert!(warnings.contains(HOSTS[victim]), "{warnings}");
-    for channel in &summary.channels {
+    for channel in carried(&summary) {
         let account = channel.account.as_ref();
         let said = account.map(|account| describe(&channel.name, account));
         println!("{} alone: {said:?}", HOSTS[other]);
     }
-    assert!(account(&summary, "arm/command").published_count > 0);
+    assert!(account(&summary, "egm/right/command").published_count > 0);
     split.lab
 }
 

@@ -43,7 +43,7 @@ fn runs_side_by_side_do_not_see_each_other() {
         assert_every_message_is_accounted_for(&summary);
         assert_accounts_close(&summary);
         // A stranger's messages would make two epochs of one channel, or more taken than ticked.
-        for (channel, role) in [("human/frame", "human"), ("arm/status", "robot")] {
+        for (channel, role) in [("human/frame", "human"), ("egm/right/feedback", "robot")] {
             let account = account(&summary, channel);
             assert_eq!(account.producer_restart_count, 0, "{channel}");
             let mut processes = summary.processes.iter();

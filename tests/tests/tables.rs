@@ -9,6 +9,7 @@ use std::time::Duration;
 use hil_tests::binary::{hil_runtime_binary, workspace_folder};
 use hil_tests::child::{ChildGuard, Finished};
 use hil_tests::run_folder::RunFolder;
+use hil_tests::trial::wait_until;
 use nix::sys::signal::Signal;
 use serde_json::Value;
 
@@ -136,6 +137,34 @@ fn an_interrupted_study_prints_what_is_complete() {
     assert!(finished.stderr.contains("ended by Ctrl-C"), "{finished:?}");
 }
 
+/// Waits until the process has a handler of its own for SIGINT.
+fn wait_until_it_heeds_interrupts(child: &ChildGuard) {
+    let status = format!("/proc/{}/status", child.pid());
+    wait_until(LIMIT, "a handler for SIGINT", || {
+        let status = fs::read_to_string(&status).unwrap();
+        let caught = status.lines().find_map(|line| line.strip_prefix("SigCgt:"));
+        let caught = u64::from_str_radix(caught.unwrap().trim(), 16).unwrap();
+        caught & (1 << (Signal::SIGINT as u32 - 1)) != 0
+    });
+}
+
+#[test]
+fn an_interruption_is_answered_from_the_first_moment_on() {
+    let mut simulate = Command::new(hil_runtime_binary());
+    simulate
+        .args(["simulate", "--topology", "deploy/topologies/emulated.toml"])
+        .args(["--set", "run.duration=\"20 h\""])
+        .current_dir(workspace_folder());
+    for mut command in [simulate, command(SHIPPED, &["--sections", "100000000"])] {
+        let mut child = ChildGuard::spawn(&mut command).unwrap();
+        wait_until_it_heeds_interrupts(&child);
+        child.signal(Signal::SIGINT).unwrap();
+        let finished = child.wait_within(LIMIT).unwrap();
+        assert_eq!(finished.status.code(), Some(130), "{finished:?}");
+        assert!(finished.stderr.contains("ended by Ctrl-C"), "{finished:?}");
+    }
+}
+
 #[test]
 fn what_cannot_be_computed_is_named() {
     let refused = |topology: &str, arguments: &[&str], words: &str| {
@@ -148,4 +177,29 @@ fn what_cannot_be_computed_is_named() {
     refused(SHIPPED, &["--sections", "0"], "tables.sections");
     let shuttle = "deploy/topologies/shuttle-local.toml";
     refused(shuttle, &[], "case shuttle has no tables");
+}
+
+/// The shipped file of case study 2, small: Bernoulli losses cost no loop, whatever the threads.
+#[test]
+fn the_motion_loss_table_is_the_same_on_any_number_of_threads() {
+    let report = |jobs: &str| {
+        let arguments = [
+            "--json",
+            "--quiet",
+            "--jobs",
+            jobs,
+            "--set",
+            "case.parameters.tables={ loops = 60, seeds = 3, conditions = ['loss-', 'short'] }",
+        ];
+        let finished = run_on("deploy/topologies/teleop-tables.toml", &arguments);
+        finished.assert_success();
+        let document: Value = serde_json::from_str(&finished.stdout).unwrap();
+        assert_eq!(document["is_passed"], true, "{}", finished.stdout);
+        // Four ratios of loss and the short range, three runs each.
+        assert_eq!(document["cost"]["ended_count"], 15);
+        document["report"].clone()
+    };
+    let (one, two) = (report("1"), report("2"));
+    assert!(one["tables"].is_array(), "{one}");
+    assert_eq!(one, two);
 }

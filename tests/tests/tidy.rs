@@ -32,7 +32,8 @@ const IMPURE_WORDS: [&str; 15] = [
     "println!",
 ];
 /// The only files that may hold `unsafe`, each for a kernel or shared-memory border.
-const UNSAFE_FILES: [&str; 4] = [
+const UNSAFE_FILES: [&str; 5] = [
+    "gateways/src/transport/tcp/info.rs",
     "gateways/src/transport/timestamping.rs",
     "runtime/src/channel/raw.rs",
     "runtime/src/channel/shm.rs",
@@ -53,6 +54,11 @@ const FORBIDDEN_DEPENDENCIES: [(&str, &[&str]); 2] = [
         ],
     ),
     ("gateways", &["hil-runtime", "iceoryx2"]),
+];
+/// Folders within a crate with the modules they must not name, not even in their tests.
+const FORBIDDEN_MODULES: [(&str, &str); 2] = [
+    ("models/src/egm", "teleoperation"),
+    ("models/src/yumi", "teleoperation"),
 ];
 const MEMBERS: [&str; 5] = ["models", "gateways", "runtime", "tests", "benches"];
 
@@ -126,6 +132,18 @@ fn unsafe_only_where_listed(file: &SourceFile) -> Vec<String> {
         .into_iter()
         .map(|line| format!("line {line}: `unsafe` in an unlisted file"))
         .collect()
+}
+
+fn modules_depend_downwards(file: &SourceFile) -> Vec<String> {
+    let rules = FORBIDDEN_MODULES.iter();
+    let own = rules.filter(|(folder, _)| file.is_under(folder));
+    own.flat_map(|(folder, module)| {
+        let lines = file.lines_with_word(module);
+        lines
+            .into_iter()
+            .map(move |line| format!("line {line}: `{module}` in {folder}"))
+    })
+    .collect()
 }
 
 fn finished(file: &SourceFile) -> Vec<String> {
@@ -266,6 +284,19 @@ fn unsafe_stays_in_the_listed_files() {
         "// unsafe is far\n",
         0,
     );
+}
+
+#[test]
+fn the_protocol_and_the_arm_know_no_case() {
+    check_tree(modules_depend_downwards);
+    let text = "//! teleoperation uses it.\nuse crate::teleoperation::Goal;\n";
+    for (path, fault_count) in [
+        ("models/src/egm/controller/tests/a.rs", 1),
+        ("models/src/yumi/a.rs", 1),
+        ("models/src/teleoperation/a.rs", 0),
+    ] {
+        check_snippet(modules_depend_downwards, path, text, fault_count);
+    }
 }
 
 #[test]

@@ -18,7 +18,8 @@ use hil_runtime::channel::{
 };
 use hil_runtime::gateway::Surroundings;
 use hil_runtime::gateway::direction::{self, Direction, Opened};
-use hil_runtime::process::launch::{DirectionLaunch, Side, SocketLaunch};
+use hil_runtime::process::launch::{DirectionLaunch, Side, SocketLaunch, Transport};
+use hil_runtime::process::pipe::RunStart;
 use hil_runtime::realtime::RealtimeRequest;
 use hil_runtime::record::{RecordFile, RecordKind, RecordSink, Recorder};
 use hil_runtime::topology::Timestamps;
@@ -261,7 +262,7 @@ impl Hosts {
                 let recorder = self.recorders[host].as_mut();
                 let recorder = recorder.expect("plans are added before recording starts");
                 let opened = self.network.on(host, || {
-                    direction::open(&launch, recorder).map(|(_, one)| one)
+                    direction::open(&launch, recorder, &RunStart::default()).map(|(_, one)| one)
                 })?;
                 let slot = usize::from(side == Side::Ingress);
                 ends[host][slot] = Some((launch, opened));
@@ -353,6 +354,7 @@ fn launch(plan: &Plan, way: usize, side: Side) -> DirectionLaunch {
         local: unset,
         peer: unset,
         socket: SocketLaunch {
+            transport: Transport::Udp,
             interface: None,
             dscp: 0,
             priority: None,

@@ -14,6 +14,7 @@ use hil_models::time::Instant;
 use super::clock_pair::monotonic_now;
 use super::emulated::{EmulatedReceiver, EmulatedSettings};
 use super::queue::{QueueSettings, queue_pair};
+use super::tcp::{TcpReceiver, TcpSender, TcpSettings};
 use super::timestamping::TimestampMode;
 use super::udp::{UdpReceiver, UdpSender, UdpSettings};
 use super::{
@@ -39,7 +40,10 @@ pub(super) fn within_bound<T>(what: &str, mut attempt: impl FnMut() -> Option<T>
 }
 
 fn next_arrival(receiver: &mut dyn DatagramReceiver, buffer: &mut [u8]) -> Received {
-    within_bound("arrival", || receiver.receive(now(), buffer).unwrap())
+    within_bound("arrival", || {
+        receiver.attend(now());
+        receiver.receive(now(), buffer).unwrap()
+    })
 }
 
 fn is_silent(sender: &mut dyn DatagramSender, receiver: &mut dyn DatagramReceiver) -> bool {
@@ -131,7 +135,10 @@ fn check_replies(
 ) {
     receiver.reply(b"heard", source).unwrap();
     let mut buffer = [0; BUFFER_BYTES];
-    let reply = within_bound("reply", || sender.receive(&mut buffer).unwrap());
+    let reply = within_bound("reply", || {
+        sender.attend(now());
+        sender.receive(&mut buffer).unwrap()
+    });
     assert_eq!(&buffer[..reply.length_bytes], b"heard", "{name}");
 }
 
@@ -155,6 +162,21 @@ pub(super) fn udp_pair(address: &str, mode: TimestampMode) -> (UdpSender, UdpRec
     let receiver = UdpReceiver::open(&settings).unwrap();
     settings.peer = receiver.local_address().unwrap();
     (UdpSender::open(&settings).unwrap(), receiver)
+}
+
+/// A sender and the receiver it is connected to, on the loopback address of `address`.
+pub(super) fn tcp_pair(address: &str) -> (TcpSender, TcpReceiver) {
+    let address = address.parse().unwrap();
+    let settings = TcpSettings::new(address, address, now);
+    let mut receiver = TcpReceiver::open(settings).unwrap();
+    let place = receiver.local_address().unwrap();
+    let mut sender = TcpSender::open(TcpSettings::new(address, place, now)).unwrap();
+    within_bound("connection", || {
+        sender.attend(now());
+        receiver.attend(now());
+        (sender.is_connected() && receiver.is_connected()).then_some(())
+    });
+    (sender, receiver)
 }
 
 fn made_up_stamps(token: TxToken) -> KernelStamps {
@@ -188,6 +210,16 @@ fn udp_over_ipv6_keeps_the_promises() {
 }
 
 #[test]
+fn tcp_keeps_the_promises() {
+    let (mut sender, mut receiver) = tcp_pair("127.0.0.1:0");
+    check_conformance("tcp", &mut sender, &mut receiver);
+    if std::net::UdpSocket::bind("[::1]:0").is_ok() {
+        let (mut sender, mut receiver) = tcp_pair("[::1]:0");
+        check_conformance("tcp over IPv6", &mut sender, &mut receiver);
+    }
+}
+
+#[test]
 fn the_queue_keeps_the_promises_with_and_without_stamps() {
     for transmit_stamps in [None, Some(made_up_stamps as fn(TxToken) -> KernelStamps)] {
         let (mut sender, mut receiver) = queue_pair(&QueueSettings {
@@ -210,4 +242,8 @@ fn a_perfect_emulated_link_keeps_the_promises_of_what_it_wraps() {
     let inner: Box<dyn DatagramReceiver> = Box::new(inner);
     let mut receiver = EmulatedReceiver::new(inner, Box::new(PerfectLink), |_| true, settings);
     check_conformance("emulated udp", &mut sender, &mut receiver);
+
+    let (mut sender, inner) = tcp_pair("127.0.0.1:0");
+    let mut receiver = EmulatedReceiver::new(inner, Box::new(PerfectLink), |_| false, settings);
+    check_conformance("emulated tcp", &mut sender, &mut receiver);
 }

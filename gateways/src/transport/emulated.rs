@@ -13,6 +13,7 @@ use std::os::fd::BorrowedFd;
 use hil_models::link::{Fate, LinkModel};
 use hil_models::time::Instant;
 
+use super::tcp::StreamFigures;
 use super::{DatagramReceiver, EmulatedDelay, Received, ReceiverCounters, SendRefusal};
 
 /// How much an emulated link may hold.
@@ -189,6 +190,14 @@ impl<R: DatagramReceiver> DatagramReceiver for EmulatedReceiver<R> {
 
     fn poll_fd(&self) -> Option<BorrowedFd<'_>> {
         self.inner.poll_fd()
+    }
+
+    fn attend(&mut self, now: Instant) {
+        self.inner.attend(now);
+    }
+
+    fn stream_figures(&self, now: Instant) -> Option<StreamFigures> {
+        self.inner.stream_figures(now)
     }
 
     /// Own counts of what was handed out, lost and dropped; the rest from below.

@@ -2,6 +2,8 @@
 //! it. They know no datagram layout; that is [`crate::protocol`].
 //!
 //! - [`udp`]: the real network, with separate sockets for sending and receiving.
+//! - [`tcp`]: the real network as a stream, with what it costs in waiting.
+//! - [`udp_server`]: one socket that hears anyone and answers, for foreign protocols.
 //! - [`queue`]: an in-process pair, for tests.
 //! - [`emulated`]: any receiver behind a link model.
 //! - [`timestamping`] and [`probe`]: what the kernel and the network card can stamp, and whether
@@ -10,13 +12,16 @@
 //!
 //! A refused send or a report of the network is a state the caller sees, never an exit.
 
+mod boxed;
 pub mod clock_pair;
 mod control;
 pub mod emulated;
 pub mod probe;
 pub mod queue;
+pub mod tcp;
 pub mod timestamping;
 pub mod udp;
+pub mod udp_server;
 mod udp_socket;
 
 #[cfg(test)]
@@ -33,6 +38,8 @@ use std::os::fd::BorrowedFd;
 
 use hil_models::time::Instant;
 use thiserror::Error;
+
+use tcp::StreamFigures;
 
 /// The stamps the kernel attached to one datagram.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -120,6 +127,9 @@ pub enum SendRefusal {
         /// Its length; 0 when the refusal came later, as a report.
         length_bytes: usize,
     },
+    /// A transport with connections has none to the peer just now.
+    #[error("there is no connection to the peer")]
+    NotConnected,
     /// Anything else the kernel answered.
     #[error("send was refused (errno {errno})")]
     Other {
@@ -166,6 +176,8 @@ pub struct SenderCounters {
     pub queue_full_count: u64,
     /// Sends refused with [`SendRefusal::TooLong`].
     pub too_long_count: u64,
+    /// Sends refused with [`SendRefusal::NotConnected`].
+    pub not_connected_count: u64,
     /// Sends refused with [`SendRefusal::Other`].
     pub other_refusal_count: u64,
     /// Transmit stamps handed out.
@@ -184,6 +196,9 @@ pub struct SenderCounters {
     pub undecodable_report_count: u64,
     /// Replies received from the peer.
     pub reply_count: u64,
+    /// Replies the kernel dropped because the receive buffer was full (`SO_RXQ_OVFL`). Known as
+    /// of the newest reply received.
+    pub kernel_drop_count: u64,
     /// What the newest network or local report said.
     pub newest_report: Option<SendRefusal>,
 }
@@ -197,6 +212,7 @@ impl SenderCounters {
             ("unreachable_count", self.unreachable_count),
             ("queue_full_count", self.queue_full_count),
             ("too_long_count", self.too_long_count),
+            ("not_connected_count", self.not_connected_count),
             ("other_refusal_count", self.other_refusal_count),
             ("stamp_count", self.stamp_count),
             ("unmatched_stamp_count", self.unmatched_stamp_count),
@@ -205,6 +221,7 @@ impl SenderCounters {
             ("local_report_count", self.local_report_count),
             ("undecodable_report_count", self.undecodable_report_count),
             ("reply_count", self.reply_count),
+            ("kernel_drop_count", self.kernel_drop_count),
         ]
         .into_iter()
     }
@@ -217,6 +234,7 @@ impl SenderCounters {
             SendRefusal::Unreachable { .. } => &mut self.unreachable_count,
             SendRefusal::QueueFull { .. } => &mut self.queue_full_count,
             SendRefusal::TooLong { .. } => &mut self.too_long_count,
+            SendRefusal::NotConnected => &mut self.not_connected_count,
             SendRefusal::Other { .. } => &mut self.other_refusal_count,
         };
         *counter += 1;
@@ -228,6 +246,7 @@ impl SenderCounters {
             + self.unreachable_count
             + self.queue_full_count
             + self.too_long_count
+            + self.not_connected_count
             + self.other_refusal_count
     }
 }
@@ -330,6 +349,25 @@ pub trait DatagramSender: Debug + Send {
 
     /// What was counted since the start.
     fn counters(&self) -> SenderCounters;
+
+    /// Does what is due beside sending, such as connecting: call it at
+    /// [`DatagramSender::next_due`] and whenever the descriptor has something.
+    fn attend(&mut self, _now: Instant) {}
+
+    /// When [`DatagramSender::attend`] is due without a word from the descriptor.
+    fn next_due(&self) -> Option<Instant> {
+        None
+    }
+
+    /// True while bytes of a datagram it took have not been given to the kernel.
+    fn has_unsent(&self) -> bool {
+        false
+    }
+
+    /// What a transport with connections saw until `now`; `None` for one without.
+    fn stream_figures(&self, _now: Instant) -> Option<StreamFigures> {
+        None
+    }
 }
 
 /// The receiving end of a transport. Nothing here blocks. See [`DatagramSender`] for an example.
@@ -356,49 +394,14 @@ pub trait DatagramReceiver: Debug + Send {
 
     /// What was counted since the start.
     fn counters(&self) -> ReceiverCounters;
-}
 
-impl<S: DatagramSender + ?Sized> DatagramSender for Box<S> {
-    fn send(&mut self, datagram: &[u8]) -> Result<TxToken, SendRefusal> {
-        (**self).send(datagram)
-    }
+    /// Does what is due beside receiving, such as taking connections: call it whenever the
+    /// descriptor has something and [`DatagramReceiver::receive`] gave nothing.
+    fn attend(&mut self, _now: Instant) {}
 
-    fn next_stamp(&mut self) -> Option<TransmitStamp> {
-        (**self).next_stamp()
-    }
-
-    fn receive(&mut self, buffer: &mut [u8]) -> io::Result<Option<Received>> {
-        (**self).receive(buffer)
-    }
-
-    fn poll_fd(&self) -> Option<BorrowedFd<'_>> {
-        (**self).poll_fd()
-    }
-
-    fn counters(&self) -> SenderCounters {
-        (**self).counters()
-    }
-}
-
-impl<R: DatagramReceiver + ?Sized> DatagramReceiver for Box<R> {
-    fn receive(&mut self, now: Instant, buffer: &mut [u8]) -> io::Result<Option<Received>> {
-        (**self).receive(now, buffer)
-    }
-
-    fn reply(&mut self, datagram: &[u8], to: SocketAddr) -> Result<(), SendRefusal> {
-        (**self).reply(datagram, to)
-    }
-
-    fn next_due(&self) -> Option<Instant> {
-        (**self).next_due()
-    }
-
-    fn poll_fd(&self) -> Option<BorrowedFd<'_>> {
-        (**self).poll_fd()
-    }
-
-    fn counters(&self) -> ReceiverCounters {
-        (**self).counters()
+    /// What a transport with connections saw until `now`; `None` for one without.
+    fn stream_figures(&self, _now: Instant) -> Option<StreamFigures> {
+        None
     }
 }
 

@@ -2,8 +2,8 @@
 //! an interface claims to offer. The control messages are decoded in a sibling file; whether a
 //! claim holds is found out by [`super::probe`].
 //!
-//! This is the only file of the crate with `unsafe`: `recvmsg`, two socket options and one
-//! `ioctl` have no safe form that does not allocate.
+//! `unsafe` is allowed here because `recvmsg`, two socket options and one `ioctl` have no safe form
+//! that does not allocate.
 
 use core::ffi::{c_char, c_int, c_ulong};
 use core::mem;

@@ -48,6 +48,8 @@ pub struct UdpSender {
     peer: SocketAddr,
     reader: MessageReader,
     counters: SenderCounters,
+    /// The kernel's drop count at the newest reply, modulo 2^32.
+    kernel_drop_count: u32,
     granted: GrantedOptions,
     mode: TimestampMode,
     /// The token of the send that the kernel counts as 0; `None` when its count is unknown.
@@ -60,23 +62,35 @@ impl UdpSender {
     /// # Errors
     /// When the settings contradict themselves or the kernel refuses a step.
     pub fn open(settings: &UdpSettings) -> Result<Self, UdpError> {
-        if settings.local.is_ipv4() != settings.peer.is_ipv4() {
+        Self::open_towards(settings, Some(settings.peer))
+    }
+
+    /// As [`UdpSender::open`], connected to `peer`, or to nobody.
+    pub(super) fn open_towards(
+        settings: &UdpSettings,
+        peer: Option<SocketAddr>,
+    ) -> Result<Self, UdpError> {
+        if let Some(peer) = peer.filter(|peer| peer.is_ipv4() != settings.local.is_ipv4()) {
             return Err(UdpError::Family {
                 local: settings.local,
-                peer: settings.peer,
+                peer,
             });
         }
         let socket = open_socket(settings)?;
+        let drops = setsockopt(&socket, sockopt::RxqOvfl, &1);
+        refuse("SO_RXQ_OVFL", 1, drops.map_err(io::Error::from))?;
         bind(&socket, settings.local)?;
         // Reports of the network go to the error queue, with their reason.
-        let reports = if settings.peer.is_ipv4() {
+        let reports = if settings.local.is_ipv4() {
             setsockopt(&socket, sockopt::Ipv4RecvErr, &true)
         } else {
             setsockopt(&socket, sockopt::Ipv6RecvErr, &true)
         };
         refuse("IP_RECVERR", true, reports.map_err(io::Error::from))?;
-        let connected = socket.connect(&SockAddr::from(settings.peer));
-        refuse("connect", settings.peer, connected)?;
+        if let Some(peer) = peer {
+            let connected = socket.connect(&SockAddr::from(peer));
+            refuse("connect", peer, connected)?;
+        }
         // Last, so that the kernel's count of sends starts with ours.
         let armed = arm_transmit(&socket, settings.timestamps);
         refuse(
@@ -90,6 +104,7 @@ impl UdpSender {
             peer: settings.peer,
             reader: MessageReader::new(),
             counters: SenderCounters::default(),
+            kernel_drop_count: 0,
             mode: settings.timestamps,
             first_token: Some(TxToken(0)),
         })
@@ -183,9 +198,19 @@ impl UdpSender {
     }
 }
 
-impl DatagramSender for UdpSender {
-    fn send(&mut self, datagram: &[u8]) -> Result<TxToken, SendRefusal> {
-        match self.socket.send_with_flags(datagram, libc::MSG_DONTWAIT) {
+impl UdpSender {
+    /// Sends to the connected peer, or to `to` when there is none.
+    pub(super) fn send_towards(
+        &mut self,
+        datagram: &[u8],
+        to: Option<&SockAddr>,
+    ) -> Result<TxToken, SendRefusal> {
+        let flags = libc::MSG_DONTWAIT;
+        let sent = match to {
+            None => self.socket.send_with_flags(datagram, flags),
+            Some(to) => self.socket.send_to_with_flags(datagram, to, flags),
+        };
+        match sent {
             Ok(_) => {
                 let token = TxToken(sent_modulo(self.counters.sent_count));
                 self.counters.sent_count += 1;
@@ -204,6 +229,20 @@ impl DatagramSender for UdpSender {
                 Err(refusal)
             }
         }
+    }
+
+    fn count_drops(&mut self, data: &ControlData) {
+        if let Some(count) = data.drop_count {
+            let new_count = count.wrapping_sub(self.kernel_drop_count);
+            self.counters.kernel_drop_count += u64::from(new_count);
+            self.kernel_drop_count = count;
+        }
+    }
+}
+
+impl DatagramSender for UdpSender {
+    fn send(&mut self, datagram: &[u8]) -> Result<TxToken, SendRefusal> {
+        self.send_towards(datagram, None)
     }
 
     fn next_stamp(&mut self) -> Option<TransmitStamp> {
@@ -236,6 +275,7 @@ impl DatagramSender for UdpSender {
             {
                 Ok(Some(message)) => {
                     let data = ControlData::decode(self.reader.control());
+                    self.count_drops(&data);
                     self.counters.reply_count += 1;
                     return Ok(Some(Received {
                         length_bytes: message.length_bytes,

@@ -176,7 +176,7 @@ pub(super) fn open_socket(settings: &UdpSettings) -> Result<Socket, UdpError> {
 
 /// Sizes the buffers. Beyond `net.core.wmem_max` and `rmem_max` that takes `CAP_NET_ADMIN`; what
 /// remains short without it is reported by [`GrantedOptions`].
-fn set_buffers(socket: &Socket, settings: &UdpSettings) -> Result<(), UdpError> {
+pub(super) fn set_buffers(socket: &Socket, settings: &UdpSettings) -> Result<(), UdpError> {
     if let Some(bytes) = settings.send_buffer_bytes {
         let doubled = doubled_buffer("SO_SNDBUF", bytes)?;
         refuse("SO_SNDBUF", bytes, socket.set_send_buffer_size(bytes))?;
@@ -203,7 +203,7 @@ fn doubled_buffer(option: &'static str, bytes: usize) -> Result<usize, UdpError>
 }
 
 /// Code point first: `IP_TOS` resets `SO_PRIORITY`.
-fn mark(socket: &Socket, settings: &UdpSettings) -> Result<(), UdpError> {
+pub(super) fn mark(socket: &Socket, settings: &UdpSettings) -> Result<(), UdpError> {
     if let Some(dscp) = settings.dscp {
         if dscp > 63 {
             return Err(UdpError::Dscp { dscp });

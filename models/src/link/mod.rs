@@ -3,6 +3,8 @@
 
 pub mod bernoulli;
 pub mod impaired;
+pub mod in_series;
+pub mod outages;
 
 use core::fmt::Debug;
 

@@ -6,5 +6,6 @@
 pub mod account;
 pub mod histogram;
 pub mod record;
+pub(crate) mod series;
 pub(crate) mod special;
 pub mod statistics;

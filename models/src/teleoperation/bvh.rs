@@ -1,10 +1,13 @@
 //! Motion files in the BVH text format (Biovision hierarchy): reader and writer on text. It opens
 //! no file, and it does not interpret the motion: see [`super::motion`].
 //!
-//! Numbers and keywords may be spread over lines at will; every error names the line it was found
-//! on. No input makes the reader panic, recurse or reserve more memory than the text's own size.
+//! [`BvhReader`] reads line by line and frame by frame, so the text may come from anywhere and
+//! need never end; [`Bvh::parse`] reads a whole file with it. Numbers and keywords may be spread
+//! over lines at will; every error names the line it was found on. No input makes the reader
+//! panic, recurse or reserve more memory than the text's own size.
 
 use core::fmt::Write as _;
+use core::ops::Range;
 
 use crate::teleoperation::skeleton::{Channel, Skeleton};
 
@@ -88,32 +91,16 @@ impl Bvh {
     /// # Errors
     /// The first line that is not as the format says.
     pub fn parse(text: &str) -> Result<Self, BvhError> {
-        let mut words = Words::new(text);
-        words.keyword("HIERARCHY", "the keyword HIERARCHY")?;
-        words.keyword("ROOT", "the keyword ROOT")?;
-        let skeleton = parse_hierarchy(&mut words)?;
-        words.keyword("MOTION", "the keyword MOTION")?;
-        words.keyword("Frames:", "the keyword Frames:")?;
-        let count_line = words.line;
-        let frame_count: usize = words.number("a frame count")?;
-        words.keyword("Frame", "the keywords Frame Time:")?;
-        words.keyword("Time:", "the keywords Frame Time:")?;
-        let frame_time_s = words.finite("a frame time in seconds")?;
-        if !(1e-6..=10.0).contains(&frame_time_s) {
-            return Err(words.error(BvhProblem::OutOfRange {
-                what: "frame time",
-                value: frame_time_s.to_string(),
-                allowed: "0.000001..=10 s",
-            }));
-        }
+        let mut reader = BvhReader::new(text.lines())?;
         let mut values = Vec::new();
-        while words.peek().is_some() {
-            values.push(words.finite("a channel value")?);
+        while reader.words.advance() {
+            values.push(reader.words.present_number("a channel value")?);
         }
-        let channel_count = skeleton.channel_count();
+        let channel_count = reader.skeleton.channel_count();
+        let frame_count = reader.announced_frame_count;
         if frame_count.checked_mul(channel_count) != Some(values.len()) || values.is_empty() {
             return Err(BvhError {
-                line: count_line,
+                line: reader.count_line,
                 problem: BvhProblem::FrameCount {
                     frame_count,
                     channel_count,
@@ -122,8 +109,8 @@ impl Bvh {
             });
         }
         Ok(Self {
-            skeleton,
-            frame_time_s,
+            skeleton: reader.skeleton,
+            frame_time_s: reader.frame_time_s,
             values,
         })
     }
@@ -150,39 +137,125 @@ impl Bvh {
     }
 }
 
+/// Reads a motion file as its lines come in: the hierarchy at once, then a frame at a time.
+#[derive(Debug)]
+pub struct BvhReader<L> {
+    words: Words<L>,
+    skeleton: Skeleton,
+    frame_time_s: f64,
+    announced_frame_count: usize,
+    count_line: usize,
+}
+
+impl<L: Iterator<Item: AsRef<str>>> BvhReader<L> {
+    /// Reads up to the frame time; `lines` come without their line ends.
+    ///
+    /// # Errors
+    /// The first line that is not as the format says.
+    pub fn new(lines: L) -> Result<Self, BvhError> {
+        let mut words = Words::new(lines);
+        words.keyword("HIERARCHY", "the keyword HIERARCHY")?;
+        words.keyword("ROOT", "the keyword ROOT")?;
+        let skeleton = parse_hierarchy(&mut words)?;
+        words.keyword("MOTION", "the keyword MOTION")?;
+        words.keyword("Frames:", "the keyword Frames:")?;
+        let count_line = words.line();
+        let announced_frame_count = words.parsed("a frame count")?;
+        words.keyword("Frame", "the keywords Frame Time:")?;
+        words.keyword("Time:", "the keywords Frame Time:")?;
+        let frame_time_s = words.number("a frame time in seconds")?;
+        if !(1e-6..=10.0).contains(&frame_time_s) {
+            return Err(words.error(BvhProblem::OutOfRange {
+                what: "frame time",
+                value: frame_time_s.to_string(),
+                allowed: "0.000001..=10 s",
+            }));
+        }
+        Ok(Self {
+            words,
+            skeleton,
+            frame_time_s,
+            announced_frame_count,
+            count_line,
+        })
+    }
+
+    /// The joints and what their channels mean.
+    pub fn skeleton(&self) -> &Skeleton {
+        &self.skeleton
+    }
+
+    /// Time from one frame to the next, seconds.
+    pub fn frame_time_s(&self) -> f64 {
+        self.frame_time_s
+    }
+
+    /// Frames the header speaks of; a live source may send any number.
+    pub fn announced_frame_count(&self) -> usize {
+        self.announced_frame_count
+    }
+
+    /// Line of the newest word, counted from 1.
+    pub fn line(&self) -> usize {
+        self.words.line()
+    }
+
+    /// Reads the next frame into `values`, which is cleared first; false at the end of the lines,
+    /// and for a skeleton without channels.
+    ///
+    /// # Errors
+    /// A word that is no number, or lines that end within a frame. The words before it are gone.
+    pub fn next_frame(&mut self, values: &mut Vec<f64>) -> Result<bool, BvhError> {
+        values.clear();
+        let channel_count = self.skeleton.channel_count();
+        if channel_count == 0 || !self.words.advance() {
+            return Ok(false);
+        }
+        values.push(self.words.present_number("a channel value")?);
+        while values.len() < channel_count {
+            values.push(self.words.number("a channel value")?);
+        }
+        Ok(true)
+    }
+}
+
 /// Reads from the root's name to the brace that closes the root.
-fn parse_hierarchy(words: &mut Words<'_>) -> Result<Skeleton, BvhError> {
+fn parse_hierarchy<L: Iterator<Item: AsRef<str>>>(
+    words: &mut Words<L>,
+) -> Result<Skeleton, BvhError> {
+    const EXPECTED: &str = "JOINT, End Site or a closing brace";
     let mut skeleton = Skeleton::default();
     let mut open: Vec<usize> = Vec::new();
     open.push(parse_joint(words, &mut skeleton, None)?);
     while let Some(&parent) = open.last() {
-        let word = words.next("JOINT, End Site or a closing brace")?;
-        if word == "}" {
+        words.next(EXPECTED)?;
+        if words.is("}") {
             open.pop();
-        } else if word.eq_ignore_ascii_case("JOINT") {
+        } else if words.is("JOINT") {
             open.push(parse_joint(words, &mut skeleton, Some(parent))?);
-        } else if word.eq_ignore_ascii_case("End") {
+        } else if words.is("End") {
             words.keyword("Site", "the keyword Site")?;
             words.keyword("{", "an opening brace")?;
             words.keyword("OFFSET", "the keyword OFFSET")?;
             for _ in 0..3 {
-                words.finite("an offset")?;
+                words.number("an offset")?;
             }
             words.keyword("}", "a closing brace")?;
         } else {
-            return Err(words.unexpected("JOINT, End Site or a closing brace", word));
+            return Err(words.unexpected(EXPECTED));
         }
     }
     Ok(skeleton)
 }
 
 /// Reads a joint's name, offset and channels; its children and closing brace come after.
-fn parse_joint(
-    words: &mut Words<'_>,
+fn parse_joint<L: Iterator<Item: AsRef<str>>>(
+    words: &mut Words<L>,
     skeleton: &mut Skeleton,
     parent: Option<usize>,
 ) -> Result<usize, BvhError> {
-    let name = words.next("a joint name")?;
+    words.next("a joint name")?;
+    let name = words.present().to_owned();
     if skeleton.joints().len() >= JOINT_COUNT_MAX {
         return Err(words.error(BvhProblem::OutOfRange {
             what: "joint count",
@@ -194,10 +267,10 @@ fn parse_joint(
     words.keyword("OFFSET", "the keyword OFFSET")?;
     let mut offset = [0.0; 3];
     for part in &mut offset {
-        *part = words.finite("an offset")?;
+        *part = words.number("an offset")?;
     }
     words.keyword("CHANNELS", "the keyword CHANNELS")?;
-    let count: usize = words.number("a channel count")?;
+    let count: usize = words.parsed("a channel count")?;
     if count > 6 {
         return Err(words.error(BvhProblem::OutOfRange {
             what: "channel count",
@@ -207,79 +280,121 @@ fn parse_joint(
     }
     let mut channels = Vec::with_capacity(count);
     for _ in 0..count {
-        let word = words.next("a channel name")?;
-        let channel = Channel::from_name(word)
-            .ok_or_else(|| words.unexpected("a channel name such as Xrotation", word))?;
+        const EXPECTED: &str = "a channel name such as Xrotation";
+        words.next("a channel name")?;
+        let channel =
+            Channel::from_name(words.present()).ok_or_else(|| words.unexpected(EXPECTED))?;
         channels.push(channel);
     }
-    Ok(skeleton.push(name, parent, offset, &channels))
+    Ok(skeleton.push(&name, parent, offset, &channels))
 }
 
-/// The text's words with the line each stands on.
-struct Words<'a> {
-    rest: &'a str,
-    line: usize,
+/// The lines' words, one at a time.
+#[derive(Debug)]
+struct Words<L> {
+    lines: L,
+    /// The line under way.
+    text: String,
+    line_count: usize,
+    /// Where in the line the newest word lies.
+    word: Range<usize>,
 }
 
-impl<'a> Words<'a> {
-    fn new(text: &'a str) -> Self {
+impl<L: Iterator<Item: AsRef<str>>> Words<L> {
+    fn new(lines: L) -> Self {
         Self {
-            rest: text.trim_start_matches('\u{feff}'),
-            line: 1,
+            lines,
+            text: String::new(),
+            line_count: 0,
+            word: 0..0,
         }
     }
 
-    /// Skips white space, counting lines; true when a word follows.
-    fn peek(&mut self) -> Option<&'a str> {
-        let word_start = self.rest.trim_start();
-        let skipped = &self.rest[..self.rest.len() - word_start.len()];
-        self.line += skipped.bytes().filter(|byte| *byte == b'\n').count();
-        self.rest = word_start;
-        word_start.split_whitespace().next()
+    /// Line of the newest word, counted from 1.
+    fn line(&self) -> usize {
+        self.line_count.max(1)
     }
 
-    fn next(&mut self, expected: &'static str) -> Result<&'a str, BvhError> {
-        let word = self
-            .peek()
-            .ok_or_else(|| self.error(BvhProblem::Ended { expected }))?;
-        self.rest = &self.rest[word.len()..];
-        Ok(word)
+    /// Goes to the next word; false when there is none.
+    fn advance(&mut self) -> bool {
+        loop {
+            let rest = &self.text[self.word.end..];
+            let trimmed = rest.trim_start();
+            if let Some(word) = trimmed.split_whitespace().next() {
+                let start = self.text.len() - trimmed.len();
+                self.word = start..start + word.len();
+                return true;
+            }
+            let Some(next) = self.lines.next() else {
+                return false;
+            };
+            self.text.clear();
+            // A byte order mark may stand before everything else.
+            let is_first = self.line_count == 0;
+            self.text.push_str(match next.as_ref() {
+                text if is_first => text.trim_start_matches('\u{feff}'),
+                text => text,
+            });
+            self.word = 0..0;
+            self.line_count += 1;
+        }
+    }
+
+    /// The newest word.
+    fn present(&self) -> &str {
+        &self.text[self.word.clone()]
+    }
+
+    fn is(&self, keyword: &str) -> bool {
+        self.present().eq_ignore_ascii_case(keyword)
+    }
+
+    fn next(&mut self, expected: &'static str) -> Result<(), BvhError> {
+        if self.advance() {
+            Ok(())
+        } else {
+            Err(self.error(BvhProblem::Ended { expected }))
+        }
     }
 
     fn keyword(&mut self, keyword: &str, expected: &'static str) -> Result<(), BvhError> {
-        let word = self.next(expected)?;
-        if word.eq_ignore_ascii_case(keyword) {
+        self.next(expected)?;
+        if self.is(keyword) {
             Ok(())
         } else {
-            Err(self.unexpected(expected, word))
+            Err(self.unexpected(expected))
         }
     }
 
-    fn number<T: core::str::FromStr>(&mut self, expected: &'static str) -> Result<T, BvhError> {
-        let word = self.next(expected)?;
-        word.parse()
-            .ok()
-            .ok_or_else(|| self.unexpected(expected, word))
+    fn parsed<T: core::str::FromStr>(&mut self, expected: &'static str) -> Result<T, BvhError> {
+        self.next(expected)?;
+        let parsed = self.present().parse().ok();
+        parsed.ok_or_else(|| self.unexpected(expected))
     }
 
-    fn finite(&mut self, expected: &'static str) -> Result<f64, BvhError> {
-        let word = self.next(expected)?;
-        word.parse()
-            .ok()
+    fn number(&mut self, expected: &'static str) -> Result<f64, BvhError> {
+        self.next(expected)?;
+        self.present_number(expected)
+    }
+
+    /// The newest word as a finite number.
+    fn present_number(&self, expected: &'static str) -> Result<f64, BvhError> {
+        let parsed = self.present().parse().ok();
+        parsed
             .filter(|value: &f64| value.is_finite())
-            .ok_or_else(|| self.unexpected(expected, word))
+            .ok_or_else(|| self.unexpected(expected))
     }
 
-    fn unexpected(&self, expected: &'static str, word: &str) -> BvhError {
+    fn unexpected(&self, expected: &'static str) -> BvhError {
         self.error(BvhProblem::Unexpected {
             expected,
-            found: word.chars().take(40).collect(),
+            found: self.present().chars().take(40).collect(),
         })
     }
 
     fn error(&self, problem: BvhProblem) -> BvhError {
         BvhError {
-            line: self.line,
+            line: self.line(),
             problem,
         }
     }
@@ -326,93 +441,5 @@ fn write_joint(text: &mut String, skeleton: &Skeleton, index: usize, depth: usiz
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::random::RandomStream;
-
-    const SMALL: &str = "HIERARCHY\nROOT Hips\n{\n  OFFSET 0 0 0\n  CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation\n  JOINT RightHand\n  {\n    OFFSET -50 40 0\n    CHANNELS 3 Yrotation Xrotation Zrotation\n    End Site\n    {\n      OFFSET -10 0 0\n    }\n  }\n}\nMOTION\nFrames: 2\nFrame Time: 0.008\n0 95 0 0 0 0 1 2 3\n0 95 0 0 0 0 1.5 -2e1 3\n";
-
-    fn check_error(text: &str, line: usize, message: &str) {
-        let error = Bvh::parse(text).unwrap_err();
-        assert_eq!(error.line, line, "{error}");
-        assert!(error.to_string().contains(message), "{error}");
-    }
-
-    #[test]
-    fn a_small_file_is_read_as_written() {
-        let bvh = Bvh::parse(SMALL).unwrap();
-        assert_eq!(bvh.frame_count(), 2);
-        assert_eq!(bvh.skeleton.channel_count(), 9);
-        assert_eq!(bvh.skeleton.joints()[1].parent, Some(0));
-        assert_eq!(bvh.frames().count(), 2);
-        assert!((bvh.values[16] + 20.0).abs() < 1e-15);
-        assert_eq!(Bvh::parse(&bvh.to_text()).unwrap(), bvh);
-    }
-
-    #[test]
-    fn windows_line_ends_and_a_byte_order_mark_change_nothing() {
-        let windows = format!("\u{feff}{}", SMALL.replace('\n', "\r\n"));
-        assert_eq!(Bvh::parse(&windows), Bvh::parse(SMALL));
-    }
-
-    #[test]
-    fn errors_name_line_and_cause() {
-        check_error("", 1, "expected the keyword HIERARCHY");
-        check_error(&SMALL.replace("-50", "west"), 8, "found \"west\"");
-        check_error(&SMALL.replace("Yrotation X", "Yaw X"), 9, "channel name");
-        check_error(&SMALL.replace("0.008", "0"), 18, "frame time 0 is outside");
-        check_error(&SMALL.replace("-2e1", "NaN"), 20, "a channel value");
-        check_error(&SMALL.replace(": 2", ": 3"), 17, "18 values found");
-        check_error(&SMALL.replace("CHANNELS 3", "CHANNELS 7"), 9, "0..=6");
-        check_error(&SMALL[..60], 5, "the end of the text");
-        let huge = SMALL.replace(": 2", ": 18446744073709551615");
-        check_error(&huge, 17, "frames of 9 values");
-    }
-
-    #[test]
-    fn deep_nesting_ends_in_an_error_not_in_an_overflow() {
-        let joint = "JOINT a { OFFSET 0 0 0 CHANNELS 0 ";
-        let deep = format!(
-            "HIERARCHY\nROOT{}",
-            joint[5..].to_owned() + &joint.repeat(5000)
-        );
-        check_error(&deep, 2, "joint count 1025 is outside 1..=1024");
-    }
-
-    #[test]
-    fn a_hundred_thousand_mutations_never_panic() {
-        let mut stream = RandomStream::new(20, "bvh mutation");
-        let pieces = [
-            "{", "}", "\n", " ", "-", "1e999", "End Site", "JOINT x", "\u{e9}", "0",
-        ];
-        let below = |stream: &mut RandomStream, bound: usize| {
-            usize::try_from(stream.next_u64() % bound as u64).unwrap()
-        };
-        let mut refused_count = 0;
-        for _ in 0..100_000 {
-            let mut bytes = SMALL.as_bytes().to_vec();
-            for _ in 0..=below(&mut stream, 4) {
-                let at = below(&mut stream, bytes.len());
-                match below(&mut stream, 4) {
-                    0 => bytes[at] = (stream.next_u64() & 0x7f) as u8,
-                    1 => bytes.truncate(at + 1),
-                    2 => drop(bytes.drain(at..(at + below(&mut stream, 30)).min(bytes.len()))),
-                    _ => {
-                        let piece = pieces[below(&mut stream, pieces.len())].bytes();
-                        drop(bytes.splice(at..at, piece));
-                    }
-                }
-                bytes.push(b'\n');
-            }
-            let text = String::from_utf8_lossy(&bytes);
-            match Bvh::parse(&text) {
-                Ok(bvh) => assert_eq!(bvh.values.len() % bvh.skeleton.channel_count(), 0),
-                Err(error) => {
-                    assert!(error.line <= 1 + text.lines().count());
-                    refused_count += 1;
-                }
-            }
-        }
-        assert!(refused_count > 50_000, "{refused_count} refused");
-    }
-}
+#[path = "bvh_tests.rs"]
+mod tests;

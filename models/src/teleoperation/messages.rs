@@ -1,69 +1,10 @@
-//! What the three roles tell each other. Layout only: no behaviour, no units other than SI.
-//!
-//! **Chain order.** Every seven-joint array lists the joints from the body to the hand:
-//! J1, J2, J7, J3, J4, J5, J6 in the maker's numbering. The arm's seventh axis is the *third* of
-//! the chain. The guided-motion protocol of the real controller carries J1..J6 and then J7 as
-//! an external axis; [`CHAIN_TO_MAKER`] converts.
+//! What the human tells the controller. Layout only: no behaviour, no units other than SI. What
+//! controller and robot tell each other is in [`crate::egm::messages`].
 
 use bytemuck::{Pod, Zeroable};
-use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion, Vector3};
 
 use crate::message::Message;
-
-/// Joints of one arm.
-pub const JOINT_COUNT: usize = 7;
-
-/// One value per joint in chain order.
-pub type Joints = [f64; JOINT_COUNT];
-
-/// The maker's joint number (1..=7) of each place in the chain.
-pub const CHAIN_TO_MAKER: [usize; JOINT_COUNT] = [1, 2, 7, 3, 4, 5, 6];
-
-/// A frame seen from another, as it travels: plain numbers, which may be nonsense.
-///
-/// Kinematics computes with [`Isometry3`], which is always a rigid motion; [`Pose::isometry`]
-/// is the gate between the two.
-#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-#[repr(C)]
-pub struct Pose {
-    /// Origin, metres.
-    pub position_m: [f64; 3],
-    /// Rotation as a quaternion, scalar part first (Hamilton convention, active); of unit length
-    /// in every message this crate sends.
-    pub quaternion_wxyz: [f64; 4],
-}
-
-impl Pose {
-    /// Largest magnitude of any number of a pose: far beyond any robot or person, far below
-    /// where arithmetic overflows.
-    pub const MAGNITUDE_MAX: f64 = 1e6;
-
-    /// The rigid motion these numbers stand for; a quaternion of another length is normalised.
-    ///
-    /// `None` when a number is none or beyond [`Pose::MAGNITUDE_MAX`], or the quaternion is
-    /// shorter than its reciprocal and so has no direction to speak of.
-    pub fn isometry(&self) -> Option<Isometry3<f64>> {
-        let [w, x, y, z] = self.quaternion_wxyz;
-        let mut numbers = self.position_m.iter().chain(&self.quaternion_wxyz);
-        if !numbers.all(|number| number.abs() <= Self::MAGNITUDE_MAX) {
-            return None;
-        }
-        let rotation =
-            UnitQuaternion::try_new(Quaternion::new(w, x, y, z), Self::MAGNITUDE_MAX.recip())?;
-        let translation = Translation3::from(Vector3::from(self.position_m));
-        Some(Isometry3::from_parts(translation, rotation))
-    }
-}
-
-impl From<Isometry3<f64>> for Pose {
-    fn from(isometry: Isometry3<f64>) -> Self {
-        let rotation = isometry.rotation;
-        Self {
-            position_m: isometry.translation.vector.into(),
-            quaternion_wxyz: [rotation.w, rotation.i, rotation.j, rotation.k],
-        }
-    }
-}
+use crate::yumi::Pose;
 
 /// Human to controller: where root and hands are.
 ///
@@ -73,7 +14,7 @@ impl From<Isometry3<f64>> for Pose {
 pub struct HumanFrame {
     /// Grid point of the capture, counted from its start; a skipped point leaves a gap.
     pub frame_index: u64,
-    /// Time of this frame since the motion's start, on the motion's own time axis: the same on
+    /// Time of this frame since the capture's start, on the motion's own time axis: the same on
     /// every host.
     pub source_time_ns: i64,
     /// Pelvis.
@@ -90,125 +31,9 @@ impl Message for HumanFrame {
 
 const _: () = assert!(size_of::<HumanFrame>() == 184);
 
-/// Desired motion of one arm.
-#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-#[repr(C)]
-pub struct ArmCommand {
-    /// Desired joint positions, chain order.
-    pub position_rad: Joints,
-    /// Desired joint speeds, chain order; zero without feed-forward.
-    pub speed_rad_per_s: Joints,
-}
-
-/// Controller to robot: where both arms shall be.
-#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-#[repr(C)]
-pub struct JointCommand {
-    /// The human frame this command answers.
-    pub frame_index: u64,
-    /// [`HumanFrame::source_time_ns`] of that frame.
-    pub source_time_ns: i64,
-    /// Right arm.
-    pub right: ArmCommand,
-    /// Left arm.
-    pub left: ArmCommand,
-    /// Bits below; all others are zero.
-    pub flags: u32,
-    /// Zero.
-    pub reserved: u32,
-}
-
-impl JointCommand {
-    /// No joint position reaches the right hand's target: the right arm holds.
-    pub const RIGHT_UNREACHABLE: u32 = 1;
-    /// As [`JointCommand::RIGHT_UNREACHABLE`], for the left arm.
-    pub const LEFT_UNREACHABLE: u32 = 1 << 1;
-    /// The right arm is on its way to the target but not there: a speed or position limit binds.
-    pub const RIGHT_LIMITED: u32 = 1 << 2;
-    /// As [`JointCommand::RIGHT_LIMITED`], for the left arm.
-    pub const LEFT_LIMITED: u32 = 1 << 3;
-    /// A hand moved farther in one frame than the mapping allows; the target follows slowly.
-    pub const JUMP_LIMITED: u32 = 1 << 4;
-
-    /// True when at least one arm's target is out of reach.
-    pub const fn is_unreachable(&self) -> bool {
-        self.flags & (Self::RIGHT_UNREACHABLE | Self::LEFT_UNREACHABLE) != 0
-    }
-}
-
-impl Message for JointCommand {
-    const NAME: &'static str = "hil.JointCommand.v1";
-}
-
-const _: () = assert!(size_of::<JointCommand>() == 248);
-
-/// State of one arm.
-#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-#[repr(C)]
-pub struct ArmStatus {
-    /// Joint positions, chain order.
-    pub measured_rad: Joints,
-    /// The reference the servo follows, chain order.
-    pub reference_rad: Joints,
-    /// Tool centre point (the flange frame `tool0`) in the robot's body frame: x forward, y to
-    /// the robot's left, z up.
-    pub tool: Pose,
-}
-
-/// Robot to controller: where both arms are.
-#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-#[repr(C)]
-pub struct JointStatus {
-    /// Servo cycle, counted from the robot's start; a skipped cycle leaves a gap.
-    pub cycle_index: u64,
-    /// [`JointCommand::frame_index`] of the reference in use; meaningless without
-    /// [`JointStatus::HAS_REFERENCE`].
-    pub reference_frame_index: u64,
-    /// Time since the reference in use arrived at the robot; without
-    /// [`JointStatus::HAS_REFERENCE`], since the robot's start.
-    pub reference_age_ns: i64,
-    /// Right arm.
-    pub right: ArmStatus,
-    /// Left arm.
-    pub left: ArmStatus,
-    /// Bits below; all others are zero.
-    pub flags: u32,
-    /// Zero.
-    pub reserved: u32,
-}
-
-impl JointStatus {
-    /// At least one command has arrived since the robot's start.
-    pub const HAS_REFERENCE: u32 = 1;
-    /// Commands came before and have stopped: the robot holds the last reference.
-    pub const HOLDING: u32 = 1 << 1;
-    /// A joint of some arm stands at its position limit.
-    pub const AT_POSITION_LIMIT: u32 = 1 << 2;
-    /// The servo wanted to go faster than a joint of some arm can.
-    pub const SPEED_LIMITED: u32 = 1 << 3;
-
-    /// True when the robot holds the last reference because commands stopped.
-    pub const fn is_holding(&self) -> bool {
-        self.flags & Self::HOLDING != 0
-    }
-}
-
-impl Message for JointStatus {
-    const NAME: &'static str = "hil.JointStatus.v1";
-}
-
-const _: () = assert!(size_of::<JointStatus>() == 368);
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn the_chain_lists_every_joint_once() {
-        let mut numbers = CHAIN_TO_MAKER;
-        numbers.sort_unstable();
-        assert_eq!(numbers, [1, 2, 3, 4, 5, 6, 7]);
-    }
 
     #[test]
     fn messages_survive_their_bytes() {
@@ -218,39 +43,5 @@ mod tests {
         let bytes = bytemuck::bytes_of(&frame).to_vec();
         let back: HumanFrame = bytemuck::pod_read_unaligned(&bytes);
         assert_eq!(back, frame);
-    }
-
-    const POSE: Pose = Pose {
-        position_m: [1.0, -2.0, 3.0],
-        quaternion_wxyz: [0.5, -0.5, 0.5, -0.5],
-    };
-
-    #[test]
-    fn a_pose_is_a_rigid_motion_and_back_whatever_its_quaternions_length() {
-        let isometry = POSE.isometry().unwrap();
-        assert_eq!(Pose::from(isometry), POSE);
-        let long = Pose {
-            quaternion_wxyz: POSE.quaternion_wxyz.map(|part| part * 3.0),
-            ..POSE
-        };
-        assert!(
-            long.isometry()
-                .unwrap()
-                .rotation
-                .angle_to(&isometry.rotation)
-                < 1e-15
-        );
-    }
-
-    #[test]
-    fn numbers_that_are_no_pose_are_refused() {
-        for nonsense in [f64::NAN, f64::INFINITY, 1e300] {
-            let (mut moved, mut turned) = (POSE, POSE);
-            moved.position_m[1] = nonsense;
-            turned.quaternion_wxyz[0] = nonsense;
-            assert_eq!(moved.isometry(), None);
-            assert_eq!(turned.isometry(), None);
-        }
-        assert_eq!(Pose::zeroed().isometry(), None);
     }
 }

@@ -1,53 +1,68 @@
 //! Case study 2: human motion drives a dual-arm `YuMi` (Lv et al., sections II.C and III.C).
 //!
 //! ```text
-//! human --human/frame--> controller --arm/command--> robot
-//!                             ^-------arm/status-------'
+//! human --human/frame--> controller --egm/{right,left}/command--> robot
+//!                             |  ^---egm/{right,left}/feedback----'  |
+//!                             '---------motion/request-------->      |
+//!                                <------motion/response--------------'
 //! ```
 //!
 //! A person swings the right arm from side to side, 125 frames a second. The controller maps the
-//! hand to a tool pose, the tool pose to joints, and commands the robot, whose servo follows by
-//! the published law of externally guided motion. Read in this order:
+//! hand to a tool pose, the tool pose to joints, and commands each arm by externally guided
+//! motion (EGM); it asks the robot's motion server to start it. The robot is a simulated maker's
+//! controller per arm: when the network is silent for too long, the session ends, and what follows
+//! is up to settings on both sides. Read in this order:
 //!
-//! 1. [`messages`]: what the roles tell each other.
+//! 1. [`messages`] and [`crate::egm::messages`]: what the roles tell each other.
 //! 2. [`motion`] with [`swing`], [`bvh`], [`skeleton`]: where the hand is.
-//! 3. [`mapping`], [`arm`], [`inverse`]: from the hand to the joints.
-//! 4. [`servo`]: from the command to the motion.
+//! 3. [`mapping`] with [`crate::yumi`]: from the hand to the joints.
+//! 4. [`crate::egm::controller`]: from the commands to the motion.
 //! 5. `score`: what the robot made of it.
+//! 6. [`experiment`]: thousands of loops over channels that a table names, in virtual time.
 //!
 //! ```
 //! use std::collections::BTreeMap;
 //! use std::time::Duration;
 //!
 //! use hil_models::case_study::CaseStudy;
+//! use hil_models::egm::parameters::EgmParameters;
 //! use hil_models::simulation::Simulation;
 //! use hil_models::teleoperation::{Teleoperation, TeleoperationParameters};
 //!
-//! let parameters = TeleoperationParameters { servo_gain_per_s: 20.0, ..Default::default() };
+//! let parameters = TeleoperationParameters {
+//!     egm: EgmParameters { position_gain_per_s: Some(5.0), ..Default::default() },
+//!     ..Default::default()
+//! };
 //! let case = Teleoperation::new(parameters, 1)?;
-//! let result = Simulation::new(&case, BTreeMap::new())?.run(Duration::from_secs(10))?;
+//! let result = Simulation::new(&case, BTreeMap::new())?.run(Duration::from_secs(12))?;
 //! let score = case.score(&result.log);
 //! let lag_ms = score.get("tracking_lag_ms").and_then(|metric| metric.value);
-//! assert!(lag_ms.is_some_and(|lag_ms| (lag_ms - 50.0).abs() < 8.0));
+//! // 195 ms by the control law and four cycles until the motion is measured.
+//! assert!(lag_ms.is_some_and(|lag_ms| (lag_ms - 211.0).abs() < 8.0));
+//! assert!(case.replay(&result.log).is_some_and(|replay| replay.is_identical()));
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 //!
-//! This first form has no guided-motion session: no time-out, no re-activation, no message queue
-//! on the robot's side. A silent network makes the robot hold; it never stops the motion for good.
+//! The robot writes everything it hears to the record. From that, [`CaseStudy::replay`] lets a
+//! fresh robot move again, in virtual time, and finds the same joints to the last bit.
 
-pub mod arm;
 pub mod bvh;
 mod controller;
+pub mod experiment;
+mod follower;
 mod human;
-pub mod inverse;
 pub mod mapping;
 pub mod messages;
 pub mod motion;
+mod motion_client;
+mod motion_path;
+mod motion_server;
 mod parameters;
+mod replay;
 mod robot;
 mod score;
-mod series;
-pub mod servo;
+#[cfg(test)]
+mod session_tests;
 pub mod skeleton;
 pub mod swing;
 #[cfg(test)]
@@ -55,27 +70,52 @@ mod tests;
 
 use crate::case_study::{CaseStudy, ChannelSpec, ParameterError, Score};
 use crate::component::{Role, into_role};
+use crate::egm::messages::{
+    EgmArrival, EgmCommand, EgmEvent, EgmFeedback, MotionArrival, MotionRequest, MotionResponse,
+};
+use crate::egm::parameters::ControllerSettings;
+use crate::plot::PlotSeries;
 use crate::random::RandomStream;
+use crate::replay::Replay;
 use crate::run_log::RunLog;
+use crate::study::{Batch, into_batch};
 use crate::teleoperation::controller::Controller;
+use crate::teleoperation::experiment::{Calibration, MotionLossStudy};
 use crate::teleoperation::human::Human;
-use crate::teleoperation::messages::{HumanFrame, JointCommand, JointStatus};
+use crate::teleoperation::messages::HumanFrame;
 use crate::teleoperation::motion::{Motion, Player};
 use crate::teleoperation::robot::Robot;
 
-pub use crate::teleoperation::parameters::{LeftArm, TeleoperationParameters};
+pub use crate::teleoperation::parameters::{
+    EgmStartRequest, LeftArm, ResumePolicy, SendPolicy, TeleoperationParameters,
+};
 
 /// Channel from human to controller.
 pub const HUMAN_FRAME: &str = "human/frame";
-/// Channel from controller to robot: the hop under test.
-pub const ARM_COMMAND: &str = "arm/command";
-/// Channel from robot to controller.
-pub const ARM_STATUS: &str = "arm/status";
+/// Channel from controller to robot: commands of the right arm, the hop under test.
+pub const EGM_RIGHT_COMMAND: &str = "egm/right/command";
+/// Channel from controller to robot: commands of the left arm.
+pub const EGM_LEFT_COMMAND: &str = "egm/left/command";
+/// Channel from controller to robot: requests to the motion server.
+pub const MOTION_REQUEST: &str = "motion/request";
+/// Channel from robot to controller: the right arm, every cycle.
+pub const EGM_RIGHT_FEEDBACK: &str = "egm/right/feedback";
+/// Channel from robot to controller: the left arm, every cycle.
+pub const EGM_LEFT_FEEDBACK: &str = "egm/left/feedback";
+/// Channel from robot to controller: answers of the motion server.
+pub const MOTION_RESPONSE: &str = "motion/response";
+/// Channel from robot to the record alone: what happened to the sessions.
+pub const EGM_EVENT: &str = "egm/event";
+/// Channel from robot to the record alone: every command as it arrived.
+pub const EGM_RECEIVED: &str = "egm/received";
+/// Channel from robot to the record alone: every request as it arrived.
+pub const MOTION_RECEIVED: &str = "motion/received";
 
 /// The case study.
 #[derive(Debug, Clone)]
 pub struct Teleoperation {
     parameters: TeleoperationParameters,
+    settings: ControllerSettings,
     motion: Motion,
     seed: u64,
 }
@@ -98,6 +138,7 @@ impl Teleoperation {
             self.parameters.loop_variation_ratio,
             RandomStream::new(self.seed, "teleoperation human"),
         )
+        .starting_at(self.parameters.motion_start_s)
     }
 }
 
@@ -107,9 +148,24 @@ impl CaseStudy for Teleoperation {
     const ROLES: &'static [&'static str] = &["human", "controller", "robot"];
     const CHANNELS: &'static [ChannelSpec] = &[
         ChannelSpec::of::<HumanFrame>(HUMAN_FRAME, "human", "controller"),
-        ChannelSpec::of::<JointCommand>(ARM_COMMAND, "controller", "robot"),
-        ChannelSpec::of::<JointStatus>(ARM_STATUS, "robot", "controller"),
+        ChannelSpec::of::<EgmCommand>(EGM_RIGHT_COMMAND, "controller", "robot"),
+        ChannelSpec::of::<EgmCommand>(EGM_LEFT_COMMAND, "controller", "robot"),
+        ChannelSpec::of::<MotionRequest>(MOTION_REQUEST, "controller", "robot"),
+        ChannelSpec::of::<EgmFeedback>(EGM_RIGHT_FEEDBACK, "robot", "controller"),
+        ChannelSpec::of::<EgmFeedback>(EGM_LEFT_FEEDBACK, "robot", "controller"),
+        ChannelSpec::of::<MotionResponse>(MOTION_RESPONSE, "robot", "controller"),
+        ChannelSpec::recorded::<EgmEvent>(EGM_EVENT, "robot"),
+        ChannelSpec::recorded::<EgmArrival>(EGM_RECEIVED, "robot"),
+        ChannelSpec::recorded::<MotionArrival>(MOTION_RECEIVED, "robot"),
     ];
+    const SERIES: &'static [&'static str] = &[
+        "fig6-input",
+        "fig7-9-tool-y",
+        "fig10-joints",
+        "fig11-joint-error",
+        "motion-loops",
+    ];
+    const CALIBRATED_FIGURES: &'static [&'static str] = &["mlr"];
     type Parameters = TeleoperationParameters;
 
     fn read_files(
@@ -121,9 +177,11 @@ impl CaseStudy for Teleoperation {
 
     fn new(parameters: Self::Parameters, seed: u64) -> Result<Self, ParameterError> {
         parameters.check()?;
+        let settings = parameters.controller_settings()?;
         let motion = parameters.motion()?;
         Ok(Self {
             parameters,
+            settings,
             motion,
             seed,
         })
@@ -136,12 +194,35 @@ impl CaseStudy for Teleoperation {
                 self.parameters.frame_period(),
             ))),
             "controller" => Some(into_role(Controller::new(self.parameters.clone()))),
-            "robot" => Some(into_role(Robot::new(&self.parameters))),
+            "robot" => Some(into_role(Robot::new(self.settings))),
             _ => None,
         }
     }
 
     fn score(&self, log: &RunLog) -> Score {
         score::score(self, log)
+    }
+
+    fn series(&self, log: &RunLog) -> Vec<PlotSeries> {
+        score::series(self, log)
+    }
+
+    fn replay(&self, log: &RunLog) -> Option<Replay> {
+        Some(replay::replay(self.settings, log))
+    }
+
+    fn calibration(
+        &self,
+        figure: &str,
+        value: f64,
+    ) -> Result<Option<Box<dyn Batch>>, ParameterError> {
+        if figure != "mlr" {
+            return Ok(None);
+        }
+        Ok(Some(into_batch(Calibration::new(self, value)?)))
+    }
+
+    fn study(&self) -> Result<Option<Box<dyn Batch>>, ParameterError> {
+        Ok(Some(into_batch(MotionLossStudy::new(self)?)))
     }
 }

@@ -5,6 +5,7 @@ use nalgebra::Isometry3;
 
 use crate::random::RandomStream;
 use crate::teleoperation::bvh::Bvh;
+use crate::teleoperation::skeleton::Skeleton;
 use crate::teleoperation::swing::Swing;
 
 /// Root and hands in the capture's frame: x to the person's left, y up, z forward.
@@ -39,7 +40,49 @@ pub enum MotionError {
     },
 }
 
-/// One loop of recorded motion.
+/// Where in a skeleton root and hands are: turns frames into poses, one at a time.
+#[derive(Debug, Clone)]
+pub struct Actor {
+    skeleton: Skeleton,
+    right_hand: usize,
+    left_hand: usize,
+    unit_m: f64,
+}
+
+impl Actor {
+    /// The person of `skeleton`, lengths times `unit_m`.
+    ///
+    /// # Errors
+    /// When a hand is missing.
+    pub fn new(skeleton: &Skeleton, unit_m: f64) -> Result<Self, MotionError> {
+        let find = |names: &[&str]| {
+            skeleton
+                .find(names)
+                .ok_or_else(|| MotionError::MissingJoint {
+                    names: names.join(", "),
+                })
+        };
+        Ok(Self {
+            right_hand: find(&RIGHT_HAND_NAMES)?,
+            left_hand: find(&LEFT_HAND_NAMES)?,
+            skeleton: skeleton.clone(),
+            unit_m,
+        })
+    }
+
+    /// Root and hands in the frame of these channel values, one per channel of the skeleton.
+    pub fn pose(&self, values: &[f64]) -> HumanPose {
+        let of = |joint| self.skeleton.pose(joint, values, self.unit_m);
+        HumanPose {
+            root: of(0),
+            right_hand: of(self.right_hand),
+            left_hand: of(self.left_hand),
+        }
+    }
+}
+
+/// One loop of recorded motion. It is repeated by time, not by frames: a loop need not be a whole
+/// number of frames long, and over hundreds of loops the rest would add up.
 #[derive(Debug, Clone)]
 pub struct Recording {
     poses: Vec<HumanPose>,
@@ -57,24 +100,13 @@ impl Recording {
     /// # Errors
     /// When a hand is missing or the file ends too early.
     pub fn new(bvh: &Bvh, period_s: f64, unit_m: f64) -> Result<Self, MotionError> {
-        let find = |names: &[&str]| {
-            bvh.skeleton
-                .find(names)
-                .ok_or_else(|| MotionError::MissingJoint {
-                    names: names.join(", "),
-                })
-        };
-        let (right, left) = (find(&RIGHT_HAND_NAMES)?, find(&LEFT_HAND_NAMES)?);
+        let actor = Actor::new(&bvh.skeleton, unit_m)?;
         let frame_time_s = bvh.frame_time_s;
         let poses: Vec<_> = bvh
             .frames()
             .enumerate()
             .take_while(|(index, _)| (*index as f64) * frame_time_s < period_s)
-            .map(|(_, values)| HumanPose {
-                root: bvh.skeleton.pose(0, values, unit_m),
-                right_hand: bvh.skeleton.pose(right, values, unit_m),
-                left_hand: bvh.skeleton.pose(left, values, unit_m),
-            })
+            .map(|(_, values)| actor.pose(values))
             .collect();
         if (poses.len() as f64 + 1.0) * frame_time_s < period_s - 1e-9 {
             return Err(MotionError::TooShort {
@@ -150,6 +182,7 @@ impl Motion {
 #[derive(Debug, Clone)]
 pub struct Player {
     motion: Motion,
+    start_s: f64,
     period_s: f64,
     variation_ratio: f64,
     random: RandomStream,
@@ -172,6 +205,7 @@ impl Player {
         let resting = motion.at(0.0, period_s);
         let mut player = Self {
             motion,
+            start_s: 0.0,
             period_s,
             variation_ratio,
             random,
@@ -186,8 +220,15 @@ impl Player {
         player
     }
 
-    /// The pose `time_s` after the motion's start. Calls come in non-decreasing time.
+    /// Rests where the motion begins until `start_s`.
+    #[must_use]
+    pub fn starting_at(self, start_s: f64) -> Self {
+        Self { start_s, ..self }
+    }
+
+    /// The pose at `time_s`. Calls come in non-decreasing time.
     pub fn at(&mut self, time_s: f64) -> HumanPose {
+        let time_s = (time_s - self.start_s).max(0.0);
         while time_s >= self.loop_start_s + self.loop_period_s {
             self.next_loop();
         }
@@ -259,6 +300,24 @@ mod tests {
     }
 
     #[test]
+    fn a_recorded_loop_of_504_frames_and_a_bit_is_repeated_by_time() {
+        // 4.033 s are 504.125 frames of 125 Hz: repeated by frames, 890 loops would end 0.89 s off.
+        let bvh = Bvh::parse(&swing_bvh(PERIOD_S, 0.1875, 125.0).unwrap()).unwrap();
+        let motion = Motion::Recorded(Recording::new(&bvh, PERIOD_S, UNIT_M).unwrap());
+        let random = RandomStream::new(0, "motion");
+        let (mut recorded, mut computed) =
+            (Player::new(motion, PERIOD_S, 0.0, random), player(0.0, 0));
+        for loop_index in [0, 1, 100, 889] {
+            for part in [0.1, 1.0, 2.5, 4.03] {
+                let time_s = f64::from(loop_index) * PERIOD_S + part;
+                let [a, b] = [&mut recorded, &mut computed]
+                    .map(|player| player.at(time_s).right_hand.translation.vector);
+                assert!((a - b).norm() < 1e-4, "{time_s} s: {}", (a - b).norm());
+            }
+        }
+    }
+
+    #[test]
     fn varied_loops_stay_continuous_and_scatter_as_told() {
         let mut player = player(0.01, 4);
         let (mut periods, mut before) = (Vec::new(), player.at(0.0));
@@ -288,6 +347,14 @@ mod tests {
         let (a, b, c) = (a.at(50.0), b.at(50.0), c.at(50.0));
         assert_eq!(a, b);
         assert_ne!(a, c);
+    }
+
+    #[test]
+    fn before_its_start_the_human_rests() {
+        let (mut late, mut prompt) = (player(0.01, 3).starting_at(2.0), player(0.01, 3));
+        assert_eq!(late.at(0.0), late.resting);
+        assert_eq!(late.at(1.999), late.resting);
+        assert_eq!(late.at(9.5), prompt.at(7.5));
     }
 
     #[test]

@@ -1,15 +1,18 @@
 //! `[case.parameters]` of the teleoperation case, their ranges, and the motion file. It opens no
-//! file: whoever can, hands the text in.
+//! file: whoever can, hands the text in. The robot's own settings are in
+//! [`crate::egm::parameters`].
 
 use core::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
 use crate::case_study::ParameterError;
+use crate::egm::messages::EgmStartParameters;
+use crate::egm::parameters::{ControllerSettings, EgmParameters};
 use crate::teleoperation::bvh::Bvh;
+use crate::teleoperation::experiment::TableParameters;
 use crate::teleoperation::mapping::MappingSettings;
 use crate::teleoperation::motion::{Motion, Recording};
-use crate::teleoperation::servo::ServoSettings;
 use crate::teleoperation::swing::Swing;
 
 /// What the left arm does.
@@ -23,6 +26,104 @@ pub enum LeftArm {
     Mirror,
 }
 
+/// When the controller sends commands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum SendPolicy {
+    /// One per human frame and arm.
+    #[default]
+    Frame,
+    /// One per feedback of the arm, as the maker recommends.
+    Coupled,
+    /// `send_hz` per second and arm, whatever comes in.
+    Free,
+}
+
+/// Where an arm goes when guided motion is back after a session ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ResumePolicy {
+    /// To where it would be had nothing happened, as fast as the robot lets it.
+    #[default]
+    Jump,
+    /// There too, but gliding from where the arm is within `blend_s`.
+    Blend,
+    /// Nowhere: hand and tool are taken anew where they are, and the motion goes on from there.
+    Reclutch,
+}
+
+/// `[case.parameters.egm_start]`: what the controller asks the robot to change when it asks for
+/// guided motion. A key left out keeps the robot's setting; ranges are those of
+/// [`EgmParameters`].
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct EgmStartRequest {
+    /// See [`EgmParameters::comm_timeout_s`].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub comm_timeout_s: Option<f64>,
+    /// See [`EgmParameters::condition_time_s`].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub condition_time_s: Option<f64>,
+    /// See [`EgmParameters::max_speed_deviation_deg_per_s`].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub max_speed_deviation_deg_per_s: Option<f64>,
+    /// See [`EgmParameters::max_position_deviation_deg`].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub max_position_deviation_deg: Option<f64>,
+    /// See [`EgmParameters::ramp_in_s`].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub ramp_in_s: Option<f64>,
+    /// See [`EgmParameters::position_correction_ratio`].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub position_correction_ratio: Option<f64>,
+    /// See [`EgmParameters::position_gain_per_s`].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub position_gain_per_s: Option<f64>,
+    /// See [`EgmParameters::low_pass_hz`].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub low_pass_hz: Option<f64>,
+}
+
+impl EgmStartRequest {
+    /// As it travels; a key left out is NaN.
+    pub(crate) fn message(&self) -> EgmStartParameters {
+        let keep = f64::NAN;
+        EgmStartParameters {
+            comm_timeout_s: self.comm_timeout_s.unwrap_or(keep),
+            condition_time_s: self.condition_time_s.unwrap_or(keep),
+            max_speed_deviation_rad_per_s: self
+                .max_speed_deviation_deg_per_s
+                .map_or(keep, f64::to_radians),
+            max_position_deviation_rad: self
+                .max_position_deviation_deg
+                .map_or(keep, f64::to_radians),
+            ramp_in_s: self.ramp_in_s.unwrap_or(keep),
+            position_correction_ratio: self.position_correction_ratio.unwrap_or(keep),
+            position_gain_per_s: self.position_gain_per_s.unwrap_or(keep),
+            low_pass_hz: self.low_pass_hz.unwrap_or(keep),
+        }
+    }
+
+    /// Checks the keys as if the robot had them: its ranges are the same.
+    fn check(&self) -> Result<(), ParameterError> {
+        let as_settings = EgmParameters {
+            comm_timeout_s: self.comm_timeout_s,
+            condition_time_s: self.condition_time_s,
+            max_speed_deviation_deg_per_s: self.max_speed_deviation_deg_per_s,
+            max_position_deviation_deg: self.max_position_deviation_deg,
+            ramp_in_s: self.ramp_in_s,
+            position_correction_ratio: self.position_correction_ratio,
+            position_gain_per_s: self.position_gain_per_s,
+            low_pass_hz: self.low_pass_hz,
+            ..EgmParameters::default()
+        };
+        as_settings.settings().map(|_| ()).map_err(|error| {
+            let key = error.key.trim_start_matches("egm.");
+            ParameterError::new(&format!("egm_start.{key}"), error.problem)
+        })
+    }
+}
+
 /// `[case.parameters]` of the teleoperation case. The defaults are the seed paper's figures where
 /// it gives them (section III.C) and the maker's defaults otherwise.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -30,6 +131,9 @@ pub enum LeftArm {
 pub struct TeleoperationParameters {
     /// Length of one motion loop, 0.5..=60 s.
     pub motion_period_s: f64,
+    /// How long the human rests before the motion begins, 0..=60 s: nobody swings before guided
+    /// motion runs, and an arm that engages in the midst of a swing works off its centre.
+    pub motion_start_s: f64,
     /// Frame rate of the motion capture, 10..=1000 Hz.
     pub rate_hz: f64,
     /// How far the synthetic human swings the hand to either side, 0.01..=0.4 m. Without effect
@@ -44,20 +148,33 @@ pub struct TeleoperationParameters {
     pub jump_max_m: f64,
     /// What the left arm does.
     pub left_arm: LeftArm,
-    /// True adds the joints' own speed to each command, so that the servo need not lag.
+    /// True adds the joints' own speed to each command, so that the robot need not lag.
     pub feed_forward: bool,
-    /// Position gain of the servo, 0..=20 1/s.
-    pub servo_gain_per_s: f64,
-    /// Corner of the servo's low-pass, 0..=100 Hz; 0 switches it off.
-    pub servo_low_pass_hz: f64,
-    /// Servo cycle, 1000..=100000 us; real controllers were seen at 4032.
-    pub servo_cycle_us: f64,
+    /// When commands are sent.
+    pub send: SendPolicy,
+    /// Commands per second and arm with `send = "free"`, 1..=1000 Hz; 250 when left out. Refused
+    /// with any other `send`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub send_hz: Option<f64>,
+    /// Where an arm goes when guided motion is back.
+    pub resume: ResumePolicy,
+    /// How long the way of `resume = "blend"` takes, 0.1..=10 s.
+    pub blend_s: f64,
+    /// How long it takes until an arm that went idle is asked to start again, 0..=60 s: with
+    /// `egm.restart = "external_trigger"` people and programs take 2 to 10.
+    pub trigger_after_s: f64,
     /// A BVH motion file to play instead of the synthetic swing. Whoever can open files puts its
     /// text in by [`TeleoperationParameters::read_files`].
     #[serde(skip_serializing_if = "Option::is_none")]
     pub motion_file: Option<String>,
     /// Length unit of the motion file, 0.0001..=1 m.
     pub motion_unit_m: f64,
+    /// The robot's settings.
+    pub egm: EgmParameters,
+    /// What the controller asks for instead of them.
+    pub egm_start: EgmStartRequest,
+    /// What `hil-runtime tables` and `calibrate` compute.
+    pub tables: TableParameters,
     /// Text of `motion_file`; never in a topology file.
     #[serde(skip)]
     pub motion_text: Option<String>,
@@ -67,6 +184,7 @@ impl Default for TeleoperationParameters {
     fn default() -> Self {
         Self {
             motion_period_s: 4.033,
+            motion_start_s: 2.0,
             rate_hz: 125.0,
             amplitude_m: 0.1875,
             loop_variation_ratio: 0.0,
@@ -74,15 +192,23 @@ impl Default for TeleoperationParameters {
             jump_max_m: 0.02,
             left_arm: LeftArm::Hold,
             feed_forward: false,
-            servo_gain_per_s: 5.0,
-            servo_low_pass_hz: 20.0,
-            servo_cycle_us: 4000.0,
+            send: SendPolicy::Frame,
+            send_hz: None,
+            resume: ResumePolicy::Jump,
+            blend_s: 1.0,
+            trigger_after_s: 3.0,
             motion_file: None,
             motion_unit_m: 0.01,
+            egm: EgmParameters::default(),
+            egm_start: EgmStartRequest::default(),
+            tables: TableParameters::default(),
             motion_text: None,
         }
     }
 }
+
+/// Commands per second and arm where nothing is said: as many as the robot has cycles.
+const SEND_HZ_DEFAULT: f64 = 250.0;
 
 /// Farthest a target may turn between two frames. At the default rate that is 12 rad/s, twice
 /// what a hand does.
@@ -116,6 +242,7 @@ impl TeleoperationParameters {
                 0.5..=60.0,
                 "0.5..=60",
             ),
+            ("motion_start_s", self.motion_start_s, 0.0..=60.0, "0..=60"),
             ("rate_hz", self.rate_hz, 10.0..=1000.0, "10..=1000"),
             ("amplitude_m", self.amplitude_m, 0.01..=0.4, "0.01..=0.4"),
             (
@@ -131,23 +258,13 @@ impl TeleoperationParameters {
                 "0.1..=2",
             ),
             ("jump_max_m", self.jump_max_m, 0.001..=1.0, "0.001..=1"),
+            ("send_hz", self.send_hz(), 1.0..=1000.0, "1..=1000"),
+            ("blend_s", self.blend_s, 0.1..=10.0, "0.1..=10"),
             (
-                "servo_gain_per_s",
-                self.servo_gain_per_s,
-                0.0..=20.0,
-                "0..=20",
-            ),
-            (
-                "servo_low_pass_hz",
-                self.servo_low_pass_hz,
-                0.0..=100.0,
-                "0..=100",
-            ),
-            (
-                "servo_cycle_us",
-                self.servo_cycle_us,
-                1000.0..=100_000.0,
-                "1000..=100000",
+                "trigger_after_s",
+                self.trigger_after_s,
+                0.0..=60.0,
+                "0..=60",
             ),
             (
                 "motion_unit_m",
@@ -159,7 +276,14 @@ impl TeleoperationParameters {
         for (key, value, allowed, allowed_text) in ranges {
             ParameterError::check(key, value, allowed, allowed_text)?;
         }
-        Ok(())
+        if let Some(send_hz) = self.send_hz
+            && self.send != SendPolicy::Free
+        {
+            let problem = format!("{send_hz} has no effect: it needs send = \"free\"");
+            return Err(ParameterError::new("send_hz", problem));
+        }
+        self.egm_start.check()?;
+        self.tables.check()
     }
 
     /// The motion to play.
@@ -179,17 +303,22 @@ impl TeleoperationParameters {
             .map_err(|error| motion_file_error(path, &error))
     }
 
+    /// Commands per second and arm with [`SendPolicy::Free`].
+    pub(crate) fn send_hz(&self) -> f64 {
+        self.send_hz.unwrap_or(SEND_HZ_DEFAULT)
+    }
+
     /// From frame to frame.
     pub(crate) fn frame_period(&self) -> Duration {
         Duration::from_secs_f64(1.0 / self.rate_hz)
     }
 
-    pub(crate) fn servo(&self) -> ServoSettings {
-        ServoSettings {
-            gain_per_s: self.servo_gain_per_s,
-            low_pass_hz: self.servo_low_pass_hz,
-            cycle: Duration::from_secs_f64(self.servo_cycle_us * 1e-6),
-        }
+    /// The robot's settings in force.
+    ///
+    /// # Errors
+    /// The first key outside its range, as `egm.<key>`.
+    pub fn controller_settings(&self) -> Result<ControllerSettings, ParameterError> {
+        self.egm.settings()
     }
 
     pub(crate) fn mapping(&self, is_mirrored: bool) -> MappingSettings {
@@ -225,14 +354,22 @@ mod tests {
     #[test]
     fn each_number_outside_its_range_is_refused_by_name() {
         check_refused("motion_period_s", |p| p.motion_period_s = 0.0);
+        check_refused("motion_start_s", |p| p.motion_start_s = 61.0);
         check_refused("rate_hz", |p| p.rate_hz = f64::NAN);
         check_refused("amplitude_m", |p| p.amplitude_m = 0.5);
         check_refused("loop_variation_ratio", |p| p.loop_variation_ratio = -0.1);
         check_refused("mapping_scale_ratio", |p| p.mapping_scale_ratio = 3.0);
         check_refused("jump_max_m", |p| p.jump_max_m = 0.0);
-        check_refused("servo_gain_per_s", |p| p.servo_gain_per_s = 20.1);
-        check_refused("servo_low_pass_hz", |p| p.servo_low_pass_hz = -1.0);
-        check_refused("servo_cycle_us", |p| p.servo_cycle_us = 4.0);
+        check_refused("send_hz", |p| {
+            p.send = SendPolicy::Free;
+            p.send_hz = Some(0.0);
+        });
+        check_refused("send_hz", |p| p.send_hz = Some(250.0));
+        check_refused("blend_s", |p| p.blend_s = 11.0);
+        check_refused("trigger_after_s", |p| p.trigger_after_s = -1.0);
+        check_refused("egm_start.comm_timeout_s", |p| {
+            p.egm_start.comm_timeout_s = Some(0.0);
+        });
         check_refused("motion_unit_m", |p| p.motion_unit_m = f64::INFINITY);
         assert_eq!(TeleoperationParameters::default().check(), Ok(()));
     }

@@ -1,127 +1,161 @@
-//! The role "robot": both arms' servos at the robot's cycle. It has no session and no time-out:
-//! when commands stop it holds the last one and says so.
+//! The role "robot": two arms, each a controller of guided motion, and the motion server, all in
+//! one cycle. It computes no control law itself: see [`crate::egm::controller`].
 //!
-//! Within a cycle it works as the real controller does: move by the reference in use, report,
-//! then take the newest command for the next cycle. Commands that came in between are passed over.
+//! The cycle lies on an absolute grid. What arrived at `a` can act from the first grid point
+//! *later* than `a`; a call that comes late goes through every grid point in between, each with
+//! what had arrived before it. So the joints follow from start, settings and arrivals alone, and
+//! those are what the robot writes to the record.
 
 use core::time::Duration;
 
 use crate::component::{Component, Outbox};
-use crate::teleoperation::arm::{Arm, LEFT_START_RAD, RIGHT_START_RAD};
-use crate::teleoperation::messages::{ArmCommand, ArmStatus, JointCommand, JointStatus};
-use crate::teleoperation::parameters::TeleoperationParameters;
-use crate::teleoperation::servo::Servo;
+use crate::egm::controller::Controller;
+use crate::egm::messages::{
+    EgmArrival, EgmCommand, EgmEvent, EgmFeedback, MotionArrival, MotionRequest, MotionResponse,
+    Side,
+};
+use crate::egm::parameters::ControllerSettings;
+use crate::teleoperation::motion_server::MotionServer;
 use crate::time::{Instant, PeriodicTimer, duration_ns};
+use crate::yumi::Joints;
+use crate::yumi::arm::{Arm, LEFT_START_RAD, RIGHT_START_RAD};
 
-/// The reference counts as held once it is older than this many command periods.
-const HOLD_AFTER_PERIODS: u32 = 5;
+/// Where the arms are at the robot's start, right then left.
+const START_RAD: [Joints; 2] = [RIGHT_START_RAD, LEFT_START_RAD];
+
+/// The arms' kinematics, right then left.
+pub(crate) fn arms() -> [Arm; 2] {
+    [Arm::right(), Arm::left()]
+}
+
+crate::message_set! {
+    /// What the robot hears, in channel order.
+    pub(crate) enum RobotInput {
+        RightCommand(EgmCommand),
+        LeftCommand(EgmCommand),
+        Request(MotionRequest),
+    }
+}
+
+crate::message_set! {
+    /// What the robot says, in channel order.
+    pub(crate) enum RobotOutput {
+        RightFeedback(EgmFeedback),
+        LeftFeedback(EgmFeedback),
+        Response(MotionResponse),
+        Event(EgmEvent),
+        CommandArrived(EgmArrival),
+        RequestArrived(MotionArrival),
+    }
+}
 
 /// The role.
 #[derive(Debug)]
 pub(crate) struct Robot {
     timer: PeriodicTimer,
-    right: (Arm, Servo),
-    left: (Arm, Servo),
-    started: Instant,
-    newest_command: Option<(Instant, JointCommand)>,
-    reference: Option<(Instant, u64)>,
-    hold_after: Duration,
+    period: Duration,
+    started: Option<Instant>,
+    /// The next grid point to go through.
+    next_cycle: u64,
+    arms: [Arm; 2],
+    controllers: [Controller; 2],
+    server: MotionServer,
 }
 
 impl Robot {
     /// A robot at rest in its start posture.
-    pub(crate) fn new(parameters: &TeleoperationParameters) -> Self {
-        let settings = parameters.servo();
+    pub(crate) fn new(settings: ControllerSettings) -> Self {
+        let controller = |side: Side| Controller::new(side, settings, START_RAD[side.index()]);
         Self {
             timer: PeriodicTimer::new(settings.cycle),
-            right: (Arm::right(), Servo::new(settings, RIGHT_START_RAD)),
-            left: (Arm::left(), Servo::new(settings, LEFT_START_RAD)),
-            started: Instant::ZERO,
-            newest_command: None,
-            reference: None,
-            hold_after: parameters.frame_period() * HOLD_AFTER_PERIODS,
+            period: settings.cycle,
+            started: None,
+            next_cycle: 0,
+            arms: arms(),
+            controllers: Side::BOTH.map(controller),
+            server: MotionServer::new(arms(), settings.cycle),
         }
     }
 
-    fn status(&self, now: Instant, cycle_index: u64) -> JointStatus {
-        let (since, reference_frame_index) = self.reference.unwrap_or((self.started, 0));
-        let reference_age_ns = now.ns_since(since);
-        let has_reference = self.reference.is_some();
-        let is_holding = has_reference && reference_age_ns > duration_ns(self.hold_after);
-        let servos = [&self.right.1, &self.left.1];
-        let is_at_position_limit = servos.iter().any(|servo| servo.is_at_position_limit());
-        let is_speed_limited = servos.iter().any(|servo| servo.is_speed_limited());
-        let flags = [
-            (has_reference, JointStatus::HAS_REFERENCE),
-            (is_holding, JointStatus::HOLDING),
-            (is_at_position_limit, JointStatus::AT_POSITION_LIMIT),
-            (is_speed_limited, JointStatus::SPEED_LIMITED),
-        ]
-        .into_iter()
-        .filter_map(|(is_set, bit)| is_set.then_some(bit))
-        .sum();
-        JointStatus {
-            cycle_index,
-            reference_frame_index,
-            reference_age_ns,
-            right: arm_status(&self.right),
-            left: arm_status(&self.left),
-            flags,
+    fn grid_point(&self, start: Instant, index: u64) -> Instant {
+        let steps = i64::try_from(index).unwrap_or(i64::MAX);
+        let since_ns = duration_ns(self.period).saturating_mul(steps);
+        Instant::from_ns(start.as_ns().saturating_add(since_ns))
+    }
+
+    /// Goes through every grid point up to and including `now`.
+    fn advance(&mut self, now: Instant, out: &mut Outbox<RobotOutput>) {
+        let Some(start) = self.started else { return };
+        loop {
+            let at = self.grid_point(start, self.next_cycle);
+            if at > now {
+                break;
+            }
+            self.next_cycle += 1;
+            self.server.take_request(&mut self.controllers);
+            for controller in &mut self.controllers {
+                controller.cycle(at, &mut |event| out.send(RobotOutput::Event(event)));
+            }
+            self.server.answer(&self.controllers, &mut |response| {
+                out.send(RobotOutput::Response(response));
+            });
+        }
+    }
+
+    fn receive(&mut self, now: Instant, side: Side, command: &EgmCommand) -> RobotOutput {
+        // A refusal is counted by the controller and told by the next cycle's events.
+        let _told_later = self.controllers[side.index()].receive(now, command);
+        RobotOutput::CommandArrived(EgmArrival {
+            at_ns: now.as_ns(),
+            side: side.number(),
             reserved: 0,
-        }
+            command: *command,
+        })
     }
-}
 
-fn arm_status((arm, servo): &(Arm, Servo)) -> ArmStatus {
-    ArmStatus {
-        measured_rad: *servo.q_rad(),
-        reference_rad: servo.reference().position_rad,
-        tool: arm.tool(servo.q_rad()).into(),
+    fn feedback(&self, side: Side) -> EgmFeedback {
+        let controller = &self.controllers[side.index()];
+        let tool = self.arms[side.index()].tool(controller.measured_rad());
+        controller.feedback(&tool.into())
     }
-}
-
-/// Far beyond any joint, far below where the control law overflows.
-const MAGNITUDE_MAX: f64 = 1e6;
-
-/// A command of non-numbers, or so large that the law overflows, would poison the arm's state for
-/// ever; the robot does not take it.
-fn is_usable(command: &ArmCommand) -> bool {
-    let speeds = command.speed_rad_per_s.iter();
-    command
-        .position_rad
-        .iter()
-        .chain(speeds)
-        .all(|value| value.abs() <= MAGNITUDE_MAX)
 }
 
 impl Component for Robot {
-    type Input = JointCommand;
-    type Output = JointStatus;
+    type Input = RobotInput;
+    type Output = RobotOutput;
 
     fn on_start(&mut self, now: Instant) {
-        self.started = now;
         self.timer.start(now);
-        self.right.1.start(now);
-        self.left.1.start(now);
+        self.started = Some(now);
+        self.next_cycle = 0;
     }
 
-    fn on_message(&mut self, now: Instant, input: &JointCommand, _out: &mut Outbox<JointStatus>) {
-        if is_usable(&input.right) && is_usable(&input.left) {
-            self.newest_command = Some((now, *input));
-        }
-    }
-
-    fn on_tick(&mut self, now: Instant, out: &mut Outbox<JointStatus>) {
-        let Some(tick) = self.timer.poll(now) else {
-            return;
+    fn on_message(&mut self, now: Instant, input: &RobotInput, out: &mut Outbox<RobotOutput>) {
+        // First everything this message comes too late for.
+        self.advance(now, out);
+        let arrival = match input {
+            RobotInput::RightCommand(command) => self.receive(now, Side::Right, command),
+            RobotInput::LeftCommand(command) => self.receive(now, Side::Left, command),
+            RobotInput::Request(request) => {
+                let refused = self.server.receive(request, &self.controllers);
+                if let Some(response) = refused {
+                    out.send(RobotOutput::Response(response));
+                }
+                RobotOutput::RequestArrived(MotionArrival {
+                    at_ns: now.as_ns(),
+                    request: *request,
+                })
+            }
         };
-        self.right.1.advance(now);
-        self.left.1.advance(now);
-        out.send(self.status(now, tick.index));
-        if let Some((arrived, command)) = self.newest_command.take() {
-            self.right.1.set_reference(&command.right);
-            self.left.1.set_reference(&command.left);
-            self.reference = Some((arrived, command.frame_index));
+        out.send(arrival);
+    }
+
+    fn on_tick(&mut self, now: Instant, out: &mut Outbox<RobotOutput>) {
+        self.advance(now, out);
+        // A late robot reports its newest cycle only; the timer counts those it passed over.
+        if self.timer.poll(now).is_some() {
+            out.send(RobotOutput::RightFeedback(self.feedback(Side::Right)));
+            out.send(RobotOutput::LeftFeedback(self.feedback(Side::Left)));
         }
     }
 
@@ -133,3 +167,7 @@ impl Component for Robot {
         self.timer.skipped_total()
     }
 }
+
+#[cfg(test)]
+#[path = "robot_tests.rs"]
+mod tests;

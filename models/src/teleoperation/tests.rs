@@ -3,28 +3,31 @@
 use core::time::Duration;
 use std::collections::BTreeMap;
 
-use bytemuck::Zeroable;
 use nalgebra::Vector3;
 
 use super::*;
 use crate::link::bernoulli::BernoulliLink;
 use crate::link::{Fate, LinkModel};
-use crate::message::Message;
+use crate::measure::series;
 use crate::simulation::{Carrier, Simulation, SimulationResult};
-use crate::teleoperation::arm::{Arm, RIGHT_START_RAD};
-use crate::teleoperation::controller::Follower;
-use crate::teleoperation::inverse::Reach;
-use crate::teleoperation::messages::Joints;
+use crate::teleoperation::follower::Follower;
 use crate::time::Instant;
+use crate::yumi::Joints;
+use crate::yumi::arm::{Arm, RIGHT_START_RAD};
+use crate::yumi::inverse::Reach;
 
+/// A case with the maker's default gain and filter, without the lag between plan and measurement:
+/// what the published control law alone does.
 fn case(change: impl FnOnce(&mut TeleoperationParameters)) -> Teleoperation {
     let mut parameters = TeleoperationParameters::default();
+    parameters.egm.position_gain_per_s = Some(5.0);
+    parameters.egm.control_delay_cycles = Some(0);
     change(&mut parameters);
     Teleoperation::new(parameters, 11).unwrap()
 }
 
 fn run(case: &Teleoperation, link: Option<Box<dyn Carrier>>, duration_s: f64) -> SimulationResult {
-    let carriers = link.map(|link| (ARM_COMMAND.to_owned(), link));
+    let carriers = link.map(|link| (EGM_RIGHT_COMMAND.to_owned(), link));
     Simulation::new(case, carriers.into_iter().collect::<BTreeMap<_, _>>())
         .unwrap()
         .run(Duration::from_secs_f64(duration_s))
@@ -47,7 +50,10 @@ struct Tracked {
 }
 
 fn track(frame_count: u64, rate_hz: f64) -> Tracked {
-    let case = case(|parameters| parameters.rate_hz = rate_hz);
+    let case = case(|parameters| {
+        parameters.rate_hz = rate_hz;
+        parameters.motion_start_s = 0.0;
+    });
     let mut player = case.player();
     let (arm, frame_s) = (Arm::right(), 1.0 / rate_hz);
     let mut hand = player.at(0.0).right_hand;
@@ -58,18 +64,18 @@ fn track(frame_count: u64, rate_hz: f64) -> Tracked {
     let mut tracked = Tracked::default();
     for frame in 0..frame_count {
         hand = player.at(frame as f64 * frame_s).right_hand;
-        let answer = follower.follow(Some(&hand), frame_s, false);
+        let answer = follower.follow(Some(&hand), frame_s);
         tracked.frame_count += 1;
         tracked.failure_count += u64::from(answer.reach != Reach::Reached);
         // Every tenth frame is checked by the full pose: that doubles the work.
         if frame % 10 == 0 {
-            let tool = arm.tool(&answer.command.position_rad);
+            let tool = arm.tool(&answer.position_rad);
             let (target, _) = clutch.follow(Some(&hand));
             let apart_m = (tool.translation.vector - target.translation.vector).norm();
             tracked.error_m_max = tracked.error_m_max.max(apart_m);
         }
         if frame % 4033 == 0 {
-            tracked.at_same_phase.push(answer.command.position_rad);
+            tracked.at_same_phase.push(answer.position_rad);
         }
     }
     tracked
@@ -106,7 +112,7 @@ fn the_same_holds_at_250_hz() {
 #[test]
 fn at_the_default_gain_the_robot_lags_195_ms_and_executes_every_loop() {
     let case = case(|_| {});
-    let result = run(&case, None, 6.0 * 4.033);
+    let result = run(&case, None, 2.0 + 6.0 * 4.033);
     let figure = figures(&case, &result);
     assert!((figure("tracking_lag_ms") - 195.0).abs() <= 8.0);
     assert!((figure("joint_error_ratio") - 0.299).abs() <= 0.015);
@@ -120,7 +126,7 @@ fn at_the_default_gain_the_robot_lags_195_ms_and_executes_every_loop() {
 /// The entries of `log` published before `until_s`.
 fn beginning(log: &RunLog, until_s: f64) -> RunLog {
     let mut beginning = RunLog::default();
-    for channel in [HUMAN_FRAME, ARM_COMMAND, ARM_STATUS] {
+    for channel in [HUMAN_FRAME, EGM_RIGHT_COMMAND, EGM_RIGHT_FEEDBACK] {
         let messages = log.raw(channel).iter();
         for logged in
             messages.take_while(|logged| logged.envelope.published_ns as f64 <= until_s * 1e9)
@@ -153,15 +159,22 @@ fn scoring_twice_the_loops_takes_twice_the_work() {
 
 #[test]
 fn the_highest_gain_and_feed_forward_follow_as_the_control_law_says() {
-    let steep = case(|parameters| parameters.servo_gain_per_s = 20.0);
-    let figure = figures(&steep, &run(&steep, None, 20.0));
+    let duration_s = 2.0 + 5.0 * 4.033;
+    let steep = case(|parameters| parameters.egm.position_gain_per_s = Some(20.0));
+    let figure = figures(&steep, &run(&steep, None, duration_s));
     assert!((figure("tracking_lag_ms") - 50.0).abs() <= 8.0);
-    assert!((figure("joint_error_ratio") - 0.078).abs() <= 0.005);
+    // The law alone misses by 7.8 %. In virtual time every second command arrives on a grid point
+    // exactly and so waits a whole cycle for the next: 4 ms more of a period of 4.033 s.
+    let ratio = figure("joint_error_ratio");
+    assert!((ratio - 0.084).abs() <= 0.005, "{ratio}");
 
     let fed = case(|parameters| parameters.feed_forward = true);
-    let figure = figures(&fed, &run(&fed, None, 20.0));
+    let figure = figures(&fed, &run(&fed, None, duration_s));
     assert!(figure("tracking_lag_ms").abs() <= 8.0);
-    assert!(figure("joint_error_ratio") < 0.01);
+    // The law alone would stay below 1 %; what is left is the age of the newest command, 4 to 12
+    // ms between frame and cycle.
+    let ratio = figure("joint_error_ratio");
+    assert!(ratio < 0.02, "{ratio}");
     assert!(
         (figure("tool_y_m_peak_to_peak") / case(|_| {}).nominal_peak_to_peak_m() - 1.0).abs()
             < 0.02
@@ -172,7 +185,7 @@ fn the_highest_gain_and_feed_forward_follow_as_the_control_law_says() {
 fn bernoulli_loss_of_half_the_commands_loses_no_loop() {
     let case = case(|_| {});
     let link = BernoulliLink::new(Duration::ZERO, 0.5, RandomStream::new(1, "link")).unwrap();
-    let figure = figures(&case, &run(&case, Some(Box::new(link)), 8.0 * 4.033));
+    let figure = figures(&case, &run(&case, Some(Box::new(link)), 2.0 + 8.0 * 4.033));
     assert!((figure("motion_loops_sent_count") - 8.0).abs() < 0.5);
     assert!(figure("motion_loss_ratio").abs() < 1e-12);
 }
@@ -195,32 +208,37 @@ impl LinkModel for Outage {
 }
 
 #[test]
-fn an_outage_of_one_period_is_one_hold_and_one_lost_loop() {
-    let case = case(|_| {});
+fn an_outage_of_one_period_within_a_session_is_one_hold_and_one_lost_loop() {
+    let case = case(|parameters| parameters.egm.comm_timeout_s = Some(60.0));
     let outage = Outage {
-        from: Instant::from_ns(12_000_000_000),
-        until: Instant::from_ns(16_033_000_000),
+        from: Instant::from_ns(14_000_000_000),
+        until: Instant::from_ns(18_033_000_000),
     };
-    let figure = figures(&case, &run(&case, Some(Box::new(outage)), 8.0 * 4.033));
+    let duration_s = 2.0 + 8.0 * 4.033;
+    let figure = figures(&case, &run(&case, Some(Box::new(outage)), duration_s));
     assert!((figure("hold_count") - 1.0).abs() < 0.1);
     assert!((figure("motion_loops_executed_count") - 7.0).abs() < 0.1);
     assert!((figure("motion_loss_ratio") - 0.125).abs() < 1e-12);
-    // The hold begins five command periods after the last command.
-    let held_s = figure("hold_time_ratio") * 8.0 * 4.033;
-    assert!((held_s - (4.033 - 0.04)).abs() < 0.02, "{held_s}");
+    let held_s = figure("hold_time_ratio") * duration_s;
+    assert!((held_s - 4.033).abs() < 0.1, "{held_s}");
 }
 
 #[test]
 fn a_mirrored_left_arm_swings_opposite_without_failure() {
     let case = case(|parameters| parameters.left_arm = LeftArm::Mirror);
     let result = run(&case, None, 9.0);
-    let statuses: Vec<_> = result.log.messages::<JointStatus>(ARM_STATUS).collect();
-    let start = statuses[0].1;
-    for (_, status) in &statuses {
-        let right_m = status.right.tool.position_m[1] - start.right.tool.position_m[1];
-        let left_m = status.left.tool.position_m[1] - start.left.tool.position_m[1];
+    let lateral_m = |channel| {
+        let feedback = result.log.messages::<EgmFeedback>(channel);
+        let all: Vec<f64> = feedback.map(|(_, one)| one.tool.position_m[1]).collect();
+        let start = all[0];
+        all.into_iter().map(move |y| y - start)
+    };
+    let mut right_max_m = 0.0_f64;
+    for (right_m, left_m) in lateral_m(EGM_RIGHT_FEEDBACK).zip(lateral_m(EGM_LEFT_FEEDBACK)) {
         assert!((right_m + left_m).abs() < 2e-3, "{right_m} {left_m}");
+        right_max_m = right_max_m.max(right_m.abs());
     }
+    assert!(right_max_m > 0.1, "{right_max_m}");
     let figure = figures(&case, &result);
     assert!(figure("ik_failure_count") + figure("ik_limited_count") < 0.5);
 }
@@ -240,83 +258,6 @@ fn equal_seeds_give_equal_runs_and_unequal_seeds_do_not() {
     assert_ne!(with_seed(1).log, with_seed(2).log);
 }
 
-/// Everything one call of a role said.
-fn hear<M: Message>(role: &mut dyn Role, port: usize, message: &M) -> Vec<Vec<u8>> {
-    let mut said = Vec::new();
-    let mut emit = |_: usize, bytes: &[u8]| said.push(bytes.to_vec());
-    assert!(role.message(Instant::ZERO, port, bytemuck::bytes_of(message), &mut emit));
-    said
-}
-
-fn first_frame() -> HumanFrame {
-    let pose = case(|_| {}).player().at(0.0);
-    HumanFrame {
-        frame_index: 0,
-        source_time_ns: 0,
-        root: pose.root.into(),
-        right_hand: pose.right_hand.into(),
-        left_hand: pose.left_hand.into(),
-    }
-}
-
-fn first_status() -> JointStatus {
-    let mut robot = case(|_| {}).role("robot").unwrap();
-    let mut status = None;
-    robot.start(Instant::ZERO);
-    robot.tick(Instant::ZERO, &mut |_, bytes| {
-        status = Some(bytemuck::pod_read_unaligned(bytes));
-    });
-    status.unwrap()
-}
-
-#[test]
-fn the_controller_engages_on_a_sound_frame_after_a_sound_status() {
-    let mut controller = case(|_| {}).role("controller").unwrap();
-    controller.start(Instant::ZERO);
-    let (frame, status) = (first_frame(), first_status());
-    assert!(hear(controller.as_mut(), 0, &frame).is_empty());
-
-    let mut broken = status;
-    broken.right.measured_rad[3] = f64::NAN;
-    assert!(hear(controller.as_mut(), 1, &broken).is_empty());
-    assert!(hear(controller.as_mut(), 0, &frame).is_empty());
-
-    assert!(hear(controller.as_mut(), 1, &status).is_empty());
-    let mut broken = frame;
-    broken.right_hand.position_m[0] = f64::INFINITY;
-    assert!(hear(controller.as_mut(), 0, &broken).is_empty());
-    let said = hear(controller.as_mut(), 0, &frame);
-    let command: JointCommand = bytemuck::pod_read_unaligned(&said[0]);
-    for (commanded, start) in command.right.position_rad.iter().zip(&RIGHT_START_RAD) {
-        assert!((commanded - start).abs() < 1e-6);
-    }
-
-    // Once engaged, a broken frame holds the target and says so.
-    let said = hear(controller.as_mut(), 0, &broken);
-    let command: JointCommand = bytemuck::pod_read_unaligned(&said[0]);
-    assert_eq!(command.flags, JointCommand::JUMP_LIMITED);
-    assert!(command.right.position_rad.iter().all(|q| q.is_finite()));
-}
-
-#[test]
-fn a_command_of_nonsense_numbers_leaves_the_robot_where_it_is() {
-    let mut robot = case(|_| {}).role("robot").unwrap();
-    robot.start(Instant::ZERO);
-    for nonsense in [f64::NAN, f64::NEG_INFINITY, 1e300] {
-        let mut command = JointCommand::zeroed();
-        command.left.speed_rad_per_s[6] = nonsense;
-        assert!(hear(robot.as_mut(), 0, &command).is_empty());
-    }
-    for cycle in 0..100 {
-        let mut status: JointStatus = first_status();
-        robot.tick(Instant::from_ns(cycle * 4_000_000), &mut |_, bytes| {
-            status = bytemuck::pod_read_unaligned(bytes);
-        });
-        assert_eq!(status.flags, 0);
-        assert_eq!(status.right, first_status().right);
-    }
-}
-
 #[test]
 fn a_motion_file_drives_the_robot_as_the_synthetic_human_does() {
     let synthetic = case(|_| {});
@@ -327,8 +268,8 @@ fn a_motion_file_drives_the_robot_as_the_synthetic_human_does() {
     });
     let last = |case| {
         let result = run(case, None, 6.0);
-        let statuses = result.log.messages::<JointStatus>(ARM_STATUS);
-        Vector3::from(statuses.last().unwrap().1.right.tool.position_m)
+        let statuses = result.log.messages::<EgmFeedback>(EGM_RIGHT_FEEDBACK);
+        Vector3::from(statuses.last().unwrap().1.tool.position_m)
     };
     let apart_m = (last(&synthetic) - last(&recorded)).norm();
     assert!(apart_m < 1e-5, "{apart_m}");

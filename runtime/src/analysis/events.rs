@@ -3,23 +3,25 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use hil_models::case_study::{MessageRef, Score, ScoreEvent};
-use hil_models::measure::account::{MessageFate, MessageStory};
+use hil_models::case_study::{ChannelSpec, MessageRef, Score, ScoreEvent};
+use hil_models::measure::account::{Happening, MessageFate, MessageStory, Side};
 use hil_models::time::Instant;
 
+use super::outages::OutageStory;
 use super::records::RunRecords;
-use crate::report::score_event::{ExplainedEvent, ExplainedMessage, ScoreEvents};
+use crate::report::score_event::{EventOutage, ExplainedEvent, ExplainedMessage, ScoreEvents};
 use crate::report::summary::{ChannelSummary, LinkKind};
 use crate::report::terminal::duration_s;
 use crate::supervisor::RunResult;
 use crate::topology::{Channel, Topology};
 
-/// The events of `score` with the fates of their messages.
+/// The events of `score` with the fates of their messages and the outages before them.
 pub(super) fn explained(
     score: &Score,
     run: (&Topology, &RunResult),
     records: &RunRecords,
     channels: &[ChannelSummary],
+    (specs, outages): (&[ChannelSpec], &[OutageStory]),
 ) -> ScoreEvents {
     let mut wanted: BTreeMap<&str, BTreeSet<(u32, u64)>> = BTreeMap::new();
     for message in score.events.iter().flat_map(|event| &event.messages) {
@@ -44,7 +46,12 @@ pub(super) fn explained(
     let ways: BTreeMap<&str, Way<'_>> = ways.collect();
     let events = score.events.iter();
     ScoreEvents {
-        events: events.map(|event| explain(event, run, &ways)).collect(),
+        events: events
+            .map(|event| ExplainedEvent {
+                outages: outages_before(event, run, (specs, outages), &ways),
+                ..explain(event, run, &ways)
+            })
+            .collect(),
         dropped_count: score.events_dropped_count,
         clocks_differ: !result.has_one_clock,
     }
@@ -52,7 +59,10 @@ pub(super) fn explained(
 
 /// Start of the run on the clock of the channel's producer. Hosts begin milliseconds apart; where
 /// they read one clock, one beginning holds for all, lest an effect come before its cause.
-fn start_of((topology, result): (&Topology, &RunResult), channel: &Channel) -> Option<Instant> {
+pub(super) fn start_of(
+    (topology, result): (&Topology, &RunResult),
+    channel: &Channel,
+) -> Option<Instant> {
     let host = &topology.process(&channel.from)?.host;
     let starts = || result.spans.values().map(|span| span.0);
     let own = result.spans.get(host).map(|span| span.0);
@@ -84,9 +94,50 @@ fn explain(
         clock: process.map_or_else(|| "unknown".to_owned(), |process| process.host.clone()),
         severity: event.severity,
         what: event.what.clone(),
+        outages: Vec::new(),
         messages: messages.collect(),
         messages_dropped_count: event.messages_dropped_count,
     }
+}
+
+/// What the channels that `event` concerns went through when it happened.
+fn outages_before(
+    event: &ScoreEvent,
+    (topology, result): (&Topology, &RunResult),
+    (specs, stories): (&[ChannelSpec], &[OutageStory]),
+    ways: &BTreeMap<&str, Way<'_>>,
+) -> Vec<EventOutage> {
+    let host_of = |process: &str| topology.process(process).map(|one| &one.host);
+    let teller = topology.channel(event.clock_of);
+    let Some(here) = teller.and_then(|one| host_of(&one.from)) else {
+        return Vec::new();
+    };
+    let before = |spec: &ChannelSpec| {
+        let story = stories.iter().find(|one| one.channel == spec.name)?;
+        let channel = topology.channel(spec.name)?;
+        let is_here = |process: &str| host_of(process) == Some(here);
+        let is_consumers = channel.to.as_deref().is_some_and(is_here);
+        let is_producers = result.has_one_clock || is_here(&channel.from);
+        let lost_published_ns = ways
+            .get(spec.name)
+            .map_or_else(Vec::new, |way| way.lost_published_ns(event));
+        // A time compares only with times of its own clock.
+        let sides = [
+            is_consumers.then_some(Side::Consumer),
+            is_producers.then_some(Side::Producer),
+        ];
+        let mut sides = sides.into_iter().flatten().map(Some).chain([None]);
+        sides.find_map(|side| {
+            story.before(&Happening {
+                at: side.map(|side| (event.at, side)),
+                lost_published_ns: &lost_published_ns,
+            })
+        })
+    };
+    let concerned = event.concerned_channels(specs);
+    let mut outages: Vec<_> = concerned.into_iter().filter_map(before).collect();
+    EventOutage::put_own_channels_first(&mut outages, &event.what);
+    outages
 }
 
 fn unavailable(message: &MessageRef, why: &str) -> ExplainedMessage {
@@ -127,6 +178,16 @@ impl Way<'_> {
             words: self.words(story),
             ..unavailable(message, "")
         }
+    }
+
+    /// Publications of the messages that `event` names and that were lost on this channel.
+    fn lost_published_ns(&self, event: &ScoreEvent) -> Vec<i64> {
+        let messages = event.messages.iter();
+        let named = messages.filter(|message| message.channel == self.channel.name);
+        let stories =
+            named.filter_map(|message| self.stories.get(&(message.epoch, message.sequence)));
+        let lost = stories.filter(|story| story.fate.is_loss());
+        lost.filter_map(|story| story.published_ns).collect()
     }
 
     fn words(&self, story: &MessageStory) -> String {

@@ -14,7 +14,7 @@ use crate::report::summary::{
 };
 use crate::supervisor::event::{Event, ProcessStory};
 use crate::supervisor::{self, RunResult};
-use crate::topology::{Channel, Topology};
+use crate::topology::{Channel, Topology, Via};
 
 pub(super) fn run_facts(
     topology: &Topology,
@@ -37,9 +37,13 @@ pub(super) fn run_facts(
         ),
         (
             "records/",
-            "one record per message and stage; layout in the runtime's docs",
+            "one record per message and stage; layout in docs/run-folder.md",
         ),
         ("logs/", "what each process said on standard error"),
+        (
+            "events.log",
+            "what happened to the robot, one line each, with the outage before it",
+        ),
     ];
     RunFacts {
         name: result.folder.name(),
@@ -178,14 +182,16 @@ pub(super) fn channel_summary(
         name: channel.name.clone(),
         from: channel.from.clone(),
         to: channel.to.clone(),
-        link: match crossing.map(|crossing| crossing.impairment.is_some()) {
+        link: match crossing.map(|crossing| &crossing.link.via) {
             None if channel.is_recorded_only() => LinkKind::RecordOnly,
-            None => LinkKind::SharedMemory,
-            Some(false) => LinkKind::Udp,
-            Some(true) => LinkKind::Emulated,
+            None | Some(Via::SharedMemory) => LinkKind::SharedMemory,
+            Some(Via::Udp(_)) => LinkKind::Udp,
+            Some(Via::Tcp(_)) => LinkKind::Tcp,
+            Some(Via::Emulated(..)) => LinkKind::Emulated,
         },
         account: (records.has(&channel.name) && !channel.is_recorded_only())
             .then(|| records.account(topology, result, channel)),
+        outages: None,
         recorded: channel
             .is_recorded_only()
             .then(|| records.recorded(&channel.name))

@@ -2,22 +2,27 @@
 //! account of each channel, and lets the case score what the robot did.
 
 mod events;
+mod faces;
 mod figures;
-mod records;
+pub(crate) mod outages;
+pub(crate) mod records;
 
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
 use hil_models::case_study::Score;
-use hil_models::run_log::RunLog;
+use hil_models::measure::account::MessageFate;
 
 use figures::{channel_summary, process_summary, realtime_facts, run_event, run_facts};
+use outages::OutageStory;
 use records::RunRecords;
 
-use crate::registry::{CaseError, Registry};
+use crate::registry::{Case, CaseError, Registry};
+use crate::report::event_log;
 use crate::report::summary::{Fact, RunSummary, ScoreMetric, SummaryError};
 use crate::report::terminal::{self, Style};
+use crate::series;
 use crate::supervisor::RunResult;
 use crate::topology::Topology;
 
@@ -32,22 +37,6 @@ pub(crate) enum AnalysisError {
     Summary(#[from] SummaryError),
     #[error("cannot write {path}: {source}")]
     Write { path: PathBuf, source: io::Error },
-}
-
-/// What the case says of the run.
-pub(crate) fn score(
-    topology: &Topology,
-    registry: &Registry,
-    log: &RunLog,
-) -> Result<Score, CaseError> {
-    let Some((case, entry)) = topology
-        .case()
-        .and_then(|case| Some((case, registry.find(&case.name)?)))
-    else {
-        return Ok(Score::default());
-    };
-    let parameters = serde_json::to_value(&case.parameters).unwrap_or_default();
-    Ok(entry.make(parameters, topology.run().seed)?.score(log))
 }
 
 /// Draws up the summary of a finished run and writes it with its report into the run's folder.
@@ -85,16 +74,74 @@ pub(crate) fn conclude(
         .iter()
         .map(|channel| channel_summary(topology, result, channel, &records))
         .collect();
-    let score = score(topology, registry, records.log())?;
+    summary.faces = faces::face_summaries(topology, result, &records);
+    let outages = add_outages(&mut summary, (topology, result), &records);
+    let case = registry.make_case(topology)?;
+    let (specs, score) = match &case {
+        Some((entry, case)) => (entry.channels, case.score(records.log())),
+        None => (&[][..], Score::default()),
+    };
     summary.score = ScoreMetric::all_of(&score);
-    summary.score_events =
-        events::explained(&score, (topology, result), &records, &summary.channels);
+    summary.score_events = events::explained(
+        &score,
+        (topology, result),
+        &records,
+        &summary.channels,
+        (specs, &outages),
+    );
     add_warnings(&mut summary, result, &records);
+    if let Some((_, case)) = case {
+        write_series(&mut summary, result, case.as_ref(), records);
+    }
+    let path = result.folder.events();
+    let text = event_log::text(&summary.run.name, &summary.score_events);
+    fs::write(&path, text).map_err(|source| AnalysisError::Write { path, source })?;
     summary.write(&result.folder.summary())?;
     let plain = terminal::render(&summary, REPORT_FILE_WIDTH, Style::Plain);
     let path = result.folder.report();
     fs::write(&path, plain).map_err(|source| AnalysisError::Write { path, source })?;
     Ok(summary)
+}
+
+/// The outages of every channel, their figures put into the summary.
+fn add_outages(
+    summary: &mut RunSummary,
+    run: (&Topology, &RunResult),
+    records: &RunRecords,
+) -> Vec<OutageStory> {
+    let mut stories = Vec::new();
+    for (summary, channel) in summary.channels.iter_mut().zip(run.0.channels()) {
+        let unknown = MessageFate::UnknownPeerRecordsUnavailable;
+        let fates = summary.account.as_ref().map(|account| &account.fates);
+        let is_partial = fates.is_some_and(|fates| fates.of(unknown) > 0);
+        if let Some(story) = OutageStory::of(run, channel, records, is_partial) {
+            summary.outages = story.figures();
+            stories.push(story);
+        }
+    }
+    stories
+}
+
+/// Writes what the case has to plot. A run whose plots cannot be written has its report still.
+fn write_series(
+    summary: &mut RunSummary,
+    result: &RunResult,
+    case: &dyn Case,
+    records: RunRecords,
+) {
+    let made = case.series(records.log());
+    // They are as large as the messages; only one of the two need be in memory.
+    drop(records);
+    match series::write(&result.folder.series(), made) {
+        Ok(names) if names.is_empty() => {}
+        Ok(names) => {
+            let what = format!("{}; columns in series/README.md", names.join(", "));
+            summary.run.files.push(Fact::new("series/", what));
+        }
+        Err(error) => summary
+            .warnings
+            .push(format!("series are missing or not whole: {error}")),
+    }
 }
 
 /// What spoils the run or the reading of its figures.

@@ -8,15 +8,16 @@ use std::time::Duration;
 
 use hil_models::measure::account::{
     AccountContext, ChannelAccount, ChannelPath, ChannelRecords, FLIGHT_TIME_MAX, Interruption,
-    MessageStory, PathProcess, RunSpan, account, stories,
+    MessageStory, Outage, PathProcess, RunSpan, account, outages, stories,
 };
 use hil_models::measure::record::{
     EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, TakenRecord,
 };
-use hil_models::run_log::RunLog;
+use hil_models::run_log::{LoggedMessage, RunLog};
 use hil_models::time::{Alignment, Instant};
 
 use super::AnalysisError;
+use crate::face::record::{FaceReceivedRecord, FaceSentRecord};
 use crate::record::{RecordFile, RecordFileError, RecordKind};
 use crate::report::summary::RecordedFigures;
 use crate::supervisor::RunResult;
@@ -32,6 +33,8 @@ pub(crate) struct ChannelFiles {
     follow_up: Option<Vec<FollowUpRecord>>,
     taken: Option<Vec<TakenRecord>>,
     round_trips_ns: Vec<i64>,
+    face_sent: Vec<FaceSentRecord>,
+    face_received: Vec<FaceReceivedRecord>,
 }
 
 /// Every record file of a run.
@@ -46,26 +49,8 @@ pub(crate) struct RunRecords {
 impl RunRecords {
     /// Reads the records folder.
     pub(crate) fn read(folder: &Path) -> Result<Self, AnalysisError> {
-        let failed = |source| AnalysisError::Folder {
-            folder: folder.to_owned(),
-            source,
-        };
-        let mut paths: Vec<PathBuf> = fs::read_dir(folder)
-            .and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect())
-            .map_err(failed)?;
-        // By name, so that the instances of a restarted process come in order.
-        paths.sort();
         let mut records = Self::default();
-        for path in paths {
-            match RecordFile::read(&path) {
-                Ok(file) => records.add(&file),
-                // A process killed while it opened its files leaves one without a header.
-                Err(error @ RecordFileError::Malformed { offset: 0, .. }) => {
-                    records.problems.push(format!("{error}; left out"));
-                }
-                Err(error) => records.problems.push(error.to_string()),
-            }
-        }
+        records.problems = read_files(folder, &|_| true, &mut |file| records.add(&file))?;
         Ok(records)
     }
 
@@ -84,6 +69,11 @@ impl RunRecords {
                 channel
                     .round_trips_ns
                     .extend(file.records::<[i64; 2]>().map(|[rtt, _]| rtt));
+            }
+            RecordKind::FaceSent => channel.face_sent.extend(file.records::<FaceSentRecord>()),
+            RecordKind::FaceReceived => {
+                let records = file.records::<FaceReceivedRecord>();
+                channel.face_received.extend(records);
             }
             RecordKind::Message => file.append_messages(&mut self.log),
         }
@@ -106,19 +96,28 @@ impl RunRecords {
 
     /// What there is of a channel that is only recorded; `None` when nothing is.
     pub(super) fn recorded(&self, channel: &str) -> Option<RecordedFigures> {
-        let mut next_of_epoch: BTreeMap<u32, u64> = BTreeMap::new();
         let messages = self.log.raw(channel);
-        for message in messages {
-            let next = next_of_epoch.entry(message.envelope.epoch).or_default();
-            *next = (*next).max(message.envelope.sequence.saturating_add(1));
-        }
-        let message_count = messages.len() as u64;
-        let given = next_of_epoch.values();
-        let given_count = given.fold(0_u64, |sum, count| sum.saturating_add(*count));
         self.has(channel).then(|| RecordedFigures {
-            message_count,
-            missing_count: given_count.saturating_sub(message_count),
+            message_count: messages.len() as u64,
+            missing_count: missing_count(messages),
         })
+    }
+
+    /// What a face recorded that sends the messages of `out` and publishes on `back`.
+    pub(super) fn of_face(
+        &self,
+        out: &str,
+        back: &str,
+    ) -> (&[FaceSentRecord], &[FaceReceivedRecord]) {
+        let sent = self
+            .channels
+            .get(out)
+            .map(|files| files.face_sent.as_slice());
+        let received = self
+            .channels
+            .get(back)
+            .map(|files| files.face_received.as_slice());
+        (sent.unwrap_or_default(), received.unwrap_or_default())
     }
 
     /// The account of `channel`.
@@ -140,6 +139,23 @@ impl RunRecords {
     ) -> BTreeMap<(u32, u64), MessageStory> {
         self.consult(run, channel, |records, context| {
             stories(records, context, wanted)
+        })
+    }
+
+    /// The outages of `channel`, in the order of its messages.
+    pub(super) fn outages(&self, run: (&Topology, &RunResult), channel: &Channel) -> Vec<Outage> {
+        self.consult(run, channel, outages)
+    }
+
+    /// The processes on the way of `channel` that were down, one for each interruption.
+    pub(super) fn interrupted(
+        &self,
+        run: (&Topology, &RunResult),
+        channel: &Channel,
+    ) -> Vec<String> {
+        self.consult(run, channel, |_, context| {
+            let interruptions = context.interruptions.iter();
+            interruptions.map(|one| one.process.clone()).collect()
         })
     }
 
@@ -186,6 +202,88 @@ impl RunRecords {
         };
         ask(&records, &context)
     }
+}
+
+/// The messages of a run, without the rest of its records.
+#[derive(Debug, Default)]
+pub(crate) struct MessageRecords {
+    /// The messages.
+    pub(crate) log: RunLog,
+    /// Channels whose messages someone recorded, be it none.
+    pub(crate) files: BTreeSet<String>,
+    /// What could not be read.
+    pub(crate) problems: Vec<String>,
+}
+
+impl MessageRecords {
+    /// Reads them from a records folder.
+    ///
+    /// # Errors
+    /// When the folder cannot be read.
+    pub(crate) fn read(folder: &Path) -> Result<Self, AnalysisError> {
+        let mut records = Self::default();
+        let problems = read_files(folder, &|name| name.contains(".message."), &mut |file| {
+            if file.header.kind != RecordKind::Message {
+                return;
+            }
+            let channel = &file.header.channel;
+            records.files.insert(channel.clone());
+            file.append_messages(&mut records.log);
+            if file.truncated_bytes > 0 {
+                let problem = format!("{channel}: a record file ends in half a message");
+                records.problems.push(problem);
+            }
+        })?;
+        records.problems.extend(problems);
+        Ok(records)
+    }
+}
+
+/// Sequence numbers below the highest of each start of a producer that are not among its
+/// recorded messages.
+pub(crate) fn missing_count(messages: &[LoggedMessage]) -> u64 {
+    let mut next_of_epoch: BTreeMap<u32, u64> = BTreeMap::new();
+    for message in messages {
+        let next = next_of_epoch.entry(message.envelope.epoch).or_default();
+        *next = (*next).max(message.envelope.sequence.saturating_add(1));
+    }
+    let given = next_of_epoch.values();
+    let given_count = given.fold(0_u64, |sum, count| sum.saturating_add(*count));
+    given_count.saturating_sub(messages.len() as u64)
+}
+
+/// Hands every record file of `folder` with a `wanted` name to `take`; gives what could not be
+/// read.
+fn read_files(
+    folder: &Path,
+    wanted: &dyn Fn(&str) -> bool,
+    take: &mut dyn FnMut(RecordFile),
+) -> Result<Vec<String>, AnalysisError> {
+    let failed = |source| AnalysisError::Folder {
+        folder: folder.to_owned(),
+        source,
+    };
+    let mut paths: Vec<PathBuf> = fs::read_dir(folder)
+        .and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect())
+        .map_err(failed)?;
+    // By name, so that the instances of a restarted process come in order.
+    paths.sort();
+    paths.retain(|path| {
+        let name = path.file_name().unwrap_or_default();
+        wanted(&name.to_string_lossy())
+    });
+    let mut problems = Vec::new();
+    for path in paths {
+        match RecordFile::read(&path) {
+            Ok(file) => take(file),
+            // A process killed while it opened its files leaves one without a header.
+            Err(error @ RecordFileError::Malformed { offset: 0, .. }) => {
+                problems.push(format!("{error}; left out"));
+            }
+            Err(error) => problems.push(error.to_string()),
+        }
+    }
+    Ok(problems)
 }
 
 fn extend<T>(records: &mut Option<Vec<T>>, more: impl Iterator<Item = T>) {

@@ -13,7 +13,7 @@ use super::type_info::TypeInfo;
 /// A channel to be created.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ChannelSettings {
-    /// Name, e.g. `arm/command`; at most 255 characters.
+    /// Name, e.g. `egm/right/command`; at most 255 characters.
     pub name: String,
     /// Name, size and alignment of its messages.
     pub message: TypeInfo,

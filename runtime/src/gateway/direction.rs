@@ -1,32 +1,28 @@
 //! One channel direction of a gateway from its launch description to its final counters: opens
 //! the socket in the normal thread, the shared-memory port in the pinned one.
 
-use std::net::{IpAddr, SocketAddr};
+use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64};
 use std::time::Duration;
 
-use hil_gateways::protocol::wire::{self, Kind};
 use hil_gateways::protocol::{EgressBridge, EgressSettings, IngressBridge, IngressSettings};
-use hil_gateways::transport::DatagramReceiver;
-use hil_gateways::transport::emulated::{EmulatedReceiver, EmulatedSettings};
+use hil_gateways::transport::tcp::ConnectionTally;
 use hil_gateways::transport::timestamping::TimestampMode;
-use hil_gateways::transport::udp::{GrantedOptions, PathMtu, UdpReceiver, UdpSender, UdpSettings};
-use hil_models::link::bernoulli::BernoulliLink;
+use hil_gateways::transport::{DatagramReceiver, DatagramSender};
 use hil_models::measure::record::{EgressRecord, FollowUpRecord, IngressRecord};
-use hil_models::random::RandomStream;
 
-use super::counters;
 use super::egress::{Armed, Attention, Egress, Line};
 use super::ingress::{Ingress, Notes};
 use super::kernel_clock::KernelClock;
+use super::socket::{Ends, OpenSocket, stamps_of};
 use super::{GatewayError, Surroundings};
+use super::{counters, stream};
 use crate::channel::{RawInput, RawOutput, Waiter};
 use crate::clock::MonotonicClock;
-use crate::process::launch::{DirectionLaunch, EmulationLaunch, Side};
-use crate::process::pipe::DirectionReport;
+use crate::process::launch::{DirectionLaunch, Side};
+use crate::process::pipe::{DirectionReport, RunStart};
 use crate::record::{RecordKind, RecordSink, Recorder};
-use crate::topology::Timestamps;
 use crate::wait::{WaitMode, WaitStrategy};
 
 /// Records a ring holds.
@@ -34,26 +30,15 @@ const RING_RECORDS: usize = 16_384;
 /// Time between clock exchanges: frequent enough for a round-trip distribution, rare enough to
 /// be a fraction of any control channel's traffic.
 const SYNC_PERIOD: Duration = Duration::from_millis(100);
-/// IP and UDP headers of a datagram.
-const IPV4_HEADERS: usize = 20 + 8;
-const IPV6_HEADERS: usize = 40 + 8;
-
 type Sinks = (RecordSink, RecordSink);
 
 /// A direction whose socket and files are open and whose port is not.
 #[derive(Debug)]
 pub struct Opened {
-    socket: Socket,
+    socket: OpenSocket,
     sinks: Sinks,
     count: Arc<AtomicU64>,
     is_established: Arc<AtomicBool>,
-    facts: Vec<(String, String)>,
-}
-
-#[derive(Debug)]
-enum Socket {
-    Sender(Box<UdpSender>),
-    Receiver(Box<dyn DatagramReceiver>),
 }
 
 /// A direction at work.
@@ -70,38 +55,17 @@ enum Way {
 }
 
 /// Opens the socket and the record files of `launch`; call it from a thread of normal priority.
+/// `start` is told when the run starts, from which an emulated link counts its outages.
 ///
 /// # Errors
 /// When the kernel refuses a socket option or a file cannot be made.
 pub fn open<'a>(
     launch: &'a DirectionLaunch,
     recorder: &mut Recorder,
+    start: &RunStart,
 ) -> Result<(&'a DirectionLaunch, Opened), GatewayError> {
-    let settings = socket_settings(launch);
     let sinks = open_sinks(launch, recorder)?;
-    let (socket, granted) = match launch.side {
-        Side::Egress => {
-            let sender = UdpSender::open(&settings)?;
-            let granted = sender.granted();
-            (Socket::Sender(Box::new(sender)), granted)
-        }
-        Side::Ingress => {
-            let receiver = UdpReceiver::open(&settings)?;
-            let granted = receiver.granted();
-            (Socket::Receiver(emulate(receiver, launch)?), granted)
-        }
-    };
-    let mut facts = socket_facts(&settings, granted);
-    if let Some(EmulationLaunch {
-        delay, loss_ratio, ..
-    }) = launch.emulation
-    {
-        let text = format!(
-            "{} ms delay (part of RX stamp → received by gateway), loss ratio {loss_ratio}",
-            delay.as_secs_f64() * 1e3
-        );
-        facts.push(("link model behind the socket".to_owned(), text));
-    }
+    let socket = OpenSocket::open(launch, start)?;
     Ok((
         launch,
         Opened {
@@ -110,7 +74,6 @@ pub fn open<'a>(
             count: Arc::default(),
             // A receiver has nobody to wait for: it takes what comes.
             is_established: Arc::new(AtomicBool::new(launch.side == Side::Ingress)),
-            facts,
         },
     ))
 }
@@ -130,101 +93,15 @@ fn open_sinks(launch: &DirectionLaunch, recorder: &mut Recorder) -> Result<Sinks
     })
 }
 
-fn socket_settings(launch: &DirectionLaunch) -> UdpSettings {
-    let socket = &launch.socket;
-    UdpSettings {
-        local: launch.local,
-        peer: launch.peer,
-        interface: socket.interface.clone(),
-        // 0 is the kernel's default; setting it would only reset the priority.
-        dscp: (socket.dscp > 0).then_some(socket.dscp),
-        priority: socket.priority,
-        send_buffer_bytes: Some(socket.send_buffer_bytes),
-        receive_buffer_bytes: Some(socket.receive_buffer_bytes),
-        timestamps: timestamp_mode(socket.timestamps),
-    }
-}
-
-pub(crate) const fn timestamp_mode(asked: Timestamps) -> TimestampMode {
-    match asked {
-        Timestamps::Off => TimestampMode::Off,
-        Timestamps::Software => TimestampMode::Software,
-        Timestamps::Hardware => TimestampMode::Hardware,
-    }
-}
-
-fn socket_facts(settings: &UdpSettings, granted: GrantedOptions) -> Vec<(String, String)> {
-    let mut facts = vec![
-        (
-            "socket".to_owned(),
-            format!("{} to or from {}", settings.local, settings.peer),
-        ),
-        (
-            "send buffer granted".to_owned(),
-            format!("{} bytes", granted.send_buffer_bytes),
-        ),
-        (
-            "receive buffer granted".to_owned(),
-            format!("{} bytes", granted.receive_buffer_bytes),
-        ),
-    ];
-    let shortfalls = granted.shortfalls(settings);
-    facts.extend(
-        shortfalls
-            .into_iter()
-            .map(|text| ("socket option".to_owned(), text)),
-    );
-    facts
-}
-
-/// Room for everything that is under way at once, up to 4000 datagrams per second.
-fn emulated_capacity(delay: Duration) -> usize {
-    EmulatedSettings::default().capacity_count + delay.as_millis() as usize * 4
-}
-
-/// Puts the receiver behind the launch's link model, if it has one. Greetings and clock exchanges
-/// pass freely: the model stands for what happens to the robot's messages.
-fn emulate(
-    receiver: UdpReceiver,
-    launch: &DirectionLaunch,
-) -> Result<Box<dyn DatagramReceiver>, GatewayError> {
-    let Some(emulation) = launch.emulation else {
-        return Ok(Box::new(receiver));
-    };
-    let stream = RandomStream::new(emulation.seed, &launch.channel);
-    let link = BernoulliLink::new(emulation.delay, emulation.loss_ratio, stream)?;
-    let settings = EmulatedSettings {
-        capacity_count: emulated_capacity(emulation.delay),
-        datagram_bytes_max: launch.socket.path_mtu_bytes,
-        clock: Some(MonotonicClock::now),
-    };
-    let is_exempt =
-        |bytes: &[u8]| wire::decode(bytes).is_ok_and(|datagram| datagram.header.kind != Kind::Data);
-    Ok(Box::new(EmulatedReceiver::new(
-        receiver,
-        Box::new(link),
-        is_exempt,
-        settings,
-    )))
-}
-
-/// What a datagram may carry: as much as the topology says, but no more than the path takes.
-fn datagram_bytes_max(launch: &DirectionLaunch, path: PathMtu) -> usize {
-    let headers = match launch.peer.ip() {
-        IpAddr::V4(_) => IPV4_HEADERS,
-        IpAddr::V6(_) => IPV6_HEADERS,
-    };
-    let configured = launch.socket.path_mtu_bytes.saturating_sub(headers);
-    if path.is_assumed {
-        return configured;
-    }
-    configured.min(usize::try_from(path.datagram_bytes).unwrap_or(configured))
-}
-
 impl Opened {
     /// Messages carried so far.
     pub fn count(&self) -> Arc<AtomicU64> {
         Arc::clone(&self.count)
+    }
+
+    /// How often its connections come and go, if it is one that connects.
+    pub(crate) fn tally(&self) -> Option<Arc<ConnectionTally>> {
+        self.socket.tally.clone()
     }
 
     /// True while the peer takes this direction's messages.
@@ -241,25 +118,15 @@ impl Opened {
         launch: &DirectionLaunch,
         surroundings: &Surroundings,
     ) -> Result<Direction, GatewayError> {
-        let mut facts = self.facts;
-        let way = match self.socket {
-            Socket::Sender(sender) => {
-                let mtu = sender.path_mtu();
-                facts.push((
-                    "path MTU".to_owned(),
-                    format!(
-                        "{} bytes, {} configured",
-                        mtu.packet_bytes, launch.socket.path_mtu_bytes
-                    ),
-                ));
-                Way::Egress(Box::new(egress(
-                    sender,
-                    self.sinks,
-                    (self.count, self.is_established),
-                    (launch, surroundings),
-                )?))
-            }
-            Socket::Receiver(receiver) => Way::Ingress(Box::new(ingress(
+        let OpenSocket { ends, facts, .. } = self.socket;
+        let way = match ends {
+            Ends::Sender(sender, datagram_bytes_max) => Way::Egress(Box::new(egress(
+                (sender, datagram_bytes_max),
+                self.sinks,
+                (self.count, self.is_established),
+                (launch, surroundings),
+            )?)),
+            Ends::Receiver(receiver) => Way::Ingress(Box::new(ingress(
                 receiver,
                 self.sinks,
                 self.count,
@@ -271,7 +138,7 @@ impl Opened {
 }
 
 fn egress(
-    sender: Box<UdpSender>,
+    (sender, datagram_max_bytes): (Box<dyn DatagramSender>, usize),
     sinks: Sinks,
     (count, is_established): (Arc<AtomicU64>, Arc<AtomicBool>),
     (launch, around): (&DirectionLaunch, &Surroundings),
@@ -281,10 +148,10 @@ fn egress(
         session: around.session,
         domain: around.fingerprint,
         clock_id: around.clock_id,
-        datagram_max_bytes: datagram_bytes_max(launch, sender.path_mtu()),
+        datagram_max_bytes,
         sync_period: SYNC_PERIOD,
     })?;
-    let mode = timestamp_mode(launch.socket.timestamps);
+    let mode = stamps_of(&launch.socket);
     let armed = Armed {
         software: mode != TimestampMode::Off,
         hardware: mode == TimestampMode::Hardware,
@@ -374,24 +241,32 @@ impl Direction {
 
     /// Every counter of the direction.
     pub fn report(&self, launch: &DirectionLaunch) -> DirectionReport {
-        let (direction, peer_state, counters) = match &self.way {
+        let now = MonotonicClock::now();
+        let (direction, peer_state, mut counters, stream) = match &self.way {
             Way::Egress(egress) => (
                 "egress",
                 counters::egress_state(egress),
                 counters::of_egress(egress),
+                egress.line.sender().stream_figures(now),
             ),
             Way::Ingress(ingress) => (
                 "ingress",
                 counters::ingress_state(ingress),
                 counters::of_ingress(ingress),
+                ingress.receiver.stream_figures(now),
             ),
         };
+        let mut facts = self.facts.clone();
+        if let Some(figures) = stream {
+            counters.extend(stream::counters(&figures));
+            facts.extend(stream::facts(&figures, launch.side));
+        }
         DirectionReport {
             channel: launch.channel.clone(),
             direction: direction.to_owned(),
             peer_state,
             counters,
-            facts: self.facts.clone(),
+            facts,
         }
     }
 }

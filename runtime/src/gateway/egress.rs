@@ -3,6 +3,7 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::Duration;
 
 use hil_gateways::protocol::egress::{RoundTrip, TransmitFailure};
 use hil_gateways::protocol::wire::Kind;
@@ -24,6 +25,9 @@ const PENDING: usize = 256;
 /// A stamp that has not come by then does not come: drivers deliver within a millisecond or so,
 /// and a record must not wait for ever.
 const STAMP_PATIENCE_NS: i64 = 20_000_000;
+
+/// How long the end of a run may wait for the kernel to take what is left.
+const HAND_OVER_MAX: Duration = Duration::from_millis(200);
 
 /// Longer than any reply; what is longer is no reply and is cut.
 const REPLY_BYTES_MAX: usize = 1024;
@@ -146,7 +150,8 @@ impl Line {
             match sent {
                 Ok(token) => self.expect_stamp(token, (kind, sequence), handed, record),
                 Err(refusal) => {
-                    bridge.on_transmit_failed(handed, failure(refusal));
+                    let is_established = bridge.peer_state() == PeerState::Established;
+                    bridge.on_transmit_failed(handed, failure(refusal, is_established));
                     if let Some(record) = record {
                         self.finish(EgressRecord {
                             flags: EgressRecord::REFUSED_BY_KERNEL,
@@ -253,7 +258,7 @@ impl Line {
             return;
         }
         self.report_count = counters.network_report_count;
-        let newest = counters.newest_report.map(failure);
+        let newest = counters.newest_report.map(|report| failure(report, true));
         if newest == Some(TransmitFailure::PeerUnreachable) {
             bridge.on_peer_unreachable(now);
         }
@@ -284,6 +289,19 @@ impl Line {
         }
     }
 
+    /// Gives the kernel what the transport still holds, for a bounded time.
+    fn hand_over(&mut self) -> Result<(), GatewayError> {
+        let end = MonotonicClock::now() + HAND_OVER_MAX;
+        loop {
+            let now = MonotonicClock::now();
+            self.sender.attend(now);
+            if !self.sender.has_unsent() || now >= end {
+                return Ok(());
+            }
+            poll_descriptors(self.sender.poll_fd().into_iter(), end)?;
+        }
+    }
+
     /// How often the real-time clock was stepped.
     pub(crate) fn clock_step_count(&self) -> u64 {
         self.clock.step_count()
@@ -294,14 +312,18 @@ fn slot_of(token: TxToken) -> usize {
     token.0 as usize % PENDING
 }
 
-fn failure(refusal: SendRefusal) -> TransmitFailure {
+/// What a refusal means for the conversation. That there is no connection yet says nothing of a
+/// peer that has not been heard of; that there is none any more says that it is gone.
+fn failure(refusal: SendRefusal, is_established: bool) -> TransmitFailure {
     match refusal {
         SendRefusal::PeerRefused | SendRefusal::Unreachable { .. } => {
             TransmitFailure::PeerUnreachable
         }
-        SendRefusal::QueueFull { .. } | SendRefusal::TooLong { .. } | SendRefusal::Other { .. } => {
-            TransmitFailure::Local
-        }
+        SendRefusal::NotConnected if is_established => TransmitFailure::PeerUnreachable,
+        SendRefusal::NotConnected
+        | SendRefusal::QueueFull { .. }
+        | SendRefusal::TooLong { .. }
+        | SendRefusal::Other { .. } => TransmitFailure::Local,
     }
 }
 
@@ -319,7 +341,7 @@ impl Egress {
         self.bridge.bye();
         self.line.transmit(&mut self.bridge);
         self.line.expire(Instant::from_ns(i64::MAX));
-        Ok(())
+        self.line.hand_over()
     }
 
     /// Sends one waiting message, or else looks after stamps, replies and appointments; false when
@@ -338,6 +360,7 @@ impl Egress {
             self.attention.is_overdue = false;
             self.attention.has_news = false;
             self.attention.looked = now;
+            self.line.sender.attend(now);
             self.line.take_stamps(&mut self.bridge);
             self.line.notice_reports(&mut self.bridge, now);
             self.hear()?;
@@ -435,7 +458,8 @@ impl Egress {
     /// Waits for a message, a stamp, a reply or an appointment.
     pub(crate) fn rest(&mut self) -> Result<(), GatewayError> {
         let now = MonotonicClock::now();
-        let mut due = self.bridge.next_wakeup();
+        let dues = [self.bridge.next_wakeup(), self.line.sender.next_due()];
+        let mut due = dues.into_iter().flatten().min();
         if self.line.pending_count > 0 {
             // A stamp makes the socket readable, but an overdue one must be given up in time.
             let patience = Instant::from_ns(now.as_ns() + STAMP_PATIENCE_NS);

@@ -100,6 +100,7 @@ impl Ingress {
         }
         let now = MonotonicClock::now();
         self.bridge.on_wakeup(now);
+        self.receiver.attend(now);
         self.clock.refresh(now);
         Ok(false)
     }

@@ -6,12 +6,15 @@
 //! - [`direction`]: one direction from its launch description to its final counters.
 //! - `egress`: shared memory to network; `ingress`: network to shared memory.
 
+mod connection;
 mod counters;
 pub mod direction;
 pub(crate) mod egress;
 pub(crate) mod ingress;
 pub(crate) mod kernel_clock;
 pub(crate) mod process;
+pub(crate) mod socket;
+mod stream;
 
 use std::fs::File;
 use std::io::{self, Read};

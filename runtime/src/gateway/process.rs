@@ -15,11 +15,13 @@ use hil_gateways::transport::probe::{
 };
 use hil_gateways::transport::timestamping::{HardwareStamping, TimestampMode};
 
+use super::connection::Connection;
 use super::direction::{self, Opened};
+use super::socket::stamps_of;
 use super::{GatewayError, Surroundings};
 use crate::channel::Domain;
 use crate::clock::MonotonicClock;
-use crate::process::launch::{DirectionLaunch, GatewayLaunch, Side, read};
+use crate::process::launch::{DirectionLaunch, GatewayLaunch, Side, Transport, read};
 use crate::process::pipe::{
     ChannelProgress, DirectionReport, FromProcess, Orders, ProcessReport, say,
 };
@@ -33,7 +35,7 @@ const PROGRESS_PERIOD: Duration = Duration::from_millis(250);
 /// How often orders and threads are looked at.
 const WATCH_PERIOD: Duration = Duration::from_millis(5);
 /// How long each half of the stamp probe may take; a restart must not wait long for it.
-const PROBE_BOUND: Duration = Duration::from_millis(300);
+pub(crate) const PROBE_BOUND: Duration = Duration::from_millis(300);
 
 /// Runs the gateway described by the launch file until told to stop.
 ///
@@ -58,7 +60,11 @@ fn prepare_and_live(path: &Path) -> Result<(), GatewayError> {
     let mut recorder = Recorder::new(&launch.records, &launch.process, launch.instance);
     let mut opened = Vec::new();
     for direction in &launch.directions {
-        opened.push(direction::open(direction, &mut recorder)?);
+        opened.push(direction::open(
+            direction,
+            &mut recorder,
+            &orders.run_start(),
+        )?);
     }
     recorder.start().map_err(GatewayError::Thread)?;
     let counters: Vec<Counter> = opened
@@ -66,6 +72,10 @@ fn prepare_and_live(path: &Path) -> Result<(), GatewayError> {
         .map(|(launch, one)| counter(launch, one))
         .collect();
     let established: Vec<_> = opened.iter().map(|(_, one)| one.is_established()).collect();
+    let mut watched: Vec<_> = opened
+        .iter()
+        .filter_map(|(launch, one)| Some(Connection::new(launch, one.tally()?)))
+        .collect();
     let (sender, ready) = channel();
     let mut threads = Vec::new();
     for (direction, one) in opened {
@@ -79,7 +89,7 @@ fn prepare_and_live(path: &Path) -> Result<(), GatewayError> {
     }
     drop(sender);
     if wait_until_open(&ready, threads.len()) {
-        watch(&orders, &threads, &counters, &established);
+        watch(&orders, &threads, (&counters, &established), &mut watched);
     }
     surroundings.stop.store(true, Ordering::Release);
     finish(threads, recorder, &stamp_facts)
@@ -90,8 +100,8 @@ fn prepare_and_live(path: &Path) -> Result<(), GatewayError> {
 fn watch(
     orders: &Orders,
     threads: &[JoinHandle<Lived>],
-    counters: &[Counter],
-    established: &[Arc<AtomicBool>],
+    (counters, established): (&[Counter], &[Arc<AtomicBool>]),
+    connections: &mut [Connection],
 ) {
     let mut is_ready = false;
     let mut told = MonotonicClock::now();
@@ -105,6 +115,11 @@ fn watch(
         if now.saturating_duration_since(told) >= PROGRESS_PERIOD {
             told = now;
             report_progress(counters);
+        }
+        if is_ready {
+            for connection in &mut *connections {
+                connection.tell(now);
+            }
         }
         thread::sleep(WATCH_PERIOD);
     }
@@ -256,23 +271,32 @@ fn warn_of_shared_cpus(launch: &GatewayLaunch) {
 
 /// Switches kernel stamps on and finds out whether they really come.
 fn arm_stamps(launch: &GatewayLaunch) -> (Option<Sentinel>, Vec<(String, String)>) {
-    let fact = |text: String| vec![("kernel stamps".to_owned(), text)];
-    let Some(direction) = launch
-        .directions
-        .iter()
-        .find(|one| one.socket.timestamps != Timestamps::Off)
-    else {
-        return (None, fact("switched off in the topology".to_owned()));
-    };
-    let settings = ProbeSettings {
-        timestamps: direction::timestamp_mode(direction.socket.timestamps),
+    let mut sockets = launch.directions.iter().map(|one| one.socket.transport);
+    if sockets.any(|transport| transport == Transport::Tcp) {
+        let why = "unavailable over TCP: the kernel stamps bytes of a stream, not messages";
+        return (None, vec![("kernel stamps".to_owned(), why.to_owned())]);
+    }
+    let mut directions = launch.directions.iter();
+    let stamped = directions.find(|one| one.socket.timestamps != Timestamps::Off);
+    arm_and_describe(stamped.map(|direction| ProbeSettings {
+        timestamps: stamps_of(&direction.socket),
         interface: direction.socket.interface.clone(),
         transmit_target: Some(direction::probe_target(direction)),
         proof_count: 5,
         bound: PROBE_BOUND,
+    }))
+}
+
+/// As [`arm_stamps`], of what is to be probed; `None` where no stamps are asked for.
+pub(crate) fn arm_and_describe(
+    settings: Option<ProbeSettings>,
+) -> (Option<Sentinel>, Vec<(String, String)>) {
+    let fact = |text: String| vec![("kernel stamps".to_owned(), text)];
+    let Some(settings) = settings else {
+        return (None, fact("switched off in the topology".to_owned()));
     };
     let card = (settings.timestamps == TimestampMode::Hardware)
-        .then(|| switch_card_on(direction.socket.interface.as_deref()));
+        .then(|| switch_card_on(settings.interface.as_deref()));
     match arm_and_probe(&settings) {
         Ok((report, sentinel)) => {
             let mut facts = fact(describe_probe(&report));

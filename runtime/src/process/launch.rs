@@ -7,6 +7,12 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use hil_models::case_study::ParameterError;
+use hil_models::link::bernoulli::BernoulliLink;
+use hil_models::link::in_series::InSeries;
+use hil_models::link::outages::{OutageLink, Outages};
+use hil_models::random::RandomStream;
+use hil_models::time::Instant;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
@@ -92,10 +98,22 @@ pub enum Side {
     Ingress,
 }
 
+/// What carries the datagrams of a hop.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Transport {
+    /// Each by itself.
+    Udp,
+    /// One connection, from the sending gateway to the receiving one.
+    Tcp,
+}
+
 /// Socket options of a hop.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SocketLaunch {
+    /// What carries the datagrams.
+    pub transport: Transport,
     /// Interface to bind to.
     pub interface: Option<String>,
     /// Differentiated-services code point (RFC 2474), 0..=63.
@@ -112,16 +130,69 @@ pub struct SocketLaunch {
     pub timestamps: Timestamps,
 }
 
-/// A static link model (seed paper, section II.B).
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+/// A static link model (seed paper, section II.B), and outages.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EmulationLaunch {
     /// Fixed one-way delay.
     pub delay: Duration,
     /// Probability of a loss, 0..=1.
     pub loss_ratio: f64,
+    /// When nothing gets through.
+    pub outages: Outages,
+    /// Name of the link: its outages are those of all its channels, both ways.
+    pub link: String,
     /// Seed of the run.
     pub seed: u64,
+}
+
+impl EmulationLaunch {
+    /// The model of one channel, on a clock that reads zero when the run starts: live and in
+    /// virtual time the same.
+    ///
+    /// # Errors
+    /// When a number is outside its range.
+    pub fn model(
+        &self,
+        channel: &str,
+    ) -> Result<InSeries<OutageLink, BernoulliLink>, ParameterError> {
+        // The link's own stream, so that all its channels fail together and no other link with them.
+        let outages = RandomStream::new(self.seed, &format!("links.{}.outages", self.link));
+        let losses = RandomStream::new(self.seed, channel);
+        Ok(InSeries::new(
+            OutageLink::new(self.outages, outages, Instant::ZERO)?,
+            BernoulliLink::new(self.delay, self.loss_ratio, losses)?,
+        ))
+    }
+
+    /// The model in words.
+    pub fn describe(&self) -> String {
+        let mut text = format!(
+            "{} ms delay, loss ratio {}",
+            self.delay.as_secs_f64() * 1e3,
+            self.loss_ratio
+        );
+        let Outages {
+            mean_s,
+            per_hour,
+            buffered,
+        } = self.outages;
+        if self.outages.is_active() {
+            let what = if buffered {
+                "which hold everything until they end"
+            } else {
+                "which lose everything"
+            };
+            let mean_ms = mean_s * 1e3;
+            let words = format!(
+                ", {per_hour} outages per hour of {mean_ms} ms on average, {what}, on all channels \
+                 of {} both ways, counted from the start of the run",
+                self.link
+            );
+            text.push_str(&words);
+        }
+        text
+    }
 }
 
 /// A launch file or card cannot be used.

@@ -3,10 +3,11 @@
 
 use std::io::{self, BufRead, Write};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU8, Ordering};
+use std::sync::atomic::{AtomicI64, AtomicU8, Ordering};
 use std::thread;
 use std::time::Duration;
 
+use hil_models::time::Instant;
 use serde::{Deserialize, Serialize};
 
 use crate::realtime::RealtimeGrant;
@@ -16,7 +17,11 @@ use crate::realtime::RealtimeGrant;
 #[serde(rename_all = "kebab-case")]
 pub enum ToProcess {
     /// Begin the run.
-    Start,
+    Start {
+        /// When it began on the host's monotonic clock; earlier than now for a process that was
+        /// started again.
+        at_ns: i64,
+    },
     /// End, leaving everything in order.
     Stop,
 }
@@ -79,6 +84,28 @@ pub struct ProcessReport {
     pub involuntary_switches: u64,
     /// Named counters of each channel direction a gateway carries.
     pub directions: Vec<DirectionReport>,
+    /// The arms of a face that speaks with a foreign program.
+    #[serde(default)]
+    pub faces: Vec<FaceReport>,
+}
+
+/// One arm of a face.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct FaceReport {
+    /// `right` or `left`.
+    pub arm: String,
+    /// `EGM robot face` or `EGM sensor face`.
+    pub kind: String,
+    /// The channel whose messages went out.
+    pub outgoing: String,
+    /// The channel that what came in went to.
+    pub incoming: String,
+    /// How the foreign program stood to it at the end, in words.
+    pub peer_state: String,
+    /// Counters by name.
+    pub counters: Vec<(String, u64)>,
+    /// Facts in words: addresses, granted buffers, stamp probe.
+    pub facts: Vec<(String, String)>,
 }
 
 /// One direction of one channel through a gateway.
@@ -104,6 +131,34 @@ const STOPPING: u8 = 2;
 #[derive(Debug, Clone)]
 pub struct Orders {
     state: Arc<AtomicU8>,
+    start: RunStart,
+}
+
+/// When the run began, for whoever counts from there; readable without a system call.
+#[derive(Debug, Clone)]
+pub struct RunStart(Arc<AtomicI64>);
+
+/// A start that has not come.
+const NOT_STARTED: i64 = i64::MIN;
+
+impl Default for RunStart {
+    /// Not yet.
+    fn default() -> Self {
+        Self(Arc::new(AtomicI64::new(NOT_STARTED)))
+    }
+}
+
+impl RunStart {
+    /// The run began at `at`.
+    pub fn set(&self, at: Instant) {
+        self.0.store(at.as_ns(), Ordering::Release);
+    }
+
+    /// When the run began; `None` before.
+    pub fn get(&self) -> Option<Instant> {
+        let at_ns = self.0.load(Ordering::Acquire);
+        (at_ns != NOT_STARTED).then(|| Instant::from_ns(at_ns))
+    }
 }
 
 impl Orders {
@@ -115,18 +170,28 @@ impl Orders {
     pub fn listen() -> io::Result<Self> {
         let state = Arc::new(AtomicU8::new(WAITING));
         let shared = Arc::clone(&state);
+        let start = RunStart::default();
+        let began = start.clone();
         thread::Builder::new()
             .name("orders".to_owned())
             .spawn(move || {
                 for line in io::stdin().lock().lines() {
                     match line.ok().and_then(|line| serde_json::from_str(&line).ok()) {
-                        Some(ToProcess::Start) => shared.store(STARTED, Ordering::Release),
+                        Some(ToProcess::Start { at_ns }) => {
+                            began.set(Instant::from_ns(at_ns));
+                            shared.store(STARTED, Ordering::Release);
+                        }
                         Some(ToProcess::Stop) | None => break,
                     }
                 }
                 shared.store(STOPPING, Ordering::Release);
             })?;
-        Ok(Self { state })
+        Ok(Self { state, start })
+    }
+
+    /// When the run began.
+    pub fn run_start(&self) -> RunStart {
+        self.start.clone()
     }
 
     /// True once the process should end.
@@ -181,8 +246,8 @@ mod tests {
             assert_eq!(serde_json::from_str::<FromProcess>(&line).unwrap(), message);
         }
         assert_eq!(
-            serde_json::to_string(&ToProcess::Start).unwrap(),
-            "\"start\""
+            serde_json::to_string(&ToProcess::Start { at_ns: 5 }).unwrap(),
+            "{\"start\":{\"at_ns\":5}}"
         );
     }
 }

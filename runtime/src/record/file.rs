@@ -21,6 +21,8 @@ use hil_models::measure::record::{
 use hil_models::message::Envelope;
 use hil_models::run_log::RunLog;
 
+use crate::face::record::{FaceReceivedRecord, FaceSentRecord};
+
 const MAGIC: &[u8; 8] = b"HILREC01";
 /// Size of the file header.
 pub const HEADER_BYTES: usize = 128;
@@ -44,11 +46,15 @@ pub enum RecordKind {
     Message,
     /// Round trips in nanoseconds (i64) with the instant they ended (i64), of a sending gateway.
     RoundTrip,
+    /// [`FaceSentRecord`]s of a face: datagrams to a foreign program.
+    FaceSent,
+    /// [`FaceReceivedRecord`]s of a face: datagrams of a foreign program.
+    FaceReceived,
 }
 
 impl RecordKind {
     /// Every kind, with the number that stands for it in the header and its name in file names.
-    const ALL: [(Self, u32, &'static str); 7] = [
+    const ALL: [(Self, u32, &'static str); 9] = [
         (Self::Published, 1, "published"),
         (Self::Taken, 2, "taken"),
         (Self::Egress, 3, "egress"),
@@ -56,6 +62,8 @@ impl RecordKind {
         (Self::FollowUp, 5, "follow-up"),
         (Self::Message, 6, "message"),
         (Self::RoundTrip, 7, "round-trip"),
+        (Self::FaceSent, 8, "face-sent"),
+        (Self::FaceReceived, 9, "face-received"),
     ];
 
     fn row(self) -> (Self, u32, &'static str) {
@@ -81,6 +89,8 @@ impl RecordKind {
             Self::Ingress => Some(size_of::<IngressRecord>()),
             Self::FollowUp => Some(size_of::<FollowUpRecord>()),
             Self::RoundTrip => Some(2 * size_of::<i64>()),
+            Self::FaceSent => Some(size_of::<FaceSentRecord>()),
+            Self::FaceReceived => Some(size_of::<FaceReceivedRecord>()),
             Self::Message => None,
         }
     }

@@ -4,6 +4,8 @@
 use hil_models::measure::account::{ChannelAccount, ClosingFigures, Coverage, MessageFate};
 use serde::{Deserialize, Serialize};
 
+use super::face::FaceSummary;
+use super::face_warnings;
 use super::summary::{ChannelSummary, Fact, LinkKind, Outcome, ProcessSummary, RunSummary};
 use super::terminal::{JOINT, grouped, percent};
 
@@ -24,6 +26,10 @@ pub enum NetworkVerdict {
     RunFailed,
     /// No channel went over a network.
     NoNetwork,
+    /// No link of ours was a network, but a foreign program took part through a face.
+    ForeignProgram,
+    /// No link of ours was a network, and nothing came to any face from a foreign program.
+    NoForeignProgram,
     /// A channel went over an emulated link, whatever carried the others.
     EmulatedLink,
     /// The host kept its ticks: what remains is the network's.
@@ -65,6 +71,7 @@ impl Assessment {
         let overruns: Vec<Overrun> = summary.processes.iter().filter_map(overrun).collect();
         let mut warnings: Vec<String> = overruns.iter().map(overrun_warning).collect();
         warnings.extend(summary.warnings.iter().cloned());
+        warnings.extend(summary.faces.iter().flat_map(face_warnings::face_warnings));
         warnings.extend(summary.processes.iter().flat_map(process_warnings));
         warnings.extend(summary.channels.iter().flat_map(channel_warnings));
         warnings.extend(summary.realtime.refused.iter().map(refused_warning));
@@ -79,14 +86,21 @@ impl Assessment {
 
 fn verdict(summary: &RunSummary, overruns: Vec<Overrun>) -> NetworkVerdict {
     let has = |link: LinkKind| summary.channels.iter().any(|channel| channel.link == link);
-    // A gateway keeps no ticks; a component that was killed took its count with it.
+    let has_face = !summary.faces.is_empty();
+    let is_face = |name: &str| summary.faces.iter().any(|face| face.process == name);
+    // A gateway or face keeps no ticks; a component that was killed took its count with it.
     let is_silent = |process: &ProcessSummary| {
-        process.role != "gateway" && process.role != "own program" && process.cpu_time_s.is_none()
+        let keeps_ticks = process.role != "gateway" && process.role != "own program";
+        keeps_ticks && !is_face(&process.name) && process.cpu_time_s.is_none()
     };
     let has_ticks = |process: &ProcessSummary| process.tick_count.is_some();
     if summary.run.outcome == Outcome::Failed {
         NetworkVerdict::RunFailed
-    } else if !has(LinkKind::Udp) && !has(LinkKind::Emulated) {
+    } else if ![LinkKind::Udp, LinkKind::Tcp, LinkKind::Emulated]
+        .into_iter()
+        .any(has)
+        && !has_face
+    {
         NetworkVerdict::NoNetwork
     } else if !overruns.is_empty() {
         NetworkVerdict::HostOverran {
@@ -96,8 +110,12 @@ fn verdict(summary: &RunSummary, overruns: Vec<Overrun>) -> NetworkVerdict {
         NetworkVerdict::TicksUnknown
     } else if has(LinkKind::Emulated) {
         NetworkVerdict::EmulatedLink
-    } else {
+    } else if has(LinkKind::Udp) || has(LinkKind::Tcp) {
         NetworkVerdict::NetworkResult
+    } else if summary.faces.iter().all(FaceSummary::is_unanswered) {
+        NetworkVerdict::NoForeignProgram
+    } else {
+        NetworkVerdict::ForeignProgram
     }
 }
 
@@ -176,7 +194,10 @@ fn channel_warnings(channel: &ChannelSummary) -> Vec<String> {
             "{name}: the account closes for {ratio} of messages, less than {least}"
         ));
     }
-    warnings.extend(stamp_warnings(name, account));
+    // A stream has no stamps, by design: nobody can do anything about it.
+    if channel.link != LinkKind::Tcp {
+        warnings.extend(stamp_warnings(name, account));
+    }
     warnings
 }
 

@@ -2,6 +2,9 @@
 //! rendering for a terminal. It measures nothing and prints nothing; the caller writes the text.
 
 pub mod assessment;
+pub(crate) mod event_log;
+pub mod face;
+mod face_warnings;
 pub mod score_event;
 pub mod summary;
 pub mod terminal;
@@ -10,3 +13,5 @@ pub mod terminal;
 mod sample;
 #[cfg(test)]
 mod sample_events;
+#[cfg(test)]
+mod sample_records;

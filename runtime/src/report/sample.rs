@@ -3,149 +3,19 @@
 //! difference.
 
 use hil_models::measure::account::{
-    AccountContext, ChannelAccount, ChannelPath, ChannelRecords, Interruption, PathProcess,
-    RunSpan, account,
+    AccountContext, ChannelAccount, ChannelPath, ChannelRecords, Coverage, account,
 };
-use hil_models::measure::record::{
-    EgressRecord, IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE,
-};
-use hil_models::random::RandomStream;
-use hil_models::time::{Alignment, Instant};
+use hil_models::time::Alignment;
 
 use super::assessment::{Assessment, NetworkVerdict};
+use super::face::{Answers, FaceSummary};
 use super::sample_events::{few_events, many_events, recorded_channel};
+use super::sample_records::Files;
 use super::summary::{
     ChannelSummary, CountByName, DirectionSummary, Fact, LinkKind, Outcome, ProcessSummary,
     RealtimeFacts, RunEvent, RunFacts, RunSummary, ScoreMetric, SummaryError,
 };
 use super::terminal::{Style, render};
-
-const PERIOD_NS: i64 = 4_000_000;
-const REALTIME_NS: i64 = 1_790_000_000_000_000_000;
-
-/// The records of 5000 messages with losses, missing stamps and a killed gateway.
-#[derive(Default)]
-struct Files {
-    published: Vec<PublishedRecord>,
-    egress: Vec<EgressRecord>,
-    ingress: Vec<IngressRecord>,
-    taken: Vec<TakenRecord>,
-}
-
-impl Files {
-    fn sample() -> Self {
-        let mut files = Self::default();
-        let mut stream = RandomStream::new(1, "report sample");
-        for sequence in 0..5_000_u64 {
-            files.write(sequence, &mut stream);
-        }
-        files
-    }
-
-    fn write(&mut self, sequence: u64, stream: &mut RandomStream) {
-        let published_ns = i64::try_from(sequence).unwrap() * PERIOD_NS;
-        let mut now_ns = published_ns;
-        let mut next = |scale: f64| {
-            // A skewed delay: mostly near its scale, sometimes far above.
-            let exponent = 0.3 * stream.normal() + if stream.chance(0.01) { 1.5 } else { 0.0 };
-            #[allow(clippy::cast_possible_truncation, reason = "far below 10^18")]
-            let delay_ns = (scale * exponent.exp()) as i64;
-            now_ns += delay_ns;
-            now_ns
-        };
-        self.published.push(PublishedRecord {
-            sequence,
-            published_ns,
-            epoch: 1,
-            reserved: 0,
-        });
-        let is_down = (2_000..2_190).contains(&sequence);
-        if sequence % 700 == 13 {
-            return;
-        }
-        let (taken_ns, handed_ns) = (next(14_000.0), next(900.0));
-        let has_tx = !sequence.is_multiple_of(97) && !is_down;
-        let tx_ns = REALTIME_NS + next(2_300.0);
-        self.egress.push(EgressRecord {
-            sequence,
-            published_ns,
-            taken_ns,
-            handed_ns,
-            tx_software_ns: if has_tx { tx_ns } else { UNAVAILABLE },
-            tx_hardware_ns: UNAVAILABLE,
-            realtime_offset_ns: REALTIME_NS,
-            epoch: 1,
-            session: 9,
-            flags: u32::from(is_down && sequence.is_multiple_of(2)),
-            fragment_count: 1,
-        });
-        if is_down || matches!(sequence, 900 | 3_000..3_003) {
-            return;
-        }
-        let rx_ns = REALTIME_NS + next(700.0);
-        let (received_ns, forwarded_ns) = (next(13_000.0), next(1_100.0));
-        self.ingress.push(IngressRecord {
-            sequence,
-            published_ns,
-            handed_ns,
-            rx_hardware_ns: UNAVAILABLE,
-            rx_software_ns: rx_ns,
-            received_ns,
-            forwarded_ns,
-            // Two reads of one clock pair differ by a little; one pair was read across a step.
-            realtime_offset_ns: REALTIME_NS + if sequence == 4_000 { 7_000 } else { 40 },
-            epoch: 1,
-            session: 9,
-            flags: 0,
-            fragment_count: 1,
-        });
-        self.taken.push(TakenRecord {
-            sequence,
-            published_ns,
-            forwarded_ns,
-            taken_ns: next(16_000.0),
-            epoch: 1,
-            reserved: 0,
-        });
-    }
-
-    fn account(&self, alignment: Option<Alignment>) -> ChannelAccount {
-        let run = RunSpan {
-            start: Instant::ZERO,
-            end: Instant::from_ns(5_000 * PERIOD_NS),
-        };
-        let interruptions = [Interruption {
-            process: "robot gateway".to_owned(),
-            place: PathProcess::ReceivingGateway,
-            from: Instant::from_ns(2_000 * PERIOD_NS - 1_000_000),
-            until: Instant::from_ns(2_190 * PERIOD_NS - 1_000_000),
-            cause: "killed by signal 9".to_owned(),
-        }];
-        let records = ChannelRecords {
-            published: Some(&self.published),
-            egress: Some(&self.egress),
-            ingress: Some(&self.ingress),
-            follow_up: None,
-            taken: Some(&self.taken),
-        };
-        let context = AccountContext {
-            producer_run: Some(run),
-            consumer_run: Some(run),
-            round_trips_ns: &[41_000, 44_000, 47_500, 90_000],
-            ..AccountContext::new(ChannelPath::Gateway { alignment })
-        };
-        account(&records, &context.with_interruptions(&interruptions))
-    }
-
-    fn direct(&self) -> ChannelAccount {
-        let records = ChannelRecords {
-            published: Some(&self.published),
-            taken: Some(&self.taken),
-            ..ChannelRecords::default()
-        };
-        account(&records, &AccountContext::new(ChannelPath::SharedMemory))
-    }
-}
 
 fn run_facts() -> RunFacts {
     RunFacts {
@@ -210,6 +80,7 @@ fn channel(
         to: Some(roles[1].to_owned()),
         link,
         account: Some(account),
+        outages: None,
         recorded: None,
         refusals: Vec::new(),
         directions: Vec::new(),
@@ -233,6 +104,7 @@ fn channels() -> Vec<ChannelSummary> {
         counters: Vec::new(),
         facts: vec![Fact::new("receive buffer granted", "425984 bytes")],
     });
+    command.outages = Some(files.outages());
     let status = channel("arm/status", back, LinkKind::Udp, files.account(None));
     let human = ["operator", "controller"];
     let motion = channel(
@@ -337,6 +209,7 @@ fn empty() -> RunSummary {
             to: Some("robot".to_owned()),
             link: LinkKind::Udp,
             account,
+            outages: None,
             recorded: None,
             refusals: Vec::new(),
             directions: Vec::new(),
@@ -474,6 +347,61 @@ fn a_host_that_overran_is_not_a_network_result() {
     );
     summary.channels.truncate(0);
     assert_eq!(Assessment::of(&summary).network, NetworkVerdict::NoNetwork);
+}
+
+#[test]
+fn a_run_whose_face_nobody_answered_does_not_claim_a_foreign_program() {
+    let mut summary = full();
+    summary.channels.truncate(0);
+    summary.faces.push(FaceSummary {
+        process: "client".to_owned(),
+        host: "local".to_owned(),
+        kind: "EGM robot face".to_owned(),
+        arm: "right".to_owned(),
+        address: "127.0.0.1:6510".to_owned(),
+        peer_state: "never answered".to_owned(),
+        cycle_ns: Some(4_000_000),
+        answers: Answers::default(),
+        segments: Vec::new(),
+        refusals: Vec::new(),
+        counters: Vec::new(),
+        facts: Vec::new(),
+    });
+    let assessment = Assessment::of(&summary);
+    assert_eq!(assessment.network, NetworkVerdict::NoForeignProgram);
+    let told = |words: &str| assessment.warnings.iter().any(|one| one.contains(words));
+    assert!(told("no foreign program answered"), "{assessment:?}");
+    let text = render(&summary, 120, Style::Plain);
+    assert!(!text.contains("took part"), "{text}");
+    summary.faces[0].answers.attended_count = 1;
+    let network = Assessment::of(&summary).network;
+    assert_eq!(network, NetworkVerdict::ForeignProgram);
+}
+
+#[test]
+fn a_stream_is_not_blamed_for_stamps_it_cannot_have() {
+    let mut summary = full();
+    let stamped = |summary: &RunSummary| {
+        let warnings = Assessment::of(summary).warnings;
+        warnings.iter().any(|one| one.contains("kernel TX stamp"))
+    };
+    for channel in &mut summary.channels {
+        if let Some(account) = &mut channel.account {
+            account.coverage.tx_software = Some(Coverage {
+                stamped_count: 0,
+                eligible_count: 100,
+            });
+        }
+    }
+    assert!(stamped(&summary));
+    for channel in &mut summary.channels {
+        channel.link = LinkKind::Tcp;
+    }
+    assert!(!stamped(&summary));
+    assert_eq!(
+        Assessment::of(&summary).network,
+        NetworkVerdict::NetworkResult
+    );
 }
 
 #[test]

@@ -2,10 +2,10 @@
 //! heard, for the reports that are checked in.
 
 use hil_models::case_study::Severity;
-use hil_models::measure::account::MessageFate;
+use hil_models::measure::account::{MessageFate, Standing};
 
 use super::assessment::{Assessment, NetworkVerdict};
-use super::score_event::{ExplainedEvent, ExplainedMessage, ScoreEvents};
+use super::score_event::{EventOutage, ExplainedEvent, ExplainedMessage, ScoreEvents};
 use super::summary::{
     ChannelSummary, Fact, LinkKind, Outcome, ProcessSummary, RecordedFigures, RunFacts, RunSummary,
 };
@@ -34,6 +34,7 @@ fn event(
         clock: "robot-pc".to_owned(),
         severity,
         what: what.to_owned(),
+        outages: Vec::new(),
         messages,
         messages_dropped_count: 0,
     }
@@ -48,21 +49,35 @@ pub(super) fn few_events() -> ScoreEvents {
     );
     let late = message(1_012, Some(MessageFate::Taken), "delivered after 812 ms");
     let unknown = message(1_013, None, "unavailable: no process left a record of it");
+    let outage = EventOutage {
+        channel: "fleet/authority".to_owned(),
+        from_s: Some(3.6),
+        until_s: Some(4.4),
+        length_s: Some(0.8),
+        lost_count: 20,
+        standing: Standing::OverFor(521_000_000),
+        other_count: 3,
+        words: "outage of 800 ms on fleet/authority, 3.600 s to 4.400 s, 20 messages lost, over \
+                for 521 ms (3 others about then)"
+            .to_owned(),
+    };
     let collision = "robots 3 and 5 of fleet 0 met in their section, 0.41 m into each other";
+    let mut incident = event(
+        4.921,
+        Severity::Incident,
+        collision,
+        vec![lost, late.clone(), unknown],
+    );
+    incident.outages.push(outage);
     ScoreEvents {
         events: vec![
             event(
                 3.75,
                 Severity::Hazard,
                 "robot 2 of fleet 1 was told to stop where it no longer could",
-                vec![late.clone()],
+                vec![late],
             ),
-            event(
-                4.921,
-                Severity::Incident,
-                collision,
-                vec![lost, late, unknown],
-            ),
+            incident,
         ],
         dropped_count: 0,
         clocks_differ: false,
@@ -77,6 +92,8 @@ pub(super) fn many_events(long: &str) -> ScoreEvents {
     let mut lost = message(7, Some(MessageFate::LostInInterruption), long);
     lost.channel = long.to_owned();
     let mut gravest = event(20.0, Severity::Incident, long, vec![lost]);
+    let named = |sequence| message(sequence, Some(MessageFate::Taken), "delivered");
+    gravest.messages.extend((8..16).map(named));
     gravest.messages_dropped_count = 3;
     gravest.at_s = None;
     events.push(gravest);
@@ -95,6 +112,7 @@ pub(super) fn recorded_channel() -> ChannelSummary {
         to: None,
         link: LinkKind::RecordOnly,
         account: None,
+        outages: None,
         recorded: Some(RecordedFigures {
             message_count: 12_345,
             missing_count: 0,
@@ -154,7 +172,7 @@ fn a_recorded_channel_needs_no_account_but_every_message() {
 #[test]
 fn one_emulated_link_among_real_ones_makes_no_network_result() {
     let mut run = summary(recorded_channel());
-    for link in [LinkKind::Udp, LinkKind::Emulated] {
+    for link in [LinkKind::Udp, LinkKind::Tcp, LinkKind::Emulated] {
         run.channels.push(ChannelSummary {
             link,
             ..recorded_channel()
@@ -194,10 +212,10 @@ fn the_page_shows_the_gravest_events_and_counts_the_rest() {
     assert!(text.contains("met (clock of robot-pc)"), "{text}");
     assert_eq!(text.matches("braked (clock of robot-pc)").count(), 11);
     assert!(text.contains(
-        "9 more events are in summary.json, or printed by --json; 17 found no room in the score"
+        "9 more events are in events.log and summary.json, or printed by --json; 17 found no room"
     ));
     assert!(text.contains("Clocks are not aligned"));
-    assert!(text.contains("and 3 more messages"));
+    assert!(text.contains("and 6 more messages"));
 }
 
 #[test]

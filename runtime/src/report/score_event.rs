@@ -1,8 +1,8 @@
 //! What happened to the robot, as a summary keeps it: each event of the score beside the fates of
 //! the messages it names. Fates are found elsewhere, in the analysis.
 
-use hil_models::case_study::{Score, Severity};
-use hil_models::measure::account::MessageFate;
+use hil_models::case_study::Severity;
+use hil_models::measure::account::{MessageFate, Standing};
 use serde::{Deserialize, Serialize};
 
 /// The events of a run's score.
@@ -29,10 +29,51 @@ pub struct ExplainedEvent {
     pub severity: Severity,
     /// What happened, in words.
     pub what: String,
+    /// What the channels that the event concerns went through about then, where there was an
+    /// outage.
+    #[serde(default)]
+    pub outages: Vec<EventOutage>,
     /// The messages concerned.
     pub messages: Vec<ExplainedMessage>,
     /// Messages the event had no room for.
     pub messages_dropped_count: u64,
+}
+
+/// What a channel went through when an event happened: the outage that has most to do with it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct EventOutage {
+    /// The channel.
+    pub channel: String,
+    /// Publication of the first lost message, seconds after the start of the run as in
+    /// [`ExplainedMessage::published_at_s`].
+    pub from_s: Option<f64>,
+    /// Publication of the next message that arrived; `None` when none did.
+    pub until_s: Option<f64>,
+    /// From the one to the other, or to the end of the run, seconds.
+    pub length_s: Option<f64>,
+    /// Messages lost in it.
+    pub lost_count: u64,
+    /// How it stands to the event in time, as far as the process that tells of it could see;
+    /// nanoseconds.
+    pub standing: Standing,
+    /// Other outages of the channel about then.
+    pub other_count: u64,
+    /// All of it in words.
+    pub words: String,
+}
+
+impl EventOutage {
+    /// Puts those first whose channel's name has most words in common with `what` happened: an
+    /// event of the right arm is about the right arm's channels before it is about the other's.
+    pub(crate) fn put_own_channels_first(outages: &mut [Self], what: &str) {
+        let words: Vec<&str> = what.split(|c: char| !c.is_alphanumeric()).collect();
+        let strangers = |outage: &Self| {
+            let parts = outage.channel.split('/');
+            let own_count = parts.filter(|part| words.contains(part)).count();
+            core::cmp::Reverse(own_count)
+        };
+        outages.sort_by_key(strangers);
+    }
 }
 
 /// One message an event names, and what became of it.
@@ -56,32 +97,26 @@ pub struct ExplainedMessage {
     pub words: String,
 }
 
-impl ScoreEvents {
-    /// The events of a run in virtual time, which keeps counts but no record of single messages.
-    pub(crate) fn in_virtual_time(score: &Score) -> Self {
-        let events = score.events.iter().map(|event| {
-            let messages = event.messages.iter().map(|message| ExplainedMessage {
-                channel: message.channel.to_owned(),
-                epoch: message.epoch,
-                sequence: message.sequence,
-                published_at_s: None,
-                fate: None,
-                delay_s: None,
-                words: "unavailable: virtual time keeps no record of single messages".to_owned(),
-            });
-            ExplainedEvent {
-                at_s: Some(event.at.as_ns() as f64 * 1e-9),
-                clock: "virtual time".to_owned(),
-                severity: event.severity,
-                what: event.what.clone(),
-                messages: messages.collect(),
-                messages_dropped_count: event.messages_dropped_count,
-            }
-        });
-        Self {
-            events: events.collect(),
-            dropped_count: score.events_dropped_count,
-            clocks_differ: false,
-        }
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_events_own_arm_comes_first() {
+        let outage = |channel: &str| EventOutage {
+            channel: channel.to_owned(),
+            from_s: None,
+            until_s: None,
+            length_s: None,
+            lost_count: 1,
+            standing: Standing::Unknown,
+            other_count: 0,
+            words: String::new(),
+        };
+        let mut outages = ["egm/right/command", "egm/left/command", "motion/request"].map(outage);
+        EventOutage::put_own_channels_first(&mut outages, "left arm: no command for 0.044 s");
+        let names = outages.map(|one| one.channel);
+        let expected = ["egm/left/command", "egm/right/command", "motion/request"];
+        assert_eq!(names, expected);
     }
 }

@@ -9,10 +9,11 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use hil_models::case_study::{Metric, Score};
-use hil_models::measure::account::ChannelAccount;
+use hil_models::measure::account::{ChannelAccount, OutageFigures};
 use serde::{Deserialize, Serialize};
 
 use super::assessment::Assessment;
+use super::face::FaceSummary;
 use super::score_event::ScoreEvents;
 
 /// Version of the `summary.json` layout.
@@ -35,6 +36,9 @@ pub struct RunSummary {
     pub events: Vec<RunEvent>,
     /// The channels, in the order of the case study.
     pub channels: Vec<ChannelSummary>,
+    /// Arms that went through a face to a foreign program.
+    #[serde(default)]
+    pub faces: Vec<FaceSummary>,
     /// What the robot did.
     pub score: Vec<ScoreMetric>,
     /// What happened to the robot, and what the network had done to the messages concerned.
@@ -55,6 +59,7 @@ impl RunSummary {
             processes: Vec::new(),
             events: Vec::new(),
             channels: Vec::new(),
+            faces: Vec::new(),
             score: Vec::new(),
             score_events: ScoreEvents::default(),
             warnings: Vec::new(),
@@ -265,6 +270,8 @@ pub enum LinkKind {
     SharedMemory,
     /// A gateway pair over UDP.
     Udp,
+    /// A gateway pair over TCP.
+    Tcp,
     /// A gateway pair over an emulated link.
     Emulated,
     /// Nothing: its messages go to the run's record only.
@@ -277,6 +284,7 @@ impl LinkKind {
         match self {
             Self::SharedMemory => "shared memory",
             Self::Udp => "UDP",
+            Self::Tcp => "TCP",
             Self::Emulated => "emulated link",
             Self::RecordOnly => "recorded only",
         }
@@ -296,6 +304,10 @@ pub struct ChannelSummary {
     pub link: LinkKind,
     /// Its latency account; `None` when no records were found or it is only recorded.
     pub account: Option<ChannelAccount>,
+    /// Its outages: messages lost in a row, by length; `None` when they are unknown or it is only
+    /// recorded.
+    #[serde(default)]
+    pub outages: Option<OutageFigures>,
     /// What was recorded of a channel that is only recorded; `None` when nothing was.
     #[serde(default)]
     pub recorded: Option<RecordedFigures>,

@@ -1,5 +1,5 @@
-//! `hil-runtime tables`: a case's study in virtual time, on as many threads as there are
-//! processors. It starts no process, opens no socket and changes no figure: those come from the
+//! `hil-runtime tables` and `calibrate`: a case's study in virtual time, on as many threads as
+//! there are processors. It starts no process, opens no socket and changes no figure: those come from the
 //! tasks alone, whatever the number of threads.
 
 mod pool;
@@ -57,7 +57,7 @@ pub(crate) struct Cost {
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum StudyError {
     /// The topology names no case.
-    #[error("the topology names no case; only a case has tables")]
+    #[error("the topology names no case; only a case can be studied")]
     NoCase,
     /// The case has none.
     #[error("case {case} has no tables")]
@@ -65,7 +65,17 @@ pub(crate) enum StudyError {
         /// Its name.
         case: String,
     },
-    /// The case refused its parameters.
+    /// The case has no search for that figure.
+    #[error("case {case} cannot be calibrated for {figure}; {known}")]
+    NoCalibration {
+        /// Its name.
+        case: String,
+        /// The figure.
+        figure: String,
+        /// What it can be calibrated for, in words.
+        known: String,
+    },
+    /// The case refused its parameters, or the figure's value.
     #[error("{message}")]
     Case {
         /// What it said.
@@ -81,24 +91,49 @@ pub(crate) enum StudyError {
     },
 }
 
+/// What is wanted of a case.
+#[derive(Debug, Clone, Copy)]
+pub(crate) enum Wanted<'a> {
+    /// Its tables.
+    Tables,
+    /// The link parameters under which a figure comes out as a value.
+    Calibration {
+        /// The figure's name.
+        figure: &'a str,
+        /// Its value.
+        value: f64,
+    },
+}
+
 /// The study of the topology's case.
 pub(crate) fn batch_of(
     topology: &Topology,
     registry: &Registry,
+    wanted: Wanted<'_>,
 ) -> Result<Box<dyn Batch>, StudyError> {
-    let case = topology.case().ok_or(StudyError::NoCase)?;
     let refused = |message: String| StudyError::Case { message };
-    let none = || StudyError::NoTables {
-        case: case.name.clone(),
-    };
-    let entry = registry.find(&case.name).ok_or_else(none)?;
-    let parameters =
-        serde_json::to_value(&case.parameters).map_err(|error| refused(error.to_string()))?;
-    let made = entry
-        .make(parameters, topology.run().seed)
+    let made = registry
+        .make_case(topology)
         .map_err(|error| refused(error.to_string()))?;
-    let batch = made.study().map_err(|error| refused(error.to_string()))?;
-    batch.ok_or_else(none)
+    let (entry, case) = made.ok_or(StudyError::NoCase)?;
+    let name = || entry.name.to_owned();
+    match wanted {
+        Wanted::Tables => case
+            .study()
+            .map_err(|error| refused(error.to_string()))?
+            .ok_or_else(|| StudyError::NoTables { case: name() }),
+        Wanted::Calibration { figure, value } => case
+            .calibration(figure, value)
+            .map_err(|error| refused(error.to_string()))?
+            .ok_or_else(|| StudyError::NoCalibration {
+                case: name(),
+                figure: figure.to_owned(),
+                known: match entry.calibrated_figures {
+                    [] => "it has no calibration".to_owned(),
+                    figures => format!("there is {}", figures.join(", ")),
+                },
+            }),
+    }
 }
 
 /// Runs every task, prints the tables and writes them where asked.
@@ -159,3 +194,6 @@ fn write_files(folder: &Path, report: &StudyReport, cost: &Cost) -> Result<(), S
     write("report.json".to_owned(), render::json(report, cost))?;
     write("report.txt".to_owned(), render::text(report, cost))
 }
+
+#[cfg(test)]
+mod tests;

@@ -111,7 +111,7 @@ fn cost_text(report: &StudyReport, cost: &Cost) -> String {
     };
     let _infallible = write!(text, ", {processor_s:.1} s of processor time");
     if processor_s > 0.0 {
-        for work in &report.work {
+        for work in report.work.iter().filter(|work| work.amount > 0.0) {
             let rate = work.amount / processor_s;
             let _infallible = write!(
                 text,
@@ -251,6 +251,15 @@ mod tests {
             ),
             "{page}"
         );
+        let nothing = StudyReport {
+            work: vec![Work {
+                name: "motion loops",
+                amount: -0.0,
+            }],
+            ..StudyReport::default()
+        };
+        let page = text(&nothing, &cost());
+        assert!(page.ends_with("4.0 s of processor time\n"), "{page}");
     }
 
     #[test]

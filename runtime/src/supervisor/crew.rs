@@ -16,6 +16,7 @@ use super::child::{Child, Word, describe_exit};
 use super::event::{Event, Interruption};
 use super::plan::{ProcessKind, ProcessPlan};
 use crate::clock::MonotonicClock;
+use crate::face::launch::FaceLaunch;
 use crate::process::launch::{ComponentLaunch, GatewayLaunch, LaunchError, write};
 use crate::process::own_program;
 use crate::process::pipe::{ChannelProgress, FromProcess, ProcessReport, ToProcess};
@@ -80,7 +81,8 @@ pub(crate) struct Crew {
     own_program: PathBuf,
     sender: SyncSender<Word>,
     words: Receiver<Word>,
-    has_started: bool,
+    /// When the run began.
+    started: Option<Instant>,
     events: Vec<Event>,
 }
 
@@ -110,7 +112,7 @@ impl Crew {
             own_program: env::current_exe().map_err(CrewError::OwnPath)?,
             sender,
             words,
-            has_started: false,
+            started: None,
             events: Vec::new(),
         })
     }
@@ -163,7 +165,7 @@ impl Crew {
         let now = MonotonicClock::now();
         member.child = Some(child);
         member.seen_alive = now;
-        if member.is_ready && self.has_started {
+        if member.is_ready && self.started.is_some() {
             // A user's own program says nothing: being started is all that is known of it.
             self.close_interruptions(index, now);
         }
@@ -186,10 +188,12 @@ impl Crew {
 
     /// Lets every process begin.
     pub(crate) fn begin(&mut self) {
-        self.has_started = true;
+        let started = MonotonicClock::now();
+        self.started = Some(started);
+        let at_ns = started.as_ns();
         for member in &mut self.members {
             if let Some(child) = &mut member.child {
-                child.order(ToProcess::Start);
+                child.order(ToProcess::Start { at_ns });
             }
         }
     }
@@ -242,7 +246,7 @@ impl Crew {
             from: Instant::from_ns(from),
             until: None,
         };
-        if self.has_started && member.restart_count < limit && member.complaint.is_none() {
+        if self.started.is_some() && member.restart_count < limit && member.complaint.is_none() {
             member.restart_count += 1;
             let text = format!(
                 "{what}; restart {} of at most {limit}",
@@ -283,9 +287,12 @@ impl Crew {
             match word {
                 FromProcess::Ready => {
                     member.is_ready = true;
-                    if self.has_started && instance > 0 {
+                    if let Some(started) = self.started
+                        && instance > 0
+                    {
+                        let at_ns = started.as_ns();
                         if let Some(child) = &mut member.child {
-                            child.order(ToProcess::Start);
+                            child.order(ToProcess::Start { at_ns });
                         }
                         self.close_interruptions(index, now);
                     }
@@ -432,6 +439,18 @@ fn write_launch(
             };
             write(path, &launch)?;
             Ok("gateway")
+        }
+        ProcessKind::Face(face) => {
+            let launch = FaceLaunch {
+                process,
+                instance,
+                domain,
+                records: folder.records(),
+                wait: plan.wait,
+                face: face.clone(),
+            };
+            write(path, &launch)?;
+            Ok("face")
         }
         ProcessKind::Foreign { .. } => Ok("foreign"),
     }

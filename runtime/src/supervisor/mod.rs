@@ -11,6 +11,7 @@ pub(crate) mod meet;
 mod outcome;
 pub(crate) mod peer;
 pub(crate) mod plan;
+mod progress_line;
 mod session;
 
 pub use domains::DomainsError;

@@ -4,14 +4,18 @@
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::path::PathBuf;
+use std::time::Duration;
 
+use hil_models::egm::messages::Side as ArmSide;
+use hil_models::egm::parameters::{ControllerSettings, EgmParameters};
 use nix::unistd::{AccessFlags, Uid, access};
 
-use crate::process::launch::{DirectionLaunch, EmulationLaunch, Side, SocketLaunch};
+use crate::face::launch::{ArmLaunch, FaceSettings};
+use crate::process::launch::{DirectionLaunch, EmulationLaunch, Side, SocketLaunch, Transport};
 use crate::realtime::{RealtimeRequest, SchedulingPolicy};
 use crate::topology::{
-    Channel, Crossing, Execution, Host, OnExit, Process, ProcessCard, Program, Scheduling,
-    Topology, Wait,
+    CardChannel, Channel, Crossing, EgmFace, Execution, FaceKind, Host, OnExit, Process,
+    ProcessCard, Program, Scheduling, Topology, Via, Wait, command_channel, feedback_channel,
 };
 use crate::wait::WaitMode;
 
@@ -20,7 +24,7 @@ use crate::wait::WaitMode;
 pub(crate) struct Plan {
     /// One per host that runs here.
     pub(crate) hosts: Vec<HostPlan>,
-    /// Gateways first: they must be ready before components publish.
+    /// Gateways and faces first: they must be ready before components publish.
     pub(crate) processes: Vec<ProcessPlan>,
 }
 
@@ -50,6 +54,8 @@ pub(crate) enum ProcessKind {
     Component(ProcessCard),
     /// The gateway of one link, in this binary.
     Gateway(Vec<DirectionLaunch>),
+    /// What speaks with a foreign program, in this binary.
+    Face(FaceSettings),
     /// The user's own program.
     Foreign {
         card: ProcessCard,
@@ -59,8 +65,9 @@ pub(crate) enum ProcessKind {
 }
 
 impl ProcessPlan {
-    pub(crate) fn is_gateway(&self) -> bool {
-        matches!(self.kind, ProcessKind::Gateway(_))
+    /// True for what carries messages instead of making them: a gateway, or a face.
+    pub(crate) fn is_carrier(&self) -> bool {
+        matches!(self.kind, ProcessKind::Gateway(_) | ProcessKind::Face(_))
     }
 
     /// The role's name, or what else it is.
@@ -68,10 +75,14 @@ impl ProcessPlan {
         match &self.kind {
             ProcessKind::Component(card) => card.role.clone().unwrap_or_default(),
             ProcessKind::Gateway(_) => "gateway".to_owned(),
+            ProcessKind::Face(face) => format!("{} by {FACE_ROLE}", face.role),
             ProcessKind::Foreign { .. } => "own program".to_owned(),
         }
     }
 }
+
+/// Who plays a role behind a face, in reports.
+pub(crate) const FACE_ROLE: &str = "foreign program";
 
 /// What to run on `hosts`, all of them on this PC.
 pub(crate) fn plan(topology: &Topology, hosts: &[&Host]) -> Plan {
@@ -96,9 +107,11 @@ pub(crate) fn plan(topology: &Topology, hosts: &[&Host]) -> Plan {
         .iter()
         .filter(|process| is_here(&process.host))
         .map(|process| component(topology, process));
+    let mut processes: Vec<ProcessPlan> = gateways.chain(processes).collect();
+    processes.sort_by_key(|process| !process.is_carrier());
     Plan {
         hosts: host_plans.collect(),
-        processes: gateways.chain(processes).collect(),
+        processes,
     }
 }
 
@@ -122,6 +135,11 @@ fn component(topology: &Topology, process: &Process) -> ProcessPlan {
             command: command.clone(),
             environment: environment.clone(),
         },
+        Program::Egm { role, face } => {
+            let host = topology.host(&process.host);
+            let interface = host.and_then(|host| host.interface.clone());
+            ProcessKind::Face(face_settings(role, face, (&card, process), interface))
+        }
     };
     ProcessPlan {
         name: process.name.clone(),
@@ -131,6 +149,80 @@ fn component(topology: &Topology, process: &Process) -> ProcessPlan {
         wait: wait_mode(process.execution.wait),
         on_exit: process.on_exit,
     }
+}
+
+fn face_settings(
+    role: &str,
+    face: &EgmFace,
+    (card, process): (&ProcessCard, &Process),
+    interface: Option<String>,
+) -> FaceSettings {
+    let mut arms = Vec::new();
+    for side in ArmSide::BOTH {
+        let Some(address) = face.address(side) else {
+            continue;
+        };
+        let (input, output) = match face.kind {
+            FaceKind::Robot => (feedback_channel(side), command_channel(side)),
+            FaceKind::Sensor => (command_channel(side), feedback_channel(side)),
+        };
+        let named = |channels: &[CardChannel], name: &str| {
+            channels
+                .iter()
+                .find(|channel| channel.name == name)
+                .cloned()
+        };
+        // A channel whose other role nobody plays is not there; the topology saw to the rest.
+        let (Some(input), Some(output)) =
+            (named(&card.inputs, input), named(&card.outputs, output))
+        else {
+            continue;
+        };
+        arms.push(ArmLaunch {
+            arm: side.word().to_owned(),
+            address,
+            input,
+            output,
+            realtime: realtime(&process.execution, arms.len()),
+        });
+    }
+    let (cycle, delay_cycles) = robot_cycle(card);
+    let is_used = |channel: &&CardChannel| arms.iter().any(|arm| arm.input == **channel);
+    FaceSettings {
+        role: role.to_owned(),
+        kind: face.kind,
+        axes: face.axes,
+        robotware: face.robotware,
+        cycle_ns: nanoseconds(cycle),
+        planned_lead_ns: nanoseconds(cycle) * delay_cycles,
+        send: face.send,
+        timestamps: face.timestamps,
+        dscp: face.dscp,
+        interface,
+        spare: card
+            .inputs
+            .iter()
+            .filter(|one| !is_used(one))
+            .cloned()
+            .collect(),
+        arms,
+    }
+}
+
+/// The robot's cycle, and by how many of them its measured joints lag the planned ones: what the
+/// case's `egm` table says, or its default.
+fn robot_cycle(card: &ProcessCard) -> (Duration, u64) {
+    let table = card.parameters.get("egm").cloned();
+    let parameters: EgmParameters = table
+        .and_then(|egm| egm.try_into().ok())
+        .unwrap_or_default();
+    let settings = parameters.settings();
+    let settings = settings.unwrap_or_else(|_checked| ControllerSettings::of(parameters.preset));
+    (settings.cycle, settings.control_delay_cycles as u64)
+}
+
+fn nanoseconds(duration: Duration) -> u64 {
+    u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX)
 }
 
 fn gateways_on(topology: &Topology, host: &Host) -> Vec<ProcessPlan> {
@@ -197,6 +289,10 @@ fn direction(crossing: &Crossing<'_>, side: Side, index: usize, seed: u64) -> Di
             priority: hop.socket_priority,
             send_buffer_bytes: hop.send_buffer_bytes,
             receive_buffer_bytes: hop.receive_buffer_bytes,
+            transport: match crossing.link.via {
+                Via::Tcp(_) => Transport::Tcp,
+                Via::SharedMemory | Via::Udp(_) | Via::Emulated(..) => Transport::Udp,
+            },
             path_mtu_bytes: hop.path_mtu_bytes,
             timestamps: hop.timestamps,
         },
@@ -205,6 +301,8 @@ fn direction(crossing: &Crossing<'_>, side: Side, index: usize, seed: u64) -> Di
         emulation: emulation.map(|impairment| EmulationLaunch {
             delay: impairment.delay,
             loss_ratio: impairment.loss_ratio,
+            outages: crossing.outages.unwrap_or_default(),
+            link: crossing.link.name.clone(),
             seed,
         }),
     }

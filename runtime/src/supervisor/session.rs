@@ -18,6 +18,7 @@ use super::meet::{Meeting, meet};
 use super::outcome::{Heard, Outcome, RunError, RunOptions, RunResult};
 use super::peer::{Peer, PeerEvent};
 use super::plan::plan;
+use super::progress_line;
 use crate::channel::clock_id;
 use crate::clock::MonotonicClock;
 use crate::console::Console;
@@ -355,27 +356,9 @@ impl Session<'_> {
             return;
         }
         self.told = WallInstant::now();
-        let mut counts: BTreeMap<(&str, &str), u64> = BTreeMap::new();
-        for progress in self
-            .crew
-            .members()
-            .iter()
-            .flat_map(|member| &member.progress)
-        {
-            counts.insert((&progress.channel, &progress.what), progress.count);
-        }
-        let channels = self.topology.channels().iter().filter_map(|channel| {
-            let told = ["published", "sent", "received", "taken", "recorded"]
-                .iter()
-                .filter_map(|what| {
-                    counts
-                        .get(&(channel.name.as_str(), *what))
-                        .map(|count| format!("{what} {count}"))
-                });
-            let told = told.collect::<Vec<_>>().join(", ");
-            (!told.is_empty()).then(|| format!("{}: {told}", channel.name))
-        });
-        let channels = channels.collect::<Vec<_>>().join(" | ");
+        let members = self.crew.members().iter();
+        let progress = members.flat_map(|member| &member.progress);
+        let channels = progress_line::of_channels(self.topology, progress);
         let (elapsed_s, total_s) = (elapsed.as_secs_f64(), duration.as_secs_f64());
         self.console
             .progress(&format!("{elapsed_s:6.1} / {total_s:.0} s  {channels}"));
@@ -386,14 +369,14 @@ impl Session<'_> {
         let reason = outcome.text();
         let meaning = outcome.meaning();
         self.say_to_all(&PeerMessage::Stop { reason, meaning });
-        self.crew.stop(STOP_PATIENCE, |plan| !plan.is_gateway());
+        self.crew.stop(STOP_PATIENCE, |plan| !plan.is_carrier());
         self.say_to_all(&PeerMessage::Quiet);
         if !matches!(outcome, Outcome::PeerLost(_)) {
             self.wait_for_quiet();
         }
         thread::sleep(DRAIN);
         self.crew
-            .stop(STOP_PATIENCE, super::plan::ProcessPlan::is_gateway);
+            .stop(STOP_PATIENCE, super::plan::ProcessPlan::is_carrier);
     }
 
     fn wait_for_quiet(&mut self) {

@@ -2,7 +2,9 @@
 //! `check_channels`. Nothing is read here; the result is the checked topology.
 
 use super::check_channels;
+use super::check_face::{check_face, check_faces, is_dispensable};
 use super::errors::{Fault, Faults, Place};
+use super::face::EgmFace;
 use super::file::{CaseEntry, File, HostEntry, ProcessEntry};
 use super::known::{KnownCase, KnownCases, ParameterFault};
 use super::limits;
@@ -45,6 +47,9 @@ pub(super) fn check(file: File<'_>, known: &KnownCases, needs: Needs, faults: &F
         );
     }
     let processes = check_processes(&file.processes, &hosts, &roles, faults);
+    let written = case_entry.and_then(|entry| entry.parameters);
+    let case_parts = (case.as_ref(), written);
+    check_faces(&file.processes, &processes, case_parts, faults);
     if let (Some(entry), Some(known), false) = (case_entry, known_case, runs_nothing) {
         check_every_role_is_played(known, &processes, entry.place, faults);
     }
@@ -214,25 +219,31 @@ fn check_processes(
             .role
             .as_ref()
             .and_then(|role| check_role(entry, role, roles, &processes, faults));
-        let program = match (&entry.command, role) {
-            (Some(command), role) => Program::Command {
-                role,
-                command: command.clone(),
-                environment: entry.environment.clone(),
-            },
-            (None, role) => Program::BuiltIn {
-                role: role.unwrap_or_default(),
-            },
-        };
+        let face = entry.egm.as_ref().zip(roles.known).zip(role.as_ref());
+        let face = face.and_then(|((face, case), role)| check_face(face, role, case, faults));
         processes.push(Process {
             name: entry.name.clone(),
             host: check_host(entry, hosts, faults),
-            program,
+            program: program(entry, role, face),
             execution: entry.execution.clone(),
             on_exit: entry.on_exit,
         });
     }
     processes
+}
+
+fn program(entry: &ProcessEntry, role: Option<String>, face: Option<EgmFace>) -> Program {
+    match (&entry.command, role, face) {
+        (Some(command), role, _) => Program::Command {
+            role,
+            command: command.clone(),
+            environment: entry.environment.clone(),
+        },
+        (None, Some(role), Some(face)) => Program::Egm { role, face },
+        (None, role, _) => Program::BuiltIn {
+            role: role.unwrap_or_default(),
+        },
+    }
 }
 
 fn check_role(
@@ -260,7 +271,9 @@ fn check_role(
         });
         return None;
     }
-    if !case.may_restart && entry.on_exit != OnExit::EndRun {
+    // A face knows nothing of the world that it could be wrong about.
+    let has_memory = entry.egm.is_none();
+    if !case.may_restart && has_memory && entry.on_exit != OnExit::EndRun {
         let problem = format!(
             "a role of case {} started anew would be wrong about the world; use \"end-run\"",
             case.name
@@ -314,7 +327,10 @@ fn check_every_role_is_played(
     for role in case.roles {
         let is_played = |process: &Process| process.role() == Some(role);
         // A role that a faulty process meant to play is not missing.
-        if !processes.iter().any(is_played) && faults.is_empty() {
+        if !processes.iter().any(is_played)
+            && faults.is_empty()
+            && !is_dispensable(role, case, processes)
+        {
             let hint = format!("no process plays role `{role}` of case `{}`", case.name);
             faults.add("processes", Some(place), Fault::Missing(hint));
         }

@@ -3,11 +3,13 @@
 
 use hil_models::case_study::ChannelSpec;
 
+use super::check_face::is_played_by_face;
 use super::errors::{Fault, Faults, Place};
 use super::file::{ChannelEntry, ProcessEntry};
 use super::file_links::LinkEntry;
 use super::known::KnownCase;
-use super::model::{Channel, ChannelPorts, Link, MessageLayout, Process, Program, Topology, Via};
+use super::model::{Channel, ChannelPorts, MessageLayout, Process, Program, Topology};
+use super::model_links::{Link, Via};
 use super::reader::At;
 use super::tree::join;
 
@@ -89,9 +91,12 @@ fn case_channels(
                 .iter()
                 .find(|process| process.role() == Some(role))
         };
-        // An unplayed role is a fault already.
+        // An unplayed role is a fault already, or nobody misses it.
         let (from, to) = (player(spec.from), spec.to.and_then(player));
-        let Some(from) = from.filter(|_| to.is_some() || spec.is_recorded_only()) else {
+        // A foreign program leaves nothing in our record.
+        let is_recorded_here = spec.is_recorded_only() && !from.is_some_and(is_played_by_face);
+        let Some(from) = from.filter(|_| to.is_some() || is_recorded_here) else {
+            refuse_unplayed(spec, entry, faults);
             continue;
         };
         channels.push(Channel {
@@ -115,6 +120,22 @@ fn case_channels(
         });
     }
     channels
+}
+
+/// A setting of a channel that is not there would be ignored in silence.
+fn refuse_unplayed(spec: &ChannelSpec, entry: Option<&ChannelEntry>, faults: &Faults) {
+    let Some(entry) = entry.filter(|_| faults.is_empty()) else {
+        return;
+    };
+    let fault = format!(
+        "has nothing to set: no process of this file plays role `{}`, so the channel is not there",
+        spec.from
+    );
+    faults.add(
+        entry.path.clone(),
+        Some(entry.place),
+        Fault::Inconsistent(fault),
+    );
 }
 
 /// What the file may say of a channel that the case declares.
@@ -295,7 +316,7 @@ impl Routes<'_> {
             return;
         }
         self.between[index] = Some(hosts);
-        let Some(Via::Udp(hop) | Via::Emulated(hop, _)) = &link.via else {
+        let Some(hop) = link.via.as_ref().and_then(Via::hop) else {
             return;
         };
         channel.ports = ChannelPorts::of(hop.port, self.carried_counts[index]);
@@ -335,7 +356,8 @@ impl Routes<'_> {
             "`{}` on host `{from}` and `{consumer}` on host `{to}`",
             channel.from
         );
-        let hint = format!("the channel joins {ends}: name a link via \"udp\" or \"emulated\"");
+        let hint =
+            format!("the channel joins {ends}: name a link via \"udp\", \"tcp\" or \"emulated\"");
         let fault = match &channel.link {
             None => Fault::Missing(hint),
             Some(link) => {
@@ -386,7 +408,7 @@ fn place_of(value: Option<&At<String>>, table: Place) -> Place {
 fn check_port_ranges(links: &[LinkEntry], carried_counts: &[usize], faults: &Faults) {
     let mut taken: Vec<(&str, core::ops::Range<usize>)> = Vec::new();
     for (link, count) in links.iter().zip(carried_counts) {
-        let Some(Via::Udp(hop) | Via::Emulated(hop, _)) = &link.via else {
+        let Some(hop) = link.via.as_ref().and_then(Via::hop) else {
             continue;
         };
         let base = usize::from(hop.port);

@@ -8,6 +8,7 @@ use std::collections::BTreeMap;
 use std::net::IpAddr;
 
 use super::errors::{Fault, Faults, Place};
+use super::face::FaceEntry;
 use super::file_links::LinkEntry;
 use super::limits;
 use super::model::{Execution, Host, MessageLayout, OnExit, Run, Scheduling, Wait};
@@ -50,6 +51,7 @@ pub(super) struct ProcessEntry {
     pub role: Option<At<String>>,
     pub command: Option<Vec<String>>,
     pub environment: BTreeMap<String, String>,
+    pub egm: Option<FaceEntry>,
     pub execution: Execution,
     pub on_exit: OnExit,
     pub path: String,
@@ -250,6 +252,12 @@ fn read_process(name: String, mut reader: Reader<'_>) -> ProcessEntry {
             "needs `run`: a built-in role reads no environment",
         );
     }
+    let egm = reader.table("egm").map(FaceEntry::read);
+    if egm.is_some() {
+        let why =
+            "does not go with `egm`: a foreign program that is not started here plays the role";
+        reader.refuse_present(&["run"], why);
+    }
     let execution = read_execution(&mut reader);
     let on_exit = read_on_exit(&mut reader, "end-run");
     let (path, place) = (reader.path.clone(), reader.place);
@@ -260,6 +268,7 @@ fn read_process(name: String, mut reader: Reader<'_>) -> ProcessEntry {
         role,
         command,
         environment,
+        egm,
         execution,
         on_exit,
         path,

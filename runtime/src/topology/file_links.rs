@@ -1,11 +1,12 @@
 //! What a `[links.<name>]` table says by itself; see `file`.
 
+use hil_models::link::outages::Outages;
+
 use super::errors::{Fault, Place};
 use super::file::{read_execution, read_on_exit};
 use super::limits;
-use super::model::{
-    Emulation, Execution, Gateway, Hop, Impairment, OnExit, Scheduling, Timestamps, Via, Wait,
-};
+use super::model::{Execution, OnExit, Scheduling, Wait};
+use super::model_links::{Emulation, Gateway, Hop, Impairment, Timestamps, Via};
 use super::reader::{At, Reader};
 
 #[derive(Debug)]
@@ -22,12 +23,14 @@ pub(super) struct LinkEntry {
 enum Kind {
     SharedMemory,
     Udp,
+    Tcp,
     Emulated,
 }
 
 const KINDS: &[(&str, Kind)] = &[
     ("shared-memory", Kind::SharedMemory),
     ("udp", Kind::Udp),
+    ("tcp", Kind::Tcp),
     ("emulated", Kind::Emulated),
 ];
 
@@ -44,7 +47,7 @@ const HOP_KEYS: &[&str] = &[
 ];
 
 /// Keys that only an emulated link has.
-const EMULATION_KEYS: &[&str] = &["delay", "loss_ratio", "forward", "backward"];
+const EMULATION_KEYS: &[&str] = &["delay", "loss_ratio", "forward", "backward", "outages"];
 
 impl LinkEntry {
     pub(super) fn read(name: String, mut reader: Reader<'_>) -> Self {
@@ -57,7 +60,16 @@ impl LinkEntry {
             let hint = format!("write one of {}", words.join(", "));
             reader.refuse("via", Fault::Missing(hint));
         }
-        let hop = read_hop(&mut reader);
+        let default = match kind {
+            Some(Kind::Tcp) => Timestamps::Off,
+            _ => Timestamps::Software,
+        };
+        let hop = read_hop(&mut reader, default);
+        if matches!(kind, Some(Kind::Tcp)) && hop.timestamps != Timestamps::Off {
+            let why = "needs via = \"udp\" or \"emulated\": a TCP stream has no messages that \
+                       the kernel could stamp; leave it out, or write \"off\"";
+            reader.refuse_present(&["timestamps"], why);
+        }
         let emulation = read_emulation(&mut reader);
         let via = kind.map(|kind| match kind {
             Kind::SharedMemory => {
@@ -66,9 +78,10 @@ impl LinkEntry {
                 Via::SharedMemory
             }
             Kind::Udp => Via::Udp(hop),
+            Kind::Tcp => Via::Tcp(hop),
             Kind::Emulated => Via::Emulated(hop, emulation),
         });
-        if matches!(via, Some(Via::SharedMemory | Via::Udp(_))) {
+        if matches!(via, Some(Via::SharedMemory | Via::Udp(_) | Via::Tcp(_))) {
             let why = "needs via = \"emulated\": no real link can be told what to do";
             reader.refuse_present(EMULATION_KEYS, why);
         }
@@ -106,7 +119,7 @@ where
     read.expect("the default of a limit fits the type of its key")
 }
 
-fn read_hop(reader: &mut Reader<'_>) -> Hop {
+fn read_hop(reader: &mut Reader<'_>, timestamps: Timestamps) -> Hop {
     Hop {
         port: integer(reader, "port", &limits::LINK_PORT),
         dscp: integer(reader, "dscp", &limits::LINK_DSCP),
@@ -115,7 +128,7 @@ fn read_hop(reader: &mut Reader<'_>) -> Hop {
         receive_buffer_bytes: integer(reader, "receive_buffer_bytes", &limits::LINK_BUFFER_BYTES),
         timestamps: reader
             .word("timestamps", Timestamps::WORDS)
-            .unwrap_or(Timestamps::Software),
+            .unwrap_or(timestamps),
         path_mtu_bytes: integer(reader, "path_mtu_bytes", &limits::LINK_PATH_MTU_BYTES),
         gateway: read_gateway(reader.table("gateway")),
     }
@@ -163,7 +176,32 @@ fn read_emulation(reader: &mut Reader<'_>) -> Emulation {
     Emulation {
         forward: direction("forward"),
         backward: direction("backward"),
+        outages: read_outages(reader.table("outages")),
     }
+}
+
+fn read_outages(reader: Option<Reader<'_>>) -> Outages {
+    let (mean, per_hour) = (&limits::LINK_OUTAGE_MEAN, &limits::LINK_OUTAGES_PER_HOUR);
+    let none = Outages {
+        mean_s: mean.default.as_secs_f64(),
+        per_hour: per_hour.default,
+        buffered: false,
+    };
+    let Some(mut reader) = reader else {
+        return none;
+    };
+    let read_mean = reader.duration("mean", mean);
+    let outages = Outages {
+        mean_s: read_mean.map_or(none.mean_s, |mean| mean.as_secs_f64()),
+        per_hour: reader.number("per_hour", per_hour).unwrap_or(none.per_hour),
+        buffered: reader.boolean("buffered").unwrap_or(none.buffered),
+    };
+    // Each number is within its own limits by now; what is left is what they say together.
+    if let Err(error) = outages.check() {
+        reader.refuse("per_hour", Fault::Inconsistent(error.problem));
+    }
+    reader.finish();
+    outages
 }
 
 fn read_impairment(reader: &mut Reader<'_>, default: Impairment) -> Impairment {

@@ -63,6 +63,17 @@ pub(super) const LINK_BUFFER_BYTES: Limit<i64> = limit(212_992, 4_096, 67_108_86
 pub(super) const LINK_PATH_MTU_BYTES: Limit<i64> = limit(1_500, 576, 65_535);
 pub(super) const LINK_DELAY: Limit<Duration> = limit(ms(0), ms(0), ms(10_000));
 pub(super) const LINK_LOSS_RATIO: Limit<f64> = limit(0.0, 0.0, 1.0);
+/// Mean length of an outage.
+pub(super) const LINK_OUTAGE_MEAN: Limit<Duration> = limit(ms(500), ms(1), ms(3_600_000));
+/// None by default. Together with the mean length they may take up 95 % of the time.
+pub(super) const LINK_OUTAGES_PER_HOUR: Limit<f64> = limit(0.0, 0.0, 100_000.0);
+
+/// Joints of an arm on the wire of an EGM face.
+pub(super) const EGM_AXES: Limit<i64> = limit(7, 6, 7);
+/// Generation of the robot's software whose fields an EGM face writes.
+pub(super) const EGM_ROBOTWARE: Limit<i64> = limit(7, 6, 7);
+/// A robot takes one message per cycle of 4 ms; senders of up to four times that are seen.
+pub(super) const EGM_SEND_HZ: Limit<f64> = limit(250.0, 1.0, 1_000.0);
 
 /// Longest name of a run, host, process, channel or link.
 pub(super) const NAME_LENGTH_MAX: usize = 64;
@@ -131,6 +142,8 @@ mod tests {
             LINK_SOCKET_PRIORITY,
             LINK_BUFFER_BYTES,
             LINK_PATH_MTU_BYTES,
+            EGM_AXES,
+            EGM_ROBOTWARE,
         ] {
             assert!(limit.allows(&limit.default), "{limit:?}");
         }
@@ -140,10 +153,13 @@ mod tests {
             RUN_PEER_TIMEOUT,
             TIMER_SLACK,
             LINK_DELAY,
+            LINK_OUTAGE_MEAN,
         ] {
             assert!(limit.allows(&limit.default), "{limit:?}");
         }
         assert!(LINK_LOSS_RATIO.allows(&LINK_LOSS_RATIO.default));
+        assert!(EGM_SEND_HZ.allows(&EGM_SEND_HZ.default));
+        assert!(LINK_OUTAGES_PER_HOUR.allows(&LINK_OUTAGES_PER_HOUR.default));
         assert!(!LINK_LOSS_RATIO.allows(&f64::NAN));
     }
 }

@@ -13,7 +13,9 @@
 mod card;
 mod check;
 mod check_channels;
+mod check_face;
 mod errors;
+mod face;
 mod file;
 mod file_links;
 mod host;
@@ -21,6 +23,7 @@ mod known;
 mod layers;
 mod limits;
 mod model;
+mod model_links;
 mod reader;
 mod resolved;
 mod suggest;
@@ -30,16 +33,18 @@ mod units;
 use std::path::Path;
 
 pub use card::{CardChannel, ProcessCard};
+pub(crate) use check_face::{command_channel, feedback_channel};
 pub use errors::{Fault, Location, TopologyError, TopologyErrors};
+pub use face::{EgmFace, FaceKind, FaceSend};
 pub use host::{HOST_VARIABLE, HostChoice, HostError, MachineIdentity, which_host};
 pub use known::{
     KnownCase, KnownCases, ParameterCheck, ParameterFault, check_parameters_with, parameters_of,
 };
 pub use model::{
-    Case, Channel, ChannelPorts, Crossing, Direction, Emulation, Execution, Gateway, Hop, Host,
-    Impairment, Link, MessageLayout, OnExit, Process, Program, Run, Scheduling, Timestamps,
-    Topology, Via, Wait,
+    Case, Channel, ChannelPorts, Crossing, Direction, Execution, Host, MessageLayout, OnExit,
+    Process, Program, Run, Scheduling, Topology, Wait,
 };
+pub use model_links::{Emulation, Gateway, Hop, Impairment, Link, Timestamps, Via};
 
 use check::Needs;
 use errors::Place;
@@ -68,6 +73,20 @@ pub fn load_case(
     known: &KnownCases,
 ) -> Result<Topology, TopologyErrors> {
     read_and_check(path, None, overrides, (known, Needs::Case))
+}
+
+/// Like [`load_case`], without any file: the case called `name` as it is by default, with the
+/// `overrides` laid over it.
+///
+/// # Errors
+/// As [`load`].
+pub fn case_by_name(
+    name: &str,
+    overrides: &[String],
+    known: &KnownCases,
+) -> Result<Topology, TopologyErrors> {
+    let text = format!("version = 1\nname = \"{name}\"\ncase.name = \"{name}\"\n");
+    read_and_check(Path::new(name), Some(text), overrides, (known, Needs::Case))
 }
 
 /// Like [`load`], but from a text; `name` stands in error messages, and what the text extends is

@@ -6,8 +6,12 @@ use core::time::Duration;
 use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
+use hil_models::link::outages::Outages;
 use hil_models::message::type_hash;
-use serde::{Deserialize, Serialize};
+
+use super::model_links::{Hop, Impairment, Link};
+
+use super::face::EgmFace;
 
 /// A topology file after every check. Only [`load`](super::load) and [`parse`](super::parse)
 /// make one.
@@ -91,14 +95,14 @@ impl Process {
     /// The role of the case it plays, if any.
     pub fn role(&self) -> Option<&str> {
         match &self.program {
-            Program::BuiltIn { role } => Some(role),
+            Program::BuiltIn { role } | Program::Egm { role, .. } => Some(role),
             Program::Command { role, .. } => role.as_deref(),
         }
     }
 }
 
 /// What a process executes.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub enum Program {
     /// A role of the case study, shipped in this binary.
     BuiltIn {
@@ -113,6 +117,13 @@ pub enum Program {
         command: Vec<String>,
         /// Variables added to its environment.
         environment: BTreeMap<String, String>,
+    },
+    /// Nothing of the role: a foreign EGM program plays it, and this process speaks with it.
+    Egm {
+        /// Name of the role.
+        role: String,
+        /// How to speak with the program.
+        face: EgmFace,
     },
 }
 
@@ -169,7 +180,7 @@ pub enum OnExit {
 /// Identity of a channel's messages; owned, because foreign channels name theirs in the file.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct MessageLayout {
-    /// Name and version, e.g. `hil.JointCommand.v1`.
+    /// Name and version, e.g. `hil.EgmCommand.v1`.
     pub name: String,
     /// Size of one message.
     pub size_bytes: usize,
@@ -201,7 +212,7 @@ pub struct Channel {
     pub depth: usize,
     /// Name of its link, if the file gives one.
     pub link: Option<String>,
-    /// UDP ports of its gateways; `None` when it stays in shared memory.
+    /// Ports of its gateways; `None` when it stays in shared memory.
     pub ports: Option<ChannelPorts>,
     /// True when the file declares it, false when the case does.
     pub is_foreign: bool,
@@ -214,7 +225,7 @@ impl Channel {
     }
 }
 
-/// The two UDP ports of a channel on a hop.
+/// The two ports of a channel on a hop. Over TCP only the receiver's is used.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ChannelPorts {
     /// Bound on the producer's host.
@@ -232,99 +243,6 @@ impl ChannelPorts {
         let receiver = sender.checked_add(1)?;
         Some(Self { sender, receiver })
     }
-}
-
-/// One `[links.<name>]`.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Link {
-    /// Its key.
-    pub name: String,
-    /// What carries the bytes.
-    pub via: Via,
-    /// Its two hosts; forward is from the first to the second. `None` while no channel uses it
-    /// and the file does not say.
-    pub between: Option<[String; 2]>,
-}
-
-impl Link {
-    /// Socket and gateway settings; `None` for shared memory.
-    pub fn hop(&self) -> Option<&Hop> {
-        match &self.via {
-            Via::SharedMemory => None,
-            Via::Udp(hop) | Via::Emulated(hop, _) => Some(hop),
-        }
-    }
-}
-
-/// What carries a link's bytes.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Via {
-    /// One host, no gateway.
-    SharedMemory,
-    /// UDP datagrams over the real network.
-    Udp(Hop),
-    /// UDP datagrams behind a model of a network.
-    Emulated(Hop, Emulation),
-}
-
-/// Socket and gateway settings of a link.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Hop {
-    /// First UDP port; see [`ChannelPorts::of`].
-    pub port: u16,
-    /// Differentiated-services code point (RFC 2474), 0..=63.
-    pub dscp: u8,
-    /// `SO_PRIORITY`; `None` leaves what the kernel derives from the code point.
-    pub socket_priority: Option<u32>,
-    /// Send buffer asked of the kernel.
-    pub send_buffer_bytes: usize,
-    /// Receive buffer asked of the kernel.
-    pub receive_buffer_bytes: usize,
-    /// Kernel time stamps asked for.
-    pub timestamps: Timestamps,
-    /// Largest IP packet the path carries.
-    pub path_mtu_bytes: usize,
-    /// How its gateways run.
-    pub gateway: Gateway,
-}
-
-/// How the gateways of a link run.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Gateway {
-    /// How the kernel schedules them and how they wait.
-    pub execution: Execution,
-    /// What the end of one means for the run.
-    pub on_exit: OnExit,
-}
-
-/// Kernel time stamps of a hop.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Timestamps {
-    /// None: only the gateways' own clock readings.
-    Off,
-    /// Taken by the kernel's network stack.
-    Software,
-    /// Taken by the network card.
-    Hardware,
-}
-
-/// What an emulated link does, in each direction.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Emulation {
-    /// From the first host of [`Link::between`] to the second.
-    pub forward: Impairment,
-    /// From the second to the first.
-    pub backward: Impairment,
-}
-
-/// The static network model of one direction.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Impairment {
-    /// Fixed one-way delay.
-    pub delay: Duration,
-    /// Probability that a datagram is lost, 0..=1.
-    pub loss_ratio: f64,
 }
 
 /// The way a channel travels on its link.
@@ -345,7 +263,7 @@ pub struct Crossing<'a> {
     pub link: &'a Link,
     /// Settings of that link.
     pub hop: &'a Hop,
-    /// Its UDP ports.
+    /// Its ports.
     pub ports: ChannelPorts,
     /// Host of the producer.
     pub from_host: &'a Host,
@@ -355,6 +273,8 @@ pub struct Crossing<'a> {
     pub direction: Direction,
     /// What the emulation does to it; `None` on a real hop.
     pub impairment: Option<Impairment>,
+    /// When the emulation lets nothing through, both ways; `None` on a real hop.
+    pub outages: Option<Outages>,
 }
 
 impl Topology {
@@ -444,11 +364,11 @@ impl Topology {
         } else {
             Direction::Backward
         };
-        let impairment = match (&link.via, direction) {
-            (Via::Emulated(_, emulation), Direction::Forward) => Some(emulation.forward),
-            (Via::Emulated(_, emulation), Direction::Backward) => Some(emulation.backward),
-            (Via::SharedMemory | Via::Udp(_), _) => None,
-        };
+        let emulation = link.emulation();
+        let impairment = emulation.map(|emulation| match direction {
+            Direction::Forward => emulation.forward,
+            Direction::Backward => emulation.backward,
+        });
         Some(Crossing {
             channel,
             link,
@@ -458,6 +378,7 @@ impl Topology {
             to_host,
             direction,
             impairment,
+            outages: emulation.map(|emulation| emulation.outages),
         })
     }
 }
@@ -482,6 +403,6 @@ macro_rules! words {
         }
     };
 }
+pub(super) use words;
 
 words!(Wait { Block = "block", Hybrid = "hybrid", Spin = "spin" });
-words!(Timestamps { Off = "off", Software = "software", Hardware = "hardware" });

@@ -3,13 +3,12 @@
 
 use core::time::Duration;
 
+use hil_models::link::outages::Outages;
 use serde::Serialize;
 use toml::{Table, Value};
 
-use super::model::{
-    Channel, Execution, Gateway, Hop, Host, Impairment, Link, OnExit, Process, Program, Scheduling,
-    Topology, Via,
-};
+use super::model::{Channel, Execution, Host, OnExit, Process, Program, Scheduling, Topology};
+use super::model_links::{Gateway, Hop, Impairment, Link, Via};
 use super::units::format_duration;
 
 impl Topology {
@@ -133,6 +132,9 @@ fn resolved_process(process: &Process) -> Table {
             .collect();
         put(&mut table, "env", variables);
     }
+    if let Program::Egm { face, .. } = &process.program {
+        put(&mut table, "egm", face.resolved());
+    }
     put_execution(&mut table, &process.execution);
     put_on_exit(&mut table, process.on_exit);
     table
@@ -196,14 +198,11 @@ fn resolved_link(link: &Link) -> Table {
     if let Some(between) = &link.between {
         put(&mut table, "between", between.to_vec());
     }
+    put(&mut table, "via", link.via.word());
     match &link.via {
-        Via::SharedMemory => put(&mut table, "via", "shared-memory"),
-        Via::Udp(hop) => {
-            put(&mut table, "via", "udp");
-            put_hop(&mut table, hop);
-        }
+        Via::SharedMemory => {}
+        Via::Udp(hop) | Via::Tcp(hop) => put_hop(&mut table, hop),
         Via::Emulated(hop, emulation) => {
-            put(&mut table, "via", "emulated");
             put_hop(&mut table, hop);
             put(
                 &mut table,
@@ -215,6 +214,7 @@ fn resolved_link(link: &Link) -> Table {
                 "backward",
                 resolved_impairment(emulation.backward),
             );
+            put(&mut table, "outages", resolved_outages(emulation.outages));
         }
     }
     table
@@ -241,6 +241,15 @@ fn resolved_gateway(gateway: &Gateway) -> Table {
     let mut table = Table::new();
     put_execution(&mut table, &gateway.execution);
     put_on_exit(&mut table, gateway.on_exit);
+    table
+}
+
+fn resolved_outages(outages: Outages) -> Table {
+    let mut table = Table::new();
+    let mean = Duration::from_secs_f64(outages.mean_s);
+    put(&mut table, "mean", duration(mean));
+    put(&mut table, "per_hour", outages.per_hour);
+    put(&mut table, "buffered", outages.buffered);
     table
 }
 

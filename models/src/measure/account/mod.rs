@@ -13,6 +13,7 @@ mod fate;
 mod figures;
 mod gaps;
 mod join;
+mod outage;
 #[cfg(test)]
 mod random_fates;
 mod segments;
@@ -28,6 +29,10 @@ use core::time::Duration;
 pub use figures::{
     BurstCount, ChannelAccount, Closing, ClosingFigures, Coverage, EndToEnd, FateCounts, Gap, Gaps,
     InterruptionFigures, SegmentFigures, StampCoverage,
+};
+pub use outage::{
+    Foregoing, Happening, LongestOutage, OUTAGE_EFFECT_MAX, Outage, OutageClass, OutageFigures,
+    OutageFinder, Standing, foregoing, outages,
 };
 pub use stage::{MessageFate, Side, Stage};
 pub use story::{MessageStory, stories};

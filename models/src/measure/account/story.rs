@@ -71,7 +71,8 @@ fn key(joined: &Joined<'_>) -> Option<(u32, u64)> {
     Some((epoch, joined.key.sequence))
 }
 
-fn published_ns(joined: &Joined<'_>) -> Option<i64> {
+/// The producer's stamp, from whichever record carries it.
+pub(super) fn published_ns(joined: &Joined<'_>) -> Option<i64> {
     let stamps = [
         joined.published.map(|record| record.published_ns),
         joined.egress.map(|record| record.published_ns),

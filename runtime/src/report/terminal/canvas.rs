@@ -161,7 +161,7 @@ pub(super) fn clean(text: &str) -> String {
 }
 
 /// At most `width` columns, with an ellipsis where something is missing.
-pub(super) fn shortened(text: &str, width: usize) -> String {
+pub(crate) fn shortened(text: &str, width: usize) -> String {
     let text = clean(text);
     if columns(&text) <= width {
         return text;
@@ -188,7 +188,7 @@ pub(super) fn right(text: &str, width: usize) -> String {
 }
 
 /// Rows of at most `width` columns, broken at blanks, or anywhere in a longer word.
-pub(super) fn wrapped(text: &str, width: usize) -> Vec<String> {
+pub(crate) fn wrapped(text: &str, width: usize) -> Vec<String> {
     let (mut rows, mut row) = (Vec::new(), String::new());
     for word in clean(text).split(' ').filter(|word| !word.is_empty()) {
         let mut word: Vec<char> = word.chars().collect();

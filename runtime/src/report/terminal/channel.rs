@@ -16,6 +16,9 @@ const NAME_WIDTH: usize = 22;
 const FIGURE_WIDTH: usize = 9;
 const BAR_GAP: usize = 2;
 
+/// The fact that gets a line of its own.
+const STALLS: &str = "stalls";
+
 pub(super) fn channel(canvas: &mut Canvas, channel: &ChannelSummary) {
     let link = channel.link.label();
     let title = format!("Channel {}", channel.name);
@@ -41,6 +44,9 @@ pub(super) fn channel(canvas: &mut Canvas, channel: &ChannelSummary) {
         round_trip(canvas, &account.round_trip);
         losses(canvas, account);
     }
+    if let Some(figures) = &channel.outages {
+        super::outages::outages(canvas, figures);
+    }
     let list = |counts: &[CountByName]| {
         let words = counts
             .iter()
@@ -55,14 +61,21 @@ pub(super) fn channel(canvas: &mut Canvas, channel: &ChannelSummary) {
         );
     }
     for direction in &channel.directions {
-        let facts = direction
+        // Whether a stream stood still is a result, and not one to be looked for among options.
+        let (stalls, facts): (Vec<_>, Vec<_>) = direction
             .facts
+            .iter()
+            .partition(|fact| fact.label == STALLS);
+        let facts = facts
             .iter()
             .map(|fact| format!("{}: {}", fact.label, fact.value));
         let words: Vec<_> = core::iter::once(format!("peer {}", direction.peer_state))
             .chain(facts)
             .collect();
         canvas.field(&direction.direction, Tone::Faint, &words.join(" · "));
+        for stalls in stalls {
+            canvas.field(STALLS, Tone::Plain, &stalls.value);
+        }
     }
 }
 

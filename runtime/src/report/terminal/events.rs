@@ -8,8 +8,9 @@ use super::canvas::{Canvas, INDENT, Tone, shortened};
 use super::units::{grouped, seconds};
 use crate::report::score_event::{ExplainedEvent, ExplainedMessage, ScoreEvents};
 
-/// Events on the page; all of them are in the summary.
+/// Events on the page, and messages of each; all of them are in the summary.
 const SHOWN_COUNT: usize = 12;
+const MESSAGES_SHOWN_COUNT: usize = 6;
 
 /// Columns of an event's time, of a message's name, and the margin of messages.
 const TIME_WIDTH: usize = 14;
@@ -48,7 +49,7 @@ pub(super) fn score_events(canvas: &mut Canvas, all: &ScoreEvents) {
     let mut more = Vec::new();
     if hidden > 0 {
         more.push(format!(
-            "{} more events are in summary.json, or printed by --json",
+            "{} more events are in events.log and summary.json, or printed by --json",
             grouped(hidden)
         ));
     }
@@ -88,7 +89,10 @@ fn one_event(canvas: &mut Canvas, event: &ExplainedEvent, clocks_differ: bool) {
         event.what.clone()
     };
     canvas.field_of(TIME_WIDTH, &time, tone, &what);
-    for message in &event.messages {
+    for outage in &event.outages {
+        canvas.paragraph(MESSAGE_MARGIN, Tone::Caution, &outage.words);
+    }
+    for message in event.messages.iter().take(MESSAGES_SHOWN_COUNT) {
         let tone = match message.fate {
             None | Some(MessageFate::UnknownPeerRecordsUnavailable) => Tone::Faint,
             Some(fate) if fate.is_loss() => Tone::Caution,
@@ -97,11 +101,10 @@ fn one_event(canvas: &mut Canvas, event: &ExplainedEvent, clocks_differ: bool) {
         let name = shortened(&name(message), NAME_WIDTH - 1);
         canvas.field_at(MESSAGE_MARGIN, (NAME_WIDTH, &name), tone, &message.words);
     }
-    if event.messages_dropped_count > 0 {
-        let text = format!(
-            "and {} more messages",
-            grouped(event.messages_dropped_count)
-        );
+    let hidden = event.messages.len().saturating_sub(MESSAGES_SHOWN_COUNT) as u64;
+    let more = hidden.saturating_add(event.messages_dropped_count);
+    if more > 0 {
+        let text = format!("and {} more messages", grouped(more));
         canvas.paragraph(MESSAGE_MARGIN, Tone::Faint, &text);
     }
 }

@@ -3,11 +3,16 @@
 mod canvas;
 mod channel;
 mod events;
+mod face;
+mod outages;
 mod tables;
 mod units;
 
 pub use canvas::Style;
-pub(crate) use units::{JOINT, duration_s, grouped, percent};
+pub(crate) use canvas::{shortened, wrapped};
+pub(crate) use units::{JOINT, duration_s, grouped, percent, seconds};
+
+use hil_models::measure::account::OutageFigures;
 
 use canvas::{Canvas, INDENT, Tone};
 
@@ -25,6 +30,9 @@ pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> Strin
     events::score_events(&mut canvas, &summary.score_events);
     for channel in &summary.channels {
         channel::channel(&mut canvas, channel);
+    }
+    for face in &summary.faces {
+        face::face(&mut canvas, face);
     }
     tables::processes(&mut canvas, &summary.processes);
     tables::events(&mut canvas, &summary.events);
@@ -49,16 +57,31 @@ pub fn render_score(
     canvas.finish()
 }
 
+/// The outages of one channel alone, as [`render`] shows them; nothing where there were none.
+pub fn render_outages(
+    channel: &str,
+    figures: &OutageFigures,
+    width_columns: usize,
+    style: Style,
+) -> String {
+    let mut canvas = Canvas::new(width_columns, style);
+    if figures.outage_count > 0 {
+        canvas.heading(&format!("Channel {channel}"), "");
+        outages::outages(&mut canvas, figures);
+    }
+    canvas.finish()
+}
+
 fn title(canvas: &mut Canvas, summary: &RunSummary) {
     let run = &summary.run;
     canvas.rule(Tone::Faint);
-    let title = canvas::shortened(&format!("{} · {}", run.case, run.name), canvas.width());
+    let title = shortened(&format!("{} · {}", run.case, run.name), canvas.width());
     let line = canvas.paint(Tone::Strong, &title);
     canvas.line(&line);
     let facts = format!(
         "{} · {} long · seed {} · host {} · topology {} ({})",
         run.started,
-        units::seconds(run.duration_s),
+        seconds(run.duration_s),
         run.seed,
         run.host,
         run.topology_file,
@@ -105,6 +128,18 @@ fn network_words(verdict: &NetworkVerdict) -> (Tone, String) {
         NetworkVerdict::NoNetwork => {
             let text = "no channel went over a network; nothing here says anything about one";
             (Tone::Plain, text.to_owned())
+        }
+        NetworkVerdict::ForeignProgram => {
+            let text = format!(
+                "a foreign program took part over its own protocol: its answers are its and its \
+                 network's; no process of ours skipped more than {limit} of its ticks"
+            );
+            (Tone::Plain, text)
+        }
+        NetworkVerdict::NoForeignProgram => {
+            let text = "no foreign program answered, and no link of ours was a network; nothing \
+                        here says anything about one";
+            (Tone::Caution, text.to_owned())
         }
         NetworkVerdict::NetworkResult => {
             let text =

@@ -113,6 +113,30 @@ const FAULTY: &[Faulty] = &[
     ),
     Faulty(
         "via = \"udp\"",
+        "via = \"emulated\"\n[links.hop.outages]\nper_hour = -1 #!",
+        "links.hop.outages.per_hour",
+        &["-1 is outside 0..=100000"],
+    ),
+    Faulty(
+        "via = \"udp\"",
+        "via = \"emulated\"\n[links.hop.outages]\nmean = \"0 s\" #!",
+        "links.hop.outages.mean",
+        &["\"0 s\" is outside"],
+    ),
+    Faulty(
+        "via = \"udp\"",
+        "via = \"emulated\"\n[links.hop.outages]\nmean = \"60 s\"\nper_hour = 60 #!",
+        "links.hop.outages.per_hour",
+        &["less than 5 % of the time in service"],
+    ),
+    Faulty(
+        "via = \"udp\"",
+        "via = \"emulated\"\n[links.hop.outages]\nrate = 3 #!",
+        "links.hop.outages.rate",
+        &[],
+    ),
+    Faulty(
+        "via = \"udp\"",
         "via = \"emulated\"\ndelay = 50 #!",
         "links.hop.delay",
         &["an integer", "duration", "20 ms"],
@@ -206,6 +230,12 @@ const FAULTY: &[Faulty] = &[
         "via = \"udp\"",
         "via = \"udp\"\ndelay = \"5 ms\" #!",
         "links.hop.delay",
+        &["needs via = \"emulated\""],
+    ),
+    Faulty(
+        "via = \"udp\"",
+        "via = \"tcp\"\n[links.hop.outages] #!\nper_hour = 3",
+        "links.hop.outages",
         &["needs via = \"emulated\""],
     ),
     Faulty(
@@ -316,7 +346,7 @@ const FAULTY: &[Faulty] = &[
         "[channels.\"arm/status\"]\nlink = \"hop\"",
         "[channels.\"arm/status\"] #!",
         "channels.\"arm/status\".link",
-        &["`robot` on host `robot-pc`", "\"udp\" or \"emulated\""],
+        &["`robot` on host `robot-pc`", "\"tcp\" or \"emulated\""],
     ),
     Faulty(
         "[channels.\"arm/status\"]\nlink = \"hop\"",

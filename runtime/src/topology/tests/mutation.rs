@@ -26,6 +26,8 @@ const TOKENS: &[&str] = &[
     "\"µs\"",
     "[links.hop]",
     "via = \"udp\"",
+    "via = \"tcp\"",
+    "[links.hop.outages]",
     "extends = \"/dev/null\"",
     "99999999999999999999",
     "1979-05-27",
@@ -67,6 +69,7 @@ via = "emulated"
 between = ["b", "a"]
 delay = "50 ms"
 backward.loss_ratio = 0.1
+outages = { mean = "500 ms", per_hour = 100, buffered = true }
 gateway.wait = "hybrid"
 "#;
 

@@ -1,6 +1,8 @@
 //! Faults that several keys make together, and faults of overrides and foreign channels.
 
 use super::faulty::GOOD;
+use hil_models::link::outages::Outages;
+
 use super::*;
 
 #[test]
@@ -11,7 +13,7 @@ fn all_faults_of_a_file_are_reported_at_once() {
             "role = \"robot\"",
             "role = \"robto\"\nwiat = \"block\"\ncpu = 5000",
         )
-        .replace("via = \"udp\"", "via = \"tcp\"\ndscp = 64");
+        .replace("via = \"udp\"", "via = \"quic\"\ndscp = 64");
     let errors = parse("faulty.toml", &text, &[], &known()).unwrap_err();
     let keys: Vec<_> = errors
         .errors()
@@ -160,6 +162,48 @@ fn one_link_joins_one_pair_of_hosts() {
         "{text}"
     );
     assert!(text.contains("between `control-pc` and `third`"), "{text}");
+}
+
+#[test]
+fn a_link_over_tcp_has_ports_and_a_hop_and_no_model() {
+    let text = EVERYTHING.replace("via = \"udp\"", "via = \"tcp\"");
+    let topology = parse("tcp.toml", &text, &[], &known()).unwrap();
+    let mut crossings = topology.crossings();
+    let image = crossings
+        .find(|crossing| crossing.channel.name == "camera/image")
+        .unwrap();
+    assert!(matches!(image.link.via, Via::Tcp(_)));
+    assert_eq!((image.ports.sender, image.ports.receiver), (9000, 9001));
+    assert_eq!((image.impairment, image.outages), (None, None));
+    assert_eq!(image.hop.timestamps, Timestamps::Off);
+    let written = topology.to_toml();
+    let again = parse("again.toml", &written, &[], &known()).unwrap();
+    assert_eq!(again, topology);
+    let stamped = text.replace("via = \"tcp\"", "via = \"tcp\"\ntimestamps = \"software\"");
+    let refused = parse("tcp.toml", &stamped, &[], &known()).unwrap_err();
+    let words = refused.to_string();
+    let expected = "links.wire.timestamps needs via = \"udp\" or \"emulated\": a TCP stream";
+    assert!(words.contains(expected), "{words}");
+}
+
+#[test]
+fn the_outages_of_a_link_are_those_of_both_ways() {
+    let topology = parse_good(EVERYTHING);
+    let expected = Outages {
+        mean_s: 1.5,
+        per_hour: 12.5,
+        buffered: true,
+    };
+    for crossing in topology.crossings().take(2) {
+        assert_eq!(crossing.outages, Some(expected));
+    }
+    let quiet = EVERYTHING.replace("outages = {", "# outages = {");
+    let quiet = parse_good(&quiet);
+    let outages = quiet
+        .crossings()
+        .next()
+        .and_then(|crossing| crossing.outages);
+    assert!(outages.is_some_and(|outages| !outages.is_active()));
 }
 
 fn check_with_refusal(table: &toml::Table, seed: u64) -> Result<toml::Table, Vec<ParameterFault>> {

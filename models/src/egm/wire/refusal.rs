@@ -1,0 +1,279 @@
+//! Why a datagram, or a command to be sent, is not taken: the causes and their counts. It decides
+//! nothing: the faces do.
+
+use crate::egm::wire::joints::ROBOT_JOINT_COUNT;
+use crate::egm::wire::{DATAGRAM_BYTES_MAX, WireError};
+
+/// One datagram or command that is not taken.
+///
+/// Joints carry the maker's numbers, J1 to J7.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum Refusal {
+    /// Longer than any message.
+    #[error("datagram of {length_bytes} bytes is longer than {DATAGRAM_BYTES_MAX}")]
+    TooLong {
+        /// Its length.
+        length_bytes: usize,
+    },
+    /// Not the bytes of the message expected.
+    #[error("datagram is not the protobuf message expected")]
+    NotProtobuf,
+    /// No header: nothing says what it is.
+    #[error("message has no header")]
+    MissingHeader,
+    /// A message, but of another type.
+    #[error("message type {found} is not {expected}")]
+    WrongMessageType {
+        /// Type in its header, as a number; 0 when it does not say.
+        found: i32,
+        /// The type expected.
+        expected: i32,
+    },
+    /// No joints: pose or speed guidance alone is not what a joint session takes.
+    #[error("message has no joints")]
+    MissingJoints,
+    /// Another number of values than the arm has joints.
+    #[error(
+        "{robot_count} joints and {external_count} external axes do not make {joint_count} \
+         joints, {ROBOT_JOINT_COUNT} of them the robot's"
+    )]
+    WrongArity {
+        /// Joints found.
+        robot_count: usize,
+        /// External axes found.
+        external_count: usize,
+        /// Joints expected, J7 included.
+        joint_count: usize,
+    },
+    /// A value that is no finite number.
+    #[error("value of J{joint} is not a finite number")]
+    NotFinite {
+        /// The first such joint; 0 stands for the tool's pose.
+        joint: usize,
+    },
+    /// A position outside the joint's limits.
+    #[error("J{joint} at {value_rad} rad is outside {min_rad}..={max_rad}")]
+    OutsideLimits {
+        /// The first such joint.
+        joint: usize,
+        /// Its value.
+        value_rad: f64,
+        /// Lowest position.
+        min_rad: f64,
+        /// Highest position.
+        max_rad: f64,
+    },
+    /// A speed no joint of a robot reaches.
+    #[error("J{joint} at {value_rad_per_s} rad/s is faster than {max_rad_per_s}")]
+    TooFast {
+        /// The first such joint.
+        joint: usize,
+        /// Its value.
+        value_rad_per_s: f64,
+        /// Highest speed taken.
+        max_rad_per_s: f64,
+    },
+    /// A command before the robot has sent anything.
+    #[error("the robot has not opened a session yet")]
+    NoSession,
+    /// A message older than one already taken: the network reordered or repeated it.
+    #[error("message {seqno} came after {newest}")]
+    Overtaken {
+        /// Its number.
+        seqno: u32,
+        /// The newest number taken.
+        newest: u32,
+    },
+}
+
+impl From<WireError> for Refusal {
+    fn from(error: WireError) -> Self {
+        match error {
+            WireError::TooLong { length_bytes } => Self::TooLong { length_bytes },
+            WireError::NotProtobuf(_) => Self::NotProtobuf,
+        }
+    }
+}
+
+/// A [`Refusal`] without its numbers: what is counted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[repr(usize)]
+pub enum Cause {
+    /// [`Refusal::TooLong`].
+    TooLong,
+    /// [`Refusal::NotProtobuf`].
+    NotProtobuf,
+    /// [`Refusal::MissingHeader`].
+    MissingHeader,
+    /// [`Refusal::WrongMessageType`].
+    WrongMessageType,
+    /// [`Refusal::MissingJoints`].
+    MissingJoints,
+    /// [`Refusal::WrongArity`].
+    WrongArity,
+    /// [`Refusal::NotFinite`].
+    NotFinite,
+    /// [`Refusal::OutsideLimits`].
+    OutsideLimits,
+    /// [`Refusal::TooFast`].
+    TooFast,
+    /// [`Refusal::NoSession`].
+    NoSession,
+    /// [`Refusal::Overtaken`].
+    Overtaken,
+}
+
+impl Cause {
+    /// Number of causes.
+    pub const COUNT: usize = 11;
+
+    /// Every cause, in the order of the counts.
+    pub const ALL: [Self; Self::COUNT] = [
+        Self::TooLong,
+        Self::NotProtobuf,
+        Self::MissingHeader,
+        Self::WrongMessageType,
+        Self::MissingJoints,
+        Self::WrongArity,
+        Self::NotFinite,
+        Self::OutsideLimits,
+        Self::TooFast,
+        Self::NoSession,
+        Self::Overtaken,
+    ];
+
+    /// A few words for a report.
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::TooLong => "too long",
+            Self::NotProtobuf => "not protobuf",
+            Self::MissingHeader => "missing header",
+            Self::WrongMessageType => "wrong message type",
+            Self::MissingJoints => "no joints",
+            Self::WrongArity => "wrong number of joints",
+            Self::NotFinite => "not a finite number",
+            Self::OutsideLimits => "outside joint limits",
+            Self::TooFast => "too fast",
+            Self::NoSession => "no session",
+            Self::Overtaken => "overtaken",
+        }
+    }
+}
+
+const _: () = {
+    let mut index = 0;
+    while index < Cause::COUNT {
+        assert!(Cause::ALL[index] as usize == index);
+        index += 1;
+    }
+};
+
+impl Refusal {
+    /// Its cause.
+    pub const fn cause(&self) -> Cause {
+        match self {
+            Self::TooLong { .. } => Cause::TooLong,
+            Self::NotProtobuf => Cause::NotProtobuf,
+            Self::MissingHeader => Cause::MissingHeader,
+            Self::WrongMessageType { .. } => Cause::WrongMessageType,
+            Self::MissingJoints => Cause::MissingJoints,
+            Self::WrongArity { .. } => Cause::WrongArity,
+            Self::NotFinite { .. } => Cause::NotFinite,
+            Self::OutsideLimits { .. } => Cause::OutsideLimits,
+            Self::TooFast { .. } => Cause::TooFast,
+            Self::NoSession => Cause::NoSession,
+            Self::Overtaken { .. } => Cause::Overtaken,
+        }
+    }
+
+    /// A few words for a report.
+    pub const fn label(&self) -> &'static str {
+        self.cause().label()
+    }
+}
+
+/// What became of the datagrams or commands of one direction. Without allocation.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct DatagramCounts {
+    accepted_count: u64,
+    refused_counts: [u64; Cause::COUNT],
+}
+
+impl DatagramCounts {
+    /// Counts one outcome and hands it on.
+    ///
+    /// # Errors
+    /// The refusal it was given.
+    pub fn note<T>(&mut self, outcome: Result<T, Refusal>) -> Result<T, Refusal> {
+        match &outcome {
+            Ok(_) => self.accepted_count += 1,
+            Err(refusal) => self.refused_counts[refusal.cause() as usize] += 1,
+        }
+        outcome
+    }
+
+    /// Those taken.
+    pub fn accepted(&self) -> u64 {
+        self.accepted_count
+    }
+
+    /// Those refused for `cause`.
+    pub fn refused(&self, cause: Cause) -> u64 {
+        self.refused_counts[cause as usize]
+    }
+
+    /// Those refused for any cause.
+    pub fn refused_total(&self) -> u64 {
+        self.refused_counts.iter().sum()
+    }
+
+    /// All that came.
+    pub fn total(&self) -> u64 {
+        self.accepted_count + self.refused_total()
+    }
+
+    /// Cause and count of each cause that occurred.
+    pub fn causes(&self) -> impl Iterator<Item = (Cause, u64)> + '_ {
+        let counted = Cause::ALL.into_iter().zip(self.refused_counts);
+        counted.filter(|(_, count)| *count > 0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_outcome_is_counted_once() {
+        let mut counts = DatagramCounts::default();
+        for index in 0..10 {
+            let outcome = match index % 3 {
+                0 => Ok(index),
+                1 => Err(Refusal::MissingHeader),
+                _ => Err(Refusal::NotFinite { joint: 7 }),
+            };
+            assert_eq!(counts.note(outcome), outcome);
+        }
+        assert_eq!(
+            (counts.accepted(), counts.refused_total(), counts.total()),
+            (4, 6, 10)
+        );
+        let causes: Vec<_> = counts.causes().collect();
+        assert_eq!(causes, [(Cause::MissingHeader, 3), (Cause::NotFinite, 3)]);
+    }
+
+    #[test]
+    fn a_refusal_states_value_and_bound() {
+        let refusal = Refusal::WrongArity {
+            robot_count: 12,
+            external_count: 1,
+            joint_count: 7,
+        };
+        let said = refusal.to_string();
+        assert!(
+            said.starts_with("12 joints and 1 external axes do not make 7 joints"),
+            "{said}"
+        );
+        assert_eq!(refusal.label(), "wrong number of joints");
+    }
+}

@@ -1,0 +1,135 @@
+//! Tests of [`super`].
+
+use super::*;
+use crate::random::RandomStream;
+
+const SMALL: &str = "HIERARCHY\nROOT Hips\n{\n  OFFSET 0 0 0\n  CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation\n  JOINT RightHand\n  {\n    OFFSET -50 40 0\n    CHANNELS 3 Yrotation Xrotation Zrotation\n    End Site\n    {\n      OFFSET -10 0 0\n    }\n  }\n}\nMOTION\nFrames: 2\nFrame Time: 0.008\n0 95 0 0 0 0 1 2 3\n0 95 0 0 0 0 1.5 -2e1 3\n";
+
+fn check_error(text: &str, line: usize, message: &str) {
+    let error = Bvh::parse(text).unwrap_err();
+    assert_eq!(error.line, line, "{error}");
+    assert!(error.to_string().contains(message), "{error}");
+}
+
+#[test]
+fn a_small_file_is_read_as_written() {
+    let bvh = Bvh::parse(SMALL).unwrap();
+    assert_eq!(bvh.frame_count(), 2);
+    assert_eq!(bvh.skeleton.channel_count(), 9);
+    assert_eq!(bvh.skeleton.joints()[1].parent, Some(0));
+    assert_eq!(bvh.frames().count(), 2);
+    assert!((bvh.values[16] + 20.0).abs() < 1e-15);
+    assert_eq!(Bvh::parse(&bvh.to_text()).unwrap(), bvh);
+}
+
+#[test]
+fn frames_come_one_at_a_time_from_a_text_that_is_still_being_written() {
+    let mut seen_count = 0;
+    let lines = SMALL.lines().inspect(|_| seen_count += 1);
+    let mut reader = BvhReader::new(lines).unwrap();
+    assert_eq!(reader.announced_frame_count(), 2);
+    assert!((reader.frame_time_s() - 0.008).abs() < 1e-15);
+    assert_eq!(reader.line(), 18);
+    let mut frame = Vec::new();
+    assert_eq!(reader.next_frame(&mut frame), Ok(true));
+    assert_eq!((reader.line(), frame.len()), (19, 9));
+    assert_eq!(reader.next_frame(&mut frame), Ok(true));
+    assert!((frame[7] + 20.0).abs() < 1e-15);
+    assert_eq!(reader.next_frame(&mut frame), Ok(false));
+    assert_eq!(seen_count, 20);
+}
+
+#[test]
+fn a_stream_that_breaks_off_or_turns_to_nonsense_names_the_line() {
+    let read = |text: &str| {
+        let mut reader = BvhReader::new(text.lines().map(str::to_owned)).unwrap();
+        let mut frame = Vec::new();
+        loop {
+            match reader.next_frame(&mut frame) {
+                Ok(true) => {}
+                Ok(false) => return None,
+                Err(error) => return Some(error.to_string()),
+            }
+        }
+    };
+    assert_eq!(read(SMALL), None);
+    // More frames than announced are no error of a stream.
+    assert_eq!(read(&format!("{SMALL}0 95 0 0 0 0 1 2 3\n")), None);
+    let broken_off = read(&format!("{SMALL}\n0 95 0\n")).unwrap();
+    assert_eq!(
+        broken_off,
+        "line 22: expected a channel value, found the end of the text"
+    );
+    let nonsense = read(&SMALL.replace("-2e1", "down")).unwrap();
+    assert_eq!(
+        nonsense,
+        "line 20: expected a channel value, found \"down\""
+    );
+}
+
+#[test]
+fn windows_line_ends_and_a_byte_order_mark_change_nothing() {
+    let windows = format!("\u{feff}{}", SMALL.replace('\n', "\r\n"));
+    assert_eq!(Bvh::parse(&windows), Bvh::parse(SMALL));
+}
+
+#[test]
+fn errors_name_line_and_cause() {
+    check_error("", 1, "expected the keyword HIERARCHY");
+    check_error(&SMALL.replace("-50", "west"), 8, "found \"west\"");
+    check_error(&SMALL.replace("Yrotation X", "Yaw X"), 9, "channel name");
+    check_error(&SMALL.replace("0.008", "0"), 18, "frame time 0 is outside");
+    check_error(&SMALL.replace("-2e1", "NaN"), 20, "a channel value");
+    check_error(&SMALL.replace(": 2", ": 3"), 17, "18 values found");
+    check_error(&SMALL.replace("CHANNELS 3", "CHANNELS 7"), 9, "0..=6");
+    check_error(&SMALL[..60], 5, "the end of the text");
+    let huge = SMALL.replace(": 2", ": 18446744073709551615");
+    check_error(&huge, 17, "frames of 9 values");
+}
+
+#[test]
+fn deep_nesting_ends_in_an_error_not_in_an_overflow() {
+    let joint = "JOINT a { OFFSET 0 0 0 CHANNELS 0 ";
+    let deep = format!(
+        "HIERARCHY\nROOT{}",
+        joint[5..].to_owned() + &joint.repeat(5000)
+    );
+    check_error(&deep, 2, "joint count 1025 is outside 1..=1024");
+}
+
+#[test]
+fn a_hundred_thousand_mutations_never_panic() {
+    let mut stream = RandomStream::new(20, "bvh mutation");
+    let pieces = [
+        "{", "}", "\n", " ", "-", "1e999", "End Site", "JOINT x", "\u{e9}", "0",
+    ];
+    let below = |stream: &mut RandomStream, bound: usize| {
+        usize::try_from(stream.next_u64() % bound as u64).unwrap()
+    };
+    let mut refused_count = 0;
+    for _ in 0..100_000 {
+        let mut bytes = SMALL.as_bytes().to_vec();
+        for _ in 0..=below(&mut stream, 4) {
+            let at = below(&mut stream, bytes.len());
+            match below(&mut stream, 4) {
+                0 => bytes[at] = (stream.next_u64() & 0x7f) as u8,
+                1 => bytes.truncate(at + 1),
+                2 => drop(bytes.drain(at..(at + below(&mut stream, 30)).min(bytes.len()))),
+                _ => {
+                    let piece = pieces[below(&mut stream, pieces.len())].bytes();
+                    drop(bytes.splice(at..at, piece));
+                }
+            }
+            bytes.push(b'\n');
+        }
+        let text = String::from_utf8_lossy(&bytes);
+        match Bvh::parse(&text) {
+            Ok(bvh) => assert_eq!(bvh.values.len() % bvh.skeleton.channel_count(), 0),
+            Err(error) => {
+                assert!(error.line <= 1 + text.lines().count());
+                refused_count += 1;
+            }
+        }
+    }
+    assert!(refused_count > 50_000, "{refused_count} refused");
+}

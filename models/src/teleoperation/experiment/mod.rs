@@ -1,0 +1,18 @@
+//! Case study 2 in virtual time, fast: thousands of motion loops a second over channels that a
+//! table names, and the search for the channel behind a given motion loss rate. The controller and
+//! the commands are those that run as processes; only their surroundings differ.
+
+mod calibration;
+mod conditions;
+mod drive;
+mod parameters;
+mod report;
+mod study;
+#[cfg(test)]
+mod tests;
+mod trajectory;
+
+pub use parameters::TableParameters;
+
+pub(crate) use calibration::Calibration;
+pub(crate) use study::MotionLossStudy;

@@ -1,0 +1,355 @@
+//! The socket of one channel direction: opened as its launch description says, behind a link model
+//! where it has one, with what the kernel granted. It moves no message.
+
+use std::net::IpAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use hil_gateways::protocol::wire::{self, Kind};
+use hil_gateways::transport::emulated::{EmulatedReceiver, EmulatedSettings};
+use hil_gateways::transport::tcp::{
+    ConnectionTally, KEEP_ALIVE_COUNT, KEEP_ALIVE_IDLE, KEEP_ALIVE_INTERVAL, TcpReceiver,
+    TcpSender, TcpSettings, USER_TIMEOUT,
+};
+use hil_gateways::transport::timestamping::TimestampMode;
+use hil_gateways::transport::udp::{GrantedOptions, PathMtu, UdpReceiver, UdpSender, UdpSettings};
+use hil_gateways::transport::{DatagramReceiver, DatagramSender};
+use hil_models::link::{Fate, LinkModel};
+use hil_models::time::Instant;
+
+use super::GatewayError;
+use crate::clock::MonotonicClock;
+use crate::process::launch::{DirectionLaunch, EmulationLaunch, Side, SocketLaunch, Transport};
+use crate::process::pipe::RunStart;
+use crate::topology::Timestamps;
+
+/// IP and UDP headers of a datagram.
+const IPV4_HEADERS: usize = 20 + 8;
+const IPV6_HEADERS: usize = 40 + 8;
+/// Most datagrams an emulated link holds during an outage.
+const HELD_COUNT_MAX: usize = 16_384;
+
+/// A direction's socket and what is known of it.
+#[derive(Debug)]
+pub(super) struct OpenSocket {
+    pub(super) ends: Ends,
+    pub(super) facts: Vec<(String, String)>,
+    /// How often its connections come and go, where this end tells of it.
+    pub(super) tally: Option<Arc<ConnectionTally>>,
+}
+
+/// Which end of the hop it is.
+#[derive(Debug)]
+pub(super) enum Ends {
+    /// The sending one, and the longest datagram it takes.
+    Sender(Box<dyn DatagramSender>, usize),
+    Receiver(Box<dyn DatagramReceiver>),
+}
+
+impl OpenSocket {
+    /// Opens it; call it from a thread of normal priority.
+    pub(super) fn open(launch: &DirectionLaunch, start: &RunStart) -> Result<Self, GatewayError> {
+        let settings = udp_settings(launch);
+        match launch.socket.transport {
+            Transport::Udp => Self::open_udp(&settings, launch, start),
+            Transport::Tcp => Self::open_tcp(&settings, launch),
+        }
+    }
+
+    fn open_udp(
+        settings: &UdpSettings,
+        launch: &DirectionLaunch,
+        start: &RunStart,
+    ) -> Result<Self, GatewayError> {
+        let (ends, mut facts) = match launch.side {
+            Side::Egress => {
+                let sender = UdpSender::open(settings)?;
+                let mut facts = socket_facts(settings, sender.granted());
+                let mtu = sender.path_mtu();
+                let configured = launch.socket.path_mtu_bytes;
+                let text = format!("{} bytes, {configured} configured", mtu.packet_bytes);
+                facts.push(("path MTU".to_owned(), text));
+                let longest = datagram_bytes_max(launch, mtu);
+                (Ends::Sender(Box::new(sender), longest), facts)
+            }
+            Side::Ingress => {
+                let receiver = UdpReceiver::open(settings)?;
+                let facts = socket_facts(settings, receiver.granted());
+                (Ends::Receiver(emulate(receiver, launch, start)?), facts)
+            }
+        };
+        if let Some(emulation) = &launch.emulation {
+            facts.push((
+                "link model behind the socket, part of RX stamp → received by gateway".to_owned(),
+                emulation.describe(),
+            ));
+        }
+        Ok(Self {
+            ends,
+            facts,
+            tally: None,
+        })
+    }
+
+    fn open_tcp(common: &UdpSettings, launch: &DirectionLaunch) -> Result<Self, GatewayError> {
+        let settings = TcpSettings {
+            interface: common.interface.clone(),
+            dscp: common.dscp,
+            priority: common.priority,
+            send_buffer_bytes: common.send_buffer_bytes,
+            receive_buffer_bytes: common.receive_buffer_bytes,
+            path_mtu_bytes: Some(launch.socket.path_mtu_bytes),
+            ..TcpSettings::new(common.local, common.peer, MonotonicClock::now)
+        };
+        let (ends, granted, tally) = match launch.side {
+            Side::Egress => {
+                let sender = TcpSender::open(settings)?;
+                let (granted, longest) = (sender.granted(), sender.datagram_bytes_max());
+                let tally = Some(sender.tally());
+                (Ends::Sender(Box::new(sender), longest), granted, tally)
+            }
+            Side::Ingress => {
+                let receiver = TcpReceiver::open(settings)?;
+                let granted = receiver.granted();
+                (Ends::Receiver(Box::new(receiver)), granted, None)
+            }
+        };
+        let mut facts = socket_facts(common, granted);
+        let options = format!(
+            "no delay; keep-alive after {} s, then {KEEP_ALIVE_COUNT} times every {} s; user \
+             time-out {} s",
+            KEEP_ALIVE_IDLE.as_secs(),
+            KEEP_ALIVE_INTERVAL.as_secs(),
+            USER_TIMEOUT.as_secs()
+        );
+        facts.push(("TCP".to_owned(), options));
+        Ok(Self { ends, facts, tally })
+    }
+}
+
+fn udp_settings(launch: &DirectionLaunch) -> UdpSettings {
+    let socket = &launch.socket;
+    UdpSettings {
+        local: launch.local,
+        peer: launch.peer,
+        interface: socket.interface.clone(),
+        // 0 is the kernel's default; setting it would only reset the priority.
+        dscp: (socket.dscp > 0).then_some(socket.dscp),
+        priority: socket.priority,
+        send_buffer_bytes: Some(socket.send_buffer_bytes),
+        receive_buffer_bytes: Some(socket.receive_buffer_bytes),
+        timestamps: stamps_of(socket),
+    }
+}
+
+/// The kernel stamps to ask for: none of a stream, whose bytes have no stamp of their own.
+pub(super) const fn stamps_of(socket: &SocketLaunch) -> TimestampMode {
+    match socket.transport {
+        Transport::Tcp => TimestampMode::Off,
+        Transport::Udp => timestamp_mode(socket.timestamps),
+    }
+}
+
+/// What a topology's word asks of the kernel.
+pub(crate) const fn timestamp_mode(asked: Timestamps) -> TimestampMode {
+    match asked {
+        Timestamps::Off => TimestampMode::Off,
+        Timestamps::Software => TimestampMode::Software,
+        Timestamps::Hardware => TimestampMode::Hardware,
+    }
+}
+
+fn socket_facts(settings: &UdpSettings, granted: GrantedOptions) -> Vec<(String, String)> {
+    let fact = |label: &str, text: String| (label.to_owned(), text);
+    let mut facts = vec![
+        fact(
+            "socket",
+            format!("{} to or from {}", settings.local, settings.peer),
+        ),
+        fact(
+            "send buffer granted",
+            format!("{} bytes", granted.send_buffer_bytes),
+        ),
+        fact(
+            "receive buffer granted",
+            format!("{} bytes", granted.receive_buffer_bytes),
+        ),
+    ];
+    let shortfalls = granted.shortfalls(settings);
+    facts.extend(
+        shortfalls
+            .into_iter()
+            .map(|text| fact("socket option", text)),
+    );
+    facts
+}
+
+/// Room for everything that is under way at once, up to 4000 datagrams per second, and for what
+/// eight mean outages hold back of 1000 per second.
+fn emulated_capacity(emulation: &EmulationLaunch) -> usize {
+    let outages = &emulation.outages;
+    let held_s = if outages.is_active() && outages.buffered {
+        8.0 * outages.mean_s
+    } else {
+        0.0
+    };
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "a checked mean is at most an hour, and what is above the bound is cut"
+    )]
+    let held_count = ((1000.0 * held_s) as usize).min(HELD_COUNT_MAX);
+    let under_way = emulation.delay.as_millis() as usize * 4;
+    EmulatedSettings::default().capacity_count + under_way + held_count
+}
+
+/// Puts the receiver behind the launch's link model, if it has one. Greetings and clock exchanges
+/// pass freely: the model stands for what happens to the robot's messages.
+fn emulate(
+    receiver: UdpReceiver,
+    launch: &DirectionLaunch,
+    start: &RunStart,
+) -> Result<Box<dyn DatagramReceiver>, GatewayError> {
+    let Some(emulation) = &launch.emulation else {
+        return Ok(Box::new(receiver));
+    };
+    let link = SinceStart {
+        link: emulation.model(&launch.channel)?,
+        start: start.clone(),
+    };
+    let settings = EmulatedSettings {
+        capacity_count: emulated_capacity(emulation),
+        datagram_bytes_max: launch.socket.path_mtu_bytes,
+        clock: Some(MonotonicClock::now),
+    };
+    let is_exempt =
+        |bytes: &[u8]| wire::decode(bytes).is_ok_and(|datagram| datagram.header.kind != Kind::Data);
+    Ok(Box::new(EmulatedReceiver::new(
+        receiver,
+        Box::new(link),
+        is_exempt,
+        settings,
+    )))
+}
+
+/// A link on a clock that reads zero when the run starts, as it does in virtual time; before the
+/// start it stands still. A gateway that is started again thus goes on where it was.
+#[derive(Debug)]
+struct SinceStart<L> {
+    link: L,
+    start: RunStart,
+}
+
+impl<L: LinkModel> LinkModel for SinceStart<L> {
+    fn offer(&mut self, now: Instant, length_bytes: usize) -> Fate {
+        let elapsed = self
+            .start
+            .get()
+            .map_or(Duration::ZERO, |start| now.saturating_duration_since(start));
+        let offered = Instant::ZERO + elapsed;
+        match self.link.offer(offered, length_bytes) {
+            Fate::Delivered(at) => Fate::Delivered(now + at.saturating_duration_since(offered)),
+            Fate::Lost => Fate::Lost,
+        }
+    }
+}
+
+/// What a datagram may carry: as much as the topology says, but no more than the path takes.
+fn datagram_bytes_max(launch: &DirectionLaunch, path: PathMtu) -> usize {
+    let headers = match launch.peer.ip() {
+        IpAddr::V4(_) => IPV4_HEADERS,
+        IpAddr::V6(_) => IPV6_HEADERS,
+    };
+    let configured = launch.socket.path_mtu_bytes.saturating_sub(headers);
+    if path.is_assumed {
+        return configured;
+    }
+    configured.min(usize::try_from(path.datagram_bytes).unwrap_or(configured))
+}
+
+#[cfg(test)]
+mod tests {
+    use hil_models::link::outages::{Outage, OutageSchedule, Outages};
+    use hil_models::random::RandomStream;
+
+    use super::*;
+
+    fn emulation(per_hour: f64) -> EmulationLaunch {
+        EmulationLaunch {
+            delay: Duration::from_millis(5),
+            loss_ratio: 0.0,
+            outages: Outages {
+                mean_s: 0.5,
+                per_hour,
+                buffered: false,
+            },
+            link: "hop".to_owned(),
+            seed: 3,
+        }
+    }
+
+    fn live(channel: &str, start: &RunStart) -> SinceStart<impl LinkModel + use<>> {
+        SinceStart {
+            link: emulation(600.0).model(channel).unwrap(),
+            start: start.clone(),
+        }
+    }
+
+    #[test]
+    fn outages_count_from_the_start_of_the_run_on_every_channel_alike() {
+        let start = RunStart::default();
+        let began = Instant::from_ns(77_000_000_000_123);
+        let (mut there, mut back) = (live("a/b", &start), live("b/a", &start));
+        // Nothing fails before the start, however long it takes.
+        for step in 0..1_000 {
+            let now = Instant::from_ns(step * 1_000_000_000);
+            assert_eq!(
+                there.offer(now, 1),
+                Fate::Delivered(now + Duration::from_millis(5))
+            );
+        }
+        start.set(began);
+        let mut restarted = None;
+        let mut virtual_time = emulation(600.0).model("a/b").unwrap();
+        let mut lost_count = 0;
+        for step in 0..100_000 {
+            let elapsed = Duration::from_millis(4 * step);
+            let now = began + elapsed;
+            let is_lost = there.offer(now, 1) == Fate::Lost;
+            lost_count += u32::from(is_lost);
+            assert_eq!(back.offer(now, 1) == Fate::Lost, is_lost);
+            let simulated = virtual_time.offer(Instant::ZERO + elapsed, 1);
+            assert_eq!(simulated == Fate::Lost, is_lost);
+            if step >= 50_000 {
+                // A gateway that was started again in the middle of the run.
+                let restarted = restarted.get_or_insert_with(|| live("a/b", &start));
+                assert_eq!(restarted.offer(now, 1) == Fate::Lost, is_lost);
+            }
+        }
+        assert!(lost_count > 1_000, "{lost_count}");
+    }
+
+    #[test]
+    fn two_links_of_one_run_fail_apart() {
+        let first = |link: &str| -> Outage {
+            let emulation = emulation(600.0);
+            let name = format!("links.{link}.outages");
+            let stream = RandomStream::new(emulation.seed, &name);
+            let mut schedule =
+                OutageSchedule::new(emulation.outages, stream, Instant::ZERO).unwrap();
+            schedule.next().unwrap()
+        };
+        assert_ne!(first("hop"), first("wire"));
+    }
+
+    #[test]
+    fn a_held_outage_has_room_and_none_has_more_than_the_bound() {
+        let mut held = emulation(100.0);
+        let lossy = emulated_capacity(&held);
+        assert_eq!(lossy, 1024 + 20);
+        held.outages.buffered = true;
+        assert_eq!(emulated_capacity(&held), lossy + 4_000);
+        held.outages.mean_s = 30.0;
+        assert_eq!(emulated_capacity(&held), lossy + HELD_COUNT_MAX);
+    }
+}

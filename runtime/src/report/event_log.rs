@@ -1,0 +1,112 @@
+//! `events.log`: what happened to the robot, one line per event, to be searched with the tools of
+//! a log. It holds no event that the score has not.
+
+use core::fmt::Write;
+
+use hil_models::case_study::Severity;
+
+use super::score_event::{ExplainedEvent, ScoreEvents};
+use super::terminal::JOINT;
+
+/// The text of the file for the run called `name`.
+pub(crate) fn text(name: &str, all: &ScoreEvents) -> String {
+    let mut text = format!("# {}\n", one_line(name));
+    text.push_str(
+        "# seconds since the start of the run, severity, what happened | outages beside it\n",
+    );
+    if all.clocks_differ {
+        text.push_str("# clocks are not aligned: times of different hosts do not compare\n");
+    }
+    for event in &all.events {
+        let line = line(event, all.clocks_differ);
+        let _infallible = writeln!(text, "{line}");
+    }
+    if all.dropped_count > 0 {
+        let count = all.dropped_count;
+        let _infallible = writeln!(text, "# {count} more events found no room in the score");
+    }
+    if all.events.is_empty() {
+        text.push_str("# nothing happened\n");
+    }
+    text
+}
+
+fn line(event: &ExplainedEvent, clocks_differ: bool) -> String {
+    let time = event
+        .at_s
+        .map_or_else(|| "-".to_owned(), |at_s| format!("{at_s:.6}"));
+    let severity = match event.severity {
+        Severity::Notice => "notice",
+        Severity::Hazard => "hazard",
+        Severity::Incident => "incident",
+    };
+    let mut line = format!("{time:>14} {severity:<8} {}", event.what.replace('|', "/"));
+    if clocks_differ {
+        line.push_str(&[" (clock of ", &event.clock, ")"].concat());
+    }
+    for outage in &event.outages {
+        line.push_str(" | ");
+        line.push_str(&outage.words);
+    }
+    one_line(&line)
+}
+
+/// A name or a cause must not begin a line of its own.
+fn one_line(text: &str) -> String {
+    let plain = |c: char| if c == JOINT || c.is_control() { ' ' } else { c };
+    text.chars().map(plain).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::report::score_event::EventOutage;
+    use hil_models::measure::account::Standing;
+
+    fn event(at_s: Option<f64>, severity: Severity, what: &str) -> ExplainedEvent {
+        ExplainedEvent {
+            at_s,
+            clock: "robot-pc".to_owned(),
+            severity,
+            what: what.to_owned(),
+            outages: Vec::new(),
+            messages: Vec::new(),
+            messages_dropped_count: 0,
+        }
+    }
+
+    #[test]
+    fn every_event_has_one_line_with_time_severity_and_cause() {
+        let mut dropped = event(
+            Some(42.204),
+            Severity::Incident,
+            "session 3 ended\nby itself",
+        );
+        dropped.outages.push(EventOutage {
+            channel: "egm/right/command".to_owned(),
+            from_s: Some(41.2),
+            until_s: None,
+            length_s: None,
+            lost_count: 230,
+            standing: Standing::UnderWay,
+            other_count: 0,
+            words: format!("outage of 1.84{JOINT}s on egm/right/command"),
+        });
+        let mut all = ScoreEvents {
+            events: vec![event(None, Severity::Notice, "hold began"), dropped],
+            dropped_count: 7,
+            clocks_differ: false,
+        };
+        let lines =
+            "# seconds since the start of the run, severity, what happened | outages beside it
+             - notice   hold began
+     42.204000 incident session 3 ended by itself | outage of 1.84 s on egm/right/command
+# 7 more events found no room in the score
+";
+        assert_eq!(text("run", &all), format!("# run\n{lines}"));
+        all.clocks_differ = true;
+        assert!(text("run", &all).contains("hold began (clock of robot-pc)\n"));
+        let nothing = text("run", &ScoreEvents::default());
+        assert!(nothing.ends_with("# nothing happened\n"));
+    }
+}

@@ -1,0 +1,112 @@
+//! A carrier in virtual time under watch: what it loses is noted as outages. It changes nothing of
+//! what the carrier does, and asks it nothing.
+
+use std::cell::RefCell;
+use std::rc::Rc;
+
+use hil_models::measure::account::{Outage, OutageFinder};
+use hil_models::message::Envelope;
+use hil_models::simulation::Carrier;
+use hil_models::time::Instant;
+
+/// The outages of a carrier, to be asked for when it is done.
+#[derive(Debug, Clone)]
+pub(super) struct Watch(Rc<RefCell<OutageFinder>>);
+
+impl Watch {
+    /// `carrier`, which will carry as before, and the watch over it.
+    pub(super) fn over(carrier: Box<dyn Carrier>) -> (Box<dyn Carrier>, Self) {
+        let watch = Self(Rc::default());
+        let watched = Watched {
+            carrier,
+            watch: watch.clone(),
+        };
+        (Box::new(watched), watch)
+    }
+
+    /// What was lost so far.
+    pub(super) fn outages(&self) -> Vec<Outage> {
+        self.0.take().finish()
+    }
+}
+
+#[derive(Debug)]
+struct Watched {
+    carrier: Box<dyn Carrier>,
+    watch: Watch,
+}
+
+impl Carrier for Watched {
+    fn offer(
+        &mut self,
+        now: Instant,
+        envelope: &Envelope,
+        payload: &[u8],
+        deliver: &mut dyn FnMut(Instant, Envelope, &[u8]),
+    ) {
+        let key = |envelope: &Envelope| (envelope.epoch, envelope.sequence);
+        let mut arrival: Option<Instant> = None;
+        self.carrier
+            .offer(now, envelope, payload, &mut |at, delivered, payload| {
+                if key(&delivered) == key(envelope) {
+                    arrival = Some(arrival.map_or(at, |known| known.min(at)));
+                }
+                deliver(at, delivered, payload);
+            });
+        let mut finder = self.watch.0.borrow_mut();
+        let published_ns = Some(now.as_ns());
+        match arrival {
+            Some(at) => finder.arrived(published_ns, Some(at.as_ns())),
+            None => finder.lost(envelope.sequence, 1, published_ns),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use hil_models::link::{Fate, LinkModel};
+
+    /// Down from 10 to 19 ms, otherwise 3 ms late.
+    #[derive(Debug)]
+    struct Down;
+
+    impl LinkModel for Down {
+        fn offer(&mut self, now: Instant, _length_bytes: usize) -> Fate {
+            let ms = now.as_ns() / 1_000_000;
+            if (10..20).contains(&ms) {
+                Fate::Lost
+            } else {
+                Fate::Delivered(Instant::from_ns(now.as_ns() + 3_000_000))
+            }
+        }
+    }
+
+    #[test]
+    fn a_watch_sees_what_the_carrier_loses_and_changes_nothing() {
+        let (mut carrier, watch) = Watch::over(Box::new(Down));
+        let mut delivered_count = 0;
+        for sequence in 0..30_u64 {
+            let ms = i64::try_from(sequence).unwrap();
+            let envelope = Envelope {
+                sequence,
+                ..Envelope::default()
+            };
+            let now = Instant::from_ns(ms * 1_000_000);
+            carrier.offer(now, &envelope, &[7], &mut |at, delivered, payload| {
+                assert_eq!(at.as_ns(), (ms + 3) * 1_000_000);
+                assert_eq!((delivered.sequence, payload), (sequence, &[7][..]));
+                delivered_count += 1;
+            });
+        }
+        assert_eq!(delivered_count, 20);
+        let outages = watch.outages();
+        assert_eq!(outages.len(), 1);
+        let found = outages[0];
+        assert_eq!((found.lost_count, found.first_sequence), (10, 10));
+        assert_eq!(found.from_ns, Some(10_000_000));
+        assert_eq!(found.until_ns, Some(20_000_000));
+        assert_eq!(found.silent_from_ns, Some(13_000_000));
+        assert_eq!(found.silent_until_ns, Some(23_000_000));
+    }
+}
