@@ -270,7 +270,7 @@ pub enum EgmEventKind {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 #[repr(u32)]
 pub enum EndCause {
-    /// Nothing came for `CommTimeout`; unit: s.
+    /// No command that was not refused came for `CommTimeout`; unit: s.
     CommTimeout = 1,
     /// All joints stayed within the convergence window for `CondTime`; unit: s.
     ConditionTime = 2,

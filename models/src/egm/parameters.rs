@@ -139,7 +139,8 @@ pub struct EgmParameters {
     /// `CondTime`, 0..=1000000 s: converged for so long, the session ends.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub condition_time_s: Option<f64>,
-    /// `CommTimeout`, 0.004..=1000000 s: without a message for so long, the session ends.
+    /// `CommTimeout`, 0.004..=1000000 s: without a message for so long, the session ends. A
+    /// refused one does not count.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub comm_timeout_s: Option<f64>,
     /// What a requested stop does.

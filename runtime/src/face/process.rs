@@ -6,7 +6,7 @@ use std::net::SocketAddr;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::mpsc::{Receiver, Sender, channel};
+use std::sync::mpsc::{Sender, channel};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
@@ -19,7 +19,7 @@ use super::{FaceError, Gate};
 use crate::channel::Domain;
 use crate::clock::MonotonicClock;
 use crate::gateway::GatewayError;
-use crate::gateway::process::{PROBE_BOUND, arm_and_describe};
+use crate::gateway::process::{PROBE_BOUND, arm_and_describe, wait_until_open};
 use crate::gateway::socket::timestamp_mode;
 use crate::process::launch::read;
 use crate::process::pipe::{ChannelProgress, FaceReport, FromProcess, Orders, ProcessReport, say};
@@ -174,11 +174,6 @@ fn live(arm: &ArmLaunch, opened: OpenedArm, around: &Around, ready: &Sender<bool
         report,
         outcome,
     }
-}
-
-fn wait_until_open(ready: &Receiver<bool>, count: usize) -> bool {
-    let opened = (0..count).filter(|_| ready.recv() == Ok(true)).count();
-    opened == count
 }
 
 fn finish(

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::mpsc::{Sender, channel};
+use std::sync::mpsc::{Receiver, Sender, channel};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
@@ -192,7 +192,8 @@ fn spawn(
         .map_err(GatewayError::Thread)
 }
 
-fn wait_until_open(ready: &std::sync::mpsc::Receiver<bool>, count: usize) -> bool {
+/// True when all of `count` threads said that they are open.
+pub(crate) fn wait_until_open(ready: &Receiver<bool>, count: usize) -> bool {
     let opened = (0..count).filter(|_| ready.recv() == Ok(true)).count();
     opened == count
 }
