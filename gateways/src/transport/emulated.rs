@@ -10,7 +10,7 @@ use std::io;
 use std::net::SocketAddr;
 use std::os::fd::BorrowedFd;
 
-use hil_models::link::{Fate, LinkModel};
+use hil_models::link::LinkModel;
 use hil_models::time::Instant;
 
 use super::tcp::StreamFigures;
@@ -131,18 +131,32 @@ impl<R: DatagramReceiver> EmulatedReceiver<R> {
         let arrived = self.newest_arrival;
         let start = place * self.datagram_bytes_max;
         let datagram = &self.storage[start..start + received.length_bytes];
-        let due = if (self.is_exempt)(datagram) {
-            arrived
-        } else {
-            // The model is asked even when there is no room, so that the fate of the n-th
-            // datagram does not depend on how full we were.
-            let Fate::Delivered(due) = self.link.offer(arrived, received.length_bytes) else {
-                self.counters.link_lost_count += 1;
-                return;
-            };
-            received.emulated = Some(EmulatedDelay { arrived, due });
-            due
+        if (self.is_exempt)(datagram) {
+            self.hold(received, place, arrived);
+            return;
+        }
+        // The model is asked even when there is no room, so that the fate of the n-th datagram
+        // does not depend on how full we were.
+        let fate = self.link.offer(arrived, received.length_bytes);
+        let Some(due) = fate.arrival() else {
+            self.counters.link_lost_count += 1;
+            return;
         };
+        received.emulated = Some(EmulatedDelay { arrived, due });
+        self.hold(received, place, due);
+        if let Some(due) = fate.second_arrival() {
+            let copy = self.free.last().copied().unwrap_or(self.held.len());
+            self.storage.copy_within(
+                start..start + received.length_bytes,
+                copy * self.datagram_bytes_max,
+            );
+            received.emulated = Some(EmulatedDelay { arrived, due });
+            self.hold(received, copy, due);
+        }
+    }
+
+    /// Keeps the datagram in `place` until `due`, if that is a place.
+    fn hold(&mut self, received: Received, place: usize, due: Instant) {
         let Some(slot) = self.held.get_mut(place) else {
             self.counters.link_overflow_count += 1;
             return;
@@ -232,6 +246,7 @@ impl<R: fmt::Debug> fmt::Debug for EmulatedReceiver<R> {
 mod tests {
     use core::time::Duration;
 
+    use hil_models::link::Fate;
     use hil_models::link::bernoulli::BernoulliLink;
     use hil_models::random::RandomStream;
 

@@ -15,8 +15,33 @@ use crate::time::Instant;
 pub enum Fate {
     /// It arrives at this instant, never before it was offered.
     Delivered(Instant),
+    /// It arrives at `first` and once more at `second`, which is never earlier.
+    Duplicated {
+        /// Its first arrival.
+        first: Instant,
+        /// Its second.
+        second: Instant,
+    },
     /// It does not arrive.
     Lost,
+}
+
+impl Fate {
+    /// When it arrives first; `None` when it is lost.
+    pub const fn arrival(self) -> Option<Instant> {
+        match self {
+            Self::Delivered(at) | Self::Duplicated { first: at, .. } => Some(at),
+            Self::Lost => None,
+        }
+    }
+
+    /// When it arrives a second time; `None` when it does not.
+    pub const fn second_arrival(self) -> Option<Instant> {
+        match self {
+            Self::Duplicated { second, .. } => Some(second),
+            Self::Delivered(_) | Self::Lost => None,
+        }
+    }
 }
 
 /// A one-directional link.

@@ -11,7 +11,7 @@ use hil_models::measure::account::{
     MessageStory, Outage, PathProcess, RunSpan, account, outages, stories,
 };
 use hil_models::measure::record::{
-    EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, TakenRecord,
+    EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
 };
 use hil_models::run_log::{LoggedMessage, RunLog};
 use hil_models::time::{Alignment, Instant};
@@ -32,7 +32,7 @@ pub(crate) struct ChannelFiles {
     ingress: Option<Vec<IngressRecord>>,
     follow_up: Option<Vec<FollowUpRecord>>,
     taken: Option<Vec<TakenRecord>>,
-    round_trips_ns: Vec<i64>,
+    round_trips: BTreeMap<(u32, u64), RoundTripRecord>,
     face_sent: Vec<FaceSentRecord>,
     face_received: Vec<FaceReceivedRecord>,
 }
@@ -66,9 +66,10 @@ impl RunRecords {
             RecordKind::Ingress => extend(&mut channel.ingress, file.records()),
             RecordKind::FollowUp => extend(&mut channel.follow_up, file.records()),
             RecordKind::RoundTrip => {
-                channel
-                    .round_trips_ns
-                    .extend(file.records::<[i64; 2]>().map(|[rtt, _]| rtt));
+                let records = file.records::<RoundTripRecord>();
+                // An exchange whose stamps were bettered later is there twice.
+                let of = |one: RoundTripRecord| ((one.session, one.sequence), one);
+                channel.round_trips.extend(records.map(of));
             }
             RecordKind::FaceSent => channel.face_sent.extend(file.records::<FaceSentRecord>()),
             RecordKind::FaceReceived => {
@@ -184,12 +185,14 @@ impl RunRecords {
         let delay = crossing
             .and_then(|crossing| crossing.impairment)
             .map(|one| one.delay);
+        let round_trips = files.round_trips.values();
+        let round_trips_ns: Vec<i64> = round_trips.map(RoundTripRecord::rtt_ns).collect();
         let context = AccountContext {
             interruptions: &interruptions,
             producer_run: span_of(&channel.from),
             consumer_run: channel.to.as_deref().and_then(span_of),
             flight_time_max: FLIGHT_TIME_MAX + delay.unwrap_or(Duration::ZERO),
-            round_trips_ns: &files.round_trips_ns,
+            round_trips_ns: &round_trips_ns,
             seed: topology.run().seed,
             ..AccountContext::new(path)
         };

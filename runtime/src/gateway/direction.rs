@@ -10,7 +10,7 @@ use hil_gateways::protocol::{EgressBridge, EgressSettings, IngressBridge, Ingres
 use hil_gateways::transport::tcp::ConnectionTally;
 use hil_gateways::transport::timestamping::TimestampMode;
 use hil_gateways::transport::{DatagramReceiver, DatagramSender};
-use hil_models::measure::record::{EgressRecord, FollowUpRecord, IngressRecord};
+use hil_models::measure::record::{EgressRecord, FollowUpRecord, IngressRecord, RoundTripRecord};
 
 use super::egress::{Armed, Attention, Egress, Line};
 use super::ingress::{Ingress, Notes};
@@ -84,7 +84,7 @@ fn open_sinks(launch: &DirectionLaunch, recorder: &mut Recorder) -> Result<Sinks
     Ok(match launch.side {
         Side::Egress => (
             sink(RecordKind::Egress, size_of::<EgressRecord>())?,
-            sink(RecordKind::RoundTrip, 2 * size_of::<i64>())?,
+            sink(RecordKind::RoundTrip, size_of::<RoundTripRecord>())?,
         ),
         Side::Ingress => (
             sink(RecordKind::Ingress, size_of::<IngressRecord>())?,

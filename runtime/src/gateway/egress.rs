@@ -9,7 +9,7 @@ use hil_gateways::protocol::egress::{RoundTrip, TransmitFailure};
 use hil_gateways::protocol::wire::Kind;
 use hil_gateways::protocol::{EgressBridge, EgressEvent, LocalRefusal, PeerState};
 use hil_gateways::transport::{DatagramSender, SendRefusal, TransmitStage, TransmitStamp, TxToken};
-use hil_models::measure::record::{EgressRecord, UNAVAILABLE};
+use hil_models::measure::record::{EgressRecord, RoundTripRecord, UNAVAILABLE};
 use hil_models::message::Envelope;
 use hil_models::time::Instant;
 
@@ -437,7 +437,16 @@ impl Egress {
             let arrival = self.line.clock.arrival(&received, now);
             let bytes = &buffer[..received.length_bytes];
             match self.bridge.on_datagram(now, arrival, bytes) {
-                Ok(EgressEvent::RoundTrip { round_trip, .. }) => self.note_round_trip(&round_trip),
+                Ok(EgressEvent::RoundTrip {
+                    round_trip,
+                    earlier,
+                    ..
+                }) => {
+                    if let Some(earlier) = earlier {
+                        self.note_round_trip(&earlier);
+                    }
+                    self.note_round_trip(&round_trip);
+                }
                 Ok(EgressEvent::Refused(status)) => {
                     if self.bridge.peer_state() == PeerState::Refused(status) {
                         return Err(GatewayError::Refused(status));
@@ -450,9 +459,21 @@ impl Egress {
     }
 
     fn note_round_trip(&mut self, round_trip: &RoundTrip) {
-        self.line
-            .round_trips
-            .push(&[round_trip.rtt_ns(), round_trip.t4_ns]);
+        let sources = [
+            round_trip.t1_source,
+            round_trip.t2_source,
+            round_trip.t3_source,
+            round_trip.t4_source,
+        ];
+        self.line.round_trips.push(&RoundTripRecord {
+            sequence: round_trip.sequence,
+            t1_ns: round_trip.t1_ns,
+            t2_ns: round_trip.t2_ns,
+            t3_ns: round_trip.t3_ns,
+            t4_ns: round_trip.t4_ns,
+            session: self.line.session,
+            sources: sources.map(|source| source as u8),
+        });
     }
 
     /// Waits for a message, a stamp, a reply or an appointment.

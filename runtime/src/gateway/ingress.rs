@@ -56,6 +56,7 @@ struct Arrival {
 
 impl Arrival {
     fn record(&self, message: &MessageInfo, forwarded_ns: i64, flags: u32) -> IngressRecord {
+        let emulated = self.received.emulated;
         IngressRecord {
             sequence: message.sequence,
             published_ns: message.published.as_ns(),
@@ -65,6 +66,8 @@ impl Arrival {
             received_ns: self.at.as_ns(),
             forwarded_ns,
             realtime_offset_ns: self.offset_ns,
+            emulated_ns: emulated.map_or(UNAVAILABLE, |delay| delay.arrived.as_ns()),
+            due_ns: emulated.map_or(UNAVAILABLE, |delay| delay.due.as_ns()),
             epoch: message.epoch,
             session: message.session,
             flags,

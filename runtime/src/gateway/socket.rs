@@ -249,6 +249,10 @@ impl<L: LinkModel> LinkModel for SinceStart<L> {
         let offered = Instant::ZERO + elapsed;
         match self.link.offer(offered, length_bytes) {
             Fate::Delivered(at) => Fate::Delivered(now + at.saturating_duration_since(offered)),
+            Fate::Duplicated { first, second } => Fate::Duplicated {
+                first: now + first.saturating_duration_since(offered),
+                second: now + second.saturating_duration_since(offered),
+            },
             Fate::Lost => Fate::Lost,
         }
     }

@@ -16,7 +16,7 @@ use std::path::{Path, PathBuf};
 
 use bytemuck::Pod;
 use hil_models::measure::record::{
-    EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, TakenRecord,
+    EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
 };
 use hil_models::message::Envelope;
 use hil_models::run_log::RunLog;
@@ -44,7 +44,7 @@ pub enum RecordKind {
     FollowUp,
     /// Messages: an [`Envelope`] and the payload.
     Message,
-    /// Round trips in nanoseconds (i64) with the instant they ended (i64), of a sending gateway.
+    /// [`RoundTripRecord`]s of a sending gateway.
     RoundTrip,
     /// [`FaceSentRecord`]s of a face: datagrams to a foreign program.
     FaceSent,
@@ -88,7 +88,7 @@ impl RecordKind {
             Self::Egress => Some(size_of::<EgressRecord>()),
             Self::Ingress => Some(size_of::<IngressRecord>()),
             Self::FollowUp => Some(size_of::<FollowUpRecord>()),
-            Self::RoundTrip => Some(2 * size_of::<i64>()),
+            Self::RoundTrip => Some(size_of::<RoundTripRecord>()),
             Self::FaceSent => Some(size_of::<FaceSentRecord>()),
             Self::FaceReceived => Some(size_of::<FaceReceivedRecord>()),
             Self::Message => None,

@@ -42,7 +42,7 @@ use crate::measure::record::{
     EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, TakenRecord,
 };
 use crate::random::RandomStream;
-use crate::time::{Alignment, Instant};
+use crate::time::{Alignment, Instant, RemoteInstant};
 
 /// Largest difference between end-to-end and the sum of segments for a message that closes.
 pub const RESIDUAL_LIMIT_NS: i64 = 1_000;
@@ -105,6 +105,13 @@ impl ChannelPath {
             Self::SharedMemory => Some(Alignment::SAME_CLOCK),
             Self::Gateway { alignment } => alignment,
         }
+    }
+
+    /// An instant of the producer's host on the clock of the consumer's, with the largest error of
+    /// the conversion in nanoseconds; `None` when the clocks are not aligned.
+    pub fn localise(self, remote: RemoteInstant) -> Option<(Instant, u64)> {
+        let alignment = self.alignment()?;
+        Some((alignment.localise(remote), alignment.bound_ns))
     }
 
     const fn is_gateway(self) -> bool {
