@@ -3,6 +3,8 @@
 
 pub mod bernoulli;
 pub mod chain;
+#[cfg(test)]
+mod chain_tests;
 pub mod delay;
 pub mod impaired;
 pub mod in_series;
