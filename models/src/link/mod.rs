@@ -16,6 +16,8 @@ pub mod spec;
 
 use core::fmt::Debug;
 
+use serde::{Deserialize, Serialize};
+
 use crate::time::Instant;
 
 /// What happens to one offered message.
@@ -76,7 +78,7 @@ impl<L: LinkModel + ?Sized> LinkModel for Box<L> {
 }
 
 /// What a link lost messages to.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct LossCauses {
     /// To outages.
     pub outage_count: u64,

@@ -12,6 +12,7 @@ use hil_models::link::spec::{LinkPlace, LinkSpec, Way};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
+use super::emulation_room::EmulationRoom;
 use crate::realtime::RealtimeRequest;
 use crate::topology::{Crossing, Direction, Timestamps};
 use crate::wait::WaitMode;
@@ -164,6 +165,17 @@ impl EmulationLaunch {
             link: &self.link,
             channel,
             way: self.way,
+        })
+    }
+
+    /// Room for what the model holds of a channel of messages of `message_bytes`.
+    ///
+    /// # Errors
+    /// When a gateway cannot hold that much.
+    pub fn room(&self, message_bytes: usize) -> Result<EmulationRoom, ParameterError> {
+        EmulationRoom::of(&self.spec, message_bytes).map_err(|error| {
+            let key = format!("links.{}.{}", self.link, error.key);
+            ParameterError::new(&key, error.problem)
         })
     }
 
