@@ -8,13 +8,15 @@ use std::time::Duration;
 
 use hil_models::measure::account::{
     AccountContext, ChannelAccount, ChannelPath, ChannelRecords, FLIGHT_TIME_MAX, Interruption,
-    MessageStory, Outage, PathProcess, RunSpan, account, outages, stories,
+    MessageStory, Outage, PathProcess, RunSpan, TooManyMessages, TraceChannel, account, link_trace,
+    outages, stories,
 };
 use hil_models::measure::record::{
     EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
 };
 use hil_models::run_log::{LoggedMessage, RunLog};
 use hil_models::time::{Alignment, Instant};
+use hil_models::trace::TraceRecord;
 
 use super::AnalysisError;
 use crate::face::record::{FaceReceivedRecord, FaceSentRecord};
@@ -157,6 +159,21 @@ impl RunRecords {
         self.consult(run, channel, |_, context| {
             let interruptions = context.interruptions.iter();
             interruptions.map(|one| one.process.clone()).collect()
+        })
+    }
+
+    /// What the link of `channel` did to every message.
+    ///
+    /// # Errors
+    /// When there are more than a trace holds.
+    pub(crate) fn link_trace(
+        &self,
+        run: (&Topology, &RunResult),
+        channel: &Channel,
+        traced: TraceChannel,
+    ) -> Result<Vec<TraceRecord>, TooManyMessages> {
+        self.consult(run, channel, |records, context| {
+            link_trace(records, context, traced)
         })
     }
 
