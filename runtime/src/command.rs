@@ -28,6 +28,7 @@ use crate::run_folder::RunFolder;
 use crate::signals::{EXIT_INTERRUPTED, Signals};
 use crate::supervisor::{self, Outcome, PeerError, RunError, RunOptions, RunResult};
 use crate::topology::{self, HOST_VARIABLE, HostChoice, MachineIdentity, Topology, which_host};
+use crate::trace;
 
 /// Exit codes, as `--help` lists them (after `sysexits.h`, which systemd knows).
 mod exit {
@@ -139,6 +140,10 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
     let Some(topology) = load(path, &args.overrides, registry, console) else {
         return exit::USAGE;
     };
+    if let Err(error) = trace::source::check(&topology) {
+        console.error(&error.to_string());
+        return exit::USAGE;
+    }
     if args.check {
         console.result(&format!(
             "{}: the file is valid; it comes to\n\n{}",

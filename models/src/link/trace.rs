@@ -270,6 +270,14 @@ impl LinkModel for TraceLink {
     fn offer(&mut self, now: Instant, _length_bytes: usize) -> Fate {
         self.offer_number(now, self.next_number)
     }
+
+    fn offer_numbered(&mut self, now: Instant, _length_bytes: usize, number: u64) -> Fate {
+        self.offer_number(now, number)
+    }
+
+    fn replay_tally(&self) -> Option<ReplayTally> {
+        Some(self.tally())
+    }
 }
 
 #[cfg(test)]

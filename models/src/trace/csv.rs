@@ -189,7 +189,8 @@ fn word(key: &str, value: &str, words: &[&str]) -> Result<usize, String> {
 
 fn number<T: core::str::FromStr>(key: &str, value: &str) -> Result<T, String> {
     let parsed = value.parse();
-    parsed.map_err(|_| format!("{key} is \"{value}\", expected a whole number in range"))
+    parsed
+        .map_err(|_not_a_number| format!("{key} is \"{value}\", expected a whole number in range"))
 }
 
 /// Where each column stands.

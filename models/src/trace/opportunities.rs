@@ -93,12 +93,12 @@ pub fn decode(text: &str) -> (Trace, Option<CsvFault>) {
 
 fn opportunity(content: &str, before_ns: i64) -> Result<i64, String> {
     let parsed: Result<i64, _> = content.parse();
-    let ms = parsed.map_err(|_| format!("\"{content}\" is no whole number of milliseconds"))?;
+    let ms = parsed
+        .map_err(|_not_a_number| format!("\"{content}\" is no whole number of milliseconds"))?;
     let at_ns = ms.checked_mul(MS_NS).filter(|ns| *ns >= 0);
     let at_ns = at_ns.ok_or_else(|| format!("{ms} ms is outside 0..=9223372036854"))?;
     if at_ns < before_ns {
-        let before_ms = before_ns / MS_NS;
-        return Err(format!("{ms} ms comes after {before_ms} ms"));
+        return Err(format!("{ms} ms comes after {} ms", before_ns / MS_NS));
     }
     Ok(at_ns)
 }

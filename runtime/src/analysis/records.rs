@@ -20,6 +20,7 @@ use hil_models::trace::TraceRecord;
 
 use super::AnalysisError;
 use crate::face::record::{FaceReceivedRecord, FaceSentRecord};
+use crate::process::launch::EmulationLaunch;
 use crate::record::{RecordFile, RecordFileError, RecordKind};
 use crate::report::summary::RecordedFigures;
 use crate::supervisor::RunResult;
@@ -204,8 +205,8 @@ impl RunRecords {
         };
         // A link that delays on purpose keeps messages under way for that much longer.
         let delay = crossing
-            .and_then(|crossing| crossing.spec)
-            .map(|spec| spec.flight_time(FLIGHT_QUANTILE));
+            .and_then(|crossing| EmulationLaunch::of(&crossing, topology.run().seed))
+            .map(|emulation| emulation.flight_time(FLIGHT_QUANTILE));
         let round_trips = files.round_trips.values();
         let round_trips_ns: Vec<i64> = round_trips.map(RoundTripRecord::rtt_ns).collect();
         let context = AccountContext {

@@ -2,4 +2,4 @@
 //! `hil-runtime trace`. What a trace is and what is computed from it is in `hil_models::trace`.
 
 pub(crate) mod capture;
-pub(crate) mod source;
+pub mod source;

@@ -6,13 +6,15 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::Duration;
 
-use hil_models::link::trace::{ReplayError, TraceLink, TraceReplay};
+use hil_models::link::trace::{ReplayError, TraceEnd, TraceLink, TraceMatch, TraceReplay};
 use hil_models::trace::wire::{self, Decoded};
 use hil_models::trace::{Trace, csv, fault::TraceFault};
 use serde::{Deserialize, Serialize};
 
 use super::capture::file_name;
+use crate::topology::Topology;
 
 /// `[links.<name>.trace]`: paths are as written, relative to the topology file.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -23,7 +25,22 @@ pub struct TraceSource {
     pub files: BTreeMap<String, String>,
     /// How they are replayed.
     pub replay: TraceReplay,
+    /// What the paths start from.
+    pub base: BaseFolder,
 }
+
+/// The folder of the topology file. Where a file lies is no part of what it says, so any two are
+/// equal: the same topology on two hosts is one.
+#[derive(Debug, Clone, Default)]
+pub struct BaseFolder(pub PathBuf);
+
+impl PartialEq for BaseFolder {
+    fn eq(&self, _other: &Self) -> bool {
+        true
+    }
+}
+
+impl Eq for BaseFolder {}
 
 /// One channel's trace and how to replay it: what a gateway is told.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -83,27 +100,17 @@ pub enum TraceFileError {
         /// Why.
         source: ReplayError,
     },
-    /// The topology names no file for a channel.
-    #[error(
-        "links.{link}.trace names no file for channel {channel}; add it to `files`, or name a `folder`"
-    )]
-    Unnamed {
-        /// The link.
-        link: String,
-        /// The channel.
-        channel: String,
-    },
 }
 
 impl TraceSource {
-    /// The file of `channel`; `folder` is that of the topology file.
-    pub fn launch(&self, channel: &str, topology_folder: &Path) -> Option<TraceLaunch> {
+    /// The trace of `channel`; `None` for one that is not named where no folder is.
+    pub fn launch(&self, channel: &str) -> Option<TraceLaunch> {
         let named = self.files.get(channel).map(PathBuf::from);
         let in_folder = || {
             let folder = self.folder.as_ref()?;
             Some(Path::new(folder).join(file_name(channel)))
         };
-        let file = topology_folder.join(named.or_else(in_folder)?);
+        let file = self.base.0.join(named.or_else(in_folder)?);
         Some(TraceLaunch {
             // A gateway may run in another folder.
             file: std::path::absolute(&file).unwrap_or(file),
@@ -112,7 +119,46 @@ impl TraceSource {
     }
 }
 
+/// Reads every trace that the links of `topology` replay, so that a run without one does not begin.
+///
+/// # Errors
+/// The first that cannot be used.
+pub fn check(topology: &Topology) -> Result<(), TraceFileError> {
+    for crossing in topology.crossings() {
+        let source = crossing
+            .link
+            .emulation()
+            .and_then(|emulation| emulation.trace.as_ref());
+        if let Some(launch) = source.and_then(|source| source.launch(&crossing.channel.name)) {
+            launch.model()?;
+        }
+    }
+    Ok(())
+}
+
 impl TraceLaunch {
+    /// The longest delay of the trace; `None` when it cannot be read.
+    pub fn delay_max(&self) -> Option<Duration> {
+        self.model().ok().map(|link| link.delay_max())
+    }
+
+    /// What it does, in words.
+    pub fn describe(&self) -> String {
+        let matching = match self.replay.matching {
+            TraceMatch::Index => "message by message",
+            TraceMatch::Time => "by the time of the run",
+        };
+        let end = match self.replay.end {
+            TraceEnd::Wrap => "begins anew",
+            TraceEnd::Perfect => "delivers at once",
+            TraceEnd::Lost => "delivers nothing",
+        };
+        format!(
+            "replay of {}, {matching}; after its end it {end}",
+            self.file.display()
+        )
+    }
+
     /// The link.
     ///
     /// # Errors
@@ -187,15 +233,16 @@ mod tests {
             folder: Some("runs/x/traces".to_owned()),
             files: BTreeMap::from([("a/b".to_owned(), "/tmp/one.trace".to_owned())]),
             replay: TraceReplay::default(),
+            base: BaseFolder(PathBuf::from("/lab")),
         };
-        let of = |channel| source.launch(channel, Path::new("/lab")).unwrap().file;
+        let of = |channel| source.launch(channel).unwrap().file;
         assert_eq!(of("a/b"), Path::new("/tmp/one.trace"));
         assert_eq!(of("b/a"), Path::new("/lab/runs/x/traces/b.a.trace"));
         let files_only = TraceSource {
             folder: None,
             ..source
         };
-        assert_eq!(files_only.launch("b/a", Path::new("/lab")), None);
+        assert_eq!(files_only.launch("b/a"), None);
     }
 
     #[test]

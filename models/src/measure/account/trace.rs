@@ -58,7 +58,7 @@ pub fn link_trace(
         origin_ns,
         last_published_ns: 0,
     };
-    let (mut traced, mut count) = (Vec::new(), 0_u64);
+    let (mut found, mut count) = (Vec::new(), 0_u64);
     for joined in join {
         count = count.saturating_add(joined.count);
         if count > TRACE_MESSAGES_MAX {
@@ -69,12 +69,12 @@ pub fn link_trace(
         for step in 0..joined.count {
             let mut record = tracer.record(&joined, fate, is_interrupted);
             record.sequence = joined.key.sequence + step;
-            traced.push(record);
+            found.push(record);
         }
     }
     // Two starts of a producer may overlap; the order of publication is that of the link.
-    traced.sort_by_key(|record| record.published_ns);
-    Ok(traced)
+    found.sort_by_key(|record| record.published_ns);
+    Ok(found)
 }
 
 /// When the second copy of a message arrived, on the consumer's host clock, by start of the
@@ -154,7 +154,8 @@ impl Tracer<'_> {
             return;
         };
         let since_departure = |ns: i64| ns.saturating_sub(departure.as_ns());
-        record.delay_ns = since_departure(arrival_ns);
+        let delay_ns = since_departure(arrival_ns);
+        record.delay_ns = delay_ns;
         record.bound_ns = bound_ns;
         let second_ns = second_ns.and_then(stamp);
         record.second_delay_ns = second_ns.map_or(UNAVAILABLE_NS, since_departure);

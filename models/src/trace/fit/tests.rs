@@ -11,11 +11,11 @@ use crate::trace::{TraceFate, TraceHeader, TraceRecord};
 const PERIOD_NS: i64 = 10_000_000;
 
 #[allow(clippy::cast_possible_truncation, reason = "delays below a minute")]
-fn trace(losses: &[bool], mut delay_s: impl FnMut() -> f64) -> Trace {
+fn trace(losses: &[bool], mut draw: impl FnMut() -> f64) -> Trace {
     let record = |(index, is_lost): (u64, &bool)| {
         let published_ns = i64::try_from(index).unwrap() * PERIOD_NS;
         let mut record = TraceRecord::published(published_ns, index, 16);
-        let delay_ns = (delay_s() * 1e9) as i64;
+        let delay_ns = (draw() * 1e9) as i64;
         if *is_lost {
             record.fate = TraceFate::LostInNetwork;
         } else {
