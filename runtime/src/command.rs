@@ -82,6 +82,11 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
         Command::Calibrate(args) => case_work::calibrate(args, registry),
         Command::Replay { run, json } => case_work::replay(&run, json, registry, console),
         Command::Report { run, json } => show_report(&run, json, console),
+        Command::Trace { command } => match trace::work::work(command, columns(), console) {
+            trace::work::End::Done => exit::RAN,
+            trace::work::End::Failed => exit::FAILED,
+            trace::work::End::Refused => exit::USAGE,
+        },
         Command::Doctor { strict, json } => {
             let worst = examine(json, console);
             if strict && worst == doctor::State::Problem {

@@ -2,4 +2,8 @@
 //! `hil-runtime trace`. What a trace is and what is computed from it is in `hil_models::trace`.
 
 pub(crate) mod capture;
+pub mod cli;
+mod open;
+mod plots;
 pub mod source;
+pub(crate) mod work;
