@@ -18,6 +18,7 @@ use crate::topology::Timestamps;
 
 /// What is known before the first socket opens.
 #[derive(Debug)]
+#[allow(dead_code, reason = "the sentinel is held, not read")]
 pub(crate) struct Arming {
     /// Held until the end, so that the kernel never switches receive stamps off in between.
     pub(crate) sentinel: Option<Sentinel>,
@@ -30,6 +31,7 @@ pub(crate) struct Arming {
 
 /// A wireless interface, by its name.
 #[derive(Debug)]
+#[allow(dead_code, reason = "the sampler of the next step takes it")]
 pub(crate) struct RadioHop {
     pub(crate) interface: String,
     pub(crate) socket: RadioSocket,
