@@ -31,6 +31,7 @@ pub mod face;
 pub mod gateway;
 pub mod host_facts;
 pub mod process;
+pub mod radio;
 pub mod realtime;
 pub mod record;
 pub mod registry;
@@ -43,6 +44,7 @@ mod simulate;
 mod study;
 pub mod supervisor;
 pub mod topology;
+pub mod trace;
 pub mod wait;
 
 use std::process::ExitCode;

@@ -12,6 +12,8 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use hil_models::case_study::Score;
+use hil_models::link::LinkModel;
+use hil_models::link::trace::{ReplayCounts, ReplayTally};
 use hil_models::measure::account::OutageFigures;
 use hil_models::simulation::{Carrier, Simulation, SimulationResult};
 
@@ -61,6 +63,8 @@ pub(crate) struct Simulated {
     case: Box<dyn Case>,
     result: SimulationResult,
     score: Score,
+    /// Of every channel that replays a trace, what it met.
+    replays: BTreeMap<String, ReplayTally>,
     /// Of every channel that a link model carried.
     outages: Vec<OutageStory>,
     /// What each model was asked for and did, by channel.
@@ -91,11 +95,13 @@ pub(crate) fn simulate(
     }
     let mut watches = Vec::new();
     let mut carriers: BTreeMap<String, Box<dyn Carrier>> = BTreeMap::new();
+    let mut replays = BTreeMap::new();
     for (name, emulation) in emulations(topology).map_err(refused)? {
         // Virtual time begins with the run.
         let link = emulation
             .model(&name)
             .map_err(|error| refused(error.to_string()))?;
+        replays.extend(link.replay_tally().map(|tally| (name.clone(), tally)));
         let (carrier, watch) = Watch::over(link);
         watches.push((name.clone(), emulation, watch));
         carriers.insert(name, carrier);
@@ -112,7 +118,7 @@ pub(crate) fn simulate(
     let score = case.score(&result.log);
     let duration = topology.run().duration;
     let links = watches.iter().map(|(name, emulation, watch)| {
-        let (words, loss_ratio) = (emulation.describe(), emulation.spec.loss.loss_ratio());
+        let (words, loss_ratio) = (emulation.describe(), emulation.loss_ratio());
         (name.clone(), watch.figures(&words, loss_ratio))
     });
     let links = links.collect();
@@ -128,6 +134,7 @@ pub(crate) fn simulate(
         case,
         result,
         score,
+        replays,
         outages,
         links,
     })
@@ -227,6 +234,9 @@ impl Simulated {
         for (name, figures) in &self.links {
             text.push_str(&figures.page(name));
         }
+        for (name, tally) in &self.replays {
+            text.push_str(&replay_line(name, &tally.counts()));
+        }
         for (name, figures) in self.outage_figures() {
             text.push_str(&terminal::render_outages(name, &figures, columns, style));
         }
@@ -249,6 +259,10 @@ impl Simulated {
             ((*name).to_owned(), counts)
         });
         let outages: BTreeMap<&str, OutageFigures> = self.outage_figures().collect();
+        let replays = self.replays.iter();
+        let replays: BTreeMap<&str, ReplayCounts> = replays
+            .map(|(name, tally)| (name.as_str(), tally.counts()))
+            .collect();
         let document = serde_json::json!({
             "name": self.topology_name,
             "seed": self.seed,
@@ -257,6 +271,7 @@ impl Simulated {
             "recorded_counts": self.result.recorded_counts,
             "links": self.links.iter().cloned().collect::<BTreeMap<_, _>>(),
             "outages": outages,
+            "trace_replays": replays,
             "score": self.score,
             "score_events": self.events,
         });
@@ -267,6 +282,28 @@ impl Simulated {
         let stories = self.outages.iter();
         stories.filter_map(|story| Some((story.channel.as_str(), story.figures()?)))
     }
+}
+
+/// What a channel met of its trace.
+fn replay_line(name: &str, counts: &ReplayCounts) -> String {
+    let mut text = format!(
+        "  {name:<18} met {} of {} records of its trace: {} delivered, {} lost",
+        counts.met_count, counts.record_count, counts.delivered_count, counts.lost_count
+    );
+    for (count, what) in [
+        (counts.unknown_count, "of unknown fate, taken as lost"),
+        (counts.beyond_end_count, "after its end"),
+        (
+            counts.negative_delay_count,
+            "with a delay below zero, taken as zero",
+        ),
+    ] {
+        if count > 0 {
+            let _infallible = write!(text, ", {count} {what}");
+        }
+    }
+    text.push('\n');
+    text
 }
 
 /// Width of `report.txt`.

@@ -18,8 +18,12 @@ use hil_models::link::{Fate, LinkModel, LossCauses};
 use hil_models::time::Instant;
 
 use super::GatewayError;
+use super::stamp_plan::StampPlan;
 use crate::clock::MonotonicClock;
-use crate::process::launch::{DirectionLaunch, Side, SocketLaunch, Transport};
+use crate::process::emulation_room::EmulationRoom;
+use crate::process::launch::{
+    DirectionLaunch, EmulationError, EmulationLaunch, Side, SocketLaunch, Transport,
+};
 use crate::process::pipe::RunStart;
 use crate::topology::Timestamps;
 
@@ -46,8 +50,12 @@ pub(super) enum Ends {
 
 impl OpenSocket {
     /// Opens it; call it from a thread of normal priority.
-    pub(super) fn open(launch: &DirectionLaunch, start: &RunStart) -> Result<Self, GatewayError> {
-        let settings = udp_settings(launch);
+    pub(super) fn open(
+        launch: &DirectionLaunch,
+        start: &RunStart,
+        plan: StampPlan,
+    ) -> Result<Self, GatewayError> {
+        let settings = udp_settings(launch, plan);
         match launch.socket.transport {
             Transport::Udp => Self::open_udp(&settings, launch, start),
             Transport::Tcp => Self::open_tcp(&settings, launch),
@@ -82,7 +90,7 @@ impl OpenSocket {
                 emulation.describe(),
             ));
             if launch.side == Side::Ingress {
-                let room = emulation.room(launch.size_bytes)?;
+                let room = room(emulation, launch)?;
                 facts.push(("room of the link model".to_owned(), room.to_string()));
             }
         }
@@ -129,7 +137,7 @@ impl OpenSocket {
     }
 }
 
-fn udp_settings(launch: &DirectionLaunch) -> UdpSettings {
+fn udp_settings(launch: &DirectionLaunch, plan: StampPlan) -> UdpSettings {
     let socket = &launch.socket;
     UdpSettings {
         local: launch.local,
@@ -140,7 +148,8 @@ fn udp_settings(launch: &DirectionLaunch) -> UdpSettings {
         priority: socket.priority,
         send_buffer_bytes: Some(socket.send_buffer_bytes),
         receive_buffer_bytes: Some(socket.receive_buffer_bytes),
-        timestamps: stamps_of(socket),
+        timestamps: plan.mode,
+        wants_radio_reports: plan.asks_radio,
     }
 }
 
@@ -186,6 +195,13 @@ fn socket_facts(settings: &UdpSettings, granted: GrantedOptions) -> Vec<(String,
     facts
 }
 
+fn room(
+    emulation: &EmulationLaunch,
+    launch: &DirectionLaunch,
+) -> Result<EmulationRoom, EmulationError> {
+    Ok(emulation.room(launch.size_bytes)?)
+}
+
 /// The longest datagram of the channel: as long as a message needs, with room for the greetings and
 /// clock exchanges that share its socket, and no longer than the path takes.
 fn held_bytes_max(launch: &DirectionLaunch) -> usize {
@@ -208,9 +224,10 @@ fn emulate(
         start: start.clone(),
     };
     let settings = EmulatedSettings {
-        capacity_count: emulation.room(launch.size_bytes)?.capacity_count,
+        capacity_count: room(emulation, launch)?.capacity_count,
         datagram_bytes_max: held_bytes_max(launch),
         clock: Some(MonotonicClock::now),
+        number_of: Some(message_number),
     };
     let is_exempt =
         |bytes: &[u8]| wire::decode(bytes).is_ok_and(|datagram| datagram.header.kind != Kind::Data);
@@ -222,6 +239,12 @@ fn emulate(
     )))
 }
 
+/// Which message of its channel a datagram carries, or a part of.
+fn message_number(bytes: &[u8]) -> Option<u64> {
+    let header = wire::decode(bytes).ok()?.header;
+    (header.kind == Kind::Data).then_some(header.sequence)
+}
+
 /// A link on a clock that reads zero when the run starts, as it does in virtual time; before the
 /// start it stands still. A gateway that is started again thus goes on where it was.
 #[derive(Debug)]
@@ -230,14 +253,15 @@ struct SinceStart<L> {
     start: RunStart,
 }
 
-impl<L: LinkModel> LinkModel for SinceStart<L> {
-    fn offer(&mut self, now: Instant, length_bytes: usize) -> Fate {
+impl<L: LinkModel> SinceStart<L> {
+    /// Asks the link on its own clock.
+    fn ask(&mut self, now: Instant, offer: impl FnOnce(&mut L, Instant) -> Fate) -> Fate {
         let elapsed = self
             .start
             .get()
             .map_or(Duration::ZERO, |start| now.saturating_duration_since(start));
         let offered = Instant::ZERO + elapsed;
-        match self.link.offer(offered, length_bytes) {
+        match offer(&mut self.link, offered) {
             Fate::Delivered(at) => Fate::Delivered(now + at.saturating_duration_since(offered)),
             Fate::Duplicated { first, second } => Fate::Duplicated {
                 first: now + first.saturating_duration_since(offered),
@@ -246,9 +270,21 @@ impl<L: LinkModel> LinkModel for SinceStart<L> {
             Fate::Lost => Fate::Lost,
         }
     }
+}
 
+impl<L: LinkModel> LinkModel for SinceStart<L> {
     fn loss_causes(&self) -> Option<LossCauses> {
         self.link.loss_causes()
+    }
+
+    fn offer(&mut self, now: Instant, length_bytes: usize) -> Fate {
+        self.ask(now, |link, at| link.offer(at, length_bytes))
+    }
+
+    fn offer_numbered(&mut self, now: Instant, length_bytes: usize, number: u64) -> Fate {
+        self.ask(now, |link, at| {
+            link.offer_numbered(at, length_bytes, number)
+        })
     }
 }
 
@@ -272,7 +308,6 @@ mod tests {
     use hil_models::random::RandomStream;
 
     use super::*;
-    use crate::process::launch::EmulationLaunch;
 
     fn emulation(per_hour: f64) -> EmulationLaunch {
         let outages = Outages {
@@ -288,6 +323,7 @@ mod tests {
             link: "hop".to_owned(),
             way: Way::Forward,
             seed: 3,
+            trace: None,
         }
     }
 

@@ -5,6 +5,7 @@ use std::fs;
 use std::io;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use hil_models::case_study::ParameterError;
 use hil_models::link::LinkModel;
@@ -15,6 +16,7 @@ use serde::{Deserialize, Serialize};
 use super::emulation_room::EmulationRoom;
 use crate::realtime::RealtimeRequest;
 use crate::topology::{Crossing, Direction, Timestamps};
+use crate::trace::source::{TraceFileError, TraceLaunch};
 use crate::wait::WaitMode;
 
 /// How to start one component here.
@@ -139,6 +141,19 @@ pub struct EmulationLaunch {
     pub way: Way,
     /// Seed of the run.
     pub seed: u64,
+    /// A recorded trace; with it the channel meets nothing of `spec`.
+    pub trace: Option<TraceLaunch>,
+}
+
+/// Why a link cannot be emulated.
+#[derive(Debug, thiserror::Error)]
+pub enum EmulationError {
+    /// A number is outside its range.
+    #[error(transparent)]
+    Parameter(#[from] ParameterError),
+    /// The trace cannot be replayed.
+    #[error(transparent)]
+    Trace(#[from] TraceFileError),
 }
 
 impl EmulationLaunch {
@@ -152,20 +167,34 @@ impl EmulationLaunch {
                 Direction::Backward => Way::Backward,
             },
             seed,
+            trace: crossing
+                .link
+                .emulation()
+                .and_then(|emulation| emulation.trace.as_ref()?.launch(&crossing.channel.name)),
         })
     }
 
     /// The model of one channel, on a clock that reads zero when the run starts.
     ///
     /// # Errors
-    /// When a number is outside its range.
-    pub fn model(&self, channel: &str) -> Result<Box<dyn LinkModel>, ParameterError> {
-        self.spec.build(&LinkPlace {
+    /// When a number is outside its range, or the trace cannot be replayed.
+    pub fn model(&self, channel: &str) -> Result<Box<dyn LinkModel>, EmulationError> {
+        if let Some(trace) = &self.trace {
+            return Ok(Box::new(trace.model()?));
+        }
+        let model = self.spec.build(&LinkPlace {
             seed: self.seed,
             link: &self.link,
             channel,
             way: self.way,
-        })
+        })?;
+        Ok(model)
+    }
+
+    /// How long all but a share of 1 - `quantile` of the messages are under way at most.
+    pub fn flight_time(&self, quantile: f64) -> Duration {
+        let traced = self.trace.as_ref().and_then(TraceLaunch::delay_max);
+        traced.unwrap_or_else(|| self.spec.flight_time(quantile))
     }
 
     /// Room for what the model holds of a channel of messages of `message_bytes`.
@@ -173,15 +202,28 @@ impl EmulationLaunch {
     /// # Errors
     /// When a gateway cannot hold that much.
     pub fn room(&self, message_bytes: usize) -> Result<EmulationRoom, ParameterError> {
-        EmulationRoom::of(&self.spec, message_bytes).map_err(|error| {
+        let traced = self.trace.as_ref().and_then(TraceLaunch::delay_max);
+        let traced = traced.map(|longest| LinkSpec::fixed(longest, 0.0));
+        let spec = traced.as_ref().unwrap_or(&self.spec);
+        EmulationRoom::of(spec, message_bytes).map_err(|error| {
             let key = format!("links.{}.{}", self.link, error.key);
             ParameterError::new(&key, error.problem)
         })
     }
 
+    /// Share of the messages that the loss law loses in the long run; `None` for a trace, which has
+    /// none.
+    pub fn loss_ratio(&self) -> Option<f64> {
+        let is_traced = self.trace.is_some();
+        (!is_traced).then(|| self.spec.loss.loss_ratio())
+    }
+
     /// The model in words.
     pub fn describe(&self) -> String {
-        self.spec.describe()
+        match &self.trace {
+            Some(trace) => trace.describe(),
+            None => self.spec.describe(),
+        }
     }
 }
 

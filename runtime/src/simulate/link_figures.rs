@@ -29,8 +29,8 @@ pub(super) struct LinkFigures {
     /// The model in words.
     model: String,
     /// Share of the messages that its loss law loses in the long run, without outages and full
-    /// queues.
-    requested_loss_ratio: f64,
+    /// queues; `None` for a replayed trace.
+    requested_loss_ratio: Option<f64>,
     /// Messages offered.
     offered_count: u64,
     /// Of those, lost.
@@ -64,7 +64,7 @@ impl LinkTally {
     }
 
     /// The figures, of a model that `model` describes.
-    pub(super) fn figures(&self, model: &str, requested_loss_ratio: f64) -> LinkFigures {
+    pub(super) fn figures(&self, model: &str, requested_loss_ratio: Option<f64>) -> LinkFigures {
         let interval = wilson(self.lost_count, self.offered_count, 0.95);
         LinkFigures {
             model: model.to_owned(),
@@ -144,7 +144,7 @@ mod tests {
             second: at(40),
         };
         tally.count(at(3), twice, Some(causes));
-        let figures = tally.figures("30 ms", 0.25);
+        let figures = tally.figures("30 ms", Some(0.25));
         let counts = (figures.offered_count, figures.lost_count);
         assert_eq!(counts, (4, 1));
         assert_eq!((figures.duplicated_count, figures.overtaken_count), (1, 1));
@@ -158,7 +158,7 @@ mod tests {
             page.contains("loss ratio 0.250000 (0.045587 to 0.699358"),
             "{page}"
         );
-        let nothing = LinkTally::default().figures("x", 0.0).page("a/b");
+        let nothing = LinkTally::default().figures("x", None).page("a/b");
         assert!(
             nothing.contains("unavailable: nothing arrived"),
             "{nothing}"

@@ -40,7 +40,7 @@ impl Watch {
     }
 
     /// What the model, which `model` describes, did so far.
-    pub(super) fn figures(&self, model: &str, requested_loss_ratio: f64) -> LinkFigures {
+    pub(super) fn figures(&self, model: &str, requested_loss_ratio: Option<f64>) -> LinkFigures {
         self.0.borrow().tally.figures(model, requested_loss_ratio)
     }
 }
@@ -61,7 +61,9 @@ impl Carrier for Watched {
     ) {
         // The length that a gateway's model would be offered: a datagram, not a message.
         let length_bytes = payload.len() + wire::HEADER_BYTES;
-        let fate = LinkModel::offer(&mut self.link, now, length_bytes);
+        let fate = self
+            .link
+            .offer_numbered(now, length_bytes, envelope.sequence);
         let arrivals = [fate.arrival(), fate.second_arrival()];
         for at in arrivals.into_iter().flatten() {
             deliver(at, *envelope, payload);

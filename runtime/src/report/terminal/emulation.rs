@@ -53,3 +53,45 @@ pub(super) fn emulation(canvas: &mut Canvas, figures: &EmulationFigures) {
     );
     canvas.field_of(LABEL_WIDTH, "scheduling error", tone, &text);
 }
+
+#[cfg(test)]
+mod tests {
+    use bytemuck::Zeroable;
+    use hil_models::measure::record::IngressRecord;
+
+    use super::*;
+    use crate::report::terminal::Style;
+
+    #[test]
+    fn the_section_separates_what_was_asked_from_what_was_given() {
+        let record = IngressRecord {
+            emulated_ns: 1_000_000,
+            due_ns: 51_000_000,
+            received_ns: 51_020_000,
+            ..IngressRecord::zeroed()
+        };
+        let page = |overflow_count| {
+            let figures = EmulationFigures::of(&[record; 10], overflow_count).unwrap();
+            let mut canvas = Canvas::new(120, Style::Plain);
+            emulation(&mut canvas, &figures);
+            canvas.finish().replace('\u{a0}', " ")
+        };
+        let kept = page(Some(0));
+        for part in [
+            "requested delay",
+            "p50 50.0 ms",
+            "of 10 datagrams",
+            "achieved delay",
+            "scheduling error",
+            "p99 20.0 µs",
+            "0 dropped for want of room; kept: p99 may be 1.00 ms",
+        ] {
+            assert!(
+                kept.replace("\n", " ").contains(part),
+                "{part} is not in\n{kept}"
+            );
+        }
+        assert!(page(Some(2)).contains("NOT kept"));
+        assert!(page(None).contains("unavailable"));
+    }
+}
