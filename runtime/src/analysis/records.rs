@@ -10,6 +10,9 @@ use hil_models::measure::account::{
     AccountContext, ChannelAccount, ChannelPath, ChannelRecords, FLIGHT_TIME_MAX, Interruption,
     MessageStory, Outage, PathProcess, RunSpan, account, outages, stories,
 };
+use hil_models::measure::radio::{
+    RadioFigures, TransmitStampFigures, radio_figures, transmit_stamps,
+};
 use hil_models::measure::record::{
     EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
 };
@@ -18,6 +21,7 @@ use hil_models::time::{Alignment, Instant};
 
 use super::AnalysisError;
 use crate::face::record::{FaceReceivedRecord, FaceSentRecord};
+use crate::radio::record::RadioRecord;
 use crate::record::{RecordFile, RecordFileError, RecordKind};
 use crate::report::summary::RecordedFigures;
 use crate::supervisor::RunResult;
@@ -46,6 +50,8 @@ pub(crate) struct ChannelFiles {
 pub(crate) struct RunRecords {
     channels: BTreeMap<String, ChannelFiles>,
     log: RunLog,
+    /// Records of radios, by `<process>/<interface>`.
+    pub(super) radios: BTreeMap<String, Vec<RadioRecord>>,
     /// Files that could not be read, with the reason.
     pub(crate) problems: Vec<String>,
 }
@@ -59,6 +65,11 @@ impl RunRecords {
     }
 
     fn add(&mut self, file: &RecordFile) {
+        if file.header.kind == RecordKind::Radio {
+            let radio = self.radios.entry(file.header.channel.clone());
+            radio.or_default().extend(file.records::<RadioRecord>());
+            return;
+        }
         let channel = self
             .channels
             .entry(file.header.channel.clone())
@@ -81,6 +92,8 @@ impl RunRecords {
                 channel.face_received.extend(records);
             }
             RecordKind::Message => file.append_messages(&mut self.log),
+            // Belongs to no channel, see above.
+            RecordKind::Radio => {}
         }
     }
 
@@ -133,6 +146,17 @@ impl RunRecords {
         channel: &Channel,
     ) -> ChannelAccount {
         self.consult((topology, result), channel, account)
+    }
+
+    /// Where the messages of `channel` were stamped, and what the radio said of them.
+    pub(super) fn radio_figures(
+        &self,
+        run: (&Topology, &RunResult),
+        channel: &Channel,
+    ) -> (Option<TransmitStampFigures>, Option<RadioFigures>) {
+        self.consult(run, channel, |records, _| {
+            (records.egress.map(transmit_stamps), radio_figures(records))
+        })
     }
 
     /// What became of the `wanted` messages of `channel`, by start of the producer and number.
