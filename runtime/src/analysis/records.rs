@@ -11,6 +11,9 @@ use hil_models::measure::account::{
     MessageStory, Outage, PathProcess, RunSpan, TooManyMessages, TraceChannel, account, link_trace,
     outages, stories,
 };
+use hil_models::measure::radio::{
+    RadioFigures, TransmitStampFigures, radio_figures, transmit_stamps,
+};
 use hil_models::measure::record::{
     EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
 };
@@ -21,6 +24,7 @@ use hil_models::trace::TraceRecord;
 use super::AnalysisError;
 use crate::face::record::{FaceReceivedRecord, FaceSentRecord};
 use crate::process::launch::EmulationLaunch;
+use crate::radio::record::RadioRecord;
 use crate::record::{RecordFile, RecordFileError, RecordKind};
 use crate::report::summary::RecordedFigures;
 use crate::supervisor::RunResult;
@@ -49,6 +53,8 @@ pub(crate) struct ChannelFiles {
 pub(crate) struct RunRecords {
     channels: BTreeMap<String, ChannelFiles>,
     log: RunLog,
+    /// Records of radios, by `<process>/<interface>`.
+    pub(super) radios: BTreeMap<String, Vec<RadioRecord>>,
     /// Files that could not be read, with the reason.
     pub(crate) problems: Vec<String>,
 }
@@ -62,6 +68,11 @@ impl RunRecords {
     }
 
     fn add(&mut self, file: &RecordFile) {
+        if file.header.kind == RecordKind::Radio {
+            let radio = self.radios.entry(file.header.channel.clone());
+            radio.or_default().extend(file.records::<RadioRecord>());
+            return;
+        }
         let channel = self
             .channels
             .entry(file.header.channel.clone())
@@ -84,6 +95,8 @@ impl RunRecords {
                 channel.face_received.extend(records);
             }
             RecordKind::Message => file.append_messages(&mut self.log),
+            // Belongs to no channel, see above.
+            RecordKind::Radio => {}
         }
     }
 
@@ -143,6 +156,17 @@ impl RunRecords {
         channel: &Channel,
     ) -> ChannelAccount {
         self.consult((topology, result), channel, account)
+    }
+
+    /// Where the messages of `channel` were stamped, and what the radio said of them.
+    pub(super) fn radio_figures(
+        &self,
+        run: (&Topology, &RunResult),
+        channel: &Channel,
+    ) -> (Option<TransmitStampFigures>, Option<RadioFigures>) {
+        self.consult(run, channel, |records, _| {
+            (records.egress.map(transmit_stamps), radio_figures(records))
+        })
     }
 
     /// What became of the `wanted` messages of `channel`, by start of the producer and number.
