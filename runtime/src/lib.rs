@@ -24,6 +24,7 @@ mod cases;
 pub mod channel;
 pub mod cli;
 pub mod clock;
+pub mod clock_discipline;
 mod command;
 pub mod console;
 pub mod doctor;

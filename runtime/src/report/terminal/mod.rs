@@ -2,6 +2,7 @@
 
 mod canvas;
 mod channel;
+mod clocks;
 mod events;
 mod face;
 mod outages;
@@ -33,6 +34,9 @@ pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> Strin
     }
     for face in &summary.faces {
         face::face(&mut canvas, face);
+    }
+    if let Some(section) = &summary.clocks {
+        clocks::clocks(&mut canvas, section);
     }
     tables::processes(&mut canvas, &summary.processes);
     tables::events(&mut canvas, &summary.events);
