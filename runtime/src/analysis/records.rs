@@ -11,6 +11,9 @@ use hil_models::measure::account::{
     MessageStory, ORDER_TOLERANCE_NS, Outage, PathProcess, RunSpan, TooManyMessages, TraceChannel,
     account, link_trace, outages, stories,
 };
+use hil_models::measure::radio::{
+    RadioFigures, TransmitStampFigures, radio_figures, transmit_stamps,
+};
 use hil_models::measure::record::{
     EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
 };
@@ -22,6 +25,7 @@ use super::AnalysisError;
 use super::clocks::HostClocks;
 use crate::face::record::{FaceReceivedRecord, FaceSentRecord};
 use crate::process::launch::EmulationLaunch;
+use crate::radio::record::RadioRecord;
 use crate::record::{RecordFile, RecordFileError, RecordKind};
 use crate::report::summary::RecordedFigures;
 use crate::supervisor::RunResult;
@@ -51,6 +55,8 @@ pub(crate) struct RunRecords {
     channels: BTreeMap<String, ChannelFiles>,
     log: RunLog,
     clocks: HostClocks,
+    /// Records of radios, by `<process>/<interface>`.
+    pub(super) radios: BTreeMap<String, Vec<RadioRecord>>,
     /// Files that could not be read, with the reason.
     pub(crate) problems: Vec<String>,
 }
@@ -64,6 +70,11 @@ impl RunRecords {
     }
 
     fn add(&mut self, file: &RecordFile) {
+        if file.header.kind == RecordKind::Radio {
+            let radio = self.radios.entry(file.header.channel.clone());
+            radio.or_default().extend(file.records::<RadioRecord>());
+            return;
+        }
         let channel = self
             .channels
             .entry(file.header.channel.clone())
@@ -86,6 +97,8 @@ impl RunRecords {
                 channel.face_received.extend(records);
             }
             RecordKind::Message => file.append_messages(&mut self.log),
+            // Belongs to no channel, see above.
+            RecordKind::Radio => {}
         }
     }
 
@@ -186,6 +199,17 @@ impl RunRecords {
         channel: &Channel,
     ) -> ChannelAccount {
         self.consult((topology, result), channel, account)
+    }
+
+    /// Where the messages of `channel` were stamped, and what the radio said of them.
+    pub(super) fn radio_figures(
+        &self,
+        run: (&Topology, &RunResult),
+        channel: &Channel,
+    ) -> (Option<TransmitStampFigures>, Option<RadioFigures>) {
+        self.consult(run, channel, |records, _| {
+            (records.egress.map(transmit_stamps), radio_figures(records))
+        })
     }
 
     /// What became of the `wanted` messages of `channel`, by start of the producer and number.

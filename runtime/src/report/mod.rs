@@ -6,6 +6,7 @@ pub mod clock_summary;
 pub(crate) mod event_log;
 pub mod face;
 mod face_warnings;
+pub mod radio;
 pub mod score_event;
 pub mod summary;
 pub mod terminal;
