@@ -5,6 +5,7 @@ pub mod bernoulli;
 pub mod impaired;
 pub mod in_series;
 pub mod outages;
+pub mod wifi;
 
 use core::fmt::Debug;
 
