@@ -184,10 +184,10 @@ fn socket_facts(settings: &UdpSettings, granted: GrantedOptions) -> Vec<(String,
     facts
 }
 
-/// Room for everything that is under way at once, up to 4000 datagrams per second, and for what
-/// eight mean outages hold back of 1000 per second.
+/// Room for everything that is under way at once, but for one in a million, at 4000 datagrams per
+/// second, and for what eight mean outages hold back of 1000 per second.
 fn emulated_capacity(emulation: &EmulationLaunch) -> usize {
-    let outages = &emulation.outages;
+    let outages = &emulation.spec.outages;
     let held_s = if outages.is_active() && outages.buffered {
         8.0 * outages.mean_s
     } else {
@@ -199,7 +199,7 @@ fn emulated_capacity(emulation: &EmulationLaunch) -> usize {
         reason = "a checked mean is at most an hour, and what is above the bound is cut"
     )]
     let held_count = ((1000.0 * held_s) as usize).min(HELD_COUNT_MAX);
-    let under_way = emulation.delay.as_millis() as usize * 4;
+    let under_way = emulation.spec.flight_time(1.0 - 1e-6).as_millis() as usize * 4;
     EmulatedSettings::default().capacity_count + under_way + held_count
 }
 
@@ -274,20 +274,24 @@ fn datagram_bytes_max(launch: &DirectionLaunch, path: PathMtu) -> usize {
 #[cfg(test)]
 mod tests {
     use hil_models::link::outages::{Outage, OutageSchedule, Outages};
+    use hil_models::link::spec::{LinkSpec, Way};
     use hil_models::random::RandomStream;
 
     use super::*;
 
     fn emulation(per_hour: f64) -> EmulationLaunch {
+        let outages = Outages {
+            mean_s: 0.5,
+            per_hour,
+            buffered: false,
+        };
         EmulationLaunch {
-            delay: Duration::from_millis(5),
-            loss_ratio: 0.0,
-            outages: Outages {
-                mean_s: 0.5,
-                per_hour,
-                buffered: false,
+            spec: LinkSpec {
+                outages,
+                ..LinkSpec::fixed(Duration::from_millis(5), 0.0)
             },
             link: "hop".to_owned(),
+            way: Way::Forward,
             seed: 3,
         }
     }
@@ -340,7 +344,7 @@ mod tests {
             let name = format!("links.{link}.outages");
             let stream = RandomStream::new(emulation.seed, &name);
             let mut schedule =
-                OutageSchedule::new(emulation.outages, stream, Instant::ZERO).unwrap();
+                OutageSchedule::new(emulation.spec.outages, stream, Instant::ZERO).unwrap();
             schedule.next().unwrap()
         };
         assert_ne!(first("hop"), first("wire"));
@@ -351,9 +355,9 @@ mod tests {
         let mut held = emulation(100.0);
         let lossy = emulated_capacity(&held);
         assert_eq!(lossy, 1024 + 20);
-        held.outages.buffered = true;
+        held.spec.outages.buffered = true;
         assert_eq!(emulated_capacity(&held), lossy + 4_000);
-        held.outages.mean_s = 30.0;
+        held.spec.outages.mean_s = 30.0;
         assert_eq!(emulated_capacity(&held), lossy + HELD_COUNT_MAX);
     }
 }
