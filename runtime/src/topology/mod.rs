@@ -19,6 +19,7 @@ mod face;
 mod file;
 mod file_impairments;
 mod file_links;
+mod file_wifi;
 mod host;
 mod known;
 mod layers;

@@ -27,7 +27,8 @@ pub use spec::{AccessCategory, PowerSave, WIFI_FIELDS, WifiField, WifiSpec};
 
 use crate::case_study::ParameterError;
 use crate::link::outages::OutageLink;
-use crate::link::{Fate, LinkModel};
+use crate::link::spec::Way;
+use crate::link::{Fate, LinkModel, LossCauses};
 use crate::random::RandomStream;
 use crate::time::Instant;
 
@@ -36,15 +37,6 @@ use contention::Contention;
 use phy::{Phy, nanoseconds};
 use power_save::Doze;
 use rate::Rates;
-
-/// Which way a link object carries messages.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum WifiDirection {
-    /// From the link's first host to its second.
-    Forward,
-    /// From the second to the first.
-    Backward,
-}
 
 /// What became of the messages offered. Every message has one of the four fates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -111,7 +103,7 @@ impl WifiLink {
     /// The first key of `spec` outside its range.
     pub fn new(
         spec: &WifiSpec,
-        direction: WifiDirection,
+        way: Way,
         random: RandomStream,
         mut shared: RandomStream,
     ) -> Result<Self, ParameterError> {
@@ -120,9 +112,8 @@ impl WifiLink {
         let (shadowing_key, fading_key) = (shared.next_u64(), shared.next_u64());
         let beacon_phase = shared.uniform();
         let is_dozing = matches!(
-            (spec.power_save, direction),
-            (PowerSave::Forward, WifiDirection::Forward)
-                | (PowerSave::Backward, WifiDirection::Backward)
+            (spec.power_save, way),
+            (PowerSave::Forward, Way::Forward) | (PowerSave::Backward, Way::Backward)
         );
         Ok(Self {
             phy: Phy::new(spec),
@@ -239,6 +230,18 @@ impl WifiLink {
     }
 }
 
+impl WifiCounts {
+    /// What the lost messages were lost to: attempts that all failed are losses by chance, and
+    /// frames that grew too old are losses to the queue.
+    pub const fn loss_causes(self) -> LossCauses {
+        LossCauses {
+            outage_count: self.outage_count,
+            chance_count: self.exhausted_count,
+            queue_count: self.expired_count,
+        }
+    }
+}
+
 impl LinkModel for WifiLink {
     fn offer(&mut self, now: Instant, length_bytes: usize) -> Fate {
         self.counts.offered_count += 1;
@@ -275,6 +278,10 @@ impl LinkModel for WifiLink {
             }
             Err(gone) => self.lost(gone),
         }
+    }
+
+    fn loss_causes(&self) -> Option<LossCauses> {
+        Some(self.counts.loss_causes())
     }
 }
 

@@ -1,12 +1,15 @@
 //! What a Wi-Fi 6 link is told: every number with its unit, its range and what it stands for, in
 //! one table that the checks and the readers of files share. It computes nothing.
 
+use core::time::Duration;
+
 use serde::{Deserialize, Serialize};
 
 use crate::case_study::ParameterError;
 use crate::link::outages::Outages;
-use crate::link::wifi::contention;
 use crate::link::wifi::preset::WifiPreset;
+use crate::link::wifi::rate::Rates;
+use crate::link::wifi::{channel, contention};
 
 /// EDCA access category, which decides how long a frame defers (IEEE 802.11-2020, 10.23.2).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -34,6 +37,40 @@ pub enum PowerSave {
     Forward,
     /// The receiver of the link's backward direction.
     Backward,
+}
+
+impl AccessCategory {
+    /// Each with its word in files.
+    pub const WORDS: &[(&'static str, Self)] = &[
+        ("background", Self::Background),
+        ("best-effort", Self::BestEffort),
+        ("video", Self::Video),
+        ("voice", Self::Voice),
+    ];
+
+    /// Its word in files.
+    pub fn word(self) -> &'static str {
+        word_of(Self::WORDS, self)
+    }
+}
+
+impl PowerSave {
+    /// Each with its word in files.
+    pub const WORDS: &[(&'static str, Self)] = &[
+        ("off", Self::Off),
+        ("forward", Self::Forward),
+        ("backward", Self::Backward),
+    ];
+
+    /// Its word in files.
+    pub fn word(self) -> &'static str {
+        word_of(Self::WORDS, self)
+    }
+}
+
+fn word_of<T: PartialEq>(words: &[(&'static str, T)], value: T) -> &'static str {
+    let found = words.iter().find(|(_, known)| *known == value);
+    found.expect("every variant has its word").0
 }
 
 /// A Wi-Fi 6 link between two stations. Missing keys are those of `wifi6-short-range`.
@@ -217,6 +254,35 @@ impl WifiSpec {
         self.check_words()?;
         self.check_contention()?;
         self.outages.check()
+    }
+
+    /// How long a message is under way at most, but for the last attempt's back-off.
+    pub fn flight_time_max(&self) -> Duration {
+        /// A last back-off from the widest window on a busy medium.
+        const LAST: Duration = Duration::from_millis(50);
+        Duration::from_secs_f64(1e-3 * self.lifetime_ms + 1e-6 * self.forwarding_us) + LAST
+    }
+
+    /// The link in words, with what follows from its numbers.
+    pub fn describe(&self) -> String {
+        let snr_db = channel::median_snr_db(self);
+        let contenders = match self.contender_count {
+            0 => "nobody else".to_owned(),
+            count => format!("{count} others, {} % busy", 100.0 * self.busy_ratio),
+        };
+        format!(
+            "Wi-Fi 6 over {} m and {} walls, {} MHz, {} streams, signal-to-noise ratio {snr_db:.1} \
+             dB, settles on MCS {} of {}, {contenders}, {} attempts within {} ms, power save {}",
+            self.distance_m,
+            self.wall_count,
+            self.channel_width_mhz,
+            self.stream_count,
+            Rates::new(self).settled(snr_db),
+            self.mcs_max,
+            self.attempt_limit,
+            self.lifetime_ms,
+            self.power_save.word(),
+        )
     }
 
     /// Numbers of which only some are allowed.

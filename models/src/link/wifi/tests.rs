@@ -26,13 +26,7 @@ fn bare() -> WifiSpec {
 
 fn link(spec: &WifiSpec, seed: u64) -> WifiLink {
     let stream = |name| RandomStream::new(seed, name);
-    WifiLink::new(
-        spec,
-        WifiDirection::Forward,
-        stream("own"),
-        stream("shared"),
-    )
-    .unwrap()
+    WifiLink::new(spec, Way::Forward, stream("own"), stream("shared")).unwrap()
 }
 
 /// Offers `count` messages of 100 bytes every `period_ns`; gives each delay, or nothing.
@@ -267,13 +261,7 @@ fn frames_for_a_dozing_receiver_wait_half_a_beacon_interval_on_average() {
     assert!(longest < 103_000_000, "{longest}");
     // The other direction, and a receiver that heard a frame just now, wait for no beacon.
     let stream = |name| RandomStream::new(8, name);
-    let mut back = WifiLink::new(
-        &spec,
-        WifiDirection::Backward,
-        stream("own"),
-        stream("shared"),
-    )
-    .unwrap();
+    let mut back = WifiLink::new(&spec, Way::Backward, stream("own"), stream("shared")).unwrap();
     assert!(
         delays(&mut back, 1000, 150_001_237)
             .iter()
@@ -305,13 +293,9 @@ fn outages_take_their_share_and_all_channels_of_a_link_together() {
         ..at_snr(bare(), 60.0)
     };
     let shared = || RandomStream::new(9, "shared");
-    let one = |own, direction| {
-        WifiLink::new(&spec, direction, RandomStream::new(own, "own"), shared()).unwrap()
-    };
-    let (mut there, mut back) = (
-        one(1, WifiDirection::Forward),
-        one(2, WifiDirection::Backward),
-    );
+    let one =
+        |own, way| WifiLink::new(&spec, way, RandomStream::new(own, "own"), shared()).unwrap();
+    let (mut there, mut back) = (one(1, Way::Forward), one(2, Way::Backward));
     let (forward, backward) = (
         delays(&mut there, COUNT, 8_000_000),
         delays(&mut back, COUNT, 8_000_000),
