@@ -14,7 +14,11 @@ use hil_models::link::reordering::{Duplication, Reordering};
 use hil_models::link::spec::LinkSpec;
 
 use super::errors::Fault;
+<<<<<<< HEAD
 use super::file_wifi::read_wifi;
+=======
+use super::file_trace::read_trace;
+>>>>>>> part/network
 use super::limits::{self, Limit};
 use super::model_links::Emulation;
 use super::reader::Reader;
@@ -30,7 +34,11 @@ pub(super) const EMULATION_KEYS: &[&str] = &[
     "forward",
     "backward",
     "outages",
+<<<<<<< HEAD
     "wifi",
+=======
+    "trace",
+>>>>>>> part/network
 ];
 
 #[derive(Debug, Clone, Copy)]
@@ -87,6 +95,7 @@ pub(super) fn read_emulation(reader: &mut Reader<'_>) -> Emulation {
     Emulation {
         forward: direction("forward"),
         backward: direction("backward"),
+        trace: read_trace(reader),
     }
 }
 

@@ -19,7 +19,11 @@ mod face;
 mod file;
 mod file_impairments;
 mod file_links;
+<<<<<<< HEAD
 mod file_wifi;
+=======
+mod file_trace;
+>>>>>>> part/network
 mod host;
 mod known;
 mod layers;
@@ -149,6 +153,7 @@ fn read_and_check(
         let file = file::read(&table, top, &layers.faults);
         check::check(file, known, needs, &layers.faults)
     };
+    let topology = topology.with_traces_beside(path);
     if layers.faults.is_empty() {
         Ok(topology)
     } else {
