@@ -14,11 +14,8 @@ use hil_models::link::reordering::{Duplication, Reordering};
 use hil_models::link::spec::LinkSpec;
 
 use super::errors::Fault;
-<<<<<<< HEAD
-use super::file_wifi::read_wifi;
-=======
 use super::file_trace::read_trace;
->>>>>>> part/network
+use super::file_wifi::read_wifi;
 use super::limits::{self, Limit};
 use super::model_links::Emulation;
 use super::reader::Reader;
@@ -34,11 +31,8 @@ pub(super) const EMULATION_KEYS: &[&str] = &[
     "forward",
     "backward",
     "outages",
-<<<<<<< HEAD
-    "wifi",
-=======
     "trace",
->>>>>>> part/network
+    "wifi",
 ];
 
 #[derive(Debug, Clone, Copy)]

@@ -19,11 +19,8 @@ mod face;
 mod file;
 mod file_impairments;
 mod file_links;
-<<<<<<< HEAD
-mod file_wifi;
-=======
 mod file_trace;
->>>>>>> part/network
+mod file_wifi;
 mod host;
 mod known;
 mod layers;

@@ -6,11 +6,8 @@ use core::time::Duration;
 use serde::Serialize;
 use toml::{Table, Value};
 
-<<<<<<< HEAD
-use super::file_wifi::resolved_wifi;
-=======
 use super::file_trace::resolved_trace;
->>>>>>> part/network
+use super::file_wifi::resolved_wifi;
 use super::model::{Channel, Execution, Host, OnExit, Process, Program, Scheduling, Topology};
 use super::model_links::{Gateway, Hop, Link, Via};
 use super::resolved_impairments::{resolved_outages, resolved_spec};
@@ -211,7 +208,6 @@ fn resolved_link(link: &Link) -> Table {
             put_hop(&mut table, hop);
             put(&mut table, "forward", resolved_spec(&emulation.forward));
             put(&mut table, "backward", resolved_spec(&emulation.backward));
-<<<<<<< HEAD
             // A radio has outages of its own, and the link then has none beside them.
             match &emulation.forward.wifi {
                 Some(wifi) => put(&mut table, "wifi", resolved_wifi(wifi)),
@@ -219,12 +215,9 @@ fn resolved_link(link: &Link) -> Table {
                     let outages = resolved_outages(emulation.forward.outages);
                     put(&mut table, "outages", outages);
                 }
-=======
-            let outages = resolved_outages(emulation.forward.outages);
-            put(&mut table, "outages", outages);
+            }
             if let Some(trace) = &emulation.trace {
                 put(&mut table, "trace", resolved_trace(trace));
->>>>>>> part/network
             }
         }
     }
