@@ -5,6 +5,8 @@ use std::path::PathBuf;
 
 use clap::{ArgGroup, Args, Parser, Subcommand};
 
+use crate::probe::arguments::ProbeArgs;
+
 const EXAMPLES: &str = "\
 Examples:
   hil-runtime --topology deploy/topologies/local.toml
@@ -216,6 +218,8 @@ pub enum Command {
         #[arg(long)]
         json: bool,
     },
+    /// Look at the wire without taking part: capture, analyse, compare with a run.
+    Probe(ProbeArgs),
     /// List the case studies with their channels and parameters.
     #[command(after_help = "Example:\n  hil-runtime cases")]
     Cases,

@@ -35,10 +35,7 @@ impl ByteOrder {
 
 /// `N` bytes from `offset`; `None` when they are not all there.
 pub(super) fn array_at<const N: usize>(bytes: &[u8], offset: usize) -> Option<[u8; N]> {
-    bytes
-        .get(offset..offset.checked_add(N)?)?
-        .try_into()
-        .ok()
+    bytes.get(offset..offset.checked_add(N)?)?.try_into().ok()
 }
 
 /// Big-endian, as networks have it.

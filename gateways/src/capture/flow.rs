@@ -386,7 +386,10 @@ fn any(
             own: None,
         });
     };
-    let (from, to) = (usize::from(offset), usize::from(offset) + usize::from(bytes));
+    let (from, to) = (
+        usize::from(offset),
+        usize::from(offset) + usize::from(bytes),
+    );
     if datagram.payload_bytes < to {
         return Err(Unidentified::Foreign);
     }

@@ -130,9 +130,8 @@ pub fn join(
     };
     let mut matches = Matches::of(&sides[0].2, &sides[1].2, window_ns);
     let is_swapped = by_direction.unwrap_or_else(|| {
-        let is_early = |pair: &&(usize, usize)| {
-            sides[1].2[pair.1].stamp_ns < sides[0].2[pair.0].stamp_ns
-        };
+        let is_early =
+            |pair: &&(usize, usize)| sides[1].2[pair.1].stamp_ns < sides[0].2[pair.0].stamp_ns;
         2 * matches.pairs.iter().filter(is_early).count() > matches.pairs.len()
     });
     if is_swapped {
@@ -143,11 +142,18 @@ pub fn join(
         Some(_) => OrderSource::PacketDirection,
         None => OrderSource::Stamps,
     };
-    let [(first_point, seen_first, first), (second_point, seen_second, second)] = sides;
-    let pairs: Vec<Pair> = matches.pairs.iter().map(|&(i, j)| Pair {
-        first: first[i],
-        second: second[j],
-    }).collect();
+    let [
+        (first_point, seen_first, first),
+        (second_point, seen_second, second),
+    ] = sides;
+    let pairs: Vec<Pair> = matches
+        .pairs
+        .iter()
+        .map(|&(i, j)| Pair {
+            first: first[i],
+            second: second[j],
+        })
+        .collect();
     let watched = (seen_first.span_ns, seen_second.span_ns);
     let figures = Tally {
         first: &first,
@@ -263,11 +269,22 @@ impl Tally<'_> {
             let at = self.first[**index].stamp_ns;
             is_covered(at, extremes, watched.1)
         };
-        let lost: Vec<usize> = self.matches.only_first.iter().filter(is_lost).copied().collect();
+        let lost: Vec<usize> = self
+            .matches
+            .only_first
+            .iter()
+            .filter(is_lost)
+            .copied()
+            .collect();
         let back = (-extremes.1, -extremes.0);
         let is_unexplained =
             |index: &&usize| is_covered(self.second[**index].stamp_ns, back, watched.0);
-        let unexplained = self.matches.only_second.iter().filter(is_unexplained).count();
+        let unexplained = self
+            .matches
+            .only_second
+            .iter()
+            .filter(is_unexplained)
+            .count();
         let only_count = self.matches.only_first.len() + self.matches.only_second.len();
         let judged = (self.pairs.len() + lost.len()) as u64;
         let lost_count = lost.len() as u64;
@@ -290,7 +307,10 @@ impl Tally<'_> {
             loss_ratio: (judged > 0).then(|| lost_count as f64 / judged as f64),
             loss_interval: ratio(lost_count, judged),
             loss_bursts: bursts(&lost),
-            delay: distribution(delays.iter().copied(), "no datagram was seen at both points"),
+            delay: distribution(
+                delays.iter().copied(),
+                "no datagram was seen at both points",
+            ),
             delay_p50_interval: interval(0.5, "probe delay p50"),
             delay_p99_interval: interval(0.99, "probe delay p99"),
             variation: distribution(

@@ -95,6 +95,8 @@ pub struct CapturedPacket<'a> {
     pub offset: u64,
     /// Which of [`reader::CaptureReader::interfaces`].
     pub interface_index: usize,
+    /// That interface's [`link_type`].
+    pub link_type: u16,
     /// Nanoseconds since 1970, on the clock of the capturing host; `None` in a simple packet
     /// block, which has none.
     pub stamp_ns: Option<i64>,

@@ -129,12 +129,7 @@ impl Observer {
     }
 
     /// Takes a packet of a file.
-    pub fn take(
-        &mut self,
-        file_index: usize,
-        interface: &CaptureInterface,
-        packet: &CapturedPacket<'_>,
-    ) {
+    pub fn take(&mut self, file_index: usize, packet: &CapturedPacket<'_>) {
         self.counts.packet_count += 1;
         let mut point = Point {
             file_index,
@@ -143,7 +138,7 @@ impl Observer {
             direction: packet.direction,
         };
         let (mut frame, mut stamp_ns) = (packet.data, packet.stamp_ns);
-        if interface.link_type == link_type::ETHERNET
+        if packet.link_type == link_type::ETHERNET
             && let Some((header, inner)) = esl::split(frame)
         {
             self.count_esl(&header);
@@ -161,7 +156,7 @@ impl Observer {
         let seen = self.seen.entry(point).or_default();
         let (first, last) = seen.span_ns.unwrap_or((stamp_ns, stamp_ns));
         seen.span_ns = Some((first.min(stamp_ns), last.max(stamp_ns)));
-        self.follow(point, stamp_ns, interface.link_type, frame);
+        self.follow(point, stamp_ns, packet.link_type, frame);
     }
 
     fn count_esl(&mut self, header: &esl::EslHeader) {
@@ -179,9 +174,9 @@ impl Observer {
                     NoDatagram::NotIp => &mut counts.not_ip_count,
                     NoDatagram::NotUdp => &mut counts.not_udp_count,
                     NoDatagram::LaterFragment => &mut counts.later_fragment_count,
-                    NoDatagram::UnknownLinkType
-                    | NoDatagram::CutShort
-                    | NoDatagram::Malformed => &mut counts.unreadable_count,
+                    NoDatagram::UnknownLinkType | NoDatagram::CutShort | NoDatagram::Malformed => {
+                        &mut counts.unreadable_count
+                    }
                 } += 1;
                 return;
             }

@@ -81,7 +81,10 @@ impl PcapFile {
         }
         let fraction_ns = i64::from(fraction) * self.fraction_ns;
         if fraction_ns >= 1_000_000_000 {
-            return Next::Fault(Problem::Malformed("a stamp's fraction is a second or more"), None);
+            return Next::Fault(
+                Problem::Malformed("a stamp's fraction is a second or more"),
+                None,
+            );
         }
         let end = RECORD_HEADER_BYTES + captured as usize;
         if bytes.len() < end {

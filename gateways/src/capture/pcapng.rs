@@ -51,7 +51,10 @@ impl PcapngFile {
             }
         }
         let Some(order) = self.order else {
-            return self.lost(window, Problem::Malformed("a block before the first section"));
+            return self.lost(
+                window,
+                Problem::Malformed("a block before the first section"),
+            );
         };
         let (Some(kind), Some(length)) = (order.u32(bytes, 0), order.u32(bytes, 4)) else {
             return missing(window, "a block", BLOCK_BYTES_MIN.into());
@@ -121,7 +124,12 @@ impl PcapngFile {
         };
         self.interface_base = interface_count;
         self.section_end = (section_bytes.cast_signed() >= 0)
-            .then(|| window.offset().checked_add(length)?.checked_add(section_bytes))
+            .then(|| {
+                window
+                    .offset()
+                    .checked_add(length)?
+                    .checked_add(section_bytes)
+            })
             .flatten();
         if major != 1 {
             return self.lost(window, Problem::Version { major, minor });
@@ -187,7 +195,9 @@ impl<'a> Body<'a> {
 
 fn describe(body: &Body<'_>, interfaces: &mut Vec<CaptureInterface>) -> Result<(), Problem> {
     let (Some(link_type), Some(snap_bytes)) = (body.u16(0), body.u32(4)) else {
-        return Err(Problem::Malformed("an interface block shorter than 8 bytes"));
+        return Err(Problem::Malformed(
+            "an interface block shorter than 8 bytes",
+        ));
     };
     if interfaces.len() >= INTERFACE_COUNT_MAX {
         return Err(Problem::Malformed("more than 4096 interfaces"));
@@ -205,8 +215,9 @@ fn describe(body: &Body<'_>, interfaces: &mut Vec<CaptureInterface>) -> Result<(
             (14, seconds) => {
                 let seconds = body.order.u64(seconds, 0).map(u64::cast_signed);
                 let offset_ns = seconds.and_then(|s| s.checked_mul(1_000_000_000));
-                interface.offset_ns = offset_ns
-                    .ok_or(Problem::Malformed("if_tsoffset does not fit into nanoseconds"))?;
+                interface.offset_ns = offset_ns.ok_or(Problem::Malformed(
+                    "if_tsoffset does not fit into nanoseconds",
+                ))?;
             }
             (9, _) => return Err(Problem::Malformed("if_tsresol is not one byte long")),
             _ => {}
@@ -309,7 +320,9 @@ fn statistics(
     base: usize,
 ) -> Result<(), Problem> {
     let Some(index) = body.u32(0) else {
-        return Err(Problem::Malformed("a statistics block shorter than 12 bytes"));
+        return Err(Problem::Malformed(
+            "a statistics block shorter than 12 bytes",
+        ));
     };
     let count = interfaces.len() - base;
     let Some(interface) = interfaces[base..].get_mut(index as usize) else {

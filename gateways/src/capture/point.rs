@@ -71,7 +71,10 @@ pub fn single_point_figures(observations: &[Observation]) -> Option<PointFigures
     }
     Some(PointFigures {
         datagram_count: observations.len() as u64,
-        payload_bytes: observations.iter().map(|one| u64::from(one.payload_bytes)).sum(),
+        payload_bytes: observations
+            .iter()
+            .map(|one| u64::from(one.payload_bytes))
+            .sum(),
         first_ns,
         last_ns,
         interval: interval.distribution("fewer than two datagrams"),
@@ -113,7 +116,9 @@ fn number_figures(observations: &[Observation]) -> Option<NumberFigures> {
     figures.step = most.map_or(1, |(step, _)| *step);
     for (difference, count) in &steps {
         let between = difference.div_ceil(figures.step).saturating_sub(1);
-        figures.skipped_count = figures.skipped_count.saturating_add(between.saturating_mul(*count));
+        figures.skipped_count = figures
+            .skipped_count
+            .saturating_add(between.saturating_mul(*count));
     }
     Some(figures)
 }

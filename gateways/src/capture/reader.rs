@@ -205,6 +205,7 @@ impl CaptureReader {
                     return Step::Packet(CapturedPacket {
                         offset: found.offset,
                         interface_index: found.interface_index,
+                        link_type: self.interfaces[found.interface_index].link_type,
                         stamp_ns: found.stamp_ns,
                         original_bytes: found.original_bytes,
                         direction: found.direction,
@@ -297,5 +298,8 @@ fn micro(order: ByteOrder) -> (Format, State) {
 }
 
 fn nano(order: ByteOrder) -> (Format, State) {
-    (Format::PcapNanoseconds, State::Pcap(PcapFile::new(order, 1)))
+    (
+        Format::PcapNanoseconds,
+        State::Pcap(PcapFile::new(order, 1)),
+    )
 }

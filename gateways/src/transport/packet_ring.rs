@@ -60,7 +60,9 @@ pub enum RingError {
         interface: String,
     },
     /// A link layer whose packets could not be read.
-    #[error("interface `{interface}` has hardware type {hardware_type}; Ethernet, loopback and bare IP can be tapped")]
+    #[error(
+        "interface `{interface}` has hardware type {hardware_type}; Ethernet, loopback and bare IP can be tapped"
+    )]
     LinkLayer {
         /// Its name.
         interface: String,
@@ -165,8 +167,8 @@ impl PacketRing {
         })?;
         // Without a protocol it hears nothing yet, but tells the link layer.
         bind(&socket, index, 0).map_err(refused("bind"))?;
-        let address: LinkAddr =
-            getsockname(socket.as_raw_fd()).map_err(|errno| refused("getsockname")(errno.into()))?;
+        let address: LinkAddr = getsockname(socket.as_raw_fd())
+            .map_err(|errno| refused("getsockname")(errno.into()))?;
         let hardware_type = address.hatype();
         let unknown = || RingError::LinkLayer {
             interface: interface.to_owned(),
@@ -260,7 +262,11 @@ impl PacketRing {
             original_bytes: header.tp_len,
             vlan: has(libc::TP_STATUS_VLAN_VALID).then_some({
                 let is_typed = has(libc::TP_STATUS_VLAN_TPID_VALID);
-                let tag_type = if is_typed { header.tp_vlan_tpid } else { 0x8100 };
+                let tag_type = if is_typed {
+                    header.tp_vlan_tpid
+                } else {
+                    0x8100
+                };
                 (tag_type, header.tp_vlan_tci)
             }),
             data,
