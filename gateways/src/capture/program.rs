@@ -175,7 +175,7 @@ fn find_udp() -> Vec<Instruction> {
     part.op(code::AND, 0x0f);
     part.op(code::LSH, 2);
     // To the sum below.
-    part.op(code::JA, 5);
+    part.op(code::JA, 6);
     // Here without IPv4, ethertype still loaded.
     part.op(code::LD_MEM, ETHERTYPE);
     part.jump(code::JEQ, IPV6, 0, 2);

@@ -186,7 +186,7 @@ impl CaptureReader {
                 return Step::Ended;
             }
             if self.window.owed_bytes > 0 {
-                return self.wait("a skipped part", self.window.owed_bytes);
+                return self.wait();
             }
             let next = match &mut self.state {
                 State::Unknown => match self.recognise() {
@@ -235,18 +235,22 @@ impl CaptureReader {
         Step::Fault(fault)
     }
 
-    fn wait(&mut self, what: &'static str, expected_bytes: u64) -> Step<'static> {
+    /// Bytes that are passed over have not come yet.
+    fn wait(&mut self) -> Step<'static> {
         if !self.window.is_complete {
             return Step::NeedsMore;
         }
-        self.fault(
-            Problem::Truncated {
-                what,
+        self.state = State::Ended;
+        Step::Fault(CaptureFault {
+            // Where the file ends.
+            offset: self.window.offset - self.window.owed_bytes,
+            problem: Problem::Truncated {
+                what: "the rest of a section",
                 available_bytes: 0,
-                expected_bytes,
+                expected_bytes: self.window.owed_bytes,
             },
-            None,
-        )
+            is_passed: false,
+        })
     }
 
     /// Looks at the first four bytes; `None` when the format is known now.

@@ -19,7 +19,7 @@ use std::os::fd::{AsRawFd, FromRawFd, OwnedFd};
 
 use nix::net::if_::if_nametoindex;
 use nix::sys::mman::{MapFlags, ProtFlags, mmap, munmap};
-use nix::sys::socket::{LinkAddr, getsockname, setsockopt, sockopt};
+use nix::sys::socket::{setsockopt, sockopt};
 use thiserror::Error;
 
 use crate::capture::flow::FlowFilter;
@@ -167,9 +167,7 @@ impl PacketRing {
         })?;
         // Without a protocol it hears nothing yet, but tells the link layer.
         bind(&socket, index, 0).map_err(refused("bind"))?;
-        let address: LinkAddr = getsockname(socket.as_raw_fd())
-            .map_err(|errno| refused("getsockname")(errno.into()))?;
-        let hardware_type = address.hatype();
+        let hardware_type = hardware_type(&socket).map_err(refused("getsockname"))?;
         let unknown = || RingError::LinkLayer {
             interface: interface.to_owned(),
             hardware_type,
@@ -363,6 +361,29 @@ fn bind(socket: &OwnedFd, interface_index: c_uint, protocol_be: u16) -> io::Resu
     // SAFETY: the kernel reads `length` bytes at `pointer`, a live address of that size.
     let result = unsafe { libc::bind(socket.as_raw_fd(), pointer, length) };
     outcome(result)
+}
+
+/// The kernel's type of the interface a socket is bound to.
+#[allow(
+    unsafe_code,
+    reason = "nix refuses a link address shorter than its structure"
+)]
+fn hardware_type(socket: &OwnedFd) -> io::Result<u16> {
+    let mut address = libc::sockaddr_ll {
+        sll_family: 0,
+        sll_protocol: 0,
+        sll_ifindex: 0,
+        sll_hatype: 0,
+        sll_pkttype: 0,
+        sll_halen: 0,
+        sll_addr: [0; 8],
+    };
+    let mut length = option_length::<libc::sockaddr_ll>();
+    let pointer = (&raw mut address).cast();
+    // SAFETY: the kernel writes at most `length` bytes at `pointer`, a live address of that size.
+    let result = unsafe { libc::getsockname(socket.as_raw_fd(), pointer, &raw mut length) };
+    outcome(result)?;
+    Ok(address.sll_hatype)
 }
 
 #[allow(unsafe_code, reason = "no crate wraps the options of packet sockets")]

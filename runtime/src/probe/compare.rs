@@ -2,7 +2,7 @@
 //! between the kernel's stamps, message by message. Neither side knows of the other: the run's come
 //! from record files and summary, the probe's from captures.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -53,7 +53,9 @@ struct ChannelComparison {
     channel: String,
     /// Every datagram of the sending gateway's socket, and the same leaving its interface.
     sent: BothCounts,
-    /// Every datagram of the receiving gateway's socket, and the same entering its interface.
+    /// Datagrams that the receiving gateway took: its messages, and greetings and requests that it
+    /// answered. What came before it listened or after it left, and farewells, which nobody
+    /// answers, are in neither count.
     received: BothCounts,
     /// Datagrams with messages, by the gateways' records.
     data_sent: BothCounts,
@@ -64,6 +66,10 @@ struct ChannelComparison {
     probe_wire: Distribution,
     /// Probe's less gateway's, message by message.
     difference: Distribution,
+    /// Probe's stamp at departure less the gateway's: the tap is ahead of the driver.
+    departure_difference: Distribution,
+    /// Probe's stamp at arrival less the gateway's.
+    arrival_difference: Distribution,
 }
 
 impl ChannelComparison {
@@ -123,6 +129,8 @@ impl Comparison {
                 ("wire, gateways", &one.gateway_wire),
                 ("wire, probe", &one.probe_wire),
                 ("probe - gateways", &one.difference),
+                ("  at departure", &one.departure_difference),
+                ("  at arrival", &one.arrival_difference),
             ] {
                 text.push_str(&format!("  {what:<18}{}\n", quantiles(distribution)));
             }
@@ -284,16 +292,37 @@ struct Probe<'a> {
 }
 
 impl Probe<'_> {
-    /// Datagrams of the channel that went `direction` and are `wanted`.
-    fn count(&self, direction: Direction, wanted: impl Fn(&OwnHeader) -> bool) -> u64 {
+    /// Headers of the channel's datagrams that went `direction`.
+    fn headers(&self, direction: Direction) -> impl Iterator<Item = OwnHeader> + '_ {
         let points = self.captures.observer.seen().iter();
-        let points = points.filter(|(point, _)| point.direction == direction);
+        let points = points.filter(move |(point, _)| point.direction == direction);
         let streams = points.flat_map(|(_, seen)| &seen.streams);
         let ours = streams.filter(|(stream, _)| {
             self.number.is_some() && stream.own.map(|(channel, _)| channel) == self.number
         });
-        let headers = ours.flat_map(|(_, list)| list).filter_map(own);
-        headers.filter(|own| wanted(own)).count() as u64
+        ours.flat_map(|(_, list)| list).filter_map(own)
+    }
+
+    fn count(&self, direction: Direction, wanted: fn(&OwnHeader) -> bool) -> u64 {
+        self.headers(direction).filter(wanted).count() as u64
+    }
+
+    /// Greetings and requests of the channel that were answered where they came in.
+    fn answered_count(&self) -> u64 {
+        let answers: BTreeSet<(u8, u32, u64)> = self
+            .headers(Direction::Outbound)
+            .filter(|own| !is_forward(own))
+            .map(|own| (own.kind as u8, own.session, own.sequence))
+            .collect();
+        let requests = self.headers(Direction::Inbound).filter(|own| {
+            let answer = match own.kind {
+                Kind::Hello => Kind::HelloAck,
+                Kind::SyncRequest => Kind::SyncResponse,
+                _ => return false,
+            };
+            answers.contains(&(answer as u8, own.session, own.sequence))
+        });
+        requests.count() as u64
     }
 
     /// Departure of the last piece and arrival of the latest, of each message of the channel.
@@ -358,19 +387,23 @@ fn channel(
         let key = (one.epoch, one.sequence);
         if let Some(departure) = departures.get(&key) {
             // A duplicate arrives later under the same number; the first one counts.
-            gateway.entry(key).or_insert(one.rx_software_ns - departure);
+            gateway
+                .entry(key)
+                .or_insert((*departure, one.rx_software_ns));
         }
     }
-    let (mut by_gateway, mut by_probe, mut difference) = (
-        LatencyHistogram::default(),
-        LatencyHistogram::default(),
-        LatencyHistogram::default(),
-    );
+    let mut columns: [LatencyHistogram; 5] = Default::default();
     for (key, (departure, arrival)) in probe.wire() {
-        if let Some(gateway_ns) = gateway.get(&key) {
-            by_gateway.record(*gateway_ns);
-            by_probe.record(arrival - departure);
-            difference.record(arrival - departure - gateway_ns);
+        if let Some((left_ns, came_ns)) = gateway.get(&key) {
+            let (ours, theirs) = (came_ns - left_ns, arrival - departure);
+            let (ahead, behind) = (departure - left_ns, arrival - came_ns);
+            for (column, value) in
+                columns
+                    .iter_mut()
+                    .zip([ours, theirs, theirs - ours, ahead, behind])
+            {
+                column.record(value);
+            }
         }
     }
     let reason = "no message was stamped by both";
@@ -382,7 +415,7 @@ fn channel(
         },
         received: BothCounts {
             gateway: sockets.1,
-            probe: probe.count(Direction::Inbound, is_forward),
+            probe: probe.count(Direction::Inbound, is_data) + probe.answered_count(),
         },
         data_sent: BothCounts {
             gateway: Some(data_sent),
@@ -392,8 +425,10 @@ fn channel(
             gateway: Some(data_received),
             probe: probe.count(Direction::Inbound, is_data),
         },
-        gateway_wire: by_gateway.distribution(reason),
-        probe_wire: by_probe.distribution(reason),
-        difference: difference.distribution(reason),
+        gateway_wire: columns[0].distribution(reason),
+        probe_wire: columns[1].distribution(reason),
+        difference: columns[2].distribution(reason),
+        departure_difference: columns[3].distribution(reason),
+        arrival_difference: columns[4].distribution(reason),
     }
 }
