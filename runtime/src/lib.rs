@@ -32,6 +32,7 @@ pub mod gateway;
 pub mod host_facts;
 pub mod probe;
 pub mod process;
+pub mod radio;
 pub mod realtime;
 pub mod record;
 pub mod registry;
@@ -44,6 +45,7 @@ mod simulate;
 mod study;
 pub mod supervisor;
 pub mod topology;
+pub mod trace;
 pub mod wait;
 
 use std::process::ExitCode;

@@ -2,12 +2,20 @@
 //! stream. They carry no bytes; virtual time and `via = "emulated"` ask them for each message.
 
 pub mod bernoulli;
+pub mod chain;
+pub mod delay;
 pub mod impaired;
 pub mod in_series;
+pub mod loss;
 pub mod outages;
+pub mod rate;
+pub mod reordering;
+pub mod spec;
+pub mod trace;
 
 use core::fmt::Debug;
 
+use self::trace::ReplayTally;
 use crate::time::Instant;
 
 /// What happens to one offered message.
@@ -49,6 +57,60 @@ pub trait LinkModel: Debug + Send {
     /// Offers a message of `length_bytes` at `now` and decides its fate. Calls come in
     /// non-decreasing `now`.
     fn offer(&mut self, now: Instant, length_bytes: usize) -> Fate;
+
+    /// As [`LinkModel::offer`], told which message of its channel it is, counted from 0: what a
+    /// recorded trace goes by. To other models it is one message like the next.
+    fn offer_numbered(&mut self, now: Instant, length_bytes: usize, number: u64) -> Fate {
+        let _ = number;
+        self.offer(now, length_bytes)
+    }
+
+    /// What the replay of a trace met so far; `None` for a model that replays none.
+    fn replay_tally(&self) -> Option<ReplayTally> {
+        None
+    }
+
+    /// What the messages lost so far were lost to; `None` for a model that does not tell causes
+    /// apart.
+    fn loss_causes(&self) -> Option<LossCauses> {
+        None
+    }
+}
+
+impl<L: LinkModel + ?Sized> LinkModel for Box<L> {
+    fn offer(&mut self, now: Instant, length_bytes: usize) -> Fate {
+        (**self).offer(now, length_bytes)
+    }
+
+    fn offer_numbered(&mut self, now: Instant, length_bytes: usize, number: u64) -> Fate {
+        (**self).offer_numbered(now, length_bytes, number)
+    }
+
+    fn replay_tally(&self) -> Option<ReplayTally> {
+        (**self).replay_tally()
+    }
+
+    fn loss_causes(&self) -> Option<LossCauses> {
+        (**self).loss_causes()
+    }
+}
+
+/// What a link lost messages to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct LossCauses {
+    /// To outages.
+    pub outage_count: u64,
+    /// By chance.
+    pub chance_count: u64,
+    /// To a full queue.
+    pub queue_count: u64,
+}
+
+impl LossCauses {
+    /// All of them.
+    pub const fn total(self) -> u64 {
+        self.outage_count + self.chance_count + self.queue_count
+    }
 }
 
 /// The shared-memory channel of one host in virtual time: everything arrives at once.

@@ -5,6 +5,7 @@ mod events;
 mod faces;
 mod figures;
 pub(crate) mod outages;
+mod radio;
 pub(crate) mod records;
 
 use std::fs;
@@ -25,6 +26,7 @@ use crate::report::terminal::{self, Style};
 use crate::series;
 use crate::supervisor::RunResult;
 use crate::topology::Topology;
+use crate::trace::capture;
 
 /// Why no summary could be made.
 #[derive(Debug, thiserror::Error)]
@@ -74,6 +76,7 @@ pub(crate) fn conclude(
         .iter()
         .map(|channel| channel_summary(topology, result, channel, &records))
         .collect();
+    capture::write(&mut summary, (topology, result), &records);
     summary.faces = faces::face_summaries(topology, result, &records);
     let outages = add_outages(&mut summary, (topology, result), &records);
     let case = registry.make_case(topology)?;
@@ -89,6 +92,7 @@ pub(crate) fn conclude(
         &summary.channels,
         (specs, &outages),
     );
+    radio::add(&mut summary, (topology, result), &records);
     add_warnings(&mut summary, result, &records);
     if let Some((_, case)) = case {
         write_series(&mut summary, result, case.as_ref(), records);

@@ -8,21 +8,32 @@ use std::time::Duration;
 
 use hil_models::measure::account::{
     AccountContext, ChannelAccount, ChannelPath, ChannelRecords, FLIGHT_TIME_MAX, Interruption,
-    MessageStory, Outage, PathProcess, RunSpan, account, outages, stories,
+    MessageStory, Outage, PathProcess, RunSpan, TooManyMessages, TraceChannel, account, link_trace,
+    outages, stories,
+};
+use hil_models::measure::radio::{
+    RadioFigures, TransmitStampFigures, radio_figures, transmit_stamps,
 };
 use hil_models::measure::record::{
     EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
 };
 use hil_models::run_log::{LoggedMessage, RunLog};
 use hil_models::time::{Alignment, Instant};
+use hil_models::trace::TraceRecord;
 
 use super::AnalysisError;
 use crate::face::record::{FaceReceivedRecord, FaceSentRecord};
+use crate::process::launch::EmulationLaunch;
+use crate::radio::record::RadioRecord;
 use crate::record::{RecordFile, RecordFileError, RecordKind};
 use crate::report::summary::RecordedFigures;
 use crate::supervisor::RunResult;
 use crate::supervisor::plan::gateway_name;
 use crate::topology::{Channel, Topology};
+
+/// Share of the messages of an emulated link that are not under way for longer than is allowed for:
+/// at the end of a run, what is younger may still arrive.
+const FLIGHT_QUANTILE: f64 = 0.9999;
 
 /// All records of one channel.
 #[derive(Debug, Default)]
@@ -42,6 +53,8 @@ pub(crate) struct ChannelFiles {
 pub(crate) struct RunRecords {
     channels: BTreeMap<String, ChannelFiles>,
     log: RunLog,
+    /// Records of radios, by `<process>/<interface>`.
+    pub(super) radios: BTreeMap<String, Vec<RadioRecord>>,
     /// Files that could not be read, with the reason.
     pub(crate) problems: Vec<String>,
 }
@@ -55,6 +68,11 @@ impl RunRecords {
     }
 
     fn add(&mut self, file: &RecordFile) {
+        if file.header.kind == RecordKind::Radio {
+            let radio = self.radios.entry(file.header.channel.clone());
+            radio.or_default().extend(file.records::<RadioRecord>());
+            return;
+        }
         let channel = self
             .channels
             .entry(file.header.channel.clone())
@@ -77,6 +95,8 @@ impl RunRecords {
                 channel.face_received.extend(records);
             }
             RecordKind::Message => file.append_messages(&mut self.log),
+            // Belongs to no channel, see above.
+            RecordKind::Radio => {}
         }
     }
 
@@ -131,6 +151,17 @@ impl RunRecords {
         self.consult((topology, result), channel, account)
     }
 
+    /// Where the messages of `channel` were stamped, and what the radio said of them.
+    pub(super) fn radio_figures(
+        &self,
+        run: (&Topology, &RunResult),
+        channel: &Channel,
+    ) -> (Option<TransmitStampFigures>, Option<RadioFigures>) {
+        self.consult(run, channel, |records, _| {
+            (records.egress.map(transmit_stamps), radio_figures(records))
+        })
+    }
+
     /// What became of the `wanted` messages of `channel`, by start of the producer and number.
     pub(super) fn stories(
         &self,
@@ -160,6 +191,21 @@ impl RunRecords {
         })
     }
 
+    /// What the link of `channel` did to every message.
+    ///
+    /// # Errors
+    /// When there are more than a trace holds.
+    pub(crate) fn link_trace(
+        &self,
+        run: (&Topology, &RunResult),
+        channel: &Channel,
+        traced: TraceChannel,
+    ) -> Result<Vec<TraceRecord>, TooManyMessages> {
+        self.consult(run, channel, |records, context| {
+            link_trace(records, context, traced)
+        })
+    }
+
     /// Asks something of the records of `channel` and of what the run knows about its way.
     fn consult<T>(
         &self,
@@ -183,8 +229,8 @@ impl RunRecords {
         };
         // A link that delays on purpose keeps messages under way for that much longer.
         let delay = crossing
-            .and_then(|crossing| crossing.impairment)
-            .map(|one| one.delay);
+            .and_then(|crossing| EmulationLaunch::of(&crossing, topology.run().seed))
+            .map(|emulation| emulation.flight_time(FLIGHT_QUANTILE));
         let round_trips = files.round_trips.values();
         let round_trips_ns: Vec<i64> = round_trips.map(RoundTripRecord::rtt_ns).collect();
         let context = AccountContext {

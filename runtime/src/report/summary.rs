@@ -14,6 +14,7 @@ use serde::{Deserialize, Serialize};
 
 use super::assessment::Assessment;
 use super::face::FaceSummary;
+use super::radio::RadioReport;
 use super::score_event::ScoreEvents;
 
 /// Version of the `summary.json` layout.
@@ -39,6 +40,9 @@ pub struct RunSummary {
     /// Arms that went through a face to a foreign program.
     #[serde(default)]
     pub faces: Vec<FaceSummary>,
+    /// What the radios of wireless hops said, and where messages were stamped.
+    #[serde(default)]
+    pub radio: RadioReport,
     /// What the robot did.
     pub score: Vec<ScoreMetric>,
     /// What happened to the robot, and what the network had done to the messages concerned.
@@ -60,6 +64,7 @@ impl RunSummary {
             events: Vec::new(),
             channels: Vec::new(),
             faces: Vec::new(),
+            radio: RadioReport::default(),
             score: Vec::new(),
             score_events: ScoreEvents::default(),
             warnings: Vec::new(),

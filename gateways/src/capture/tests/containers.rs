@@ -300,6 +300,8 @@ fn blocks_out_of_order_cost_only_those_that_came_too_early() {
 
 #[test]
 fn what_the_writer_wrote_reads_the_same() {
+    use Direction::{Inbound, Outbound, Unknown};
+
     let mut file = Vec::new();
     writer::begin(&mut file, "test", "none");
     let interface = CaptureInterface {
@@ -311,9 +313,9 @@ fn what_the_writer_wrote_reads_the_same() {
     writer::interface(&mut file, &interface, "hil");
     let stamp_ns = 1_790_000_000_987_654_321;
     for (direction, data) in [
-        (Direction::Inbound, [&b"abc"[..], &b"defg"[..]]),
-        (Direction::Outbound, [b"", b""]),
-        (Direction::Unknown, [b"x", b""]),
+        (Inbound, [&b"abc"[..], &b"defg"[..]]),
+        (Outbound, [b"", b""]),
+        (Unknown, [b"x", b""]),
     ] {
         let packet = PacketToWrite {
             interface_index: 0,
@@ -329,7 +331,6 @@ fn what_the_writer_wrote_reads_the_same() {
     assert_eq!(faults, []);
     assert_eq!(packets[0].data, b"abcdefg");
     let directions: Vec<Direction> = packets.iter().map(|one| one.direction).collect();
-    use Direction::{Inbound, Outbound, Unknown};
     assert_eq!(directions, [Inbound, Outbound, Unknown]);
     for packet in &packets {
         assert_eq!(packet.stamp_ns, Some(stamp_ns.cast_signed()));

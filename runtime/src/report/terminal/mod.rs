@@ -5,11 +5,14 @@ mod channel;
 mod events;
 mod face;
 mod outages;
+mod radio;
 mod tables;
+mod trace;
 mod units;
 
 pub use canvas::Style;
 pub(crate) use canvas::{shortened, wrapped};
+pub(crate) use trace::{render_fit, render_trace, render_trace_plots};
 pub(crate) use units::{JOINT, duration_s, grouped, percent, seconds};
 
 use hil_models::measure::account::OutageFigures;
@@ -30,10 +33,12 @@ pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> Strin
     events::score_events(&mut canvas, &summary.score_events);
     for channel in &summary.channels {
         channel::channel(&mut canvas, channel);
+        radio::channel(&mut canvas, summary.radio.channel(&channel.name));
     }
     for face in &summary.faces {
         face::face(&mut canvas, face);
     }
+    radio::hops(&mut canvas, &summary.radio);
     tables::processes(&mut canvas, &summary.processes);
     tables::events(&mut canvas, &summary.events);
     tables::realtime(&mut canvas, &summary.realtime);
