@@ -31,6 +31,7 @@ pub mod doctor;
 pub mod face;
 pub mod gateway;
 pub mod host_facts;
+pub mod probe;
 pub mod process;
 pub mod radio;
 pub mod realtime;
