@@ -11,6 +11,7 @@ mod misspelt;
 mod mutation;
 mod recorded;
 mod relations;
+mod wifi;
 
 use core::time::Duration;
 use std::path::{Path, PathBuf};
@@ -123,6 +124,7 @@ const SHIPPED: &[&str] = &[
     "outages.toml",
     "static-cells.toml",
     "bad-link.toml",
+    "wifi6.toml",
     "egm-client.toml",
     "egm-robot.toml",
     "shuttle-local.toml",

@@ -2,6 +2,7 @@
 
 mod canvas;
 mod channel;
+mod clocks;
 mod emulation;
 mod events;
 mod face;
@@ -38,6 +39,9 @@ pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> Strin
     }
     for face in &summary.faces {
         face::face(&mut canvas, face);
+    }
+    if let Some(section) = &summary.clocks {
+        clocks::clocks(&mut canvas, section);
     }
     radio::hops(&mut canvas, &summary.radio);
     tables::processes(&mut canvas, &summary.processes);
