@@ -88,7 +88,7 @@ pub(crate) fn examine(
 }
 
 /// The interfaces of this network namespace with their flags, sorted by name.
-fn interfaces() -> Result<BTreeMap<String, InterfaceFlags>, String> {
+pub(super) fn interfaces() -> Result<BTreeMap<String, InterfaceFlags>, String> {
     let addresses = getifaddrs().map_err(|errno| format!("getifaddrs: {errno}"))?;
     Ok(addresses
         .map(|address| (address.interface_name, address.flags))

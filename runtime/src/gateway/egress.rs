@@ -25,6 +25,8 @@ const PENDING: usize = 256;
 /// A stamp that has not come by then does not come: drivers deliver within a millisecond or so,
 /// and a record must not wait for ever.
 const STAMP_PATIENCE_NS: i64 = 20_000_000;
+/// The same for a card's stamp, which the driver fetches from a worker of normal priority.
+const CARD_STAMP_PATIENCE_NS: i64 = 200_000_000;
 
 /// How long the end of a run may wait for the kernel to take what is left.
 const HAND_OVER_MAX: Duration = Duration::from_millis(200);
@@ -280,9 +282,14 @@ impl Line {
         if self.pending_count == 0 {
             return;
         }
+        let patience_ns = if self.wants_hardware {
+            CARD_STAMP_PATIENCE_NS
+        } else {
+            STAMP_PATIENCE_NS
+        };
         for slot in 0..PENDING {
             let is_overdue =
-                self.pending[slot].is_some_and(|one| now.ns_since(one.handed) > STAMP_PATIENCE_NS);
+                self.pending[slot].is_some_and(|one| now.ns_since(one.handed) > patience_ns);
             if is_overdue && let Some(pending) = self.pending[slot].take() {
                 self.retire(pending);
             }

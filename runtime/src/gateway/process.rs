@@ -13,7 +13,7 @@ use std::time::Duration;
 use hil_gateways::transport::probe::{
     Availability, ProbeReport, ProbeSettings, Sentinel, arm_and_probe,
 };
-use hil_gateways::transport::timestamping::{HardwareStamping, TimestampMode};
+use hil_gateways::transport::timestamping::TimestampMode;
 
 use super::connection::Connection;
 use super::direction::{self, Opened};
@@ -36,6 +36,8 @@ const PROGRESS_PERIOD: Duration = Duration::from_millis(250);
 const WATCH_PERIOD: Duration = Duration::from_millis(5);
 /// How long each half of the stamp probe may take; a restart must not wait long for it.
 pub(crate) const PROBE_BOUND: Duration = Duration::from_millis(300);
+/// The same where a card is to stamp: its driver answers from a worker of normal priority.
+const CARD_PROBE_BOUND: Duration = Duration::from_secs(1);
 
 /// Runs the gateway described by the launch file until told to stop.
 ///
@@ -296,29 +298,14 @@ pub(crate) fn arm_and_describe(
     let Some(settings) = settings else {
         return (None, fact("switched off in the topology".to_owned()));
     };
-    let card = (settings.timestamps == TimestampMode::Hardware)
-        .then(|| switch_card_on(settings.interface.as_deref()));
-    match arm_and_probe(&settings) {
-        Ok((report, sentinel)) => {
-            let mut facts = fact(describe_probe(&report));
-            facts.extend(card.map(|text| ("network card stamps".to_owned(), text)));
-            (Some(sentinel), facts)
-        }
-        Err(error) => (None, fact(format!("unavailable: {error}"))),
-    }
-}
-
-/// A card stamps nothing until it is told to; says what it settled for.
-fn switch_card_on(interface: Option<&str>) -> String {
-    let Some(interface) = interface else {
-        return "unavailable: the host names no interface in the topology".to_owned();
+    let bound = if settings.timestamps == TimestampMode::Hardware {
+        CARD_PROBE_BOUND
+    } else {
+        settings.bound
     };
-    match HardwareStamping::request(interface) {
-        Ok(settled) => format!(
-            "switched on for {interface}: transmit {}, receive filter {}",
-            settled.is_transmit_on, settled.receive_filter
-        ),
-        Err(error) => format!("unavailable: {interface} cannot be switched on: {error}"),
+    match arm_and_probe(&ProbeSettings { bound, ..settings }) {
+        Ok((report, sentinel)) => (Some(sentinel), fact(describe_probe(&report))),
+        Err(error) => (None, fact(format!("unavailable: {error}"))),
     }
 }
 

@@ -15,6 +15,7 @@ use serde::{Deserialize, Serialize};
 use super::assessment::Assessment;
 use super::face::FaceSummary;
 use super::score_event::ScoreEvents;
+use crate::card_clock::figures::HardwareStamps;
 
 /// Version of the `summary.json` layout.
 pub const SCHEMA_VERSION: u32 = 1;
@@ -39,6 +40,9 @@ pub struct RunSummary {
     /// Arms that went through a face to a foreign program.
     #[serde(default)]
     pub faces: Vec<FaceSummary>,
+    /// What the network cards stamped; `None` unless hardware stamps were asked for.
+    #[serde(default)]
+    pub hardware_stamps: Option<HardwareStamps>,
     /// What the robot did.
     pub score: Vec<ScoreMetric>,
     /// What happened to the robot, and what the network had done to the messages concerned.
@@ -60,6 +64,7 @@ impl RunSummary {
             events: Vec::new(),
             channels: Vec::new(),
             faces: Vec::new(),
+            hardware_stamps: None,
             score: Vec::new(),
             score_events: ScoreEvents::default(),
             warnings: Vec::new(),

@@ -4,6 +4,7 @@
 use hil_models::time::Instant;
 use serde::{Deserialize, Serialize};
 
+use crate::card_clock::CardStory;
 use crate::process::pipe::ProcessReport;
 
 /// One thing that happened.
@@ -58,4 +59,7 @@ pub struct HostStory {
     pub events: Vec<Event>,
     /// How the processes fared.
     pub processes: Vec<ProcessStory>,
+    /// What became of the network cards it armed.
+    #[serde(default)]
+    pub cards: Vec<CardStory>,
 }

@@ -19,6 +19,7 @@ use super::outcome::{Heard, Outcome, RunError, RunOptions, RunResult};
 use super::peer::{Peer, PeerEvent};
 use super::plan::plan;
 use super::progress_line;
+use crate::card_clock::CardWatch;
 use crate::channel::clock_id;
 use crate::clock::MonotonicClock;
 use crate::console::Console;
@@ -67,8 +68,11 @@ pub fn run(
     let peers = gather_peers(topology, &hosts, &domains, (signals, console))?;
     let here = clock_id()?;
     let crew = Crew::new(plan.processes, domains.addresses(), &folder)?;
+    // Before the gateways: they find out by sending what the cards deliver.
+    let cards = CardWatch::start(topology, &hosts, &folder.records());
     let mut session = Session {
         topology,
+        cards,
         is_first_host: topology
             .hosts()
             .first()
@@ -184,6 +188,7 @@ fn gather_peers(
 
 struct Session<'a> {
     topology: &'a Topology,
+    cards: CardWatch,
     is_first_host: bool,
     /// All hosts of the run read one clock.
     has_one_clock: bool,
@@ -402,13 +407,15 @@ impl Session<'_> {
         (started, facts): (String, HostFacts),
     ) -> RunResult {
         let own_hosts: Vec<String> = self.domains.addresses().into_keys().collect();
+        let watch = core::mem::take(&mut self.cards);
+        let (cards, mut problems) = watch.finish();
         let own = HostStory {
             hosts: own_hosts.clone(),
             span,
             events: self.crew.events().to_vec(),
             processes: self.stories(),
+            cards,
         };
-        let mut problems = Vec::new();
         let mut stories = vec![own.clone()];
         if let Outcome::PeerLost(who) = &outcome {
             problems.push(format!("no records of the host that vanished ({who})"));
@@ -438,6 +445,7 @@ impl Session<'_> {
         let since_start =
             |event: &Event| spans.get(&event.host).map(|span| event.at.ns_since(span.0));
         events.sort_by_key(since_start);
+        let cards = stories.iter().flat_map(|one| one.cards.clone()).collect();
         let processes = stories.into_iter().flat_map(|one| one.processes).collect();
         RunResult {
             folder,
@@ -446,6 +454,7 @@ impl Session<'_> {
             started,
             events,
             processes,
+            cards,
             has_one_clock,
             own_hosts,
             problems,
