@@ -15,6 +15,7 @@
 
 pub mod arrival;
 pub mod case_study;
+pub mod clock;
 pub mod component;
 pub mod egm;
 pub mod endpoint;

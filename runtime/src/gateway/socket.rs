@@ -18,6 +18,7 @@ use hil_models::link::{Fate, LinkModel};
 use hil_models::time::Instant;
 
 use super::GatewayError;
+use super::stamp_plan::StampPlan;
 use crate::clock::MonotonicClock;
 use crate::process::launch::{DirectionLaunch, EmulationLaunch, Side, SocketLaunch, Transport};
 use crate::process::pipe::RunStart;
@@ -48,8 +49,12 @@ pub(super) enum Ends {
 
 impl OpenSocket {
     /// Opens it; call it from a thread of normal priority.
-    pub(super) fn open(launch: &DirectionLaunch, start: &RunStart) -> Result<Self, GatewayError> {
-        let settings = udp_settings(launch);
+    pub(super) fn open(
+        launch: &DirectionLaunch,
+        start: &RunStart,
+        plan: StampPlan,
+    ) -> Result<Self, GatewayError> {
+        let settings = udp_settings(launch, plan);
         match launch.socket.transport {
             Transport::Udp => Self::open_udp(&settings, launch, start),
             Transport::Tcp => Self::open_tcp(&settings, launch),
@@ -127,7 +132,7 @@ impl OpenSocket {
     }
 }
 
-fn udp_settings(launch: &DirectionLaunch) -> UdpSettings {
+fn udp_settings(launch: &DirectionLaunch, plan: StampPlan) -> UdpSettings {
     let socket = &launch.socket;
     UdpSettings {
         local: launch.local,
@@ -138,7 +143,8 @@ fn udp_settings(launch: &DirectionLaunch) -> UdpSettings {
         priority: socket.priority,
         send_buffer_bytes: Some(socket.send_buffer_bytes),
         receive_buffer_bytes: Some(socket.receive_buffer_bytes),
-        timestamps: stamps_of(socket),
+        timestamps: plan.mode,
+        wants_radio_reports: plan.asks_radio,
     }
 }
 
