@@ -26,6 +26,7 @@ use crate::report::terminal::{self, Style};
 use crate::series;
 use crate::supervisor::RunResult;
 use crate::topology::Topology;
+use crate::trace::capture;
 
 /// Why no summary could be made.
 #[derive(Debug, thiserror::Error)]
@@ -75,6 +76,7 @@ pub(crate) fn conclude(
         .iter()
         .map(|channel| channel_summary(topology, result, channel, &records))
         .collect();
+    capture::write(&mut summary, (topology, result), &records);
     summary.faces = faces::face_summaries(topology, result, &records);
     summary.hardware_stamps = cards::hardware_stamps(topology, result, &records);
     let outages = add_outages(&mut summary, (topology, result), &records);

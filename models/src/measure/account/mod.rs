@@ -29,6 +29,7 @@ mod story;
 mod synthetic;
 #[cfg(test)]
 mod tests;
+mod trace;
 
 use core::time::Duration;
 
@@ -42,6 +43,7 @@ pub use outage::{
 };
 pub use stage::{MessageFate, Side, Stage};
 pub use story::{MessageStory, stories};
+pub use trace::{TRACE_MESSAGES_MAX, TooManyMessages, TraceChannel, link_trace};
 
 use crate::clock::ClockMap;
 use crate::measure::histogram::LatencyHistogram;
