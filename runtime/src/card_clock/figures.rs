@@ -73,7 +73,7 @@ pub(crate) struct Places<'a> {
     /// Clock of the receiving card.
     pub(crate) receiver: Option<&'a CardTimeline>,
     /// From the sending host's clock to the receiving host's.
-    pub(crate) path: ChannelPath,
+    pub(crate) path: ChannelPath<'a>,
     /// The receiving card, if there is one.
     pub(crate) receiving_card: Option<&'a CardStory>,
 }
@@ -227,7 +227,7 @@ fn crossing(
     left: Option<Bounded>,
     came: Option<Bounded>,
     record: &IngressRecord,
-    path: ChannelPath,
+    path: ChannelPath<'_>,
 ) -> Option<Bounded> {
     let (left, came) = (left?, came?);
     let (local, alignment_bound_ns) = path.localise(RemoteInstant::from_ns(left.value_ns))?;
