@@ -6,6 +6,7 @@
 pub mod account;
 pub mod card_clock;
 pub mod histogram;
+pub mod radio;
 pub mod record;
 pub(crate) mod series;
 pub(crate) mod special;

@@ -6,6 +6,7 @@ mod events;
 mod faces;
 mod figures;
 pub(crate) mod outages;
+mod radio;
 pub(crate) mod records;
 
 use std::fs;
@@ -93,6 +94,7 @@ pub(crate) fn conclude(
         &summary.channels,
         (specs, &outages),
     );
+    radio::add(&mut summary, (topology, result), &records);
     add_warnings(&mut summary, result, &records);
     if let Some((_, case)) = case {
         write_series(&mut summary, result, case.as_ref(), records);

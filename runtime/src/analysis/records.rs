@@ -12,6 +12,9 @@ use hil_models::measure::account::{
     outages, stories,
 };
 use hil_models::measure::card_clock::{CardClockRecord, CardTimeline};
+use hil_models::measure::radio::{
+    RadioFigures, TransmitStampFigures, radio_figures, transmit_stamps,
+};
 use hil_models::measure::record::{
     EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
 };
@@ -22,6 +25,7 @@ use hil_models::trace::TraceRecord;
 use super::AnalysisError;
 use crate::face::record::{FaceReceivedRecord, FaceSentRecord};
 use crate::process::launch::EmulationLaunch;
+use crate::radio::record::RadioRecord;
 use crate::record::{RecordFile, RecordFileError, RecordKind};
 use crate::report::summary::RecordedFigures;
 use crate::supervisor::RunResult;
@@ -51,6 +55,8 @@ pub(crate) struct RunRecords {
     channels: BTreeMap<String, ChannelFiles>,
     cards: BTreeMap<String, Vec<CardClockRecord>>,
     log: RunLog,
+    /// Records of radios, by `<process>/<interface>`.
+    pub(super) radios: BTreeMap<String, Vec<RadioRecord>>,
     /// Files that could not be read, with the reason.
     pub(crate) problems: Vec<String>,
 }
@@ -67,6 +73,11 @@ impl RunRecords {
         if file.header.kind == RecordKind::CardClock {
             let card = self.cards.entry(file.header.channel.clone()).or_default();
             card.extend(file.records::<CardClockRecord>());
+            return;
+        }
+        if file.header.kind == RecordKind::Radio {
+            let radio = self.radios.entry(file.header.channel.clone());
+            radio.or_default().extend(file.records::<RadioRecord>());
             return;
         }
         let channel = self
@@ -91,7 +102,8 @@ impl RunRecords {
                 channel.face_received.extend(records);
             }
             RecordKind::Message => file.append_messages(&mut self.log),
-            RecordKind::CardClock => {}
+            // They belong to no channel, see above.
+            RecordKind::CardClock | RecordKind::Radio => {}
         }
     }
 
@@ -157,6 +169,17 @@ impl RunRecords {
         channel: &Channel,
     ) -> ChannelAccount {
         self.consult((topology, result), channel, account)
+    }
+
+    /// Where the messages of `channel` were stamped, and what the radio said of them.
+    pub(super) fn radio_figures(
+        &self,
+        run: (&Topology, &RunResult),
+        channel: &Channel,
+    ) -> (Option<TransmitStampFigures>, Option<RadioFigures>) {
+        self.consult(run, channel, |records, _| {
+            (records.egress.map(transmit_stamps), radio_figures(records))
+        })
     }
 
     /// What became of the `wanted` messages of `channel`, by start of the producer and number.

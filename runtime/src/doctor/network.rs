@@ -136,8 +136,8 @@ fn judge(finding: Finding, capabilities: StampCapabilities, is_wireless: bool) -
     if is_wireless {
         return worsen(finding)
             .because(
-                "wireless drivers give no software transmit stamp whatever they claim, so a report \
-                 shows the time from handing over to the receive stamp as one segment",
+                "wireless drivers stamp no departures whatever they claim, so a run asks for the \
+                 stamp before the queue instead and for the radio's acknowledgements",
             )
             .fixed_by("none needed; the report says which stamps there were");
     }

@@ -23,6 +23,7 @@ use hil_models::message::Envelope;
 use hil_models::run_log::RunLog;
 
 use crate::face::record::{FaceReceivedRecord, FaceSentRecord};
+use crate::radio::record::RadioRecord;
 
 const MAGIC: &[u8; 8] = b"HILREC01";
 /// Size of the file header.
@@ -53,11 +54,13 @@ pub enum RecordKind {
     FaceReceived,
     /// [`CardClockRecord`]s of a supervisor; the channel is `<host>/<interface>` of the card.
     CardClock,
+    /// [`RadioRecord`]s of a gateway on a wireless hop; the channel is `<process>/<interface>`.
+    Radio,
 }
 
 impl RecordKind {
     /// Every kind, with the number that stands for it in the header and its name in file names.
-    const ALL: [(Self, u32, &'static str); 10] = [
+    const ALL: [(Self, u32, &'static str); 11] = [
         (Self::Published, 1, "published"),
         (Self::Taken, 2, "taken"),
         (Self::Egress, 3, "egress"),
@@ -68,6 +71,7 @@ impl RecordKind {
         (Self::FaceSent, 8, "face-sent"),
         (Self::FaceReceived, 9, "face-received"),
         (Self::CardClock, 10, "card-clock"),
+        (Self::Radio, 15, "radio"),
     ];
 
     fn row(self) -> (Self, u32, &'static str) {
@@ -96,6 +100,7 @@ impl RecordKind {
             Self::FaceSent => Some(size_of::<FaceSentRecord>()),
             Self::FaceReceived => Some(size_of::<FaceReceivedRecord>()),
             Self::CardClock => Some(size_of::<CardClockRecord>()),
+            Self::Radio => Some(size_of::<RadioRecord>()),
             Self::Message => None,
         }
     }

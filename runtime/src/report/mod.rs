@@ -5,6 +5,7 @@ pub mod assessment;
 pub(crate) mod event_log;
 pub mod face;
 mod face_warnings;
+pub mod radio;
 pub mod score_event;
 pub mod summary;
 pub mod terminal;

@@ -14,6 +14,7 @@ use serde::{Deserialize, Serialize};
 
 use super::assessment::Assessment;
 use super::face::FaceSummary;
+use super::radio::RadioReport;
 use super::score_event::ScoreEvents;
 use crate::card_clock::figures::HardwareStamps;
 
@@ -43,6 +44,9 @@ pub struct RunSummary {
     /// What the network cards stamped; `None` unless hardware stamps were asked for.
     #[serde(default)]
     pub hardware_stamps: Option<HardwareStamps>,
+    /// What the radios of wireless hops said, and where messages were stamped.
+    #[serde(default)]
+    pub radio: RadioReport,
     /// What the robot did.
     pub score: Vec<ScoreMetric>,
     /// What happened to the robot, and what the network had done to the messages concerned.
@@ -65,6 +69,7 @@ impl RunSummary {
             channels: Vec::new(),
             faces: Vec::new(),
             hardware_stamps: None,
+            radio: RadioReport::default(),
             score: Vec::new(),
             score_events: ScoreEvents::default(),
             warnings: Vec::new(),

@@ -6,6 +6,7 @@ mod channel;
 mod events;
 mod face;
 mod outages;
+mod radio;
 mod tables;
 mod trace;
 mod units;
@@ -33,6 +34,7 @@ pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> Strin
     events::score_events(&mut canvas, &summary.score_events);
     for channel in &summary.channels {
         channel::channel(&mut canvas, channel);
+        radio::channel(&mut canvas, summary.radio.channel(&channel.name));
     }
     for face in &summary.faces {
         face::face(&mut canvas, face);
@@ -40,6 +42,7 @@ pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> Strin
     if let Some(stamps) = &summary.hardware_stamps {
         cards::hardware_stamps(&mut canvas, stamps);
     }
+    radio::hops(&mut canvas, &summary.radio);
     tables::processes(&mut canvas, &summary.processes);
     tables::events(&mut canvas, &summary.events);
     tables::realtime(&mut canvas, &summary.realtime);
