@@ -19,6 +19,7 @@ pub mod card_clock;
 pub mod clock_pair;
 mod control;
 pub mod emulated;
+pub mod packet_ring;
 pub mod probe;
 pub mod queue;
 pub mod radio;

@@ -13,6 +13,7 @@ use hil_models::measure::account::{ChannelAccount, OutageFigures};
 use serde::{Deserialize, Serialize};
 
 use super::assessment::Assessment;
+use super::clock_summary::ClockSection;
 use super::face::FaceSummary;
 use super::radio::RadioReport;
 use super::score_event::ScoreEvents;
@@ -32,6 +33,9 @@ pub struct RunSummary {
     pub host_facts: Vec<Fact>,
     /// What real-time settings the kernel granted and refused.
     pub realtime: RealtimeFacts,
+    /// How the hosts' clocks relate, and what that rests on.
+    #[serde(default)]
+    pub clocks: Option<ClockSection>,
     /// The processes of the run.
     pub processes: Vec<ProcessSummary>,
     /// What happened, in order of time.
@@ -64,6 +68,7 @@ impl RunSummary {
             run,
             host_facts: Vec::new(),
             realtime: RealtimeFacts::default(),
+            clocks: None,
             processes: Vec::new(),
             events: Vec::new(),
             channels: Vec::new(),

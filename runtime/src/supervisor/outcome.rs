@@ -14,6 +14,7 @@ use super::frame::{EndMeaning, PeerMessage};
 use super::meet::PeerError;
 use crate::card_clock::CardStory;
 use crate::channel::DomainError;
+use crate::clock_discipline::HostDiscipline;
 use crate::host_facts::HostFacts;
 use crate::run_folder::RunFolder;
 
@@ -130,6 +131,8 @@ pub struct RunResult {
     pub cards: Vec<CardStory>,
     /// True when all hosts read one clock.
     pub has_one_clock: bool,
+    /// Who steers each host's system clock, of the hosts that told.
+    pub disciplines: BTreeMap<String, HostDiscipline>,
     /// Hosts that ran here.
     pub own_hosts: Vec<String>,
     /// What spoils the completeness of the report.

@@ -11,7 +11,7 @@ use serde_json::json;
 
 use super::crew::{self, Crew, Verdict};
 use super::domains::Domains;
-use super::event::{Event, HostStory, ProcessStory};
+use super::event::{Event, HostStory, ProcessStory, disciplines};
 use super::exchange::exchange;
 use super::frame::{Frame, PeerHello, PeerMessage};
 use super::meet::{Meeting, meet};
@@ -22,6 +22,7 @@ use super::progress_line;
 use crate::card_clock::CardWatch;
 use crate::channel::clock_id;
 use crate::clock::MonotonicClock;
+use crate::clock_discipline::HostDiscipline;
 use crate::console::Console;
 use crate::host_facts::HostFacts;
 use crate::run_folder::{RunFolder, utc_text};
@@ -61,6 +62,7 @@ pub fn run(
     crew::find_programs(&plan.processes)?;
     let folder = make_folder(topology, &hosts)?;
     let facts = HostFacts::gather();
+    let discipline = HostDiscipline::gather().ok();
     write_manifest(topology, options, &folder, &facts)?;
     let run = folder.root().to_string_lossy();
     let domains = Domains::create(&plan.hosts, options.domain_root.as_ref(), &run)?;
@@ -83,6 +85,7 @@ pub fn run(
         peers,
         signals,
         console,
+        discipline,
         cleaned: WallInstant::now(),
         greeted: WallInstant::now(),
         told: WallInstant::now(),
@@ -198,6 +201,8 @@ struct Session<'a> {
     peers: Vec<Peer>,
     signals: &'a Signals,
     console: &'a mut Console,
+    /// Who steered the system clock before the run.
+    discipline: Option<HostDiscipline>,
     cleaned: WallInstant,
     greeted: WallInstant,
     told: WallInstant,
@@ -413,6 +418,7 @@ impl Session<'_> {
             hosts: own_hosts.clone(),
             span,
             events: self.crew.events().to_vec(),
+            discipline: self.discipline(),
             processes: self.stories(),
             cards,
         };
@@ -440,6 +446,7 @@ impl Session<'_> {
             story.hosts.iter().map(move |host| (host.clone(), span))
         });
         let spans: BTreeMap<String, (Instant, Instant)> = spans.collect();
+        let disciplines = disciplines(&stories);
         let mut events: Vec<Event> = stories.iter().flat_map(|one| one.events.clone()).collect();
         // Each host counts from its own start of the run.
         let since_start =
@@ -456,10 +463,17 @@ impl Session<'_> {
             processes,
             cards,
             has_one_clock,
+            disciplines,
             own_hosts,
             problems,
             facts,
         }
+    }
+
+    /// Who steered this host's system clock, before and after.
+    fn discipline(&self) -> Option<HostDiscipline> {
+        let before = self.discipline.clone()?;
+        Some(before.worse(HostDiscipline::gather().ok()?))
     }
 
     fn stories(&self) -> Vec<ProcessStory> {

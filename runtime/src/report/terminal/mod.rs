@@ -3,6 +3,7 @@
 mod canvas;
 mod cards;
 mod channel;
+mod clocks;
 mod events;
 mod face;
 mod outages;
@@ -41,6 +42,9 @@ pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> Strin
     }
     if let Some(stamps) = &summary.hardware_stamps {
         cards::hardware_stamps(&mut canvas, stamps);
+    }
+    if let Some(section) = &summary.clocks {
+        clocks::clocks(&mut canvas, section);
     }
     radio::hops(&mut canvas, &summary.radio);
     tables::processes(&mut canvas, &summary.processes);
