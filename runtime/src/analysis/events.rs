@@ -95,6 +95,7 @@ fn explain(
         severity: event.severity,
         what: event.what.clone(),
         outages: Vec::new(),
+        network: None,
         messages: messages.collect(),
         messages_dropped_count: event.messages_dropped_count,
     }

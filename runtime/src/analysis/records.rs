@@ -161,7 +161,7 @@ impl RunRecords {
     }
 
     /// Asks something of the records of `channel` and of what the run knows about its way.
-    fn consult<T>(
+    pub(super) fn consult<T>(
         &self,
         (topology, result): (&Topology, &RunResult),
         channel: &Channel,

@@ -48,6 +48,14 @@ fn line(event: &ExplainedEvent, clocks_differ: bool) -> String {
         line.push_str(" | ");
         line.push_str(&outage.words);
     }
+    if let Some(network) = &event.network {
+        if network.events.is_empty() {
+            line.push_str(&[" | ", &network.nothing_words()].concat());
+        }
+        for one in &network.events {
+            line.push_str(&[" | ", &one.words].concat());
+        }
+    }
     one_line(&line)
 }
 
@@ -70,6 +78,7 @@ mod tests {
             severity,
             what: what.to_owned(),
             outages: Vec::new(),
+            network: None,
             messages: Vec::new(),
             messages_dropped_count: 0,
         }

@@ -5,6 +5,7 @@ pub mod assessment;
 pub(crate) mod event_log;
 pub mod face;
 mod face_warnings;
+pub mod network;
 pub mod score_event;
 pub mod summary;
 pub mod terminal;
@@ -13,5 +14,7 @@ pub mod terminal;
 mod sample;
 #[cfg(test)]
 mod sample_events;
+#[cfg(test)]
+mod sample_network;
 #[cfg(test)]
 mod sample_records;

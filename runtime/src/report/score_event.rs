@@ -5,6 +5,8 @@ use hil_models::case_study::Severity;
 use hil_models::measure::account::{MessageFate, Standing};
 use serde::{Deserialize, Serialize};
 
+use super::network::ForegoingNetwork;
+
 /// The events of a run's score.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct ScoreEvents {
@@ -33,6 +35,10 @@ pub struct ExplainedEvent {
     /// outage.
     #[serde(default)]
     pub outages: Vec<EventOutage>,
+    /// What happened on any network in the seconds before; `None` when the run crossed none, or
+    /// the event has no time.
+    #[serde(default)]
+    pub network: Option<ForegoingNetwork>,
     /// The messages concerned.
     pub messages: Vec<ExplainedMessage>,
     /// Messages the event had no room for.

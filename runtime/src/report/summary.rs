@@ -14,6 +14,7 @@ use serde::{Deserialize, Serialize};
 
 use super::assessment::Assessment;
 use super::face::FaceSummary;
+use super::network::NetworkReport;
 use super::score_event::ScoreEvents;
 
 /// Version of the `summary.json` layout.
@@ -44,6 +45,10 @@ pub struct RunSummary {
     /// What happened to the robot, and what the network had done to the messages concerned.
     #[serde(default)]
     pub score_events: ScoreEvents,
+    /// The network in the field's terms, and on one axis with the robot; `None` when no channel
+    /// crossed one.
+    #[serde(default)]
+    pub network: Option<NetworkReport>,
     /// Anything else a reader must know; [`Assessment::warnings`] come on top.
     pub warnings: Vec<String>,
 }
@@ -62,6 +67,7 @@ impl RunSummary {
             faces: Vec::new(),
             score: Vec::new(),
             score_events: ScoreEvents::default(),
+            network: None,
             warnings: Vec::new(),
         }
     }

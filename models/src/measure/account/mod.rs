@@ -14,6 +14,7 @@ mod figures;
 mod gaps;
 mod join;
 mod outage;
+mod passage;
 #[cfg(test)]
 mod random_fates;
 mod segments;
@@ -34,6 +35,7 @@ pub use outage::{
     Foregoing, Happening, LongestOutage, OUTAGE_EFFECT_MAX, Outage, OutageClass, OutageFigures,
     OutageFinder, Standing, foregoing, outages,
 };
+pub use passage::passages;
 pub use stage::{MessageFate, Side, Stage};
 pub use story::{MessageStory, stories};
 
