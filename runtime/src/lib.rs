@@ -31,6 +31,7 @@ pub mod face;
 pub mod gateway;
 pub mod host_facts;
 pub mod process;
+pub mod radio;
 pub mod realtime;
 pub mod record;
 pub mod registry;

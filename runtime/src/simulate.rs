@@ -139,7 +139,7 @@ fn link_models(topology: &Topology) -> Result<Vec<NamedCarrier>, String> {
     let mut carriers: Vec<NamedCarrier> = Vec::new();
     for crossing in topology.crossings() {
         let name = &crossing.channel.name;
-        let impairment = crossing.impairment.ok_or_else(|| {
+        let emulation = EmulationLaunch::of(&crossing, topology.run().seed).ok_or_else(|| {
             format!(
                 "channel {name} crosses link {} via {}, whose delay only a real run shows; use \
                  via = \"emulated\" to simulate it",
@@ -147,13 +147,6 @@ fn link_models(topology: &Topology) -> Result<Vec<NamedCarrier>, String> {
                 crossing.link.via.word()
             )
         })?;
-        let emulation = EmulationLaunch {
-            delay: impairment.delay,
-            loss_ratio: impairment.loss_ratio,
-            outages: crossing.outages.unwrap_or_default(),
-            link: crossing.link.name.clone(),
-            seed: topology.run().seed,
-        };
         // Virtual time begins with the run.
         let link = emulation.model(name).map_err(|error| error.to_string())?;
         carriers.push((name.clone(), Box::new(link)));

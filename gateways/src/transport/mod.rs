@@ -4,6 +4,7 @@
 //! - [`udp`]: the real network, with separate sockets for sending and receiving.
 //! - [`tcp`]: the real network as a stream, with what it costs in waiting.
 //! - [`udp_server`]: one socket that hears anyone and answers, for foreign protocols.
+//! - [`radio`]: whether the peer radio acknowledged each datagram.
 //! - [`queue`]: an in-process pair, for tests.
 //! - [`emulated`]: any receiver behind a link model.
 //! - [`timestamping`] and [`probe`]: what the kernel and the network card can stamp, and whether
@@ -18,6 +19,7 @@ mod control;
 pub mod emulated;
 pub mod probe;
 pub mod queue;
+pub mod radio;
 pub mod tcp;
 pub mod timestamping;
 pub mod udp;
@@ -39,6 +41,7 @@ use std::os::fd::BorrowedFd;
 use hil_models::time::Instant;
 use thiserror::Error;
 
+use radio::RadioReport;
 use tcp::StreamFigures;
 
 /// The stamps the kernel attached to one datagram.
@@ -199,6 +202,14 @@ pub struct SenderCounters {
     /// Replies the kernel dropped because the receive buffer was full (`SO_RXQ_OVFL`). Known as
     /// of the newest reply received.
     pub kernel_drop_count: u64,
+    /// Datagrams the peer radio acknowledged; asked for on wireless interfaces only.
+    pub radio_acknowledged_count: u64,
+    /// Datagrams the peer radio did not acknowledge.
+    pub radio_unacknowledged_count: u64,
+    /// Reports of the radio that name no send of ours or came too late to be matched, dropped.
+    pub radio_unmatched_count: u64,
+    /// Reports of the radio dropped because nobody took them in time.
+    pub radio_overflow_count: u64,
     /// What the newest network or local report said.
     pub newest_report: Option<SendRefusal>,
 }
@@ -222,6 +233,13 @@ impl SenderCounters {
             ("undecodable_report_count", self.undecodable_report_count),
             ("reply_count", self.reply_count),
             ("kernel_drop_count", self.kernel_drop_count),
+            ("radio_acknowledged_count", self.radio_acknowledged_count),
+            (
+                "radio_unacknowledged_count",
+                self.radio_unacknowledged_count,
+            ),
+            ("radio_unmatched_count", self.radio_unmatched_count),
+            ("radio_overflow_count", self.radio_overflow_count),
         ]
         .into_iter()
     }
@@ -277,6 +295,13 @@ pub struct ReceiverCounters {
     pub link_lost_count: u64,
     /// Datagrams dropped because the emulation already held as many as it may.
     pub link_overflow_count: u64,
+    /// Datagrams that arrived with the code point this end marks with; counted where it marks.
+    pub mark_kept_count: u64,
+    /// Datagrams that arrived with another code point: something on the way changed it, or the
+    /// sender marks otherwise.
+    pub mark_changed_count: u64,
+    /// The code point of the newest of those.
+    pub newest_other_dscp: Option<u8>,
 }
 
 impl ReceiverCounters {
@@ -294,12 +319,30 @@ impl ReceiverCounters {
             ("reply_refused_count", self.reply_refused_count),
             ("link_lost_count", self.link_lost_count),
             ("link_overflow_count", self.link_overflow_count),
+            ("mark_kept_count", self.mark_kept_count),
+            ("mark_changed_count", self.mark_changed_count),
         ]
         .into_iter()
     }
 }
 
 impl ReceiverCounters {
+    /// Compares the mark of an arrival with the one it should have; neither is known without
+    /// marking.
+    pub(crate) fn count_mark(&mut self, expected_dscp: Option<u8>, class: Option<u8>) {
+        let Some((expected_dscp, class)) = expected_dscp.zip(class) else {
+            return;
+        };
+        // The two low bits are for congestion (RFC 3168).
+        let dscp = class >> 2;
+        if dscp == expected_dscp {
+            self.mark_kept_count += 1;
+        } else {
+            self.mark_changed_count += 1;
+            self.newest_other_dscp = Some(dscp);
+        }
+    }
+
     pub(crate) fn count_received(&mut self, received: &Received) {
         self.received_count += 1;
         self.truncated_count += u64::from(received.is_truncated);
@@ -336,6 +379,12 @@ pub trait DatagramSender: Debug + Send {
     /// kernel charges unfetched stamps to the receive buffer, so a sender that is never drained
     /// hears no replies. Reports of the network are swallowed and counted on the way.
     fn next_stamp(&mut self) -> Option<TransmitStamp>;
+
+    /// The next report of the radio that [`DatagramSender::next_stamp`] found on its way; call it
+    /// until `None` after that. A transport without a radio has none.
+    fn next_radio_report(&mut self) -> Option<RadioReport> {
+        None
+    }
 
     /// The next reply of the peer, if one has arrived.
     ///

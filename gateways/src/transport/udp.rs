@@ -10,9 +10,11 @@ use hil_models::time::Instant;
 use nix::sys::socket::{setsockopt, sockopt};
 use socket2::{SockAddr, Socket};
 
-use super::control::{ControlData, QueueEntry};
+use super::control::{ControlData, QueueEntry, SCM_WIFI_STATUS};
+use super::radio::{RETURNED_BYTES, RadioLedger, RadioReport};
 use super::timestamping::{
     MessageReader, Queue, TimestampMode, arm_receive, arm_transmit, int_option, restart_send_count,
+    set_int_option,
 };
 pub use super::udp_socket::{GrantedOptions, UdpError, UdpSettings};
 use super::udp_socket::{bind, granted_options, local_address, open_socket, refuse};
@@ -54,6 +56,8 @@ pub struct UdpSender {
     mode: TimestampMode,
     /// The token of the send that the kernel counts as 0; `None` when its count is unknown.
     first_token: Option<TxToken>,
+    /// Where the radio is asked.
+    radio: Option<Box<RadioLedger>>,
 }
 
 impl UdpSender {
@@ -98,7 +102,14 @@ impl UdpSender {
             format!("{:?}", settings.timestamps),
             armed,
         )?;
+        let mut radio = None;
+        if settings.wants_radio_reports {
+            let asked = set_int_option(&socket, libc::SOL_SOCKET, SCM_WIFI_STATUS, 1);
+            refuse("SO_WIFI_STATUS", 1, asked)?;
+            radio = Some(Box::new(RadioLedger::new()));
+        }
         Ok(Self {
+            radio,
             granted: granted_options(&socket, settings)?,
             socket,
             peer: settings.peer,
@@ -168,6 +179,22 @@ impl UdpSender {
         self.first_token = restarted.then_some(TxToken(sent_modulo(self.counters.sent_count)));
     }
 
+    /// Matches a radio's report to its send by the packet it brought back.
+    fn absorb_report(&mut self, packet: &[u8], is_acknowledged: bool) {
+        let Some(radio) = &mut self.radio else {
+            self.counters.undecodable_report_count += 1;
+            return;
+        };
+        let matched = radio.settle(packet, is_acknowledged);
+        self.counters.radio_overflow_count = radio.overflow_count;
+        let counter = match matched {
+            None => &mut self.counters.radio_unmatched_count,
+            Some(report) if report.is_acknowledged => &mut self.counters.radio_acknowledged_count,
+            Some(_) => &mut self.counters.radio_unacknowledged_count,
+        };
+        *counter += 1;
+    }
+
     /// Sorts one entry of the error queue; a stamp of one of our sends is handed on.
     fn absorb_entry(&mut self, data: &ControlData) -> Option<TransmitStamp> {
         let entry = data.extended_error.map(|error| error.entry());
@@ -214,6 +241,9 @@ impl UdpSender {
             Ok(_) => {
                 let token = TxToken(sent_modulo(self.counters.sent_count));
                 self.counters.sent_count += 1;
+                if let Some(radio) = &mut self.radio {
+                    radio.note(datagram, token);
+                }
                 Ok(token)
             }
             Err(error) => {
@@ -246,14 +276,23 @@ impl DatagramSender for UdpSender {
     }
 
     fn next_stamp(&mut self) -> Option<TransmitStamp> {
+        let mut packet = [0; RETURNED_BYTES];
+        // Only a radio's reports bring something back.
+        let room = if self.radio.is_some() {
+            packet.len()
+        } else {
+            0
+        };
         for _ in 0..DRAIN_COUNT_MAX {
             match self
                 .reader
-                .read(self.socket.as_fd(), &mut [], Queue::Errors)
+                .read(self.socket.as_fd(), &mut packet[..room], Queue::Errors)
             {
-                Ok(Some(_)) => {
+                Ok(Some(message)) => {
                     let data = ControlData::decode(self.reader.control());
-                    if let Some(stamp) = self.absorb_entry(&data) {
+                    if let Some(is_acknowledged) = data.is_acknowledged {
+                        self.absorb_report(&packet[..message.length_bytes], is_acknowledged);
+                    } else if let Some(stamp) = self.absorb_entry(&data) {
                         return Some(stamp);
                     }
                 }
@@ -265,6 +304,10 @@ impl DatagramSender for UdpSender {
             }
         }
         None
+    }
+
+    fn next_radio_report(&mut self) -> Option<RadioReport> {
+        self.radio.as_mut()?.take()
     }
 
     fn receive(&mut self, buffer: &mut [u8]) -> io::Result<Option<Received>> {
@@ -329,6 +372,8 @@ pub struct UdpReceiver {
     /// The kernel's drop count at the newest datagram, modulo 2^32.
     kernel_drop_count: u32,
     granted: GrantedOptions,
+    /// The code point arrivals should have.
+    dscp: Option<u8>,
 }
 
 impl UdpReceiver {
@@ -347,6 +392,14 @@ impl UdpReceiver {
         )?;
         let drops = setsockopt(&socket, sockopt::RxqOvfl, &1);
         refuse("SO_RXQ_OVFL", 1, drops.map_err(io::Error::from))?;
+        if settings.dscp.is_some() {
+            let (option, level, name) = if settings.local.is_ipv4() {
+                ("IP_RECVTOS", libc::SOL_IP, libc::IP_RECVTOS)
+            } else {
+                ("IPV6_RECVTCLASS", libc::SOL_IPV6, libc::IPV6_RECVTCLASS)
+            };
+            refuse(option, 1, set_int_option(&socket, level, name, 1))?;
+        }
         bind(&socket, settings.local)?;
         Ok(Self {
             granted: granted_options(&socket, settings)?,
@@ -354,6 +407,7 @@ impl UdpReceiver {
             reader: MessageReader::new(),
             counters: ReceiverCounters::default(),
             kernel_drop_count: 0,
+            dscp: settings.dscp,
         })
     }
 
@@ -397,6 +451,7 @@ impl DatagramReceiver for UdpReceiver {
             };
             let is_damaged = data.is_damaged || message.is_control_truncated;
             self.counters.damaged_control_count += u64::from(is_damaged);
+            self.counters.count_mark(self.dscp, data.traffic_class);
             self.counters.count_received(&received);
             return Ok(Some(received));
         }

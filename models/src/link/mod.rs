@@ -2,9 +2,15 @@
 //! stream. They carry no bytes; virtual time and `via = "emulated"` ask them for each message.
 
 pub mod bernoulli;
+pub mod chain;
+pub mod delay;
 pub mod impaired;
 pub mod in_series;
+pub mod loss;
 pub mod outages;
+pub mod rate;
+pub mod reordering;
+pub mod spec;
 
 use core::fmt::Debug;
 
@@ -49,6 +55,40 @@ pub trait LinkModel: Debug + Send {
     /// Offers a message of `length_bytes` at `now` and decides its fate. Calls come in
     /// non-decreasing `now`.
     fn offer(&mut self, now: Instant, length_bytes: usize) -> Fate;
+
+    /// What the messages lost so far were lost to; `None` for a model that does not tell causes
+    /// apart.
+    fn loss_causes(&self) -> Option<LossCauses> {
+        None
+    }
+}
+
+impl<L: LinkModel + ?Sized> LinkModel for Box<L> {
+    fn offer(&mut self, now: Instant, length_bytes: usize) -> Fate {
+        (**self).offer(now, length_bytes)
+    }
+
+    fn loss_causes(&self) -> Option<LossCauses> {
+        (**self).loss_causes()
+    }
+}
+
+/// What a link lost messages to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct LossCauses {
+    /// To outages.
+    pub outage_count: u64,
+    /// By chance.
+    pub chance_count: u64,
+    /// To a full queue.
+    pub queue_count: u64,
+}
+
+impl LossCauses {
+    /// All of them.
+    pub const fn total(self) -> u64 {
+        self.outage_count + self.chance_count + self.queue_count
+    }
 }
 
 /// The shared-memory channel of one host in virtual time: everything arrives at once.

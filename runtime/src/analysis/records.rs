@@ -24,6 +24,10 @@ use crate::supervisor::RunResult;
 use crate::supervisor::plan::gateway_name;
 use crate::topology::{Channel, Topology};
 
+/// Share of the messages of an emulated link that are not under way for longer than is allowed for:
+/// at the end of a run, what is younger may still arrive.
+const FLIGHT_QUANTILE: f64 = 0.9999;
+
 /// All records of one channel.
 #[derive(Debug, Default)]
 pub(crate) struct ChannelFiles {
@@ -183,8 +187,8 @@ impl RunRecords {
         };
         // A link that delays on purpose keeps messages under way for that much longer.
         let delay = crossing
-            .and_then(|crossing| crossing.impairment)
-            .map(|one| one.delay);
+            .and_then(|crossing| crossing.spec)
+            .map(|spec| spec.flight_time(FLIGHT_QUANTILE));
         let round_trips = files.round_trips.values();
         let round_trips_ns: Vec<i64> = round_trips.map(RoundTripRecord::rtt_ns).collect();
         let context = AccountContext {

@@ -6,14 +6,17 @@
 //! - [`direction`]: one direction from its launch description to its final counters.
 //! - `egress`: shared memory to network; `ingress`: network to shared memory.
 
+pub(crate) mod arming;
 mod connection;
 mod counters;
 pub mod direction;
 pub(crate) mod egress;
 pub(crate) mod ingress;
 pub(crate) mod kernel_clock;
+mod line;
 pub(crate) mod process;
 pub(crate) mod socket;
+pub mod stamp_plan;
 mod stream;
 
 use std::fs::File;

@@ -18,6 +18,7 @@ use hil_models::link::{Fate, LinkModel};
 use hil_models::time::Instant;
 
 use super::GatewayError;
+use super::stamp_plan::StampPlan;
 use crate::clock::MonotonicClock;
 use crate::process::launch::{DirectionLaunch, EmulationLaunch, Side, SocketLaunch, Transport};
 use crate::process::pipe::RunStart;
@@ -48,8 +49,12 @@ pub(super) enum Ends {
 
 impl OpenSocket {
     /// Opens it; call it from a thread of normal priority.
-    pub(super) fn open(launch: &DirectionLaunch, start: &RunStart) -> Result<Self, GatewayError> {
-        let settings = udp_settings(launch);
+    pub(super) fn open(
+        launch: &DirectionLaunch,
+        start: &RunStart,
+        plan: StampPlan,
+    ) -> Result<Self, GatewayError> {
+        let settings = udp_settings(launch, plan);
         match launch.socket.transport {
             Transport::Udp => Self::open_udp(&settings, launch, start),
             Transport::Tcp => Self::open_tcp(&settings, launch),
@@ -127,7 +132,7 @@ impl OpenSocket {
     }
 }
 
-fn udp_settings(launch: &DirectionLaunch) -> UdpSettings {
+fn udp_settings(launch: &DirectionLaunch, plan: StampPlan) -> UdpSettings {
     let socket = &launch.socket;
     UdpSettings {
         local: launch.local,
@@ -138,7 +143,8 @@ fn udp_settings(launch: &DirectionLaunch) -> UdpSettings {
         priority: socket.priority,
         send_buffer_bytes: Some(socket.send_buffer_bytes),
         receive_buffer_bytes: Some(socket.receive_buffer_bytes),
-        timestamps: stamps_of(socket),
+        timestamps: plan.mode,
+        wants_radio_reports: plan.asks_radio,
     }
 }
 
@@ -184,10 +190,10 @@ fn socket_facts(settings: &UdpSettings, granted: GrantedOptions) -> Vec<(String,
     facts
 }
 
-/// Room for everything that is under way at once, up to 4000 datagrams per second, and for what
-/// eight mean outages hold back of 1000 per second.
+/// Room for everything that is under way at once, but for one in a million, at 4000 datagrams per
+/// second, and for what eight mean outages hold back of 1000 per second.
 fn emulated_capacity(emulation: &EmulationLaunch) -> usize {
-    let outages = &emulation.outages;
+    let outages = &emulation.spec.outages;
     let held_s = if outages.is_active() && outages.buffered {
         8.0 * outages.mean_s
     } else {
@@ -199,7 +205,7 @@ fn emulated_capacity(emulation: &EmulationLaunch) -> usize {
         reason = "a checked mean is at most an hour, and what is above the bound is cut"
     )]
     let held_count = ((1000.0 * held_s) as usize).min(HELD_COUNT_MAX);
-    let under_way = emulation.delay.as_millis() as usize * 4;
+    let under_way = emulation.spec.flight_time(1.0 - 1e-6).as_millis() as usize * 4;
     EmulatedSettings::default().capacity_count + under_way + held_count
 }
 
@@ -274,20 +280,24 @@ fn datagram_bytes_max(launch: &DirectionLaunch, path: PathMtu) -> usize {
 #[cfg(test)]
 mod tests {
     use hil_models::link::outages::{Outage, OutageSchedule, Outages};
+    use hil_models::link::spec::{LinkSpec, Way};
     use hil_models::random::RandomStream;
 
     use super::*;
 
     fn emulation(per_hour: f64) -> EmulationLaunch {
+        let outages = Outages {
+            mean_s: 0.5,
+            per_hour,
+            buffered: false,
+        };
         EmulationLaunch {
-            delay: Duration::from_millis(5),
-            loss_ratio: 0.0,
-            outages: Outages {
-                mean_s: 0.5,
-                per_hour,
-                buffered: false,
+            spec: LinkSpec {
+                outages,
+                ..LinkSpec::fixed(Duration::from_millis(5), 0.0)
             },
             link: "hop".to_owned(),
+            way: Way::Forward,
             seed: 3,
         }
     }
@@ -340,7 +350,7 @@ mod tests {
             let name = format!("links.{link}.outages");
             let stream = RandomStream::new(emulation.seed, &name);
             let mut schedule =
-                OutageSchedule::new(emulation.outages, stream, Instant::ZERO).unwrap();
+                OutageSchedule::new(emulation.spec.outages, stream, Instant::ZERO).unwrap();
             schedule.next().unwrap()
         };
         assert_ne!(first("hop"), first("wire"));
@@ -351,9 +361,9 @@ mod tests {
         let mut held = emulation(100.0);
         let lossy = emulated_capacity(&held);
         assert_eq!(lossy, 1024 + 20);
-        held.outages.buffered = true;
+        held.spec.outages.buffered = true;
         assert_eq!(emulated_capacity(&held), lossy + 4_000);
-        held.outages.mean_s = 30.0;
+        held.spec.outages.mean_s = 30.0;
         assert_eq!(emulated_capacity(&held), lossy + HELD_COUNT_MAX);
     }
 }

@@ -17,6 +17,7 @@ mod check_face;
 mod errors;
 mod face;
 mod file;
+mod file_impairments;
 mod file_links;
 mod host;
 mod known;
@@ -26,6 +27,7 @@ mod model;
 mod model_links;
 mod reader;
 mod resolved;
+mod resolved_impairments;
 mod suggest;
 mod tree;
 mod units;
@@ -44,7 +46,7 @@ pub use model::{
     Case, Channel, ChannelPorts, Crossing, Direction, Execution, Host, MessageLayout, OnExit,
     Process, Program, Run, Scheduling, Topology, Wait,
 };
-pub use model_links::{Emulation, Gateway, Hop, Impairment, Link, Timestamps, Via};
+pub use model_links::{Emulation, Gateway, Hop, Link, Timestamps, Via};
 
 use check::Needs;
 use errors::Place;

@@ -2,9 +2,8 @@
 //! no file and opens no socket.
 
 use core::fmt;
-use core::time::Duration;
 
-use hil_models::link::outages::Outages;
+use hil_models::link::spec::LinkSpec;
 use serde::{Deserialize, Serialize};
 
 use super::model::{Execution, OnExit, words};
@@ -46,7 +45,7 @@ pub enum Via {
     /// One TCP connection per channel over the real network.
     Tcp(Hop),
     /// UDP datagrams behind a model of a network.
-    Emulated(Hop, Emulation),
+    Emulated(Hop, Box<Emulation>),
 }
 
 impl Via {
@@ -111,24 +110,14 @@ pub enum Timestamps {
     Hardware,
 }
 
-/// What an emulated link does, in each direction.
-#[derive(Debug, Clone, Copy, PartialEq)]
+/// What an emulated link does, in each direction. Outages strike both at once and are those of
+/// either.
+#[derive(Debug, Clone, PartialEq)]
 pub struct Emulation {
     /// From the first host of [`Link::between`] to the second.
-    pub forward: Impairment,
+    pub forward: LinkSpec,
     /// From the second to the first.
-    pub backward: Impairment,
-    /// When nothing gets through, on all channels of the link and both ways at once.
-    pub outages: Outages,
-}
-
-/// The static network model of one direction.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Impairment {
-    /// Fixed one-way delay.
-    pub delay: Duration,
-    /// Probability that a datagram is lost, 0..=1.
-    pub loss_ratio: f64,
+    pub backward: LinkSpec,
 }
 
 words!(Timestamps { Off = "off", Software = "software", Hardware = "hardware" });
