@@ -235,7 +235,12 @@ impl Simulated {
             style,
         ));
         if let Some(report) = &self.network {
-            text.push_str(&terminal::render_network(report, &self.events, columns, style));
+            text.push_str(&terminal::render_network(
+                report,
+                &self.events,
+                columns,
+                style,
+            ));
         }
         text
     }

@@ -342,13 +342,13 @@ mod tests {
         }
     }
 
-    /// Of 200 pairs without any connection 10 should reach p <= 0.05; three standard deviations of
-    /// the binomial are 9. Series with long memory are a little above, sparse ones below.
+    /// Of 120 pairs without any connection 6 should reach p <= 0.05; three standard deviations of
+    /// the binomial are 7. Series with long memory are a little above, sparse ones below.
     #[test]
     fn independent_series_are_called_correlated_in_five_of_a_hundred_cases() {
         for (name, memory) in [("white", 0.0), ("long memory", 0.9), ("outages", -1.0)] {
             let (mut alone, mut in_family) = (0, 0);
-            for seed in 0..200 {
+            for seed in 0..120 {
                 let mut random = RandomStream::new(seed, name);
                 let mut one = |count| {
                     if memory < 0.0 {
@@ -357,7 +357,7 @@ mod tests {
                         series(count, memory, &mut random)
                     }
                 };
-                let causes = [one(400), one(400), one(400)];
+                let causes = [one(400), one(400)];
                 let effect = [one(400)];
                 let mut random = RandomStream::new(seed, "shuffles");
                 let Ok(found) = family(&causes, &effect, WINDOW, &mut random) else {
@@ -369,11 +369,11 @@ mod tests {
                 in_family += i32::from(best.fold(1.0, f64::min) <= 0.05);
             }
             // Sparse series have few coincidences, so the test is careful with them.
-            let least = if memory < 0.0 { 0 } else { 2 };
-            assert!((least..=22).contains(&alone), "{name}: {alone} of 200");
+            let least = i32::from(memory >= 0.0);
+            assert!((least..=14).contains(&alone), "{name}: {alone} of 120");
             assert!(
-                (least..=22).contains(&in_family),
-                "{name}: {in_family} of 200"
+                (least..=14).contains(&in_family),
+                "{name}: {in_family} of 120"
             );
         }
     }

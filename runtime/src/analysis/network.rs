@@ -5,12 +5,12 @@
 use std::collections::BTreeSet;
 
 use hil_models::case_study::{ErrorSeries, Severity};
+use hil_models::measure::account::{Side, passages};
 use hil_models::measure::correlation::{self, LagWindow};
 use hil_models::measure::network::{
     NetworkBin, NetworkBins, NetworkContext, NetworkEvent, NetworkEventKind, NetworkFigures,
     Passage, SeriesSpan, bin_width_ns, clock_steps, interruptions, network_events,
 };
-use hil_models::measure::account::{Side, passages};
 use hil_models::measure::record::IngressRecord;
 use hil_models::plot::PlotSeries;
 use hil_models::random::RandomStream;
@@ -102,7 +102,11 @@ impl RobotSeries {
                 continue;
             };
             let known: f64 = bin.unwrap_or(0.0);
-            *bin = Some(if is_count { known + value } else { known.max(*value) });
+            *bin = Some(if is_count {
+                known + value
+            } else {
+                known.max(*value)
+            });
         }
         let mut held = 0.0;
         let held_or = |bin: Option<f64>| {
@@ -119,7 +123,9 @@ impl RobotSeries {
     reason = "the value is checked to lie in 0..2^32"
 )]
 fn index_of(bin: f64) -> Option<usize> {
-    (0.0..4_294_967_296.0).contains(&bin).then_some(bin as usize)
+    (0.0..4_294_967_296.0)
+        .contains(&bin)
+        .then_some(bin as usize)
 }
 
 /// A network under way of being put together, channel by channel, so that the passages of only
@@ -166,7 +172,10 @@ impl NetworkBuilder {
         self.events.push(TimedEvent {
             channel: channel.to_owned(),
             from_s: since_s(event.from.ns),
-            until_s: event.until_ns.map(since_s).filter(|until_s| *until_s < end_s),
+            until_s: event
+                .until_ns
+                .map(since_s)
+                .filter(|until_s| *until_s < end_s),
             kind: event.kind,
         });
     }
@@ -208,7 +217,9 @@ impl NetworkBuilder {
         };
         let series = self.bins.iter().map(|(channel, bins)| {
             let notes = vec![
-                format!("bins of {width_s} s; a message belongs where it was handed to the network"),
+                format!(
+                    "bins of {width_s} s; a message belongs where it was handed to the network"
+                ),
                 "silence is seen from the receiver; an empty field had no message".to_owned(),
             ];
             bins.to_series(channel, notes)
@@ -350,7 +361,11 @@ fn correlate(
             }));
         }
     }
-    let is_constant = |values: &[f64]| values.windows(2).all(|pair| pair[0].total_cmp(&pair[1]).is_eq());
+    let is_constant = |values: &[f64]| {
+        values
+            .windows(2)
+            .all(|pair| pair[0].total_cmp(&pair[1]).is_eq())
+    };
     let of_network = names.iter().zip(&causes);
     let constant_causes = of_network
         .filter(|(_, values)| is_constant(values))

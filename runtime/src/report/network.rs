@@ -68,7 +68,9 @@ impl TimedEvent {
         if self.from_s > at_s {
             return None;
         }
-        let over_s = self.until_s.map_or(0.0, |until_s| (at_s - until_s).max(0.0));
+        let over_s = self
+            .until_s
+            .map_or(0.0, |until_s| (at_s - until_s).max(0.0));
         (over_s <= FOREGOING_S).then_some(over_s)
     }
 
@@ -255,8 +257,14 @@ impl CorrelationTests {
     /// Those that chance among all pairs does not explain, the strongest first.
     pub(crate) fn significant(&self) -> Vec<&TestedPair> {
         let pairs = self.pairs.iter();
-        let mut found: Vec<_> = pairs.filter(|pair| pair.correlation.p_family <= P_MAX).collect();
-        found.sort_by(|a, b| b.correlation.coefficient.total_cmp(&a.correlation.coefficient));
+        let mut found: Vec<_> = pairs
+            .filter(|pair| pair.correlation.p_family <= P_MAX)
+            .collect();
+        found.sort_by(|a, b| {
+            b.correlation
+                .coefficient
+                .total_cmp(&a.correlation.coefficient)
+        });
         found
     }
 }
@@ -266,7 +274,10 @@ impl TestedPair {
     pub(crate) fn words(&self, count: usize, shuffle_count: u64) -> String {
         let (robot, network, channel) = (&self.robot, &self.network, &self.channel);
         let how = if self.correlation.lag_bins > 0 {
-            format!("follows the {network} on {channel} by {}", duration_s(self.lag_s))
+            format!(
+                "follows the {network} on {channel} by {}",
+                duration_s(self.lag_s)
+            )
         } else if self.correlation.lag_bins < 0 {
             let lead = duration_s(-self.lag_s);
             format!("precedes the {network} on {channel} by {lead}")
@@ -281,8 +292,8 @@ impl TestedPair {
         } = self.correlation;
         let shuffles = grouped(shuffle_count);
         format!(
-            "{robot} {how}: r{JOINT}={JOINT}{coefficient:.2}, p{JOINT}={JOINT}{p_value:.4} of \
-             {shuffles} block shuffles, {p_family:.4} in view of all {count} pairs"
+            "{robot} {how}: r{JOINT}={JOINT}{coefficient:.2}, p{JOINT}={JOINT}{p_value:.3} of \
+             {shuffles} block shuffles, {p_family:.3} in view of all {count} pairs"
         )
     }
 }
@@ -334,7 +345,10 @@ mod tests {
     fn a_timed_event_keeps_its_numbers_in_json() {
         let event = outage(3.0, Some(3.8));
         let text = serde_json::to_string(&event).unwrap();
-        assert!(text.contains("\"kind\":\"outage\",\"lost_count\":80"), "{text}");
+        assert!(
+            text.contains("\"kind\":\"outage\",\"lost_count\":80"),
+            "{text}"
+        );
         assert_eq!(serde_json::from_str::<TimedEvent>(&text).unwrap(), event);
     }
 
@@ -355,10 +369,12 @@ mod tests {
         let words = |lag_bins| pair(lag_bins).words(12, 499).replace(JOINT, " ");
         assert_eq!(
             words(11),
-            "joint error follows the silence on shuttle/command by 1.10 s: r = 0.62, p = 0.0020 of \
-             499 block shuffles, 0.0040 in view of all 12 pairs"
+            "joint error follows the silence on shuttle/command by 1.10 s: r = 0.62, p = 0.002 of \
+             499 block shuffles, 0.004 in view of all 12 pairs"
         );
-        assert!(words(-4).starts_with("joint error precedes the silence on shuttle/command by 400 ms"));
+        assert!(
+            words(-4).starts_with("joint error precedes the silence on shuttle/command by 400 ms")
+        );
         assert!(words(0).contains("goes with the silence"));
     }
 }

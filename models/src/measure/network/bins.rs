@@ -70,7 +70,9 @@ impl NetworkBins {
     /// them. `width_ns` is above zero.
     pub fn of(passages: &[Passage], span: SeriesSpan, width_ns: i64) -> Self {
         let width_ns = width_ns.max(1);
-        let count = usize::try_from(span.duration_ns.max(0).div_euclid(width_ns) + 1).unwrap_or(1);
+        let count =
+            usize::try_from(span.duration_ns.max(1).saturating_add(width_ns - 1) / width_ns)
+                .unwrap_or(1);
         let mut bins = vec![NetworkBin::default(); count];
         let mut delays_ns: Vec<Vec<i64>> = vec![Vec::new(); count];
         for one in passages {

@@ -14,9 +14,6 @@ use crate::measure::record::UNAVAILABLE;
 /// Losses in a row that last this long are an outage, shorter ones a burst of losses.
 pub const EVENT_OUTAGE_MIN_NS: i64 = 100_000_000;
 
-/// Fewer messages than this have no 99.9th percentile.
-const P999_COUNT_MIN: usize = 1_000;
-
 /// What the real-time clock may be corrected by without a step: the rate that the kernel's clock
 /// discipline never exceeds (500 ppm), and 1 ms for reading two clocks as a pair.
 const STEP_MIN_NS: u64 = 1_000_000;
@@ -38,8 +35,8 @@ pub enum NetworkEventKind {
         /// Of so many, from the first to the last of them.
         of_count: u64,
     },
-    /// Messages arrived later than the next one should have: above the 99.9th percentile of the
-    /// run and above the median by more than one period.
+    /// Messages arrived later than the next one should have: above the median by more than one mean
+    /// period, and above the 99th percentile of the run.
     Delay {
         /// Messages.
         late_count: u64,
@@ -142,26 +139,20 @@ fn losses(passages: &[Passage]) -> Vec<NetworkEvent> {
     found
 }
 
-/// What a delay must exceed to be an event; `None` without delays or a period.
+/// What a delay must exceed to be an event: the median and one mean period, so that the next
+/// message should have been there; and the 99th percentile, as messages of several robots may follow
+/// each other at once. `None` without delays or a period.
 fn delay_limit_ns(passages: &[Passage]) -> Option<i64> {
     let mut delays_ns: Vec<i64> = passages.iter().filter_map(|one| one.delay_ns).collect();
     delays_ns.sort_unstable();
-    let pairs = passages
-        .windows(2)
-        .filter(|pair| !pair[1].begins_epoch_after(&pair[0]));
-    let mut periods_ns: Vec<i64> = pairs
-        .filter_map(|pair| Some(pair[1].offered_ns?.saturating_sub(pair[0].offered_ns?)))
-        .collect();
-    periods_ns.sort_unstable();
-    if delays_ns.is_empty() || periods_ns.is_empty() {
+    let times = || passages.iter().filter_map(|one| one.offered_ns);
+    let length_ns = times().max()?.saturating_sub(times().min()?);
+    let period_ns = length_ns / i64::try_from(times().count()).ok()?;
+    if delays_ns.is_empty() || period_ns == 0 {
         return None;
     }
-    let limit_ns = at_share(&delays_ns, 0.5).saturating_add(at_share(&periods_ns, 0.5));
-    Some(if delays_ns.len() < P999_COUNT_MIN {
-        limit_ns
-    } else {
-        limit_ns.max(at_share(&delays_ns, 0.999))
-    })
+    let limit_ns = at_share(&delays_ns, 0.5).saturating_add(period_ns);
+    Some(limit_ns.max(at_share(&delays_ns, 0.99)))
 }
 
 fn late(passages: &[Passage]) -> Vec<NetworkEvent> {

@@ -3,11 +3,9 @@
 
 use hil_models::case_study::Severity;
 use hil_models::measure::account::MessageFate;
-use hil_models::measure::network::NetworkEventKind;
 
 use super::canvas::{Canvas, INDENT, Tone, shortened};
 use super::units::{duration_s, grouped, seconds};
-use crate::report::network::ForegoingEvent;
 use crate::report::score_event::{ExplainedEvent, ExplainedMessage, ScoreEvents};
 
 /// Events on the page, and messages of each; all of them are in the summary.
@@ -123,19 +121,17 @@ fn network_before(canvas: &mut Canvas, event: &ExplainedEvent) {
         canvas.paragraph(MESSAGE_MARGIN, Tone::Faint, &network.nothing_words());
         return;
     }
-    let is_told = |one: &ForegoingEvent| {
-        let is_outage = matches!(one.event.kind, NetworkEventKind::Outage { .. });
-        let mut outages = event.outages.iter();
-        is_outage && outages.any(|outage| outage.channel == one.event.channel)
-    };
-    let rest: Vec<_> = network.events.iter().filter(|one| !is_told(one)).collect();
+    let rest = event.network_beside();
     for one in rest.iter().take(NETWORK_SHOWN_COUNT) {
         canvas.paragraph(MESSAGE_MARGIN, Tone::Caution, &one.words);
     }
     let hidden = rest.len().saturating_sub(NETWORK_SHOWN_COUNT) as u64 + network.more_count;
     if hidden > 0 {
         let window = duration_s(network.foregoing_s);
-        let text = format!("and {} more on the network in the {window} before", grouped(hidden));
+        let text = format!(
+            "and {} more on the network in the {window} before",
+            grouped(hidden)
+        );
         canvas.paragraph(MESSAGE_MARGIN, Tone::Faint, &text);
     }
 }

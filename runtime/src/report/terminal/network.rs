@@ -26,7 +26,7 @@ const RUNS_SHOWN_COUNT: usize = 6;
 pub(super) fn network(canvas: &mut Canvas, report: &NetworkReport) {
     canvas.heading(
         "Network",
-        "from the sending gateway's hand-over to the kernel to the receiving gateway",
+        "from the hand-over to the kernel to the receiving gateway",
     );
     let name_width = canvas.width() - INDENT - HEADS.len() * COLUMN_WIDTH;
     let head: String = HEADS.iter().map(|head| right(head, COLUMN_WIDTH)).collect();
@@ -142,7 +142,10 @@ fn delay_words(delay: &DelayFigures) -> String {
 fn bound_words(delay: &DelayFigures, figures: &NetworkFigures) -> String {
     let bound = i64::try_from(delay.alignment_bound_ns).unwrap_or(i64::MAX);
     match (bound, delay.is_bound_wider) {
-        (0, _) => format!("{} messages; one clock, no error of alignment", grouped(delay.count)),
+        (0, _) => format!(
+            "{} messages; one clock, no error of alignment",
+            grouped(delay.count)
+        ),
         (_, false) => format!(
             "{} messages, each within ±{} by the clocks' alignment",
             grouped(delay.count),
@@ -357,8 +360,10 @@ fn correlations(canvas: &mut Canvas, tests: &CorrelationTests) {
             )
         })
     } else {
-        let hidden = found.len().saturating_sub(PAIRS_SHOWN_COUNT);
-        format!("{hidden} more pairs beyond chance, {others} not.")
+        match found.len().saturating_sub(PAIRS_SHOWN_COUNT) {
+            0 => format!("The other {others} pairs of series do not correlate beyond chance."),
+            hidden => format!("{hidden} more pairs correlate beyond chance, {others} do not."),
+        }
     };
     if !tests.constant.is_empty() {
         let count = tests.constant.len();

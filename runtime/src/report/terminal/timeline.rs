@@ -17,11 +17,11 @@ pub(super) fn timeline(canvas: &mut Canvas, all: &Timeline) {
         return;
     };
     let whole_s = all.step_s * step_count as f64;
-    let name_width = if canvas.width() < 100 { 16 } else { 20 };
+    let name_width = if canvas.width() < 100 { 18 } else { 20 };
     let room = canvas.width() - INDENT - name_width - WHAT_WIDTH - SCALE_WIDTH - 2;
     let column_s = whole_s / room as f64;
     let aside = format!(
-        "{} a column; each row scaled to its own largest value, · where there was none",
+        "{} a column, each row to its own largest value, · none",
         duration_s(column_s)
     );
     canvas.heading("Timeline", &aside);
@@ -34,7 +34,11 @@ pub(super) fn timeline(canvas: &mut Canvas, all: &Timeline) {
             // A robot's rows have names of their own.
             format!("{} ", left(&row.what, name_width + WHAT_WIDTH - 1))
         } else {
-            format!("{}{}", left(name, name_width), left(&row.what, WHAT_WIDTH))
+            format!(
+                "{} {}",
+                left(name, name_width - 1),
+                left(&row.what, WHAT_WIDTH)
+            )
         };
         let tone = if is_robot { Tone::Bad } else { Tone::Bar };
         let line = format!(
@@ -70,8 +74,10 @@ fn strip(values: &[Option<f64>], width: usize) -> String {
     let largest = values.iter().flatten().copied().fold(0.0, f64::max);
     let column = |index: usize| {
         let from = index * values.len() / width;
-        let until = ((index + 1) * values.len()).div_ceil(width).max(from + 1);
-        let within = values.get(from..until.min(values.len())).unwrap_or_default();
+        let until = ((index + 1) * values.len() / width).max(from + 1);
+        let within = values
+            .get(from..until.min(values.len()))
+            .unwrap_or_default();
         match within.iter().flatten().copied().reduce(f64::max) {
             None => '·',
             Some(value) if value > 0.0 => LEVELS[level(value / largest)],
@@ -124,7 +130,9 @@ mod tests {
             of: of.to_owned(),
             what: what.to_owned(),
             unit: unit.to_owned(),
-            values: (0..120).map(|step| Some(if step == at { value } else { 0.0 })).collect(),
+            values: (0..120)
+                .map(|step| Some(if step == at { value } else { 0.0 }))
+                .collect(),
         };
         let all = Timeline {
             step_s: 0.1,
@@ -139,11 +147,20 @@ mod tests {
             timeline(&mut canvas, &all);
             let page = canvas.finish();
             let rows: Vec<&str> = page.lines().collect();
-            assert!(rows.iter().all(|row| row.chars().count() <= width), "{page}");
+            assert!(
+                rows.iter().all(|row| row.chars().count() <= width),
+                "{page}"
+            );
             let place = |row: &str| row.chars().position(|c| c == '█').unwrap();
-            assert!(place(rows[2]) < place(rows[3]) && place(rows[3]) < place(rows[4]), "{page}");
+            assert!(
+                place(rows[2]) < place(rows[3]) && place(rows[3]) < place(rows[4]),
+                "{page}"
+            );
             assert!(rows[4].contains("error of the cart's speed"), "{page}");
-            assert!(rows[3].ends_with("812 ms") && rows[5].contains("6.000 s"), "{page}");
+            assert!(
+                rows[3].ends_with("812 ms") && rows[5].contains("6.000 s"),
+                "{page}"
+            );
         }
     }
 }
