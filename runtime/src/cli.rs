@@ -5,6 +5,8 @@ use std::path::PathBuf;
 
 use clap::{ArgGroup, Args, Parser, Subcommand};
 
+use crate::trace::cli::TraceCommand;
+
 const EXAMPLES: &str = "\
 Examples:
   hil-runtime --topology deploy/topologies/local.toml
@@ -203,6 +205,12 @@ pub enum Command {
         /// Print JSON instead of text.
         #[arg(long)]
         json: bool,
+    },
+    /// Describe, fit, plot and convert link traces.
+    Trace {
+        /// What to do with them.
+        #[command(subcommand)]
+        command: TraceCommand,
     },
     /// Say what this host can measure and what to change.
     #[command(

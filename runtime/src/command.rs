@@ -28,6 +28,7 @@ use crate::run_folder::RunFolder;
 use crate::signals::{EXIT_INTERRUPTED, Signals};
 use crate::supervisor::{self, Outcome, PeerError, RunError, RunOptions, RunResult};
 use crate::topology::{self, HOST_VARIABLE, HostChoice, MachineIdentity, Topology, which_host};
+use crate::trace;
 
 /// Exit codes, as `--help` lists them (after `sysexits.h`, which systemd knows).
 mod exit {
@@ -81,6 +82,11 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
         Command::Calibrate(args) => case_work::calibrate(args, registry),
         Command::Replay { run, json } => case_work::replay(&run, json, registry, console),
         Command::Report { run, json } => show_report(&run, json, console),
+        Command::Trace { command } => match trace::work::work(command, columns(), console) {
+            trace::work::End::Done => exit::RAN,
+            trace::work::End::Failed => exit::FAILED,
+            trace::work::End::Refused => exit::USAGE,
+        },
         Command::Doctor { strict, json } => {
             let worst = examine(json, console);
             if strict && worst == doctor::State::Problem {
@@ -139,6 +145,10 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
     let Some(topology) = load(path, &args.overrides, registry, console) else {
         return exit::USAGE;
     };
+    if let Err(error) = trace::source::check(&topology) {
+        console.error(&error.to_string());
+        return exit::USAGE;
+    }
     if args.check {
         console.result(&format!(
             "{}: the file is valid; it comes to\n\n{}",

@@ -44,6 +44,7 @@ mod simulate;
 mod study;
 pub mod supervisor;
 pub mod topology;
+pub mod trace;
 pub mod wait;
 
 use std::process::ExitCode;

@@ -12,6 +12,8 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use hil_models::case_study::Score;
+use hil_models::link::LinkModel;
+use hil_models::link::trace::{ReplayCounts, ReplayTally};
 use hil_models::measure::account::OutageFigures;
 use hil_models::plot::PlotSeries;
 use hil_models::simulation::{Carrier, Simulation, SimulationResult};
@@ -62,6 +64,8 @@ pub(crate) struct Simulated {
     case: Box<dyn Case>,
     result: SimulationResult,
     score: Score,
+    /// Of every channel that replays a trace, what it met.
+    replays: BTreeMap<String, ReplayTally>,
     /// Of every channel that a link model carried.
     outages: Vec<OutageStory>,
     events: ScoreEvents,
@@ -93,7 +97,10 @@ pub(crate) fn simulate(
     }
     let mut watches = Vec::new();
     let mut carriers: BTreeMap<String, Box<dyn Carrier>> = BTreeMap::new();
-    for (name, carrier) in link_models(topology).map_err(refused)? {
+    let mut replays = BTreeMap::new();
+    for (name, link) in link_models(topology).map_err(refused)? {
+        replays.extend(link.replay_tally().map(|tally| (name.clone(), tally)));
+        let carrier: Box<dyn Carrier> = Box::new(link);
         let (carrier, watch) = Watch::over(carrier);
         watches.push((name.clone(), watch));
         carriers.insert(name, carrier);
@@ -127,16 +134,17 @@ pub(crate) fn simulate(
         case,
         result,
         score,
+        replays,
         outages,
     })
 }
 
 /// A channel's name and what carries it.
-type NamedCarrier = (String, Box<dyn Carrier>);
+type NamedLink = (String, Box<dyn LinkModel>);
 
 /// The link models of the channels that cross a link.
-fn link_models(topology: &Topology) -> Result<Vec<NamedCarrier>, String> {
-    let mut carriers: Vec<NamedCarrier> = Vec::new();
+fn link_models(topology: &Topology) -> Result<Vec<NamedLink>, String> {
+    let mut carriers: Vec<NamedLink> = Vec::new();
     for crossing in topology.crossings() {
         let name = &crossing.channel.name;
         let emulation = EmulationLaunch::of(&crossing, topology.run().seed).ok_or_else(|| {
@@ -149,7 +157,7 @@ fn link_models(topology: &Topology) -> Result<Vec<NamedCarrier>, String> {
         })?;
         // Virtual time begins with the run.
         let link = emulation.model(name).map_err(|error| error.to_string())?;
-        carriers.push((name.clone(), Box::new(link)));
+        carriers.push((name.clone(), link));
     }
     Ok(carriers)
 }
@@ -225,6 +233,9 @@ impl Simulated {
         for (name, count) in &self.result.recorded_counts {
             let _infallible = writeln!(text, "  {name:<18} recorded  {count:>8}");
         }
+        for (name, tally) in &self.replays {
+            text.push_str(&replay_line(name, &tally.counts()));
+        }
         for (name, figures) in self.outage_figures() {
             text.push_str(&terminal::render_outages(name, &figures, columns, style));
         }
@@ -255,6 +266,10 @@ impl Simulated {
             ((*name).to_owned(), counts)
         });
         let outages: BTreeMap<&str, OutageFigures> = self.outage_figures().collect();
+        let replays = self.replays.iter();
+        let replays: BTreeMap<&str, ReplayCounts> = replays
+            .map(|(name, tally)| (name.as_str(), tally.counts()))
+            .collect();
         let document = serde_json::json!({
             "name": self.topology_name,
             "seed": self.seed,
@@ -262,6 +277,7 @@ impl Simulated {
             "channels": channels.collect::<serde_json::Map<_, _>>(),
             "recorded_counts": self.result.recorded_counts,
             "outages": outages,
+            "trace_replays": replays,
             "score": self.score,
             "score_events": self.events,
             "network": self.network,
@@ -273,6 +289,28 @@ impl Simulated {
         let stories = self.outages.iter();
         stories.filter_map(|story| Some((story.channel.as_str(), story.figures()?)))
     }
+}
+
+/// What a channel met of its trace.
+fn replay_line(name: &str, counts: &ReplayCounts) -> String {
+    let mut text = format!(
+        "  {name:<18} met {} of {} records of its trace: {} delivered, {} lost",
+        counts.met_count, counts.record_count, counts.delivered_count, counts.lost_count
+    );
+    for (count, what) in [
+        (counts.unknown_count, "of unknown fate, taken as lost"),
+        (counts.beyond_end_count, "after its end"),
+        (
+            counts.negative_delay_count,
+            "with a delay below zero, taken as zero",
+        ),
+    ] {
+        if count > 0 {
+            let _infallible = write!(text, ", {count} {what}");
+        }
+    }
+    text.push('\n');
+    text
 }
 
 /// Width of `report.txt`.

@@ -27,6 +27,9 @@ pub struct EmulatedSettings {
     /// milliseconds if the thread was held up in between, and a datagram would be early by as
     /// much. `None` trusts `now`, as virtual time does.
     pub clock: Option<fn() -> Instant>,
+    /// Which message of its channel a datagram belongs to; `None` where nobody can tell. Only a
+    /// recorded trace asks.
+    pub number_of: Option<fn(&[u8]) -> Option<u64>>,
 }
 
 impl Default for EmulatedSettings {
@@ -36,6 +39,7 @@ impl Default for EmulatedSettings {
             capacity_count: 1024,
             datagram_bytes_max: 1472,
             clock: None,
+            number_of: None,
         }
     }
 }
@@ -50,6 +54,7 @@ pub struct EmulatedReceiver<R> {
     is_exempt: fn(&[u8]) -> bool,
     datagram_bytes_max: usize,
     clock: Option<fn() -> Instant>,
+    number_of: Option<fn(&[u8]) -> Option<u64>>,
     /// One buffer per place and a last one for arrivals that find no place.
     storage: Box<[u8]>,
     held: Box<[Option<Received>]>,
@@ -76,6 +81,7 @@ impl<R: DatagramReceiver> EmulatedReceiver<R> {
             capacity_count,
             datagram_bytes_max,
             clock,
+            number_of,
         } = settings;
         assert!(
             capacity_count > 0 && datagram_bytes_max > 0,
@@ -88,6 +94,7 @@ impl<R: DatagramReceiver> EmulatedReceiver<R> {
             is_exempt,
             datagram_bytes_max,
             clock,
+            number_of,
             storage: storage.into_boxed_slice(),
             held: vec![None; capacity_count].into_boxed_slice(),
             free: (0..capacity_count).rev().collect(),
@@ -137,7 +144,13 @@ impl<R: DatagramReceiver> EmulatedReceiver<R> {
         }
         // The model is asked even when there is no room, so that the fate of the n-th datagram
         // does not depend on how full we were.
-        let fate = self.link.offer(arrived, received.length_bytes);
+        let number = self.number_of.and_then(|number_of| number_of(datagram));
+        let fate = match number {
+            Some(number) => self
+                .link
+                .offer_numbered(arrived, received.length_bytes, number),
+            None => self.link.offer(arrived, received.length_bytes),
+        };
         let Some(due) = fate.arrival() else {
             self.counters.link_lost_count += 1;
             return;
@@ -278,6 +291,7 @@ mod tests {
             capacity_count,
             datagram_bytes_max: 16,
             clock: None,
+            number_of: None,
         };
         let is_handshake = |datagram: &[u8]| datagram.first() == Some(&b'h');
         let receiver = EmulatedReceiver::new(inner, Box::new(link), is_handshake, settings);

@@ -11,9 +11,11 @@ pub mod outages;
 pub mod rate;
 pub mod reordering;
 pub mod spec;
+pub mod trace;
 
 use core::fmt::Debug;
 
+use self::trace::ReplayTally;
 use crate::time::Instant;
 
 /// What happens to one offered message.
@@ -56,6 +58,18 @@ pub trait LinkModel: Debug + Send {
     /// non-decreasing `now`.
     fn offer(&mut self, now: Instant, length_bytes: usize) -> Fate;
 
+    /// As [`LinkModel::offer`], told which message of its channel it is, counted from 0: what a
+    /// recorded trace goes by. To other models it is one message like the next.
+    fn offer_numbered(&mut self, now: Instant, length_bytes: usize, number: u64) -> Fate {
+        let _ = number;
+        self.offer(now, length_bytes)
+    }
+
+    /// What the replay of a trace met so far; `None` for a model that replays none.
+    fn replay_tally(&self) -> Option<ReplayTally> {
+        None
+    }
+
     /// What the messages lost so far were lost to; `None` for a model that does not tell causes
     /// apart.
     fn loss_causes(&self) -> Option<LossCauses> {
@@ -66,6 +80,14 @@ pub trait LinkModel: Debug + Send {
 impl<L: LinkModel + ?Sized> LinkModel for Box<L> {
     fn offer(&mut self, now: Instant, length_bytes: usize) -> Fate {
         (**self).offer(now, length_bytes)
+    }
+
+    fn offer_numbered(&mut self, now: Instant, length_bytes: usize, number: u64) -> Fate {
+        (**self).offer_numbered(now, length_bytes, number)
+    }
+
+    fn replay_tally(&self) -> Option<ReplayTally> {
+        (**self).replay_tally()
     }
 
     fn loss_causes(&self) -> Option<LossCauses> {

@@ -27,6 +27,7 @@ use crate::report::terminal::{self, Style};
 use crate::series;
 use crate::supervisor::RunResult;
 use crate::topology::Topology;
+use crate::trace::capture;
 
 /// Why no summary could be made.
 #[derive(Debug, thiserror::Error)]
@@ -76,6 +77,7 @@ pub(crate) fn conclude(
         .iter()
         .map(|channel| channel_summary(topology, result, channel, &records))
         .collect();
+    capture::write(&mut summary, (topology, result), &records);
     summary.faces = faces::face_summaries(topology, result, &records);
     let outages = add_outages(&mut summary, (topology, result), &records);
     let case = registry.make_case(topology)?;

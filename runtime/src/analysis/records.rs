@@ -8,16 +8,19 @@ use std::time::Duration;
 
 use hil_models::measure::account::{
     AccountContext, ChannelAccount, ChannelPath, ChannelRecords, FLIGHT_TIME_MAX, Interruption,
-    MessageStory, Outage, PathProcess, RunSpan, account, outages, stories,
+    MessageStory, Outage, PathProcess, RunSpan, TooManyMessages, TraceChannel, account, link_trace,
+    outages, stories,
 };
 use hil_models::measure::record::{
     EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
 };
 use hil_models::run_log::{LoggedMessage, RunLog};
 use hil_models::time::{Alignment, Instant};
+use hil_models::trace::TraceRecord;
 
 use super::AnalysisError;
 use crate::face::record::{FaceReceivedRecord, FaceSentRecord};
+use crate::process::launch::EmulationLaunch;
 use crate::record::{RecordFile, RecordFileError, RecordKind};
 use crate::report::summary::RecordedFigures;
 use crate::supervisor::RunResult;
@@ -164,6 +167,21 @@ impl RunRecords {
         })
     }
 
+    /// What the link of `channel` did to every message.
+    ///
+    /// # Errors
+    /// When there are more than a trace holds.
+    pub(crate) fn link_trace(
+        &self,
+        run: (&Topology, &RunResult),
+        channel: &Channel,
+        traced: TraceChannel,
+    ) -> Result<Vec<TraceRecord>, TooManyMessages> {
+        self.consult(run, channel, |records, context| {
+            link_trace(records, context, traced)
+        })
+    }
+
     /// Asks something of the records of `channel` and of what the run knows about its way.
     pub(super) fn consult<T>(
         &self,
@@ -187,8 +205,8 @@ impl RunRecords {
         };
         // A link that delays on purpose keeps messages under way for that much longer.
         let delay = crossing
-            .and_then(|crossing| crossing.spec)
-            .map(|spec| spec.flight_time(FLIGHT_QUANTILE));
+            .and_then(|crossing| EmulationLaunch::of(&crossing, topology.run().seed))
+            .map(|emulation| emulation.flight_time(FLIGHT_QUANTILE));
         let round_trips = files.round_trips.values();
         let round_trips_ns: Vec<i64> = round_trips.map(RoundTripRecord::rtt_ns).collect();
         let context = AccountContext {

@@ -205,7 +205,7 @@ fn emulated_capacity(emulation: &EmulationLaunch) -> usize {
         reason = "a checked mean is at most an hour, and what is above the bound is cut"
     )]
     let held_count = ((1000.0 * held_s) as usize).min(HELD_COUNT_MAX);
-    let under_way = emulation.spec.flight_time(1.0 - 1e-6).as_millis() as usize * 4;
+    let under_way = emulation.flight_time(1.0 - 1e-6).as_millis() as usize * 4;
     EmulatedSettings::default().capacity_count + under_way + held_count
 }
 
@@ -227,6 +227,7 @@ fn emulate(
         capacity_count: emulated_capacity(emulation),
         datagram_bytes_max: launch.socket.path_mtu_bytes,
         clock: Some(MonotonicClock::now),
+        number_of: Some(message_number),
     };
     let is_exempt =
         |bytes: &[u8]| wire::decode(bytes).is_ok_and(|datagram| datagram.header.kind != Kind::Data);
@@ -238,6 +239,12 @@ fn emulate(
     )))
 }
 
+/// Which message of its channel a datagram carries, or a part of.
+fn message_number(bytes: &[u8]) -> Option<u64> {
+    let header = wire::decode(bytes).ok()?.header;
+    (header.kind == Kind::Data).then_some(header.sequence)
+}
+
 /// A link on a clock that reads zero when the run starts, as it does in virtual time; before the
 /// start it stands still. A gateway that is started again thus goes on where it was.
 #[derive(Debug)]
@@ -246,14 +253,15 @@ struct SinceStart<L> {
     start: RunStart,
 }
 
-impl<L: LinkModel> LinkModel for SinceStart<L> {
-    fn offer(&mut self, now: Instant, length_bytes: usize) -> Fate {
+impl<L: LinkModel> SinceStart<L> {
+    /// Asks the link on its own clock.
+    fn ask(&mut self, now: Instant, offer: impl FnOnce(&mut L, Instant) -> Fate) -> Fate {
         let elapsed = self
             .start
             .get()
             .map_or(Duration::ZERO, |start| now.saturating_duration_since(start));
         let offered = Instant::ZERO + elapsed;
-        match self.link.offer(offered, length_bytes) {
+        match offer(&mut self.link, offered) {
             Fate::Delivered(at) => Fate::Delivered(now + at.saturating_duration_since(offered)),
             Fate::Duplicated { first, second } => Fate::Duplicated {
                 first: now + first.saturating_duration_since(offered),
@@ -261,6 +269,18 @@ impl<L: LinkModel> LinkModel for SinceStart<L> {
             },
             Fate::Lost => Fate::Lost,
         }
+    }
+}
+
+impl<L: LinkModel> LinkModel for SinceStart<L> {
+    fn offer(&mut self, now: Instant, length_bytes: usize) -> Fate {
+        self.ask(now, |link, at| link.offer(at, length_bytes))
+    }
+
+    fn offer_numbered(&mut self, now: Instant, length_bytes: usize, number: u64) -> Fate {
+        self.ask(now, |link, at| {
+            link.offer_numbered(at, length_bytes, number)
+        })
     }
 }
 
@@ -299,6 +319,7 @@ mod tests {
             link: "hop".to_owned(),
             way: Way::Forward,
             seed: 3,
+            trace: None,
         }
     }
 

@@ -5,6 +5,7 @@ use std::fs;
 use std::io;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use hil_models::case_study::ParameterError;
 use hil_models::link::LinkModel;
@@ -14,6 +15,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::realtime::RealtimeRequest;
 use crate::topology::{Crossing, Direction, Timestamps};
+use crate::trace::source::{TraceFileError, TraceLaunch};
 use crate::wait::WaitMode;
 
 /// How to start one component here.
@@ -138,6 +140,19 @@ pub struct EmulationLaunch {
     pub way: Way,
     /// Seed of the run.
     pub seed: u64,
+    /// A recorded trace; with it the channel meets nothing of `spec`.
+    pub trace: Option<TraceLaunch>,
+}
+
+/// Why a link cannot be emulated.
+#[derive(Debug, thiserror::Error)]
+pub enum EmulationError {
+    /// A number is outside its range.
+    #[error(transparent)]
+    Parameter(#[from] ParameterError),
+    /// The trace cannot be replayed.
+    #[error(transparent)]
+    Trace(#[from] TraceFileError),
 }
 
 impl EmulationLaunch {
@@ -151,25 +166,42 @@ impl EmulationLaunch {
                 Direction::Backward => Way::Backward,
             },
             seed,
+            trace: crossing
+                .link
+                .emulation()
+                .and_then(|emulation| emulation.trace.as_ref()?.launch(&crossing.channel.name)),
         })
     }
 
     /// The model of one channel, on a clock that reads zero when the run starts.
     ///
     /// # Errors
-    /// When a number is outside its range.
-    pub fn model(&self, channel: &str) -> Result<Box<dyn LinkModel>, ParameterError> {
-        self.spec.build(&LinkPlace {
+    /// When a number is outside its range, or the trace cannot be replayed.
+    pub fn model(&self, channel: &str) -> Result<Box<dyn LinkModel>, EmulationError> {
+        if let Some(trace) = &self.trace {
+            return Ok(Box::new(trace.model()?));
+        }
+        let model = self.spec.build(&LinkPlace {
             seed: self.seed,
             link: &self.link,
             channel,
             way: self.way,
-        })
+        })?;
+        Ok(model)
+    }
+
+    /// How long all but a share of 1 - `quantile` of the messages are under way at most.
+    pub fn flight_time(&self, quantile: f64) -> Duration {
+        let traced = self.trace.as_ref().and_then(TraceLaunch::delay_max);
+        traced.unwrap_or_else(|| self.spec.flight_time(quantile))
     }
 
     /// The model in words.
     pub fn describe(&self) -> String {
-        self.spec.describe()
+        match &self.trace {
+            Some(trace) => trace.describe(),
+            None => self.spec.describe(),
+        }
     }
 }
 

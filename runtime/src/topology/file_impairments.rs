@@ -14,6 +14,7 @@ use hil_models::link::reordering::{Duplication, Reordering};
 use hil_models::link::spec::LinkSpec;
 
 use super::errors::Fault;
+use super::file_trace::read_trace;
 use super::limits::{self, Limit};
 use super::model_links::Emulation;
 use super::reader::Reader;
@@ -29,6 +30,7 @@ pub(super) const EMULATION_KEYS: &[&str] = &[
     "forward",
     "backward",
     "outages",
+    "trace",
 ];
 
 #[derive(Debug, Clone, Copy)]
@@ -84,6 +86,7 @@ pub(super) fn read_emulation(reader: &mut Reader<'_>) -> Emulation {
     Emulation {
         forward: direction("forward"),
         backward: direction("backward"),
+        trace: read_trace(reader),
     }
 }
 

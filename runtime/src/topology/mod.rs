@@ -19,6 +19,7 @@ mod face;
 mod file;
 mod file_impairments;
 mod file_links;
+mod file_trace;
 mod host;
 mod known;
 mod layers;
@@ -148,6 +149,7 @@ fn read_and_check(
         let file = file::read(&table, top, &layers.faults);
         check::check(file, known, needs, &layers.faults)
     };
+    let topology = topology.with_traces_beside(path);
     if layers.faults.is_empty() {
         Ok(topology)
     } else {

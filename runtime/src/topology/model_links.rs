@@ -2,11 +2,13 @@
 //! no file and opens no socket.
 
 use core::fmt;
+use std::path::Path;
 
 use hil_models::link::spec::LinkSpec;
 use serde::{Deserialize, Serialize};
 
-use super::model::{Execution, OnExit, words};
+use super::model::{Execution, OnExit, Topology, words};
+use crate::trace::source::{BaseFolder, TraceSource};
 
 /// One `[links.<name>]`.
 #[derive(Debug, Clone, PartialEq)]
@@ -18,6 +20,21 @@ pub struct Link {
     /// Its two hosts; forward is from the first to the second. `None` while no channel uses it
     /// and the file does not say.
     pub between: Option<[String; 2]>,
+}
+
+impl Topology {
+    /// The same with its traces looked for beside the file at `path`.
+    pub(super) fn with_traces_beside(mut self, path: &Path) -> Self {
+        let folder = path.parent().unwrap_or(Path::new(""));
+        for link in &mut self.links {
+            if let Via::Emulated(_, emulation) = &mut link.via
+                && let Some(trace) = &mut emulation.trace
+            {
+                trace.base = BaseFolder(folder.to_owned());
+            }
+        }
+        self
+    }
 }
 
 impl Link {
@@ -118,6 +135,8 @@ pub struct Emulation {
     pub forward: LinkSpec,
     /// From the second to the first.
     pub backward: LinkSpec,
+    /// Recorded traces: a channel that has one meets nothing of the above.
+    pub trace: Option<TraceSource>,
 }
 
 words!(Timestamps { Off = "off", Software = "software", Hardware = "hardware" });

@@ -6,6 +6,7 @@ use core::time::Duration;
 use serde::Serialize;
 use toml::{Table, Value};
 
+use super::file_trace::resolved_trace;
 use super::model::{Channel, Execution, Host, OnExit, Process, Program, Scheduling, Topology};
 use super::model_links::{Gateway, Hop, Link, Via};
 use super::resolved_impairments::{resolved_outages, resolved_spec};
@@ -208,6 +209,9 @@ fn resolved_link(link: &Link) -> Table {
             put(&mut table, "backward", resolved_spec(&emulation.backward));
             let outages = resolved_outages(emulation.forward.outages);
             put(&mut table, "outages", outages);
+            if let Some(trace) = &emulation.trace {
+                put(&mut table, "trace", resolved_trace(trace));
+            }
         }
     }
     table

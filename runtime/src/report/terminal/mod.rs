@@ -8,10 +8,12 @@ mod network;
 mod outages;
 mod tables;
 mod timeline;
+mod trace;
 mod units;
 
 pub use canvas::Style;
 pub(crate) use canvas::{shortened, wrapped};
+pub(crate) use trace::{render_fit, render_trace, render_trace_plots};
 pub(crate) use units::{JOINT, duration_s, grouped, percent, seconds};
 
 use hil_models::measure::account::OutageFigures;
