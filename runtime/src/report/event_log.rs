@@ -49,10 +49,8 @@ fn line(event: &ExplainedEvent, clocks_differ: bool) -> String {
         line.push_str(" | ");
         line.push_str(&outage.words);
     }
-    if let Some(network) = &event.network {
-        if network.events.is_empty() {
-            line.push_str(&[" | ", &network.nothing_words()].concat());
-        }
+    if let Some(network) = event.network.as_ref().filter(|one| one.events.is_empty()) {
+        line.push_str(&[" | ", &network.nothing_words()].concat());
     }
     for one in event.network_beside() {
         line.push_str(&[" | ", &one.words].concat());

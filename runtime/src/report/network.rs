@@ -273,16 +273,11 @@ impl TestedPair {
     /// The pair in words, of `count` pairs and `shuffle_count` turns.
     pub(crate) fn words(&self, count: usize, shuffle_count: u64) -> String {
         let (robot, network, channel) = (&self.robot, &self.network, &self.channel);
-        let how = if self.correlation.lag_bins > 0 {
-            format!(
-                "follows the {network} on {channel} by {}",
-                duration_s(self.lag_s)
-            )
-        } else if self.correlation.lag_bins < 0 {
-            let lead = duration_s(-self.lag_s);
-            format!("precedes the {network} on {channel} by {lead}")
-        } else {
-            format!("goes with the {network} on {channel} in the same bin")
+        let by = duration_s(self.lag_s.abs());
+        let how = match self.correlation.lag_bins {
+            1.. => format!("follows the {network} on {channel} by {by}"),
+            0 => format!("goes with the {network} on {channel} in the same bin"),
+            _ => format!("precedes the {network} on {channel} by {by}"),
         };
         let PairCorrelation {
             coefficient,

@@ -24,9 +24,9 @@ fn passages(seed: u64, has_clock: bool) -> Vec<Passage> {
         let offered_ns = i64::try_from(sequence).unwrap() * 8 * MS;
         let ms = offered_ns / MS;
         let is_lost = (3_600..4_400).contains(&ms) || (15_000..15_300).contains(&ms);
-        let noise_us = random.uniform() * 600.0;
+        let noise = random.uniform();
         #[allow(clippy::cast_possible_truncation, reason = "below 600 µs")]
-        let noise_ns = (noise_us * 1e3) as i64;
+        let noise_ns = (noise * 600e3) as i64;
         let late_ns = if (11_000..11_040).contains(&ms) {
             25 * MS
         } else {

@@ -59,6 +59,7 @@ mod tests {
 
     #[test]
     fn losses_of_the_host_are_kept_apart_from_those_of_the_network() {
+        use Crossing::{Arrived, LostByHost, LostByNetwork};
         use MessageFate as Fate;
         let mut files = Files::default();
         for (sequence, fate) in (0_u64..).zip([
@@ -74,7 +75,6 @@ mod tests {
         }
         let found = passages(&files.records(), &same_clock(1_000_000_000));
         let crossings: Vec<_> = found.iter().map(|one| one.crossing).collect();
-        use Crossing::{Arrived, LostByHost, LostByNetwork};
         assert_eq!(
             crossings,
             [

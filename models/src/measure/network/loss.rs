@@ -240,7 +240,7 @@ fn wilson_of(share: f64, n: f64) -> Interval {
 }
 
 fn bursts(runs: &[LossRun], of_count: u64, lost_count: u64) -> Option<BurstFigures> {
-    let (mut count, mut length, mut lost) = (0_u64, 0_u64, 0_u64);
+    let (mut count, mut length, mut lost_in_bursts) = (0_u64, 0_u64, 0_u64);
     for cluster in clusters(runs) {
         let lost_here: u64 = cluster.iter().map(|run| run.lost_count).sum();
         let (first, last) = cluster.first().zip(cluster.last())?;
@@ -248,17 +248,17 @@ fn bursts(runs: &[LossRun], of_count: u64, lost_count: u64) -> Option<BurstFigur
             continue;
         }
         count += 1;
-        lost += lost_here;
+        lost_in_bursts += lost_here;
         length += last.place + last.lost_count - first.place;
     }
     let rest = of_count.saturating_sub(length) as f64;
     (count > 0).then(|| BurstFigures {
         count,
         length_mean: length as f64 / count as f64,
-        loss_ratio: lost as f64 / length as f64,
+        loss_ratio: lost_in_bursts as f64 / length as f64,
         gap_length_mean: rest / count as f64,
         gap_loss_ratio: if rest > 0.0 {
-            lost_count.saturating_sub(lost) as f64 / rest
+            lost_count.saturating_sub(lost_in_bursts) as f64 / rest
         } else {
             0.0
         },

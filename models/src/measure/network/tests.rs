@@ -44,7 +44,7 @@ fn passages(count: u64, is_lost: impl Fn(u64) -> bool) -> Vec<Passage> {
 
 fn figures(passages: &[Passage]) -> NetworkFigures {
     let context = NetworkContext {
-        run_ns: Some((0, passages.len() as i64 * PERIOD_NS)),
+        run_ns: Some((0, i64::try_from(passages.len()).unwrap() * PERIOD_NS)),
         payload_bytes: Some(64),
         duplicated_count: Some(0),
         round_trips_ns: &[4_000_000],
@@ -80,7 +80,14 @@ fn delays_and_their_variation_are_those_that_were_put_in() {
 
 #[test]
 fn jitter_approaches_the_difference_that_every_message_has() {
-    let delay = |sequence: u64| DELAY_NS + if sequence % 2 == 0 { 0 } else { 160_000 };
+    let delay = |sequence: u64| {
+        DELAY_NS
+            + if sequence.is_multiple_of(2) {
+                0
+            } else {
+                160_000
+            }
+    };
     let all: Vec<_> = (0..2_000).map(|one| arrived(one, delay(one))).collect();
     let jitter = figures(&all).successive.measured().unwrap().jitter;
     assert!((jitter.max_ns - 160_000.0).abs() < 1.0, "{jitter:?}");

@@ -1,6 +1,8 @@
 //! The network of a run: a table of all channels, then the figures of each with their intervals;
 //! and what preceded what. Figures are not computed here.
 
+use core::fmt::Write;
+
 use hil_models::measure::network::{
     DelayFigures, DelayQuantile, Figure, LossFigures, NetworkFigures, SuccessiveVariation,
 };
@@ -204,13 +206,13 @@ fn loss_words(loss: &LossFigures) -> String {
     let bounds = |interval: hil_models::measure::statistics::Interval| {
         format!("[{}, {}]", percent(interval.low), percent(interval.high))
     };
-    let (lost, of) = (grouped(loss.lost_count), grouped(loss.of_count));
+    let (count, of) = (grouped(loss.lost_count), grouped(loss.of_count));
     if loss.lost_count == 0 {
         let high = percent(loss.interval.high);
         return format!("none of {of}; below {high} if losses were independent");
     }
     format!(
-        "{lost} of {of}: {} {}; bursts leave as much as {} independent messages would tell (if all \
+        "{count} of {of}: {} {}; bursts leave as much as {} independent messages would tell (if all \
          were: {})",
         percent(loss.ratio),
         bounds(loss.interval),
@@ -235,23 +237,24 @@ fn runs_words(loss: &LossFigures) -> String {
     let mut text = shown.join(", ");
     let hidden = loss.runs.len().saturating_sub(RUNS_SHOWN_COUNT);
     if hidden > 0 {
-        text.push_str(&format!(", {hidden} shorter lengths"));
+        let _infallible = write!(text, ", {hidden} shorter lengths");
     }
     if let Some(longest) = loss.longest {
         let start = seconds(longest.start_ns as f64 * 1e-9);
         let open = if longest.is_open { ", to the end" } else { "" };
         let length = duration(longest.length_ns);
-        text.push_str(&format!("; longest {length} from {start}{open}"));
+        let _infallible = write!(text, "; longest {length} from {start}{open}");
     }
     if let Some(bursts) = loss.bursts {
-        text.push_str(&format!(
+        let _infallible = write!(
+            text,
             "; {} bursts (RFC 3611) of {} messages, {} of them lost, gaps of {} with {} lost",
             grouped(bursts.count),
             figure(bursts.length_mean),
             percent(bursts.loss_ratio),
             figure(bursts.gap_length_mean.round()),
-            percent(bursts.gap_loss_ratio),
-        ));
+            percent(bursts.gap_loss_ratio)
+        );
     }
     text
 }
@@ -369,18 +372,20 @@ fn correlations(canvas: &mut Canvas, tests: &CorrelationTests) {
         let count = tests.constant.len();
         let first = tests.constant.iter().take(3).cloned().collect::<Vec<_>>();
         let more = if count > 3 { ", …" } else { "" };
-        text.push_str(&format!(
+        let _infallible = write!(
+            text,
             " The same all the time, so not tested: {}{more}.",
             first.join(", ")
-        ));
+        );
     }
-    text.push_str(&format!(
+    let _infallible = write!(
+        text,
         " Bins of {}, lags from -{} to {}; {} block shuffles, seed {}.",
         duration_s(tests.bin_s),
         duration_s(tests.lead_max_s),
         duration_s(tests.lag_max_s),
         grouped(tests.shuffle_count),
         tests.seed
-    ));
+    );
     canvas.paragraph(INDENT, Tone::Faint, &text);
 }
