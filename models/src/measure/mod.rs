@@ -8,6 +8,7 @@ pub mod account;
 pub mod correlation;
 pub mod histogram;
 pub mod network;
+pub mod radio;
 pub mod record;
 pub(crate) mod series;
 pub(crate) mod special;

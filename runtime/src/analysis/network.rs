@@ -16,7 +16,7 @@ use hil_models::plot::PlotSeries;
 use hil_models::random::RandomStream;
 use hil_models::time::Instant;
 
-use super::events::start_of;
+use super::events::{start_of, start_on};
 use super::records::RunRecords;
 use crate::report::network::{
     ChannelNetwork, Correlation, CorrelationTests, FOREGOING_S, ForegoingEvent, ForegoingNetwork,
@@ -286,6 +286,13 @@ fn trouble(bin: &NetworkBin, index: usize) -> Option<f64> {
     }
 }
 
+/// True for a channel with less than a message per bin: its silence is nobody's trouble, as nobody
+/// speaks.
+fn speaks_seldom(bins: &NetworkBins) -> bool {
+    let sent_count: u64 = bins.bins.iter().map(|bin| bin.sent_count).sum();
+    sent_count < bins.bins.len() as u64
+}
+
 type RobotBins = [(RobotSeries, Vec<f64>)];
 
 fn timeline(all: &[(String, NetworkBins)], robot: &RobotBins, width_s: f64) -> Timeline {
@@ -301,6 +308,9 @@ fn timeline(all: &[(String, NetworkBins)], robot: &RobotBins, width_s: f64) -> T
     let mut rows = Vec::new();
     for (channel, bins) in all {
         for (index, (what, _, unit)) in TROUBLES.iter().enumerate() {
+            if *what == "silence" && speaks_seldom(bins) {
+                continue;
+            }
             let values = bins.bins.iter().map(|bin| trouble(bin, index));
             rows.push(row(channel, what, unit, values.collect()));
         }
@@ -323,7 +333,10 @@ fn correlate(
     let mut names = Vec::new();
     let mut causes = Vec::new();
     for (channel, bins) in all {
-        for (index, (_, network, _)) in TROUBLES.iter().enumerate() {
+        for (index, (what, network, _)) in TROUBLES.iter().enumerate() {
+            if *what == "silence" && speaks_seldom(bins) {
+                continue;
+            }
             let mut held = 0.0;
             let values = bins.bins.iter().map(|bin| {
                 // What is unknown where nothing arrived goes on as it was.
@@ -400,11 +413,12 @@ pub(super) fn of_run(
         }
     }
     let errors = errors.into_iter().filter_map(|one| {
-        let start = start_of(run, topology.channel(one.clock_of)?)?;
+        let start = start_of(run, topology.channel(one.clock_of)?, records.clocks())?;
         Some(RobotSeries::of(one, start))
     });
     let seed = topology.run().seed;
-    builder.finish(score, errors.collect(), (seed, !result.has_one_clock))
+    let clocks_differ = !records.clocks().are_aligned(result.spans.keys());
+    builder.finish(score, errors.collect(), (seed, clocks_differ))
 }
 
 fn add_channel(
@@ -419,19 +433,17 @@ fn add_channel(
         let host = topology.process(process).map(|process| &process.host);
         host.map_or("", |host| host.as_str())
     });
-    let producer_start = start_of(run, channel)?;
-    let (own_start, own_end) = *result.spans.get(hosts[1])?;
+    let [producer_start, consumer_start] =
+        hosts.map(|host| start_on(result, host, records.clocks()));
+    let (producer_start, consumer_start) = producer_start.zip(consumer_start)?;
+    let (_, consumer_end) = *result.spans.get(hosts[1])?;
     let (_, producer_end) = *result.spans.get(hosts[0])?;
     let span = SeriesSpan {
         producer_start_ns: producer_start.as_ns(),
-        consumer_start_ns: if result.has_one_clock {
-            producer_start.as_ns()
-        } else {
-            own_start.as_ns()
-        },
+        consumer_start_ns: consumer_start.as_ns(),
         duration_ns: producer_end
             .ns_since(producer_start)
-            .max(own_end.ns_since(own_start)),
+            .max(consumer_end.ns_since(consumer_start)),
     };
     let payload_bytes = records.log().raw(&channel.name).first();
     let payload_bytes = payload_bytes.map(|message| message.payload.len() as u64);

@@ -2,10 +2,12 @@
 
 mod canvas;
 mod channel;
+mod clocks;
 mod events;
 mod face;
 mod network;
 mod outages;
+mod radio;
 mod tables;
 mod timeline;
 mod trace;
@@ -38,10 +40,15 @@ pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> Strin
     }
     for channel in &summary.channels {
         channel::channel(&mut canvas, channel);
+        radio::channel(&mut canvas, summary.radio.channel(&channel.name));
     }
     for face in &summary.faces {
         face::face(&mut canvas, face);
     }
+    if let Some(section) = &summary.clocks {
+        clocks::clocks(&mut canvas, section);
+    }
+    radio::hops(&mut canvas, &summary.radio);
     tables::processes(&mut canvas, &summary.processes);
     tables::events(&mut canvas, &summary.events);
     tables::realtime(&mut canvas, &summary.realtime);

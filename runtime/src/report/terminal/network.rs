@@ -1,6 +1,7 @@
 //! The network of a run: a table of all channels, then the figures of each with their intervals;
 //! and what preceded what. Figures are not computed here.
 
+use core::cmp::Ordering;
 use core::fmt::Write;
 
 use hil_models::measure::network::{
@@ -9,7 +10,9 @@ use hil_models::measure::network::{
 
 use super::canvas::{Canvas, INDENT, Tone, left, right};
 use super::units::{JOINT, duration, duration_s, figure, grouped, percent, seconds};
-use crate::report::network::{ChannelNetwork, Correlation, CorrelationTests, NetworkReport};
+use crate::report::network::{
+    ChannelNetwork, Correlation, CorrelationTests, NetworkReport, TestedPair,
+};
 use crate::report::score_event::ScoreEvents;
 
 /// Columns of the table behind the channel's name.
@@ -353,15 +356,17 @@ fn correlations(canvas: &mut Canvas, tests: &CorrelationTests) {
     let mut text = if tests.pairs.is_empty() {
         "No pair of series to test: of each, one or both are the same all the time.".to_owned()
     } else if found.is_empty() {
-        let best = tests.pairs.iter().map(|pair| &pair.correlation);
-        let best = best.max_by(|a, b| b.p_family.total_cmp(&a.p_family));
-        best.map_or_else(String::new, |best| {
-            format!(
-                "None of {others} pairs of series correlates beyond chance (the best: \
-                 r{JOINT}={JOINT}{:.2}, p{JOINT}={JOINT}{:.3} in view of all).",
-                best.coefficient, best.p_family
-            )
-        })
+        let pairs = tests.pairs.iter();
+        let best = pairs.min_by(|a, b| {
+            let key =
+                |pair: &TestedPair| (pair.correlation.p_family, -pair.correlation.coefficient);
+            key(a).partial_cmp(&key(b)).unwrap_or(Ordering::Equal)
+        });
+        let best = best.map(|best| best.words(tests.pairs.len(), tests.shuffle_count));
+        let best = best.unwrap_or_default();
+        format!(
+            "None of {others} pairs of series correlates beyond chance. The nearest to it: {best}."
+        )
     } else {
         match found.len().saturating_sub(PAIRS_SHOWN_COUNT) {
             0 => format!("The other {others} pairs of series do not correlate beyond chance."),
