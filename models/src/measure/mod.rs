@@ -5,6 +5,7 @@
 //! robot followed, [`histogram`] and [`statistics`] turn samples into figures with intervals.
 
 pub mod account;
+pub mod card_clock;
 pub mod correlation;
 pub mod histogram;
 pub mod network;
