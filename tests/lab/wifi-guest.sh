@@ -1,7 +1,7 @@
 #!/bin/bash
 # Inside the emulated PC, as /share/run.sh: joins two simulated radios to an access point and a
 # station in two network namespaces, runs one split shuttle between them, then over a cable,
-# first plain, then with 5 ms and 2 % loss where each end sends. wifi.sh judges what it leaves in /share.
+# with 5 ms and 2 % loss where each end sends, then plain. wifi.sh judges what it leaves in /share.
 set -u
 share=/share
 # shellcheck disable=SC1091
@@ -114,10 +114,11 @@ ip netns exec sta "$work/hil-runtime" doctor >"$share/doctor.txt" 2>&1
 run_pair wifi ap sta || result=1
 ip netns exec sta iw dev wlan0 station dump >"$share/wifi/station.txt"
 cable
-run_pair plain left right || result=1
 for space in left right; do
     # shellcheck disable=SC2086,SC2154
     ip netns exec "$space" tc qdisc add dev eth0 root netem $cable || fail "no netem"
 done
 run_pair cable left right || result=1
+for space in left right; do ip netns exec "$space" tc qdisc del dev eth0 root; done
+run_pair plain left right || result=1
 exit "$result"
