@@ -20,16 +20,19 @@
 //! 5. [`realtime`], [`clock`], [`wait`], [`host_facts`], [`doctor`]: the machine.
 
 mod analysis;
+pub mod card_clock;
 mod cases;
 pub mod channel;
 pub mod cli;
 pub mod clock;
+pub mod clock_discipline;
 mod command;
 pub mod console;
 pub mod doctor;
 pub mod face;
 pub mod gateway;
 pub mod host_facts;
+pub mod probe;
 pub mod process;
 pub mod radio;
 pub mod realtime;
