@@ -1,6 +1,8 @@
 //! From the records of a finished run to its summary: reads the record files, draws up the
 //! account of each channel, and lets the case score what the robot did.
 
+mod cards;
+mod clocks;
 mod events;
 mod faces;
 mod figures;
@@ -15,6 +17,7 @@ use std::path::{Path, PathBuf};
 use hil_models::case_study::Score;
 use hil_models::measure::account::MessageFate;
 
+use clocks::HostClocks;
 use figures::{channel_summary, process_summary, realtime_facts, run_event, run_facts};
 use outages::OutageStory;
 use records::RunRecords;
@@ -55,6 +58,8 @@ pub(crate) fn conclude(
     if !result.has_one_clock {
         records.set_clocks_differ();
     }
+    let clocks = HostClocks::of(topology, result, &records);
+    records.set_clocks(clocks);
     let mut summary = RunSummary::new(run_facts(topology, result, topology_file, command_line));
     summary.host_facts = result
         .facts
@@ -65,6 +70,7 @@ pub(crate) fn conclude(
     for process in &result.processes {
         summary.processes.push(process_summary(process));
     }
+    summary.clocks = Some(records.clocks().section().clone());
     summary.realtime = realtime_facts(&result.processes);
     summary.events = result
         .events
@@ -78,6 +84,7 @@ pub(crate) fn conclude(
         .collect();
     capture::write(&mut summary, (topology, result), &records);
     summary.faces = faces::face_summaries(topology, result, &records);
+    summary.hardware_stamps = cards::hardware_stamps(topology, result, &records);
     let outages = add_outages(&mut summary, (topology, result), &records);
     let case = registry.make_case(topology)?;
     let (specs, score) = match &case {
@@ -172,13 +179,7 @@ fn add_warnings(summary: &mut RunSummary, result: &RunResult, records: &RunRecor
             ));
         }
     }
-    if !result.has_one_clock {
-        summary.warnings.push(
-            "clocks not aligned: no figure crosses from one host to the other; segments on one \
-             host and round trips are given"
-                .to_owned(),
-        );
-    }
+    summary.warnings.extend(records.clocks().warnings());
 }
 
 /// Width of `report.txt`.

@@ -2,6 +2,7 @@
 //! rendering for a terminal. It measures nothing and prints nothing; the caller writes the text.
 
 pub mod assessment;
+pub mod clock_summary;
 pub(crate) mod event_log;
 pub mod face;
 mod face_warnings;

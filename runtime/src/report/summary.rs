@@ -13,9 +13,11 @@ use hil_models::measure::account::{ChannelAccount, OutageFigures};
 use serde::{Deserialize, Serialize};
 
 use super::assessment::Assessment;
+use super::clock_summary::ClockSection;
 use super::face::FaceSummary;
 use super::radio::RadioReport;
 use super::score_event::ScoreEvents;
+use crate::card_clock::figures::HardwareStamps;
 
 /// Version of the `summary.json` layout.
 pub const SCHEMA_VERSION: u32 = 1;
@@ -31,6 +33,9 @@ pub struct RunSummary {
     pub host_facts: Vec<Fact>,
     /// What real-time settings the kernel granted and refused.
     pub realtime: RealtimeFacts,
+    /// How the hosts' clocks relate, and what that rests on.
+    #[serde(default)]
+    pub clocks: Option<ClockSection>,
     /// The processes of the run.
     pub processes: Vec<ProcessSummary>,
     /// What happened, in order of time.
@@ -40,6 +45,9 @@ pub struct RunSummary {
     /// Arms that went through a face to a foreign program.
     #[serde(default)]
     pub faces: Vec<FaceSummary>,
+    /// What the network cards stamped; `None` unless hardware stamps were asked for.
+    #[serde(default)]
+    pub hardware_stamps: Option<HardwareStamps>,
     /// What the radios of wireless hops said, and where messages were stamped.
     #[serde(default)]
     pub radio: RadioReport,
@@ -60,10 +68,12 @@ impl RunSummary {
             run,
             host_facts: Vec::new(),
             realtime: RealtimeFacts::default(),
+            clocks: None,
             processes: Vec::new(),
             events: Vec::new(),
             channels: Vec::new(),
             faces: Vec::new(),
+            hardware_stamps: None,
             radio: RadioReport::default(),
             score: Vec::new(),
             score_events: ScoreEvents::default(),

@@ -1,7 +1,9 @@
 //! Renders a summary for a terminal of 80 to 120 columns. It returns text; the caller prints it.
 
 mod canvas;
+mod cards;
 mod channel;
+mod clocks;
 mod events;
 mod face;
 mod outages;
@@ -37,6 +39,12 @@ pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> Strin
     }
     for face in &summary.faces {
         face::face(&mut canvas, face);
+    }
+    if let Some(stamps) = &summary.hardware_stamps {
+        cards::hardware_stamps(&mut canvas, stamps);
+    }
+    if let Some(section) = &summary.clocks {
+        clocks::clocks(&mut canvas, section);
     }
     radio::hops(&mut canvas, &summary.radio);
     tables::processes(&mut canvas, &summary.processes);
