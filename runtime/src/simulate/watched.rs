@@ -1,5 +1,5 @@
-//! A link model in virtual time under watch: what it does is counted, and what it loses is noted as
-//! outages. It changes nothing of what the model does.
+//! A link model in virtual time under watch: what becomes of each message is noted, and what it
+//! loses as outages. It changes nothing of what the model does.
 
 use std::cell::RefCell;
 use std::rc::Rc;
@@ -7,6 +7,7 @@ use std::rc::Rc;
 use hil_gateways::protocol::wire;
 use hil_models::link::LinkModel;
 use hil_models::measure::account::{Outage, OutageFinder};
+use hil_models::measure::network::{Crossing, Passage};
 use hil_models::message::Envelope;
 use hil_models::simulation::Carrier;
 use hil_models::time::Instant;
@@ -21,6 +22,8 @@ pub(super) struct Watch(Rc<RefCell<Seen>>);
 struct Seen {
     finder: OutageFinder,
     tally: LinkTally,
+    passages: Vec<Passage>,
+    duplicated_count: u64,
 }
 
 impl Watch {
@@ -42,6 +45,12 @@ impl Watch {
     /// What the model, which `model` describes, did so far.
     pub(super) fn figures(&self, model: &str, requested_loss_ratio: Option<f64>) -> LinkFigures {
         self.0.borrow().tally.figures(model, requested_loss_ratio)
+    }
+
+    /// The way of every message so far, and how many copies came on top.
+    pub(super) fn passages(&self) -> (Vec<Passage>, u64) {
+        let mut seen = self.0.borrow_mut();
+        (core::mem::take(&mut seen.passages), seen.duplicated_count)
     }
 }
 
@@ -70,6 +79,22 @@ impl Carrier for Watched {
         }
         let mut seen = self.watch.0.borrow_mut();
         seen.tally.count(now, fate, self.link.loss_causes());
+        seen.duplicated_count += u64::from(fate.second_arrival().is_some());
+        let arrival = fate.arrival();
+        seen.passages.push(Passage {
+            epoch_rank: envelope.epoch,
+            sequence: envelope.sequence,
+            count: 1,
+            offered_ns: Some(now.as_ns()),
+            received_ns: arrival.map(Instant::as_ns),
+            delay_ns: arrival.map(|at| at.ns_since(now)),
+            delay_bound_ns: 0,
+            crossing: if arrival.is_some() {
+                Crossing::Arrived
+            } else {
+                Crossing::LostByNetwork
+            },
+        });
         let published_ns = Some(now.as_ns());
         match fate.arrival() {
             Some(at) => seen.finder.arrived(published_ns, Some(at.as_ns())),
@@ -116,6 +141,10 @@ mod tests {
             });
         }
         assert_eq!(delivered_count, 20);
+        let (passages, duplicated_count) = watch.passages();
+        assert_eq!((passages.len(), duplicated_count), (30, 0));
+        assert_eq!(passages[9].delay_ns, Some(3_000_000));
+        assert_eq!(passages[10].crossing, Crossing::LostByNetwork);
         let outages = watch.outages();
         assert_eq!(outages.len(), 1);
         let found = outages[0];
