@@ -2,6 +2,7 @@
 //! links. It starts no process and opens no socket.
 
 mod events;
+mod link_figures;
 mod watched;
 
 use core::fmt::Write;
@@ -25,8 +26,9 @@ use crate::report::summary::ScoreMetric;
 use crate::report::terminal::{self, Style};
 use crate::run_folder::RunFolder;
 use crate::series;
-use crate::topology::{Program, Topology};
+use crate::topology::{Crossing, Program, Topology};
 
+use self::link_figures::LinkFigures;
 use self::watched::Watch;
 
 /// What the outcome is rendered as.
@@ -65,6 +67,8 @@ pub(crate) struct Simulated {
     replays: BTreeMap<String, ReplayTally>,
     /// Of every channel that a link model carried.
     outages: Vec<OutageStory>,
+    /// What each model was asked for and did, by channel.
+    links: Vec<(String, LinkFigures)>,
     events: ScoreEvents,
 }
 
@@ -92,11 +96,14 @@ pub(crate) fn simulate(
     let mut watches = Vec::new();
     let mut carriers: BTreeMap<String, Box<dyn Carrier>> = BTreeMap::new();
     let mut replays = BTreeMap::new();
-    for (name, link) in link_models(topology).map_err(refused)? {
+    for (name, emulation) in emulations(topology).map_err(refused)? {
+        // Virtual time begins with the run.
+        let link = emulation
+            .model(&name)
+            .map_err(|error| refused(error.to_string()))?;
         replays.extend(link.replay_tally().map(|tally| (name.clone(), tally)));
-        let carrier: Box<dyn Carrier> = Box::new(link);
-        let (carrier, watch) = Watch::over(carrier);
-        watches.push((name.clone(), watch));
+        let (carrier, watch) = Watch::over(link);
+        watches.push((name.clone(), emulation, watch));
         carriers.insert(name, carrier);
     }
     let roles = entry
@@ -110,9 +117,14 @@ pub(crate) fn simulate(
         .map_err(|error| refused(error.to_string()))?;
     let score = case.score(&result.log);
     let duration = topology.run().duration;
+    let links = watches.iter().map(|(name, emulation, watch)| {
+        let (words, loss_ratio) = (emulation.describe(), emulation.loss_ratio());
+        (name.clone(), watch.figures(&words, loss_ratio))
+    });
+    let links = links.collect();
     let outages: Vec<_> = watches
         .into_iter()
-        .map(|(name, watch)| events::story(name, watch.outages(), duration))
+        .map(|(name, _, watch)| events::story(name, watch.outages(), duration))
         .collect();
     Ok(Simulated {
         topology_name: topology.name().to_owned(),
@@ -124,18 +136,16 @@ pub(crate) fn simulate(
         score,
         replays,
         outages,
+        links,
     })
 }
 
-/// A channel's name and what carries it.
-type NamedLink = (String, Box<dyn LinkModel>);
-
-/// The link models of the channels that cross a link.
-fn link_models(topology: &Topology) -> Result<Vec<NamedLink>, String> {
-    let mut carriers: Vec<NamedLink> = Vec::new();
-    for crossing in topology.crossings() {
+/// What the links do to the channels that cross one, by the channel's name.
+fn emulations(topology: &Topology) -> Result<Vec<(String, EmulationLaunch)>, String> {
+    let seed = topology.run().seed;
+    let emulation = |crossing: Crossing<'_>| {
         let name = &crossing.channel.name;
-        let emulation = EmulationLaunch::of(&crossing, topology.run().seed).ok_or_else(|| {
+        let emulation = EmulationLaunch::of(&crossing, seed).ok_or_else(|| {
             format!(
                 "channel {name} crosses link {} via {}, whose delay only a real run shows; use \
                  via = \"emulated\" to simulate it",
@@ -143,11 +153,9 @@ fn link_models(topology: &Topology) -> Result<Vec<NamedLink>, String> {
                 crossing.link.via.word()
             )
         })?;
-        // Virtual time begins with the run.
-        let link = emulation.model(name).map_err(|error| error.to_string())?;
-        carriers.push((name.clone(), link));
-    }
-    Ok(carriers)
+        Ok((name.clone(), emulation))
+    };
+    topology.crossings().map(emulation).collect()
 }
 
 /// Makes sure that nothing is in the way of the files in `folder`, before anything is computed.
@@ -220,6 +228,12 @@ impl Simulated {
         for (name, count) in &self.result.recorded_counts {
             let _infallible = writeln!(text, "  {name:<18} recorded  {count:>8}");
         }
+        if !self.links.is_empty() {
+            text.push_str("\nLink models, asked and done:\n");
+        }
+        for (name, figures) in &self.links {
+            text.push_str(&figures.page(name));
+        }
         for (name, tally) in &self.replays {
             text.push_str(&replay_line(name, &tally.counts()));
         }
@@ -255,6 +269,7 @@ impl Simulated {
             "duration_s": self.duration_s,
             "channels": channels.collect::<serde_json::Map<_, _>>(),
             "recorded_counts": self.result.recorded_counts,
+            "links": self.links.iter().cloned().collect::<BTreeMap<_, _>>(),
             "outages": outages,
             "trace_replays": replays,
             "score": self.score,

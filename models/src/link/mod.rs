@@ -3,6 +3,8 @@
 
 pub mod bernoulli;
 pub mod chain;
+#[cfg(test)]
+mod chain_tests;
 pub mod delay;
 pub mod impaired;
 pub mod in_series;
@@ -15,6 +17,8 @@ pub mod trace;
 pub mod wifi;
 
 use core::fmt::Debug;
+
+use serde::{Deserialize, Serialize};
 
 use self::trace::ReplayTally;
 use crate::time::Instant;
@@ -97,7 +101,7 @@ impl<L: LinkModel + ?Sized> LinkModel for Box<L> {
 }
 
 /// What a link lost messages to.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct LossCauses {
     /// To outages.
     pub outage_count: u64,

@@ -3,6 +3,7 @@
 
 pub mod assessment;
 pub mod clock_summary;
+pub mod emulation;
 pub(crate) mod event_log;
 pub mod face;
 mod face_warnings;

@@ -14,6 +14,7 @@ use serde::{Deserialize, Serialize};
 
 use super::assessment::Assessment;
 use super::clock_summary::ClockSection;
+use super::emulation::EmulationFigures;
 use super::face::FaceSummary;
 use super::radio::RadioReport;
 use super::score_event::ScoreEvents;
@@ -318,6 +319,10 @@ pub struct ChannelSummary {
     /// recorded.
     #[serde(default)]
     pub outages: Option<OutageFigures>,
+    /// How well the hosts kept its emulated link; `None` on every other link, or when no message
+    /// came through it.
+    #[serde(default)]
+    pub emulation: Option<EmulationFigures>,
     /// What was recorded of a channel that is only recorded; `None` when nothing was.
     #[serde(default)]
     pub recorded: Option<RecordedFigures>,

@@ -6,6 +6,7 @@ mod faulty;
 mod fleet;
 mod hosts;
 mod layers;
+mod links;
 mod misspelt;
 mod mutation;
 mod recorded;
@@ -122,6 +123,8 @@ const SHIPPED: &[&str] = &[
     "emulated.toml",
     "outages.toml",
     "wifi6.toml",
+    "static-cells.toml",
+    "bad-link.toml",
     "egm-client.toml",
     "egm-robot.toml",
     "shuttle-local.toml",

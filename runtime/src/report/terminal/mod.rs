@@ -3,6 +3,7 @@
 mod canvas;
 mod channel;
 mod clocks;
+mod emulation;
 mod events;
 mod face;
 mod outages;
@@ -14,7 +15,7 @@ mod units;
 pub use canvas::Style;
 pub(crate) use canvas::{shortened, wrapped};
 pub(crate) use trace::{render_fit, render_trace, render_trace_plots};
-pub(crate) use units::{JOINT, duration_s, grouped, percent, seconds};
+pub(crate) use units::{JOINT, duration, duration_s, grouped, percent, seconds};
 
 use hil_models::measure::account::OutageFigures;
 
@@ -133,6 +134,14 @@ fn network_words(verdict: &NetworkVerdict) -> (Tone, String) {
                  skipped more than {limit} of its ticks"
             );
             (Tone::Good, text)
+        }
+        NetworkVerdict::EmulationNotKept { channels } => {
+            let text = format!(
+                "NOT a network result, nor one about the link model: the host could not keep the \
+                 emulated link of {}; repeat on an idle host or at a lower rate",
+                channels.join(", ")
+            );
+            (Tone::Bad, text)
         }
         NetworkVerdict::NoNetwork => {
             let text = "no channel went over a network; nothing here says anything about one";
