@@ -15,6 +15,7 @@ pub mod reordering;
 pub mod spec;
 pub mod trace;
 pub mod wifi;
+mod trace_ticks;
 
 use core::fmt::Debug;
 
