@@ -76,6 +76,7 @@ fn rich() -> LinkSpec {
             ratio: 0.02,
             lag: ms(5),
         }),
+        wifi: None,
     }
 }
 

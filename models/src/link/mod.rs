@@ -14,8 +14,8 @@ pub mod rate;
 pub mod reordering;
 pub mod spec;
 pub mod trace;
-pub mod wifi;
 mod trace_ticks;
+pub mod wifi;
 
 use core::fmt::Debug;
 

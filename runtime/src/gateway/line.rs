@@ -22,6 +22,8 @@ const PENDING: usize = 256;
 /// A stamp that has not come by then does not come: drivers deliver within a millisecond or so,
 /// and a record must not wait for ever.
 pub(super) const STAMP_PATIENCE_NS: i64 = 20_000_000;
+/// The same for a card's stamp, which the driver fetches from a worker of normal priority.
+const CARD_STAMP_PATIENCE_NS: i64 = 200_000_000;
 /// A radio reports after its last retry, with other stations and its queue before that.
 const RADIO_PATIENCE_NS: i64 = 200_000_000;
 /// How long the end of a run may wait for the kernel to take what is left.
@@ -277,6 +279,8 @@ impl Line {
     const fn patience_ns(&self) -> i64 {
         if self.awaited.asks_radio {
             RADIO_PATIENCE_NS
+        } else if self.awaited.awaits_hardware() {
+            CARD_STAMP_PATIENCE_NS
         } else {
             STAMP_PATIENCE_NS
         }

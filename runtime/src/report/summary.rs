@@ -18,6 +18,7 @@ use super::emulation::EmulationFigures;
 use super::face::FaceSummary;
 use super::radio::RadioReport;
 use super::score_event::ScoreEvents;
+use crate::card_clock::figures::HardwareStamps;
 
 /// Version of the `summary.json` layout.
 pub const SCHEMA_VERSION: u32 = 1;
@@ -48,6 +49,9 @@ pub struct RunSummary {
     /// What the radios of wireless hops said, and where messages were stamped.
     #[serde(default)]
     pub radio: RadioReport,
+    /// What the network cards stamped; `None` unless hardware stamps were asked for.
+    #[serde(default)]
+    pub hardware_stamps: Option<HardwareStamps>,
     /// What the robot did.
     pub score: Vec<ScoreMetric>,
     /// What happened to the robot, and what the network had done to the messages concerned.
@@ -71,6 +75,7 @@ impl RunSummary {
             channels: Vec::new(),
             faces: Vec::new(),
             radio: RadioReport::default(),
+            hardware_stamps: None,
             score: Vec::new(),
             score_events: ScoreEvents::default(),
             warnings: Vec::new(),

@@ -4,6 +4,7 @@
 use hil_models::time::Instant;
 use serde::{Deserialize, Serialize};
 
+use crate::card_clock::CardStory;
 use crate::clock_discipline::HostDiscipline;
 use crate::process::pipe::ProcessReport;
 
@@ -62,4 +63,7 @@ pub struct HostStory {
     pub discipline: Option<HostDiscipline>,
     /// How the processes fared.
     pub processes: Vec<ProcessStory>,
+    /// What became of the network cards it armed.
+    #[serde(default)]
+    pub cards: Vec<CardStory>,
 }

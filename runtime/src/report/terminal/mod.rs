@@ -1,6 +1,7 @@
 //! Renders a summary for a terminal of 80 to 120 columns. It returns text; the caller prints it.
 
 mod canvas;
+mod cards;
 mod channel;
 mod clocks;
 mod emulation;
@@ -44,6 +45,9 @@ pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> Strin
         clocks::clocks(&mut canvas, section);
     }
     radio::hops(&mut canvas, &summary.radio);
+    if let Some(stamps) = &summary.hardware_stamps {
+        cards::hardware_stamps(&mut canvas, stamps);
+    }
     tables::processes(&mut canvas, &summary.processes);
     tables::events(&mut canvas, &summary.events);
     tables::realtime(&mut canvas, &summary.realtime);
