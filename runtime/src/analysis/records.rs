@@ -72,14 +72,14 @@ impl RunRecords {
     }
 
     fn add(&mut self, file: &RecordFile) {
-        if file.header.kind == RecordKind::Radio {
-            let radio = self.radios.entry(file.header.channel.clone());
-            radio.or_default().extend(file.records::<RadioRecord>());
-            return;
-        }
         if file.header.kind == RecordKind::CardClock {
             let card = self.cards.entry(file.header.channel.clone()).or_default();
             card.extend(file.records::<CardClockRecord>());
+            return;
+        }
+        if file.header.kind == RecordKind::Radio {
+            let radio = self.radios.entry(file.header.channel.clone());
+            radio.or_default().extend(file.records::<RadioRecord>());
             return;
         }
         let channel = self
@@ -105,7 +105,7 @@ impl RunRecords {
             }
             RecordKind::Message => file.append_messages(&mut self.log),
             // They belong to no channel, see above.
-            RecordKind::Radio | RecordKind::CardClock => {}
+            RecordKind::CardClock | RecordKind::Radio => {}
         }
     }
 

@@ -100,8 +100,8 @@ pub fn examine(request: &DoctorRequest, stamps: &dyn StampCapabilityQuery) -> Do
     let files = &request.files;
     let mut findings = Vec::new();
     findings.extend(network::examine(files, &request.interfaces, stamps));
-    findings.extend(radio::examine(&request.interfaces));
     findings.extend(card::examine(&request.interfaces, stamps, &probe_card));
+    findings.extend(radio::examine(&request.interfaces));
     findings.extend(clocks::examine(files));
     findings.extend(processors::examine(files, &request.pinned_cpus));
     findings.extend(privileges::examine(files));

@@ -22,7 +22,8 @@ use crate::radio::socket::RadioSocket;
 use crate::record::{RecordKind, RecordSink, Recorder};
 use crate::topology::Timestamps;
 
-/// Longest probe where a card is to stamp: its driver answers from a worker of normal priority.
+/// How long each half of the probe may take where a card is to stamp: its driver answers from a
+/// worker of normal priority.
 const CARD_PROBE_BOUND: Duration = Duration::from_secs(1);
 /// Records of a radio that a ring holds: minutes of them.
 const RADIO_RECORDS: usize = 4096;

@@ -52,10 +52,10 @@ pub enum RecordKind {
     FaceSent,
     /// [`FaceReceivedRecord`]s of a face: datagrams of a foreign program.
     FaceReceived,
-    /// [`RadioRecord`]s of a gateway on a wireless hop; the channel is `<process>/<interface>`.
-    Radio,
     /// [`CardClockRecord`]s of a supervisor; the channel is `<host>/<interface>` of the card.
     CardClock,
+    /// [`RadioRecord`]s of a gateway on a wireless hop; the channel is `<process>/<interface>`.
+    Radio,
 }
 
 impl RecordKind {
@@ -99,8 +99,8 @@ impl RecordKind {
             Self::RoundTrip => Some(size_of::<RoundTripRecord>()),
             Self::FaceSent => Some(size_of::<FaceSentRecord>()),
             Self::FaceReceived => Some(size_of::<FaceReceivedRecord>()),
-            Self::Radio => Some(size_of::<RadioRecord>()),
             Self::CardClock => Some(size_of::<CardClockRecord>()),
+            Self::Radio => Some(size_of::<RadioRecord>()),
             Self::Message => None,
         }
     }

@@ -46,12 +46,12 @@ pub struct RunSummary {
     /// Arms that went through a face to a foreign program.
     #[serde(default)]
     pub faces: Vec<FaceSummary>,
-    /// What the radios of wireless hops said, and where messages were stamped.
-    #[serde(default)]
-    pub radio: RadioReport,
     /// What the network cards stamped; `None` unless hardware stamps were asked for.
     #[serde(default)]
     pub hardware_stamps: Option<HardwareStamps>,
+    /// What the radios of wireless hops said, and where messages were stamped.
+    #[serde(default)]
+    pub radio: RadioReport,
     /// What the robot did.
     pub score: Vec<ScoreMetric>,
     /// What happened to the robot, and what the network had done to the messages concerned.
@@ -74,8 +74,8 @@ impl RunSummary {
             events: Vec::new(),
             channels: Vec::new(),
             faces: Vec::new(),
-            radio: RadioReport::default(),
             hardware_stamps: None,
+            radio: RadioReport::default(),
             score: Vec::new(),
             score_events: ScoreEvents::default(),
             warnings: Vec::new(),

@@ -1,6 +1,8 @@
 //! What happened during a run beside the messages: processes that died, restarted or complained,
 //! and what each said at its end. Plain data that hosts exchange.
 
+use std::collections::BTreeMap;
+
 use hil_models::time::Instant;
 use serde::{Deserialize, Serialize};
 
@@ -66,4 +68,14 @@ pub struct HostStory {
     /// What became of the network cards it armed.
     #[serde(default)]
     pub cards: Vec<CardStory>,
+}
+
+/// Who steers the system clock, by host.
+pub(super) fn disciplines(stories: &[HostStory]) -> BTreeMap<String, HostDiscipline> {
+    let told = stories.iter().flat_map(|story| {
+        let discipline = story.discipline.as_ref();
+        let hosts = story.hosts.iter();
+        hosts.filter_map(move |host| Some((host.clone(), discipline?.clone())))
+    });
+    told.collect()
 }

@@ -11,7 +11,7 @@ use serde_json::json;
 
 use super::crew::{self, Crew, Verdict};
 use super::domains::Domains;
-use super::event::{Event, HostStory, ProcessStory};
+use super::event::{Event, HostStory, ProcessStory, disciplines};
 use super::exchange::exchange;
 use super::frame::{Frame, PeerHello, PeerMessage};
 use super::meet::{Meeting, meet};
@@ -189,16 +189,6 @@ fn gather_peers(
     let names: Vec<&str> = peers.iter().map(|peer| peer.hello.host.as_str()).collect();
     console.say(&format!("connected with {}", names.join(", ")));
     Ok(peers)
-}
-
-/// By host.
-fn disciplines(stories: &[HostStory]) -> BTreeMap<String, HostDiscipline> {
-    let told = stories.iter().flat_map(|story| {
-        let discipline = story.discipline.as_ref();
-        let hosts = story.hosts.iter();
-        hosts.filter_map(move |host| Some((host.clone(), discipline?.clone())))
-    });
-    told.collect()
 }
 
 struct Session<'a> {

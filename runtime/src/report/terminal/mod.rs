@@ -41,13 +41,13 @@ pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> Strin
     for face in &summary.faces {
         face::face(&mut canvas, face);
     }
+    if let Some(stamps) = &summary.hardware_stamps {
+        cards::hardware_stamps(&mut canvas, stamps);
+    }
     if let Some(section) = &summary.clocks {
         clocks::clocks(&mut canvas, section);
     }
     radio::hops(&mut canvas, &summary.radio);
-    if let Some(stamps) = &summary.hardware_stamps {
-        cards::hardware_stamps(&mut canvas, stamps);
-    }
     tables::processes(&mut canvas, &summary.processes);
     tables::events(&mut canvas, &summary.events);
     tables::realtime(&mut canvas, &summary.realtime);
