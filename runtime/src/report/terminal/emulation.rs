@@ -74,7 +74,8 @@ mod tests {
             let figures = EmulationFigures::of(&[record; 10], overflow_count).unwrap();
             let mut canvas = Canvas::new(120, Style::Plain);
             emulation(&mut canvas, &figures);
-            canvas.finish().replace('\u{a0}', " ")
+            let text = canvas.finish().replace('\u{a0}', " ");
+            text.split_whitespace().collect::<Vec<_>>().join(" ")
         };
         let kept = page(Some(0));
         for part in [
@@ -86,10 +87,7 @@ mod tests {
             "p99 20.0 µs",
             "0 dropped for want of room; kept: p99 may be 1.00 ms",
         ] {
-            assert!(
-                kept.replace("\n", " ").contains(part),
-                "{part} is not in\n{kept}"
-            );
+            assert!(kept.contains(part), "{part} is not in\n{kept}");
         }
         assert!(page(Some(2)).contains("NOT kept"));
         assert!(page(None).contains("unavailable"));
