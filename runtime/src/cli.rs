@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use clap::{ArgGroup, Args, Parser, Subcommand};
 
+use crate::probe::arguments::ProbeArgs;
 use crate::trace::cli::TraceCommand;
 
 const EXAMPLES: &str = "\
@@ -224,6 +225,8 @@ pub enum Command {
         #[arg(long)]
         json: bool,
     },
+    /// Look at the wire without taking part: capture, analyse, compare with a run.
+    Probe(ProbeArgs),
     /// List the case studies with their channels and parameters.
     #[command(after_help = "Example:\n  hil-runtime cases")]
     Cases,

@@ -20,6 +20,7 @@ use crate::console::Console;
 use crate::doctor::{self, DoctorRequest, StampCapabilities};
 use crate::face;
 use crate::gateway;
+use crate::probe;
 use crate::process::{component, own_program};
 use crate::registry::Registry;
 use crate::report::summary::RunSummary;
@@ -95,6 +96,7 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
                 exit::RAN
             }
         }
+        Command::Probe(args) => probe::run(&args, console),
         Command::Cases => {
             console.result(&cases::list(registry));
             exit::RAN

@@ -17,6 +17,7 @@ mod boxed;
 pub mod clock_pair;
 mod control;
 pub mod emulated;
+pub mod packet_ring;
 pub mod probe;
 pub mod queue;
 pub mod radio;

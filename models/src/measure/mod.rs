@@ -5,6 +5,7 @@
 
 pub mod account;
 pub mod histogram;
+pub mod radio;
 pub mod record;
 pub(crate) mod series;
 pub(crate) mod special;

@@ -1,10 +1,12 @@
 //! From the records of a finished run to its summary: reads the record files, draws up the
 //! account of each channel, and lets the case score what the robot did.
 
+mod clocks;
 mod events;
 mod faces;
 mod figures;
 pub(crate) mod outages;
+mod radio;
 pub(crate) mod records;
 
 use std::fs;
@@ -14,6 +16,7 @@ use std::path::{Path, PathBuf};
 use hil_models::case_study::Score;
 use hil_models::measure::account::MessageFate;
 
+use clocks::HostClocks;
 use figures::{channel_summary, process_summary, realtime_facts, run_event, run_facts};
 use outages::OutageStory;
 use records::RunRecords;
@@ -54,6 +57,8 @@ pub(crate) fn conclude(
     if !result.has_one_clock {
         records.set_clocks_differ();
     }
+    let clocks = HostClocks::of(topology, result, &records);
+    records.set_clocks(clocks);
     let mut summary = RunSummary::new(run_facts(topology, result, topology_file, command_line));
     summary.host_facts = result
         .facts
@@ -64,6 +69,7 @@ pub(crate) fn conclude(
     for process in &result.processes {
         summary.processes.push(process_summary(process));
     }
+    summary.clocks = Some(records.clocks().section().clone());
     summary.realtime = realtime_facts(&result.processes);
     summary.events = result
         .events
@@ -91,6 +97,7 @@ pub(crate) fn conclude(
         &summary.channels,
         (specs, &outages),
     );
+    radio::add(&mut summary, (topology, result), &records);
     add_warnings(&mut summary, result, &records);
     if let Some((_, case)) = case {
         write_series(&mut summary, result, case.as_ref(), records);
@@ -170,13 +177,7 @@ fn add_warnings(summary: &mut RunSummary, result: &RunResult, records: &RunRecor
             ));
         }
     }
-    if !result.has_one_clock {
-        summary.warnings.push(
-            "clocks not aligned: no figure crosses from one host to the other; segments on one \
-             host and round trips are given"
-                .to_owned(),
-        );
-    }
+    summary.warnings.extend(records.clocks().warnings());
 }
 
 /// Width of `report.txt`.

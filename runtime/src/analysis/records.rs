@@ -8,19 +8,24 @@ use std::time::Duration;
 
 use hil_models::measure::account::{
     AccountContext, ChannelAccount, ChannelPath, ChannelRecords, FLIGHT_TIME_MAX, Interruption,
-    MessageStory, Outage, PathProcess, RunSpan, TooManyMessages, TraceChannel, account, link_trace,
-    outages, stories,
+    MessageStory, ORDER_TOLERANCE_NS, Outage, PathProcess, RunSpan, TooManyMessages, TraceChannel,
+    account, link_trace, outages, stories,
+};
+use hil_models::measure::radio::{
+    RadioFigures, TransmitStampFigures, radio_figures, transmit_stamps,
 };
 use hil_models::measure::record::{
     EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
 };
 use hil_models::run_log::{LoggedMessage, RunLog};
-use hil_models::time::{Alignment, Instant};
+use hil_models::time::Instant;
 use hil_models::trace::TraceRecord;
 
 use super::AnalysisError;
+use super::clocks::HostClocks;
 use crate::face::record::{FaceReceivedRecord, FaceSentRecord};
 use crate::process::launch::EmulationLaunch;
+use crate::radio::record::RadioRecord;
 use crate::record::{RecordFile, RecordFileError, RecordKind};
 use crate::report::summary::RecordedFigures;
 use crate::supervisor::RunResult;
@@ -49,6 +54,9 @@ pub(crate) struct ChannelFiles {
 pub(crate) struct RunRecords {
     channels: BTreeMap<String, ChannelFiles>,
     log: RunLog,
+    clocks: HostClocks,
+    /// Records of radios, by `<process>/<interface>`.
+    pub(super) radios: BTreeMap<String, Vec<RadioRecord>>,
     /// Files that could not be read, with the reason.
     pub(crate) problems: Vec<String>,
 }
@@ -62,6 +70,11 @@ impl RunRecords {
     }
 
     fn add(&mut self, file: &RecordFile) {
+        if file.header.kind == RecordKind::Radio {
+            let radio = self.radios.entry(file.header.channel.clone());
+            radio.or_default().extend(file.records::<RadioRecord>());
+            return;
+        }
         let channel = self
             .channels
             .entry(file.header.channel.clone())
@@ -84,12 +97,62 @@ impl RunRecords {
                 channel.face_received.extend(records);
             }
             RecordKind::Message => file.append_messages(&mut self.log),
+            // Belongs to no channel, see above.
+            RecordKind::Radio => {}
         }
     }
 
     /// See [`RunLog::set_clocks_differ`].
     pub(super) fn set_clocks_differ(&mut self) {
         self.log.set_clocks_differ();
+    }
+
+    /// Relates the hosts' clocks; until then none are aligned.
+    pub(super) fn set_clocks(&mut self, clocks: HostClocks) {
+        self.clocks = clocks;
+    }
+
+    /// How the hosts' clocks relate.
+    pub(super) const fn clocks(&self) -> &HostClocks {
+        &self.clocks
+    }
+
+    /// The clock exchanges of the gateways of `channel`.
+    pub(super) fn round_trips(&self, channel: &str) -> impl Iterator<Item = &RoundTripRecord> {
+        let files = self.channels.get(channel);
+        files
+            .into_iter()
+            .flat_map(|files| files.round_trips.values())
+    }
+
+    /// Real-time minus monotonic clock of `host` as its gateways noted it; `None` when none did, or
+    /// the clock was stepped.
+    pub(super) fn realtime_offset_ns(&self, topology: &Topology, host: &str) -> Option<i64> {
+        let is_here = |process: &str| {
+            topology
+                .process(process)
+                .is_some_and(|one| one.host == host)
+        };
+        let mut ends: Option<(i64, i64)> = None;
+        for channel in topology.channels() {
+            let Some(files) = self.channels.get(&channel.name) else {
+                continue;
+            };
+            let sent = files.egress.iter().flatten();
+            let sent = sent.map(|record| record.realtime_offset_ns);
+            let sent = sent.filter(|_| is_here(&channel.from));
+            let is_receiver = channel.to.as_deref().is_some_and(is_here);
+            let received = files.ingress.iter().flatten();
+            let received = received.map(|record| record.realtime_offset_ns);
+            let received = received.filter(|_| is_receiver);
+            for offset_ns in sent.chain(received) {
+                let (lowest, highest) = ends.unwrap_or((offset_ns, offset_ns));
+                ends = Some((lowest.min(offset_ns), highest.max(offset_ns)));
+            }
+        }
+        let (lowest, highest) = ends?;
+        let width_ns = highest.saturating_sub(lowest);
+        (width_ns <= ORDER_TOLERANCE_NS).then_some(lowest + width_ns / 2)
     }
 
     /// True when anything was recorded of `channel`.
@@ -136,6 +199,17 @@ impl RunRecords {
         channel: &Channel,
     ) -> ChannelAccount {
         self.consult((topology, result), channel, account)
+    }
+
+    /// Where the messages of `channel` were stamped, and what the radio said of them.
+    pub(super) fn radio_figures(
+        &self,
+        run: (&Topology, &RunResult),
+        channel: &Channel,
+    ) -> (Option<TransmitStampFigures>, Option<RadioFigures>) {
+        self.consult(run, channel, |records, _| {
+            (records.egress.map(transmit_stamps), radio_figures(records))
+        })
     }
 
     /// What became of the `wanted` messages of `channel`, by start of the producer and number.
@@ -198,8 +272,11 @@ impl RunRecords {
         };
         let crossing = topology.crossing(channel);
         let path = if crossing.is_some() {
-            let alignment = result.has_one_clock.then_some(Alignment::SAME_CLOCK);
-            ChannelPath::Gateway { alignment }
+            let host_of = |process: Option<&str>| Some(&topology.process(process?)?.host);
+            let hosts = host_of(Some(&channel.from)).zip(host_of(channel.to.as_deref()));
+            hosts.map_or(ChannelPath::Gateway { alignment: None }, |(from, to)| {
+                self.clocks.path(from, to)
+            })
         } else {
             ChannelPath::SharedMemory
         };

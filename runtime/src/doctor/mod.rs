@@ -10,6 +10,7 @@ mod finding;
 mod network;
 mod privileges;
 mod processors;
+mod radio;
 mod render;
 mod shared_memory;
 mod wakeup;
@@ -94,6 +95,7 @@ pub fn examine(request: &DoctorRequest, stamps: &dyn StampCapabilityQuery) -> Do
     let files = &request.files;
     let mut findings = Vec::new();
     findings.extend(network::examine(files, &request.interfaces, stamps));
+    findings.extend(radio::examine(&request.interfaces));
     findings.extend(clocks::examine(files));
     findings.extend(processors::examine(files, &request.pinned_cpus));
     findings.extend(privileges::examine(files));

@@ -1,6 +1,9 @@
 //! Switches kernel stamps on before the measured threads start, finds out by sending which really
 //! come, and says what the sockets of a hop are to ask for. It opens no socket of a channel.
 
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
 use hil_gateways::transport::probe::{
     Availability, ProbeReport, ProbeSettings, Sentinel, arm_and_probe,
 };
@@ -8,13 +11,20 @@ use hil_gateways::transport::timestamping::{
     HardwareStamping, TimestampMode, interface_with_address,
 };
 
+use super::GatewayError;
 use super::direction;
 use super::process::PROBE_BOUND;
 use super::socket::stamps_of;
 use super::stamp_plan::StampPlan;
 use crate::process::launch::{DirectionLaunch, GatewayLaunch, Transport};
+use crate::radio::record::RadioRecord;
+use crate::radio::sampler::Sampler;
 use crate::radio::socket::RadioSocket;
+use crate::record::{RecordKind, RecordSink, Recorder};
 use crate::topology::Timestamps;
+
+/// Records of a radio that a ring holds: minutes of them.
+const RADIO_RECORDS: usize = 4096;
 
 /// What is known before the first socket opens.
 #[derive(Debug)]
@@ -25,16 +35,31 @@ pub(crate) struct Arming {
     /// What was found, in words.
     pub(crate) facts: Vec<(String, String)>,
     found: Option<(ProbeReport, Option<ProbeReport>)>,
-    /// The wireless interface of the hop.
-    pub(crate) radio: Option<RadioHop>,
+    is_wireless: bool,
+    /// The wireless interface of the hop, until its sampler starts.
+    radio: Option<RadioHop>,
 }
 
 /// A wireless interface, by its name.
 #[derive(Debug)]
-#[allow(dead_code, reason = "the sampler of the next step takes it")]
 pub(crate) struct RadioHop {
     pub(crate) interface: String,
     pub(crate) socket: RadioSocket,
+}
+
+/// A radio's sampler that has not started.
+#[derive(Debug)]
+pub(super) struct PreparedSampler {
+    radio: RadioHop,
+    sink: RecordSink,
+}
+
+impl PreparedSampler {
+    /// Starts it; call from a thread of normal priority.
+    pub(super) fn start(self, stop: Arc<AtomicBool>) -> Result<Sampler, GatewayError> {
+        let RadioHop { interface, socket } = self.radio;
+        Sampler::start(interface, socket, self.sink, stop).map_err(GatewayError::Thread)
+    }
 }
 
 impl Arming {
@@ -46,7 +71,22 @@ impl Arming {
             Some((first, second)) => StampPlan::found(asked, first, second.as_ref()),
             None => StampPlan::asked(asked),
         };
-        plan.on_radio(self.radio.is_some() && is_datagram)
+        plan.on_radio(self.is_wireless && is_datagram)
+    }
+
+    /// Opens the record file of the hop's radio, if it has one.
+    pub(super) fn prepare_sampler(
+        &mut self,
+        process: &str,
+        recorder: &mut Recorder,
+    ) -> Result<Option<PreparedSampler>, GatewayError> {
+        let Some(radio) = self.radio.take() else {
+            return Ok(None);
+        };
+        let name = format!("{process}/{}", radio.interface);
+        let size = size_of::<RadioRecord>();
+        let sink = recorder.sink(RecordKind::Radio, &name, size, RADIO_RECORDS)?;
+        Ok(Some(PreparedSampler { radio, sink }))
     }
 }
 
@@ -62,6 +102,7 @@ pub(super) fn arm(launch: &GatewayLaunch) -> Arming {
             sentinel: None,
             facts,
             found: None,
+            is_wireless: radio.is_some(),
             radio,
         };
     }
@@ -84,6 +125,7 @@ pub(super) fn arm(launch: &GatewayLaunch) -> Arming {
             .push(("stamp fallback".to_owned(), text.to_owned()));
     }
     armed.facts.append(&mut facts);
+    armed.is_wireless = radio.is_some();
     armed.radio = radio;
     armed
 }
@@ -95,10 +137,21 @@ fn find_radio(launch: &GatewayLaunch) -> (Option<RadioHop>, Vec<(String, String)
     };
     let label = || "radio".to_owned();
     match RadioSocket::open(&interface) {
-        Ok((socket, wireless)) => {
+        Ok((mut socket, wireless)) => {
+            let power_save = match socket.is_power_save_on() {
+                Ok(true) => {
+                    ", power save ON: a sleeping radio hears of arrivals with a beacon only, some \
+                     100 ms late"
+                }
+                Ok(false) => ", power save off",
+                Err(_) => ", power save unavailable: the driver does not say",
+            };
             let frequency = wireless.frequency_mhz;
             let channel = frequency.map_or_else(String::new, |mhz| format!(", {mhz} MHz"));
-            let text = format!("{interface} is an {}{channel}", wireless.label());
+            let text = format!(
+                "{interface} is an {}{channel}{power_save}",
+                wireless.label()
+            );
             let text = text.replace("an station", "a station");
             (Some(RadioHop { interface, socket }), vec![(label(), text)])
         }
@@ -118,6 +171,7 @@ pub(crate) fn arm_and_describe(settings: Option<ProbeSettings>) -> Arming {
         sentinel,
         facts: vec![("kernel stamps".to_owned(), text)],
         found,
+        is_wireless: false,
         radio: None,
     };
     let Some(settings) = settings else {

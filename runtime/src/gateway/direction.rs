@@ -269,6 +269,12 @@ impl Direction {
             ),
         };
         let mut facts = self.facts.clone();
+        if let Way::Ingress(ingress) = &self.way
+            && launch.socket.dscp > 0
+        {
+            let counters = ingress.receiver.counters();
+            facts.extend(counters::mark_fact(launch.socket.dscp, &counters));
+        }
         if let Some(figures) = stream {
             counters.extend(stream::counters(&figures));
             facts.extend(stream::facts(&figures, launch.side));

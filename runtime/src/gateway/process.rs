@@ -20,6 +20,7 @@ use crate::process::pipe::{
     ChannelProgress, DirectionReport, FromProcess, Orders, ProcessReport, say,
 };
 use crate::process::usage::add_usage;
+use crate::radio::sampler::Sampler;
 use crate::realtime::{self, RealtimeGrant, SpinAdvice};
 use crate::record::Recorder;
 use crate::wait::WaitMode;
@@ -47,7 +48,7 @@ fn prepare_and_live(path: &Path) -> Result<(), GatewayError> {
     let launch: GatewayLaunch = read(path)?;
     let domain = Domain::open(&launch.domain.parse()?)?;
     let surroundings = Arc::new(Surroundings::new(domain)?);
-    let armed = arming::arm(&launch);
+    let mut armed = arming::arm(&launch);
     warn_of_shared_cpus(&launch);
     let mut recorder = Recorder::new(&launch.records, &launch.process, launch.instance);
     let mut opened = Vec::new();
@@ -59,7 +60,10 @@ fn prepare_and_live(path: &Path) -> Result<(), GatewayError> {
             armed.plan(direction),
         )?);
     }
+    let sampler = armed.prepare_sampler(&launch.process, &mut recorder)?;
     recorder.start().map_err(GatewayError::Thread)?;
+    let stop = Arc::clone(&surroundings.stop);
+    let sampler = sampler.map(|one| one.start(stop)).transpose()?;
     let counters: Vec<Counter> = opened
         .iter()
         .map(|(launch, one)| counter(launch, one))
@@ -85,6 +89,7 @@ fn prepare_and_live(path: &Path) -> Result<(), GatewayError> {
         watch(&orders, &threads, (&counters, &established), &mut watched);
     }
     surroundings.stop.store(true, Ordering::Release);
+    armed.facts.extend(sampler.map(Sampler::finish));
     finish(threads, recorder, &armed.facts)
 }
 

@@ -1,6 +1,7 @@
 //! The socket of one channel direction: opened as its launch description says, behind a link model
 //! where it has one, with what the kernel granted. It moves no message.
 
+use std::fs;
 use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::Duration;
@@ -22,6 +23,7 @@ use super::stamp_plan::StampPlan;
 use crate::clock::MonotonicClock;
 use crate::process::launch::{DirectionLaunch, EmulationLaunch, Side, SocketLaunch, Transport};
 use crate::process::pipe::RunStart;
+use crate::radio::category;
 use crate::topology::Timestamps;
 
 /// IP and UDP headers of a datagram.
@@ -56,20 +58,23 @@ impl OpenSocket {
     ) -> Result<Self, GatewayError> {
         let settings = udp_settings(launch, plan);
         match launch.socket.transport {
-            Transport::Udp => Self::open_udp(&settings, launch, start),
+            Transport::Udp => Self::open_udp(&settings, (launch, plan), start),
             Transport::Tcp => Self::open_tcp(&settings, launch),
         }
     }
 
     fn open_udp(
         settings: &UdpSettings,
-        launch: &DirectionLaunch,
+        (launch, plan): (&DirectionLaunch, StampPlan),
         start: &RunStart,
     ) -> Result<Self, GatewayError> {
         let (ends, mut facts) = match launch.side {
             Side::Egress => {
                 let sender = UdpSender::open(settings)?;
                 let mut facts = socket_facts(settings, sender.granted());
+                if plan.asks_radio {
+                    facts.push(access_category(sender.granted()));
+                }
                 let mtu = sender.path_mtu();
                 let configured = launch.socket.path_mtu_bytes;
                 let text = format!("{} bytes, {configured} configured", mtu.packet_bytes);
@@ -163,6 +168,13 @@ pub(crate) const fn timestamp_mode(asked: Timestamps) -> TimestampMode {
         Timestamps::Software => TimestampMode::Software,
         Timestamps::Hardware => TimestampMode::Hardware,
     }
+}
+
+/// Where this direction stands when stations contend for the air.
+fn access_category(granted: GrantedOptions) -> (String, String) {
+    let release = fs::read_to_string("/proc/sys/kernel/osrelease").unwrap_or_default();
+    let text = category::describe(granted.priority, granted.dscp, release.trim());
+    ("access category".to_owned(), text)
 }
 
 fn socket_facts(settings: &UdpSettings, granted: GrantedOptions) -> Vec<(String, String)> {

@@ -81,6 +81,28 @@ pub const fn category(user_priority: u8) -> AccessCategory {
     }
 }
 
+/// In words, where a socket with these marks stands when stations contend, on a kernel of this
+/// release.
+pub fn describe(priority: u32, dscp: u8, release: &str) -> String {
+    let marks = format!("priority {priority} and dscp {dscp}");
+    let Some(mapping) = Mapping::of_release(release) else {
+        return format!("unavailable: kernel release {release:?} cannot be read ({marks})");
+    };
+    let of = |mapping| {
+        let user = user_priority(priority, dscp, mapping);
+        (user, category(user))
+    };
+    let (user, found) = of(mapping);
+    let mut text = format!("{found}: {marks} give user priority {user}");
+    let (other_user, other) = of(Mapping::Rfc8325);
+    if mapping == Mapping::TopBits && other != found {
+        let more = format!("; a kernel with the mapping of RFC 8325 says {other_user}, {other}");
+        text.push_str(&more);
+    }
+    text.push_str(", unless the access point gave a QoS map or demands admission");
+    text
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -113,6 +135,20 @@ mod tests {
         }
         assert_eq!(user_priority(264, 46, Mapping::TopBits), 5);
         assert_eq!(user_priority(7, 0, Mapping::TopBits), 0);
+    }
+
+    #[test]
+    fn the_words_name_the_category_and_what_a_newer_kernel_would_say() {
+        let words = describe(4, 46, "6.1.0-56-amd64");
+        assert!(
+            words.starts_with("video (AC_VI): priority 4 and dscp 46"),
+            "{words}"
+        );
+        assert!(words.contains("RFC 8325 says 6, voice (AC_VO)"), "{words}");
+        let words = describe(262, 0, "6.18.0");
+        assert!(words.starts_with("voice (AC_VO)"), "{words}");
+        assert!(!words.contains("RFC 8325"), "{words}");
+        assert!(describe(0, 0, "?").starts_with("unavailable"));
     }
 
     #[test]

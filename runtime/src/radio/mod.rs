@@ -2,12 +2,13 @@
 //! and never on the measured path.
 //!
 //! - `netlink`, `nl80211`: the messages, as bytes.
-//! - `socket`: asking and listening.
+//! - `socket`: asking and listening; `sampler`: doing so ten times a second.
+//! - [`record`]: what is written down.
 //! - [`category`]: which access category a mark leads to.
 
 pub mod category;
 mod netlink;
-#[allow(dead_code, reason = "the sampler of the next step reads them")]
-mod nl80211;
-#[allow(dead_code, reason = "the sampler of the next step asks")]
+pub(crate) mod nl80211;
+pub mod record;
+pub(crate) mod sampler;
 pub(crate) mod socket;

@@ -28,7 +28,6 @@ pub(crate) mod attribute {
     pub(crate) const REASON_CODE: u16 = 54;
     pub(crate) const STATUS_CODE: u16 = 72;
     pub(crate) const PS_STATE: u16 = 93;
-    pub(crate) const CQM: u16 = 94;
 }
 
 /// `CTRL_ATTR_*` of `linux/genetlink.h`.

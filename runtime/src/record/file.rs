@@ -22,6 +22,7 @@ use hil_models::message::Envelope;
 use hil_models::run_log::RunLog;
 
 use crate::face::record::{FaceReceivedRecord, FaceSentRecord};
+use crate::radio::record::RadioRecord;
 
 const MAGIC: &[u8; 8] = b"HILREC01";
 /// Size of the file header.
@@ -50,11 +51,13 @@ pub enum RecordKind {
     FaceSent,
     /// [`FaceReceivedRecord`]s of a face: datagrams of a foreign program.
     FaceReceived,
+    /// [`RadioRecord`]s of a gateway on a wireless hop; the channel is `<process>/<interface>`.
+    Radio,
 }
 
 impl RecordKind {
     /// Every kind, with the number that stands for it in the header and its name in file names.
-    const ALL: [(Self, u32, &'static str); 9] = [
+    const ALL: [(Self, u32, &'static str); 10] = [
         (Self::Published, 1, "published"),
         (Self::Taken, 2, "taken"),
         (Self::Egress, 3, "egress"),
@@ -64,6 +67,7 @@ impl RecordKind {
         (Self::RoundTrip, 7, "round-trip"),
         (Self::FaceSent, 8, "face-sent"),
         (Self::FaceReceived, 9, "face-received"),
+        (Self::Radio, 15, "radio"),
     ];
 
     fn row(self) -> (Self, u32, &'static str) {
@@ -91,6 +95,7 @@ impl RecordKind {
             Self::RoundTrip => Some(size_of::<RoundTripRecord>()),
             Self::FaceSent => Some(size_of::<FaceSentRecord>()),
             Self::FaceReceived => Some(size_of::<FaceReceivedRecord>()),
+            Self::Radio => Some(size_of::<RadioRecord>()),
             Self::Message => None,
         }
     }

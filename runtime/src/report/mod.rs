@@ -2,9 +2,11 @@
 //! rendering for a terminal. It measures nothing and prints nothing; the caller writes the text.
 
 pub mod assessment;
+pub mod clock_summary;
 pub(crate) mod event_log;
 pub mod face;
 mod face_warnings;
+pub mod radio;
 pub mod score_event;
 pub mod summary;
 pub mod terminal;

@@ -13,7 +13,9 @@ use hil_models::measure::account::{ChannelAccount, OutageFigures};
 use serde::{Deserialize, Serialize};
 
 use super::assessment::Assessment;
+use super::clock_summary::ClockSection;
 use super::face::FaceSummary;
+use super::radio::RadioReport;
 use super::score_event::ScoreEvents;
 
 /// Version of the `summary.json` layout.
@@ -30,6 +32,9 @@ pub struct RunSummary {
     pub host_facts: Vec<Fact>,
     /// What real-time settings the kernel granted and refused.
     pub realtime: RealtimeFacts,
+    /// How the hosts' clocks relate, and what that rests on.
+    #[serde(default)]
+    pub clocks: Option<ClockSection>,
     /// The processes of the run.
     pub processes: Vec<ProcessSummary>,
     /// What happened, in order of time.
@@ -39,6 +44,9 @@ pub struct RunSummary {
     /// Arms that went through a face to a foreign program.
     #[serde(default)]
     pub faces: Vec<FaceSummary>,
+    /// What the radios of wireless hops said, and where messages were stamped.
+    #[serde(default)]
+    pub radio: RadioReport,
     /// What the robot did.
     pub score: Vec<ScoreMetric>,
     /// What happened to the robot, and what the network had done to the messages concerned.
@@ -56,10 +64,12 @@ impl RunSummary {
             run,
             host_facts: Vec::new(),
             realtime: RealtimeFacts::default(),
+            clocks: None,
             processes: Vec::new(),
             events: Vec::new(),
             channels: Vec::new(),
             faces: Vec::new(),
+            radio: RadioReport::default(),
             score: Vec::new(),
             score_events: ScoreEvents::default(),
             warnings: Vec::new(),

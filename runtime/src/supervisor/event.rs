@@ -4,6 +4,7 @@
 use hil_models::time::Instant;
 use serde::{Deserialize, Serialize};
 
+use crate::clock_discipline::HostDiscipline;
 use crate::process::pipe::ProcessReport;
 
 /// One thing that happened.
@@ -56,6 +57,9 @@ pub struct HostStory {
     pub span: (Instant, Instant),
     /// What happened, in order of time.
     pub events: Vec<Event>,
+    /// Who steers the system clock; `None` when not even the kernel says.
+    #[serde(default)]
+    pub discipline: Option<HostDiscipline>,
     /// How the processes fared.
     pub processes: Vec<ProcessStory>,
 }

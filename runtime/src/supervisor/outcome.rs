@@ -13,6 +13,7 @@ use super::event::{Event, ProcessStory};
 use super::frame::{EndMeaning, PeerMessage};
 use super::meet::PeerError;
 use crate::channel::DomainError;
+use crate::clock_discipline::HostDiscipline;
 use crate::host_facts::HostFacts;
 use crate::run_folder::RunFolder;
 
@@ -126,6 +127,8 @@ pub struct RunResult {
     pub processes: Vec<ProcessStory>,
     /// True when all hosts read one clock.
     pub has_one_clock: bool,
+    /// Who steers each host's system clock, of the hosts that told.
+    pub disciplines: BTreeMap<String, HostDiscipline>,
     /// Hosts that ran here.
     pub own_hosts: Vec<String>,
     /// What spoils the completeness of the report.

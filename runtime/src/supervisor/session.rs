@@ -21,6 +21,7 @@ use super::plan::plan;
 use super::progress_line;
 use crate::channel::clock_id;
 use crate::clock::MonotonicClock;
+use crate::clock_discipline::HostDiscipline;
 use crate::console::Console;
 use crate::host_facts::HostFacts;
 use crate::run_folder::{RunFolder, utc_text};
@@ -60,6 +61,7 @@ pub fn run(
     crew::find_programs(&plan.processes)?;
     let folder = make_folder(topology, &hosts)?;
     let facts = HostFacts::gather();
+    let discipline = HostDiscipline::gather().ok();
     write_manifest(topology, options, &folder, &facts)?;
     let run = folder.root().to_string_lossy();
     let domains = Domains::create(&plan.hosts, options.domain_root.as_ref(), &run)?;
@@ -79,6 +81,7 @@ pub fn run(
         peers,
         signals,
         console,
+        discipline,
         cleaned: WallInstant::now(),
         greeted: WallInstant::now(),
         told: WallInstant::now(),
@@ -182,6 +185,16 @@ fn gather_peers(
     Ok(peers)
 }
 
+/// By host.
+fn disciplines(stories: &[HostStory]) -> BTreeMap<String, HostDiscipline> {
+    let told = stories.iter().flat_map(|story| {
+        let discipline = story.discipline.as_ref();
+        let hosts = story.hosts.iter();
+        hosts.filter_map(move |host| Some((host.clone(), discipline?.clone())))
+    });
+    told.collect()
+}
+
 struct Session<'a> {
     topology: &'a Topology,
     is_first_host: bool,
@@ -193,6 +206,8 @@ struct Session<'a> {
     peers: Vec<Peer>,
     signals: &'a Signals,
     console: &'a mut Console,
+    /// Who steered the system clock before the run.
+    discipline: Option<HostDiscipline>,
     cleaned: WallInstant,
     greeted: WallInstant,
     told: WallInstant,
@@ -406,6 +421,7 @@ impl Session<'_> {
             hosts: own_hosts.clone(),
             span,
             events: self.crew.events().to_vec(),
+            discipline: self.discipline(),
             processes: self.stories(),
         };
         let mut problems = Vec::new();
@@ -433,6 +449,7 @@ impl Session<'_> {
             story.hosts.iter().map(move |host| (host.clone(), span))
         });
         let spans: BTreeMap<String, (Instant, Instant)> = spans.collect();
+        let disciplines = disciplines(&stories);
         let mut events: Vec<Event> = stories.iter().flat_map(|one| one.events.clone()).collect();
         // Each host counts from its own start of the run.
         let since_start =
@@ -447,10 +464,17 @@ impl Session<'_> {
             events,
             processes,
             has_one_clock,
+            disciplines,
             own_hosts,
             problems,
             facts,
         }
+    }
+
+    /// Who steered this host's system clock, before and after.
+    fn discipline(&self) -> Option<HostDiscipline> {
+        let before = self.discipline.clone()?;
+        Some(before.worse(HostDiscipline::gather().ok()?))
     }
 
     fn stories(&self) -> Vec<ProcessStory> {

@@ -2,9 +2,11 @@
 
 mod canvas;
 mod channel;
+mod clocks;
 mod events;
 mod face;
 mod outages;
+mod radio;
 mod tables;
 mod trace;
 mod units;
@@ -32,10 +34,15 @@ pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> Strin
     events::score_events(&mut canvas, &summary.score_events);
     for channel in &summary.channels {
         channel::channel(&mut canvas, channel);
+        radio::channel(&mut canvas, summary.radio.channel(&channel.name));
     }
     for face in &summary.faces {
         face::face(&mut canvas, face);
     }
+    if let Some(section) = &summary.clocks {
+        clocks::clocks(&mut canvas, section);
+    }
+    radio::hops(&mut canvas, &summary.radio);
     tables::processes(&mut canvas, &summary.processes);
     tables::events(&mut canvas, &summary.events);
     tables::realtime(&mut canvas, &summary.realtime);
