@@ -55,7 +55,6 @@ fn rich() -> LinkSpec {
             per_hour: 600.0,
             buffered: false,
         },
-        wifi: None,
         loss: LossLaw::GilbertElliott(GilbertElliott {
             to_bad: 0.01,
             to_good: 0.2,
