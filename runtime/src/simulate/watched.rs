@@ -1,5 +1,5 @@
-//! A link model in virtual time under watch: what it does is counted, and what it loses is noted as
-//! outages. It changes nothing of what the model does.
+//! A link model in virtual time under watch: what it does is counted, what becomes of each message is
+//! noted, and what it loses as outages. It changes nothing of what the model does.
 
 use std::cell::RefCell;
 use std::rc::Rc;
@@ -7,6 +7,7 @@ use std::rc::Rc;
 use hil_gateways::protocol::wire;
 use hil_models::link::LinkModel;
 use hil_models::measure::account::{Outage, OutageFinder};
+use hil_models::measure::network::{Crossing, Passage};
 use hil_models::message::Envelope;
 use hil_models::simulation::Carrier;
 use hil_models::time::Instant;
@@ -19,8 +20,10 @@ pub(super) struct Watch(Rc<RefCell<Seen>>);
 
 #[derive(Debug, Default)]
 struct Seen {
-    finder: OutageFinder,
+    outages: OutageFinder,
     tally: LinkTally,
+    passages: Vec<Passage>,
+    duplicated_count: u64,
 }
 
 impl Watch {
@@ -36,12 +39,18 @@ impl Watch {
 
     /// What was lost so far.
     pub(super) fn outages(&self) -> Vec<Outage> {
-        core::mem::take(&mut self.0.borrow_mut().finder).finish()
+        core::mem::take(&mut self.0.borrow_mut().outages).finish()
     }
 
     /// What the model, which `model` describes, did so far.
     pub(super) fn figures(&self, model: &str, requested_loss_ratio: Option<f64>) -> LinkFigures {
         self.0.borrow().tally.figures(model, requested_loss_ratio)
+    }
+
+    /// The way of every message so far, and how many copies came on top.
+    pub(super) fn passages(&self) -> (Vec<Passage>, u64) {
+        let mut seen = self.0.borrow_mut();
+        (core::mem::take(&mut seen.passages), seen.duplicated_count)
     }
 }
 
@@ -70,11 +79,30 @@ impl Carrier for Watched {
         }
         let mut seen = self.watch.0.borrow_mut();
         seen.tally.count(now, fate, self.link.loss_causes());
+        seen.duplicated_count += u64::from(fate.second_arrival().is_some());
+        seen.passages.push(passage(now, envelope, fate.arrival()));
         let published_ns = Some(now.as_ns());
         match fate.arrival() {
-            Some(at) => seen.finder.arrived(published_ns, Some(at.as_ns())),
-            None => seen.finder.lost(envelope.sequence, 1, published_ns),
+            Some(at) => seen.outages.arrived(published_ns, Some(at.as_ns())),
+            None => seen.outages.lost(envelope.sequence, 1, published_ns),
         }
+    }
+}
+
+fn passage(now: Instant, envelope: &Envelope, arrival: Option<Instant>) -> Passage {
+    Passage {
+        epoch_rank: envelope.epoch,
+        sequence: envelope.sequence,
+        count: 1,
+        offered_ns: Some(now.as_ns()),
+        received_ns: arrival.map(Instant::as_ns),
+        delay_ns: arrival.map(|at| at.ns_since(now)),
+        delay_bound_ns: 0,
+        crossing: if arrival.is_some() {
+            Crossing::Arrived
+        } else {
+            Crossing::LostByNetwork
+        },
     }
 }
 
@@ -116,6 +144,10 @@ mod tests {
             });
         }
         assert_eq!(delivered_count, 20);
+        let (passages, duplicated_count) = watch.passages();
+        assert_eq!((passages.len(), duplicated_count), (30, 0));
+        assert_eq!(passages[9].delay_ns, Some(3_000_000));
+        assert_eq!(passages[10].crossing, Crossing::LostByNetwork);
         let outages = watch.outages();
         assert_eq!(outages.len(), 1);
         let found = outages[0];
