@@ -20,6 +20,7 @@
 //! 5. [`realtime`], [`clock`], [`wait`], [`host_facts`], [`doctor`]: the machine.
 
 mod analysis;
+pub mod card_clock;
 mod cases;
 pub mod channel;
 pub mod cli;

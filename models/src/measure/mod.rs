@@ -4,6 +4,7 @@
 //! [`histogram`] and [`statistics`] turn samples into figures with intervals.
 
 pub mod account;
+pub mod card_clock;
 pub mod histogram;
 pub mod radio;
 pub mod record;

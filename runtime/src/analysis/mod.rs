@@ -1,6 +1,7 @@
 //! From the records of a finished run to its summary: reads the record files, draws up the
 //! account of each channel, and lets the case score what the robot did.
 
+mod cards;
 mod clocks;
 mod events;
 mod faces;
@@ -83,6 +84,7 @@ pub(crate) fn conclude(
         .collect();
     capture::write(&mut summary, (topology, result), &records);
     summary.faces = faces::face_summaries(topology, result, &records);
+    summary.hardware_stamps = cards::hardware_stamps(topology, result, &records);
     let outages = add_outages(&mut summary, (topology, result), &records);
     let case = registry.make_case(topology)?;
     let (specs, score) = match &case {

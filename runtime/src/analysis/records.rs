@@ -11,6 +11,7 @@ use hil_models::measure::account::{
     MessageStory, ORDER_TOLERANCE_NS, Outage, PathProcess, RunSpan, TooManyMessages, TraceChannel,
     account, link_trace, outages, stories,
 };
+use hil_models::measure::card_clock::{CardClockRecord, CardTimeline};
 use hil_models::measure::radio::{
     RadioFigures, TransmitStampFigures, radio_figures, transmit_stamps,
 };
@@ -53,6 +54,7 @@ pub(crate) struct ChannelFiles {
 #[derive(Debug, Default)]
 pub(crate) struct RunRecords {
     channels: BTreeMap<String, ChannelFiles>,
+    cards: BTreeMap<String, Vec<CardClockRecord>>,
     log: RunLog,
     clocks: HostClocks,
     /// Records of radios, by `<process>/<interface>`.
@@ -70,6 +72,11 @@ impl RunRecords {
     }
 
     fn add(&mut self, file: &RecordFile) {
+        if file.header.kind == RecordKind::CardClock {
+            let card = self.cards.entry(file.header.channel.clone()).or_default();
+            card.extend(file.records::<CardClockRecord>());
+            return;
+        }
         if file.header.kind == RecordKind::Radio {
             let radio = self.radios.entry(file.header.channel.clone());
             radio.or_default().extend(file.records::<RadioRecord>());
@@ -97,9 +104,22 @@ impl RunRecords {
                 channel.face_received.extend(records);
             }
             RecordKind::Message => file.append_messages(&mut self.log),
-            // Belongs to no channel, see above.
-            RecordKind::Radio => {}
+            // They belong to no channel, see above.
+            RecordKind::CardClock | RecordKind::Radio => {}
         }
+    }
+
+    /// The clock of a card, as [`crate::card_clock`] names it; `None` when it was not read.
+    pub(super) fn card_timeline(&self, card: &str) -> Option<CardTimeline> {
+        self.cards.get(card).map(|pairs| CardTimeline::new(pairs))
+    }
+
+    /// What the gateways recorded of `channel`: what they sent and what they received.
+    pub(super) fn of_gateways(&self, channel: &str) -> (&[EgressRecord], &[IngressRecord]) {
+        let files = self.channels.get(channel);
+        let egress = files.and_then(|files| files.egress.as_deref());
+        let ingress = files.and_then(|files| files.ingress.as_deref());
+        (egress.unwrap_or_default(), ingress.unwrap_or_default())
     }
 
     /// See [`RunLog::set_clocks_differ`].
@@ -257,7 +277,7 @@ impl RunRecords {
     }
 
     /// Asks something of the records of `channel` and of what the run knows about its way.
-    fn consult<T>(
+    pub(super) fn consult<T>(
         &self,
         (topology, result): (&Topology, &RunResult),
         channel: &Channel,
@@ -271,6 +291,9 @@ impl RunRecords {
             Some(RunSpan { start, end })
         };
         let crossing = topology.crossing(channel);
+        let cards_share_clock = crossing
+            .as_ref()
+            .is_some_and(|crossing| super::cards::share_a_clock(result, crossing));
         let path = if crossing.is_some() {
             let host_of = |process: Option<&str>| Some(&topology.process(process?)?.host);
             let hosts = host_of(Some(&channel.from)).zip(host_of(channel.to.as_deref()));
@@ -291,6 +314,7 @@ impl RunRecords {
             producer_run: span_of(&channel.from),
             consumer_run: channel.to.as_deref().and_then(span_of),
             flight_time_max: FLIGHT_TIME_MAX + delay.unwrap_or(Duration::ZERO),
+            cards_share_clock,
             round_trips_ns: &round_trips_ns,
             seed: topology.run().seed,
             ..AccountContext::new(path)

@@ -17,6 +17,7 @@ use super::clock_summary::ClockSection;
 use super::face::FaceSummary;
 use super::radio::RadioReport;
 use super::score_event::ScoreEvents;
+use crate::card_clock::figures::HardwareStamps;
 
 /// Version of the `summary.json` layout.
 pub const SCHEMA_VERSION: u32 = 1;
@@ -44,6 +45,9 @@ pub struct RunSummary {
     /// Arms that went through a face to a foreign program.
     #[serde(default)]
     pub faces: Vec<FaceSummary>,
+    /// What the network cards stamped; `None` unless hardware stamps were asked for.
+    #[serde(default)]
+    pub hardware_stamps: Option<HardwareStamps>,
     /// What the radios of wireless hops said, and where messages were stamped.
     #[serde(default)]
     pub radio: RadioReport,
@@ -69,6 +73,7 @@ impl RunSummary {
             events: Vec::new(),
             channels: Vec::new(),
             faces: Vec::new(),
+            hardware_stamps: None,
             radio: RadioReport::default(),
             score: Vec::new(),
             score_events: ScoreEvents::default(),

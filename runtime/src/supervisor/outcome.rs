@@ -12,6 +12,7 @@ use super::domains::DomainsError;
 use super::event::{Event, ProcessStory};
 use super::frame::{EndMeaning, PeerMessage};
 use super::meet::PeerError;
+use crate::card_clock::CardStory;
 use crate::channel::DomainError;
 use crate::clock_discipline::HostDiscipline;
 use crate::host_facts::HostFacts;
@@ -125,6 +126,9 @@ pub struct RunResult {
     pub events: Vec<Event>,
     /// How the processes of all hosts fared.
     pub processes: Vec<ProcessStory>,
+    /// What became of the network cards of all hosts; empty unless hardware stamps were asked
+    /// for.
+    pub cards: Vec<CardStory>,
     /// True when all hosts read one clock.
     pub has_one_clock: bool,
     /// Who steers each host's system clock, of the hosts that told.

@@ -11,7 +11,7 @@ use serde_json::json;
 
 use super::crew::{self, Crew, Verdict};
 use super::domains::Domains;
-use super::event::{Event, HostStory, ProcessStory};
+use super::event::{Event, HostStory, ProcessStory, disciplines};
 use super::exchange::exchange;
 use super::frame::{Frame, PeerHello, PeerMessage};
 use super::meet::{Meeting, meet};
@@ -19,6 +19,7 @@ use super::outcome::{Heard, Outcome, RunError, RunOptions, RunResult};
 use super::peer::{Peer, PeerEvent};
 use super::plan::plan;
 use super::progress_line;
+use crate::card_clock::CardWatch;
 use crate::channel::clock_id;
 use crate::clock::MonotonicClock;
 use crate::clock_discipline::HostDiscipline;
@@ -69,8 +70,11 @@ pub fn run(
     let peers = gather_peers(topology, &hosts, &domains, (signals, console))?;
     let here = clock_id()?;
     let crew = Crew::new(plan.processes, domains.addresses(), &folder)?;
+    // Before the gateways: they find out by sending what the cards deliver.
+    let cards = CardWatch::start(topology, &hosts, &folder.records());
     let mut session = Session {
         topology,
+        cards,
         is_first_host: topology
             .hosts()
             .first()
@@ -185,18 +189,9 @@ fn gather_peers(
     Ok(peers)
 }
 
-/// By host.
-fn disciplines(stories: &[HostStory]) -> BTreeMap<String, HostDiscipline> {
-    let told = stories.iter().flat_map(|story| {
-        let discipline = story.discipline.as_ref();
-        let hosts = story.hosts.iter();
-        hosts.filter_map(move |host| Some((host.clone(), discipline?.clone())))
-    });
-    told.collect()
-}
-
 struct Session<'a> {
     topology: &'a Topology,
+    cards: CardWatch,
     is_first_host: bool,
     /// All hosts of the run read one clock.
     has_one_clock: bool,
@@ -417,14 +412,16 @@ impl Session<'_> {
         (started, facts): (String, HostFacts),
     ) -> RunResult {
         let own_hosts: Vec<String> = self.domains.addresses().into_keys().collect();
+        let watch = core::mem::take(&mut self.cards);
+        let (cards, mut problems) = watch.finish();
         let own = HostStory {
             hosts: own_hosts.clone(),
             span,
             events: self.crew.events().to_vec(),
             discipline: self.discipline(),
             processes: self.stories(),
+            cards,
         };
-        let mut problems = Vec::new();
         let mut stories = vec![own.clone()];
         if let Outcome::PeerLost(who) = &outcome {
             problems.push(format!("no records of the host that vanished ({who})"));
@@ -455,6 +452,7 @@ impl Session<'_> {
         let since_start =
             |event: &Event| spans.get(&event.host).map(|span| event.at.ns_since(span.0));
         events.sort_by_key(since_start);
+        let cards = stories.iter().flat_map(|one| one.cards.clone()).collect();
         let processes = stories.into_iter().flat_map(|one| one.processes).collect();
         RunResult {
             folder,
@@ -463,6 +461,7 @@ impl Session<'_> {
             started,
             events,
             processes,
+            cards,
             has_one_clock,
             disciplines,
             own_hosts,

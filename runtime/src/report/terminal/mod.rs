@@ -1,6 +1,7 @@
 //! Renders a summary for a terminal of 80 to 120 columns. It returns text; the caller prints it.
 
 mod canvas;
+mod cards;
 mod channel;
 mod clocks;
 mod events;
@@ -38,6 +39,9 @@ pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> Strin
     }
     for face in &summary.faces {
         face::face(&mut canvas, face);
+    }
+    if let Some(stamps) = &summary.hardware_stamps {
+        cards::hardware_stamps(&mut canvas, stamps);
     }
     if let Some(section) = &summary.clocks {
         clocks::clocks(&mut canvas, section);
