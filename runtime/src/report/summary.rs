@@ -15,6 +15,7 @@ use serde::{Deserialize, Serialize};
 use super::assessment::Assessment;
 use super::clock_summary::ClockSection;
 use super::face::FaceSummary;
+use super::network::NetworkReport;
 use super::radio::RadioReport;
 use super::score_event::ScoreEvents;
 use crate::card_clock::figures::HardwareStamps;
@@ -56,6 +57,10 @@ pub struct RunSummary {
     /// What happened to the robot, and what the network had done to the messages concerned.
     #[serde(default)]
     pub score_events: ScoreEvents,
+    /// The network in the field's terms, and on one axis with the robot; `None` when no channel
+    /// crossed one.
+    #[serde(default)]
+    pub network: Option<NetworkReport>,
     /// Anything else a reader must know; [`Assessment::warnings`] come on top.
     pub warnings: Vec<String>,
 }
@@ -77,6 +82,7 @@ impl RunSummary {
             radio: RadioReport::default(),
             score: Vec::new(),
             score_events: ScoreEvents::default(),
+            network: None,
             warnings: Vec::new(),
         }
     }
