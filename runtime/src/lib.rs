@@ -20,10 +20,12 @@
 //! 5. [`realtime`], [`clock`], [`wait`], [`host_facts`], [`doctor`]: the machine.
 
 mod analysis;
+pub mod card_clock;
 mod cases;
 pub mod channel;
 pub mod cli;
 pub mod clock;
+pub mod clock_discipline;
 mod command;
 pub mod console;
 pub mod doctor;

@@ -2,6 +2,7 @@
 //! links. It starts no process and opens no socket.
 
 mod events;
+mod network;
 mod watched;
 
 use core::fmt::Write;
@@ -12,14 +13,16 @@ use std::path::{Path, PathBuf};
 
 use hil_models::case_study::Score;
 use hil_models::link::LinkModel;
-use hil_models::link::trace::{ReplayCounts, ReplayTally};
+use hil_models::link::trace::{ReplayCounts, ReplayTally, TraceMatch};
 use hil_models::measure::account::OutageFigures;
+use hil_models::plot::PlotSeries;
 use hil_models::simulation::{Carrier, Simulation, SimulationResult};
 
 use crate::analysis::outages::OutageStory;
 use crate::process::launch::EmulationLaunch;
 use crate::registry::{Case, Registry};
 use crate::report::event_log;
+use crate::report::network::NetworkReport;
 use crate::report::score_event::ScoreEvents;
 use crate::report::summary::ScoreMetric;
 use crate::report::terminal::{self, Style};
@@ -66,6 +69,9 @@ pub(crate) struct Simulated {
     /// Of every channel that a link model carried.
     outages: Vec<OutageStory>,
     events: ScoreEvents,
+    /// `None` when no link model carried anything.
+    network: Option<NetworkReport>,
+    network_series: Vec<PlotSeries>,
 }
 
 /// Runs the topology's case in virtual time.
@@ -111,14 +117,20 @@ pub(crate) fn simulate(
     let score = case.score(&result.log);
     let duration = topology.run().duration;
     let outages: Vec<_> = watches
-        .into_iter()
-        .map(|(name, watch)| events::story(name, watch.outages(), duration))
+        .iter()
+        .map(|(name, watch)| events::story(name.clone(), watch.outages(), duration))
         .collect();
+    let mut events = events::explained(&score, entry.channels, &outages, &result.log);
+    let errors = case.errors(&result.log);
+    let (network, network_series) =
+        network::of_simulation(topology, watches, &result.log, (errors, &mut events)).unzip();
     Ok(Simulated {
         topology_name: topology.name().to_owned(),
         duration_s: duration.as_secs_f64(),
         seed: topology.run().seed,
-        events: events::explained(&score, entry.channels, &outages, &result.log),
+        events,
+        network,
+        network_series: network_series.unwrap_or_default(),
         case,
         result,
         score,
@@ -197,7 +209,8 @@ impl Simulated {
         ] {
             fs::write(&path, text).map_err(|error| failed(path, error))?;
         }
-        let made = self.case.series(&self.result.log);
+        let mut made = self.case.series(&self.result.log);
+        made.extend(self.network_series.iter().cloned());
         series::write(&files.series(), made)
             .map_err(|error| SimulateError::Output(error.to_string()))
     }
@@ -232,6 +245,14 @@ impl Simulated {
             columns,
             style,
         ));
+        if let Some(report) = &self.network {
+            text.push_str(&terminal::render_network(
+                report,
+                &self.events,
+                columns,
+                style,
+            ));
+        }
         text
     }
 
@@ -259,6 +280,7 @@ impl Simulated {
             "trace_replays": replays,
             "score": self.score,
             "score_events": self.events,
+            "network": self.network,
         });
         format!("{document:#}\n")
     }
@@ -275,8 +297,19 @@ fn replay_line(name: &str, counts: &ReplayCounts) -> String {
         "  {name:<18} met {} of {} records of its trace: {} delivered, {} lost",
         counts.met_count, counts.record_count, counts.delivered_count, counts.lost_count
     );
+    let how = match counts.matching {
+        TraceMatch::Index => "message by message",
+        TraceMatch::Time => "by time",
+        TraceMatch::Tick => "tick by tick",
+    };
+    let _infallible = write!(text, ", {how}");
     for (count, what) in [
         (counts.unknown_count, "of unknown fate, taken as lost"),
+        (
+            counts.unpublished_count,
+            "at ticks without a record, taken as lost",
+        ),
+        (counts.repeated_count, "at a tick for the second time"),
         (counts.beyond_end_count, "after its end"),
         (
             counts.negative_delay_count,

@@ -14,6 +14,8 @@
 //! A refused send or a report of the network is a state the caller sees, never an exit.
 
 mod boxed;
+pub mod card_arming;
+pub mod card_clock;
 pub mod clock_pair;
 mod control;
 pub mod emulated;

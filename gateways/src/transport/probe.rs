@@ -20,6 +20,8 @@ use super::{DatagramReceiver, DatagramSender, SendRefusal, TransmitStage, TxToke
 
 /// How long one probe datagram may take to come back with its stamps.
 const STAMP_WAIT: Duration = Duration::from_millis(20);
+/// The same for a card's stamp, which the driver fetches from a worker.
+const CARD_STAMP_WAIT: Duration = Duration::from_millis(100);
 /// Pause after a probe that came without a stamp: time for the kernel's worker.
 const RETRY_PAUSE: Duration = Duration::from_millis(2);
 /// What a probe datagram contains; no gateway takes it for one of its own.
@@ -303,7 +305,12 @@ fn collect_stamps(
         mode == TimestampMode::Hardware,
     ];
     let mut seen = [false; 3];
-    let end = monotonic_now()? + STAMP_WAIT;
+    let patience = if mode == TimestampMode::Hardware {
+        CARD_STAMP_WAIT
+    } else {
+        STAMP_WAIT
+    };
+    let end = monotonic_now()? + patience;
     loop {
         while let Some(stamp) = sender.next_stamp() {
             if stamp.token != token {

@@ -25,7 +25,7 @@ pub enum TimestampMode {
     /// driver gives none, as on Wi-Fi.
     Scheduled,
     /// Software and network card stamps. The card must be set up for it, see
-    /// [`HardwareStamping::request`].
+    /// [`super::card_arming`].
     Hardware,
 }
 
@@ -340,22 +340,27 @@ impl HardwareStamping {
         Self::exchange(interface, libc::SIOCGHWTSTAMP, (0, 0))
     }
 
-    /// Asks the card to stamp everything (`SIOCSHWTSTAMP`) and says what it settled for. Needs
-    /// `CAP_NET_ADMIN` and changes the card for all its users.
+    /// Sets the card up (`SIOCSHWTSTAMP`) and says what it settled for. Needs `CAP_NET_ADMIN` and
+    /// changes the card for all its users; [`super::card_arming`] also puts it back.
     ///
     /// # Errors
-    /// `EOPNOTSUPP` when it cannot stamp, `ERANGE` when it cannot stamp all arrivals, `EPERM`.
-    pub fn request(interface: &str) -> io::Result<Self> {
-        let wanted = (libc::HWTSTAMP_TX_ON, libc::HWTSTAMP_FILTER_ALL);
+    /// `EOPNOTSUPP` when it cannot stamp, `ERANGE` when it does not have that filter, `EPERM`.
+    pub fn set(interface: &str, wanted: Self) -> io::Result<Self> {
+        let transmit = if wanted.is_transmit_on {
+            libc::HWTSTAMP_TX_ON
+        } else {
+            libc::HWTSTAMP_TX_OFF
+        };
+        let wanted = (transmit, wanted.receive_filter);
         Self::exchange(interface, libc::SIOCSHWTSTAMP, wanted)
     }
 
     #[allow(unsafe_code, reason = "no crate wraps SIOCGHWTSTAMP and SIOCSHWTSTAMP")]
-    fn exchange(interface: &str, request: c_ulong, wanted: (u32, u32)) -> io::Result<Self> {
+    fn exchange(interface: &str, request: c_ulong, wanted: (u32, i32)) -> io::Result<Self> {
         let mut config = libc::hwtstamp_config {
             flags: 0,
             tx_type: wanted.0.cast_signed(),
-            rx_filter: wanted.1.cast_signed(),
+            rx_filter: wanted.1,
         };
         let data = (&raw mut config).cast();
         // SAFETY: both requests read and write one `hwtstamp_config`, which `config` is.
@@ -455,7 +460,11 @@ mod tests {
         assert!(!claims.tx_hardware && !claims.rx_hardware);
         let refusal = HardwareStamping::query("lo").unwrap_err();
         assert_eq!(refusal.raw_os_error(), Some(libc::EOPNOTSUPP));
-        assert!(HardwareStamping::request("lo").is_err());
+        let off = HardwareStamping {
+            is_transmit_on: false,
+            receive_filter: 0,
+        };
+        assert!(HardwareStamping::set("lo", off).is_err());
     }
 
     #[test]

@@ -155,15 +155,15 @@ fn line(points: &[Anchor]) -> Option<Line> {
         rows.iter().map(|row| value(row) * row.2).sum::<f64>() / weight
     };
     let (mean_x, mean_y) = (mean(|row| row.0), mean(|row| row.1));
-    let sum_xx: f64 = rows.iter().map(|(x, _, w)| w * (x - mean_x).powi(2)).sum();
-    let sum_xy: f64 = rows
+    let spread: f64 = rows.iter().map(|(x, _, w)| w * (x - mean_x).powi(2)).sum();
+    let covariance: f64 = rows
         .iter()
         .map(|(x, y, w)| w * (x - mean_x) * (y - mean_y))
         .sum();
-    if rows.len() < 3 || sum_xx <= 0.0 {
+    if rows.len() < 3 || spread <= 0.0 {
         return None;
     }
-    let slope = sum_xy / sum_xx;
+    let slope = covariance / spread;
     let residual: f64 = rows
         .iter()
         .map(|(x, y, w)| w * (y - mean_y - slope * (x - mean_x)).powi(2))
@@ -171,11 +171,14 @@ fn line(points: &[Anchor]) -> Option<Line> {
     let variance = residual / (rows.len() as f64 - 2.0);
     Some(Line {
         slope,
-        slope_error: (variance / sum_xx).sqrt(),
+        slope_error: (variance / spread).sqrt(),
     })
 }
 
-/// A number of nanoseconds far below what a double holds exactly.
+#[allow(
+    clippy::cast_possible_truncation,
+    reason = "a drift over a run is far below 292 years; beyond, the conversion saturates"
+)]
 fn round(value: f64) -> i64 {
     value.round() as i64
 }

@@ -108,12 +108,11 @@ impl Exchange {
     /// clock could be.
     pub(super) fn constraint(&self, settings: &ClockSettings) -> Option<Constraint> {
         let error = |indices: [usize; 2]| -> i64 {
-            let kernel = indices
-                .into_iter()
-                .filter(|index| self.kinds[*index] == StampKind::KernelSoftware);
-            settings
-                .stamp_error_ns
-                .saturating_mul(kernel.count() as i64)
+            let [first_ns, second_ns] = indices.map(|index| match self.kinds[index] {
+                StampKind::KernelSoftware => settings.stamp_error_ns,
+                StampKind::Application | StampKind::NetworkCard => 0,
+            });
+            first_ns.saturating_add(second_ns)
         };
         let (there_error_ns, back_error_ns) = match self.requester {
             Requester::Local => (error([0, 1]), error([2, 3])),

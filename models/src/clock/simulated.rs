@@ -1,6 +1,11 @@
 //! Two hosts with imperfect clocks and a path that favours one direction, for tests of the
 //! estimator: drift that wanders, steps, stamps that err, bursts, losses. The truth is known.
 
+#![allow(
+    clippy::cast_possible_truncation,
+    reason = "simulated times are far below 292 years"
+)]
+
 use super::{Exchange, Requester};
 use crate::measure::record::RoundTripRecord;
 use crate::random::RandomStream;
@@ -55,6 +60,7 @@ impl SimulatedClock {
 
 /// What one direction of the path does.
 #[derive(Debug, Clone, Copy)]
+#[allow(clippy::struct_field_names, reason = "units stand at the end")]
 struct Direction {
     floor_ns: f64,
     jitter_ns: f64,

@@ -1,5 +1,11 @@
 //! The estimator against clocks whose truth is known.
 
+#![allow(
+    clippy::cast_possible_truncation,
+    clippy::cast_possible_wrap,
+    reason = "simulated times are far below 292 years, and mutations may wrap"
+)]
+
 use super::simulated::SimulatedRun;
 use super::{ClockMap, ClockSettings, Exchange, Localised, Requester};
 use crate::measure::record::{RoundTripRecord, UNAVAILABLE};

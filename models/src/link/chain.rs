@@ -9,6 +9,7 @@ use super::outages::OutageLink;
 use super::rate::Bottleneck;
 use super::reordering::Strikes;
 use super::spec::{LinkPlace, LinkSpec};
+use super::wifi::WifiLink;
 use super::{Fate, LinkModel, LossCauses};
 use crate::case_study::ParameterError;
 use crate::random::RandomStream;
@@ -18,6 +19,7 @@ use crate::time::Instant;
 #[derive(Debug, Clone)]
 pub struct LinkChain {
     outages: OutageLink,
+    wifi: Option<Box<WifiLink>>,
     loss: LossProcess,
     bottleneck: Option<Bottleneck>,
     delay: (DelaySampler, RandomStream),
@@ -27,6 +29,8 @@ pub struct LinkChain {
     /// No later message arrives before, unless it was held back.
     floor: Instant,
     lost: LossCauses,
+    /// When the last message was through the radio: later ones are no earlier.
+    behind_radio: Instant,
 }
 
 impl LinkChain {
@@ -40,9 +44,14 @@ impl LinkChain {
         let shared =
             |part: &str| RandomStream::new(place.seed, &format!("links.{}{part}", place.link));
         let outages = OutageLink::new(spec.outages, shared(".outages"), Instant::ZERO)?;
+        let wifi = spec.wifi.as_ref().map(|wifi| {
+            let link = WifiLink::new(wifi, place.way, own(".wifi"), shared(".wifi"));
+            link.map(Box::new)
+        });
         let strikes = |ratio, later, part| Strikes::new(ratio, later, own(part));
         Ok(Self {
             outages,
+            wifi: wifi.transpose()?,
             loss: LossProcess::new(spec.loss, own(""), shared(".bursts"))?,
             bottleneck: spec.rate.map(Bottleneck::new).transpose()?,
             delay: (DelaySampler::new(&spec.delay)?, own(".delay")),
@@ -55,18 +64,27 @@ impl LinkChain {
                 .map(|one| strikes(one.ratio, one.lag, ".duplication")),
             floor: Instant::from_ns(i64::MIN),
             lost: LossCauses::default(),
+            behind_radio: Instant::from_ns(i64::MIN),
         })
     }
 
     /// When a message offered at `now` is at the end of the queue; `None` when it is lost before.
     fn through_queue(&mut self, now: Instant, length_bytes: usize) -> Option<Instant> {
         let after_outage = self.outages.offer(now, length_bytes).arrival();
-        let sets_out = after_outage.unwrap_or(now);
+        let after_radio = match &mut self.wifi {
+            Some(wifi) => after_outage.and_then(|at| wifi.offer(at, length_bytes).arrival()),
+            None => after_outage,
+        };
+        // The loss is asked in order of time, for what the radio lost as well.
+        self.behind_radio = self.behind_radio.max(after_radio.unwrap_or(now));
+        let sets_out = self.behind_radio;
         let is_lost = self.loss.is_lost(sets_out);
         if after_outage.is_none() {
             self.lost.outage_count += 1;
             return None;
         }
+        // The radio counts what it loses by itself.
+        after_radio?;
         if is_lost {
             self.lost.chance_count += 1;
             return None;
@@ -103,6 +121,7 @@ impl LinkModel for LinkChain {
     }
 
     fn loss_causes(&self) -> Option<LossCauses> {
-        Some(self.lost)
+        let radio = self.wifi.as_ref().and_then(|wifi| wifi.loss_causes());
+        Some(self.lost.plus(radio.unwrap_or_default()))
     }
 }

@@ -12,6 +12,8 @@ pub mod rate;
 pub mod reordering;
 pub mod spec;
 pub mod trace;
+mod trace_ticks;
+pub mod wifi;
 
 use core::fmt::Debug;
 
@@ -107,6 +109,15 @@ pub struct LossCauses {
 }
 
 impl LossCauses {
+    /// These and others.
+    pub const fn plus(self, other: Self) -> Self {
+        Self {
+            outage_count: self.outage_count + other.outage_count,
+            chance_count: self.chance_count + other.chance_count,
+            queue_count: self.queue_count + other.queue_count,
+        }
+    }
+
     /// All of them.
     pub const fn total(self) -> u64 {
         self.outage_count + self.chance_count + self.queue_count

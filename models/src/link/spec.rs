@@ -6,12 +6,14 @@
 //!
 //! 1. **Outages**, first, because they are what a radio next to the sender does: what is lost here
 //!    takes no place in the queue, and what is held back arrives at the queue in one go.
-//! 2. **Loss** by chance, also before the queue, as in Linux netem: a lost message takes no place.
-//! 3. **Rate and queue**: serialisation and waiting, tail drop.
-//! 4. **Delay**: what is left of the way, independent of the load. With `reorders` = false a message
+//! 2. **Wi-Fi** ([`super::wifi`]), the mechanistic model of a radio hop, where there is one. It delivers
+//!    in order.
+//! 3. **Loss** by chance, also before the queue, as in Linux netem: a lost message takes no place.
+//! 4. **Rate and queue**: serialisation and waiting, tail drop.
+//! 5. **Delay**: what is left of the way, independent of the load. With `reorders` = false a message
 //!    arrives no earlier than the one before it.
-//! 5. **Reordering**, after the floor of the delay, which would undo it.
-//! 6. **Duplication**, last: the copy repeats an arrival.
+//! 6. **Reordering**, after the floor of the delay, which would undo it.
+//! 7. **Duplication**, last: the copy repeats an arrival.
 //!
 //! Each part has a random stream of its own and draws for every message, whatever the parts before
 //! it did: turning one part on changes no draw of another, and the draws for the n-th message of a
@@ -28,6 +30,7 @@ use super::loss::LossLaw;
 use super::outages::Outages;
 use super::rate::RateLimit;
 use super::reordering::{Duplication, Reordering};
+use super::wifi::WifiSpec;
 use crate::case_study::ParameterError;
 
 /// One direction of a link. The default does nothing.
@@ -36,6 +39,8 @@ use crate::case_study::ParameterError;
 pub struct LinkSpec {
     /// When nothing gets through: on all channels of the link and both ways at once.
     pub outages: Outages,
+    /// A Wi-Fi 6 hop with outages, losses, queue and delay of its own.
+    pub wifi: Option<WifiSpec>,
     /// What is lost by chance.
     pub loss: LossLaw,
     /// A rate with a queue; `None` is as fast as it gets.
@@ -92,6 +97,9 @@ impl LinkSpec {
     /// The first key outside its range.
     pub fn check(&self) -> Result<(), ParameterError> {
         self.outages.check()?;
+        if let Some(wifi) = &self.wifi {
+            wifi.check()?;
+        }
         self.loss.check()?;
         if let Some(rate) = &self.rate {
             rate.check()?;
@@ -121,12 +129,21 @@ impl LinkSpec {
         let queue = self.rate.map_or(Duration::ZERO, |rate| rate.longest());
         let hold = self.reordering.map_or(Duration::ZERO, |one| one.hold);
         let lag = self.duplication.map_or(Duration::ZERO, |one| one.lag);
-        queue + self.delay.quantile(quantile) + hold + lag
+        let radio = self
+            .wifi
+            .map_or(Duration::ZERO, |wifi| wifi.flight_time_max());
+        radio + queue + self.delay.quantile(quantile) + hold + lag
     }
 
     /// The description in words.
     pub fn describe(&self) -> String {
         let mut parts = vec![self.delay.to_string(), self.loss.to_string()];
+        if let Some(wifi) = &self.wifi {
+            parts.insert(0, wifi.describe());
+            if wifi.outages.is_active() {
+                parts.insert(1, describe_outages(&wifi.outages));
+            }
+        }
         if !self.delay.is_fixed() {
             let order = if self.reorders {
                 "messages overtake"

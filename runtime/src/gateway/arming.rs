@@ -3,13 +3,12 @@
 
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
+use std::time::Duration;
 
 use hil_gateways::transport::probe::{
     Availability, ProbeReport, ProbeSettings, Sentinel, arm_and_probe,
 };
-use hil_gateways::transport::timestamping::{
-    HardwareStamping, TimestampMode, interface_with_address,
-};
+use hil_gateways::transport::timestamping::{TimestampMode, interface_with_address};
 
 use super::GatewayError;
 use super::direction;
@@ -23,6 +22,9 @@ use crate::radio::socket::RadioSocket;
 use crate::record::{RecordKind, RecordSink, Recorder};
 use crate::topology::Timestamps;
 
+/// How long each half of the probe may take where a card is to stamp: its driver answers from a
+/// worker of normal priority.
+const CARD_PROBE_BOUND: Duration = Duration::from_secs(1);
 /// Records of a radio that a ring holds: minutes of them.
 const RADIO_RECORDS: usize = 4096;
 
@@ -177,19 +179,20 @@ pub(crate) fn arm_and_describe(settings: Option<ProbeSettings>) -> Arming {
     let Some(settings) = settings else {
         return with(None, "switched off in the topology".to_owned(), None);
     };
-    let card = (settings.timestamps == TimestampMode::Hardware)
-        .then(|| switch_card_on(settings.interface.as_deref()));
-    let mut armed = match arm_and_probe(&settings) {
+    let bound = if settings.timestamps == TimestampMode::Hardware {
+        CARD_PROBE_BOUND
+    } else {
+        settings.bound
+    };
+    let settings = ProbeSettings { bound, ..settings };
+    match arm_and_probe(&settings) {
         Ok((report, sentinel)) => {
             let second = probe_before_queue(&settings, &report);
             let text = describe_probe(&report, second.as_ref());
             with(Some(sentinel), text, Some((report, second)))
         }
         Err(error) => with(None, format!("unavailable: {error}"), None),
-    };
-    let card = card.map(|text| ("network card stamps".to_owned(), text));
-    armed.facts.extend(card);
-    armed
+    }
 }
 
 /// Where no departure was stamped: whether the stack stamps before the queue.
@@ -206,20 +209,6 @@ fn probe_before_queue(settings: &ProbeSettings, first: &ProbeReport) -> Option<P
     arm_and_probe(&settings)
         .ok()
         .map(|(report, _sentinel)| report)
-}
-
-/// A card stamps nothing until it is told to; says what it settled for.
-fn switch_card_on(interface: Option<&str>) -> String {
-    let Some(interface) = interface else {
-        return "unavailable: the host names no interface in the topology".to_owned();
-    };
-    match HardwareStamping::request(interface) {
-        Ok(settled) => format!(
-            "switched on for {interface}: transmit {}, receive filter {}",
-            settled.is_transmit_on, settled.receive_filter
-        ),
-        Err(error) => format!("unavailable: {interface} cannot be switched on: {error}"),
-    }
 }
 
 fn describe_probe(report: &ProbeReport, second: Option<&ProbeReport>) -> String {

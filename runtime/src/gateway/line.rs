@@ -22,8 +22,9 @@ const PENDING: usize = 256;
 /// A stamp that has not come by then does not come: drivers deliver within a millisecond or so,
 /// and a record must not wait for ever.
 pub(super) const STAMP_PATIENCE_NS: i64 = 20_000_000;
-/// A radio reports after its last retry, with other stations and its queue before that.
-const RADIO_PATIENCE_NS: i64 = 200_000_000;
+/// A radio reports after its last retry, with other stations and its queue before that; the driver
+/// of a card that stamps fetches the stamp from a worker of normal priority.
+const LATE_PATIENCE_NS: i64 = 200_000_000;
 /// How long the end of a run may wait for the kernel to take what is left.
 const HAND_OVER_MAX: Duration = Duration::from_millis(200);
 
@@ -275,8 +276,8 @@ impl Line {
 
     /// How long a datagram may wait for what is still to come of it.
     const fn patience_ns(&self) -> i64 {
-        if self.awaited.asks_radio {
-            RADIO_PATIENCE_NS
+        if self.awaited.asks_radio || self.awaited.awaits_hardware() {
+            LATE_PATIENCE_NS
         } else {
             STAMP_PATIENCE_NS
         }

@@ -15,6 +15,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use bytemuck::Pod;
+use hil_models::measure::card_clock::CardClockRecord;
 use hil_models::measure::record::{
     EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
 };
@@ -51,13 +52,15 @@ pub enum RecordKind {
     FaceSent,
     /// [`FaceReceivedRecord`]s of a face: datagrams of a foreign program.
     FaceReceived,
+    /// [`CardClockRecord`]s of a supervisor; the channel is `<host>/<interface>` of the card.
+    CardClock,
     /// [`RadioRecord`]s of a gateway on a wireless hop; the channel is `<process>/<interface>`.
     Radio,
 }
 
 impl RecordKind {
     /// Every kind, with the number that stands for it in the header and its name in file names.
-    const ALL: [(Self, u32, &'static str); 10] = [
+    const ALL: [(Self, u32, &'static str); 11] = [
         (Self::Published, 1, "published"),
         (Self::Taken, 2, "taken"),
         (Self::Egress, 3, "egress"),
@@ -67,6 +70,7 @@ impl RecordKind {
         (Self::RoundTrip, 7, "round-trip"),
         (Self::FaceSent, 8, "face-sent"),
         (Self::FaceReceived, 9, "face-received"),
+        (Self::CardClock, 10, "card-clock"),
         (Self::Radio, 15, "radio"),
     ];
 
@@ -95,6 +99,7 @@ impl RecordKind {
             Self::RoundTrip => Some(size_of::<RoundTripRecord>()),
             Self::FaceSent => Some(size_of::<FaceSentRecord>()),
             Self::FaceReceived => Some(size_of::<FaceReceivedRecord>()),
+            Self::CardClock => Some(size_of::<CardClockRecord>()),
             Self::Radio => Some(size_of::<RadioRecord>()),
             Self::Message => None,
         }

@@ -35,6 +35,7 @@ fn event(
         severity,
         what: what.to_owned(),
         outages: Vec::new(),
+        network: None,
         messages,
         messages_dropped_count: 0,
     }

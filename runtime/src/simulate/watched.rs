@@ -1,17 +1,25 @@
-//! A carrier in virtual time under watch: what it loses is noted as outages. It changes nothing of
-//! what the carrier does, and asks it nothing.
+//! A carrier in virtual time under watch: what becomes of each message is noted, and what it loses
+//! as outages. It changes nothing of what the carrier does, and asks it nothing.
 
 use std::cell::RefCell;
 use std::rc::Rc;
 
 use hil_models::measure::account::{Outage, OutageFinder};
+use hil_models::measure::network::{Crossing, Passage};
 use hil_models::message::Envelope;
 use hil_models::simulation::Carrier;
 use hil_models::time::Instant;
 
-/// The outages of a carrier, to be asked for when it is done.
+/// What a carrier did, to be asked for when it is done.
 #[derive(Debug, Clone)]
-pub(super) struct Watch(Rc<RefCell<OutageFinder>>);
+pub(super) struct Watch(Rc<RefCell<Seen>>);
+
+#[derive(Debug, Default)]
+struct Seen {
+    outages: OutageFinder,
+    passages: Vec<Passage>,
+    duplicated_count: u64,
+}
 
 impl Watch {
     /// `carrier`, which will carry as before, and the watch over it.
@@ -26,7 +34,13 @@ impl Watch {
 
     /// What was lost so far.
     pub(super) fn outages(&self) -> Vec<Outage> {
-        self.0.take().finish()
+        core::mem::take(&mut self.0.borrow_mut().outages).finish()
+    }
+
+    /// The way of every message so far, and how many copies came on top.
+    pub(super) fn passages(&self) -> (Vec<Passage>, u64) {
+        let mut seen = self.0.borrow_mut();
+        (core::mem::take(&mut seen.passages), seen.duplicated_count)
     }
 }
 
@@ -46,14 +60,32 @@ impl Carrier for Watched {
     ) {
         let key = |envelope: &Envelope| (envelope.epoch, envelope.sequence);
         let mut arrival: Option<Instant> = None;
+        let mut copy_count = 0_u64;
         self.carrier
             .offer(now, envelope, payload, &mut |at, delivered, payload| {
                 if key(&delivered) == key(envelope) {
                     arrival = Some(arrival.map_or(at, |known| known.min(at)));
+                    copy_count += 1;
                 }
                 deliver(at, delivered, payload);
             });
-        let mut finder = self.watch.0.borrow_mut();
+        let mut seen = self.watch.0.borrow_mut();
+        seen.duplicated_count += copy_count.saturating_sub(1);
+        seen.passages.push(Passage {
+            epoch_rank: envelope.epoch,
+            sequence: envelope.sequence,
+            count: 1,
+            offered_ns: Some(now.as_ns()),
+            received_ns: arrival.map(Instant::as_ns),
+            delay_ns: arrival.map(|at| at.ns_since(now)),
+            delay_bound_ns: 0,
+            crossing: if arrival.is_some() {
+                Crossing::Arrived
+            } else {
+                Crossing::LostByNetwork
+            },
+        });
+        let finder = &mut seen.outages;
         let published_ns = Some(now.as_ns());
         match arrival {
             Some(at) => finder.arrived(published_ns, Some(at.as_ns())),
@@ -100,6 +132,10 @@ mod tests {
             });
         }
         assert_eq!(delivered_count, 20);
+        let (passages, duplicated_count) = watch.passages();
+        assert_eq!((passages.len(), duplicated_count), (30, 0));
+        assert_eq!(passages[9].delay_ns, Some(3_000_000));
+        assert_eq!(passages[10].crossing, Crossing::LostByNetwork);
         let outages = watch.outages();
         assert_eq!(outages.len(), 1);
         let found = outages[0];

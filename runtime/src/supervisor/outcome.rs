@@ -12,7 +12,9 @@ use super::domains::DomainsError;
 use super::event::{Event, ProcessStory};
 use super::frame::{EndMeaning, PeerMessage};
 use super::meet::PeerError;
+use crate::card_clock::CardStory;
 use crate::channel::DomainError;
+use crate::clock_discipline::HostDiscipline;
 use crate::host_facts::HostFacts;
 use crate::run_folder::RunFolder;
 
@@ -124,8 +126,13 @@ pub struct RunResult {
     pub events: Vec<Event>,
     /// How the processes of all hosts fared.
     pub processes: Vec<ProcessStory>,
+    /// What became of the network cards of all hosts; empty unless hardware stamps were asked
+    /// for.
+    pub cards: Vec<CardStory>,
     /// True when all hosts read one clock.
     pub has_one_clock: bool,
+    /// Who steers each host's system clock, of the hosts that told.
+    pub disciplines: BTreeMap<String, HostDiscipline>,
     /// Hosts that ran here.
     pub own_hosts: Vec<String>,
     /// What spoils the completeness of the report.

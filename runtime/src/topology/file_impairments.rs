@@ -15,6 +15,7 @@ use hil_models::link::spec::LinkSpec;
 
 use super::errors::Fault;
 use super::file_trace::read_trace;
+use super::file_wifi::read_wifi;
 use super::limits::{self, Limit};
 use super::model_links::Emulation;
 use super::reader::Reader;
@@ -31,6 +32,7 @@ pub(super) const EMULATION_KEYS: &[&str] = &[
     "backward",
     "outages",
     "trace",
+    "wifi",
 ];
 
 #[derive(Debug, Clone, Copy)]
@@ -71,7 +73,8 @@ const LOSS_WORDS: &[(&str, LossWord)] = &[
 /// key or table of its own for.
 pub(super) fn read_emulation(reader: &mut Reader<'_>) -> Emulation {
     let none = LinkSpec {
-        outages: read_outages(reader.table("outages")),
+        wifi: read_wifi(reader),
+        outages: read_outages(reader.table("outages"), NO_OUTAGES),
         ..LinkSpec::default()
     };
     let both = read_spec(reader, &none);
@@ -335,13 +338,16 @@ fn read_rate(mut reader: Reader<'_>) -> Option<RateLimit> {
     })
 }
 
-fn read_outages(reader: Option<Reader<'_>>) -> Outages {
+/// What a link without outages says of them.
+const NO_OUTAGES: Outages = Outages {
+    mean_s: limits::LINK_OUTAGE_MEAN.default.as_millis() as f64 * 1e-3,
+    per_hour: limits::LINK_OUTAGES_PER_HOUR.default,
+    buffered: false,
+};
+
+/// Outages as the table has them; what it leaves out is that of `none`.
+pub(super) fn read_outages(reader: Option<Reader<'_>>, none: Outages) -> Outages {
     let (mean, per_hour) = (&limits::LINK_OUTAGE_MEAN, &limits::LINK_OUTAGES_PER_HOUR);
-    let none = Outages {
-        mean_s: mean.default.as_secs_f64(),
-        per_hour: per_hour.default,
-        buffered: false,
-    };
     let Some(mut reader) = reader else {
         return none;
     };

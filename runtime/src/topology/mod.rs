@@ -20,6 +20,7 @@ mod file;
 mod file_impairments;
 mod file_links;
 mod file_trace;
+mod file_wifi;
 mod host;
 mod known;
 mod layers;

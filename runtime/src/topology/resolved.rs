@@ -7,6 +7,7 @@ use serde::Serialize;
 use toml::{Table, Value};
 
 use super::file_trace::resolved_trace;
+use super::file_wifi::resolved_wifi;
 use super::model::{Channel, Execution, Host, OnExit, Process, Program, Scheduling, Topology};
 use super::model_links::{Gateway, Hop, Link, Via};
 use super::resolved_impairments::{resolved_outages, resolved_spec};
@@ -207,8 +208,14 @@ fn resolved_link(link: &Link) -> Table {
             put_hop(&mut table, hop);
             put(&mut table, "forward", resolved_spec(&emulation.forward));
             put(&mut table, "backward", resolved_spec(&emulation.backward));
-            let outages = resolved_outages(emulation.forward.outages);
-            put(&mut table, "outages", outages);
+            // A radio has outages of its own, and the link then has none beside them.
+            match &emulation.forward.wifi {
+                Some(wifi) => put(&mut table, "wifi", resolved_wifi(wifi)),
+                None => {
+                    let outages = resolved_outages(emulation.forward.outages);
+                    put(&mut table, "outages", outages);
+                }
+            }
             if let Some(trace) = &emulation.trace {
                 put(&mut table, "trace", resolved_trace(trace));
             }

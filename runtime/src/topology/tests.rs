@@ -10,6 +10,7 @@ mod misspelt;
 mod mutation;
 mod recorded;
 mod relations;
+mod wifi;
 
 use core::time::Duration;
 use std::path::{Path, PathBuf};
@@ -120,6 +121,7 @@ const SHIPPED: &[&str] = &[
     "split.toml",
     "emulated.toml",
     "outages.toml",
+    "wifi6.toml",
     "egm-client.toml",
     "egm-robot.toml",
     "shuttle-local.toml",
