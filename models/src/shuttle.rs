@@ -193,12 +193,16 @@ fn travel(log: &RunLog) -> Option<Travel> {
         }
         blocks[index] += step_m;
     }
-    let half_waves = end.seconds_since(start) / HALF_WAVE_S;
-    blocks.truncate(ceil_count(half_waves.floor()));
-    let interval = Estimate::of_mean(&blocks).and_then(|mean| mean.interval);
+    // The cart rests at the end of a half wave, so one that is all but over counts as whole.
+    let half_waves = (end.seconds_since(start) / HALF_WAVE_S).round();
+    blocks.truncate(ceil_count(half_waves));
+    let mean = Estimate::of_mean(&blocks)?;
+    let spread_m = mean
+        .interval
+        .map(|(low, high)| 0.5 * (high - low) * half_waves);
     Some(Travel {
         whole_m,
-        interval: interval.map(|(low, high)| (low * half_waves, high * half_waves)),
+        interval: spread_m.map(|spread_m| (whole_m - spread_m, whole_m + spread_m)),
     })
 }
 

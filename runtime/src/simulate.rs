@@ -14,7 +14,7 @@ use std::path::{Path, PathBuf};
 
 use hil_models::case_study::Score;
 use hil_models::link::LinkModel;
-use hil_models::link::trace::{ReplayCounts, ReplayTally};
+use hil_models::link::trace::{ReplayCounts, ReplayTally, TraceMatch};
 use hil_models::measure::account::OutageFigures;
 use hil_models::plot::PlotSeries;
 use hil_models::simulation::{Carrier, Simulation, SimulationResult};
@@ -132,14 +132,16 @@ pub(crate) fn simulate(
         .iter()
         .map(|(name, _, watch)| events::story(name.clone(), watch.outages(), duration))
         .collect();
-    let watches = watches
-        .into_iter()
-        .map(|(name, _, watch)| (name, watch))
-        .collect();
     let mut events = events::explained(&score, entry.channels, &outages, &result.log);
     let errors = case.errors(&result.log);
-    let (network, network_series) =
-        network::of_simulation(topology, watches, &result.log, (errors, &mut events)).unzip();
+    let watches = watches.into_iter().map(|(name, _, watch)| (name, watch));
+    let (network, network_series) = network::of_simulation(
+        topology,
+        watches.collect(),
+        &result.log,
+        (errors, &mut events),
+    )
+    .unzip();
     Ok(Simulated {
         topology_name: topology.name().to_owned(),
         duration_s: duration.as_secs_f64(),
@@ -316,8 +318,19 @@ fn replay_line(name: &str, counts: &ReplayCounts) -> String {
         "  {name:<18} met {} of {} records of its trace: {} delivered, {} lost",
         counts.met_count, counts.record_count, counts.delivered_count, counts.lost_count
     );
+    let how = match counts.matching {
+        TraceMatch::Index => "message by message",
+        TraceMatch::Time => "by time",
+        TraceMatch::Tick => "tick by tick",
+    };
+    let _infallible = write!(text, ", {how}");
     for (count, what) in [
         (counts.unknown_count, "of unknown fate, taken as lost"),
+        (
+            counts.unpublished_count,
+            "at ticks without a record, taken as lost",
+        ),
+        (counts.repeated_count, "at a tick for the second time"),
         (counts.beyond_end_count, "after its end"),
         (
             counts.negative_delay_count,

@@ -55,7 +55,6 @@ fn rich() -> LinkSpec {
             per_hour: 600.0,
             buffered: false,
         },
-        wifi: None,
         loss: LossLaw::GilbertElliott(GilbertElliott {
             to_bad: 0.01,
             to_good: 0.2,
@@ -77,6 +76,7 @@ fn rich() -> LinkSpec {
             ratio: 0.02,
             lag: ms(5),
         }),
+        wifi: None,
     }
 }
 

@@ -1,5 +1,5 @@
-//! A link model in virtual time under watch: what becomes of each message is noted, and what it
-//! loses as outages. It changes nothing of what the model does.
+//! A link model in virtual time under watch: what it does is counted, what becomes of each message is
+//! noted, and what it loses as outages. It changes nothing of what the model does.
 
 use std::cell::RefCell;
 use std::rc::Rc;
@@ -20,7 +20,7 @@ pub(super) struct Watch(Rc<RefCell<Seen>>);
 
 #[derive(Debug, Default)]
 struct Seen {
-    finder: OutageFinder,
+    outages: OutageFinder,
     tally: LinkTally,
     passages: Vec<Passage>,
     duplicated_count: u64,
@@ -39,7 +39,7 @@ impl Watch {
 
     /// What was lost so far.
     pub(super) fn outages(&self) -> Vec<Outage> {
-        core::mem::take(&mut self.0.borrow_mut().finder).finish()
+        core::mem::take(&mut self.0.borrow_mut().outages).finish()
     }
 
     /// What the model, which `model` describes, did so far.
@@ -80,26 +80,29 @@ impl Carrier for Watched {
         let mut seen = self.watch.0.borrow_mut();
         seen.tally.count(now, fate, self.link.loss_causes());
         seen.duplicated_count += u64::from(fate.second_arrival().is_some());
-        let arrival = fate.arrival();
-        seen.passages.push(Passage {
-            epoch_rank: envelope.epoch,
-            sequence: envelope.sequence,
-            count: 1,
-            offered_ns: Some(now.as_ns()),
-            received_ns: arrival.map(Instant::as_ns),
-            delay_ns: arrival.map(|at| at.ns_since(now)),
-            delay_bound_ns: 0,
-            crossing: if arrival.is_some() {
-                Crossing::Arrived
-            } else {
-                Crossing::LostByNetwork
-            },
-        });
+        seen.passages.push(passage(now, envelope, fate.arrival()));
         let published_ns = Some(now.as_ns());
         match fate.arrival() {
-            Some(at) => seen.finder.arrived(published_ns, Some(at.as_ns())),
-            None => seen.finder.lost(envelope.sequence, 1, published_ns),
+            Some(at) => seen.outages.arrived(published_ns, Some(at.as_ns())),
+            None => seen.outages.lost(envelope.sequence, 1, published_ns),
         }
+    }
+}
+
+fn passage(now: Instant, envelope: &Envelope, arrival: Option<Instant>) -> Passage {
+    Passage {
+        epoch_rank: envelope.epoch,
+        sequence: envelope.sequence,
+        count: 1,
+        offered_ns: Some(now.as_ns()),
+        received_ns: arrival.map(Instant::as_ns),
+        delay_ns: arrival.map(|at| at.ns_since(now)),
+        delay_bound_ns: 0,
+        crossing: if arrival.is_some() {
+            Crossing::Arrived
+        } else {
+            Crossing::LostByNetwork
+        },
     }
 }
 
