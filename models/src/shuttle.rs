@@ -9,7 +9,7 @@ use core::time::Duration;
 use bytemuck::{Pod, Zeroable};
 use serde::{Deserialize, Serialize};
 
-use crate::case_study::{CaseStudy, ChannelSpec, Metric, ParameterError, Score};
+use crate::case_study::{CaseStudy, ChannelSpec, ErrorSeries, Metric, ParameterError, Score};
 use crate::component::{Component, Outbox, Role, into_role};
 use crate::measure::series::Estimate;
 use crate::measure::special::ceil_count;
@@ -112,6 +112,15 @@ impl CaseStudy for Shuttle {
         }
     }
 
+    fn errors(&self, log: &RunLog) -> Vec<ErrorSeries> {
+        // Stamps of two clocks cannot be told apart from an error.
+        if log.has_one_clock() {
+            vec![speed_error(log)]
+        } else {
+            Vec::new()
+        }
+    }
+
     fn score(&self, log: &RunLog) -> Score {
         let commands: Vec<_> = log.messages::<ShuttleCommand>("shuttle/command").collect();
         let travel = travel(log);
@@ -130,6 +139,34 @@ impl CaseStudy for Shuttle {
             }],
             ..Score::default()
         }
+    }
+}
+
+/// By how much the cart's speed from status to status misses the newest command sent by the former:
+/// what a command that comes later than a period, or not at all, leaves undone.
+fn speed_error(log: &RunLog) -> ErrorSeries {
+    let mut commands = log.messages::<ShuttleCommand>("shuttle/command").peekable();
+    let mut newest: Option<ShuttleCommand> = None;
+    let mut before: Option<(Instant, f64)> = None;
+    let mut samples = Vec::new();
+    for (at, status) in log.messages::<ShuttleStatus>("shuttle/status") {
+        let passed_s = before.map_or(0.0, |before| at.seconds_since(before.0));
+        if let (Some(command), Some((_, from_m))) = (newest, before)
+            && passed_s > 0.0
+        {
+            let driven_mps = (status.position_m - from_m) / passed_s;
+            samples.push((at, (command.speed_mps - driven_mps).abs()));
+        }
+        while let Some((_, command)) = commands.next_if(|next| next.0 <= at) {
+            newest = Some(command);
+        }
+        before = Some((at, status.position_m));
+    }
+    ErrorSeries {
+        label: "error of the cart's speed",
+        unit: "m/s",
+        clock_of: "shuttle/status",
+        samples,
     }
 }
 
@@ -156,12 +193,16 @@ fn travel(log: &RunLog) -> Option<Travel> {
         }
         blocks[index] += step_m;
     }
-    let half_waves = end.seconds_since(start) / HALF_WAVE_S;
-    blocks.truncate(ceil_count(half_waves.floor()));
-    let interval = Estimate::of_mean(&blocks).and_then(|mean| mean.interval);
+    // The cart rests at the end of a half wave, so one that is all but over counts as whole.
+    let half_waves = (end.seconds_since(start) / HALF_WAVE_S).round();
+    blocks.truncate(ceil_count(half_waves));
+    let mean = Estimate::of_mean(&blocks)?;
+    let spread_m = mean
+        .interval
+        .map(|(low, high)| 0.5 * (high - low) * half_waves);
     Some(Travel {
         whole_m,
-        interval: interval.map(|(low, high)| (low * half_waves, high * half_waves)),
+        interval: spread_m.map(|spread_m| (whole_m - spread_m, whole_m + spread_m)),
     })
 }
 

@@ -21,6 +21,7 @@ use crate::doctor::{self, DoctorRequest, StampCapabilities};
 use crate::face;
 use crate::gateway;
 use crate::probe;
+use crate::process::emulation_room::check_emulation;
 use crate::process::{component, own_program};
 use crate::registry::Registry;
 use crate::report::summary::RunSummary;
@@ -152,6 +153,14 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
         return exit::USAGE;
     }
     if args.check {
+        if let Err(error) = check_emulation(&topology) {
+            console.error(&format!(
+                "{}: the file is valid and can be simulated, but no gateway can keep its emulated \
+                 link: {error}",
+                path.display()
+            ));
+            return exit::USAGE;
+        }
         console.result(&format!(
             "{}: the file is valid; it comes to\n\n{}",
             path.display(),
@@ -230,6 +239,7 @@ fn exit_code_of_error(error: &RunError) -> u8 {
         ) => exit::USAGE,
         RunError::Peer(PeerError::Interrupted { .. }) => interrupted(),
         RunError::Start(_) => exit::FAILED,
+        RunError::Emulation(_) => exit::USAGE,
         RunError::Domains(_) | RunError::Identity(_) => exit::INTERNAL,
     }
 }

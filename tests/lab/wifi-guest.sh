@@ -1,7 +1,7 @@
 #!/bin/bash
 # Inside the emulated PC, as /share/run.sh: joins two simulated radios to an access point and a
-# station in two network namespaces, runs one split shuttle between them, then the same over a
-# cable of 5 ms and 2 % loss. wifi.sh judges what it leaves in /share.
+# station in two network namespaces, runs one split shuttle between them, then over a cable,
+# with 5 ms and 2 % loss where each end sends, then plain. wifi.sh judges what it leaves in /share.
 set -u
 share=/share
 # shellcheck disable=SC1091
@@ -9,29 +9,36 @@ source "$share/settings"
 say() { printf '[guest %s s] %s\n' "$(cut -d' ' -f1 /proc/uptime)" "$*"; }
 fail() { say "error: $*"; exit 1; }
 
-# A host of its own for a command: network namespace, shared memory, service files and /sys.
+# Everything a run touches is in memory: on a clock that skips idle time a slow disk looks slower.
+work=/lab
+mkdir -p "$work" && mount -t tmpfs tmpfs "$work" || fail "no memory for the runs"
+cp "$share/hil-runtime" "$share"/*.toml "$work/" || fail "no binary in the share"
+
+# on SPACE COMMAND...: as a host of its own, with its network, shared memory and service files.
 on() {
     local space=$1
     shift
     ip netns exec "$space" unshare --mount bash -c \
-        'mount -t tmpfs tmpfs /dev/shm && mount -t tmpfs tmpfs /run && mount -t tmpfs tmpfs /tmp &&
-         cd /tmp && exec "$@"' on "$@"
+        'for folder in /dev/shm /run /tmp; do mount -t tmpfs tmpfs "$folder" || exit 1; done
+         exec "$@"' on "$@"
 }
 
 # run_pair NAME CONTROL_SPACE ROBOT_SPACE: both hosts of topology NAME.toml at once.
 run_pair() {
     local name=$1 host space processes=() result=0 process
+    say "$name starts"
     for host in control-pc robot-pc; do
         space=$2
         [[ $host == control-pc ]] || space=$3
-        mkdir -p "$share/$name/$host"
-        on "$space" timeout "$limit_s" "$share/hil-runtime" --topology "$share/$name.toml" \
-            --host "$host" --output "$share/$name/$host" \
-            >"$share/$name/$host.txt" 2>"$share/$name/$host.err" &
+        mkdir -p "$work/$name/$host"
+        (cd "$work/$name/$host" && on "$space" timeout -k 5 "$limit_s" "$work/hil-runtime" \
+            --topology "$work/$name.toml" --host "$host" --quiet >report.txt 2>errors.txt) &
         processes+=($!)
     done
     for process in "${processes[@]}"; do wait "$process" || result=$?; done
+    cp -r "$work/$name" "$share/"
     say "$name ended with $result"
+    [[ $result == 0 ]] || tail -n 5 "$work/$name"/*/errors.txt
     return "$result"
 }
 
@@ -91,25 +98,27 @@ address() {
     ip netns exec "$1" ip link set "$2" up
 }
 
-# A cable with the impairment where each end sends.
+# A cable between two more hosts.
 cable() {
     modprobe -a veth sch_netem || fail "no veth or netem in this kernel"
     ip netns add left && ip netns add right || fail "no network namespaces"
     ip link add eth0 netns left type veth peer name eth0 netns right || fail "no cable"
     address left eth0 1
     address right eth0 2
-    local space
-    for space in left right; do
-        # shellcheck disable=SC2086
-        ip netns exec "$space" tc qdisc add dev eth0 root netem $cable || fail "no netem"
-    done
 }
 
 radios
 say "associated: $(ip netns exec sta iw dev wlan0 link | sed -n 's/^\t//p' | tr '\n' ' ')"
 result=0
+ip netns exec sta "$work/hil-runtime" doctor >"$share/doctor.txt" 2>&1
 run_pair wifi ap sta || result=1
 ip netns exec sta iw dev wlan0 station dump >"$share/wifi/station.txt"
 cable
+for space in left right; do
+    # shellcheck disable=SC2086,SC2154
+    ip netns exec "$space" tc qdisc add dev eth0 root netem $cable || fail "no netem"
+done
 run_pair cable left right || result=1
+for space in left right; do ip netns exec "$space" tc qdisc del dev eth0 root; done
+run_pair plain left right || result=1
 exit "$result"

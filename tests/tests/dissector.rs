@@ -118,12 +118,8 @@ fn sample_header(kind: Kind) -> Header {
     header
 }
 
-#[test]
-fn the_lua_dissector_shows_every_field_of_every_kind() {
-    if !has_tshark() {
-        return;
-    }
-    let folder = RunFolder::new("dissector");
+/// One datagram of each kind, in frames.
+fn sample_frames() -> Vec<Vec<u8>> {
     let mut data = sample_header(Kind::Data);
     data.published_ns = i64::MIN;
     data.follow_up = Some(FollowUpField {
@@ -169,7 +165,7 @@ fn the_lua_dissector_shows_every_field_of_every_kind() {
         ack.encode(&mut bodies[1]),
         response.encode(&mut bodies[2]),
     ];
-    let frames: Vec<Vec<u8>> = [
+    [
         datagram(&data, b"0123456789"),
         datagram(&sample_header(Kind::SyncRequest), &[0; 80]),
         datagram(&sample_header(Kind::SyncResponse), &bodies[2][..lengths[2]]),
@@ -179,9 +175,14 @@ fn the_lua_dissector_shows_every_field_of_every_kind() {
     ]
     .iter()
     .map(|bytes| udp_frame(bytes))
-    .collect();
-    let file = capture(&folder, &frames);
-    let common = [
+    .collect()
+}
+
+type Fields = Vec<(&'static str, String)>;
+
+/// What tshark must find in all of them.
+fn common_fields() -> Fields {
+    [
         ("hil.magic", "HILG"),
         ("hil.version", "1"),
         ("hil.flags", "0x0000"),
@@ -192,11 +193,17 @@ fn the_lua_dissector_shows_every_field_of_every_kind() {
         ("hil.type_hash", "0xfeedfacecafebeef"),
         ("hil.handed_ns", "123456789012345"),
         ("_ws.expert", ""),
-    ];
+    ]
+    .map(|(name, value)| (name, value.to_owned()))
+    .to_vec()
+}
+
+/// What it must find in each.
+fn own_fields() -> [Fields; 6] {
     let dd = "d0".repeat(16);
     let d1 = "d1".repeat(16);
     let bitmap = format!("03{}{}80", "00".repeat(23), "00".repeat(7));
-    let own: [&[(&str, &str)]; 6] = [
+    let own: [&[(&'static str, &str)]; 6] = [
         &[
             ("hil.kind", "1"),
             ("hil.published_ns", "-9223372036854775808"),
@@ -244,16 +251,28 @@ fn the_lua_dissector_shows_every_field_of_every_kind() {
         ],
         &[("hil.kind", "6"), ("hil.payload", "")],
     ];
-    let mut fields: Vec<&str> = common
-        .iter()
-        .chain(own.iter().copied().flatten())
-        .map(|(name, _)| *name)
-        .collect();
+    own.map(|list| {
+        list.iter()
+            .map(|(name, value)| (*name, (*value).to_owned()))
+            .collect()
+    })
+}
+
+#[test]
+fn the_lua_dissector_shows_every_field_of_every_kind() {
+    if !has_tshark() {
+        return;
+    }
+    let folder = RunFolder::new("dissector");
+    let file = capture(&folder, &sample_frames());
+    let (common, own) = (common_fields(), own_fields());
+    let all = common.iter().chain(own.iter().flatten());
+    let mut fields: Vec<&str> = all.map(|(name, _)| *name).collect();
     fields.sort_unstable();
     fields.dedup();
     let packets = tshark(&file, &["-X", &dissector()], &fields);
     assert_eq!(packets.len(), 6);
-    for (packet, own) in packets.iter().zip(own) {
+    for (packet, own) in packets.iter().zip(&own) {
         for (field, expected) in common.iter().chain(own) {
             assert_eq!(packet[*field], *expected, "{field} of {packet:?}");
         }

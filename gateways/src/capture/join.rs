@@ -265,26 +265,7 @@ impl Tally<'_> {
             delays.iter().min().copied().unwrap_or(0),
             delays.iter().max().copied().unwrap_or(0),
         );
-        let is_lost = |index: &&usize| {
-            let at = self.first[**index].stamp_ns;
-            is_covered(at, extremes, watched.1)
-        };
-        let lost: Vec<usize> = self
-            .matches
-            .only_first
-            .iter()
-            .filter(is_lost)
-            .copied()
-            .collect();
-        let back = (-extremes.1, -extremes.0);
-        let is_unexplained =
-            |index: &&usize| is_covered(self.second[**index].stamp_ns, back, watched.0);
-        let unexplained = self
-            .matches
-            .only_second
-            .iter()
-            .filter(is_unexplained)
-            .count();
+        let (lost, unexplained) = self.judged(extremes, watched);
         let only_count = self.matches.only_first.len() + self.matches.only_second.len();
         let judged = (self.pairs.len() + lost.len()) as u64;
         let lost_count = lost.len() as u64;
@@ -329,6 +310,27 @@ impl Tally<'_> {
                 "fewer than two arrivals",
             ),
         }
+    }
+
+    /// Positions of what was lost, and how many were unexplained; the rest of what was seen at one
+    /// point only lies at an edge.
+    fn judged(&self, (fastest, slowest): (i64, i64), watched: (Span, Span)) -> (Vec<usize>, usize) {
+        let is_lost = |index: &&usize| {
+            is_covered(self.first[**index].stamp_ns, (fastest, slowest), watched.1)
+        };
+        let back = (-slowest, -fastest);
+        let is_unexplained =
+            |index: &&usize| is_covered(self.second[**index].stamp_ns, back, watched.0);
+        let only_second = self.matches.only_second.iter();
+        (
+            self.matches
+                .only_first
+                .iter()
+                .filter(is_lost)
+                .copied()
+                .collect(),
+            only_second.filter(is_unexplained).count(),
+        )
     }
 
     /// Positions of departure, and pairs, in the order of arrival.

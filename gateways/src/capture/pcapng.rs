@@ -40,15 +40,8 @@ impl PcapngFile {
         if bytes.len() < BLOCK_BYTES_MIN as usize {
             return missing(window, "a block", BLOCK_BYTES_MIN.into());
         }
-        let is_section = array_at(bytes, 0) == Some(SECTION.to_be_bytes());
-        if is_section {
-            match array_at(bytes, 8).map(u32::from_le_bytes) {
-                Some(BYTE_ORDER_MAGIC) => self.order = Some(ByteOrder::Little),
-                Some(other) if other.swap_bytes() == BYTE_ORDER_MAGIC => {
-                    self.order = Some(ByteOrder::Big);
-                }
-                _ => return self.lost(window, Problem::Malformed("no byte-order magic")),
-            }
+        if let Err(problem) = self.note_order(bytes) {
+            return self.lost(window, problem);
         }
         let Some(order) = self.order else {
             return self.lost(
@@ -103,6 +96,19 @@ impl PcapngFile {
             Ok(()) => Next::Passed(length),
             Err(problem) => Next::Fault(problem, Some(length)),
         }
+    }
+
+    /// A section says the order of its numbers.
+    fn note_order(&mut self, bytes: &[u8]) -> Result<(), Problem> {
+        if array_at(bytes, 0) != Some(SECTION.to_be_bytes()) {
+            return Ok(());
+        }
+        self.order = match array_at(bytes, 8).map(u32::from_le_bytes) {
+            Some(BYTE_ORDER_MAGIC) => Some(ByteOrder::Little),
+            Some(other) if other.swap_bytes() == BYTE_ORDER_MAGIC => Some(ByteOrder::Big),
+            _ => return Err(Problem::Malformed("no byte-order magic")),
+        };
+        Ok(())
     }
 
     fn section(

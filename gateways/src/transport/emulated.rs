@@ -238,6 +238,7 @@ impl<R: DatagramReceiver> DatagramReceiver for EmulatedReceiver<R> {
             truncated_count: own.truncated_count,
             link_lost_count: inner.link_lost_count + own.link_lost_count,
             link_overflow_count: inner.link_overflow_count + own.link_overflow_count,
+            link_loss_causes: self.link.loss_causes().or(inner.link_loss_causes),
             ..inner
         }
     }
@@ -365,6 +366,106 @@ mod tests {
         sender.send(&[9]).unwrap();
         assert_eq!(take(&mut receiver, due), None);
         assert_eq!(take(&mut receiver, Instant::from_ns(20 * MS)).unwrap().0, 9);
+    }
+
+    /// Delivers every datagram after 10 ms and once more after 25 ms.
+    #[derive(Debug)]
+    struct Twice;
+
+    impl LinkModel for Twice {
+        fn offer(&mut self, now: Instant, _length_bytes: usize) -> Fate {
+            Fate::Duplicated {
+                first: now + Duration::from_millis(10),
+                second: now + Duration::from_millis(25),
+            }
+        }
+    }
+
+    #[test]
+    fn a_copy_comes_when_it_is_due_with_the_bytes_and_the_arrival_of_the_original() {
+        let (mut sender, mut receiver) = emulated(Twice, 8);
+        sender.send(b"ab").unwrap();
+        assert_eq!(take(&mut receiver, Instant::ZERO), None);
+        // What comes in between must not overwrite the copy.
+        sender.send(b"cd").unwrap();
+        let mut seen = Vec::new();
+        for ms in 1..=40 {
+            let mut buffer = [0; 16];
+            let now = Instant::from_ns(ms * MS);
+            while let Some(received) = receiver.receive(now, &mut buffer).unwrap() {
+                let delay = received.emulated.unwrap();
+                assert_eq!((received.length_bytes, delay.due), (2, now));
+                seen.push((buffer[..2].to_vec(), delay.arrived.as_ns() / MS, ms));
+            }
+        }
+        let expected = [("ab", 0, 10), ("cd", 1, 11), ("ab", 0, 25), ("cd", 1, 26)];
+        let expected = expected.map(|(text, arrived, due)| (text.into(), arrived, due));
+        assert_eq!(seen, expected);
+        assert_eq!((receiver.held_count(), receiver.free.len()), (0, 8));
+        assert_eq!(receiver.counters().link_overflow_count, 0);
+    }
+
+    #[test]
+    fn copies_that_find_no_room_are_counted_and_the_receiver_stays_bounded() {
+        let (mut sender, mut receiver) = emulated(Twice, 3);
+        for byte in 0..4 {
+            sender.send(&[byte]).unwrap();
+            assert_eq!(take(&mut receiver, Instant::ZERO), None);
+            assert!(receiver.held_count() <= 3);
+        }
+        // Two places for the first, one for the second: its copy, and both of the others, drop.
+        assert_eq!(receiver.counters().link_overflow_count, 5);
+        let at = |ms| Instant::from_ns(ms * MS);
+        assert_eq!(take(&mut receiver, at(10)).unwrap().0, 0);
+        assert_eq!(take(&mut receiver, at(10)).unwrap().0, 1);
+        assert_eq!(take(&mut receiver, at(24)), None);
+        assert_eq!(take(&mut receiver, at(25)).unwrap().0, 0);
+        assert_eq!((receiver.held_count(), receiver.free.len()), (0, 3));
+        // And it is as good as new.
+        sender.send(b"9").unwrap();
+        assert_eq!(take(&mut receiver, at(30)), None);
+        assert_eq!(take(&mut receiver, at(40)).unwrap().0, b'9');
+        assert_eq!(take(&mut receiver, at(55)).unwrap().0, b'9');
+    }
+
+    #[test]
+    fn a_hundred_thousand_random_fates_leave_nothing_behind() {
+        #[derive(Debug)]
+        struct Random(RandomStream);
+        impl LinkModel for Random {
+            fn offer(&mut self, now: Instant, _length_bytes: usize) -> Fate {
+                let mut later = |at: Instant| at + Duration::from_nanos(self.0.next_u64() % 5_000);
+                let first = later(now);
+                let second = later(first);
+                match self.0.next_u64() % 3 {
+                    0 => Fate::Lost,
+                    1 => Fate::Delivered(first),
+                    _ => Fate::Duplicated { first, second },
+                }
+            }
+        }
+        let stream = RandomStream::new(17, "random fates");
+        let (mut sender, mut receiver) = emulated(Random(stream), 5);
+        let mut newest_due = Instant::ZERO;
+        let mut taken_count = 0;
+        for step in 0..100_000_i64 {
+            let now = Instant::from_ns(step * 1_000);
+            sender.send(b"message").unwrap();
+            while let Some((_, arrival)) = take(&mut receiver, now) {
+                let delay = arrival.emulated.unwrap();
+                assert!(delay.due <= now && delay.arrived <= delay.due);
+                newest_due = newest_due.max(delay.due);
+                taken_count += 1;
+            }
+            assert_eq!(receiver.held_count() + receiver.free.len(), 5);
+            assert!(receiver.next_due().is_none_or(|due| due > now));
+        }
+        let end = Instant::from_ns(i64::MAX);
+        taken_count += core::iter::from_fn(|| take(&mut receiver, end)).count() as u64;
+        let counters = receiver.counters();
+        assert_eq!((receiver.held_count(), receiver.free.len()), (0, 5));
+        assert_eq!(counters.received_count, taken_count);
+        assert!(counters.link_overflow_count > 1_000, "{counters:?}");
     }
 
     #[test]

@@ -41,6 +41,7 @@ use std::io;
 use std::net::SocketAddr;
 use std::os::fd::BorrowedFd;
 
+use hil_models::link::LossCauses;
 use hil_models::time::Instant;
 use thiserror::Error;
 
@@ -298,6 +299,8 @@ pub struct ReceiverCounters {
     pub link_lost_count: u64,
     /// Datagrams dropped because the emulation already held as many as it may.
     pub link_overflow_count: u64,
+    /// What the lost ones were lost to; `None` without a link model, or for one that does not tell.
+    pub link_loss_causes: Option<LossCauses>,
     /// Datagrams that arrived with the code point this end marks with; counted where it marks.
     pub mark_kept_count: u64,
     /// Datagrams that arrived with another code point: something on the way changed it, or the
@@ -326,6 +329,13 @@ impl ReceiverCounters {
             ("mark_changed_count", self.mark_changed_count),
         ]
         .into_iter()
+        .chain(self.link_loss_causes.into_iter().flat_map(|causes| {
+            [
+                ("link_lost_to_outages_count", causes.outage_count),
+                ("link_lost_by_chance_count", causes.chance_count),
+                ("link_lost_to_full_queue_count", causes.queue_count),
+            ]
+        }))
     }
 }
 

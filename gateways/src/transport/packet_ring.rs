@@ -33,6 +33,12 @@ const BLOCK_BYTES: usize = 1 << 16;
 /// Room in a frame before the packet: the kernel's header and address, and what aligns them.
 const FRAME_HEADER_BYTES: usize = 96;
 
+/// `ETH_P_ALL` and `AF_PACKET` as a link address has them.
+const EVERY_PROTOCOL: u16 = 3;
+const PACKET_FAMILY: u16 = 17;
+const _: () = assert!(EVERY_PROTOCOL as c_int == libc::ETH_P_ALL);
+const _: () = assert!(PACKET_FAMILY as c_int == libc::AF_PACKET);
+
 /// How a tap is opened.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RingSettings {
@@ -194,7 +200,7 @@ impl PacketRing {
         set_option(&socket, libc::SOL_PACKET, libc::PACKET_RX_RING, &request)
             .map_err(refused("PACKET_RX_RING"))?;
         let map = Mapping::of(&socket, ring_bytes).map_err(refused("mmap"))?;
-        let everything = (libc::ETH_P_ALL as u16).to_be();
+        let everything = EVERY_PROTOCOL.to_be();
         bind(&socket, index, everything).map_err(refused("bind"))?;
         Ok(Self {
             socket,
@@ -348,7 +354,7 @@ fn open_socket() -> io::Result<OwnedFd> {
 #[allow(unsafe_code, reason = "nix cannot make a link address")]
 fn bind(socket: &OwnedFd, interface_index: c_uint, protocol_be: u16) -> io::Result<()> {
     let address = libc::sockaddr_ll {
-        sll_family: libc::AF_PACKET as u16,
+        sll_family: PACKET_FAMILY,
         sll_protocol: protocol_be,
         sll_ifindex: c_int::try_from(interface_index).map_err(io::Error::other)?,
         sll_hatype: 0,
@@ -427,6 +433,13 @@ struct Mapping {
     start: NonNull<u8>,
     length_bytes: usize,
 }
+
+// SAFETY: the memory belongs to the process, not to a thread, and a mapping is never shared.
+#[allow(
+    unsafe_code,
+    reason = "a ring may be looked into by another thread than opened it"
+)]
+unsafe impl Send for Mapping {}
 
 impl Mapping {
     #[allow(unsafe_code, reason = "mapping memory is what this is for")]

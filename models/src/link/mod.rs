@@ -3,6 +3,8 @@
 
 pub mod bernoulli;
 pub mod chain;
+#[cfg(test)]
+mod chain_tests;
 pub mod delay;
 pub mod impaired;
 pub mod in_series;
@@ -12,9 +14,12 @@ pub mod rate;
 pub mod reordering;
 pub mod spec;
 pub mod trace;
+mod trace_ticks;
 pub mod wifi;
 
 use core::fmt::Debug;
+
+use serde::{Deserialize, Serialize};
 
 use self::trace::ReplayTally;
 use crate::time::Instant;
@@ -97,7 +102,7 @@ impl<L: LinkModel + ?Sized> LinkModel for Box<L> {
 }
 
 /// What a link lost messages to.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct LossCauses {
     /// To outages.
     pub outage_count: u64,

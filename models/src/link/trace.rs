@@ -7,6 +7,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use core::time::Duration;
 use serde::{Deserialize, Serialize};
 
+use crate::link::trace_ticks::Ticks;
 use crate::link::{Fate, LinkModel};
 use crate::time::Instant;
 use crate::trace::{Trace, TraceFate, TraceRecord};
@@ -20,6 +21,11 @@ pub enum TraceMatch {
     Index,
     /// The record published last at that time of the run, before the first record the first.
     Time,
+    /// The record of the same tick: as many periods after the first message of its channel as the
+    /// record is after the first of the trace. What nobody published live is lost, so the other end
+    /// hears at each tick what it heard live. A trace without a period, or of a producer that was
+    /// started anew, is matched by index instead, and the counts say so.
+    Tick,
 }
 
 /// What a message meets that comes after the end of the trace.
@@ -68,6 +74,8 @@ pub enum ReplayError {
 /// What a replay met so far. Read it while the link works, or after.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct ReplayCounts {
+    /// How records were matched in the end.
+    pub matching: TraceMatch,
     /// Records of the trace.
     pub record_count: u64,
     /// Messages offered.
@@ -80,6 +88,10 @@ pub struct ReplayCounts {
     pub lost_count: u64,
     /// Of those within it, lost here because nobody knows what became of the trace's.
     pub unknown_count: u64,
+    /// Lost because the trace has no record at their tick: nobody published live.
+    pub unpublished_count: u64,
+    /// Messages at a tick that had its message already; they met the same record again.
+    pub repeated_count: u64,
     /// After the end of the trace.
     pub beyond_end_count: u64,
     /// Delivered at once because the trace's delay is below zero, which clocks within their bound
@@ -92,6 +104,8 @@ struct Cells {
     delivered: AtomicU64,
     lost: AtomicU64,
     unknown: AtomicU64,
+    unpublished: AtomicU64,
+    repeated: AtomicU64,
     beyond_end: AtomicU64,
     negative_delay: AtomicU64,
 }
@@ -101,6 +115,7 @@ struct Cells {
 pub struct ReplayTally {
     cells: Arc<Cells>,
     record_count: u64,
+    matching: TraceMatch,
 }
 
 impl ReplayTally {
@@ -111,14 +126,20 @@ impl ReplayTally {
         let lost_count = of(&self.cells.lost);
         let unknown_count = of(&self.cells.unknown);
         let beyond_end_count = of(&self.cells.beyond_end);
+        let unpublished_count = of(&self.cells.unpublished);
+        let repeated_count = of(&self.cells.repeated);
         let met_count = delivered_count + lost_count + unknown_count;
+        let apart_count = unpublished_count + repeated_count + beyond_end_count;
         ReplayCounts {
+            matching: self.matching,
             record_count: self.record_count,
-            offered_count: met_count + beyond_end_count,
+            offered_count: met_count + apart_count,
             met_count,
             delivered_count,
             lost_count,
             unknown_count,
+            unpublished_count,
+            repeated_count,
             beyond_end_count,
             negative_delay_count: of(&self.cells.negative_delay),
         }
@@ -133,6 +154,11 @@ pub struct TraceLink {
     /// Length of one round through the trace, above zero.
     span_ns: i64,
     next_number: u64,
+    /// Where records are matched by ticks.
+    ticks: Option<Ticks>,
+    /// The first message offered, and the tick of the last.
+    first_offer: Option<Instant>,
+    last_tick: Option<usize>,
     cells: Arc<Cells>,
 }
 
@@ -141,7 +167,7 @@ impl TraceLink {
     ///
     /// # Errors
     /// [`ReplayError`].
-    pub fn new(trace: Arc<Trace>, replay: TraceReplay) -> Result<Self, ReplayError> {
+    pub fn new(trace: Arc<Trace>, mut replay: TraceReplay) -> Result<Self, ReplayError> {
         let Some(last) = trace.records.last() else {
             return Err(ReplayError::Empty);
         };
@@ -158,11 +184,22 @@ impl TraceLink {
             .published_ns
             .saturating_add(trace.period_ns().unwrap_or(0));
         let span_ns = after_last_ns.max(trace.header.duration_ns).max(1);
+        let period_ns = trace.period_ns().unwrap_or(0);
+        let ticks = match replay.matching {
+            TraceMatch::Index | TraceMatch::Time => None,
+            TraceMatch::Tick => Ticks::of(&trace.records, period_ns),
+        };
+        if replay.matching == TraceMatch::Tick && ticks.is_none() {
+            replay.matching = TraceMatch::Index;
+        }
         Ok(Self {
             trace,
             replay,
             span_ns,
             next_number: 0,
+            ticks,
+            first_offer: None,
+            last_tick: None,
             cells: Arc::default(),
         })
     }
@@ -172,6 +209,7 @@ impl TraceLink {
         ReplayTally {
             cells: Arc::clone(&self.cells),
             record_count: self.trace.records.len() as u64,
+            matching: self.replay.matching,
         }
     }
 
@@ -191,6 +229,10 @@ impl TraceLink {
         let place = match self.replay.matching {
             TraceMatch::Index => self.by_index(number),
             TraceMatch::Time => self.by_time(now),
+            TraceMatch::Tick => match self.by_tick(now) {
+                Ok(place) => place,
+                Err(fate) => return fate,
+            },
         };
         let Some((record, is_beyond)) = place else {
             add(&self.cells.beyond_end);
@@ -230,6 +272,29 @@ impl TraceLink {
         let records = &self.trace.records;
         let after = records.partition_point(|record| record.published_ns <= at_ns);
         Some((records[after.saturating_sub(1)], is_beyond))
+    }
+
+    /// As the others, or the fate of a message that meets no record of its own.
+    fn by_tick(&mut self, now: Instant) -> Result<Option<(TraceRecord, bool)>, Fate> {
+        let first = *self.first_offer.get_or_insert(now);
+        let ticks = self.ticks.as_ref().expect("matching by ticks has them");
+        let offered = ticks.at(now.ns_since(first));
+        let is_beyond = offered >= ticks.count();
+        if is_beyond && self.replay.end != TraceEnd::Wrap {
+            return Ok(None);
+        }
+        let place = ticks.record_of(offered % ticks.count());
+        let is_repeated = self.last_tick.replace(offered) == Some(offered);
+        let Some(place) = place else {
+            add(&self.cells.unpublished);
+            return Err(Fate::Lost);
+        };
+        let record = self.trace.records[place];
+        if is_repeated && !is_beyond {
+            add(&self.cells.repeated);
+            return Err(self.fate(&record, now));
+        }
+        Ok(Some((record, is_beyond)))
     }
 
     fn fate(&self, record: &TraceRecord, now: Instant) -> Fate {
@@ -349,6 +414,37 @@ mod tests {
             assert_eq!(link.offer(at(ms), 1), met(ms)[index], "{ms} ms");
         }
         assert_eq!(link.tally().counts().beyond_end_count, 2);
+    }
+
+    #[test]
+    fn by_tick_a_message_meets_the_record_of_its_tick_and_what_nobody_published_is_lost() {
+        let mut ticking = trace();
+        ticking.records = (0..100)
+            .filter(|tick| tick % 10 != 7)
+            .map(|tick| TraceRecord::published(3 * MS + tick * 10 * MS, 0, 1).delivered(tick, 0))
+            .collect();
+        let replay = TraceReplay {
+            matching: TraceMatch::Tick,
+            end: TraceEnd::Perfect,
+            delay_otherwise: None,
+        };
+        let mut link = TraceLink::new(Arc::new(ticking), replay).unwrap();
+        for tick in 0..100 {
+            let now = at(500 + tick * 10);
+            let expected = match tick % 10 {
+                7 => Fate::Lost,
+                _ => Fate::Delivered(Instant::from_ns(now.as_ns() + tick)),
+            };
+            assert_eq!(link.offer(now, 1), expected, "tick {tick}");
+        }
+        assert_eq!(link.offer(at(500 + 991), 1), link.offer(at(500 + 991), 1));
+        assert_eq!(link.offer(at(1_500), 1), Fate::Delivered(at(1_500)));
+        let counts = link.tally().counts();
+        assert_eq!((counts.met_count, counts.unpublished_count), (90, 10));
+        assert_eq!((counts.repeated_count, counts.beyond_end_count), (2, 1));
+        assert_eq!(counts.offered_count, 103);
+        let without_period = TraceLink::new(Arc::new(trace()), replay).unwrap();
+        assert_eq!(without_period.tally().counts().matching, TraceMatch::Index);
     }
 
     #[test]

@@ -24,7 +24,7 @@ pub(crate) struct HostClocks {
 #[derive(Debug)]
 enum Relation {
     Constant(Option<Alignment>),
-    Mapped(ClockMap),
+    Mapped(Box<ClockMap>),
 }
 
 impl HostClocks {
@@ -138,7 +138,10 @@ impl HostClocks {
         };
         choose(&mut pair, (result.has_one_clock, &there), disciplined);
         let (forwards, backwards) = match (pair.rung, pair.disciplined) {
-            (ClockRung::Exchanges, _) => (Relation::Mapped(there), Relation::Mapped(back)),
+            (ClockRung::Exchanges, _) => (
+                Relation::Mapped(Box::new(there)),
+                Relation::Mapped(Box::new(back)),
+            ),
             (ClockRung::Disciplined, Some(offset)) => {
                 let constant = |offset_ns| {
                     let bound_ns = offset.bound_ns;
@@ -165,7 +168,7 @@ fn choose(
 ) {
     if has_one_clock {
         pair.rung = ClockRung::OneClock;
-        pair.basis = "same boot, same time namespace: stamps compare as they are".to_owned();
+        "same boot, same time namespace: stamps compare as they are".clone_into(&mut pair.basis);
         return;
     }
     let middle = map.figures().offset;
@@ -176,10 +179,10 @@ fn choose(
             let exchanged_ns = map.figures().bound.map(|bound| bound.median_ns);
             if pair.contradiction.is_some() {
                 pair.rung = ClockRung::None;
-                pair.basis = "the rungs contradict each other".to_owned();
+                "the rungs contradict each other".clone_into(&mut pair.basis);
             } else if exchanged_ns.is_none_or(|bound_ns| offset.bound_ns < bound_ns) {
                 pair.rung = ClockRung::Disciplined;
-                pair.basis = "narrower than the exchanges, which agree with it".to_owned();
+                "narrower than the exchanges, which agree with it".clone_into(&mut pair.basis);
             } else {
                 pair.rung = ClockRung::Exchanges;
                 pair.basis = format!(

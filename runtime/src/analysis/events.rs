@@ -65,7 +65,11 @@ pub(super) fn start_of(
     channel: &Channel,
     clocks: &HostClocks,
 ) -> Option<Instant> {
-    let host = &topology.process(&channel.from)?.host;
+    start_on(result, &topology.process(&channel.from)?.host, clocks)
+}
+
+/// Start of the run on the clock of `host`; see [`start_of`].
+pub(super) fn start_on(result: &RunResult, host: &str, clocks: &HostClocks) -> Option<Instant> {
     let own = result.spans.get(host).map(|span| span.0)?;
     let starts = result.spans.iter().map(|(host, span)| (host, span.0));
     clocks.earliest_on(host, starts).or(Some(own))
@@ -91,6 +95,7 @@ fn explain(
         severity: event.severity,
         what: event.what.clone(),
         outages: Vec::new(),
+        network: None,
         messages: messages.collect(),
         messages_dropped_count: event.messages_dropped_count,
     }

@@ -6,6 +6,7 @@ mod clocks;
 mod events;
 mod faces;
 mod figures;
+pub(crate) mod network;
 pub(crate) mod outages;
 mod radio;
 pub(crate) mod records;
@@ -16,6 +17,7 @@ use std::path::{Path, PathBuf};
 
 use hil_models::case_study::Score;
 use hil_models::measure::account::MessageFate;
+use hil_models::plot::PlotSeries;
 
 use clocks::HostClocks;
 use figures::{channel_summary, process_summary, realtime_facts, run_event, run_facts};
@@ -99,11 +101,20 @@ pub(crate) fn conclude(
         &summary.channels,
         (specs, &outages),
     );
+    let errors = case.as_ref().map(|(_, case)| case.errors(records.log()));
+    let network = network::of_run(
+        (topology, result),
+        &records,
+        errors.unwrap_or_default(),
+        &mut summary.score_events,
+    );
+    let (network, network_series) = network.unzip();
+    summary.network = network;
     radio::add(&mut summary, (topology, result), &records);
     add_warnings(&mut summary, result, &records);
-    if let Some((_, case)) = case {
-        write_series(&mut summary, result, case.as_ref(), records);
-    }
+    let case = case.as_ref().map(|(_, case)| case.as_ref());
+    let network_series = network_series.unwrap_or_default();
+    write_series(&mut summary, result, (case, network_series), records);
     let path = result.folder.events();
     let text = event_log::text(&summary.run.name, &summary.score_events);
     fs::write(&path, text).map_err(|source| AnalysisError::Write { path, source })?;
@@ -133,14 +144,15 @@ fn add_outages(
     stories
 }
 
-/// Writes what the case has to plot. A run whose plots cannot be written has its report still.
+/// Writes what the case and the network have to plot. A run whose plots cannot be written has its report still.
 fn write_series(
     summary: &mut RunSummary,
     result: &RunResult,
-    case: &dyn Case,
+    (case, network): (Option<&dyn Case>, Vec<PlotSeries>),
     records: RunRecords,
 ) {
-    let made = case.series(records.log());
+    let mut made = case.map_or_else(Vec::new, |case| case.series(records.log()));
+    made.extend(network);
     // They are as large as the messages; only one of the two need be in memory.
     drop(records);
     match series::write(&result.folder.series(), made) {

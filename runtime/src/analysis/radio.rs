@@ -142,7 +142,7 @@ fn station(mac: [u8; 6], samples: &[&RadioRecord]) -> StationSummary {
             .max()
             .and_then(|ms| u64::try_from(ms).ok()),
         connected_s: known(|one| one.connected_s)
-            .last()
+            .next_back()
             .and_then(|s| u64::try_from(s).ok()),
     }
 }

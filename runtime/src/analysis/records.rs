@@ -180,6 +180,13 @@ impl RunRecords {
         self.channels.contains_key(channel)
     }
 
+    /// What the receiving gateway of `channel` noted of each datagram; empty when it left nothing.
+    pub(super) fn arrivals(&self, channel: &str) -> &[IngressRecord] {
+        let files = self.channels.get(channel);
+        let records = files.and_then(|files| files.ingress.as_deref());
+        records.unwrap_or_default()
+    }
+
     /// Every message of the run.
     pub(crate) fn log(&self) -> &RunLog {
         &self.log

@@ -40,7 +40,7 @@ impl ChronyTracking {
             let text = fields[index];
             let value: f64 = text
                 .parse()
-                .map_err(|_| format!("{name} {text:?} is not a number"))?;
+                .map_err(|error| format!("{name} {text:?}: {error}"))?;
             // A day: a clock that far off has no bound worth the name.
             if (lowest..=86_400.0).contains(&value) {
                 Ok(value)
@@ -50,7 +50,7 @@ impl ChronyTracking {
         };
         let stratum = fields[2]
             .parse()
-            .map_err(|_| format!("stratum {:?} is not a number", fields[2]))?;
+            .map_err(|error| format!("stratum {:?}: {error}", fields[2]))?;
         Ok(Self {
             reference: format!("{} {}", fields[0], fields[1]).trim().to_owned(),
             stratum,
@@ -68,6 +68,11 @@ impl ChronyTracking {
 
     /// Largest error of the system clock against the reference, nanoseconds: root dispersion, half
     /// the root delay, and what chronyd has yet to slew (chrony FAQ, "clock error bound").
+    #[allow(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "each part is at most a day and none below zero"
+    )]
     pub fn bound_ns(&self) -> u64 {
         let bound_s = self.root_dispersion_s + self.root_delay_s / 2.0 + self.system_offset_s.abs();
         (bound_s * 1e9).ceil() as u64

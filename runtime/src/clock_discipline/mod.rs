@@ -66,7 +66,7 @@ impl HostDiscipline {
                 Err(why) => found.basis = format!("ptp4l runs but says nothing: {why}"),
             }
         } else {
-            found.basis = "neither chronyd nor ptp4l runs here".to_owned();
+            "neither chronyd nor ptp4l runs here".clone_into(&mut found.basis);
         }
         Ok(found)
     }

@@ -21,6 +21,10 @@ impl PtpStatus {
     ///
     /// # Errors
     /// In words: a missing or unreadable field, or more than one clock that answered.
+    #[allow(
+        clippy::cast_possible_truncation,
+        reason = "numbers beyond nine days are refused"
+    )]
     pub fn parse(text: &str) -> Result<Self, String> {
         let value = |name: &str| -> Result<&str, String> {
             let mut found = text.lines().filter_map(|line| {
@@ -37,7 +41,7 @@ impl PtpStatus {
             let text = value(name)?;
             let number: f64 = text
                 .parse()
-                .map_err(|_| format!("{name} {text:?} is not a number"))?;
+                .map_err(|error| format!("{name} {text:?}: {error}"))?;
             // Nine days in nanoseconds: a double holds them exactly.
             if number.abs() <= 8e14 {
                 Ok(number)
@@ -68,6 +72,11 @@ impl PtpStatus {
 
     /// Largest error against the grandmaster, nanoseconds: the offset not yet corrected, and a path
     /// that may take all of its time in one direction.
+    #[allow(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "checked when read: not below zero, and nine days at most"
+    )]
     pub fn bound_ns(&self) -> u64 {
         let path_ns = self.path_delay_ns.ceil() as u64;
         self.master_offset_ns.unsigned_abs().saturating_add(path_ns)

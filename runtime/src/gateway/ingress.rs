@@ -18,7 +18,7 @@ use super::{GatewayError, poll_descriptors};
 use crate::channel::{ChannelError, RawOutput};
 use crate::clock::MonotonicClock;
 use crate::record::RecordSink;
-use crate::wait::{Pause, WaitStrategy};
+use crate::wait::{Pause, WaitStrategy, release};
 
 /// Everything the thread works with.
 #[derive(Debug)]
@@ -168,9 +168,17 @@ impl Ingress {
 
     /// Waits for a datagram or an appointment.
     pub(crate) fn rest(&mut self) -> Result<(), GatewayError> {
-        let dues = [self.bridge.next_wakeup(), self.receiver.next_due()];
-        let due = dues.into_iter().flatten().min();
-        match self.wait.pause(MonotonicClock::now(), due) {
+        let now = MonotonicClock::now();
+        let due = self.receiver.next_due();
+        let pause = if self.is_emulated {
+            // A link model's delay is a promise; the bridge's appointments are not.
+            let pause = self.wait.pause(now, self.bridge.next_wakeup());
+            due.map_or(pause, |due| pause.sooner(release(now, due)))
+        } else {
+            let dues = [self.bridge.next_wakeup(), due];
+            self.wait.pause(now, dues.into_iter().flatten().min())
+        };
+        match pause {
             Pause::Spin => core::hint::spin_loop(),
             Pause::Sleep(until) => {
                 poll_descriptors(self.receiver.poll_fd().into_iter(), until)?;

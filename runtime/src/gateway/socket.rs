@@ -15,13 +15,16 @@ use hil_gateways::transport::tcp::{
 use hil_gateways::transport::timestamping::TimestampMode;
 use hil_gateways::transport::udp::{GrantedOptions, PathMtu, UdpReceiver, UdpSender, UdpSettings};
 use hil_gateways::transport::{DatagramReceiver, DatagramSender};
-use hil_models::link::{Fate, LinkModel};
+use hil_models::link::{Fate, LinkModel, LossCauses};
 use hil_models::time::Instant;
 
 use super::GatewayError;
 use super::stamp_plan::StampPlan;
 use crate::clock::MonotonicClock;
-use crate::process::launch::{DirectionLaunch, EmulationLaunch, Side, SocketLaunch, Transport};
+use crate::process::emulation_room::EmulationRoom;
+use crate::process::launch::{
+    DirectionLaunch, EmulationError, EmulationLaunch, Side, SocketLaunch, Transport,
+};
 use crate::process::pipe::RunStart;
 use crate::radio::category;
 use crate::topology::Timestamps;
@@ -29,8 +32,6 @@ use crate::topology::Timestamps;
 /// IP and UDP headers of a datagram.
 const IPV4_HEADERS: usize = 20 + 8;
 const IPV6_HEADERS: usize = 40 + 8;
-/// Most datagrams an emulated link holds during an outage.
-const HELD_COUNT_MAX: usize = 16_384;
 
 /// A direction's socket and what is known of it.
 #[derive(Debug)]
@@ -93,6 +94,10 @@ impl OpenSocket {
                 "link model behind the socket, part of RX stamp → received by gateway".to_owned(),
                 emulation.describe(),
             ));
+            if launch.side == Side::Ingress {
+                let room = room(emulation, launch)?;
+                facts.push(("room of the link model".to_owned(), room.to_string()));
+            }
         }
         Ok(Self {
             ends,
@@ -202,23 +207,18 @@ fn socket_facts(settings: &UdpSettings, granted: GrantedOptions) -> Vec<(String,
     facts
 }
 
-/// Room for everything that is under way at once, but for one in a million, at 4000 datagrams per
-/// second, and for what eight mean outages hold back of 1000 per second.
-fn emulated_capacity(emulation: &EmulationLaunch) -> usize {
-    let outages = &emulation.spec.outages;
-    let held_s = if outages.is_active() && outages.buffered {
-        8.0 * outages.mean_s
-    } else {
-        0.0
-    };
-    #[expect(
-        clippy::cast_possible_truncation,
-        clippy::cast_sign_loss,
-        reason = "a checked mean is at most an hour, and what is above the bound is cut"
-    )]
-    let held_count = ((1000.0 * held_s) as usize).min(HELD_COUNT_MAX);
-    let under_way = emulation.flight_time(1.0 - 1e-6).as_millis() as usize * 4;
-    EmulatedSettings::default().capacity_count + under_way + held_count
+fn room(
+    emulation: &EmulationLaunch,
+    launch: &DirectionLaunch,
+) -> Result<EmulationRoom, EmulationError> {
+    Ok(emulation.room(launch.size_bytes)?)
+}
+
+/// The longest datagram of the channel: as long as a message needs, with room for the greetings and
+/// clock exchanges that share its socket, and no longer than the path takes.
+fn held_bytes_max(launch: &DirectionLaunch) -> usize {
+    let message = launch.size_bytes + wire::HEADER_BYTES + wire::TAG_BYTES;
+    message.max(512).min(launch.socket.path_mtu_bytes)
 }
 
 /// Puts the receiver behind the launch's link model, if it has one. Greetings and clock exchanges
@@ -236,8 +236,8 @@ fn emulate(
         start: start.clone(),
     };
     let settings = EmulatedSettings {
-        capacity_count: emulated_capacity(emulation),
-        datagram_bytes_max: launch.socket.path_mtu_bytes,
+        capacity_count: room(emulation, launch)?.capacity_count,
+        datagram_bytes_max: held_bytes_max(launch),
         clock: Some(MonotonicClock::now),
         number_of: Some(message_number),
     };
@@ -285,6 +285,10 @@ impl<L: LinkModel> SinceStart<L> {
 }
 
 impl<L: LinkModel> LinkModel for SinceStart<L> {
+    fn loss_causes(&self) -> Option<LossCauses> {
+        self.link.loss_causes()
+    }
+
     fn offer(&mut self, now: Instant, length_bytes: usize) -> Fate {
         self.ask(now, |link, at| link.offer(at, length_bytes))
     }
@@ -387,16 +391,5 @@ mod tests {
             schedule.next().unwrap()
         };
         assert_ne!(first("hop"), first("wire"));
-    }
-
-    #[test]
-    fn a_held_outage_has_room_and_none_has_more_than_the_bound() {
-        let mut held = emulation(100.0);
-        let lossy = emulated_capacity(&held);
-        assert_eq!(lossy, 1024 + 20);
-        held.spec.outages.buffered = true;
-        assert_eq!(emulated_capacity(&held), lossy + 4_000);
-        held.spec.outages.mean_s = 30.0;
-        assert_eq!(emulated_capacity(&held), lossy + HELD_COUNT_MAX);
     }
 }

@@ -358,20 +358,8 @@ fn is_data(own: &OwnHeader) -> bool {
     own.kind == Kind::Data
 }
 
-fn channel(
-    name: &str,
-    side: &GatewaySide,
-    sockets: (Option<u64>, Option<u64>),
-    probe: &Probe<'_>,
-) -> ChannelComparison {
-    let has_left = |one: &&EgressRecord| one.flags & EgressRecord::REFUSED_BY_KERNEL == 0;
-    let left = side.egress.iter().filter(has_left);
-    let data_sent: u64 = left.map(|one| u64::from(one.fragment_count)).sum();
-    let data_received: u64 = side
-        .ingress
-        .iter()
-        .map(|one| u64::from(one.fragment_count))
-        .sum();
+/// Departure and arrival of each message by the gateways' kernel stamps.
+fn gateway_wire(side: &GatewaySide) -> BTreeMap<Message, (i64, i64)> {
     let mut gateway = BTreeMap::new();
     let departures: BTreeMap<Message, i64> = side
         .egress
@@ -392,6 +380,24 @@ fn channel(
                 .or_insert((*departure, one.rx_software_ns));
         }
     }
+    gateway
+}
+
+fn channel(
+    name: &str,
+    side: &GatewaySide,
+    sockets: (Option<u64>, Option<u64>),
+    probe: &Probe<'_>,
+) -> ChannelComparison {
+    let has_left = |one: &&EgressRecord| one.flags & EgressRecord::REFUSED_BY_KERNEL == 0;
+    let left = side.egress.iter().filter(has_left);
+    let data_sent: u64 = left.map(|one| u64::from(one.fragment_count)).sum();
+    let data_received: u64 = side
+        .ingress
+        .iter()
+        .map(|one| u64::from(one.fragment_count))
+        .sum();
+    let gateway = gateway_wire(side);
     let mut columns: [LatencyHistogram; 5] = Default::default();
     for (key, (departure, arrival)) in probe.wire() {
         if let Some((left_ns, came_ns)) = gateway.get(&key) {

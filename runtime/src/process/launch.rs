@@ -13,6 +13,7 @@ use hil_models::link::spec::{LinkPlace, LinkSpec, Way};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
+use super::emulation_room::EmulationRoom;
 use crate::realtime::RealtimeRequest;
 use crate::topology::{Crossing, Direction, Timestamps};
 use crate::trace::source::{TraceFileError, TraceLaunch};
@@ -194,6 +195,27 @@ impl EmulationLaunch {
     pub fn flight_time(&self, quantile: f64) -> Duration {
         let traced = self.trace.as_ref().and_then(TraceLaunch::delay_max);
         traced.unwrap_or_else(|| self.spec.flight_time(quantile))
+    }
+
+    /// Room for what the model holds of a channel of messages of `message_bytes`.
+    ///
+    /// # Errors
+    /// When a gateway cannot hold that much.
+    pub fn room(&self, message_bytes: usize) -> Result<EmulationRoom, ParameterError> {
+        let traced = self.trace.as_ref().and_then(TraceLaunch::delay_max);
+        let traced = traced.map(|longest| LinkSpec::fixed(longest, 0.0));
+        let spec = traced.as_ref().unwrap_or(&self.spec);
+        EmulationRoom::of(spec, message_bytes).map_err(|error| {
+            let key = format!("links.{}.{}", self.link, error.key);
+            ParameterError::new(&key, error.problem)
+        })
+    }
+
+    /// Share of the messages that the loss law loses in the long run; `None` for a trace, which has
+    /// none.
+    pub fn loss_ratio(&self) -> Option<f64> {
+        let is_traced = self.trace.is_some();
+        (!is_traced).then(|| self.spec.loss.loss_ratio())
     }
 
     /// The model in words.

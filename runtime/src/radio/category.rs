@@ -32,8 +32,8 @@ impl fmt::Display for AccessCategory {
 pub enum Mapping {
     /// The three top bits of the code point: Linux before 6.8 as it was released.
     TopBits,
-    /// RFC 8325, section 4: Linux 6.8 and later, where no QoS map of the access point says
-    /// otherwise.
+    /// RFC 8325, section 4: Linux 6.8 and later, where no quality-of-service map of the access
+    /// point says otherwise.
     Rfc8325,
 }
 
@@ -59,14 +59,16 @@ pub fn user_priority(priority: u32, dscp: u8, mapping: Mapping) -> u8 {
         return u8::try_from(direct).expect("matched up to 7");
     }
     let top_bits = (dscp & 63) >> 3;
-    match (mapping, dscp) {
-        (Mapping::TopBits, _) => top_bits,
+    if mapping == Mapping::TopBits {
+        return top_bits;
+    }
+    match dscp {
         // Lower effort, CS1, CS2, AF2x, CS3, AF3x, voice admit and expedited forwarding.
-        (_, 1) => 1,
-        (_, 16) => 0,
-        (_, 18 | 20 | 22) => 3,
-        (_, 24 | 26 | 28 | 30) => 4,
-        (_, 44 | 46) => 6,
+        1 => 1,
+        16 => 0,
+        18 | 20 | 22 => 3,
+        24 | 26 | 28 | 30 => 4,
+        44 | 46 => 6,
         _ => top_bits,
     }
 }

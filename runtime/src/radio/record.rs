@@ -155,12 +155,15 @@ impl RateRecord {
         };
         let mut text = generation.to_owned();
         if self.mcs != NO_BYTE {
-            text.push_str(&format!(" MCS {}", self.mcs));
+            let words = format!(" MCS {}", self.mcs);
+            text.push_str(&words);
         }
         if self.stream_count != NO_BYTE {
-            text.push_str(&format!(", {} spatial streams", self.stream_count));
+            let words = format!(", {} spatial streams", self.stream_count);
+            text.push_str(&words);
         }
-        text.push_str(&format!(", {} MHz", self.width_mhz));
+        let words = format!(", {} MHz", self.width_mhz);
+        text.push_str(&words);
         Some(text)
     }
 }

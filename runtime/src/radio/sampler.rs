@@ -83,10 +83,8 @@ impl Sampler {
         if !self.hears_events {
             text.push_str("; events of the association unavailable");
         } else if tally.event_count > 0 {
-            text.push_str(&format!(
-                "; {} events of the association",
-                tally.event_count
-            ));
+            let words = format!("; {} events of the association", tally.event_count);
+            text.push_str(&words);
         }
         if tally.left_out_count > 0 {
             let more = format!(
@@ -96,7 +94,8 @@ impl Sampler {
             text.push_str(&more);
         }
         if let Some(error) = tally.newest_failure {
-            text.push_str(&format!("; {} failed: {error}", tally.failed_count));
+            let words = format!("; {} failed: {error}", tally.failed_count);
+            text.push_str(&words);
         }
         (label, text)
     }

@@ -14,7 +14,9 @@ use serde::{Deserialize, Serialize};
 
 use super::assessment::Assessment;
 use super::clock_summary::ClockSection;
+use super::emulation::EmulationFigures;
 use super::face::FaceSummary;
+use super::network::NetworkReport;
 use super::radio::RadioReport;
 use super::score_event::ScoreEvents;
 use crate::card_clock::figures::HardwareStamps;
@@ -56,6 +58,10 @@ pub struct RunSummary {
     /// What happened to the robot, and what the network had done to the messages concerned.
     #[serde(default)]
     pub score_events: ScoreEvents,
+    /// The network in the field's terms, and on one axis with the robot; `None` when no channel
+    /// crossed one.
+    #[serde(default)]
+    pub network: Option<NetworkReport>,
     /// Anything else a reader must know; [`Assessment::warnings`] come on top.
     pub warnings: Vec<String>,
 }
@@ -77,6 +83,7 @@ impl RunSummary {
             radio: RadioReport::default(),
             score: Vec::new(),
             score_events: ScoreEvents::default(),
+            network: None,
             warnings: Vec::new(),
         }
     }
@@ -323,6 +330,10 @@ pub struct ChannelSummary {
     /// recorded.
     #[serde(default)]
     pub outages: Option<OutageFigures>,
+    /// How well the hosts kept its emulated link; `None` on every other link, or when no message
+    /// came through it.
+    #[serde(default)]
+    pub emulation: Option<EmulationFigures>,
     /// What was recorded of a channel that is only recorded; `None` when nothing was.
     #[serde(default)]
     pub recorded: Option<RecordedFigures>,

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use std::io;
 use std::path::PathBuf;
 
+use hil_models::case_study::ParameterError;
 use hil_models::time::Instant;
 
 use super::crew::CrewError;
@@ -52,6 +53,9 @@ pub enum RunError {
     /// A process cannot be started.
     #[error("{0}")]
     Start(String),
+    /// An emulated link asks for more than a gateway can hold.
+    #[error("the emulated link cannot be kept: {0}")]
+    Emulation(ParameterError),
 }
 
 impl From<CrewError> for RunError {

@@ -25,6 +25,7 @@ use crate::clock::MonotonicClock;
 use crate::clock_discipline::HostDiscipline;
 use crate::console::Console;
 use crate::host_facts::HostFacts;
+use crate::process::emulation_room::check_emulation;
 use crate::run_folder::{RunFolder, utc_text};
 use crate::signals::Signals;
 use crate::topology::{Host, Topology};
@@ -60,6 +61,7 @@ pub fn run(
         .collect();
     let plan = plan(topology, &hosts);
     crew::find_programs(&plan.processes)?;
+    check_emulation(topology).map_err(RunError::Emulation)?;
     let folder = make_folder(topology, &hosts)?;
     let facts = HostFacts::gather();
     let discipline = HostDiscipline::gather().ok();

@@ -106,7 +106,7 @@ fn read_spec(reader: &mut Reader<'_>, default: &LinkSpec) -> LinkSpec {
     if let Some(ratio) = ratio {
         spec.loss = LossLaw::bernoulli(ratio);
     }
-    if let Some(table) = reader.table("loss") {
+    if let Some(table) = reader.table_or("loss", "a table with a law; did you mean `loss_ratio`?") {
         if ratio.is_some() {
             let why = "beside [loss] says the loss twice; leave one of them out";
             reader.refuse_present(&["loss_ratio"], why);

@@ -7,6 +7,7 @@ use super::limits;
 use super::model::{Execution, OnExit, Scheduling, Wait};
 use super::model_links::{Gateway, Hop, Timestamps, Via};
 use super::reader::{At, Reader};
+use super::units::format_duration;
 
 #[derive(Debug)]
 pub(super) struct LinkEntry {
@@ -66,6 +67,9 @@ impl LinkEntry {
                        the kernel could stamp; leave it out, or write \"off\"";
             reader.refuse_present(&["timestamps"], why);
         }
+        if matches!(kind, Some(Kind::Emulated)) {
+            refuse_slack(&reader, &hop.gateway.execution);
+        }
         let emulation = read_emulation(&mut reader);
         let via = kind.map(|kind| match kind {
             Kind::SharedMemory => {
@@ -90,6 +94,21 @@ impl LinkEntry {
         };
         reader.finish();
         entry
+    }
+}
+
+/// An emulated delay ends with a timer, which the kernel may fire later by the slack; real-time
+/// threads have none (prctl(2), `PR_SET_TIMERSLACK`).
+fn refuse_slack(reader: &Reader<'_>, execution: &Execution) {
+    let (slack, most) = (execution.timer_slack, limits::EMULATED_TIMER_SLACK_MAX);
+    if slack > most && execution.scheduling == Scheduling::Other {
+        let problem = format!(
+            "has a timer_slack of \"{}\", by which every delay of the emulated link could be late; \
+             at most \"{}\", or scheduling = \"fifo\"",
+            format_duration(slack),
+            format_duration(most)
+        );
+        reader.refuse("gateway", Fault::Inconsistent(problem));
     }
 }
 

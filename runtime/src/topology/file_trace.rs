@@ -9,7 +9,11 @@ use super::reader::Reader;
 use super::resolved::{duration, put};
 use crate::trace::source::{BaseFolder, TraceSource};
 
-const MATCHES: &[(&str, TraceMatch)] = &[("index", TraceMatch::Index), ("time", TraceMatch::Time)];
+const MATCHES: &[(&str, TraceMatch)] = &[
+    ("index", TraceMatch::Index),
+    ("time", TraceMatch::Time),
+    ("tick", TraceMatch::Tick),
+];
 
 const ENDS: &[(&str, TraceEnd)] = &[
     ("wrap", TraceEnd::Wrap),

@@ -302,8 +302,20 @@ impl<'t> Reader<'t> {
 
     /// A table; the caller ends it with [`Reader::finish`].
     pub(super) fn table(&mut self, key: &'static str) -> Option<Reader<'t>> {
+        self.table_or(key, "a table")
+    }
+
+    /// As [`Reader::table`], with words of its own for anything else.
+    pub(super) fn table_or(
+        &mut self,
+        key: &'static str,
+        expected: &'static str,
+    ) -> Option<Reader<'t>> {
         let node = self.node(key)?;
-        self.table_of(key, node)
+        if matches!(node.value, Value::Table(_)) {
+            return self.table_of(key, node);
+        }
+        self.wrong_type(key, node, expected)
     }
 
     fn table_of(&self, key: &str, node: &'t Node) -> Option<Reader<'t>> {

@@ -6,6 +6,7 @@ mod faulty;
 mod fleet;
 mod hosts;
 mod layers;
+mod links;
 mod misspelt;
 mod mutation;
 mod recorded;
@@ -121,6 +122,8 @@ const SHIPPED: &[&str] = &[
     "split.toml",
     "emulated.toml",
     "outages.toml",
+    "static-cells.toml",
+    "bad-link.toml",
     "wifi6.toml",
     "egm-client.toml",
     "egm-robot.toml",

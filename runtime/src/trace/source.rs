@@ -147,6 +147,7 @@ impl TraceLaunch {
         let matching = match self.replay.matching {
             TraceMatch::Index => "message by message",
             TraceMatch::Time => "by the time of the run",
+            TraceMatch::Tick => "tick by tick",
         };
         let end = match self.replay.end {
             TraceEnd::Wrap => "begins anew",

@@ -250,7 +250,7 @@ fn a_corrupt_block_with_sound_lengths_is_passed_and_broken_lengths_end_the_secti
     // The same with a broken length: the rest of this section is lost, the next one is not.
     let mut broken = unknown;
     broken[4] = 0xff;
-    let length = (blocks.len() + broken.len() + third.len()) as i64;
+    let length = i64::try_from(blocks.len() + broken.len() + third.len()).unwrap();
     let first = [
         maker.section(length),
         blocks.clone(),

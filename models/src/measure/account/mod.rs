@@ -20,6 +20,7 @@ mod figures;
 mod gaps;
 mod join;
 mod outage;
+mod passage;
 #[cfg(test)]
 mod random_fates;
 mod segments;
@@ -41,6 +42,7 @@ pub use outage::{
     Foregoing, Happening, LongestOutage, OUTAGE_EFFECT_MAX, Outage, OutageClass, OutageFigures,
     OutageFinder, Standing, foregoing, outages,
 };
+pub use passage::passages;
 pub use stage::{MessageFate, Side, Stage};
 pub use story::{MessageStory, stories};
 pub use trace::{TRACE_MESSAGES_MAX, TooManyMessages, TraceChannel, link_trace};

@@ -45,6 +45,9 @@ pub(super) fn channel(canvas: &mut Canvas, channel: &ChannelSummary) {
         round_trip(canvas, &account.round_trip);
         losses(canvas, account);
     }
+    if let Some(figures) = &channel.emulation {
+        super::emulation::emulation(canvas, figures);
+    }
     if let Some(figures) = &channel.outages {
         super::outages::outages(canvas, figures);
     }
