@@ -25,6 +25,12 @@ GUEST_MODULES=(net crypto lib arch fs/9p fs/netfs fs/fscache fs/ext4 fs/jbd2 fs/
 # What finds the root file system.
 ROOT_MODULES=(virtio_pci virtio_blk crc32c_generic ext4)
 
+# What the guest is made of: an image of another recipe is made again.
+guest_recipe() {
+    { echo "$GUEST_PACKAGES ${GUEST_MODULES[*]} ${ROOT_MODULES[*]}"
+      cat "$LAB_DIR/guest-init.sh"; } | sha256sum | cut -d ' ' -f 1
+}
+
 build_guest() {
     local work=$LAB_CACHE/guest.work root=$LAB_CACHE/guest.work/root version
     rm -rf "$work"
@@ -49,7 +55,9 @@ build_guest() {
     mke2fs -q -t ext4 -O ^has_journal -m 0 -d "$root" "$work/guest.ext4" \
         "$(($(du -sm "$root" | cut -f1) * 5 / 4 + 128))M" || lab_fail "mke2fs failed"
     # The image last: it is what says that all three are there.
-    mv "$work/vmlinuz" "$work/initramfs.gz" "$work/guest.ext4" "$LAB_CACHE/" || exit 2
+    guest_recipe >"$work/guest.recipe"
+    mv "$work/vmlinuz" "$work/initramfs.gz" "$work/guest.recipe" "$work/guest.ext4" \
+        "$LAB_CACHE/" || exit 2
     rm -rf "$work" "$LAB_CACHE/kernel-packages"
 }
 
@@ -130,8 +138,9 @@ main() {
     for part in "${wanted[@]}"; do
         [[ -z "$fresh" ]] || rm -rf "$LAB_CACHE/${part:?}" "$LAB_CACHE/$part.ext4"
         case $part in
-            guest) [[ -s "$LAB_CACHE/guest.ext4" && ! "$LAB_DIR/guest-init.sh" -nt \
-                "$LAB_CACHE/guest.ext4" ]] || { requirements; build_guest; } ;;
+            guest) [[ -s "$LAB_CACHE/guest.ext4" &&
+                $(cat "$LAB_CACHE/guest.recipe" 2>/dev/null) == "$(guest_recipe)" ]] ||
+                { requirements; build_guest; } ;;
             qemu7) [[ -d "$LAB_CACHE/qemu7" ]] ||
                 { requirements; build_qemu qemu7 "$LAB_SUITE"; } ;;
             qemu10) [[ -d "$LAB_CACHE/qemu10" ]] ||

@@ -24,11 +24,8 @@ fn card_lines(canvas: &mut Canvas, card: &CardSummary) {
     } else {
         Tone::Caution
     };
-    canvas.field(
-        &story.name(),
-        Tone::Plain,
-        &format!("claims {}", story.claims),
-    );
+    canvas.paragraph(INDENT, Tone::Strong, &story.name());
+    canvas.field("claims", Tone::Plain, &story.claims);
     canvas.field("armed", tone, &story.arming);
     canvas.field("before, after", Tone::Faint, &story.restoring);
     match &card.clock {
@@ -81,10 +78,11 @@ fn channel_lines(canvas: &mut Canvas, channel: &ChannelStamps) {
     let sent = share(channel.tx_hardware_count, channel.sent_count);
     let both = grouped(channel.tx_both_count);
     canvas.blank();
+    canvas.paragraph(INDENT, Tone::Strong, &channel.channel);
     canvas.field(
-        &channel.channel,
-        Tone::Strong,
-        &format!("hardware TX {sent}, the software stamp beside it on {both}"),
+        "hardware TX",
+        Tone::Plain,
+        &format!("{sent}, the software stamp beside it on {both}"),
     );
     let received = share(channel.rx_hardware_count, channel.received_count);
     let reason = if channel.rx_reason.is_empty() {
@@ -92,7 +90,7 @@ fn channel_lines(canvas: &mut Canvas, channel: &ChannelStamps) {
     } else {
         format!(": {}", channel.rx_reason)
     };
-    canvas.field("", Tone::Plain, &format!("hardware RX {received}{reason}"));
+    canvas.field("hardware RX", Tone::Plain, &format!("{received}{reason}"));
     for segment in &channel.segments {
         canvas.paragraph(INDENT + 2, segment_tone(segment), &segment_words(segment));
     }
