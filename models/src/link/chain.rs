@@ -121,7 +121,7 @@ impl LinkModel for LinkChain {
     }
 
     fn loss_causes(&self) -> Option<LossCauses> {
-        let radio = self.wifi.as_ref().and_then(|wifi| wifi.loss_causes());
+        let radio = self.wifi.as_ref().and_then(LinkModel::loss_causes);
         Some(self.lost.plus(radio.unwrap_or_default()))
     }
 }

@@ -114,6 +114,7 @@ pub struct LossCauses {
 
 impl LossCauses {
     /// These and others.
+    #[must_use]
     pub const fn plus(self, other: Self) -> Self {
         Self {
             outage_count: self.outage_count + other.outage_count,

@@ -13,7 +13,7 @@ use crate::time::Instant;
 /// One direction.
 #[derive(Debug)]
 pub(crate) enum Path {
-    Impaired(ImpairedLink),
+    Impaired(Box<ImpairedLink>),
     Wifi(Box<WifiLink>),
 }
 
@@ -31,7 +31,7 @@ impl Path {
         Ok(match &links.wifi {
             None => {
                 let stalls = RandomStream::new(seed, "fleet stalls");
-                Self::Impaired(ImpairedLink::new(impairments, own, stalls)?)
+                Self::Impaired(Box::new(ImpairedLink::new(impairments, own, stalls)?))
             }
             Some(wifi) => {
                 let shared = RandomStream::new(seed, "fleet radio");

@@ -1,7 +1,7 @@
 //! Law of a shifted exponential delay: `min`, plus a time without memory. What waiting behind
 //! Poisson traffic in a single queue looks like; real queues remember, this law does not.
 //!
-//! P(delay > min + x) = exp(-x / mean_excess); a draw above `max` is drawn anew.
+//! `P(delay > min + x) = exp(-x / mean_excess)`; a draw above `max` is drawn anew.
 
 use core::time::Duration;
 

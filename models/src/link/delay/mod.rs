@@ -21,6 +21,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::case_study::ParameterError;
 use crate::random::RandomStream;
+use crate::time::duration_ns;
 
 pub use exponential::Exponential;
 pub use fixed::Fixed;
@@ -125,7 +126,7 @@ impl DelayLaw {
     /// The delay that a share of `quantile` of all messages does not exceed, to 1 ns; `quantile`
     /// within 0..=1.
     pub fn quantile(&self, quantile: f64) -> Duration {
-        let (mut low_ns, mut high_ns) = (0_u64, DELAY_MAX.as_nanos() as u64);
+        let (mut low_ns, mut high_ns) = (0_u64, duration_ns(DELAY_MAX).unsigned_abs());
         while low_ns < high_ns {
             let middle_ns = u64::midpoint(low_ns, high_ns);
             if self.distribution(middle_ns as f64 * 1e-9) >= quantile {

@@ -4,7 +4,7 @@
 //! the same bursts, whatever their rates, and both directions do when their mean times are equal.
 //!
 //! The states of two instants t apart agree more than by chance by
-//! exp(-t (1 / good_mean + 1 / bad_mean)). What is lost of a message that comes alone is as in the
+//! `exp(-t (1 / good_mean + 1 / bad_mean))`. What is lost of a message that comes alone is as in the
 //! per-message law: the long-run ratio. It models no retransmission and no delay.
 
 use core::time::Duration;
@@ -36,7 +36,7 @@ const fn one() -> f64 {
 }
 
 const SHORTEST: Duration = Duration::from_micros(1);
-const LONGEST: Duration = Duration::from_secs(3600);
+const LONGEST: Duration = Duration::from_hours(1);
 
 impl Bursts {
     /// Checks every number against its range.

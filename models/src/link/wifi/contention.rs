@@ -58,7 +58,7 @@ pub(crate) struct Contention {
     pub(crate) access: Access,
     /// Probability that another station begins in a slot.
     pub(crate) begin_ratio: f64,
-    /// ln(1 - begin_ratio), to skip empty slots.
+    /// `ln(1 - begin_ratio)`, to skip empty slots.
     stay_log: f64,
     busy_ratio: f64,
     busy_mean_ns: f64,

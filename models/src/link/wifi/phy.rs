@@ -53,7 +53,7 @@ const BLOCK_ACK_BITS: u64 = 22 + 8 * 32;
 /// Largest payload of one Ethernet-sized IP packet behind its header.
 const IP_PAYLOAD_BYTES: u64 = 1480;
 const UDP_HEADER_BYTES: u64 = 8;
-/// Per packet: A-MPDU delimiter 4, QoS data header with four addresses 32, CCMP 16, LLC 8, IPv4
+/// Per packet: A-MPDU delimiter 4, `QoS` data header with four addresses 32, CCMP 16, LLC 8, IPv4
 /// 20, FCS 4, padding 2 on average.
 const PACKET_OVERHEAD_BYTES: u64 = 4 + 32 + 16 + 8 + 20 + 4 + 2;
 
@@ -119,7 +119,7 @@ impl Phy {
     }
 }
 
-/// N_SD of a full-width resource unit (27.5).
+/// `N_SD` of a full-width resource unit (27.5).
 const fn data_subcarriers(channel_width_mhz: u32) -> u32 {
     match channel_width_mhz {
         20 => 234,

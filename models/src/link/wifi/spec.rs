@@ -50,7 +50,7 @@ impl AccessCategory {
 
     /// Its word in files.
     pub fn word(self) -> &'static str {
-        word_of(Self::WORDS, self)
+        word_of(Self::WORDS, &self)
     }
 }
 
@@ -64,12 +64,12 @@ impl PowerSave {
 
     /// Its word in files.
     pub fn word(self) -> &'static str {
-        word_of(Self::WORDS, self)
+        word_of(Self::WORDS, &self)
     }
 }
 
-fn word_of<T: PartialEq>(words: &[(&'static str, T)], value: T) -> &'static str {
-    let found = words.iter().find(|(_, known)| *known == value);
+fn word_of<T: PartialEq>(words: &[(&'static str, T)], value: &T) -> &'static str {
+    let found = words.iter().find(|(_, known)| known == value);
     found.expect("every variant has its word").0
 }
 
