@@ -136,7 +136,7 @@ fn run(
             Vec::new()
         }
     };
-    let mut rounds: Vec<(&'static str, Box<dyn FnMut() -> Vec<u64> + '_>)> = Vec::new();
+    let mut rounds: Vec<(&'static str, Round<'_>)> = Vec::new();
     for (title, names) in MEASURED {
         let index = cases.iter().position(|case| case.title == title);
         let Some(index) = index else { continue };
@@ -154,6 +154,9 @@ fn run(
     let mut floor = || turns.floor(&far, SLICE);
     compare(round_count, &mut floor, &mut contestants)
 }
+
+/// One slice of a contestant: its samples, nanoseconds.
+type Round<'a> = Box<dyn FnMut() -> Vec<u64> + 'a>;
 
 fn report(outcome: &Comparison) {
     let references: Vec<usize> = (0..outcome.rows.len()).map(|index| index & !1).collect();

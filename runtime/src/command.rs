@@ -153,20 +153,7 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
         return exit::USAGE;
     }
     if args.check {
-        if let Err(error) = check_emulation(&topology) {
-            console.error(&format!(
-                "{}: the file is valid and can be simulated, but no gateway can keep its emulated \
-                 link: {error}",
-                path.display()
-            ));
-            return exit::USAGE;
-        }
-        console.result(&format!(
-            "{}: the file is valid; it comes to\n\n{}",
-            path.display(),
-            topology.to_toml()
-        ));
-        return exit::RAN;
+        return show_check(path, &topology, console);
     }
     let hosts = match hosts_here(&topology, args.host.as_deref()) {
         Ok(hosts) => hosts,
@@ -217,6 +204,24 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
     }
 }
 
+/// What the file comes to, or why no run of it can be what it says.
+fn show_check(path: &Path, topology: &Topology, console: &mut Console) -> u8 {
+    if let Err(error) = check_emulation(topology) {
+        console.error(&format!(
+            "{}: the file is valid and can be simulated, but no gateway can keep its emulated \
+             link: {error}",
+            path.display()
+        ));
+        return exit::USAGE;
+    }
+    console.result(&format!(
+        "{}: the file is valid; it comes to\n\n{}",
+        path.display(),
+        topology.to_toml()
+    ));
+    exit::RAN
+}
+
 /// Why a run does not end with exit code 0, for those who do not read its report.
 fn complaint(result: &RunResult) -> String {
     let is_incomplete = result.has_gaps() && exit_code(&result.outcome) == exit::RAN;
@@ -234,12 +239,12 @@ fn exit_code_of_error(error: &RunError) -> u8 {
             exit::PEER_ABSENT
         }
         RunError::Folder { .. }
+        | RunError::Emulation(_)
         | RunError::Peer(
             PeerError::Mismatch { .. } | PeerError::Listen { .. } | PeerError::Own { .. },
         ) => exit::USAGE,
         RunError::Peer(PeerError::Interrupted { .. }) => interrupted(),
         RunError::Start(_) => exit::FAILED,
-        RunError::Emulation(_) => exit::USAGE,
         RunError::Domains(_) | RunError::Identity(_) => exit::INTERNAL,
     }
 }

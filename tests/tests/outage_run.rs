@@ -111,17 +111,7 @@ fn a_live_run_loses_the_spans_that_virtual_time_loses() {
     assert!(output.status.success(), "{output:?}");
     let virtual_time: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
     let live = serde_json::to_value(summary.network.as_ref().unwrap()).unwrap();
-    for (name, network) in [("live", &live), ("virtual", &virtual_time["network"])] {
-        let pair = pair_of(network, "shuttle/command");
-        println!("{name}: {pair}");
-        let of = |key: &str| pair[key].as_f64().unwrap();
-        // The cart drives on as it was told last until the silence is over.
-        assert!((0.0..=1.0).contains(&of("lag_s")), "{pair}");
-        assert!(of("coefficient") > 0.15, "{pair}");
-    }
-    // The same figure each time: virtual time depends on nothing but the seed.
-    let pair = pair_of(&virtual_time["network"], "shuttle/command");
-    assert!(pair["p_family"].as_f64().unwrap() <= 0.05, "{pair}");
+    assert_the_error_follows_the_silence(&live, &virtual_time["network"]);
     for name in CHANNELS {
         assert_the_report_shows_what_preceded_what(&live, name);
         assert_the_report_shows_what_preceded_what(&virtual_time["network"], name);
@@ -173,6 +163,20 @@ fn a_live_run_loses_the_spans_that_virtual_time_loses() {
         let told = facts.filter(|fact| fact.value.contains("2400 outages per hour of 300 ms"));
         assert_eq!(told.count(), 1);
     }
+}
+
+fn assert_the_error_follows_the_silence(live: &serde_json::Value, simulated: &serde_json::Value) {
+    for (name, network) in [("live", live), ("virtual", simulated)] {
+        let pair = pair_of(network, "shuttle/command");
+        println!("{name}: {pair}");
+        let of = |key: &str| pair[key].as_f64().unwrap();
+        // The cart drives on as it was told last until the silence is over.
+        assert!((0.0..=1.0).contains(&of("lag_s")), "{pair}");
+        assert!(of("coefficient") > 0.15, "{pair}");
+    }
+    // The same figure each time: virtual time depends on nothing but the seed.
+    let pair = pair_of(simulated, "shuttle/command");
+    assert!(pair["p_family"].as_f64().unwrap() <= 0.05, "{pair}");
 }
 
 /// `account` closes; what is shown here is what the report makes of it: which outage went before

@@ -133,7 +133,7 @@ fn check_analysis(captures: &[std::path::PathBuf; 2]) {
 fn check_cut(captures: &[std::path::PathBuf; 2]) {
     let bytes = std::fs::read(&captures[0]).unwrap();
     let cut = captures[0].with_extension("cut.pcapng");
-    std::fs::write(&cut, &bytes[..bytes.len() / 2 + 1]).unwrap();
+    std::fs::write(&cut, &bytes[..=bytes.len() / 2]).unwrap();
     let (report, code) = json(&[Path::new("analyse"), &cut]);
     assert_eq!(code, Some(1));
     let file = &report["files"][0];

@@ -293,7 +293,7 @@ fn written(folder: &RunFolder) -> std::path::PathBuf {
     let record = |index: u64| {
         let published_ns = i64::try_from(index).unwrap() * 10_000_000;
         let mut record = TraceRecord::published(published_ns, index, 16);
-        if index % 3 == 0 {
+        if index.is_multiple_of(3) {
             record.fate = TraceFate::LostInNetwork;
         } else {
             record = record.delivered(5_000_000 + published_ns % 7_000, 0);

@@ -40,7 +40,9 @@ impl Drainer {
                 for mut pair in incoming {
                     let mut file = Vec::new();
                     while is_wanted.load(Ordering::Acquire) {
-                        pair.iter_mut().for_each(|ring| drain(ring, &mut file));
+                        for ring in &mut pair {
+                            drain(ring, &mut file);
+                        }
                         thread::sleep(LOOK_PERIOD);
                     }
                     let mut sum = RingCounters::default();

@@ -1,5 +1,5 @@
 //! The header by which the Beckhoff ET2000 tells at which of its ports a frame was seen, and when:
-//! the EtherCAT switch link. 16 bytes in front of the Ethernet frame or behind it, before no frame
+//! the `EtherCAT` switch link. 16 bytes in front of the Ethernet frame or behind it, before no frame
 //! check sequence:
 //!
 //! | offset | bytes | field |

@@ -138,7 +138,7 @@ fn port(key: &'static str, value: &str) -> Result<u16, FlowError> {
 }
 
 fn address(key: &'static str, value: &str) -> Result<IpAddr, FlowError> {
-    value.parse().map_err(|_| FlowError::Value {
+    value.parse().map_err(|_unsaid| FlowError::Value {
         key,
         value: value.to_owned(),
         expected: "an IPv4 or IPv6 address without port",
@@ -313,7 +313,7 @@ fn own(datagram: &UdpDatagram<'_>) -> Result<DatagramIdentity, Unidentified> {
             Unidentified::Foreign
         });
     };
-    let header = Header::decode(bytes).map_err(|_| Unidentified::Foreign)?;
+    let header = Header::decode(bytes).map_err(|_refusal| Unidentified::Foreign)?;
     let series = [
         header.session.to_le_bytes(),
         header.epoch.to_le_bytes(),

@@ -235,7 +235,7 @@ fn describe(body: &Body<'_>, interfaces: &mut Vec<CaptureInterface>) -> Result<(
     outcome
 }
 
-/// Nanoseconds to a unit, as a fraction: if_tsresol holds a negative power of 10, or of 2 with its
+/// Nanoseconds to a unit, as a fraction: `if_tsresol` holds a negative power of 10, or of 2 with its
 /// top bit set.
 fn unit_ns(resolution: u8) -> Result<(u64, u64), Problem> {
     let exponent = u32::from(resolution & 0x7f);

@@ -116,7 +116,7 @@ impl<C: CardControl> ArmedCard<C> {
                 Ok(_) => {
                     // What it settled for instead is not what it was.
                     if let Some(former) = former {
-                        let _ = card.set(former);
+                        let _refused_again = card.set(former);
                     }
                     let error = io::Error::other("it accepts the setting and leaves them off");
                     return Err(ArmError::Refused(error));
@@ -177,7 +177,7 @@ impl<C: CardControl> Drop for ArmedCard<C> {
     fn drop(&mut self) {
         if !self.is_restored {
             // There is nobody left to tell.
-            let _ = self.restore();
+            let _untold = self.restore();
         }
     }
 }

@@ -127,7 +127,7 @@ impl CardClock {
     }
 }
 
-/// The clock behind an open `/dev/ptpN` (`FD_TO_CLOCKID` of clock_getres(2)).
+/// The clock behind an open `/dev/ptpN` (`FD_TO_CLOCKID` of `clock_getres(2)`).
 const fn dynamic_clock(descriptor: RawFd) -> ClockId {
     ClockId::from_raw((!descriptor << 3) | 3)
 }

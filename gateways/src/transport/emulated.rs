@@ -29,7 +29,7 @@ pub struct EmulatedSettings {
     pub clock: Option<fn() -> Instant>,
     /// Which message of its channel a datagram belongs to; `None` where nobody can tell. Only a
     /// recorded trace asks.
-    pub number_of: Option<fn(&[u8]) -> Option<u64>>,
+    pub number_of: Option<NumberOf>,
 }
 
 impl Default for EmulatedSettings {
@@ -44,6 +44,9 @@ impl Default for EmulatedSettings {
     }
 }
 
+/// Reads which message of its channel a datagram belongs to.
+pub type NumberOf = fn(&[u8]) -> Option<u64>;
+
 /// Position in the order of delivery: due first, then arrival, and the buffer that holds it.
 type Position = Reverse<(Instant, u64, usize)>;
 
@@ -54,7 +57,7 @@ pub struct EmulatedReceiver<R> {
     is_exempt: fn(&[u8]) -> bool,
     datagram_bytes_max: usize,
     clock: Option<fn() -> Instant>,
-    number_of: Option<fn(&[u8]) -> Option<u64>>,
+    number_of: Option<NumberOf>,
     /// One buffer per place and a last one for arrivals that find no place.
     storage: Box<[u8]>,
     held: Box<[Option<Received>]>,

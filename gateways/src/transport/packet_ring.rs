@@ -434,11 +434,11 @@ struct Mapping {
     length_bytes: usize,
 }
 
-// SAFETY: the memory belongs to the process, not to a thread, and a mapping is never shared.
 #[allow(
     unsafe_code,
     reason = "a ring may be looked into by another thread than opened it"
 )]
+// SAFETY: the memory belongs to the process, not to a thread, and a mapping is never shared.
 unsafe impl Send for Mapping {}
 
 impl Mapping {

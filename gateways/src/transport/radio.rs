@@ -43,8 +43,8 @@ pub(super) fn datagram(packet: &[u8]) -> Option<(&[u8], usize)> {
     let transport = match version(bytes, 0)? {
         4 => {
             let length = usize::from(bytes[0] & 0x0f) * 4;
-            // More fragments, or an offset: no UDP header of ours.
-            let is_whole = u16_at(bytes, 6)? & 0x3fff == 0;
+            // More fragments, or an offset: no UDP header of ours. The two top bits say neither.
+            let is_whole = u16_at(bytes, 6)? << 2 == 0;
             (length >= 20 && is_whole && *bytes.get(9)? == UDP).then_some(length)?
         }
         6 => (*bytes.get(6)? == UDP).then_some(40)?,

@@ -256,7 +256,7 @@ fn open_card(host: &Host) -> WatchedCard {
     let interface = match interface_of(host) {
         Ok(interface) => interface,
         Err(reason) => {
-            story.interface = "unknown".to_owned();
+            "unknown".clone_into(&mut story.interface);
             story.arming = format!("unavailable: {reason}");
             return WatchedCard { story, armed: None };
         }

@@ -39,17 +39,19 @@ impl Reading {
         let mut text = name.unwrap_or_default().into_owned();
         let interface = file.interfaces.get(point.interface_index);
         match interface.and_then(|one| one.name.as_deref()) {
-            Some(interface) => text.push_str(&format!(":{interface}")),
+            Some(interface) => {
+                let _infallible = write!(text, ":{interface}");
+            }
             None if file.interfaces.len() > 1 => {
-                text.push_str(&format!(":{}", point.interface_index));
+                let _infallible = write!(text, ":{}", point.interface_index);
             }
             None => {}
         }
         if let Some(port) = point.esl_port {
-            text.push_str(&format!(":port{port}"));
+            let _infallible = write!(text, ":port{port}");
         }
         if point.direction != hil_gateways::capture::Direction::Unknown {
-            text.push_str(&format!(" ({})", point.direction.label()));
+            let _infallible = write!(text, " ({})", point.direction.label());
         }
         text
     }

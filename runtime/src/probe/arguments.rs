@@ -129,7 +129,7 @@ fn parse_duration(text: &str) -> Result<Duration, String> {
     };
     let number: f64 = digits
         .parse()
-        .map_err(|_| format!("`{text}` is no time; e.g. 60s"))?;
+        .map_err(|_unsaid| format!("`{text}` is no time; e.g. 60s"))?;
     let whole = number * seconds;
     if !(1e-3..=1e7).contains(&whole) {
         return Err(format!("{text} is outside 1ms..=10000000s"));

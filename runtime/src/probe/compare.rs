@@ -2,6 +2,7 @@
 //! between the kernel's stamps, message by message. Neither side knows of the other: the run's come
 //! from record files and summary, the probe's from captures.
 
+use core::fmt::Write as _;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::io;
@@ -105,7 +106,7 @@ impl Comparison {
     pub(super) fn to_text(&self, limit_us: f64) -> String {
         let mut text = format!("{}: gateways and probe\n", self.run);
         for one in &self.channels {
-            text.push_str(&format!("\n{}\n", one.channel));
+            let _infallible = write!(text, "\n{}\n", one.channel);
             for (what, counts) in [
                 ("sent", one.sent),
                 ("received", one.received),
@@ -120,10 +121,11 @@ impl Comparison {
                 } else {
                     "DIFFERENT"
                 };
-                text.push_str(&format!(
-                    "  {what:<18}{gateway:>10} {:>10}  {word}\n",
+                let _infallible = writeln!(
+                    text,
+                    "  {what:<18}{gateway:>10} {:>10}  {word}",
                     counts.probe
-                ));
+                );
             }
             for (what, distribution) in [
                 ("wire, gateways", &one.gateway_wire),
@@ -132,15 +134,16 @@ impl Comparison {
                 ("  at departure", &one.departure_difference),
                 ("  at arrival", &one.arrival_difference),
             ] {
-                text.push_str(&format!("  {what:<18}{}\n", quantiles(distribution)));
+                let _infallible = writeln!(text, "  {what:<18}{}", quantiles(distribution));
             }
-            text.push_str(&match one.medians_apart_us() {
+            let verdict = match one.medians_apart_us() {
                 Some(apart) if apart <= limit_us => {
                     format!("  medians {apart:.2} us apart, at most {limit_us} us\n")
                 }
                 Some(apart) => format!("  medians {apart:.2} us apart, MORE than {limit_us} us\n"),
                 None => "  medians unavailable\n".to_owned(),
-            });
+            };
+            text.push_str(&verdict);
         }
         text
     }

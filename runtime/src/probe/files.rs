@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use hil_gateways::capture::CaptureInterface;
 use hil_gateways::capture::observe::Observer;
-use hil_gateways::capture::reader::{CaptureReader, Step};
+use hil_gateways::capture::reader::{CaptureReader, Format, Step};
 
 /// Bytes read at once.
 const READ_BYTES: usize = 1 << 18;
@@ -83,7 +83,7 @@ pub(super) fn read(
             Step::Ended => break,
         }
     }
-    file.format = reader.format().map(|format| format.label());
+    file.format = reader.format().map(Format::label);
     file.interfaces = reader.interfaces().to_vec();
     observer.widen(file_index, &file.interfaces);
     Ok(file)

@@ -7,6 +7,7 @@ mod compare;
 mod files;
 mod live;
 
+use core::fmt::Write as _;
 use std::path::Path;
 use std::time::Duration;
 
@@ -184,20 +185,20 @@ fn conclude(request: &Request, result: &LiveResult, console: &mut Console) -> u8
     let mut dropped_count = 0;
     for one in &result.interfaces {
         dropped_count += one.counters.dropped_count;
-        text.push_str(&format!(
+        let _infallible = write!(
+            text,
             "{}: {} in, {} out, {} dropped by the kernel",
             one.name, one.inbound_count, one.outbound_count, one.counters.dropped_count
-        ));
+        );
         if one.late_stamp_count > 0 {
             let late = one.late_stamp_count;
-            text.push_str(&format!(
-                ", {late} stamped by the tap instead of in the stack"
-            ));
+            let _infallible = write!(text, ", {late} stamped by the tap instead of in the stack");
         }
         text.push('\n');
     }
-    text.push_str(&format!(
-        "{}: {} bytes in {:.1} s{}\n",
+    let _infallible = writeln!(
+        text,
+        "{}: {} bytes in {:.1} s{}",
         request.output.display(),
         result.file_bytes,
         result.length.as_secs_f64(),
@@ -205,7 +206,7 @@ fn conclude(request: &Request, result: &LiveResult, console: &mut Console) -> u8
             .ended_by
             .map(|by| format!(", ended by {by}"))
             .unwrap_or_default()
-    ));
+    );
     console.result(&text);
     let is_early = |planned: Duration| result.length < planned;
     if dropped_count > 0 {

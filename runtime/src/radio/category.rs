@@ -55,8 +55,9 @@ impl Mapping {
 /// The user priority 0..=7 of IEEE 802.1D that a socket priority and a code point lead to
 /// (`cfg80211_classify8021d`): socket priorities 256..=263 are user priorities as they stand.
 pub fn user_priority(priority: u32, dscp: u8, mapping: Mapping) -> u8 {
-    if let Some(direct @ 0..=7) = priority.checked_sub(256) {
-        return u8::try_from(direct).expect("matched up to 7");
+    if (256..=263).contains(&priority) {
+        // The low byte of 256 + n is n.
+        return priority.to_le_bytes()[0];
     }
     let top_bits = (dscp & 63) >> 3;
     if mapping == Mapping::TopBits {

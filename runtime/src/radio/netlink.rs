@@ -128,20 +128,35 @@ impl<'a> Attributes<'a> {
     }
 
     /// The content of the first with this number.
-    pub(crate) fn find(mut self, number: u16) -> Option<&'a [u8]> {
-        self.find_map(|(one, content)| (one == number).then_some(content))
+    pub(crate) fn find(self, number: u16) -> Option<&'a [u8]> {
+        self.into_iter()
+            .find_map(|(one, content)| (one == number).then_some(content))
     }
 }
 
-impl<'a> Iterator for Attributes<'a> {
+impl<'a> IntoIterator for Attributes<'a> {
+    type Item = (u16, &'a [u8]);
+    type IntoIter = AttributeIter<'a>;
+
+    fn into_iter(self) -> AttributeIter<'a> {
+        AttributeIter(self)
+    }
+}
+
+/// Goes through [`Attributes`].
+#[derive(Debug, Clone)]
+pub(crate) struct AttributeIter<'a>(Attributes<'a>);
+
+impl<'a> Iterator for AttributeIter<'a> {
     type Item = (u16, &'a [u8]);
 
     fn next(&mut self) -> Option<Self::Item> {
-        let length = usize::from(u16_at(self.rest, 0)?);
-        let content = self.rest.get(ATTRIBUTE_BYTES..length)?;
-        let number = u16_at(self.rest, 2)? & ATTRIBUTE_NUMBER;
+        let rest = &mut self.0.rest;
+        let length = usize::from(u16_at(rest, 0)?);
+        let content = rest.get(ATTRIBUTE_BYTES..length)?;
+        let number = u16_at(rest, 2)? & ATTRIBUTE_NUMBER;
         let next = length.next_multiple_of(ALIGNMENT_BYTES);
-        self.rest = self.rest.get(next..).unwrap_or_default();
+        *rest = rest.get(next..).unwrap_or_default();
         Some((number, content))
     }
 }
@@ -191,6 +206,6 @@ mod tests {
             assert_eq!(Answers::new(&bytes).count(), 0, "{length}");
         }
         let attributes = Attributes::nested(&[3, 0, 1, 0]);
-        assert_eq!(attributes.count(), 0);
+        assert_eq!(attributes.into_iter().count(), 0);
     }
 }

@@ -44,7 +44,9 @@ pub(crate) mod control {
 pub(crate) fn family(attributes: Attributes<'_>, group: &[u8]) -> Option<(u16, Option<u32>)> {
     let number = u16_at(attributes.find(control::FAMILY_ID)?, 0)?;
     let groups = attributes.find(control::GROUPS).unwrap_or_default();
-    let mut groups = Attributes::nested(groups).map(|(_, one)| Attributes::nested(one));
+    let mut groups = Attributes::nested(groups)
+        .into_iter()
+        .map(|(_, one)| Attributes::nested(one));
     let found = groups.find(|one| one.find(control::GROUP_NAME) == Some(group));
     let id = found.and_then(|one| u32_at(one.find(control::GROUP_ID)?, 0));
     Some((number, id))

@@ -253,20 +253,22 @@ fn read_delay_law(word: DelayWord, reader: &mut Reader<'_>) -> Option<DelayLaw> 
                 max,
             })
         }
-        DelayWord::Histogram => {
-            missing(
-                reader,
-                "edges",
-                "an array of durations, one more than weights",
-            );
-            missing(reader, "weights", "an array of numbers, one per bin");
-            let edges = reader.durations("edges", &LINK_DELAY);
-            let weights = reader.numbers("weights", &limits::LINK_DELAY_WEIGHT);
-            DelayLaw::Histogram(Histogram {
-                edges: edges?,
-                weights: weights?,
-            })
-        }
+        DelayWord::Histogram => DelayLaw::Histogram(read_histogram(reader)?),
+    })
+}
+
+fn read_histogram(reader: &mut Reader<'_>) -> Option<Histogram> {
+    missing(
+        reader,
+        "edges",
+        "an array of durations, one more than weights",
+    );
+    missing(reader, "weights", "an array of numbers, one per bin");
+    let edges = reader.durations("edges", &limits::LINK_DELAY);
+    let weights = reader.numbers("weights", &limits::LINK_DELAY_WEIGHT);
+    Some(Histogram {
+        edges: edges?,
+        weights: weights?,
     })
 }
 

@@ -209,12 +209,11 @@ fn resolved_link(link: &Link) -> Table {
             put(&mut table, "forward", resolved_spec(&emulation.forward));
             put(&mut table, "backward", resolved_spec(&emulation.backward));
             // A radio has outages of its own, and the link then has none beside them.
-            match &emulation.forward.wifi {
-                Some(wifi) => put(&mut table, "wifi", resolved_wifi(wifi)),
-                None => {
-                    let outages = resolved_outages(emulation.forward.outages);
-                    put(&mut table, "outages", outages);
-                }
+            if let Some(wifi) = &emulation.forward.wifi {
+                put(&mut table, "wifi", resolved_wifi(wifi));
+            } else {
+                let outages = resolved_outages(emulation.forward.outages);
+                put(&mut table, "outages", outages);
             }
             if let Some(trace) = &emulation.trace {
                 put(&mut table, "trace", resolved_trace(trace));

@@ -68,7 +68,7 @@ fn sample_pcap() -> Vec<u8> {
     for sequence in 0..3 {
         let frame = udp_frame((1, 2), &message(sequence));
         let length = u32::try_from(frame.len()).unwrap();
-        for word in [sequence as u32, 5, length, length] {
+        for word in [u32::try_from(sequence).unwrap(), 5, length, length] {
             file.extend(word.to_le_bytes());
         }
         file.extend(frame);

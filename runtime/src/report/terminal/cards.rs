@@ -1,6 +1,8 @@
 //! The part of a report about network cards that stamp: the cards, their clocks, and what their
 //! stamps add to the account of each channel.
 
+use core::fmt::Write as _;
+
 use hil_models::measure::card_clock::CardClockFigures;
 
 use super::canvas::{Canvas, INDENT, Tone};
@@ -53,15 +55,18 @@ fn clock_words(clock: &CardClockFigures) -> String {
         unsigned(clock.bound_max_ns),
     );
     match clock.frequency {
-        Some(frequency) => text.push_str(&format!(
-            "; runs {:+.3} ppm ± {:.3} ppm fast",
-            frequency.offset_ppb / 1e3,
-            frequency.bound_ppb / 1e3
-        )),
+        Some(frequency) => {
+            let _infallible = write!(
+                text,
+                "; runs {:+.3} ppm ± {:.3} ppm fast",
+                frequency.offset_ppb / 1e3,
+                frequency.bound_ppb / 1e3
+            );
+        }
         None => text.push_str("; frequency unavailable: too short"),
     }
     if clock.step_count > 0 {
-        text.push_str(&format!("; stepped {} times", grouped(clock.step_count)));
+        let _infallible = write!(text, "; stepped {} times", grouped(clock.step_count));
     }
     text
 }
@@ -130,9 +135,7 @@ fn segment_words(segment: &CardSegment) -> String {
     };
     if segment.unplaced_count > 0 {
         let count = grouped(segment.unplaced_count);
-        text.push_str(&format!(
-            "; {count} stamps have no place on the host's clock"
-        ));
+        let _infallible = write!(text, "; {count} stamps have no place on the host's clock");
     }
     text
 }

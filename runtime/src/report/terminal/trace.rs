@@ -1,6 +1,8 @@
 //! A link trace on a page: its figures, the laws fitted to it, and its plots. The figures are
 //! computed elsewhere.
 
+use core::fmt::Write as _;
+
 use hil_models::trace::figures::{Memory, RunCount, TraceFigures};
 use hil_models::trace::fit::{Fit, Ranking, TraceFit};
 use hil_models::trace::{Trace, TraceHeader};
@@ -45,19 +47,7 @@ pub(crate) fn render_trace(
         "memory of loss",
         &memory_words(figures.loss_memory.as_ref()),
     );
-    let outage = figures.longest_outage.map_or_else(
-        || "none".to_owned(),
-        |outage| {
-            let end = if outage.is_open { ", to the end" } else { "" };
-            format!(
-                "{} from {} on, {} messages{end}",
-                duration(outage.length_ns),
-                seconds(outage.from_ns as f64 * 1e-9),
-                grouped(outage.lost_count)
-            )
-        },
-    );
-    field("longest outage", &outage);
+    field("longest outage", &outage_words(figures));
     field("delay", &delay_words(figures));
     for quantile in &figures.quantiles {
         let interval = quantile.interval.map_or_else(String::new, |interval| {
@@ -112,6 +102,19 @@ fn heading(canvas: &mut Canvas, header: &TraceHeader) {
     canvas.heading(&of(&header.channel, "a trace"), &aside);
 }
 
+fn outage_words(figures: &TraceFigures) -> String {
+    let Some(outage) = figures.longest_outage else {
+        return "none".to_owned();
+    };
+    let end = if outage.is_open { ", to the end" } else { "" };
+    format!(
+        "{} from {} on, {} messages{end}",
+        duration(outage.length_ns),
+        seconds(outage.from_ns as f64 * 1e-9),
+        grouped(outage.lost_count)
+    )
+}
+
 fn rate_words(figures: &TraceFigures) -> String {
     match (figures.rate_hz, figures.rate_bytes_per_s) {
         (Some(rate), Some(bytes)) => format!("{rate:.2} per second, {bytes:.0} bytes per second"),
@@ -137,7 +140,7 @@ fn loss_words(figures: &TraceFigures) -> String {
     );
     if counts.unknown_count > 0 {
         let unknown = grouped(counts.unknown_count);
-        text.push_str(&format!("; the fate of {unknown} is unknown"));
+        let _infallible = write!(text, "; the fate of {unknown} is unknown");
     }
     text
 }
