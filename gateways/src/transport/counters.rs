@@ -1,5 +1,4 @@
-//! What the two ends of a transport count, whatever carries the datagrams. Counting is theirs; this says
-//! what each number means.
+//! What the two ends of a transport count. It counts nothing by itself.
 
 use hil_models::link::LossCauses;
 
@@ -130,6 +129,10 @@ pub struct ReceiverCounters {
     pub reply_count: u64,
     /// Replies it refused.
     pub reply_refused_count: u64,
+    /// Transmit stamps of replies handed out.
+    pub reply_stamp_count: u64,
+    /// Transmit stamps of replies that were asked for and did not come in time.
+    pub reply_stamp_missing_count: u64,
     /// Datagrams the link model lost.
     pub link_lost_count: u64,
     /// Datagrams dropped because the emulation already held as many as it may.
@@ -158,6 +161,8 @@ impl ReceiverCounters {
             ("kernel_drop_count", self.kernel_drop_count),
             ("reply_count", self.reply_count),
             ("reply_refused_count", self.reply_refused_count),
+            ("reply_stamp_count", self.reply_stamp_count),
+            ("reply_stamp_missing_count", self.reply_stamp_missing_count),
             ("link_lost_count", self.link_lost_count),
             ("link_overflow_count", self.link_overflow_count),
             ("mark_kept_count", self.mark_kept_count),

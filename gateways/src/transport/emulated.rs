@@ -210,6 +210,19 @@ impl<R: DatagramReceiver> DatagramReceiver for EmulatedReceiver<R> {
         self.inner.reply(datagram, to)
     }
 
+    fn reply_stamped(
+        &mut self,
+        now: Instant,
+        datagram: &[u8],
+        to: SocketAddr,
+    ) -> Result<(), SendRefusal> {
+        self.inner.reply_stamped(now, datagram, to)
+    }
+
+    fn take_reply_stamp(&mut self, now: Instant) -> Option<i64> {
+        self.inner.take_reply_stamp(now)
+    }
+
     fn next_due(&self) -> Option<Instant> {
         let own = self.order.peek().map(|&Reverse((due, _, _))| due);
         match (own, self.inner.next_due()) {

@@ -24,9 +24,11 @@ pub mod packet_ring;
 pub mod probe;
 pub mod queue;
 pub mod radio;
+mod reply_stamps;
 pub mod tcp;
 pub mod timestamping;
 pub mod udp;
+mod udp_receiver;
 pub mod udp_server;
 mod udp_socket;
 
@@ -34,6 +36,8 @@ mod udp_socket;
 mod conformance_tests;
 #[cfg(test)]
 mod host_tests;
+#[cfg(test)]
+mod reply_stamp_tests;
 #[cfg(test)]
 mod trap_tests;
 
@@ -45,9 +49,8 @@ use std::os::fd::BorrowedFd;
 use hil_models::time::Instant;
 use thiserror::Error;
 
-pub use self::counters::{ReceiverCounters, SenderCounters};
+pub use counters::{ReceiverCounters, SenderCounters};
 use radio::RadioReport;
-
 use tcp::StreamFigures;
 
 /// The stamps the kernel attached to one datagram.
@@ -248,12 +251,33 @@ pub trait DatagramReceiver: Debug + Send {
     /// When the transport itself is broken; a bad or foreign datagram is not an error.
     fn receive(&mut self, now: Instant, buffer: &mut [u8]) -> io::Result<Option<Received>>;
 
-    /// Sends `datagram` back to `to`, the source of an earlier datagram. Replies get no transmit
-    /// stamp: stamps would compete with arrivals for the receive buffer.
+    /// Sends `datagram` back to `to`, the source of an earlier datagram, without a transmit stamp:
+    /// stamps would compete with arrivals for the receive buffer.
     ///
     /// # Errors
     /// The state that kept it from leaving; it is counted.
     fn reply(&mut self, datagram: &[u8], to: SocketAddr) -> Result<(), SendRefusal>;
+
+    /// As [`DatagramReceiver::reply`], and asks for the stamp of its departure, where the
+    /// transport has stamps. It is for few replies, as each costs system calls.
+    ///
+    /// # Errors
+    /// As [`DatagramReceiver::reply`].
+    fn reply_stamped(
+        &mut self,
+        _now: Instant,
+        datagram: &[u8],
+        to: SocketAddr,
+    ) -> Result<(), SendRefusal> {
+        self.reply(datagram, to)
+    }
+
+    /// When the newest stamped reply left, nanoseconds of this host's `CLOCK_REALTIME`; once, and
+    /// `None` while it has not come. Call it after the reply and whenever nothing arrived; it
+    /// makes a system call only while a stamp may be there.
+    fn take_reply_stamp(&mut self, _now: Instant) -> Option<i64> {
+        None
+    }
 
     /// When a datagram held back by a link model is due; `None` when none is held. A wait for
     /// [`DatagramReceiver::poll_fd`] must end then.
