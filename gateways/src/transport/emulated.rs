@@ -273,4 +273,5 @@ impl<R: fmt::Debug> fmt::Debug for EmulatedReceiver<R> {
 }
 
 #[cfg(test)]
+#[path = "emulated_tests.rs"]
 mod tests;

@@ -1,4 +1,5 @@
-//! The emulation over the queue transport, in made-up time.
+//! Emulated receivers over queues: what the link model says happens to the datagrams, nothing is lost
+//! uncounted, and what is held stays bounded.
 
 use core::time::Duration;
 
