@@ -208,6 +208,9 @@ pub enum Command {
         json: bool,
     },
     /// Describe, fit, plot and convert link traces.
+    #[command(
+        after_help = "Examples:\n  hil-runtime trace info runs/NAME      # what its links did\n  hil-runtime trace fit runs/NAME/traces/shuttle.command.trace"
+    )]
     Trace {
         /// What to do with them.
         #[command(subcommand)]
