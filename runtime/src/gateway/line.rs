@@ -378,7 +378,6 @@ mod tests {
     use std::io;
     use std::os::fd::BorrowedFd;
 
-    use hil_gateways::protocol::wire::Kind;
     use hil_gateways::transport::timestamping::TimestampMode;
     use hil_gateways::transport::{Received, SenderCounters};
 
