@@ -106,7 +106,7 @@ pub(crate) fn conclude(
         (topology, result),
         &records,
         errors.unwrap_or_default(),
-        &mut summary.score_events,
+        (&mut summary.score_events, &mut summary.warnings),
     );
     let (network, network_series) = network.unzip();
     summary.network = network;

@@ -403,13 +403,17 @@ pub(super) fn of_run(
     run: (&Topology, &RunResult),
     records: &RunRecords,
     errors: Vec<ErrorSeries>,
-    score: &mut ScoreEvents,
+    (score, warnings): (&mut ScoreEvents, &mut Vec<String>),
 ) -> Option<(NetworkReport, Vec<PlotSeries>)> {
     let (topology, result) = run;
     let mut builder = NetworkBuilder::default();
     for channel in topology.channels() {
         if topology.crossing(channel).is_some() && records.has(&channel.name) {
-            add_channel(&mut builder, run, records, channel);
+            let added = add_channel(&mut builder, run, records, channel);
+            warnings.extend(added.err().map(|missing| {
+                let name = &channel.name;
+                format!("{name}: left out of the network's figures: {missing}")
+            }));
         }
     }
     let errors = errors.into_iter().filter_map(|one| {
@@ -426,18 +430,21 @@ fn add_channel(
     run: (&Topology, &RunResult),
     records: &RunRecords,
     channel: &Channel,
-) -> Option<()> {
+) -> Result<(), String> {
     let (topology, result) = run;
-    let to = channel.to.as_deref()?;
+    let to = channel.to.as_deref().ok_or("nobody receives it")?;
     let hosts = [&channel.from, to].map(|process| {
         let host = topology.process(process).map(|process| &process.host);
         host.map_or("", |host| host.as_str())
     });
-    let [producer_start, consumer_start] =
-        hosts.map(|host| start_on(result, host, records.clocks()));
-    let (producer_start, consumer_start) = producer_start.zip(consumer_start)?;
-    let (_, consumer_end) = *result.spans.get(hosts[1])?;
-    let (_, producer_end) = *result.spans.get(hosts[0])?;
+    let within = |host: &str| {
+        let span = start_on(result, host, records.clocks()).zip(result.spans.get(host));
+        let missing = || format!("when the run began and ended on host {host} is unavailable");
+        span.map(|(start, (_, end))| (start, *end))
+            .ok_or_else(missing)
+    };
+    let (producer_start, producer_end) = within(hosts[0])?;
+    let (consumer_start, consumer_end) = within(hosts[1])?;
     let span = SeriesSpan {
         producer_start_ns: producer_start.as_ns(),
         consumer_start_ns: consumer_start.as_ns(),
@@ -469,5 +476,5 @@ fn add_channel(
             },
         });
     });
-    Some(())
+    Ok(())
 }

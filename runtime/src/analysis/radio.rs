@@ -43,7 +43,10 @@ pub(super) fn add(
         let start = result.spans.get(&host).map(|span| span.0);
         let mut hop = summarise(samples);
         (hop.process, hop.interface, hop.host) = (process.to_owned(), interface.to_owned(), host);
-        add_events(&mut summary.events, &hop, samples, start);
+        match start {
+            Some(start) => add_events(&mut summary.events, &hop, samples, start),
+            None => summary.warnings.extend(left_out(&hop)),
+        }
         match write_series(&result.folder.series(), &hop, samples, start) {
             Ok(file) => {
                 let what = "samples of the radio; columns in its first line".to_owned();
@@ -159,11 +162,23 @@ fn words_of(record: &RadioRecord) -> Option<&'static str> {
     })
 }
 
+/// What to say of events that have no place on the run's axis; nothing when there are none.
+fn left_out(hop: &RadioHopSummary) -> Option<String> {
+    let (process, interface, host) = (&hop.process, &hop.interface, &hop.host);
+    (hop.event_count > 0).then(|| {
+        format!(
+            "{process}: {} events of the association of {interface} are left out: when the run \
+             began on host {host:?} is unavailable",
+            hop.event_count
+        )
+    })
+}
+
 fn add_events(
     events: &mut Vec<RunEvent>,
     hop: &RadioHopSummary,
     samples: &[RadioRecord],
-    start: Option<Instant>,
+    start: Instant,
 ) {
     for record in samples {
         let Some(what) = words_of(record) else {
@@ -176,7 +191,7 @@ fn add_events(
         };
         let code = (record.code != NO_CODE).then(|| format!("802.11 code {}", record.code));
         events.push(RunEvent {
-            at_s: start.map_or(0.0, |start| seconds_since(record.at_ns, start)),
+            at_s: seconds_since(record.at_ns, start),
             what: format!("{}: {} {what}{whom}", hop.process, hop.interface),
             cause: code.unwrap_or_default(),
         });
@@ -213,10 +228,11 @@ fn write_series(
         format!("{mbps},{modulation}")
     };
     for one in samples.iter().filter(|one| one.event == SAMPLE) {
-        let at_s = start.map_or(f64::NAN, |start| seconds_since(one.at_ns, start));
+        let at_s = start.map(|start| format!("{:.6}", seconds_since(one.at_ns, start)));
+        let at_s = at_s.unwrap_or_default();
         writeln!(
             text,
-            "{at_s:.6},{},{},{},{},{},{},{},{},{},{},{},{}",
+            "{at_s},{},{},{},{},{},{},{},{},{},{},{},{}",
             mac_text(one.mac),
             signal(one.signal_dbm),
             signal(one.signal_average_dbm),
@@ -284,9 +300,25 @@ mod tests {
         assert_eq!((hop.event_count, hop.stations.len()), (1, 0));
         (hop.process, hop.interface) = ("gateway".to_owned(), "wlan0".to_owned());
         let mut events = Vec::new();
-        add_events(&mut events, &hop, &samples, Some(Instant::ZERO));
+        add_events(&mut events, &hop, &samples, Instant::ZERO);
         assert_eq!(events[0].what, "gateway: wlan0 disconnected");
         assert_eq!(events[0].cause, "802.11 code 3");
         assert!((events[0].at_s - 1.5).abs() < 1e-9);
+    }
+
+    #[test]
+    fn events_without_a_start_are_left_out_and_said_to_be() {
+        let happening = Happening {
+            command: command::ROAM,
+            ifindex: 3,
+            mac: None,
+            code: None,
+        };
+        let mut hop = summarise(&[RadioRecord::happening(5, &happening)]);
+        (hop.process, hop.interface) = ("gateway".to_owned(), "wlan0".to_owned());
+        let warning = left_out(&hop).unwrap();
+        assert!(warning.contains("1 events of the association of wlan0 are left out"));
+        assert!(warning.contains("unavailable"), "{warning}");
+        assert_eq!(left_out(&summarise(&[sample(0, -40, 7)])), None);
     }
 }

@@ -1,7 +1,7 @@
 //! From the records of a run to what the cards' stamps say: per card its clock against the host's,
 //! per channel the segments that end or begin in a card, each with its bound. It opens no card.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use hil_models::measure::account::ChannelPath;
 use hil_models::measure::card_clock::{Bounded, CardClockFigures, CardTimeline};
@@ -41,7 +41,7 @@ pub struct ChannelStamps {
     pub tx_hardware_count: u64,
     /// Of those, with the kernel's own stamp beside it.
     pub tx_both_count: u64,
-    /// Messages that arrived.
+    /// Messages that arrived, each once however many copies of it came.
     pub received_count: u64,
     /// Of those, with a stamp of the receiving card.
     pub rx_hardware_count: u64,
@@ -136,12 +136,9 @@ pub(crate) fn channel_stamps(
     let is_sent = |one: &&EgressRecord| one.flags & EgressRecord::REFUSED_BY_KERNEL == 0;
     let sent: Vec<&EgressRecord> = egress.iter().filter(is_sent).collect();
     let stamped = || sent.iter().filter(|one| one.tx_hardware_ns != UNAVAILABLE);
-    let arrived = || {
-        ingress
-            .iter()
-            .filter(|one| one.rx_hardware_ns != UNAVAILABLE)
-    };
-    let rx_hardware_count = arrived().count() as u64;
+    let ingress = first_arrivals(ingress);
+    let is_stamped = |one: &&&IngressRecord| one.rx_hardware_ns != UNAVAILABLE;
+    let rx_hardware_count = ingress.iter().filter(is_stamped).count() as u64;
     ChannelStamps {
         channel: channel.to_owned(),
         sent_count: sent.len() as u64,
@@ -156,8 +153,15 @@ pub(crate) fn channel_stamps(
         } else {
             String::new()
         },
-        segments: segments(&sent, ingress, places),
+        segments: segments(&sent, &ingress, places),
     }
+}
+
+/// What came first of each message: a copy took a way of its own, behind one that was measured.
+fn first_arrivals(ingress: &[IngressRecord]) -> Vec<&IngressRecord> {
+    let mut seen = BTreeSet::new();
+    let mut first = |one: &&IngressRecord| seen.insert((one.epoch, one.sequence));
+    ingress.iter().filter(&mut first).collect()
 }
 
 fn rx_reason(card: Option<&CardStory>) -> String {
@@ -173,7 +177,7 @@ fn rx_reason(card: Option<&CardStory>) -> String {
 
 fn segments(
     sent: &[&EgressRecord],
-    ingress: &[IngressRecord],
+    ingress: &[&IngressRecord],
     places: &Places<'_>,
 ) -> Vec<CardSegment> {
     let place = |clock: Option<&CardTimeline>, ns: i64| clock?.to_realtime(ns);
@@ -301,6 +305,11 @@ mod tests {
     }
 
     fn figures_of(rx: bool) -> ChannelStamps {
+        figures_with(rx, &[])
+    }
+
+    /// With one more record for each of `copies`: its sequence number, and its flags.
+    fn figures_with(rx: bool, copies: &[(u64, u32)]) -> ChannelStamps {
         let egress: Vec<EgressRecord> = (0..100)
             .map(|index| {
                 sent(
@@ -310,6 +319,14 @@ mod tests {
             })
             .collect();
         let mut ingress: Vec<IngressRecord> = egress.iter().map(came).collect();
+        for (sequence, flags) in copies {
+            let original = egress.iter().find(|one| one.sequence == *sequence);
+            let mut copy = came(original.unwrap());
+            copy.rx_hardware_ns += 30_000_000;
+            copy.rx_software_ns += 30_000_000;
+            copy.flags = *flags;
+            ingress.push(copy);
+        }
         if !rx {
             for one in &mut ingress {
                 one.rx_hardware_ns = UNAVAILABLE;
@@ -364,6 +381,21 @@ mod tests {
             // Up to 100 ns of wander come on top.
             assert!((bound_ns..bound_ns + 130).contains(&bound), "{segment:?}");
         }
+    }
+
+    #[test]
+    fn copies_of_a_message_are_neither_counted_nor_measured() {
+        let copies = [
+            (3, IngressRecord::DUPLICATE),
+            (3, IngressRecord::DUPLICATE),
+            (9, IngressRecord::LATE),
+        ];
+        let figures = figures_with(true, &copies);
+        assert_eq!(
+            (figures.received_count, figures.rx_hardware_count),
+            (100, 100)
+        );
+        assert_eq!(figures, figures_of(true), "the first copy is the message");
     }
 
     #[test]

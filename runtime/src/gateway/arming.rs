@@ -15,11 +15,11 @@ use super::direction;
 use super::process::PROBE_BOUND;
 use super::socket::stamps_of;
 use super::stamp_plan::StampPlan;
-use crate::process::launch::{DirectionLaunch, GatewayLaunch, Transport};
+use crate::process::launch::{DirectionLaunch, GatewayLaunch, Side, Transport};
 use crate::radio::record::RadioRecord;
 use crate::radio::sampler::Sampler;
 use crate::radio::socket::RadioSocket;
-use crate::record::{RecordKind, RecordSink, Recorder};
+use crate::record::{RecordFileError, RecordKind, RecordSink, Recorder};
 use crate::topology::Timestamps;
 
 /// How long each half of the probe may take where a card is to stamp: its driver answers from a
@@ -30,10 +30,9 @@ const RADIO_RECORDS: usize = 4096;
 
 /// What is known before the first socket opens.
 #[derive(Debug)]
-#[allow(dead_code, reason = "the sentinel is held, not read")]
 pub(crate) struct Arming {
     /// Held until the end, so that the kernel never switches receive stamps off in between.
-    pub(crate) sentinel: Option<Sentinel>,
+    _sentinel: Option<Sentinel>,
     /// What was found, in words.
     pub(crate) facts: Vec<(String, String)>,
     found: Option<(ProbeReport, Option<ProbeReport>)>,
@@ -69,27 +68,43 @@ impl Arming {
     pub(crate) fn plan(&self, direction: &DirectionLaunch) -> StampPlan {
         let asked = stamps_of(&direction.socket);
         let is_datagram = direction.socket.transport == Transport::Udp;
-        let plan = match &self.found {
-            Some((first, second)) => StampPlan::found(asked, first, second.as_ref()),
-            None => StampPlan::asked(asked),
+        let plan = match (&self.found, direction.side) {
+            (Some((first, second)), Side::Egress) => {
+                StampPlan::found(asked, first, second.as_ref())
+            }
+            // The probe says nothing of arrivals, which a card may stamp where it stamps no
+            // departures; and nothing waits for their stamps.
+            _ => StampPlan::asked(asked),
         };
         plan.on_radio(self.is_wireless && is_datagram)
     }
 
-    /// Opens the record file of the hop's radio, if it has one.
+    /// Opens the record file of the hop's radio, if it has one. Where it cannot be opened the run
+    /// goes on without samples, and a fact says so.
     pub(super) fn prepare_sampler(
         &mut self,
         process: &str,
         recorder: &mut Recorder,
-    ) -> Result<Option<PreparedSampler>, GatewayError> {
-        let Some(radio) = self.radio.take() else {
-            return Ok(None);
-        };
-        let name = format!("{process}/{}", radio.interface);
-        let size = size_of::<RadioRecord>();
-        let sink = recorder.sink(RecordKind::Radio, &name, size, RADIO_RECORDS)?;
-        Ok(Some(PreparedSampler { radio, sink }))
+    ) -> Option<PreparedSampler> {
+        let radio = self.radio.take()?;
+        match open_sink((process, &radio.interface), recorder) {
+            Ok(sink) => Some(PreparedSampler { radio, sink }),
+            Err(error) => {
+                let text = format!("unavailable: {error}");
+                self.facts.push(("radio samples".to_owned(), text));
+                None
+            }
+        }
     }
+}
+
+fn open_sink(
+    (process, interface): (&str, &str),
+    recorder: &mut Recorder,
+) -> Result<RecordSink, RecordFileError> {
+    let name = format!("{process}/{interface}");
+    let size = size_of::<RadioRecord>();
+    recorder.sink(RecordKind::Radio, &name, size, RADIO_RECORDS)
 }
 
 /// Switches kernel stamps on and finds out whether they really come, and whether the hop is a
@@ -101,7 +116,7 @@ pub(super) fn arm(launch: &GatewayLaunch) -> Arming {
         let why = "unavailable over TCP: the kernel stamps bytes of a stream, not messages";
         facts.insert(0, ("kernel stamps".to_owned(), why.to_owned()));
         return Arming {
-            sentinel: None,
+            _sentinel: None,
             facts,
             found: None,
             is_wireless: radio.is_some(),
@@ -122,9 +137,7 @@ pub(super) fn arm(launch: &GatewayLaunch) -> Arming {
     if let (Some((first, second)), Some(asked)) = (&armed.found, asked)
         && let Some(text) = StampPlan::found(asked, first, second.as_ref()).fallback()
     {
-        armed
-            .facts
-            .push(("stamp fallback".to_owned(), text.to_owned()));
+        armed.facts.push(("stamp fallback".to_owned(), text));
     }
     armed.facts.append(&mut facts);
     armed.is_wireless = radio.is_some();
@@ -170,7 +183,7 @@ fn interface_of(direction: &DirectionLaunch) -> Option<String> {
 /// Arms and probes what `settings` ask for; `None` where no stamps are wanted.
 pub(crate) fn arm_and_describe(settings: Option<ProbeSettings>) -> Arming {
     let with = |sentinel, text: String, found| Arming {
-        sentinel,
+        _sentinel: sentinel,
         facts: vec![("kernel stamps".to_owned(), text)],
         found,
         is_wireless: false,
@@ -179,6 +192,7 @@ pub(crate) fn arm_and_describe(settings: Option<ProbeSettings>) -> Arming {
     let Some(settings) = settings else {
         return with(None, "switched off in the topology".to_owned(), None);
     };
+    let asked_bound = settings.bound;
     let bound = if settings.timestamps == TimestampMode::Hardware {
         CARD_PROBE_BOUND
     } else {
@@ -187,7 +201,7 @@ pub(crate) fn arm_and_describe(settings: Option<ProbeSettings>) -> Arming {
     let settings = ProbeSettings { bound, ..settings };
     match arm_and_probe(&settings) {
         Ok((report, sentinel)) => {
-            let second = probe_before_queue(&settings, &report);
+            let second = probe_before_queue(settings, asked_bound, &report);
             let text = describe_probe(&report, second.as_ref());
             with(Some(sentinel), text, Some((report, second)))
         }
@@ -196,14 +210,18 @@ pub(crate) fn arm_and_describe(settings: Option<ProbeSettings>) -> Arming {
 }
 
 /// Where no departure was stamped: whether the stack stamps before the queue.
-fn probe_before_queue(settings: &ProbeSettings, first: &ProbeReport) -> Option<ProbeReport> {
-    let is_missed = first.tx_software != Availability::Seen;
-    if settings.timestamps != TimestampMode::Software || !is_missed {
+fn probe_before_queue(
+    settings: ProbeSettings,
+    bound: Duration,
+    first: &ProbeReport,
+) -> Option<ProbeReport> {
+    if !StampPlan::needs_second_probe(settings.timestamps, first) {
         return None;
     }
     let settings = ProbeSettings {
         timestamps: TimestampMode::Scheduled,
-        ..settings.clone()
+        bound,
+        ..settings
     };
     // The first probe's sentinel keeps receive stamps on.
     arm_and_probe(&settings)
@@ -233,4 +251,40 @@ fn describe_probe(report: &ProbeReport, second: Option<&ProbeReport>) -> String 
         text.push_str(&more);
     }
     text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_name_too_long_for_a_record_file_ends_no_gateway() {
+        let folder = std::env::temp_dir().join(format!("hil-arming-{}", std::process::id()));
+        std::fs::create_dir_all(&folder).unwrap();
+        let mut recorder = Recorder::new(&folder, "gateway", 0);
+        let process = format!("gateway-{}-robot-pc", "l".repeat(80));
+        let error = open_sink((&process, "wlan0"), &mut recorder).unwrap_err();
+        assert!(
+            error.to_string().contains("longer than 96 bytes"),
+            "{error}"
+        );
+        let sink = open_sink(("gateway-air-robot-pc", "wlan0"), &mut recorder);
+        assert!(sink.is_ok());
+        std::fs::remove_dir_all(&folder).unwrap();
+    }
+
+    #[test]
+    fn loopback_has_no_card_to_wait_for() {
+        let settings = ProbeSettings {
+            bound: PROBE_BOUND,
+            proof_count: 5,
+            ..ProbeSettings::loopback(TimestampMode::Hardware)
+        };
+        let armed = arm_and_describe(Some(settings));
+        let (first, second) = armed.found.unwrap();
+        assert_eq!(first.tx_hardware, Availability::NotOffered);
+        let plan = StampPlan::found(TimestampMode::Hardware, &first, second.as_ref());
+        assert!(!plan.awaits_hardware(), "{plan:?}");
+        assert!(plan.fallback().unwrap().contains("do not come"));
+    }
 }

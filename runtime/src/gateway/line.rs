@@ -34,6 +34,8 @@ pub(crate) struct Line {
     pub(super) sender: Box<dyn DatagramSender>,
     pending: Box<[Option<Pending>]>,
     pub(super) pending_count: usize,
+    /// At or before the slot of the oldest that is pending: tokens go round the slots in order.
+    oldest: usize,
     records: RecordSink,
     pub(super) round_trips: RecordSink,
     pub(super) session: u32,
@@ -68,6 +70,7 @@ impl Line {
             sender,
             pending: vec![None; PENDING].into_boxed_slice(),
             pending_count: 0,
+            oldest: 0,
             records,
             round_trips,
             session,
@@ -145,6 +148,12 @@ impl Line {
         let slot = slot_of(token);
         if let Some(old) = self.pending[slot].take() {
             self.retire(old);
+        }
+        if self.pending_count == 0 {
+            self.oldest = slot;
+        } else if self.oldest == slot {
+            // Gone round once: the newest takes this slot, and the oldest is in a later one.
+            self.oldest = (slot + 1) % PENDING;
         }
         self.pending[slot] = Some(Pending {
             token,
@@ -285,16 +294,18 @@ impl Line {
 
     /// Gives up on stamps and reports that are overdue at `now`.
     pub(super) fn expire(&mut self, now: Instant) {
-        if self.pending_count == 0 {
-            return;
-        }
         let patience_ns = self.patience_ns();
-        for slot in 0..PENDING {
-            let is_overdue =
-                self.pending[slot].is_some_and(|one| now.ns_since(one.handed) > patience_ns);
-            if is_overdue && let Some(pending) = self.pending[slot].take() {
-                self.retire(pending);
+        // Something is pending, so the walk ends within one round.
+        while self.pending_count > 0 {
+            match self.pending[self.oldest] {
+                Some(one) if now.ns_since(one.handed) <= patience_ns => return,
+                Some(one) => {
+                    self.pending[self.oldest] = None;
+                    self.retire(one);
+                }
+                None => {}
             }
+            self.oldest = (self.oldest + 1) % PENDING;
         }
     }
 
@@ -364,7 +375,92 @@ fn failure(refusal: SendRefusal, is_established: bool) -> TransmitFailure {
 
 #[cfg(test)]
 mod tests {
+    use std::io;
+    use std::os::fd::BorrowedFd;
+
+    use hil_gateways::transport::timestamping::TimestampMode;
+    use hil_gateways::transport::{Received, SenderCounters};
+
     use super::*;
+    use crate::record::{RecordKind, Recorder};
+
+    /// Sends nothing and hears nothing.
+    #[derive(Debug)]
+    struct Silent;
+
+    impl DatagramSender for Silent {
+        fn send(&mut self, _datagram: &[u8]) -> Result<TxToken, SendRefusal> {
+            Ok(TxToken(0))
+        }
+
+        fn next_stamp(&mut self) -> Option<TransmitStamp> {
+            None
+        }
+
+        fn receive(&mut self, _buffer: &mut [u8]) -> io::Result<Option<Received>> {
+            Ok(None)
+        }
+
+        fn poll_fd(&self) -> Option<BorrowedFd<'_>> {
+            None
+        }
+
+        fn counters(&self) -> SenderCounters {
+            SenderCounters::default()
+        }
+    }
+
+    fn silent_line(folder: &std::path::Path) -> Line {
+        std::fs::create_dir_all(folder).unwrap();
+        let mut recorder = Recorder::new(folder, "gateway", 0);
+        let mut sink = |kind| recorder.sink(kind, "x", 8, 16).unwrap();
+        let sinks = (sink(RecordKind::Egress), sink(RecordKind::RoundTrip));
+        let plan = StampPlan::asked(TimestampMode::Software);
+        Line::new(Box::new(Silent), sinks, 1, plan).unwrap()
+    }
+
+    #[test]
+    fn what_is_overdue_goes_and_the_rest_stays_however_often_tokens_go_round() {
+        let folder = std::env::temp_dir().join(format!("hil-line-{}", std::process::id()));
+        let mut line = silent_line(&folder);
+        let spacing_ns = 1_000_000;
+        let kept = usize::try_from(STAMP_PATIENCE_NS / spacing_ns).unwrap() + 1;
+        // Past the wrap of the tokens, and of the slots many times.
+        let first = u32::MAX - 700;
+        for step in 0..2_000_u32 {
+            let now = Instant::from_ns(i64::from(step) * spacing_ns);
+            let token = TxToken(first.wrapping_add(step));
+            line.expect_stamp(token, (Kind::Data, u64::from(step)), now, None);
+            // Every third is stamped at once, and for a while all are.
+            if step % 3 == 0 || (800..1_200).contains(&step) {
+                let slot = slot_of(token);
+                let pending = line.pending[slot].as_mut().unwrap();
+                pending.is_stamped = true;
+                line.retire_if_complete(slot);
+            }
+            line.expire(now);
+            let left = line.pending.iter().flatten();
+            let is_timely = |one: &Pending| now.ns_since(one.handed) <= STAMP_PATIENCE_NS;
+            assert!(left.clone().all(is_timely), "step {step}");
+            assert_eq!(left.count(), line.pending_count, "step {step}");
+            assert!(line.pending_count <= kept);
+        }
+        assert!(line.pending_count > kept / 2, "{}", line.pending_count);
+        // Without a look in between the slots go round over what waits; the end takes it all.
+        for step in 2_000..2_600_u32 {
+            let token = TxToken(first.wrapping_add(step));
+            let now = Instant::from_ns(i64::from(step) * spacing_ns);
+            line.expect_stamp(token, (Kind::Data, u64::from(step)), now, None);
+        }
+        assert_eq!(line.pending_count, PENDING);
+        line.expire(Instant::from_ns(
+            (2_599 - 9) * spacing_ns + STAMP_PATIENCE_NS,
+        ));
+        assert_eq!(line.pending_count, 10, "the oldest went first");
+        line.expire(Instant::from_ns(i64::MAX));
+        assert_eq!(line.pending_count, 0);
+        std::fs::remove_dir_all(&folder).unwrap();
+    }
 
     #[test]
     fn a_departure_replaces_a_stamp_before_the_queue_in_either_order() {

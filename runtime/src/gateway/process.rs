@@ -60,7 +60,7 @@ fn prepare_and_live(path: &Path) -> Result<(), GatewayError> {
             armed.plan(direction),
         )?);
     }
-    let sampler = armed.prepare_sampler(&launch.process, &mut recorder)?;
+    let sampler = armed.prepare_sampler(&launch.process, &mut recorder);
     recorder.start().map_err(GatewayError::Thread)?;
     let stop = Arc::clone(&surroundings.stop);
     let sampler = sampler.map(|one| one.start(stop)).transpose()?;

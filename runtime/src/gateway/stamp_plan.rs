@@ -4,6 +4,19 @@
 use hil_gateways::transport::probe::{Availability, ProbeReport};
 use hil_gateways::transport::timestamping::TimestampMode;
 
+/// Whether a card's stamps of what is sent are to come.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum CardStamps {
+    /// Nobody asked for them.
+    NotAsked,
+    /// They come, or nothing is known yet.
+    Expected,
+    /// The driver claims them; none came, but nothing proves that a datagram left either.
+    Unproved,
+    /// They were asked for and do not come.
+    Missing,
+}
+
 /// What sockets ask for and records wait for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct StampPlan {
@@ -16,6 +29,8 @@ pub struct StampPlan {
     pub is_queueing_stamped: bool,
     /// The hop is wireless: ask the radio which datagrams were acknowledged.
     pub asks_radio: bool,
+    /// What the card is known to do.
+    pub card: CardStamps,
 }
 
 impl StampPlan {
@@ -26,14 +41,57 @@ impl StampPlan {
             is_departure_stamped: true,
             is_queueing_stamped: false,
             asks_radio: false,
+            card: match mode {
+                TimestampMode::Hardware => CardStamps::Expected,
+                _ => CardStamps::NotAsked,
+            },
         }
     }
 
     /// The plan after sending found `first` in mode `asked`, and `second` with stamps before the
     /// queue asked for as well, where the first was not what it should be.
     pub fn found(asked: TimestampMode, first: &ProbeReport, second: Option<&ProbeReport>) -> Self {
-        let plan = Self::asked(asked);
-        if asked != TimestampMode::Software || first.tx_software == Availability::Seen {
+        match asked {
+            TimestampMode::Off | TimestampMode::Scheduled => Self::asked(asked),
+            TimestampMode::Software => Self::without_card(first, second),
+            TimestampMode::Hardware => Self::with_card(first, second),
+        }
+    }
+
+    /// True where a second probe has to find out what the first left open.
+    pub(super) fn needs_second_probe(asked: TimestampMode, first: &ProbeReport) -> bool {
+        let is_card_silent = first.tx_hardware != Availability::Seen;
+        let is_missed = first.tx_software != Availability::Seen;
+        match asked {
+            TimestampMode::Off | TimestampMode::Scheduled => false,
+            TimestampMode::Software => is_missed,
+            TimestampMode::Hardware => is_missed && is_card_silent,
+        }
+    }
+
+    fn with_card(first: &ProbeReport, second: Option<&ProbeReport>) -> Self {
+        let asked = Self::asked(TimestampMode::Hardware);
+        match card_stamps(first, second) {
+            CardStamps::Missing => Self {
+                card: CardStamps::Missing,
+                ..Self::without_card(first, second)
+            },
+            CardStamps::Unproved => Self {
+                card: CardStamps::Unproved,
+                ..asked
+            },
+            // The card's stamps prove that the datagrams left: a driver that does not claim to
+            // stamp departures itself and did not will not.
+            CardStamps::NotAsked | CardStamps::Expected => Self {
+                is_departure_stamped: first.tx_software != Availability::NotOffered,
+                ..asked
+            },
+        }
+    }
+
+    fn without_card(first: &ProbeReport, second: Option<&ProbeReport>) -> Self {
+        let plan = Self::asked(TimestampMode::Software);
+        if first.tx_software == Availability::Seen {
             return plan;
         }
         let seen = |pick: fn(&ProbeReport) -> Availability| second.map(pick);
@@ -48,7 +106,7 @@ impl StampPlan {
             mode: TimestampMode::Scheduled,
             is_departure_stamped: !never,
             is_queueing_stamped,
-            asks_radio: false,
+            ..plan
         }
     }
 
@@ -77,9 +135,33 @@ impl StampPlan {
         !self.is_departure_stamped
     }
 
-    /// What a reader must know of the transmit stamps; `None` where they are departures.
-    pub fn fallback(self) -> Option<&'static str> {
+    /// What a reader must know of the transmit stamps; `None` where they are what was asked for.
+    pub fn fallback(self) -> Option<String> {
+        let kernel = self.kernel_fallback();
+        match self.card {
+            CardStamps::NotAsked | CardStamps::Expected => kernel.map(str::to_owned),
+            CardStamps::Unproved => Some(
+                "hardware stamps: claimed by the driver, none seen, and nothing shows that a probe \
+                 left, perhaps because the peer was not there yet: each record waits for its \
+                 stamps for up to 200 ms"
+                    .to_owned(),
+            ),
+            CardStamps::Missing => {
+                let instead = kernel.unwrap_or("TX stamp of the departure by the kernel instead");
+                Some(format!(
+                    "hardware stamps were asked for and do not come, so no record waits for them; \
+                     {instead}"
+                ))
+            }
+        }
+    }
+
+    fn kernel_fallback(self) -> Option<&'static str> {
         match (self.mode, self.is_departure_stamped) {
+            (TimestampMode::Hardware, false) => Some(
+                "TX stamp of the card only: this driver stamps no departures in software, so no \
+                 record waits for that",
+            ),
             (TimestampMode::Scheduled, false) => Some(
                 "TX stamp before the queue: this driver stamps no departures, so what a datagram \
                  waits in the queue and the driver counts as wire",
@@ -93,6 +175,27 @@ impl StampPlan {
                  peer was not there yet",
             ),
             _ => None,
+        }
+    }
+}
+
+/// What two probes say of the card. A driver that claims its stamps and gave none within the whole
+/// bound of the probe, though datagrams left, gives none: often its card is not armed.
+fn card_stamps(first: &ProbeReport, second: Option<&ProbeReport>) -> CardStamps {
+    let is_departure_seen = |report: &ProbeReport| report.tx_software == Availability::Seen;
+    // Where only the second probe saw departures, the first came before the peer did.
+    let passed_second = |second: &ProbeReport| {
+        second.tx_scheduled == Availability::Seen && !is_departure_seen(second)
+    };
+    match first.tx_hardware {
+        Availability::Seen => CardStamps::Expected,
+        Availability::NotOffered => CardStamps::Missing,
+        Availability::ClaimedButNotSeen => {
+            if is_departure_seen(first) || second.is_some_and(passed_second) {
+                CardStamps::Missing
+            } else {
+                CardStamps::Unproved
+            }
         }
     }
 }
@@ -156,5 +259,90 @@ mod tests {
         let silent = report(NotOffered, NotOffered);
         let plan = StampPlan::found(software, &silent, Some(&silent));
         assert!(plan.is_departure_stamped && !plan.is_queueing_stamped);
+    }
+
+    fn with_hardware(hardware: Availability, software: Availability) -> ProbeReport {
+        ProbeReport {
+            tx_hardware: hardware,
+            ..report(software, Availability::NotOffered)
+        }
+    }
+
+    #[test]
+    fn a_card_that_stamps_is_recorded_beside_the_kernel() {
+        use Availability::{NotOffered, Seen};
+        let hardware = TimestampMode::Hardware;
+        let first = with_hardware(Seen, Seen);
+        assert!(!StampPlan::needs_second_probe(hardware, &first));
+        let plan = StampPlan::found(hardware, &first, None);
+        assert_eq!(plan, StampPlan::asked(hardware));
+        assert!(plan.awaits_software() && plan.awaits_hardware());
+        assert_eq!(plan.fallback(), None);
+        // A driver without stamps of its own keeps nobody waiting for them.
+        let first = with_hardware(Seen, NotOffered);
+        assert!(!StampPlan::needs_second_probe(hardware, &first));
+        let plan = StampPlan::found(hardware, &first, None);
+        assert!(!plan.awaits_software() && plan.awaits_hardware());
+        assert!(plan.fallback().unwrap().contains("of the card only"));
+    }
+
+    #[test]
+    fn a_card_that_offers_no_stamps_is_planned_for_as_in_software() {
+        use Availability::{NotOffered, Seen};
+        let hardware = TimestampMode::Hardware;
+        let wired = with_hardware(NotOffered, Seen);
+        assert!(!StampPlan::needs_second_probe(hardware, &wired));
+        let plan = StampPlan::found(hardware, &wired, None);
+        assert_eq!(plan.mode, TimestampMode::Software);
+        assert!(plan.awaits_software() && !plan.awaits_hardware());
+        let text = plan.fallback().unwrap();
+        assert!(text.starts_with("hardware stamps were asked for and do not come"));
+        assert!(text.contains("of the departure by the kernel"), "{text}");
+
+        let radio = with_hardware(NotOffered, NotOffered);
+        assert!(StampPlan::needs_second_probe(hardware, &radio));
+        let second = report(NotOffered, Seen);
+        let plan = StampPlan::found(hardware, &radio, Some(&second));
+        assert_eq!(plan.mode, TimestampMode::Scheduled);
+        assert!(plan.awaits_software() && plan.is_before_queue_final());
+        assert!(!plan.awaits_hardware());
+        let text = plan.fallback().unwrap();
+        assert!(text.starts_with("hardware stamps were asked for and do not come"));
+        assert!(text.contains("before the queue"), "{text}");
+    }
+
+    #[test]
+    fn a_claim_of_the_card_counts_only_while_nothing_is_known_to_have_left() {
+        use Availability::{ClaimedButNotSeen, NotOffered, Seen};
+        let hardware = TimestampMode::Hardware;
+        let found = |software, second: Option<&ProbeReport>| {
+            let first = with_hardware(ClaimedButNotSeen, software);
+            StampPlan::found(hardware, &first, second)
+        };
+        // The kernel saw departures, the card stamped none.
+        let plan = found(Seen, None);
+        assert_eq!(
+            (plan.mode, plan.card),
+            (TimestampMode::Software, CardStamps::Missing)
+        );
+        // Datagrams passed the queue, and nobody stamped a departure.
+        let plan = found(NotOffered, Some(&report(NotOffered, Seen)));
+        assert_eq!(
+            (plan.mode, plan.card),
+            (TimestampMode::Scheduled, CardStamps::Missing)
+        );
+        assert!(!plan.awaits_hardware());
+        // No peer at all, or only when the second probe began: the card may be good.
+        let late = report(Seen, Seen);
+        for second in [
+            None,
+            Some(&report(ClaimedButNotSeen, NotOffered)),
+            Some(&late),
+        ] {
+            let plan = found(ClaimedButNotSeen, second);
+            assert_eq!((plan.mode, plan.card), (hardware, CardStamps::Unproved));
+            assert!(plan.awaits_hardware() && plan.awaits_software());
+            assert!(plan.fallback().unwrap().contains("none seen"));
+        }
     }
 }

@@ -71,9 +71,9 @@ pub(crate) enum Answer<'a> {
         command: u8,
         attributes: Attributes<'a>,
     },
-    /// The end of a dump.
+    /// The end of a dump that did not fail.
     Done,
-    /// The kernel refused, with this errno; 0 acknowledges.
+    /// The kernel refused, or gave a dump up on the way, with this errno; 0 acknowledges.
     Error(i32),
 }
 
@@ -102,7 +102,12 @@ impl<'a> Iterator for Answers<'a> {
         self.rest = self.rest.get(next..).unwrap_or_default();
         let answer = match kind {
             ERROR => Answer::Error(u32_at(body, 0)?.cast_signed().checked_neg()?),
-            DONE => Answer::Done,
+            // A dump fails in here: the kernel ends it with the errno, of a command that the
+            // driver does not know just like of one that broke off half way.
+            DONE => match u32_at(body, 0).map_or(0, u32::cast_signed) {
+                0.. => Answer::Done,
+                errno => Answer::Error(errno.checked_neg()?),
+            },
             family => Answer::Message {
                 family,
                 command: *body.first()?,
@@ -196,6 +201,21 @@ mod tests {
         bytes.extend([20, 0, 0, 0, 3, 0, 2, 0, 9, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]);
         let answers: Vec<_> = Answers::new(&bytes).collect();
         assert_eq!(answers, [(9, Answer::Error(19)), (9, Answer::Done)]);
+    }
+
+    #[test]
+    fn a_dump_that_failed_is_a_refusal_and_not_an_empty_list() {
+        let mut bytes = vec![20, 0, 0, 0, 3, 0, 2, 0, 9, 0, 0, 0, 0, 0, 0, 0];
+        bytes.extend((-libc::EOPNOTSUPP).to_ne_bytes());
+        let answers: Vec<_> = Answers::new(&bytes).collect();
+        assert_eq!(answers, [(9, Answer::Error(libc::EOPNOTSUPP))]);
+        // Without content there is nothing that failed.
+        let bare = [16, 0, 0, 0, 3, 0, 2, 0, 9, 0, 0, 0, 0, 0, 0, 0];
+        let answers: Vec<_> = Answers::new(&bare).collect();
+        assert_eq!(answers, [(9, Answer::Done)]);
+        // No errno is the negation of this.
+        bytes[16..].copy_from_slice(&i32::MIN.to_ne_bytes());
+        assert_eq!(Answers::new(&bytes).count(), 0);
     }
 
     #[test]

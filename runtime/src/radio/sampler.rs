@@ -28,6 +28,9 @@ struct Tally {
     failed_count: u64,
     left_out_count: u64,
     event_count: u64,
+    /// Times the kernel threw events away, each for one event or more.
+    overrun_count: u64,
+    event_failure: Option<io::Error>,
     newest_failure: Option<io::Error>,
 }
 
@@ -79,34 +82,53 @@ impl Sampler {
         let Ok(tally) = self.thread.join() else {
             return (label, "unavailable: the sampler panicked".to_owned());
         };
-        let mut text = format!("{} of {}", tally.sample_count, self.interface);
-        if !self.hears_events {
-            text.push_str("; events of the association unavailable");
-        } else if tally.event_count > 0 {
-            let words = format!("; {} events of the association", tally.event_count);
-            text.push_str(&words);
-        }
-        if tally.left_out_count > 0 {
-            let more = format!(
-                "; {} stations beyond {STATION_COUNT_MAX} left out",
-                tally.left_out_count
-            );
-            text.push_str(&more);
-        }
-        if let Some(error) = tally.newest_failure {
-            let words = format!("; {} failed: {error}", tally.failed_count);
-            text.push_str(&words);
-        }
-        (label, text)
+        (label, describe(&tally, &self.interface, self.hears_events))
     }
+}
+
+fn describe(tally: &Tally, interface: &str, hears_events: bool) -> String {
+    let mut text = format!("{} of {}", tally.sample_count, interface);
+    if !hears_events {
+        text.push_str("; events of the association unavailable");
+    } else if tally.event_count > 0 {
+        let words = format!("; {} events of the association", tally.event_count);
+        text.push_str(&words);
+    }
+    if tally.overrun_count > 0 {
+        let words = format!(
+            "; the kernel threw events away {} times: roams may be missing",
+            tally.overrun_count
+        );
+        text.push_str(&words);
+    }
+    if let Some(error) = &tally.event_failure {
+        let words = format!("; events of the association broke off: {error}");
+        text.push_str(&words);
+    }
+    if tally.left_out_count > 0 {
+        let more = format!(
+            "; {} stations beyond {STATION_COUNT_MAX} left out",
+            tally.left_out_count
+        );
+        text.push_str(&more);
+    }
+    if let Some(error) = &tally.newest_failure {
+        let words = format!("; {} failed: {error}", tally.failed_count);
+        text.push_str(&words);
+    }
+    text
 }
 
 fn look(socket: &mut RadioSocket, sink: &mut RecordSink, tally: &mut Tally) {
     let at_ns = MonotonicClock::now().as_ns();
-    socket.happenings(|happening| {
+    let heard = socket.happenings(|happening| {
         tally.event_count += 1;
         sink.push(&RadioRecord::happening(at_ns, &happening));
     });
+    match heard {
+        Ok(overrun_count) => tally.overrun_count += overrun_count,
+        Err(error) => tally.event_failure = Some(error),
+    }
     match socket.stations() {
         Ok(stations) => {
             tally.sample_count += 1;
@@ -118,5 +140,27 @@ fn look(socket: &mut RadioSocket, sink: &mut RecordSink, tally: &mut Tally) {
             tally.failed_count += 1;
             tally.newest_failure = Some(error);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lost_events_and_failures_are_told_beside_what_was_sampled() {
+        let mut tally = Tally {
+            sample_count: 40,
+            event_count: 2,
+            ..Tally::default()
+        };
+        let quiet = describe(&tally, "wlan0", true);
+        assert_eq!(quiet, "40 of wlan0; 2 events of the association");
+        tally.overrun_count = 3;
+        tally.event_failure = Some(io::Error::from_raw_os_error(libc::EBADF));
+        let text = describe(&tally, "wlan0", true);
+        assert!(text.contains("threw events away 3 times"), "{text}");
+        assert!(text.contains("broke off"), "{text}");
+        assert!(describe(&tally, "wlan0", false).contains("unavailable"));
     }
 }

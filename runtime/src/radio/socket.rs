@@ -2,7 +2,7 @@
 //! longer than its bound.
 
 use std::io;
-use std::os::fd::{AsRawFd, OwnedFd};
+use std::os::fd::{AsRawFd, OwnedFd, RawFd};
 use std::time::Duration;
 
 use nix::errno::Errno;
@@ -131,24 +131,31 @@ impl RadioSocket {
         found.into_iter().next().ok_or_else(unanswered)
     }
 
-    /// Gives `note` what happened to the association since the last call; does not wait.
-    pub(crate) fn happenings(&mut self, mut note: impl FnMut(Happening)) {
-        let Some(events) = &self.events else { return };
-        while let Ok(length) = recv(events.as_raw_fd(), &mut self.buffer, MsgFlags::MSG_DONTWAIT) {
-            for (_, answer) in Answers::new(&self.buffer[..length]) {
+    /// Gives `note` what happened to the association since the last call, and says how often the
+    /// kernel threw events away because they came faster than they were taken; does not wait.
+    ///
+    /// # Errors
+    /// When the socket breaks; what was there before has been given.
+    pub(crate) fn happenings(&mut self, mut note: impl FnMut(Happening)) -> io::Result<u64> {
+        let Some(events) = &self.events else {
+            return Ok(0);
+        };
+        let (family, ifindex) = (self.family, self.ifindex);
+        drain(events.as_raw_fd(), &mut self.buffer, |bytes| {
+            for (_, answer) in Answers::new(bytes) {
                 if let Answer::Message {
-                    family,
+                    family: of,
                     command,
                     attributes,
                 } = answer
-                    && family == self.family
+                    && of == family
                     && let Some(happening) = Happening::decode(command, attributes)
-                    && happening.ifindex == self.ifindex
+                    && happening.ifindex == ifindex
                 {
                     note(happening);
                 }
             }
-        }
+        })
     }
 
     fn ask<T>(
@@ -195,6 +202,22 @@ impl RadioSocket {
                     }
                 }
             }
+        }
+    }
+}
+
+/// Takes every message there is without waiting; says how often the kernel reported an overrun.
+fn drain(descriptor: RawFd, buffer: &mut [u8], mut take: impl FnMut(&[u8])) -> io::Result<u64> {
+    let mut overrun_count = 0;
+    loop {
+        match recv(descriptor, buffer, MsgFlags::MSG_DONTWAIT) {
+            // No message of netlink is empty.
+            Err(Errno::EAGAIN) | Ok(0) => return Ok(overrun_count),
+            Ok(length) => take(&buffer[..length]),
+            Err(Errno::EINTR) => {}
+            // Told once for each time the queue was full; what is in the queue is still good.
+            Err(Errno::ENOBUFS) => overrun_count += 1,
+            Err(errno) => return Err(errno.into()),
         }
     }
 }

@@ -127,6 +127,21 @@ pub enum RecordFileError {
         /// What is wrong.
         problem: &'static str,
     },
+    /// The records are laid out in another way than this program's.
+    #[error(
+        "record file {path}, byte 12: {kind} records of {found_bytes} bytes, where this program \
+         has {expected}; written by another version of hil-runtime?"
+    )]
+    OtherLayout {
+        /// The file.
+        path: PathBuf,
+        /// Of what, as in file names.
+        kind: &'static str,
+        /// Size of one record as the header says it.
+        found_bytes: u32,
+        /// Size or sizes this program knows.
+        expected: String,
+    },
 }
 
 /// Identity of a record file: what its header says.
@@ -193,12 +208,23 @@ impl RecordHeader {
         let kind = RecordKind::from_number(word(8))
             .ok_or_else(|| malformed(path, 8, "unknown record kind"))?;
         let record_bytes = word(12);
-        let fits = match kind.record_bytes() {
-            Some(size) => record_bytes as usize == size,
-            None => record_bytes as usize >= size_of::<Envelope>(),
-        };
+        let least = size_of::<Envelope>();
+        let (fits, expected) = kind.record_bytes().map_or_else(
+            || {
+                (
+                    record_bytes as usize >= least,
+                    format!("at least {least} bytes"),
+                )
+            },
+            |size| (record_bytes as usize == size, format!("{size} bytes")),
+        );
         if !fits {
-            return Err(malformed(path, 12, "the record size does not fit the kind"));
+            return Err(RecordFileError::OtherLayout {
+                path: path.to_owned(),
+                kind: kind.row().2,
+                found_bytes: record_bytes,
+                expected,
+            });
         }
         let name = header[32..].split(|byte| *byte == 0).next().unwrap_or(&[]);
         let channel = str::from_utf8(name)
@@ -328,6 +354,29 @@ mod tests {
         let file = RecordFile::parse(Path::new("x"), bytes).unwrap();
         assert_eq!(file.records::<PublishedRecord>().count(), 2);
         assert_eq!(file.truncated_bytes, size_of::<PublishedRecord>() - 5);
+    }
+
+    #[test]
+    fn a_file_of_another_layout_names_both_sizes_and_where_it_comes_from() {
+        let mut bytes = sample();
+        bytes[12] += 8;
+        let error = RecordFile::parse(Path::new("x"), bytes).unwrap_err();
+        let size = size_of::<PublishedRecord>();
+        let expected = format!(
+            "record file x, byte 12: published records of {} bytes, where this program has {size} \
+             bytes; written by another version of hil-runtime?",
+            size + 8
+        );
+        assert_eq!(error.to_string(), expected);
+        let mut bytes = sample();
+        bytes[8] = 6;
+        bytes[12..16].copy_from_slice(&1_u32.to_le_bytes());
+        let error = RecordFile::parse(Path::new("x"), bytes).unwrap_err();
+        let text = error.to_string();
+        assert!(
+            text.contains("message records of 1 bytes, where this program has at least"),
+            "{text}"
+        );
     }
 
     #[test]
