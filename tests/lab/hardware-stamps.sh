@@ -6,7 +6,7 @@
 #
 #   --binary   hil-runtime to test (default: target/release/hil-runtime of this workspace)
 #   --seconds  length of the run (20)
-#   --output   folder for what the PCs leave (default: a new one, named at the end)
+#   --output   folder for what the PCs leave, new or empty (default: a new one, named at the end)
 #   --nic      card; e1000e advertises stamps that never come, and the report must say so
 #
 # It checks that the cards were armed and put back, that the sending card's stamps came, each
@@ -42,6 +42,9 @@ done
 [[ -x $BINARY ]] ||
     lab_fail "$BINARY is missing; build it with: cargo build --release --package hil-runtime"
 lab_need python3 python3
+[[ -z $OUTPUT || ! -e $OUTPUT || -d $OUTPUT ]] || lab_fail "--output $OUTPUT is no folder"
+[[ -z $OUTPUT || ! -d $OUTPUT || -z $(ls -A "$OUTPUT") ]] ||
+    lab_fail "--output $OUTPUT is not empty; what is in it is kept"
 bash "$LAB_DIR/images.sh" guest qemu10 || exit 2
 [[ -n $OUTPUT ]] || OUTPUT=$(mktemp -d "${TMPDIR:-/tmp}/hardware-stamps.XXXXXX")
 mkdir -p "$OUTPUT" || exit 2
@@ -49,7 +52,6 @@ mkdir -p "$OUTPUT" || exit 2
 # prepare NAME ADDRESS: the shared folder of one PC.
 prepare() {
     local share=$OUTPUT/$1
-    rm -rf "$share"
     mkdir -p "$share/topologies"
     { cp "$BINARY" "$share/hil-runtime" &&
         cp "$WORKSPACE"/deploy/topologies/*.toml "$share/topologies/"; } ||

@@ -27,8 +27,14 @@ const FILTER_NAMES: [&str; 16] = [
     "PTPv2 delay request",
     "NTP",
 ];
-const FILTER_NONE: i32 = 0;
 const FILTER_ALL: i32 = 1;
+/// Names of `HWTSTAMP_TX_*` in the order of their numbers.
+const TRANSMIT_NAMES: [&str; 4] = [
+    "off",
+    "on",
+    "on with one-step PTP sync",
+    "on with one-step PTP sync and peer delay",
+];
 
 /// The settings of one card, as the kernel lets them be read and written.
 pub trait CardControl: fmt::Debug + Send {
@@ -68,6 +74,12 @@ pub enum ArmError {
     /// The interface has no card that stamps.
     #[error("its driver sets up no hardware stamps, as on loopback, veth and virtio")]
     NotOffered,
+    /// The driver does not say how the card is set up.
+    #[error(
+        "its driver does not say how the card is set up ({0}), as on loopback, veth and virtio; what \
+         could not be put back is left alone"
+    )]
+    Unreadable(io::Error),
     /// Not allowed.
     #[error("switching the card's stamps on needs CAP_NET_ADMIN")]
     NotAllowed,
@@ -81,30 +93,31 @@ pub enum ArmError {
 #[derive(Debug)]
 pub struct ArmedCard<C: CardControl = InterfaceCard> {
     card: C,
-    former: Option<HardwareStamping>,
+    former: HardwareStamping,
     granted: HardwareStamping,
     refusal: Option<String>,
     is_restored: bool,
 }
 
 impl<C: CardControl> ArmedCard<C> {
-    /// Asks for stamps of all that is sent and all that arrives. A card that cannot stamp all
-    /// arrivals keeps the receive filter it has, which a PTP daemon may depend on: no other
-    /// filter lets a run's datagrams through.
+    /// Asks for stamps of all that is sent and all that arrives. What the card is set up for
+    /// besides stays: its flags, a transmit type that gives stamps already, and, when it cannot
+    /// stamp all arrivals, its receive filter, which a PTP daemon may depend on. No other filter
+    /// lets a run's datagrams through.
     ///
     /// # Errors
-    /// When the card does not even stamp what it sends; it is left as it was.
+    /// When the card does not say how it is set up, or does not even stamp what it sends; it is left
+    /// as it was.
     pub fn arm(card: C) -> Result<Self, ArmError> {
-        let former = card.query().ok();
-        let kept_filter = former.map_or(FILTER_NONE, |former| former.receive_filter);
+        let former = card.query().map_err(ArmError::Unreadable)?;
         let mut refusal: Option<io::Error> = None;
-        for receive_filter in [FILTER_ALL, kept_filter, FILTER_NONE] {
+        for receive_filter in [FILTER_ALL, former.receive_filter] {
             let wanted = HardwareStamping {
-                is_transmit_on: true,
                 receive_filter,
+                ..former.with_transmit()
             };
             match card.set(wanted) {
-                Ok(granted) if granted.is_transmit_on => {
+                Ok(granted) if granted.is_transmit_on() => {
                     return Ok(Self {
                         card,
                         former,
@@ -115,9 +128,7 @@ impl<C: CardControl> ArmedCard<C> {
                 }
                 Ok(_) => {
                     // What it settled for instead is not what it was.
-                    if let Some(former) = former {
-                        let _refused_again = card.set(former);
-                    }
+                    let _refused_again = card.set(former);
                     let error = io::Error::other("it accepts the setting and leaves them off");
                     return Err(ArmError::Refused(error));
                 }
@@ -133,8 +144,8 @@ impl<C: CardControl> ArmedCard<C> {
         Err(ArmError::Refused(refusal.unwrap_or_else(nothing)))
     }
 
-    /// How it was set up before; `None` when the driver does not say.
-    pub const fn former(&self) -> Option<HardwareStamping> {
+    /// How it was set up before.
+    pub const fn former(&self) -> HardwareStamping {
         self.former
     }
 
@@ -150,26 +161,38 @@ impl<C: CardControl> ArmedCard<C> {
 
     /// What was asked for and granted, in words.
     pub fn describe(&self) -> String {
-        let filter = filter_name(self.granted.receive_filter);
+        let granted = describe_setting(self.granted);
         match &self.refusal {
             Some(refusal) => format!(
-                "transmit on; receive filter {filter} (all was refused: {refusal}): arriving \
-                 datagrams of a run get no hardware stamp from this card"
+                "{granted} (all was refused: {refusal}): arriving datagrams of a run get no hardware \
+                 stamp from this card"
             ),
-            None => format!("transmit on; receive filter {filter}"),
+            None => granted,
         }
     }
 
-    /// Puts the card back as it was, or switches it off where that is not known.
+    /// Puts the card back as it was; gives how it says it is set up now, which may differ from
+    /// [`ArmedCard::former`].
     ///
     /// # Errors
     /// When the driver refuses.
     pub fn restore(&mut self) -> io::Result<HardwareStamping> {
         self.is_restored = true;
-        self.card.set(self.former.unwrap_or(HardwareStamping {
-            is_transmit_on: false,
-            receive_filter: FILTER_NONE,
-        }))
+        let settled = self.card.set(self.former)?;
+        Ok(self.card.query().unwrap_or(settled))
+    }
+
+    /// Puts the card back as it was, and says what it was and whether that came about.
+    pub fn restore_in_words(&mut self) -> String {
+        let former = describe_setting(self.former);
+        match self.restore() {
+            Ok(now) if now == self.former => format!("was {former}; put back so"),
+            Ok(now) => format!(
+                "was {former}; could NOT be put back so: the card settled for {}",
+                describe_setting(now)
+            ),
+            Err(error) => format!("was {former}; could NOT be put back: {error}"),
+        }
     }
 }
 
@@ -184,16 +207,24 @@ impl<C: CardControl> Drop for ArmedCard<C> {
 
 /// A receive filter in words.
 pub fn filter_name(filter: i32) -> String {
-    let known = usize::try_from(filter).ok();
-    let name = known.and_then(|number| FILTER_NAMES.get(number));
-    name.map_or_else(|| format!("number {filter}"), |name| (*name).to_owned())
+    numbered(&FILTER_NAMES, filter)
+}
+
+fn numbered(names: &[&str], number: i32) -> String {
+    let known = usize::try_from(number).ok();
+    let name = known.and_then(|index| names.get(index));
+    name.map_or_else(|| format!("number {number}"), |name| (*name).to_owned())
 }
 
 /// A setting in words.
 pub fn describe_setting(setting: HardwareStamping) -> String {
-    let transmit = if setting.is_transmit_on { "on" } else { "off" };
+    let transmit = numbered(&TRANSMIT_NAMES, setting.transmit_type);
     let filter = filter_name(setting.receive_filter);
-    format!("transmit {transmit}, receive filter {filter}")
+    let flags = match setting.flags {
+        0 => String::new(),
+        flags => format!(", flags {flags:#x}"),
+    };
+    format!("transmit {transmit}, receive filter {filter}{flags}")
 }
 
 #[cfg(test)]
@@ -202,11 +233,12 @@ mod tests {
 
     use super::*;
 
-    const OFF: HardwareStamping = HardwareStamping {
-        is_transmit_on: false,
-        receive_filter: FILTER_NONE,
-    };
+    const OFF: HardwareStamping = HardwareStamping::OFF;
     const PTP_V2_EVENT: i32 = 12;
+    const TX_ON: i32 = 1;
+    const TX_ONESTEP_SYNC: i32 = 2;
+    const TX_ONESTEP_P2P: i32 = 3;
+    const BONDED: i32 = 1;
 
     /// A card that accepts some filters and remembers how it is set.
     #[derive(Debug, Clone)]
@@ -247,8 +279,13 @@ mod tests {
             if !self.filters.contains(&wanted.receive_filter) {
                 return Err(io::Error::from_raw_os_error(self.error));
             }
+            let transmit_type = if self.can_transmit {
+                wanted.transmit_type
+            } else {
+                OFF.transmit_type
+            };
             let settled = HardwareStamping {
-                is_transmit_on: wanted.is_transmit_on && self.can_transmit,
+                transmit_type,
                 ..wanted
             };
             *self.setting.lock().unwrap() = settled;
@@ -261,8 +298,8 @@ mod tests {
         let card = FakeCard::new(&[0, 1], OFF);
         let armed = ArmedCard::arm(card.clone()).unwrap();
         assert!(armed.stamps_all_arrivals());
-        assert_eq!(armed.describe(), "transmit on; receive filter all");
-        assert!(card.setting().is_transmit_on);
+        assert_eq!(armed.describe(), "transmit on, receive filter all");
+        assert_eq!(card.setting().transmit_type, TX_ON);
         drop(armed);
         assert_eq!(card.setting(), OFF);
     }
@@ -270,8 +307,9 @@ mod tests {
     #[test]
     fn a_card_that_refuses_all_arrivals_keeps_the_filter_of_a_ptp_daemon() {
         let daemon = HardwareStamping {
-            is_transmit_on: true,
+            transmit_type: TX_ON,
             receive_filter: PTP_V2_EVENT,
+            ..OFF
         };
         let card = FakeCard::new(&[0, PTP_V2_EVENT], daemon);
         let mut armed = ArmedCard::arm(card.clone()).unwrap();
@@ -284,21 +322,74 @@ mod tests {
     }
 
     #[test]
-    fn a_card_that_knows_no_other_filter_is_granted_none() {
-        let card = FakeCard::new(&[0], OFF);
-        let armed = ArmedCard::arm(card).unwrap();
-        assert_eq!(armed.granted().receive_filter, FILTER_NONE);
-        assert_eq!(armed.former(), Some(OFF));
+    fn one_step_ptp_and_the_flags_of_a_bond_stay_while_armed_and_afterwards() {
+        for transmit_type in [TX_ON, TX_ONESTEP_SYNC, TX_ONESTEP_P2P] {
+            let daemon = HardwareStamping {
+                flags: BONDED,
+                transmit_type,
+                receive_filter: PTP_V2_EVENT,
+            };
+            let card = FakeCard::new(&[0, 1, PTP_V2_EVENT], daemon);
+            let mut armed = ArmedCard::arm(card.clone()).unwrap();
+            let while_armed = HardwareStamping {
+                receive_filter: FILTER_ALL,
+                ..daemon
+            };
+            assert_eq!((armed.granted(), card.setting()), (while_armed, while_armed));
+            let told = armed.restore_in_words();
+            assert!(told.ends_with("flags 0x1; put back so"), "{told}");
+            assert_eq!(card.setting(), daemon);
+        }
     }
 
     #[test]
-    fn a_card_that_does_not_tell_its_setting_is_switched_off_at_the_end() {
-        let mut card = FakeCard::new(&[0, 1], OFF);
+    fn a_filter_of_another_user_is_never_switched_off() {
+        let daemon = HardwareStamping {
+            transmit_type: TX_ON,
+            receive_filter: PTP_V2_EVENT,
+            ..OFF
+        };
+        // It grants nothing but silence now.
+        let card = FakeCard::new(&[0], daemon);
+        let error = ArmedCard::arm(card.clone()).unwrap_err();
+        assert!(matches!(error, ArmError::Refused(_)), "{error}");
+        assert_eq!(card.setting(), daemon);
+    }
+
+    #[test]
+    fn a_card_that_settles_for_something_else_at_the_end_is_said_to() {
+        let one_step = HardwareStamping {
+            transmit_type: TX_ONESTEP_SYNC,
+            ..OFF
+        };
+        let mut armed = ArmedCard::arm(FakeCard::new(&[0, 1], one_step)).unwrap();
+        armed.card.can_transmit = false;
+        let told = armed.restore_in_words();
+        let expected = "was transmit on with one-step PTP sync, receive filter none; could NOT be put \
+                        back so: the card settled for transmit off, receive filter none";
+        assert_eq!(told, expected);
+    }
+
+    #[test]
+    fn a_card_that_knows_no_other_filter_is_granted_none() {
+        let card = FakeCard::new(&[0], OFF);
+        let armed = ArmedCard::arm(card).unwrap();
+        assert_eq!(armed.granted().receive_filter, OFF.receive_filter);
+        assert_eq!(armed.former(), OFF);
+    }
+
+    #[test]
+    fn a_card_that_does_not_tell_its_setting_is_left_alone() {
+        let found = HardwareStamping {
+            transmit_type: TX_ON,
+            receive_filter: PTP_V2_EVENT,
+            ..OFF
+        };
+        let mut card = FakeCard::new(&[0, 1, PTP_V2_EVENT], found);
         card.has_query = false;
-        let mut armed = ArmedCard::arm(card.clone()).unwrap();
-        assert_eq!(armed.former(), None);
-        assert_eq!(armed.restore().unwrap(), OFF);
-        assert_eq!(card.setting(), OFF);
+        let error = ArmedCard::arm(card.clone()).unwrap_err().to_string();
+        assert!(error.contains("could not be put back"), "{error}");
+        assert_eq!(card.setting(), found);
     }
 
     #[test]
@@ -326,7 +417,7 @@ mod tests {
         let interface = "lo".to_owned();
         let error = ArmedCard::arm(InterfaceCard { interface }).unwrap_err();
         assert!(
-            matches!(error, ArmError::NotOffered | ArmError::NotAllowed),
+            matches!(error, ArmError::Unreadable(_)),
             "{error}"
         );
     }

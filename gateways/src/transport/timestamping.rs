@@ -334,23 +334,51 @@ impl TimestampCapabilities {
     }
 }
 
-/// How a network card is set up to stamp (`struct hwtstamp_config` of `linux/net_tstamp.h`).
-/// This is a setting of the card, shared by all its users such as a PTP daemon.
+/// How a network card is set up to stamp (`struct hwtstamp_config` of `linux/net_tstamp.h`), in the
+/// kernel's own numbers so that it can be put back as it was. This is a setting of the card, shared
+/// by all its users such as a PTP daemon.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct HardwareStamping {
-    /// The card stamps what leaves (`HWTSTAMP_TX_ON`).
-    pub is_transmit_on: bool,
+    /// `HWTSTAMP_FLAG_*`: 1 where a bonded interface answers for the card that is active.
+    pub flags: i32,
+    /// How it stamps what leaves, one of `HWTSTAMP_TX_*`: 0 not, 1 on, 2 and 3 on with one-step PTP
+    /// messages.
+    pub transmit_type: i32,
     /// Which arrivals it stamps: 0 none, 1 all, else one of `HWTSTAMP_FILTER_*`.
     pub receive_filter: i32,
 }
 
 impl HardwareStamping {
+    /// Everything off (`HWTSTAMP_TX_OFF`, `HWTSTAMP_FILTER_NONE`).
+    pub const OFF: Self = Self {
+        flags: 0,
+        transmit_type: libc::HWTSTAMP_TX_OFF.cast_signed(),
+        receive_filter: libc::HWTSTAMP_FILTER_NONE.cast_signed(),
+    };
+
+    /// The card stamps what leaves: all types but `HWTSTAMP_TX_OFF` do.
+    pub const fn is_transmit_on(&self) -> bool {
+        self.transmit_type != Self::OFF.transmit_type
+    }
+
+    /// This setting with transmit stamps: a type that gives them, such as one-step PTP, stays.
+    #[must_use]
+    pub const fn with_transmit(self) -> Self {
+        if self.is_transmit_on() {
+            return self;
+        }
+        Self {
+            transmit_type: libc::HWTSTAMP_TX_ON.cast_signed(),
+            ..self
+        }
+    }
+
     /// How the card behind `interface` is set up now (`SIOCGHWTSTAMP`).
     ///
     /// # Errors
-    /// `EOPNOTSUPP` when it cannot stamp, as on loopback, veth and virtio.
+    /// `EOPNOTSUPP` when it cannot stamp, as on loopback, veth and virtio, or does not say.
     pub fn query(interface: &str) -> io::Result<Self> {
-        Self::exchange(interface, libc::SIOCGHWTSTAMP, (0, 0))
+        Self::OFF.exchange(interface, libc::SIOCGHWTSTAMP)
     }
 
     /// Sets the card up (`SIOCSHWTSTAMP`) and says what it settled for. Needs `CAP_NET_ADMIN` and
@@ -359,27 +387,22 @@ impl HardwareStamping {
     /// # Errors
     /// `EOPNOTSUPP` when it cannot stamp, `ERANGE` when it does not have that filter, `EPERM`.
     pub fn set(interface: &str, wanted: Self) -> io::Result<Self> {
-        let transmit = if wanted.is_transmit_on {
-            libc::HWTSTAMP_TX_ON
-        } else {
-            libc::HWTSTAMP_TX_OFF
-        };
-        let wanted = (transmit, wanted.receive_filter);
-        Self::exchange(interface, libc::SIOCSHWTSTAMP, wanted)
+        wanted.exchange(interface, libc::SIOCSHWTSTAMP)
     }
 
     #[allow(unsafe_code, reason = "no crate wraps SIOCGHWTSTAMP and SIOCSHWTSTAMP")]
-    fn exchange(interface: &str, request: c_ulong, wanted: (u32, i32)) -> io::Result<Self> {
+    fn exchange(self, interface: &str, request: c_ulong) -> io::Result<Self> {
         let mut config = libc::hwtstamp_config {
-            flags: 0,
-            tx_type: wanted.0.cast_signed(),
-            rx_filter: wanted.1,
+            flags: self.flags,
+            tx_type: self.transmit_type,
+            rx_filter: self.receive_filter,
         };
         let data = (&raw mut config).cast();
         // SAFETY: both requests read and write one `hwtstamp_config`, which `config` is.
         unsafe { device_request(interface, request, data) }?;
         Ok(Self {
-            is_transmit_on: config.tx_type != libc::HWTSTAMP_TX_OFF.cast_signed(),
+            flags: config.flags,
+            transmit_type: config.tx_type,
             receive_filter: config.rx_filter,
         })
     }
@@ -473,11 +496,7 @@ mod tests {
         assert!(!claims.tx_hardware && !claims.rx_hardware);
         let refusal = HardwareStamping::query("lo").unwrap_err();
         assert_eq!(refusal.raw_os_error(), Some(libc::EOPNOTSUPP));
-        let off = HardwareStamping {
-            is_transmit_on: false,
-            receive_filter: 0,
-        };
-        assert!(HardwareStamping::set("lo", off).is_err());
+        assert!(HardwareStamping::set("lo", HardwareStamping::OFF).is_err());
     }
 
     #[test]

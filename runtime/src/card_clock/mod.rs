@@ -15,7 +15,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use hil_gateways::transport::card_arming::{ArmedCard, InterfaceCard, describe_setting};
+use hil_gateways::transport::card_arming::{ArmedCard, InterfaceCard};
 use hil_gateways::transport::card_clock::CardClock;
 use hil_gateways::transport::clock_pair::ClockPair;
 use hil_gateways::transport::timestamping::{TimestampCapabilities, interface_with_address};
@@ -195,7 +195,7 @@ impl CardWatch {
         // In the reverse order: of two hosts with one card, the first found its former setting.
         for card in self.cards.iter_mut().rev() {
             if let Some(armed) = &mut card.armed {
-                card.story.restoring = restore(armed);
+                card.story.restoring = armed.restore_in_words();
             }
         }
         let stories = self.cards.iter().map(|card| card.story.clone()).collect();
@@ -296,16 +296,6 @@ fn describe_claims(claims: &TimestampCapabilities) -> String {
         "nothing".to_owned()
     } else {
         claimed.join(", ")
-    }
-}
-
-fn restore(armed: &mut ArmedCard) -> String {
-    let former = armed
-        .former()
-        .map_or_else(|| "unknown".to_owned(), describe_setting);
-    match armed.restore() {
-        Ok(now) => format!("was {former}; put back: {}", describe_setting(now)),
-        Err(error) => format!("was {former}; could NOT be put back: {error}"),
     }
 }
 
