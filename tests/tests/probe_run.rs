@@ -18,8 +18,9 @@ use serde_json::Value;
 const HOSTS: [&str; 2] = ["control-pc", "robot-pc"];
 const START_LIMIT: Duration = Duration::from_mins(1);
 const RUN_LIMIT: Duration = Duration::from_mins(2);
-/// Farthest that the medians of both may lie apart, microseconds.
-const MEDIAN_LIMIT_US: f64 = 5.0;
+/// Farthest that the medians of both may lie apart, microseconds: what only a wrong stamp or a wrong
+/// match reaches. How near they are on a quiet machine is for `probe compare` to say.
+const MEDIAN_LIMIT_US: f64 = 100.0;
 
 fn start_probe(host: &LabHost, output: &Path) -> ChildGuard {
     let mut command = host.command(hil_runtime_binary());
@@ -74,6 +75,8 @@ fn probe_and_gateways_agree_on_every_datagram_and_on_the_time_on_the_wire() {
         files[0].root(),
         &captures[0],
         &captures[1],
+        Path::new("--limit"),
+        Path::new("100"),
     ];
     let (comparison, code) = json(&arguments);
     println!("{comparison:#}");
@@ -90,6 +93,12 @@ fn probe_and_gateways_agree_on_every_datagram_and_on_the_time_on_the_wire() {
             assert!(counts["probe"].as_u64().unwrap() > 100, "{channel:#}");
         }
         let p50_us = |what: &str| channel[what]["p50_ns"].as_f64().unwrap() * 1e-3;
+        println!(
+            "{}: medians {} us by the gateways, {} us by the probe",
+            channel["channel"],
+            p50_us("gateway_wire"),
+            p50_us("probe_wire")
+        );
         let apart_us = (p50_us("probe_wire") - p50_us("gateway_wire")).abs();
         assert!(
             apart_us <= MEDIAN_LIMIT_US,
@@ -100,6 +109,90 @@ fn probe_and_gateways_agree_on_every_datagram_and_on_the_time_on_the_wire() {
 
     check_analysis(&captures);
     check_cut(&captures);
+    check_comparisons_with_faults(files[0].root(), &captures);
+}
+
+/// A capture with a fault, and one of another time, beside the run.
+fn check_comparisons_with_faults(run: &Path, captures: &[std::path::PathBuf; 2]) {
+    let bytes = std::fs::read(&captures[0]).unwrap();
+    let cut = captures[0].with_extension("tail.pcapng");
+    std::fs::write(&cut, &bytes[..bytes.len() - 1]).unwrap();
+    // Its section and interface, and no packet.
+    let block = |at: usize| u32::from_le_bytes(bytes[at + 4..at + 8].try_into().unwrap()) as usize;
+    let empty = captures[0].with_extension("empty.pcapng");
+    std::fs::write(&empty, &bytes[..block(0) + block(block(0))]).unwrap();
+    for (file, code, words) in [
+        (&cut, 1, "cut short"),
+        (&empty, 2, "holds no message of the run"),
+    ] {
+        let mut command = Command::new(hil_runtime_binary());
+        command
+            .args(["probe", "compare", "--limit", "100"])
+            .arg(run);
+        command.arg(file).arg(&captures[1]);
+        let mut child = ChildGuard::spawn(&mut command).unwrap();
+        let finished = child.wait_within(RUN_LIMIT).unwrap();
+        assert_eq!(finished.status.code(), Some(code), "{finished:?}");
+        assert!(finished.stderr.contains(words), "{finished:?}");
+    }
+}
+
+fn ip(host: &LabHost, arguments: &str) -> String {
+    let mut command = host.command("ip");
+    command.args(arguments.split(' '));
+    let mut child = ChildGuard::spawn(&mut command).unwrap();
+    let finished = child.wait_within(START_LIMIT).unwrap();
+    finished.assert_success();
+    finished.stdout
+}
+
+#[test]
+fn an_interface_that_goes_ends_the_capture_with_a_whole_file_and_its_own_exit_code() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let folder = RunFolder::new("probe-gone");
+    std::fs::create_dir_all(folder.path()).unwrap();
+    let output = folder.path().join("gone.pcapng");
+    let host = lab.host(0);
+    let start = |name: &str, more: &[&str]| {
+        let mut command = host.command(hil_runtime_binary());
+        command.args(["probe", "--interface", name, "--output"]);
+        command.arg(&output).args(more);
+        ChildGuard::spawn(&mut command).unwrap()
+    };
+    ip(host, "link add gone0 type veth peer name gone1");
+    ip(host, "link set gone0 up");
+    let mut probe = start("gone0", &[]);
+    probe.wait_for_output("probing gone0", START_LIMIT).unwrap();
+    // The card passes frames of other addresses as long as the probe runs.
+    assert!(ip(host, "-d link show gone0").contains("promiscuity 1"));
+    ip(host, "link del gone0");
+    let finished = probe.wait_within(START_LIMIT).unwrap();
+    assert_eq!(finished.status.code(), Some(1), "{finished:?}");
+    assert!(finished.stderr.contains("gone0: "), "{finished:?}");
+    assert!(finished.stderr.contains("it has gone"), "{finished:?}");
+    let (report, code) = json(&[Path::new("analyse"), &output]);
+    assert_eq!(
+        (code, &report["files"][0]["dropped_count"]),
+        (Some(0), &0.into())
+    );
+
+    // The file stays unless told otherwise, and a tap leaves nothing behind.
+    let before = std::fs::read(&output).unwrap();
+    let finished = start(INTERFACE, &[]).wait_within(START_LIMIT).unwrap();
+    assert_eq!(finished.status.code(), Some(2), "{finished:?}");
+    assert!(
+        finished.stderr.contains("exists; say --force"),
+        "{finished:?}"
+    );
+    assert_eq!(std::fs::read(&output).unwrap(), before);
+    let more = ["--force", "--duration", "100ms"];
+    let finished = start(INTERFACE, &more).wait_within(START_LIMIT).unwrap();
+    finished.assert_success();
+    assert_ne!(std::fs::read(&output).unwrap(), before);
+    let link = ip(host, &format!("-d link show {INTERFACE}"));
+    assert!(link.contains("promiscuity 0"), "{link}");
 }
 
 /// What the captures say on their own.

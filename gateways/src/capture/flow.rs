@@ -216,6 +216,9 @@ pub struct Numbered {
     pub series: u64,
     /// The number.
     pub number: u64,
+    /// Bits it has on the wire, 8..=64: behind the highest number comes 0. `None` for one that never
+    /// wraps, and whose `series` is always another when it begins anew.
+    pub bits: Option<u8>,
     /// True when further datagrams bear the same number: pieces of a message.
     pub is_piece: bool,
 }
@@ -324,6 +327,7 @@ fn own(datagram: &UdpDatagram<'_>) -> Result<DatagramIdentity, Unidentified> {
         number: Some(Numbered {
             series: hash(series.as_flattened()),
             number: header.sequence,
+            bits: None,
             is_piece: header.fragment_count > 1,
         }),
         own: Some(OwnHeader {
@@ -361,6 +365,7 @@ fn egm(datagram: &UdpDatagram<'_>) -> Result<DatagramIdentity, Unidentified> {
         number: header.seqno.map(|seqno| Numbered {
             series: 0,
             number: seqno.into(),
+            bits: Some(32),
             is_piece: false,
         }),
         own: None,
@@ -406,6 +411,7 @@ fn any(
         number: Some(Numbered {
             series: 0,
             number,
+            bits: Some(8 * bytes),
             is_piece: false,
         }),
         own: None,

@@ -113,17 +113,29 @@ pub struct Joined {
     pub figures: JoinFigures,
 }
 
-/// Joins what two points saw of `stream`; `None` when one of them saw nothing of it. Stamps of one
-/// datagram lie at most `window_ns` apart.
+/// Joins what two points saw of `stream`; `None` when neither saw anything of it, or one did not and
+/// nothing tells that it was watched. Stamps of one datagram lie at most `window_ns` apart.
+///
+/// A point that was watched and saw nothing has lost everything. Whether the stream should have come
+/// by there at all is for the caller to know: see [`super::pairing`].
 pub fn join(
     stream: &Stream,
     (a, seen_a): (&Point, &Seen),
     (b, seen_b): (&Point, &Seen),
     window_ns: i64,
 ) -> Option<Joined> {
-    let (list_a, list_b) = (seen_a.streams.get(stream)?, seen_b.streams.get(stream)?);
-    let mut sides = [(a, seen_a, sorted(list_a)), (b, seen_b, sorted(list_b))];
+    let list = |seen: &Seen| {
+        let list = seen.streams.get(stream).map(|list| sorted(list));
+        list.or_else(|| seen.span_ns.map(|_watched| Vec::new()))
+    };
+    let mut sides = [(a, seen_a, list(seen_a)?), (b, seen_b, list(seen_b)?)];
+    let is_empty = [sides[0].2.is_empty(), sides[1].2.is_empty()];
+    if is_empty == [true; 2] {
+        return None;
+    }
+    // Through a host with two taps the way is in, then out; but both then read one clock.
     let by_direction = match (a.direction, b.direction) {
+        _ if a.file_index == b.file_index => None,
         (Direction::Outbound, Direction::Inbound) => Some(false),
         (Direction::Inbound, Direction::Outbound) => Some(true),
         _ => None,
@@ -132,7 +144,8 @@ pub fn join(
     let is_swapped = by_direction.unwrap_or_else(|| {
         let is_early =
             |pair: &&(usize, usize)| sides[1].2[pair.1].stamp_ns < sides[0].2[pair.0].stamp_ns;
-        2 * matches.pairs.iter().filter(is_early).count() > matches.pairs.len()
+        // The one point that saw it is the first.
+        is_empty[0] || 2 * matches.pairs.iter().filter(is_early).count() > matches.pairs.len()
     });
     if is_swapped {
         sides.reverse();

@@ -5,7 +5,7 @@
 //! ```text
 //! file bytes -> CaptureReader -> packet -> esl -> link -> flow -> Observation
 //!                                                                    |
-//!                              point::single_point_figures <--- per stream ---> join::join_figures
+//!                              point::single_point_figures <--- per stream ---> pairing::join_all
 //! ```
 
 mod bytes;
@@ -14,6 +14,7 @@ pub mod flow;
 pub mod join;
 pub mod link;
 pub mod observe;
+pub mod pairing;
 mod pcap;
 mod pcapng;
 pub mod point;

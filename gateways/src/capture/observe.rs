@@ -237,7 +237,31 @@ impl Observer {
 
     /// Widens the time a point was watched to what its file says; a file may have been watching
     /// longer than its packets tell.
+    /// An interface of which the file has no packet but tells how long it was watched has points too.
     pub fn widen(&mut self, file_index: usize, interfaces: &[CaptureInterface]) {
+        for (interface_index, interface) in interfaces.iter().enumerate() {
+            let (Some(start), Some(end)) = (interface.start_ns, interface.end_ns) else {
+                continue;
+            };
+            let point = |direction| Point {
+                file_index,
+                interface_index,
+                esl_port: None,
+                direction,
+            };
+            let is_here = |one: &Point| (one.file_index, one.interface_index);
+            let mut here = self
+                .seen
+                .keys()
+                .filter(|one| is_here(one) == (file_index, interface_index));
+            if here.any(|one| one.esl_port.is_some() || one.direction == Direction::Unknown) {
+                continue;
+            }
+            for direction in [Direction::Inbound, Direction::Outbound] {
+                let seen = self.seen.entry(point(direction)).or_default();
+                seen.span_ns.get_or_insert((start, end));
+            }
+        }
         for (point, seen) in &mut self.seen {
             if point.file_index != file_index || point.esl_port.is_some() {
                 continue;

@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 use hil_models::measure::histogram::{Distribution, LatencyHistogram};
 use serde::{Deserialize, Serialize};
 
+use super::flow::Numbered;
 use super::observe::Observation;
 
 /// Figures of one stream at one point.
@@ -39,7 +40,8 @@ pub struct GapFigures {
 /// Figures of sequence numbers, each series apart.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct NumberFigures {
-    /// Series met: a new one begins when a session or producer starts.
+    /// Series met: a new one begins when a session or producer starts, or a number falls back too
+    /// far to be late.
     pub series_count: u64,
     /// What one number differs from the next by, most often.
     pub step: u64,
@@ -83,20 +85,82 @@ pub fn single_point_figures(observations: &[Observation]) -> Option<PointFigures
     })
 }
 
+/// Numbers that a late datagram may lie behind the newest, and that may be missing where the count
+/// passes its end; farther back or on it has begun anew (RFC 3550 appendix A.1).
+const LATE_MAX: u64 = 100;
+const MISSING_AT_WRAP_MAX: u64 = 3000;
+
+/// A count without its wraps.
+#[derive(Debug)]
+struct Unwrapped {
+    /// Highest number so far, unwrapped. It starts one lap up, so that one may be late at once.
+    top: u64,
+    restart_count: u64,
+}
+
+impl Unwrapped {
+    fn from(first: &Numbered) -> Self {
+        let mut count = Self {
+            top: 0,
+            restart_count: 0,
+        };
+        count.begin(first);
+        count
+    }
+
+    fn begin(&mut self, first: &Numbered) {
+        self.top = match first.bits {
+            Some(bits @ ..64) => (1 << bits) + first.number,
+            _ => first.number,
+        };
+    }
+
+    /// The number as it would be if the count never wrapped.
+    fn take(&mut self, one: &Numbered) -> u64 {
+        let Some(bits) = one.bits else {
+            self.top = self.top.max(one.number);
+            return one.number;
+        };
+        // 64 bits never wrap in practice, so that half of them as a lap change nothing.
+        let lap = 1_u64 << bits.min(63);
+        let newest = self.top % lap;
+        let ahead = one.number.wrapping_sub(newest) % lap;
+        let behind = newest.wrapping_sub(one.number) % lap;
+        let has_wrapped = one.number < newest;
+        if behind <= LATE_MAX.min(lap / 4) {
+            return self.top - behind;
+        }
+        let may_be_missing = if has_wrapped {
+            MISSING_AT_WRAP_MAX.min(lap / 2)
+        } else {
+            lap / 2
+        };
+        if ahead <= may_be_missing {
+            self.top = self.top.saturating_add(ahead);
+        } else {
+            self.restart_count += 1;
+            self.begin(one);
+        }
+        self.top
+    }
+}
+
 fn number_figures(observations: &[Observation]) -> Option<NumberFigures> {
     let mut in_time: Vec<&Observation> = observations.iter().collect();
     in_time.sort_by_key(|one| one.stamp_ns);
-    let mut series: BTreeMap<u64, Vec<u64>> = BTreeMap::new();
+    // By what the datagrams say, and by how often the counting began anew unsaid.
+    let mut series: BTreeMap<(u64, u64), Vec<u64>> = BTreeMap::new();
     let mut figures = NumberFigures::default();
-    let mut highest: BTreeMap<u64, u64> = BTreeMap::new();
+    let mut counts: BTreeMap<u64, Unwrapped> = BTreeMap::new();
     let (mut has_pieces, mut repeated_count) = (false, 0);
     for one in in_time {
         let numbered = one.identity.number?;
-        let list = series.entry(numbered.series).or_default();
-        let top = highest.entry(numbered.series).or_insert(numbered.number);
-        figures.reordered_count += u64::from(numbered.number < *top);
-        *top = numbered.number.max(*top);
-        list.push(numbered.number);
+        let count = counts.entry(numbered.series);
+        let count = count.or_insert_with(|| Unwrapped::from(&numbered));
+        let number = count.take(&numbered);
+        figures.reordered_count += u64::from(number < count.top);
+        let list = series.entry((numbered.series, count.restart_count));
+        list.or_default().push(number);
         has_pieces |= numbered.is_piece;
     }
     figures.series_count = series.len() as u64;

@@ -19,7 +19,7 @@ use std::os::fd::{AsRawFd, FromRawFd, OwnedFd};
 
 use nix::net::if_::if_nametoindex;
 use nix::sys::mman::{MapFlags, ProtFlags, mmap, munmap};
-use nix::sys::socket::{setsockopt, sockopt};
+use nix::sys::socket::{getsockopt, setsockopt, sockopt};
 use thiserror::Error;
 
 use crate::capture::flow::FlowFilter;
@@ -33,11 +33,21 @@ const BLOCK_BYTES: usize = 1 << 16;
 /// Room in a frame before the packet: the kernel's header and address, and what aligns them.
 const FRAME_HEADER_BYTES: usize = 96;
 
-/// `ETH_P_ALL` and `AF_PACKET` as a link address has them.
+/// `ETH_P_ALL` and `AF_PACKET` as a link address has them, `PACKET_MR_PROMISC` below.
 const EVERY_PROTOCOL: u16 = 3;
 const PACKET_FAMILY: u16 = 17;
 const _: () = assert!(EVERY_PROTOCOL as c_int == libc::ETH_P_ALL);
 const _: () = assert!(PACKET_FAMILY as c_int == libc::AF_PACKET);
+const _: () = assert!(1 == libc::PACKET_MR_PROMISC);
+const NO_ADDRESS: libc::sockaddr_ll = libc::sockaddr_ll {
+    sll_family: 0,
+    sll_protocol: 0,
+    sll_ifindex: 0,
+    sll_hatype: 0,
+    sll_pkttype: 0,
+    sll_halen: 0,
+    sll_addr: [0; 8],
+};
 
 /// How a tap is opened.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -202,6 +212,7 @@ impl PacketRing {
         let map = Mapping::of(&socket, ring_bytes).map_err(refused("mmap"))?;
         let everything = EVERY_PROTOCOL.to_be();
         bind(&socket, index, everything).map_err(refused("bind"))?;
+        listen_to_all(&socket, index).map_err(refused("PACKET_ADD_MEMBERSHIP"))?;
         Ok(Self {
             socket,
             map,
@@ -280,6 +291,19 @@ impl PacketRing {
         true
     }
 
+    /// What has happened to the interface since it was last asked: `ENETDOWN` when it was taken down
+    /// or has gone. Packets come again if it does.
+    ///
+    /// # Errors
+    /// What happened.
+    pub fn check(&self) -> io::Result<()> {
+        // Reading sets the socket's error to zero.
+        match getsockopt(&self.socket, sockopt::SocketError)? {
+            0 => Ok(()),
+            errno => Err(io::Error::from_raw_os_error(errno)),
+        }
+    }
+
     /// What the kernel counted until now.
     ///
     /// # Errors
@@ -353,15 +377,10 @@ fn open_socket() -> io::Result<OwnedFd> {
 
 #[allow(unsafe_code, reason = "nix cannot make a link address")]
 fn bind(socket: &OwnedFd, interface_index: c_uint, protocol_be: u16) -> io::Result<()> {
-    let address = libc::sockaddr_ll {
-        sll_family: PACKET_FAMILY,
-        sll_protocol: protocol_be,
-        sll_ifindex: c_int::try_from(interface_index).map_err(io::Error::other)?,
-        sll_hatype: 0,
-        sll_pkttype: 0,
-        sll_halen: 0,
-        sll_addr: [0; 8],
-    };
+    let mut address = NO_ADDRESS;
+    address.sll_family = PACKET_FAMILY;
+    address.sll_protocol = protocol_be;
+    address.sll_ifindex = c_int::try_from(interface_index).map_err(io::Error::other)?;
     let length = option_length::<libc::sockaddr_ll>();
     let pointer = (&raw const address).cast();
     // SAFETY: the kernel reads `length` bytes at `pointer`, a live address of that size.
@@ -375,15 +394,7 @@ fn bind(socket: &OwnedFd, interface_index: c_uint, protocol_be: u16) -> io::Resu
     reason = "nix refuses a link address shorter than its structure"
 )]
 fn hardware_type(socket: &OwnedFd) -> io::Result<u16> {
-    let mut address = libc::sockaddr_ll {
-        sll_family: 0,
-        sll_protocol: 0,
-        sll_ifindex: 0,
-        sll_hatype: 0,
-        sll_pkttype: 0,
-        sll_halen: 0,
-        sll_addr: [0; 8],
-    };
+    let mut address = NO_ADDRESS;
     let mut length = option_length::<libc::sockaddr_ll>();
     let pointer = (&raw mut address).cast();
     // SAFETY: the kernel writes at most `length` bytes at `pointer`, a live address of that size.
@@ -399,6 +410,22 @@ fn set_option<T>(socket: &OwnedFd, level: c_int, name: c_int, value: &T) -> io::
     // SAFETY: the kernel reads `length` bytes at `pointer`, a live value of that size.
     let result = unsafe { libc::setsockopt(descriptor, level, name, pointer, length) };
     outcome(result)
+}
+
+/// Lets the card pass frames of other addresses, as on a mirror port, until the socket is closed.
+fn listen_to_all(socket: &OwnedFd, interface_index: c_uint) -> io::Result<()> {
+    let membership = libc::packet_mreq {
+        mr_ifindex: c_int::try_from(interface_index).map_err(io::Error::other)?,
+        mr_type: 1,
+        mr_alen: 0,
+        mr_address: [0; 8],
+    };
+    set_option(
+        socket,
+        libc::SOL_PACKET,
+        libc::PACKET_ADD_MEMBERSHIP,
+        &membership,
+    )
 }
 
 fn attach(socket: &OwnedFd, program: &[crate::capture::program::Instruction]) -> io::Result<()> {

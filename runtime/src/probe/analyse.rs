@@ -5,8 +5,9 @@ use core::fmt::Write as _;
 use std::path::Path;
 
 use hil_gateways::capture::flow::FlowFilter;
-use hil_gateways::capture::join::{JoinFigures, Joined, OrderSource, join};
+use hil_gateways::capture::join::{JoinFigures, Joined, OrderSource};
 use hil_gateways::capture::observe::{Observer, PacketCounts, Point, Stream};
+use hil_gateways::capture::pairing::join_all;
 use hil_gateways::capture::point::{PointFigures, single_point_figures};
 use hil_models::measure::histogram::Distribution;
 use hil_models::measure::statistics::IntervalNs;
@@ -56,21 +57,34 @@ impl Reading {
         text
     }
 
-    /// Every stream that two points saw, joined.
+    /// Every stream at two points, joined.
     pub(super) fn joined(&self, window_ns: i64) -> Vec<(Stream, Joined)> {
-        let points: Vec<_> = self.observer.seen().iter().collect();
-        let mut found = Vec::new();
-        for (index, a) in points.iter().enumerate() {
-            for b in &points[index + 1..] {
-                for stream in a.1.streams.keys() {
-                    if let Some(joined) = join(stream, *a, *b, window_ns) {
-                        found.push((*stream, joined));
-                    }
-                }
+        join_all(&self.observer, window_ns)
+    }
+
+    /// True when a file has a fault or says that packets were dropped.
+    pub(super) fn has_gaps(&self) -> bool {
+        let is_bad = |file: &CaptureFile| file.fault_count > 0 || file.dropped_count() > Some(0);
+        self.files.iter().any(is_bad)
+    }
+
+    /// Every fault told and every gap, in words.
+    pub(super) fn complaints(&self) -> Vec<String> {
+        let mut complaints = Vec::new();
+        for file in &self.files {
+            complaints.extend(file.faults.iter().cloned());
+            let (path, told) = (file.path.display(), file.faults.len() as u64);
+            if file.fault_count > told {
+                complaints.push(format!("{path}: {} more faults", file.fault_count - told));
+            }
+            if let Some(count) = file.dropped_count().filter(|count| *count > 0) {
+                complaints.push(format!(
+                    "{path}: {count} packets were dropped while it was captured: what it lacks may \
+                     have been on the wire"
+                ));
             }
         }
-        found.sort_by_key(|(stream, joined)| (*stream, joined.first_point));
-        found
+        complaints
     }
 }
 
@@ -159,18 +173,6 @@ impl Report {
                 })
                 .collect(),
         }
-    }
-
-    /// True when a file has a fault or says that packets were dropped.
-    pub(super) fn has_gaps(&self) -> bool {
-        let is_bad = |file: &FileReport| file.fault_count > 0 || file.dropped_count > Some(0);
-        self.files.iter().any(is_bad)
-    }
-
-    /// Every fault told, in words.
-    pub(super) fn faults(&self) -> impl Iterator<Item = &str> {
-        let lists = self.files.iter().map(|file| file.faults.iter());
-        lists.flatten().map(String::as_str)
     }
 
     /// True when no packet was read at all.

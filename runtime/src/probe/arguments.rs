@@ -23,8 +23,8 @@ Flows: hil (our datagrams), egm:port=6510, udp:CONDITIONS; conditions with comma
   port=N sport=N dport=N src=ADDRESS dst=ADDRESS, and for udp id=OFFSET+BYTES[le] (a number in
   the payload; without it the whole payload is hashed)
 
-Exit codes: 0 done; 1 packets were dropped, a file has a fault, or the figures differ; 2 wrong
-arguments or nothing to read; 69 no such interface; 78 the right to capture is missing (root or
+Exit codes: 0 done; 1 packets were dropped, an interface failed, a file has a fault, or the figures
+differ; 2 wrong arguments, nothing to read, or a capture without anything of the run; 69 no such interface; 78 the right to capture is missing (root or
 CAP_NET_RAW); 130 interrupted before --duration was over, the file is complete";
 
 /// Look at the wire without taking part: capture, analyse, compare with a run.
@@ -52,6 +52,9 @@ pub(crate) struct LiveArgs {
     /// The pcapng file to write.
     #[arg(long, short, value_name = "FILE")]
     pub(crate) output: Option<PathBuf>,
+    /// Replace the output file if it exists.
+    #[arg(long)]
+    pub(crate) force: bool,
     /// What to follow [default: hil]; may be repeated.
     #[arg(long, value_name = "FLOW")]
     pub(crate) flow: Vec<FlowFilter>,

@@ -33,6 +33,8 @@ pub(super) enum CompareError {
     Summary { path: PathBuf, source: SummaryError },
     #[error("{0}: no record of a gateway, so there is no wire to compare")]
     NoGateway(PathBuf),
+    #[error("{capture}: holds no message of the run {run}: another time, place or flow?")]
+    NothingOfRun { capture: PathBuf, run: String },
 }
 
 /// A count of both sides.
@@ -170,6 +172,10 @@ pub(super) fn compare(
     if sides.is_empty() {
         return Err(CompareError::NoGateway(run.to_owned()));
     }
+    if let Some(capture) = file_without(&sides, captures) {
+        let run = folder.name();
+        return Err(CompareError::NothingOfRun { capture, run });
+    }
     let summary = summary(&folder)?;
     let joined = captures.joined(window_ns);
     let numbers = channel_numbers(&sides, captures);
@@ -192,6 +198,25 @@ pub(super) fn compare(
         run: folder.name(),
         channels: channels.collect(),
     })
+}
+
+/// A capture in which no message of the run was seen.
+fn file_without(sides: &BTreeMap<String, GatewaySide>, captures: &Reading) -> Option<PathBuf> {
+    let mut of_run: BTreeSet<Message> = BTreeSet::new();
+    for side in sides.values() {
+        of_run.extend(side.egress.iter().map(|one| (one.epoch, one.sequence)));
+        of_run.extend(side.ingress.iter().map(|one| (one.epoch, one.sequence)));
+    }
+    let is_of_run = |own: OwnHeader| is_data(&own) && of_run.contains(&(own.epoch, own.sequence));
+    let has_some = |index: usize| {
+        let points = captures.observer.seen().iter();
+        let points = points.filter(|(point, _)| point.file_index == index);
+        let mut observations = points.flat_map(|(_, seen)| seen.streams.values().flatten());
+        observations.any(|one| own(one).is_some_and(is_of_run))
+    };
+    let mut files = captures.files.iter().enumerate();
+    let (_, file) = files.find(|(index, _)| !has_some(*index))?;
+    Some(file.path.clone())
 }
 
 fn gateway_sides(folder: &RunFolder) -> Result<BTreeMap<String, GatewaySide>, CompareError> {

@@ -2,7 +2,7 @@
 //! It analyses nothing. Nothing waits for a packet, so that no sender pays for waking the probe.
 
 use std::fs::File;
-use std::io::{self, Write};
+use std::io::{self, Seek, Write};
 use std::path::{Path, PathBuf};
 use std::thread;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
@@ -29,19 +29,23 @@ const WRITE_BYTES: usize = 1 << 18;
 pub(super) struct Request {
     pub(super) interfaces: Vec<String>,
     pub(super) output: PathBuf,
+    /// Whether the output may replace a file.
+    pub(super) replaces: bool,
     pub(super) flows: Vec<FlowFilter>,
     pub(super) duration: Option<Duration>,
     pub(super) snap_bytes: u32,
     pub(super) ring_bytes: usize,
 }
 
-/// Why a capture failed. What was written until then is a whole file.
+/// Why a capture failed. What was written until then is a file of whole blocks.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum LiveError {
     #[error(transparent)]
     Ring(#[from] RingError),
     #[error("capture file {path}: {source}")]
     File { path: PathBuf, source: io::Error },
+    #[error("{path}: exists; say --force")]
+    Exists { path: PathBuf },
     #[error("the kernel does not tell what it dropped on {interface}: {source}")]
     Counters {
         interface: String,
@@ -58,6 +62,8 @@ pub(super) struct InterfaceResult {
     /// Stamped by the tap itself, because the kernel had not yet.
     pub(super) late_stamp_count: u64,
     pub(super) counters: RingCounters,
+    /// The interface was taken down or has gone.
+    pub(super) has_failed: bool,
 }
 
 /// How a capture ended.
@@ -72,6 +78,8 @@ pub(super) struct LiveResult {
 
 struct Tap {
     ring: PacketRing,
+    /// When the interface had gone, nanoseconds since 1970.
+    gone_ns: Option<u64>,
     result: InterfaceResult,
 }
 
@@ -89,6 +97,7 @@ pub(super) fn capture(
     for name in &request.interfaces {
         taps.push(Tap {
             ring: PacketRing::open(name, &request.flows, &settings)?,
+            gone_ns: None,
             result: InterfaceResult {
                 name: name.clone(),
                 ..InterfaceResult::default()
@@ -96,7 +105,7 @@ pub(super) fn capture(
         });
     }
     let start_ns = realtime_ns();
-    let mut file = Output::create(&request.output)?;
+    let mut file = Output::create(&request.output, request.replaces)?;
     describe(&mut file.buffer, request, &taps);
     file.write_out()?;
     let began = Instant::now();
@@ -114,8 +123,9 @@ pub(super) fn capture(
         let look_ns = realtime_ns();
         for (index, tap) in taps.iter_mut().enumerate() {
             drain(tap, index, &mut file)?;
+            watch(tap, look_ns, console);
         }
-        if is_over {
+        if is_over || taps.iter().all(|tap| tap.gone_ns.is_some()) {
             break (ended_by, look_ns);
         }
         if Instant::now() >= progress_due {
@@ -131,7 +141,7 @@ pub(super) fn capture(
             matched_count,
             dropped_count,
         } = tap.result.counters;
-        let span = (start_ns, end_ns.max(start_ns));
+        let span = (start_ns, tap.gone_ns.unwrap_or(end_ns).max(start_ns));
         writer::statistics(&mut file.buffer, index, span, matched_count, dropped_count);
     }
     file.finish()?;
@@ -168,7 +178,7 @@ pub(super) fn flow_list(flows: &[FlowFilter]) -> String {
 fn drain(tap: &mut Tap, index: usize, file: &mut Output) -> Result<(), LiveError> {
     let is_ethernet = tap.ring.link_type() == link_type::ETHERNET;
     let interface_index = u32::try_from(index).unwrap_or(u32::MAX);
-    let Tap { ring, result } = tap;
+    let Tap { ring, result, .. } = tap;
     // A ring that fills as fast as it is emptied must not keep the others waiting.
     for _ in 0..ring.frame_count() {
         let buffer = &mut file.buffer;
@@ -188,6 +198,22 @@ fn drain(tap: &mut Tap, index: usize, file: &mut Output) -> Result<(), LiveError
         }
     }
     Ok(())
+}
+
+/// Says what has happened to the interface of a tap. One that is down may come up again; one that has
+/// gone does not come back under its number.
+fn watch(tap: &mut Tap, now_ns: u64, console: &mut Console) {
+    let Err(error) = tap.ring.check() else {
+        return;
+    };
+    tap.result.has_failed = true;
+    let what = if nix::net::if_::if_nametoindex(tap.result.name.as_str()).is_ok() {
+        "nothing is captured until it is up again"
+    } else {
+        tap.gone_ns.get_or_insert(now_ns);
+        "it has gone, and its part of the capture ends here"
+    };
+    console.warn(&format!("{}: {error}: {what}", tap.result.name));
 }
 
 /// Puts a packet into the file as it was on the wire, with the VLAN tag the kernel took out.
@@ -261,26 +287,49 @@ struct Output {
 }
 
 impl Output {
-    fn create(path: &Path) -> Result<Self, LiveError> {
-        let file = File::create(path).map_err(|source| LiveError::File {
-            path: path.to_owned(),
-            source,
-        })?;
-        Ok(Self {
-            path: path.to_owned(),
-            file,
-            buffer: Vec::with_capacity(2 * WRITE_BYTES),
-            written_bytes: 0,
-        })
+    fn create(path: &Path, replaces: bool) -> Result<Self, LiveError> {
+        let mut options = File::options();
+        options.write(true);
+        if replaces {
+            options.create(true).truncate(true);
+        } else {
+            options.create_new(true);
+        }
+        let path = path.to_owned();
+        match options.open(&path) {
+            Ok(file) => Ok(Self {
+                path,
+                file,
+                buffer: Vec::with_capacity(2 * WRITE_BYTES),
+                written_bytes: 0,
+            }),
+            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {
+                Err(LiveError::Exists { path })
+            }
+            Err(source) => Err(LiveError::File { path, source }),
+        }
     }
 
-    /// Whole blocks only, so that a file is sound up to its last write.
+    /// Whole blocks only: where the disk fills up within one, that one is taken back.
     fn write_out(&mut self) -> Result<(), LiveError> {
         let outcome = self.file.write_all(&self.buffer);
-        outcome.map_err(|source| self.failed(source))?;
+        if let Err(source) = outcome {
+            // Where writing failed cutting may fail too; the first error is the one to fix.
+            let _cut = self.cut_to_whole_blocks().is_ok();
+            return Err(self.failed(source));
+        }
         self.written_bytes += self.buffer.len() as u64;
         self.buffer.clear();
         Ok(())
+    }
+
+    fn cut_to_whole_blocks(&mut self) -> io::Result<()> {
+        let there_bytes = self
+            .file
+            .stream_position()?
+            .saturating_sub(self.written_bytes);
+        let whole_bytes = whole_blocks(&self.buffer, there_bytes);
+        self.file.set_len(self.written_bytes + whole_bytes)
     }
 
     fn finish(&mut self) -> Result<(), LiveError> {
@@ -292,6 +341,42 @@ impl Output {
         LiveError::File {
             path: self.path.clone(),
             source,
+        }
+    }
+}
+
+/// Bytes of the blocks in `buffer` that end within its first `there_bytes`.
+fn whole_blocks(buffer: &[u8], there_bytes: u64) -> u64 {
+    let mut whole = 0_usize;
+    while let Some(length) = buffer.get(whole + 4..whole + 8) {
+        let length = length.try_into().map_or(0, u32::from_le_bytes) as usize;
+        if length == 0 || (whole + length) as u64 > there_bytes {
+            break;
+        }
+        whole += length;
+    }
+    whole as u64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_file_that_could_not_grow_is_cut_behind_its_last_whole_block() {
+        let mut buffer = Vec::new();
+        writer::begin(&mut buffer, "test", "none");
+        let head = buffer.len() as u64;
+        writer::statistics(&mut buffer, 0, (0, 1), 2, 3);
+        let all = buffer.len() as u64;
+        for (there, whole) in [
+            (0, 0),
+            (head - 1, 0),
+            (head, head),
+            (all - 1, head),
+            (all, all),
+        ] {
+            assert_eq!(whole_blocks(&buffer, there), whole, "{there} of {all}");
         }
     }
 }

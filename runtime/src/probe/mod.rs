@@ -50,6 +50,9 @@ pub(crate) fn run(args: &ProbeArgs, console: &mut Console) -> u8 {
             let Some(captures) = read(&paths, reading, console) else {
                 return exit::USAGE;
             };
+            for complaint in captures.complaints() {
+                console.warn(&complaint);
+            }
             match compare::compare(run, &captures, window_ns(reading)) {
                 Ok(comparison) => {
                     console.result(&if reading.json {
@@ -57,7 +60,7 @@ pub(crate) fn run(args: &ProbeArgs, console: &mut Console) -> u8 {
                     } else {
                         comparison.to_text(*limit)
                     });
-                    if comparison.agrees_within(*limit) {
+                    if comparison.agrees_within(*limit) && !captures.has_gaps() {
                         exit::DONE
                     } else {
                         exit::GAPS
@@ -109,10 +112,11 @@ fn analyse(paths: &[&Path], reading: &ReadingArgs, console: &mut Console) -> u8 
         return exit::USAGE;
     };
     let report = Report::of(&captures, window_ns(reading));
-    for fault in report.faults() {
-        console.warn(fault);
+    let complaints = captures.complaints();
+    for complaint in &complaints {
+        console.warn(complaint);
     }
-    if report.is_empty() && report.faults().next().is_some() {
+    if report.is_empty() && !complaints.is_empty() {
         return exit::USAGE;
     }
     console.result(&if reading.json {
@@ -120,7 +124,7 @@ fn analyse(paths: &[&Path], reading: &ReadingArgs, console: &mut Console) -> u8 
     } else {
         report.to_text()
     });
-    if report.has_gaps() {
+    if captures.has_gaps() {
         exit::GAPS
     } else {
         exit::DONE
@@ -149,6 +153,7 @@ fn capture(args: &LiveArgs) -> u8 {
     let request = Request {
         interfaces: args.interface.clone(),
         output: output.clone(),
+        replaces: args.force,
         duration: args.duration,
         snap_bytes: args
             .snap_length
@@ -170,7 +175,8 @@ fn capture(args: &LiveArgs) -> u8 {
             match error {
                 LiveError::Ring(RingError::Interface { .. }) => exit::NO_INTERFACE,
                 LiveError::Ring(RingError::Size { .. } | RingError::LinkLayer { .. })
-                | LiveError::File { .. } => exit::USAGE,
+                | LiveError::File { .. }
+                | LiveError::Exists { .. } => exit::USAGE,
                 LiveError::Ring(RingError::Rights { .. }) => exit::HOST_UNFIT,
                 LiveError::Ring(RingError::Refused { .. }) | LiveError::Counters { .. } => {
                     exit::INTERNAL
@@ -194,6 +200,9 @@ fn conclude(request: &Request, result: &LiveResult, console: &mut Console) -> u8
             let late = one.late_stamp_count;
             let _infallible = write!(text, ", {late} stamped by the tap instead of in the stack");
         }
+        if one.has_failed {
+            text.push_str(", interrupted");
+        }
         text.push('\n');
     }
     let _infallible = writeln!(
@@ -209,7 +218,10 @@ fn conclude(request: &Request, result: &LiveResult, console: &mut Console) -> u8
     );
     console.result(&text);
     let is_early = |planned: Duration| result.length < planned;
-    if dropped_count > 0 {
+    if result.interfaces.iter().any(|one| one.has_failed) {
+        console.warn("an interface failed while it was watched: the file has a gap from there on");
+        exit::GAPS
+    } else if dropped_count > 0 {
         console.warn("packets were dropped: the file has gaps; a larger --ring may help");
         exit::GAPS
     } else if result.ended_by.is_some() && request.duration.is_some_and(is_early) {
