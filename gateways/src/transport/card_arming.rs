@@ -335,7 +335,10 @@ mod tests {
                 receive_filter: FILTER_ALL,
                 ..daemon
             };
-            assert_eq!((armed.granted(), card.setting()), (while_armed, while_armed));
+            assert_eq!(
+                (armed.granted(), card.setting()),
+                (while_armed, while_armed)
+            );
             let told = armed.restore_in_words();
             assert!(told.ends_with("flags 0x1; put back so"), "{told}");
             assert_eq!(card.setting(), daemon);
@@ -416,10 +419,7 @@ mod tests {
     fn loopback_has_no_card_to_arm() {
         let interface = "lo".to_owned();
         let error = ArmedCard::arm(InterfaceCard { interface }).unwrap_err();
-        assert!(
-            matches!(error, ArmError::Unreadable(_)),
-            "{error}"
-        );
+        assert!(matches!(error, ArmError::Unreadable(_)), "{error}");
     }
 
     #[test]
