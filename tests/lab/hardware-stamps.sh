@@ -51,7 +51,8 @@ prepare() {
     local share=$OUTPUT/$1
     rm -rf "$share"
     mkdir -p "$share/topologies"
-    cp "$BINARY" "$share/hil-runtime" && cp "$WORKSPACE"/deploy/topologies/*.toml "$share/topologies/" ||
+    { cp "$BINARY" "$share/hil-runtime" &&
+        cp "$WORKSPACE"/deploy/topologies/*.toml "$share/topologies/"; } ||
         lab_fail "cannot fill $share"
     cat >"$share/run.sh" <<RUN
 modprobe $NIC
@@ -60,12 +61,15 @@ ip address add $2/24 dev eth0 && ip link set eth0 up || exit 3
 for _ in \$(seq 100); do [ "\$(cat /sys/class/net/eth0/carrier)" = 1 ] && break; sleep 0.1; done
 cp /share/hil-runtime /tmp/ && cp -r /share/topologies /tmp/
 /tmp/hil-runtime doctor --json >/share/doctor.json 2>/share/doctor.txt
+ethtool -S eth0 >/share/card-before.txt
 /tmp/hil-runtime --topology /tmp/topologies/shuttle-split.toml --host $1 \\
     --set 'hosts.control-pc.interface="eth0"' --set 'hosts.robot-pc.interface="eth0"' \\
     --set 'links.hop.timestamps="hardware"' \\
     --set 'run.duration="$SECONDS_OF_RUN s"' --set 'run.start_timeout="$BOOT_LIMIT s"' \\
     --set 'run.record="/tmp/record"'
 code=\$?
+ethtool -S eth0 >/share/card-after.txt
+/tmp/hil-runtime doctor --json >/share/doctor-after.json 2>/share/doctor-after.txt
 cp -r /tmp/record /share/
 exit \$code
 RUN

@@ -9,8 +9,10 @@ import sys
 
 NIC, FOLDER = sys.argv[1], sys.argv[2]
 HOSTS = ("control-pc", "robot-pc")
-# Of two stamps wanted at once the card of the emulation takes one: it has one register.
-TX_SHARE_MIN = 0.95
+SENDERS = {"shuttle/command": HOSTS[0], "shuttle/status": HOSTS[1]}
+# The card has one stamp register: what is sent before its driver read it gets none. How often
+# that is depends on the load of the emulating host; the driver counts it, and so it is checked.
+TX_SHARE_MIN = 0.5
 failures = 0
 
 
@@ -26,15 +28,32 @@ def microseconds(distribution, *names):
     return ", ".join(f"{name[:-3]} {distribution[name] / 1e3:.1f}" for name in names) + " us"
 
 
+def finding(host, file_name):
+    with open(f"{FOLDER}/{host}/{file_name}", encoding="utf-8") as file:
+        findings = {one["id"]: one["value"] for one in json.load(file)["findings"]}
+    return findings.get("card.eth0", "")
+
+
 def doctor(host):
-    with open(f"{FOLDER}/{host}/doctor.json", encoding="utf-8") as file:
-        findings = {one["id"]: one for one in json.load(file)["findings"]}
-    found = findings.get("card.eth0")
-    check(found is not None, f"{host}: doctor examined the card")
-    if found:
-        print(f"        doctor: {found['value']}")
-        words = "delivers" if NIC == "igb" else "advertised but never delivered"
-        check(words in found["value"], f"{host}: doctor says the card {words}")
+    found, after = finding(host, "doctor.json"), finding(host, "doctor-after.json")
+    check(found != "", f"{host}: doctor examined the card")
+    print(f"        doctor: {found}")
+    words = "delivers" if NIC == "igb" else "advertised but never delivered"
+    check(words in found, f"{host}: doctor says the card {words}")
+    setting = after.split(";")[0]
+    check(setting == found.split(";")[0] != "",
+          f"{host}: after the run doctor finds the card as before it: {setting}")
+
+
+def not_stamped(host):
+    """Stamps that the card's driver itself says it did not give during the run."""
+    counts = []
+    for when in ("before", "after"):
+        with open(f"{FOLDER}/{host}/card-{when}.txt", encoding="utf-8") as file:
+            pairs = (line.split(":") for line in file if "tx_hwtstamp_" in line)
+            counts.append({name.strip(): int(value) for name, value in pairs})
+    before, after = counts
+    return {name: after[name] - before[name] for name in after}
 
 
 def card(one):
@@ -68,7 +87,13 @@ def channel(one, summary):
           f"{name}: software TX {software['stamped_count']} of {software['eligible_count']}")
     text = f"{name}: hardware TX {stamped} of {sent}, with the software stamp beside it {both}"
     if NIC == "igb":
-        check(stamped >= TX_SHARE_MIN * sent, text)
+        check(stamped >= TX_SHARE_MIN * sent, f"{text} ({100 * stamped / sent:.2f} %)")
+        given_up = not_stamped(SENDERS[name])
+        told = ", ".join(f"{key} {value}" for key, value in given_up.items())
+        # The driver counts those of clock exchanges as well.
+        check(given_up and sent - stamped <= sum(given_up.values()),
+              f"{name}: none of the {sent - stamped} missing was lost after the driver: it says "
+              + told)
         check(both >= 0.95 * stamped, f"{name}: both kinds side by side on {both} of {stamped}")
         for segment in one["segments"][:2]:
             check(segment["distribution"]["state"] == "measured"

@@ -64,6 +64,19 @@ impl<R: DatagramReceiver + ?Sized> DatagramReceiver for Box<R> {
         (**self).reply(datagram, to)
     }
 
+    fn reply_stamped(
+        &mut self,
+        now: Instant,
+        datagram: &[u8],
+        to: SocketAddr,
+    ) -> Result<(), SendRefusal> {
+        (**self).reply_stamped(now, datagram, to)
+    }
+
+    fn take_reply_stamp(&mut self, now: Instant) -> Option<i64> {
+        (**self).take_reply_stamp(now)
+    }
+
     fn next_due(&self) -> Option<Instant> {
         (**self).next_due()
     }

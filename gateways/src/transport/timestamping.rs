@@ -30,6 +30,11 @@ pub enum TimestampMode {
 }
 
 impl TimestampMode {
+    /// True where the driver is to stamp what leaves, and not known never to.
+    pub(super) const fn stamps_departures(self) -> bool {
+        matches!(self, Self::Software | Self::Hardware)
+    }
+
     /// What a receiver asks for. Never transmit stamps: unfetched ones would take the room of
     /// arrivals.
     fn receive_flags(self) -> TimestampingFlag {
@@ -86,13 +91,21 @@ pub(super) fn restart_send_count(socket: &impl AsFd, mode: TimestampMode) -> io:
     arm_transmit(socket, mode)
 }
 
-/// Asks for the stamps of `mode` on a receiving socket.
+/// Asks for the stamps of `mode` on a receiving socket, and how to bring those of replies that ask
+/// for one themselves: with their number, counted from 0 here, and no copy.
 pub(super) fn arm_receive(socket: &impl AsFd, mode: TimestampMode) -> io::Result<()> {
-    Ok(setsockopt(
-        socket,
-        sockopt::Timestamping,
-        &mode.receive_flags(),
-    )?)
+    let mut flags = mode.receive_flags();
+    if mode.stamps_departures() {
+        flags |= TimestampingFlag::SOF_TIMESTAMPING_OPT_ID
+            | TimestampingFlag::SOF_TIMESTAMPING_OPT_TSONLY;
+    }
+    Ok(setsockopt(socket, sockopt::Timestamping, &flags)?)
+}
+
+/// Makes the kernel count the next reply that asks for a stamp as 0 again.
+pub(super) fn restart_reply_count(socket: &impl AsFd, mode: TimestampMode) -> io::Result<()> {
+    setsockopt(socket, sockopt::Timestamping, &mode.receive_flags())?;
+    arm_receive(socket, mode)
 }
 
 /// Room for the control messages of one datagram: stamps, drop count, an error report and more

@@ -4,6 +4,9 @@
 use super::ClockSettings;
 use super::exchange::{Constraint, Edge};
 
+/// Parts of a line whose slopes are compared.
+const PART_COUNT: usize = 4;
+
 /// One point of the estimate.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Anchor {
@@ -16,7 +19,7 @@ pub(super) struct Anchor {
 pub(super) struct Line {
     /// Gain of the offset per nanosecond of the other host's clock.
     pub(super) slope: f64,
-    /// Standard error of the slope.
+    /// Standard error of the slope, at least that of the mean of a slope that changes with time.
     pub(super) slope_error: f64,
 }
 
@@ -169,10 +172,29 @@ fn line(points: &[Anchor]) -> Option<Line> {
         .map(|(x, y, w)| w * (y - mean_y - slope * (x - mean_x)).powi(2))
         .sum();
     let variance = residual / (rows.len() as f64 - 2.0);
+    let scatter = slope_scatter(points).unwrap_or(0.0);
     Some(Line {
         slope,
-        slope_error: (variance / spread).sqrt(),
+        slope_error: (variance / spread).sqrt().max(scatter),
     })
+}
+
+/// How uncertain the mean of a slope is that changes with time: standard deviation of the slopes
+/// of up to [`PART_COUNT`] equally long parts, over the square root of their number. What is left
+/// about a straight line does not tell, as neighbours stray together. `None` below two parts.
+fn slope_scatter(points: &[Anchor]) -> Option<f64> {
+    let count = PART_COUNT.min(points.len().checked_sub(1)?);
+    let end = |part: usize| points[part * (points.len() - 1) / count].middle;
+    let slopes: Vec<f64> = (0..count)
+        .map(|part| {
+            let (from, until) = (end(part), end(part + 1));
+            let span_ns = until.at_ns.saturating_sub(from.at_ns).max(1);
+            until.offset_ns.saturating_sub(from.offset_ns) as f64 / span_ns as f64
+        })
+        .collect();
+    let mean = slopes.iter().sum::<f64>() / count as f64;
+    let squares: f64 = slopes.iter().map(|slope| (slope - mean).powi(2)).sum();
+    (count >= 2).then(|| (squares / (count as f64 - 1.0) / count as f64).sqrt())
 }
 
 #[allow(

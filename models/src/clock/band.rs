@@ -1,8 +1,8 @@
 //! The guaranteed interval of the offset over one stretch without a noticed step, and the search
 //! for steps. Only causality and the drift allowance are used here.
 
-use super::ClockSettings;
 use super::exchange::{Constraint, Edge};
+use super::{BEYOND_NS_MAX, ClockSettings};
 
 /// The tightest bounds among some exchanges, each the best for the instants on one side of it.
 #[derive(Debug, Clone, Copy)]
@@ -82,8 +82,16 @@ impl Band {
     }
 
     /// Smallest and largest offset at `at_ns`: the hull of what exchanges that were over by then
-    /// and exchanges that had not begun allow. `None` when there is neither, or one contradicts itself.
+    /// and exchanges that had not begun allow. At the ends there is one of the two only. `None` more
+    /// than [`BEYOND_NS_MAX`] outside all exchanges, and when one of the two contradicts itself.
     pub(super) fn interval_at(&self, at_ns: i64, settings: &ClockSettings) -> Option<(i64, i64)> {
+        let (begun_ns, over_ns) = (self.future.first()?.0, self.past.last()?.0);
+        let is_near = (begun_ns.saturating_sub(BEYOND_NS_MAX)
+            ..=over_ns.saturating_add(BEYOND_NS_MAX))
+            .contains(&at_ns);
+        if !is_near {
+            return None;
+        }
         let past = self.past.partition_point(|(last_ns, _)| *last_ns <= at_ns);
         let past = past.checked_sub(1).map(|index| self.past[index].1);
         let future = self

@@ -15,17 +15,21 @@ pub struct ClockFigures {
     pub unused_count: u64,
     /// Stamps of the exchanges given, four each, by what took them.
     pub stamp_counts: BTreeMap<StampKind, u64>,
-    /// Smallest round trip, nanoseconds.
+    /// Smallest round trip, nanoseconds; 0 when errors of the stamps make it less than nothing.
     pub rtt_min_ns: Option<i64>,
-    /// The offset in the middle of the exchanges.
+    /// The offset in the middle of the exchanges or, when a clock was stepped just there, at the
+    /// nearest instant that has one.
     pub offset: Option<OffsetFigures>,
+    /// The offset in the middle of each stretch between noticed steps, in order of time: one
+    /// offset cannot be held against a run with steps.
+    pub stretch_offsets: Vec<OffsetFigures>,
     /// Standard deviation of the estimate's points about the line between their neighbours,
     /// nanoseconds; says nothing of a path that is always slower one way.
     pub spread_ns: Option<f64>,
     /// How much faster this host's clock runs than the other's, parts per million, over the longest
     /// stretch without a step.
     pub skew_ppm: Option<f64>,
-    /// Its standard error.
+    /// Its standard error: of the line, or of the mean of four parts' slopes, whichever is larger.
     pub skew_error_ppm: Option<f64>,
     /// Largest error of a converted instant, over the time of the exchanges.
     pub bound: Option<BoundFigures>,

@@ -70,7 +70,8 @@ impl ClockMap {
         map
     }
 
-    /// `remote` on this host's clock; `None` around a step and without exchanges.
+    /// `remote` on this host's clock; `None` around a step, more than
+    /// [`BEYOND_NS_MAX`](super::BEYOND_NS_MAX) outside the exchanges and without any.
     pub fn localise(&self, remote: RemoteInstant) -> Option<Localised> {
         let at_ns = remote.as_ns();
         let piece = self.piece_at(at_ns)?;
@@ -91,7 +92,10 @@ impl ClockMap {
             // The offset changes by a thousandth of the time at most: three rounds reach a
             // nanosecond from years away.
             for _ in 0..3 {
-                let offset_ns = piece.offset_at(at_ns, &self.settings)?.estimate_ns;
+                // The first guess may lie beyond what has an interval, and the result within.
+                let bounded = piece.offset_at(at_ns, &self.settings);
+                let bounded_ns = bounded.map(|offset| offset.estimate_ns);
+                let offset_ns = bounded_ns.or_else(|| piece.anchors.offset_at(at_ns))?;
                 at_ns = local.as_ns().saturating_sub(offset_ns);
             }
             let remote = RemoteInstant::from_ns(at_ns);
@@ -113,19 +117,34 @@ impl ClockMap {
 
     fn add_figures(&mut self, constraints: &[Constraint], stretches: &[Stretch]) {
         let middle_of = |one: &Constraint| one.middle().at_ns;
-        self.figures.rtt_min_ns = constraints.iter().map(|one| one.rtt_ns).min();
+        self.figures.rtt_min_ns = rtt_min_ns(constraints);
         let ends = constraints.first().zip(constraints.last());
         self.figures.offset = ends.and_then(|(first, last)| {
-            let (first_ns, last_ns) = (middle_of(first), middle_of(last));
-            let middle_ns = first_ns.saturating_add(last_ns.saturating_sub(first_ns) / 2);
-            let piece = self.piece_at(middle_ns).or(self.pieces.first())?;
-            piece.offset_at(middle_ns, &self.settings)
+            let middle_ns = half_way(middle_of(first), middle_of(last));
+            // In a step there is no offset: then the nearest instant that has one.
+            let offsets = stretches
+                .iter()
+                .zip(&self.pieces)
+                .filter_map(|(one, piece)| {
+                    let (first, last) = one.constraints.first().zip(one.constraints.last())?;
+                    let at_ns = middle_ns.clamp(middle_of(first), middle_of(last));
+                    piece.offset_at(at_ns, &self.settings)
+                });
+            offsets.min_by_key(|offset| offset.at_ns.abs_diff(middle_ns))
         });
+        let by_stretch = stretches
+            .iter()
+            .zip(&self.pieces)
+            .filter_map(|(one, piece)| {
+                let (first, last) = one.constraints.first().zip(one.constraints.last())?;
+                let at_ns = half_way(middle_of(first), middle_of(last));
+                piece.offset_at(at_ns, &self.settings)
+            });
+        self.figures.stretch_offsets = by_stretch.collect();
         // Bounds are widest half-way between exchanges.
-        let between = constraints.windows(2).map(|pair| {
-            let (first_ns, last_ns) = (middle_of(&pair[0]), middle_of(&pair[1]));
-            first_ns.saturating_add(last_ns.saturating_sub(first_ns) / 2)
-        });
+        let between = constraints
+            .windows(2)
+            .map(|pair| half_way(middle_of(&pair[0]), middle_of(&pair[1])));
         let instants = constraints.iter().map(middle_of).chain(between);
         let bounds = instants.filter_map(|at_ns| {
             let localised = self.localise(RemoteInstant::from_ns(at_ns))?;
@@ -177,6 +196,16 @@ impl Piece {
     }
 }
 
+/// Errors of the stamps can make a fast exchange seem to have taken less than nothing.
+fn rtt_min_ns(constraints: &[Constraint]) -> Option<i64> {
+    let smallest_ns = constraints.iter().map(|one| one.rtt_ns).min()?;
+    Some(smallest_ns.max(0))
+}
+
+const fn half_way(first_ns: i64, last_ns: i64) -> i64 {
+    first_ns.saturating_add(last_ns.saturating_sub(first_ns) / 2)
+}
+
 fn no_figures(exchanges: &[Exchange], settings: &ClockSettings) -> ClockFigures {
     let mut stamp_counts = BTreeMap::new();
     for kind in exchanges.iter().flat_map(Exchange::kinds) {
@@ -188,6 +217,7 @@ fn no_figures(exchanges: &[Exchange], settings: &ClockSettings) -> ClockFigures 
         stamp_counts,
         rtt_min_ns: None,
         offset: None,
+        stretch_offsets: Vec::new(),
         spread_ns: None,
         skew_ppm: None,
         skew_error_ppm: None,

@@ -20,6 +20,11 @@
 //! either all that went before or all that came after is of the same side of the step. A
 //! step that no constant offset explains is noticed, and instants around it have no alignment at
 //! all.
+//!
+//! This needs an exchange on either side. Before the first exchange is over, and once the last one
+//! has begun, there is one side only: there, a step between an instant and the exchanges is not
+//! covered, and [`BEYOND_NS_MAX`] outside them the alignment ends. The same holds at the ends of
+//! every stretch between noticed steps.
 
 mod anchors;
 mod band;
@@ -36,6 +41,15 @@ pub use figures::{BoundFigures, ClockFigures, ClockStep, OffsetFigures};
 pub use map::{ClockMap, Localised};
 
 use serde::{Deserialize, Serialize};
+
+/// How long before the first exchange began and after the last one was over instants still convert.
+///
+/// Gateways exchange clocks ten times a second, and an exchange counts only once its response is
+/// back. So a run begins and ends with messages without an exchange beyond them: a period's worth,
+/// and a round trip's on top, which is most of a second on the slowest paths. What is assumed for
+/// them beyond the drift allowance is that no clock is stepped in that second; a monotonic clock
+/// cannot be set and steps only when its host stood still.
+pub const BEYOND_NS_MAX: i64 = 1_000_000_000;
 
 /// What the estimator takes for granted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]

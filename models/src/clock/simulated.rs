@@ -199,9 +199,22 @@ impl SimulatedRun {
         )
     }
 
-    /// Steps of both clocks.
-    pub(super) fn step_count(&self) -> usize {
-        self.local.steps.len() + self.remote.steps.len()
+    /// Lets one of the clocks gain `size_ns` at `true_ns`.
+    pub(super) fn step(&mut self, is_local: bool, true_ns: i64, size_ns: i64) {
+        let clock = if is_local {
+            &mut self.local
+        } else {
+            &mut self.remote
+        };
+        clock.steps.push((true_ns, size_ns));
+    }
+
+    /// What the offset gained by the steps of both clocks, in order of time.
+    pub(super) fn offset_steps_ns(&self) -> Vec<i64> {
+        let remote = self.remote.steps.iter().map(|(at, gain)| (*at, -gain));
+        let mut steps: Vec<_> = self.local.steps.iter().copied().chain(remote).collect();
+        steps.sort_unstable();
+        steps.into_iter().map(|(_, gain_ns)| gain_ns).collect()
     }
 
     /// How much faster the local clock ran than the other one, parts per million.

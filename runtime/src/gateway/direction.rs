@@ -213,6 +213,7 @@ fn ingress(
         stop: Arc::clone(&around.stop),
         foreign_count: 0,
         clock: KernelClock::read()?,
+        response: None,
         buffer: vec![0; usize::from(u16::MAX)].into_boxed_slice(),
     })
 }

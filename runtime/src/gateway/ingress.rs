@@ -7,6 +7,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use hil_gateways::protocol::ingress::{FollowUp, MessageInfo};
 use hil_gateways::protocol::sequence::Order;
+use hil_gateways::protocol::wire::Kind;
 use hil_gateways::protocol::{Delivery, Disposition, IngressBridge};
 use hil_gateways::transport::{DatagramReceiver, Received};
 use hil_models::measure::record::{FollowUpRecord, IngressRecord, UNAVAILABLE};
@@ -36,7 +37,16 @@ pub(crate) struct Ingress {
     /// Datagrams from an address that is not the peer's, dropped unread.
     pub(crate) foreign_count: u64,
     pub(crate) clock: KernelClock,
+    /// The clock response whose departure the kernel is to stamp.
+    pub(crate) response: Option<Response>,
     pub(crate) buffer: Box<[u8]>,
+}
+
+/// A clock response that left.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Response {
+    sequence: u64,
+    handed: Instant,
 }
 
 /// Where the thread's records go.
@@ -103,6 +113,7 @@ impl Ingress {
         }
         let now = MonotonicClock::now();
         self.bridge.on_wakeup(now);
+        self.take_response_stamp(now);
         self.receiver.attend(now);
         self.clock.refresh(now);
         Ok(false)
@@ -160,9 +171,37 @@ impl Ingress {
 
     /// Sends the replies that are due; a reply that cannot leave is counted by the transport.
     fn answer(&mut self) {
-        while let Some(reply) = self.bridge.poll_transmit(MonotonicClock::now()) {
+        loop {
+            let now = MonotonicClock::now();
+            let Some(reply) = self.bridge.poll_transmit(now) else {
+                return;
+            };
             let to = reply.destination.unwrap_or(self.peer);
-            let _counted = self.receiver.reply(reply.datagram, to).is_err();
+            if reply.kind != Kind::SyncResponse {
+                let _counted = self.receiver.reply(reply.datagram, to).is_err();
+                continue;
+            }
+            let sent = self.receiver.reply_stamped(now, reply.datagram, to);
+            self.response = sent.is_ok().then_some(Response {
+                sequence: reply.sequence,
+                handed: now,
+            });
+            self.take_response_stamp(now);
+        }
+    }
+
+    /// Takes the kernel's stamp of the newest clock response, if it has come; it rides on the next.
+    fn take_response_stamp(&mut self, now: Instant) {
+        let Some(realtime_ns) = self.receiver.take_reply_stamp(now) else {
+            return;
+        };
+        if let Some(response) = self.response.take() {
+            let left_ns = realtime_ns - self.clock.offset_ns();
+            self.bridge.on_transmit_stamp(
+                Kind::SyncResponse,
+                response.sequence,
+                left_ns.saturating_sub(response.handed.as_ns()),
+            );
         }
     }
 

@@ -213,12 +213,15 @@ pub fn read(path: &Path) -> Result<Vec<u8>, TraceFileError> {
     })
 }
 
-/// True for what may be CSV: it begins with a remark or a letter of a column's name, and is no
-/// trace by its first bytes.
+/// True for what may be CSV: text by its first bytes, and no trace.
 pub fn looks_like_text(bytes: &[u8]) -> bool {
     let start = &bytes[..bytes.len().min(512)];
+    // A letter may be cut in two at the end.
+    let is_utf8 =
+        core::str::from_utf8(start).map_or_else(|end| end.error_len().is_none(), |_| true);
     !start.starts_with(&wire::MAGIC)
         && !start.is_empty()
+        && is_utf8
         && start
             .iter()
             .all(|byte| byte.is_ascii_graphic() || byte.is_ascii_whitespace() || *byte >= 0x80)
