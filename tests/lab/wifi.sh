@@ -16,7 +16,7 @@
 #    and 0.02 lies inside the interval of the loss, both ways.
 #
 # Needs root (network namespaces are the PC's own, but its share keeps file owners), python3 and
-# what images.sh names. Took 10 minutes on two cores with a load of 15; the PC is given 15.
+# what images.sh names. Took 5 to 10 minutes on two cores with a load of 15; the PC is given 15.
 # Exit code 0 when all held, 1 when something did not, 2 when the lab itself failed.
 set -u -o pipefail
 # shellcheck source=tests/lab/lib.sh
