@@ -17,7 +17,9 @@
 //!
 //! Each part has a random stream of its own and draws for every message, whatever the parts before
 //! it did: turning one part on changes no draw of another, and the draws for the n-th message of a
-//! channel depend on the seed and on n alone, whatever other channels carry.
+//! channel depend on the seed and on n alone, whatever other channels carry. Wi-Fi is the exception:
+//! it draws per attempt and back-off, so its draws for a message depend also on when the messages of
+//! its channel before it were offered and what they met.
 
 use core::time::Duration;
 

@@ -1,5 +1,5 @@
 //! The textual form of a trace: lines `# key: value` for the header, then comma-separated values
-//! (RFC 4180) with the names of their columns first. Text in, text out: it opens no file.
+//! with the names of their columns first, as in RFC 4180 but without quoting. Text in, text out: it opens no file.
 
 use core::fmt::Write;
 
@@ -97,8 +97,8 @@ fn one_line(text: &str) -> String {
 /// trace.
 ///
 /// # Errors
-/// When there is no line with column names, or one that cannot be used; every later fault is
-/// beside what could be read.
+/// Before the first row: no line with column names, or a line that cannot be used. Every later
+/// fault is beside what could be read.
 pub fn decode(text: &str) -> Result<CsvDecoded, CsvFault> {
     let mut header = TraceHeader::new("");
     let mut records: Vec<TraceRecord> = Vec::new();
@@ -112,10 +112,15 @@ pub fn decode(text: &str) -> Result<CsvDecoded, CsvFault> {
         line += 1;
         let content = raw.trim_end_matches(['\n', '\r']);
         if let Some(remark) = content.strip_prefix('#') {
-            if let Err(what) = read_remark(remark, &mut header, &mut promised) {
-                return Err(fail(line, start, what));
+            match read_remark(remark, &mut header, &mut promised) {
+                Ok(()) => continue,
+                Err(what) if records.is_empty() => return Err(fail(line, start, what)),
+                Err(what) => {
+                    let fault = Some(fail(line, start, what));
+                    let trace = Trace { header, records };
+                    return Ok(CsvDecoded { trace, fault });
+                }
             }
-            continue;
         }
         if content.trim().is_empty() {
             continue;
@@ -353,6 +358,20 @@ mod tests {
         let fault = decode(cut).unwrap().fault.unwrap();
         assert_eq!(fault.what, "2 records, record_count says 3");
         assert_eq!(fault.offset, cut.len() as u64);
+    }
+
+    #[test]
+    fn a_bad_key_after_rows_keeps_the_rows() {
+        let text = "published_ns,delay_ns\n0,5\n10,6\n# direction: sideways\n20,7\n";
+        let decoded = decode(text).unwrap();
+        assert_eq!(decoded.trace.records.len(), 2);
+        let fault = decoded.fault.unwrap();
+        assert!(
+            fault.line == 4 && fault.what.contains("sideways"),
+            "{fault}"
+        );
+        let before = "published_ns,delay_ns\n# direction: sideways\n0,5\n";
+        assert_eq!(decode(before).unwrap_err().line, 2);
     }
 
     #[test]

@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{Trace, TraceCounts, TraceFate, TraceRecord, UNAVAILABLE_NS, UNBOUNDED_NS};
 use crate::measure::histogram::{Distribution, LatencyHistogram};
+use crate::measure::network::has_tail;
 use crate::measure::statistics::{
     CONFIDENCE, Interval, IntervalNs, block_bootstrap_quantile, wilson,
 };
@@ -34,7 +35,8 @@ pub struct QuantileFigure {
     pub quantile: f64,
     /// Its value.
     pub value_ns: i64,
-    /// 95 % interval, by resampling blocks; `None` below 100 delays.
+    /// 95 % interval, by resampling blocks; `None` below 100 delays or with fewer than ten beyond
+    /// the quantile.
     pub interval: Option<IntervalNs>,
 }
 
@@ -204,7 +206,9 @@ fn quantiles(delays_ns: &[i64], seed: u64) -> Vec<QuantileFigure> {
         QuantileFigure {
             quantile,
             value_ns: ascending[rank.clamp(1, ascending.len()) - 1],
-            interval: block_bootstrap_quantile(delays_ns, quantile, CONFIDENCE, &mut random),
+            interval: has_tail(ascending.len(), quantile)
+                .then(|| block_bootstrap_quantile(delays_ns, quantile, CONFIDENCE, &mut random))
+                .flatten(),
         }
     };
     QUANTILES.into_iter().map(of).collect()
@@ -339,6 +343,19 @@ mod tests {
         let within = single.independent_within;
         let outside = single.coefficients.iter().filter(|c| c.abs() > within);
         assert!(outside.count() <= 12, "5 of 100 are expected");
+    }
+
+    #[test]
+    fn a_quantile_with_fewer_than_ten_delays_beyond_it_has_no_interval() {
+        let delays = |count: i64| (0..count).map(|at| at * 7_919 % 9_973).collect::<Vec<_>>();
+        let with = |count| -> Vec<f64> {
+            let figures = quantiles(&delays(count), 1).into_iter();
+            let told = figures.filter(|figure| figure.interval.is_some());
+            told.map(|figure| figure.quantile).collect()
+        };
+        assert_eq!(with(150), [0.1, 0.5, 0.9]);
+        assert_eq!(with(2_000), [0.01, 0.1, 0.5, 0.9, 0.99]);
+        assert_eq!(with(10_000), QUANTILES);
     }
 
     #[test]

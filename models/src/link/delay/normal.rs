@@ -24,7 +24,7 @@ pub struct Normal {
     pub mean: Duration,
     /// Standard deviation before it is cut, 1 ns..=10 s.
     pub deviation: Duration,
-    /// Longest delay, up to 10 s; at least half of all draws are below it.
+    /// Longest delay, up to 10 s; at least a quarter of all draws is below it.
     #[serde(default = "super::delay_max")]
     pub max: Duration,
 }

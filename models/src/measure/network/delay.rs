@@ -11,6 +11,12 @@ use crate::random::RandomStream;
 /// Fewest samples beyond a quantile for which resampling says anything about it.
 const TAIL_COUNT_MIN: f64 = 10.0;
 
+/// True when enough of `count` samples lie beyond the quantile `share`, on its nearer side, for an
+/// interval by resampling.
+pub(crate) fn has_tail(count: usize, share: f64) -> bool {
+    share.min(1.0 - share) * count as f64 >= TAIL_COUNT_MIN
+}
+
 /// A quantile of the delay with its 95 % interval.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DelayQuantile {
@@ -112,7 +118,7 @@ pub(super) fn delays(passages: &[Passage], random: &mut RandomStream) -> Figure<
     };
     let mut quantile = |share: f64| DelayQuantile {
         value_ns: at_share(&ascending, share),
-        interval: ((1.0 - share) * ascending.len() as f64 >= TAIL_COUNT_MIN)
+        interval: has_tail(ascending.len(), share)
             .then(|| block_bootstrap_quantile(&delays_ns, share, CONFIDENCE, random))
             .flatten(),
     };

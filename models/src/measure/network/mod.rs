@@ -20,6 +20,7 @@ mod tests;
 use serde::{Deserialize, Serialize};
 
 pub use bins::{NetworkBin, NetworkBins, SeriesSpan, bin_width_ns};
+pub(crate) use delay::has_tail;
 pub use delay::{
     DelayFigures, DelayQuantile, DelayVariation, InterarrivalJitter, SuccessiveVariation,
 };

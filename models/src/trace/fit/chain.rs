@@ -50,14 +50,17 @@ impl Chain {
             .map(|loss| if is_lost { loss } else { 1.0 - loss })
     }
 
-    /// Logarithm of the probability of `losses`.
+    /// Logarithm of the probability of `losses`; minus infinity when they cannot be.
     pub(super) fn log_likelihood(&self, losses: &[bool]) -> f64 {
         let steps = self.steps();
         let (mut state, mut sum) = (self.stationary(), 0.0);
         for is_lost in losses {
             let emission = self.emission(*is_lost);
             let joint = [state[0] * emission[0], state[1] * emission[1]];
-            let total = (joint[0] + joint[1]).max(f64::MIN_POSITIVE);
+            let total = joint[0] + joint[1];
+            if total <= 0.0 {
+                return f64::NEG_INFINITY;
+            }
             sum += total.ln();
             let here = [joint[0] / total, joint[1] / total];
             state = [0, 1].map(|to| here[0] * steps[0][to] + here[1] * steps[1][to]);

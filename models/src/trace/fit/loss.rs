@@ -1,20 +1,27 @@
 //! Loss laws fitted to a trace: independent losses, bursts counted in messages (Gilbert, and
 //! Gilbert and Elliott), and outages counted in time.
 
+use std::borrow::Cow;
+
 use super::chain::Chain;
 use super::goodness::burst_test;
 use super::{Fit, REFUSED_BELOW, Ranking, duration_text};
+use crate::link::loss::{GilbertElliott, LossLaw};
+use crate::link::outages::Outages;
+use crate::link::spec::LinkSpec;
 use crate::trace::{Trace, TraceFate};
 
-/// Most messages a law is fitted to: the first of the trace.
-pub(super) const MESSAGES_MAX: usize = 200_000;
+/// Most messages the ascent to the law of Gilbert and Elliott looks at; every other law, and every
+/// likelihood, is of all of them.
+pub(super) const ASCENT_MAX: usize = 200_000;
+/// Stretches of successive messages that these are, spread evenly over the trace.
+const STRETCHES: usize = 20;
 /// Fewest losses for laws of bursts.
 const LOSSES_MIN: usize = 10;
 const HOUR_S: f64 = 3600.0;
 
 /// All laws of loss for `losses`, the messages of known fate of `trace`.
 pub(super) fn rank(trace: &Trace, losses: &[bool]) -> Ranking {
-    let losses = &losses[..losses.len().min(MESSAGES_MAX)];
     if losses.is_empty() {
         return Ranking::none("no message has a known fate");
     }
@@ -28,15 +35,24 @@ pub(super) fn rank(trace: &Trace, losses: &[bool]) -> Ranking {
             why: why.to_owned(),
         };
     }
+    let mut left_out = Vec::new();
     if lost_count >= LOSSES_MIN {
         let gilbert = gilbert_chain(losses);
-        fits.push(gilbert_fit(losses, gilbert));
-        fits.push(elliott_fit(losses, gilbert));
-        fits.extend(outages_fit(trace, losses, gilbert));
+        let others = [
+            gilbert_fit(losses, gilbert),
+            elliott_fit(losses, gilbert),
+            outages_fit(trace, losses, gilbert),
+        ];
+        for fit in others {
+            match fit {
+                Ok(fit) => fits.push(fit),
+                Err(why) => left_out.push(why),
+            }
+        }
     }
     Ranking::sort(&mut fits);
     let accepted = fits.iter().position(Fit::is_accepted);
-    let why = match accepted {
+    let mut why = match accepted {
         Some(_) => format!(
             "smallest AIC among those whose burst lengths have a probability of {REFUSED_BELOW} \
              or more, or are too few to test"
@@ -46,6 +62,10 @@ pub(super) fn rank(trace: &Trace, losses: &[bool]) -> Ranking {
              replay the trace itself where they matter"
         ),
     };
+    for reason in left_out {
+        why.push_str("; left out: ");
+        why.push_str(&reason);
+    }
     Ranking {
         best: Some(accepted.unwrap_or(0)),
         fits,
@@ -85,7 +105,28 @@ fn gilbert_chain(losses: &[bool]) -> Chain {
     }
 }
 
-fn chain_fit(law: &str, method: &str, losses: &[bool], chain: Chain, numbers: (u32, usize)) -> Fit {
+fn chain_fit(
+    law: &str,
+    method: &str,
+    losses: &[bool],
+    chain: Chain,
+    numbers: (u32, usize),
+) -> Result<Fit, String> {
+    if chain.to_bad <= 0.0 || chain.to_good <= 0.0 {
+        return Err(format!(
+            "{law}, as the trace never goes back from one state"
+        ));
+    }
+    let spec = LinkSpec {
+        loss: LossLaw::GilbertElliott(GilbertElliott {
+            to_bad: chain.to_bad,
+            to_good: chain.to_good,
+            good_loss_ratio: chain.loss[0],
+            bad_loss_ratio: chain.loss[1],
+        }),
+        ..LinkSpec::default()
+    };
+    spec.check().map_err(|why| format!("{law}: {why}"))?;
     let mut fit = Fit::new(law, method, numbers.0, Some(chain.log_likelihood(losses)));
     fit.bursts = burst_test(losses, &chain, numbers.1);
     let [good, bad] = chain.loss;
@@ -98,16 +139,38 @@ fn chain_fit(law: &str, method: &str, losses: &[bool], chain: Chain, numbers: (u
          good_loss_ratio = {good:?}\nbad_loss_ratio = {bad:?}\n",
         chain.to_bad, chain.to_good
     );
-    fit
+    Ok(fit)
 }
 
-fn gilbert_fit(losses: &[bool], chain: Chain) -> Fit {
+fn gilbert_fit(losses: &[bool], chain: Chain) -> Result<Fit, String> {
     let method = "shares of the steps between loss and delivery (largest likelihood)";
     chain_fit("gilbert", method, losses, chain, (2, 1))
 }
 
+/// Stretches of `losses` one after another; all of them when they are few. The joints are steps that
+/// never were, one in [`ASCENT_MAX`] / [`STRETCHES`].
+fn stretches(losses: &[bool]) -> Cow<'_, [bool]> {
+    if losses.len() <= ASCENT_MAX {
+        return Cow::Borrowed(losses);
+    }
+    let length = ASCENT_MAX / STRETCHES;
+    let free = losses.len() - length;
+    let begins = (0..STRETCHES).map(|stretch| free / (STRETCHES - 1) * stretch);
+    let parts = begins.flat_map(|begin| &losses[begin..begin + length]);
+    Cow::Owned(parts.copied().collect())
+}
+
 /// From several beginnings, as an ascent finds the next hill only.
-fn elliott_fit(losses: &[bool], gilbert: Chain) -> Fit {
+fn elliott_fit(all: &[bool], gilbert: Chain) -> Result<Fit, String> {
+    let stretches = stretches(all);
+    let losses: &[bool] = &stretches;
+    let lost_count = losses.iter().filter(|is_lost| **is_lost).count();
+    if lost_count < LOSSES_MIN {
+        return Err(format!(
+            "gilbert-elliott, as {lost_count} of the {} messages looked at were lost",
+            losses.len()
+        ));
+    }
     let ratio = losses.iter().filter(|is_lost| **is_lost).count() as f64 / losses.len() as f64;
     let begun = |to_bad: f64, to_good: f64, loss| Chain {
         to_bad: to_bad.clamp(1e-6, 0.5),
@@ -128,16 +191,19 @@ fn elliott_fit(losses: &[bool], gilbert: Chain) -> Fit {
     let best = found.reduce(|a, b| if b.1 > a.1 { b } else { a });
     let chain = best.map_or(gilbert, |(chain, _)| chain.good_first());
     let method = "expectation and maximisation (Baum and Welch), best of 4 beginnings";
-    chain_fit("gilbert-elliott", method, losses, chain, (4, 2))
+    chain_fit("gilbert-elliott", method, all, chain, (4, 2))
 }
 
 /// A link that fails and recovers in continuous time, asked at the times of publication: the
 /// Gilbert chain at the middle period gives its rates, the likelihood takes the real times.
-fn outages_fit(trace: &Trace, losses: &[bool], gilbert: Chain) -> Option<Fit> {
-    let period_s = trace.period_ns()? as f64 * 1e-9;
+fn outages_fit(trace: &Trace, losses: &[bool], gilbert: Chain) -> Result<Fit, String> {
+    let period_s = trace.period_ns().unwrap_or(0) as f64 * 1e-9;
     let kept = 1.0 - gilbert.to_bad - gilbert.to_good;
     if period_s <= 0.0 || kept <= 0.0 {
-        return None;
+        return Err("outages, as losses have no memory in time".to_owned());
+    }
+    if gilbert.to_bad <= 0.0 || gilbert.to_good <= 0.0 {
+        return Err("outages, as the trace never goes back from one state".to_owned());
     }
     // What two states at rates a and b are after a time T: a/(a+b) (1 - exp(-(a+b) T)).
     let both = -kept.ln() / period_s;
@@ -145,6 +211,15 @@ fn outages_fit(trace: &Trace, losses: &[bool], gilbert: Chain) -> Option<Fit> {
     let (fails, recovers) = (both * gilbert.to_bad / sum, both * gilbert.to_good / sum);
     let mean_s = 1.0 / recovers;
     let per_hour = HOUR_S / (1.0 / fails + mean_s);
+    let spec = LinkSpec {
+        outages: Outages {
+            mean_s,
+            per_hour,
+            buffered: false,
+        },
+        ..LinkSpec::default()
+    };
+    spec.check().map_err(|why| format!("outages: {why}"))?;
     let known = trace.records.iter();
     let known = known.filter(|record| record.fate != TraceFate::Unknown);
     let times: Vec<i64> = known.map(|record| record.published_ns).collect();
@@ -176,5 +251,5 @@ fn outages_fit(trace: &Trace, losses: &[bool], gilbert: Chain) -> Option<Fit> {
          per_hour = {per_hour:?}\n",
         duration_text(mean_s)
     );
-    Some(fit)
+    Ok(fit)
 }

@@ -146,11 +146,18 @@ impl TraceFit {
                 figures.counts.reordered_count, figures.counts.duplicated_count
             ));
         }
+        if losses.len() > loss::ASCENT_MAX {
+            remarks.push(format!(
+                "the law of Gilbert and Elliott was sought in {} of {} messages, in stretches spread                  over the run; its likelihood, and all of the other loss laws, is of all.",
+                loss::ASCENT_MAX,
+                losses.len()
+            ));
+        }
         Self {
             loss: loss::rank(trace, &losses),
             delay: delay::rank(&delays_s, &tested, seed),
             remarks,
-            loss_message_count: losses.len().min(loss::MESSAGES_MAX),
+            loss_message_count: losses.len(),
             tested_delay_count: tested.len(),
             seed,
         }

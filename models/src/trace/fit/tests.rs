@@ -187,3 +187,61 @@ fn equal_seeds_give_equal_fits_and_the_distance_is_the_textbooks() {
     let (a, b) = ([1.0, 2.0, 3.0, 4.0], [3.0, 4.0, 5.0, 6.0]);
     assert!((ks_of_two(&a, &b) - 0.5).abs() < 1e-12);
 }
+
+#[test]
+fn losses_late_in_a_long_trace_are_seen_by_every_law() {
+    let mut losses = vec![false; 600_000];
+    for burst in 0..60 {
+        losses[450_000 + burst * 2_000..][..25].fill(true);
+    }
+    let fit = TraceFit::of(&trace(&losses, || 0.005), 1);
+    assert_eq!(fit.loss_message_count, 600_000);
+    let bernoulli = find(&fit.loss, "bernoulli");
+    assert_eq!(bernoulli.parameters, "ratio 0.002500");
+    assert!(
+        fit.remarks
+            .iter()
+            .any(|remark| remark.contains("200000 of 600000"))
+    );
+    let gilbert = &find(&fit.loss, "gilbert").parameters;
+    assert!(gilbert.contains("to good 0.040000"), "{gilbert}");
+    let outages = &find(&fit.loss, "outages").parameters;
+    assert!(outages.starts_with("24"), "{outages}");
+    find(&fit.loss, "gilbert-elliott");
+}
+
+#[test]
+fn a_trace_that_never_recovers_or_cannot_be_written_down_drops_the_law_and_says_why() {
+    let mut losses = vec![false; 5_000];
+    losses[4_000..].fill(true);
+    let fit = TraceFit::of(&trace(&losses, || 0.005), 1);
+    let laws: Vec<&str> = fit.loss.fits.iter().map(|fit| fit.law.as_str()).collect();
+    assert!(
+        !laws.contains(&"gilbert") && !laws.contains(&"outages"),
+        "{laws:?}"
+    );
+    let why = &fit.loss.why;
+    assert!(
+        why.contains("left out: gilbert,") && why.contains("left out: outages,"),
+        "{why}"
+    );
+    let finite = fit.loss.fits.iter().filter_map(|fit| fit.log_likelihood);
+    assert!(
+        finite.into_iter().all(|ln| ln > -10_000.0),
+        "{:?}",
+        fit.loss
+    );
+    // A failure every 2 ms: more per hour than a link takes.
+    let chain = Chain {
+        to_bad: 0.2,
+        to_good: 0.3,
+        loss: [0.0, 1.0],
+    };
+    let mut fast = trace(&drawn(chain, 20_000, 3), || 0.005);
+    for record in &mut fast.records {
+        record.published_ns /= 10;
+    }
+    let loss = TraceFit::of(&fast, 1).loss;
+    assert!(loss.fits.iter().all(|fit| fit.law != "outages"));
+    assert!(loss.why.contains("per_hour"), "{}", loss.why);
+}
