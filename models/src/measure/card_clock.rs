@@ -31,6 +31,9 @@ pub struct CardClockRecord {
 /// How much either clock's rate may change between two pairs without showing in them, parts per
 /// billion: short-term wander of the crystals of PCs is well below.
 pub const WANDER_PPB: u64 = 1_000;
+/// Largest difference of the rates of a card's and a host's clock, for which a single pair gives no
+/// figure: 100 ppm of the crystal, and the 500 ppm that the kernel may steer by, parts per billion.
+const RATE_MAX_PPB: u64 = 600_000;
 /// A change of the offset that departs from the usual rate by more is a step of a clock, parts
 /// per billion: servos change a rate by less between two reads.
 const STEP_PPB: u64 = 200_000;
@@ -95,7 +98,7 @@ impl CardTimeline {
         let next = piece.partition_point(|record| card_of(record) < card_ns);
         match (next.checked_sub(1).map(|at| &piece[at]), piece.get(next)) {
             (Some(before), Some(after)) => Some(self.between(before, after, card_ns)),
-            (Some(only), None) | (None, Some(only)) => Some(self.beside(only, card_ns)),
+            (Some(only), None) | (None, Some(only)) => Some(beside(piece, only, card_ns)),
             (None, None) => None,
         }
     }
@@ -108,26 +111,15 @@ impl CardTimeline {
         let offset_ns = before.card_offset_ns.saturating_add(saturated(share));
         let nearer_ns = since_ns.min(span_ns.saturating_sub(since_ns));
         let departed_ns = departure_ns(before, after, self.rate_ppb);
-        let unexplained_ns = departed_ns.saturating_sub(before.bound_ns + after.bound_ns);
+        let unexplained_ns = departed_ns.saturating_sub(sum_of_bounds(before, after));
         Bounded {
             value_ns: card_ns.saturating_sub(offset_ns),
-            bound_ns: before.bound_ns.max(after.bound_ns)
-                + unexplained_ns
-                + part_of(nearer_ns, WANDER_PPB)
-                + 1,
-        }
-    }
-
-    /// Outside the pairs the usual rate is gone on with, and may be wrong by a hundred times the
-    /// wander.
-    fn beside(&self, pair: &CardClockRecord, card_ns: i64) -> Bounded {
-        let away_ns = card_ns.saturating_sub(card_of(pair));
-        let change = i128::from(away_ns) * i128::from(self.rate_ppb) / 1_000_000_000;
-        let offset_ns = pair.card_offset_ns.saturating_add(saturated(change));
-        let strayed_ns = part_of(away_ns.saturating_abs(), 100 * WANDER_PPB);
-        Bounded {
-            value_ns: card_ns.saturating_sub(offset_ns),
-            bound_ns: pair.bound_ns + strayed_ns + 1,
+            bound_ns: before
+                .bound_ns
+                .max(after.bound_ns)
+                .saturating_add(unexplained_ns)
+                .saturating_add(part_of(nearer_ns, WANDER_PPB))
+                .saturating_add(1),
         }
     }
 
@@ -179,20 +171,49 @@ pub struct Frequency {
     pub bound_ppb: f64,
 }
 
-/// From the narrowest pair of the first quarter to that of the last one.
-fn frequency(piece: &[CardClockRecord]) -> Option<Frequency> {
+/// Outside the pairs their mean rate is gone on with. It may be wrong by what the bounds of the two
+/// pairs it is from allow, and by a hundred times the wander; of one pair alone no rate is known.
+fn beside(piece: &[CardClockRecord], pair: &CardClockRecord, card_ns: i64) -> Bounded {
+    let away_ns = card_ns.saturating_sub(card_of(pair));
+    let known = ends(piece).map(|(first, last)| {
+        let span = i128::from(last.realtime_ns.saturating_sub(first.realtime_ns));
+        let change = i128::from(last.card_offset_ns) - i128::from(first.card_offset_ns);
+        let error = i128::from(sum_of_bounds(&first, &last));
+        let away = i128::from(away_ns);
+        let error_ns = saturated(away.abs().saturating_mul(error) / span + 1).unsigned_abs();
+        let strayed_ns = part_of(away_ns, 100 * WANDER_PPB);
+        let change_ns = saturated(away.saturating_mul(change) / span);
+        (change_ns, error_ns.saturating_add(strayed_ns))
+    });
+    let (change_ns, strayed_ns) = known.unwrap_or((0, part_of(away_ns, RATE_MAX_PPB)));
+    let offset_ns = pair.card_offset_ns.saturating_add(change_ns);
+    Bounded {
+        value_ns: card_ns.saturating_sub(offset_ns),
+        bound_ns: pair.bound_ns.saturating_add(strayed_ns).saturating_add(2),
+    }
+}
+
+/// The narrowest pair of the first quarter and that of the last one; `None` when they are the same.
+fn ends(piece: &[CardClockRecord]) -> Option<(CardClockRecord, CardClockRecord)> {
     let quarter = (piece.len() / 4).max(1);
     let narrowest = |part: &[CardClockRecord]| part.iter().min_by_key(|one| one.bound_ns).copied();
     let first = narrowest(&piece[..quarter.min(piece.len())])?;
     let last = narrowest(&piece[piece.len() - quarter.min(piece.len())..])?;
+    (last.realtime_ns > first.realtime_ns).then_some((first, last))
+}
+
+fn frequency(piece: &[CardClockRecord]) -> Option<Frequency> {
+    let (first, last) = ends(piece)?;
     let span_ns = last.realtime_ns.saturating_sub(first.realtime_ns);
-    (span_ns > 0).then(|| {
-        let change_ns = last.card_offset_ns.saturating_sub(first.card_offset_ns);
-        Frequency {
-            offset_ppb: change_ns as f64 * 1e9 / span_ns as f64,
-            bound_ppb: (first.bound_ns + last.bound_ns) as f64 * 1e9 / span_ns as f64,
-        }
+    let change_ns = last.card_offset_ns.saturating_sub(first.card_offset_ns);
+    Some(Frequency {
+        offset_ppb: change_ns as f64 * 1e9 / span_ns as f64,
+        bound_ppb: sum_of_bounds(&first, &last) as f64 * 1e9 / span_ns as f64,
     })
+}
+
+const fn sum_of_bounds(one: &CardClockRecord, other: &CardClockRecord) -> u64 {
+    one.bound_ns.saturating_add(other.bound_ns)
 }
 
 const fn card_of(record: &CardClockRecord) -> i64 {
@@ -235,7 +256,7 @@ fn is_step(before: &CardClockRecord, after: &CardClockRecord, rate_ppb: i64) -> 
     let span_ns = after.realtime_ns.saturating_sub(before.realtime_ns);
     let allowed_ns = part_of(span_ns, STEP_PPB).max(STEP_NS_MIN);
     let departed_ns = departure_ns(before, after, rate_ppb);
-    span_ns <= 0 || departed_ns > allowed_ns + before.bound_ns + after.bound_ns
+    span_ns <= 0 || departed_ns > allowed_ns.saturating_add(sum_of_bounds(before, after))
 }
 
 #[cfg(test)]
@@ -304,6 +325,52 @@ mod tests {
                 );
             }
         }
+    }
+
+    #[test]
+    fn few_pairs_bound_the_stamps_beside_them_at_both_ends() {
+        let mut answered_count = 0;
+        for seed in 0..4_000 {
+            let mut random = RandomStream::new(seed, "few card pairs");
+            let ppb = i64::try_from(up_to(&mut random, 200_000)).unwrap() - 100_000;
+            let all = pairs(&mut random, 5_000, ppb);
+            let count = 1 + usize::try_from(seed % 4).unwrap();
+            let timeline = CardTimeline::new(&all[..count]);
+            let last_ns = i64::try_from(count - 1).unwrap() * PERIOD_NS;
+            for end_ns in [0, last_ns] {
+                for _ in 0..10 {
+                    let away_ns = i64::try_from(up_to(&mut random, 480_000_000)).unwrap();
+                    let true_ns = EPOCH_NS + end_ns + away_ns - 240_000_000;
+                    let Some(found) = timeline.to_realtime(card_at(true_ns, 5_000, ppb)) else {
+                        continue;
+                    };
+                    answered_count += 1;
+                    let error_ns = found.value_ns.abs_diff(true_ns);
+                    assert!(error_ns <= found.bound_ns, "seed {seed}: {found:?}");
+                }
+            }
+        }
+        assert!(answered_count > 70_000, "{answered_count}");
+    }
+
+    #[test]
+    fn a_damaged_bound_saturates() {
+        let damaged = |index: i64| CardClockRecord {
+            realtime_ns: EPOCH_NS + index * PERIOD_NS,
+            card_offset_ns: 0,
+            realtime_offset_ns: 0,
+            bound_ns: u64::MAX,
+        };
+        let timeline = CardTimeline::new(&[damaged(0), damaged(1)]);
+        for true_ns in [
+            EPOCH_NS + PERIOD_NS / 2,
+            EPOCH_NS - 7,
+            EPOCH_NS + 2 * PERIOD_NS,
+        ] {
+            let found = timeline.to_realtime(true_ns).unwrap();
+            assert_eq!(found.bound_ns, u64::MAX);
+        }
+        assert!(timeline.figures().unwrap().frequency.is_some());
     }
 
     #[test]

@@ -27,8 +27,15 @@ fn passage(joined: &Joined<'_>, fate: MessageFate, context: &AccountContext<'_>)
         _ if joined.ingress.is_some() => Crossing::Arrived,
         MessageFate::Taken | MessageFate::SupersededAtConsumer => Crossing::Arrived,
         MessageFate::LostOnWire => Crossing::LostByNetwork,
-        MessageFate::InFlight | MessageFate::UnknownPeerRecordsUnavailable => Crossing::Unknown,
-        _ => Crossing::LostByHost,
+        MessageFate::InFlight
+        | MessageFate::Unexplained
+        | MessageFate::UnknownPeerRecordsUnavailable => Crossing::Unknown,
+        MessageFate::SupersededAtInput
+        | MessageFate::RefusedByKernel
+        | MessageFate::RefusedAtIngress
+        | MessageFate::Late
+        | MessageFate::Duplicate
+        | MessageFate::LostInInterruption => Crossing::LostByHost,
     };
     let handed_ns = joined
         .egress

@@ -23,7 +23,8 @@ const SLEW_MAX_RATIO: f64 = 500e-6;
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case")]
 pub enum NetworkEventKind {
-    /// No message got through for at least [`EVENT_OUTAGE_MIN_NS`]; `lost_count` were lost.
+    /// No message got through for at least [`EVENT_OUTAGE_MIN_NS`]; `lost_count`, at least two, were
+    /// lost.
     Outage {
         /// Messages lost.
         lost_count: u64,
@@ -105,8 +106,9 @@ fn losses(passages: &[Passage]) -> Vec<NetworkEvent> {
             let length_ns = run
                 .until_ns
                 .map(|until_ns| until_ns.saturating_sub(from_ns));
-            // One that did not end counts when it cost more than one message.
-            let is_outage = length_ns.map_or(run.lost_count > 1, |ns| ns >= EVENT_OUTAGE_MIN_NS);
+            // A single loss is none, however slowly a channel sends.
+            let is_long = length_ns.is_none_or(|ns| ns >= EVENT_OUTAGE_MIN_NS);
+            let is_outage = run.lost_count > 1 && is_long;
             if is_outage {
                 lost_in_outages += run.lost_count;
                 found.push(NetworkEvent {

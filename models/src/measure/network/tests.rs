@@ -176,6 +176,24 @@ fn an_outage_that_lasts_to_the_end_is_open() {
     );
 }
 
+#[test]
+fn a_single_loss_of_a_slow_channel_is_no_event_and_two_in_a_row_are() {
+    let slowed = |mut all: Vec<Passage>| {
+        for one in &mut all {
+            // Every 500 ms.
+            one.offered_ns = one.offered_ns.map(|ns| ns * 50);
+        }
+        all
+    };
+    let single = slowed(passages(200, |one| one % 50 == 20));
+    assert_eq!(network_events(&single), []);
+    let pair = network_events(&slowed(passages(200, |one| one == 20 || one == 21)));
+    assert_eq!(pair.len(), 1);
+    assert_eq!(pair[0].kind, NetworkEventKind::Outage { lost_count: 2 });
+    let length_ns = pair[0].until_ns.unwrap() - pair[0].from.ns;
+    assert_eq!(length_ns, 1_000_000_000);
+}
+
 /// Gilbert's chain: lost while bad, with 20 messages a bad spell.
 fn chain(count: u64, random: &mut RandomStream) -> Vec<Passage> {
     let mut is_bad = false;
