@@ -163,12 +163,17 @@ impl WifiLink {
     }
 
     /// Sends a PPDU that goes on the air at `at` for the first time, until it is received or given
-    /// up; sets when the next may follow.
+    /// up; sets when the next may follow. No attempt begins after the lifetime.
     fn send(&mut self, offered: Instant, mut at: Instant, air_bytes: u64) -> Received {
         let access = self.contention.access;
         let mut window = access.window_min;
         let mut result = Err(Gone::Exhausted);
         for attempt in 0..self.attempt_limit {
+            if at.ns_since(offered) > self.lifetime_ns {
+                // It grew too old in its back-off, which the next frame takes over.
+                self.ready = at;
+                return Err(Gone::Expired);
+            }
             let (snr_db, settled) = self.local(at);
             let mcs = self.rates.stepped_down(settled, attempt);
             let ppdu_ns = self.phy.ppdu_ns(mcs, air_bytes);
@@ -190,10 +195,6 @@ impl WifiLink {
             at = after(at, air_ns + self.phy.response_ns(mcs));
             if is_received {
                 result = Ok(received);
-                break;
-            }
-            if at.ns_since(offered) > self.lifetime_ns {
-                result = Err(Gone::Expired);
                 break;
             }
             window = access.widened(window);

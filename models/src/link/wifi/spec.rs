@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::case_study::ParameterError;
 use crate::link::outages::Outages;
+use crate::link::wifi::phy::PPDU_MAX_NS;
 use crate::link::wifi::preset::WifiPreset;
 use crate::link::wifi::rate::Rates;
 use crate::link::wifi::{channel, contention};
@@ -127,7 +128,7 @@ pub struct WifiSpec {
     pub busy_ratio: f64,
     /// Mean of one of their busy periods, exponential, µs.
     pub busy_mean_us: f64,
-    /// A frame that was not delivered so long after it was offered is given up, ms.
+    /// No attempt begins so long after the frame was offered: it is given up, ms.
     pub lifetime_ms: f64,
     /// What drivers and bridges take besides, µs.
     pub forwarding_us: f64,
@@ -256,10 +257,10 @@ impl WifiSpec {
         self.outages.check()
     }
 
-    /// How long a message is under way at most, but for the last attempt's back-off.
+    /// How long a message is under way at most: its last attempt begins within the lifetime and
+    /// lasts no longer than a PPDU may.
     pub fn flight_time_max(&self) -> Duration {
-        /// A last back-off from the widest window on a busy medium.
-        const LAST: Duration = Duration::from_millis(50);
+        const LAST: Duration = Duration::from_nanos(PPDU_MAX_NS.unsigned_abs());
         Duration::from_secs_f64(1e-3 * self.lifetime_ms + 1e-6 * self.forwarding_us) + LAST
     }
 

@@ -214,6 +214,35 @@ fn a_frame_older_than_its_lifetime_is_given_up_and_the_queue_stays_bounded() {
 }
 
 #[test]
+fn no_frame_is_older_than_the_flight_time_however_busy_the_medium() {
+    let spec = WifiSpec {
+        contender_count: 30,
+        busy_ratio: 0.9,
+        busy_mean_us: 3_000.0,
+        lifetime_ms: 20.0,
+        forwarding_us: 200.0,
+        ..at_snr(bare(), 12.0)
+    };
+    let longest_ns = i64::try_from(spec.flight_time_max().as_nanos()).unwrap();
+    assert_eq!(longest_ns, 20_000_000 + 200_000 + 5_484_000);
+    for length_bytes in [100, 20_000] {
+        let mut link = link(&spec, 9);
+        let (mut late_count, mut longest_found_ns) = (0, 0);
+        for index in 0..20_000_i64 {
+            let now = Instant::from_ns(index * 40_000_000);
+            if let Some(at) = link.offer(now, length_bytes).arrival() {
+                longest_found_ns = longest_found_ns.max(at.ns_since(now));
+            } else {
+                late_count += 1;
+            }
+        }
+        assert!(longest_found_ns <= longest_ns, "{longest_found_ns}");
+        assert!(link.counts().expired_count > 0, "{late_count} lost");
+        assert!(link.counts().delivered_count > 0);
+    }
+}
+
+#[test]
 fn rayleigh_fading_loses_what_its_density_says() {
     let spec = WifiSpec {
         fading_m: 1.0,
