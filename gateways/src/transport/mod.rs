@@ -20,6 +20,7 @@ pub mod clock_pair;
 mod control;
 mod counters;
 pub mod emulated;
+pub mod interface;
 pub mod packet_ring;
 pub mod probe;
 pub mod queue;

@@ -14,7 +14,8 @@ use nix::poll::{PollFd, PollFlags, ppoll};
 use thiserror::Error;
 
 use super::clock_pair::monotonic_now;
-use super::timestamping::{TimestampCapabilities, TimestampMode, interface_with_address};
+use super::interface::interface_with_address;
+use super::timestamping::{TimestampCapabilities, TimestampMode};
 use super::udp::{UdpError, UdpReceiver, UdpSender, UdpSettings};
 use super::{DatagramReceiver, DatagramSender, SendRefusal, TransmitStage, TxToken};
 

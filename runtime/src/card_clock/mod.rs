@@ -18,7 +18,8 @@ use std::time::Duration;
 use hil_gateways::transport::card_arming::{ArmedCard, InterfaceCard};
 use hil_gateways::transport::card_clock::CardClock;
 use hil_gateways::transport::clock_pair::ClockPair;
-use hil_gateways::transport::timestamping::{TimestampCapabilities, interface_with_address};
+use hil_gateways::transport::interface::interface_with_address;
+use hil_gateways::transport::timestamping::TimestampCapabilities;
 use hil_models::measure::card_clock::CardClockRecord;
 use serde::{Deserialize, Serialize};
 

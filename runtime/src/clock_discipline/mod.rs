@@ -98,16 +98,19 @@ impl HostDiscipline {
         );
         if has_phc2sys {
             self.basis.push_str(", phc2sys runs");
+        } else {
+            // ptp4l may steer a card's clock alone, while some other daemon keeps the system's.
+            self.basis
+                .push_str(", but no phc2sys, so the system clock may be kept by anybody");
         }
         if !status.is_present {
             self.basis.push_str("; follows no other clock");
         } else if !self.is_kernel_synchronised {
             self.basis
                 .push_str("; the kernel says that nobody keeps the clock");
-        } else {
-            let steps_ns = if has_phc2sys { PHC2SYS_ERROR_NS } else { 0 };
+        } else if has_phc2sys {
             self.reference = Some(format!("ptp {}", status.grandmaster));
-            self.bound_ns = Some(status.bound_ns().saturating_add(steps_ns));
+            self.bound_ns = Some(status.bound_ns().saturating_add(PHC2SYS_ERROR_NS));
         }
     }
 
@@ -209,12 +212,14 @@ mod tests {
             path_delay_ns: 9_310.0,
         };
         let mut host = nobody();
-        host.believe_ptp(&status, false);
-        assert_eq!(host.bound_ns, Some(9_620));
-        let mut host = nobody();
         host.is_kernel_synchronised = false;
-        host.believe_ptp(&status, false);
+        host.believe_ptp(&status, true);
         assert_eq!(host.bound_ns, None);
+        // It may steer a card's clock only.
+        let mut host = nobody();
+        host.believe_ptp(&status, false);
+        assert_eq!((host.bound_ns, host.reference), (None, None));
+        assert!(host.basis.contains("no phc2sys"), "{}", host.basis);
         let mut host = nobody();
         host.believe_ptp(&status, true);
         assert_eq!(host.bound_ns, Some(9_620 + PHC2SYS_ERROR_NS));

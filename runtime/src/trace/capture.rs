@@ -6,7 +6,9 @@ use std::path::Path;
 
 use hil_models::measure::account::TraceChannel;
 use hil_models::trace::wire;
-use hil_models::trace::{Trace, TraceArrival, TraceDirection, TraceHeader, UNAVAILABLE_NS};
+use hil_models::trace::{
+    Trace, TraceArrival, TraceDirection, TraceHeader, TraceRecord, UNAVAILABLE_NS,
+};
 
 use crate::analysis::records::RunRecords;
 use crate::report::summary::{Fact, RunSummary};
@@ -65,7 +67,7 @@ fn write_one(
         return Ok(false);
     }
     let trace = Trace {
-        header: header(run.1, crossing),
+        header: header(run.1, crossing, &found),
         records: found,
     };
     let bytes = wire::encode(&trace).map_err(|error| error.to_string())?;
@@ -75,10 +77,12 @@ fn write_one(
     Ok(true)
 }
 
-fn header(result: &RunResult, crossing: &Crossing<'_>) -> TraceHeader {
+fn header(result: &RunResult, crossing: &Crossing<'_>, records: &[TraceRecord]) -> TraceHeader {
     let span = result.spans.get(&crossing.from_host.name);
     let clock = if result.has_one_clock {
         "one clock"
+    } else if records.iter().any(|record| record.delay().is_some()) {
+        "two clocks, aligned within the bound of each record"
     } else {
         NOT_ALIGNED
     };
