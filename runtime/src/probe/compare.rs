@@ -265,17 +265,25 @@ fn summary(folder: &RunFolder) -> Result<Option<RunSummary>, CompareError> {
         .map_err(|source| CompareError::Summary { path, source })
 }
 
-/// Datagrams sent and received by the sockets of a channel, by the run's summary.
+/// Datagrams sent and received by the sockets of a channel, by the run's summary. Farewells received
+/// are left out: whether one is depends on which gateway ends first.
 fn socket_counts(summary: &RunSummary, channel: &str) -> (Option<u64>, Option<u64>) {
-    let of = |counter: &str| {
+    let of = |direction: &str, counter: &str| {
         let channel = summary.channels.iter().find(|one| one.name == channel)?;
-        let counters = channel.directions.iter().flat_map(|one| &one.counters);
+        let ways = channel.directions.iter();
+        let counters = ways
+            .filter(|one| one.direction == direction)
+            .flat_map(|one| &one.counters);
         let named = counters
             .filter(|one| one.name == counter)
             .map(|one| one.count);
         named.reduce(|a, b| a + b)
     };
-    (of("socket: sent_count"), of("socket: received_count"))
+    let received = of("ingress", "socket: received_count").zip(of("ingress", "bye_count"));
+    (
+        of("egress", "socket: sent_count"),
+        received.and_then(|(all, farewells)| all.checked_sub(farewells)),
+    )
 }
 
 /// The number by which each channel goes on the wire, found by the first message both sides know:
