@@ -14,7 +14,7 @@ use crate::run_log::RunLog;
 use crate::study::Batch;
 
 pub use crate::score::{
-    EVENT_MESSAGES_MAX, EVENTS_MAX, MessageRef, Metric, Score, ScoreEvent, Severity,
+    EVENT_MESSAGES_MAX, EVENTS_MAX, ErrorSeries, MessageRef, Metric, Score, ScoreEvent, Severity,
 };
 
 /// A kind of experiment that a topology file can name in `[case]`.
@@ -63,6 +63,12 @@ pub trait CaseStudy: Sized + Debug + 'static {
 
     /// What the robot did, from the messages of a finished run.
     fn score(&self, log: &RunLog) -> Score;
+
+    /// The robot's errors over time, to be held against what the network did at the time; none by
+    /// default, and then only the events of the score are.
+    fn errors(&self, _log: &RunLog) -> Vec<ErrorSeries> {
+        Vec::new()
+    }
 
     /// What a plot of the finished run shows, for the run's folder; nothing by default.
     fn series(&self, _log: &RunLog) -> Vec<PlotSeries> {

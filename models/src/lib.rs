@@ -10,11 +10,13 @@
 //! 5. [`link`]: what a network does to a message; [`measure`]: how that is accounted.
 //! 6. [`egm`], [`yumi`] and [`teleoperation`]: the dual-arm robot of the seed paper, its guided
 //!    motion and the person who guides it; [`fleet`]: its seven vehicles.
-//! 7. [`study`]: batches of virtual-time runs that end in tables.
+//! 7. [`trace`]: what a link did to every message of a run, as data.
+//! 8. [`study`]: batches of virtual-time runs that end in tables.
 #![forbid(unsafe_code)]
 
 pub mod arrival;
 pub mod case_study;
+pub mod clock;
 pub mod component;
 pub mod egm;
 pub mod endpoint;
@@ -32,4 +34,5 @@ pub mod simulation;
 pub mod study;
 pub mod teleoperation;
 pub mod time;
+pub mod trace;
 pub mod yumi;

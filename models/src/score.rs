@@ -83,6 +83,21 @@ pub struct MessageRef {
     pub sequence: u64,
 }
 
+/// How far the robot was from what it was to do, over time, to be held against what the network did
+/// at the time.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ErrorSeries {
+    /// The words a report prints, e.g. `joint error of the right arm`.
+    pub label: &'static str,
+    /// SI unit.
+    pub unit: &'static str,
+    /// The channel whose producer's clock the times are read from, as in
+    /// [`ScoreEvent::clock_of`].
+    pub clock_of: &'static str,
+    /// Times in ascending order, and magnitudes of the error.
+    pub samples: Vec<(Instant, f64)>,
+}
+
 impl MessageRef {
     /// The message of `channel` that was logged with `envelope`.
     pub const fn of(channel: &'static str, envelope: &Envelope) -> Self {

@@ -9,8 +9,10 @@ use core::time::Duration;
 use bytemuck::{Pod, Zeroable};
 use serde::{Deserialize, Serialize};
 
-use crate::case_study::{CaseStudy, ChannelSpec, Metric, ParameterError, Score};
+use crate::case_study::{CaseStudy, ChannelSpec, ErrorSeries, Metric, ParameterError, Score};
 use crate::component::{Component, Outbox, Role, into_role};
+use crate::measure::series::Estimate;
+use crate::measure::special::ceil_count;
 use crate::message::Message;
 use crate::run_log::RunLog;
 use crate::time::{Instant, PeriodicTimer};
@@ -110,27 +112,98 @@ impl CaseStudy for Shuttle {
         }
     }
 
+    fn errors(&self, log: &RunLog) -> Vec<ErrorSeries> {
+        // Stamps of two clocks cannot be told apart from an error.
+        if log.has_one_clock() {
+            vec![speed_error(log)]
+        } else {
+            Vec::new()
+        }
+    }
+
     fn score(&self, log: &RunLog) -> Score {
         let commands: Vec<_> = log.messages::<ShuttleCommand>("shuttle/command").collect();
-        let travelled = log
-            .messages::<ShuttleStatus>("shuttle/status")
-            .map(|(_, status)| status.position_m)
-            .fold((None, 0.0), |(last, sum): (Option<f64>, f64), x| {
-                (Some(x), sum + last.map_or(0.0, |last| (x - last).abs()))
-            });
-        let value = travelled.0.is_some().then_some(travelled.1);
+        let travel = travel(log);
         Score {
             metrics: vec![Metric {
                 name: "travelled_m",
                 label: "distance travelled",
-                value,
-                interval: None,
+                value: travel.map(|travel| travel.whole_m),
+                interval: travel.and_then(|travel| travel.interval),
                 unit: "m",
-                method: format!("sum of status steps; {} commands sent", commands.len()),
+                method: format!(
+                    "sum of status steps; {} commands sent; 95 % interval from the half waves of the \
+                     run, from 5 of them on",
+                    commands.len()
+                ),
             }],
             ..Score::default()
         }
     }
+}
+
+/// By how much the cart's speed from status to status misses the newest command sent by the former:
+/// what a command that comes later than a period, or not at all, leaves undone.
+fn speed_error(log: &RunLog) -> ErrorSeries {
+    let mut commands = log.messages::<ShuttleCommand>("shuttle/command").peekable();
+    let mut newest: Option<ShuttleCommand> = None;
+    let mut before: Option<(Instant, f64)> = None;
+    let mut samples = Vec::new();
+    for (at, status) in log.messages::<ShuttleStatus>("shuttle/status") {
+        let passed_s = before.map_or(0.0, |before| at.seconds_since(before.0));
+        if let (Some(command), Some((_, from_m))) = (newest, before)
+            && passed_s > 0.0
+        {
+            let driven_mps = (status.position_m - from_m) / passed_s;
+            samples.push((at, (command.speed_mps - driven_mps).abs()));
+        }
+        while let Some((_, command)) = commands.next_if(|next| next.0 <= at) {
+            newest = Some(command);
+        }
+        before = Some((at, status.position_m));
+    }
+    ErrorSeries {
+        label: "error of the cart's speed",
+        unit: "m/s",
+        clock_of: "shuttle/status",
+        samples,
+    }
+}
+
+/// How far the cart went.
+#[derive(Debug, Clone, Copy)]
+struct Travel {
+    whole_m: f64,
+    interval: Option<(f64, f64)>,
+}
+
+/// The whole way, and what the scatter of the half waves says of it; `None` without a status.
+fn travel(log: &RunLog) -> Option<Travel> {
+    let statuses: Vec<_> = log.messages::<ShuttleStatus>("shuttle/status").collect();
+    let (start, _) = *statuses.first()?;
+    let (end, _) = *statuses.last()?;
+    let (mut blocks, mut whole_m): (Vec<f64>, f64) = (Vec::new(), 0.0);
+    for pair in statuses.windows(2) {
+        let step_m = (pair[1].1.position_m - pair[0].1.position_m).abs();
+        whole_m += step_m;
+        let half_waves = pair[0].0.seconds_since(start) / HALF_WAVE_S;
+        let index = ceil_count(half_waves.floor());
+        if blocks.len() <= index {
+            blocks.resize(index + 1, 0.0);
+        }
+        blocks[index] += step_m;
+    }
+    // The cart rests at the end of a half wave, so one that is all but over counts as whole.
+    let half_waves = (end.seconds_since(start) / HALF_WAVE_S).round();
+    blocks.truncate(ceil_count(half_waves));
+    let mean = Estimate::of_mean(&blocks)?;
+    let spread_m = mean
+        .interval
+        .map(|(low, high)| 0.5 * (high - low) * half_waves);
+    Some(Travel {
+        whole_m,
+        interval: spread_m.map(|spread_m| (whole_m - spread_m, whole_m + spread_m)),
+    })
 }
 
 /// Half the period of the square wave the controller follows.

@@ -11,7 +11,7 @@ use std::rc::Rc;
 use crate::case_study::{CaseStudy, ChannelSpec, inputs_of, outputs_of};
 use crate::component::Role;
 use crate::endpoint::{Endpoint, InputPort, OutputPort, PortCountError};
-use crate::link::{Fate, LinkModel, PerfectLink};
+use crate::link::{LinkModel, PerfectLink};
 use crate::message::Envelope;
 use crate::run_log::RunLog;
 use crate::time::Instant;
@@ -40,7 +40,11 @@ impl<L: LinkModel> Carrier for L {
         payload: &[u8],
         deliver: &mut dyn FnMut(Instant, Envelope, &[u8]),
     ) {
-        if let Fate::Delivered(at) = LinkModel::offer(self, now, payload.len()) {
+        let fate = self.offer_numbered(now, payload.len(), envelope.sequence);
+        for at in [fate.arrival(), fate.second_arrival()]
+            .into_iter()
+            .flatten()
+        {
             deliver(at, *envelope, payload);
         }
     }

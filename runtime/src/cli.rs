@@ -5,6 +5,9 @@ use std::path::PathBuf;
 
 use clap::{ArgGroup, Args, Parser, Subcommand};
 
+use crate::probe::arguments::ProbeArgs;
+use crate::trace::cli::TraceCommand;
+
 const EXAMPLES: &str = "\
 Examples:
   hil-runtime --topology deploy/topologies/local.toml
@@ -204,6 +207,15 @@ pub enum Command {
         #[arg(long)]
         json: bool,
     },
+    /// Describe, fit, plot and convert link traces.
+    #[command(
+        after_help = "Examples:\n  hil-runtime trace info runs/NAME      # what its links did\n  hil-runtime trace fit runs/NAME/traces/shuttle.command.trace"
+    )]
+    Trace {
+        /// What to do with them.
+        #[command(subcommand)]
+        command: TraceCommand,
+    },
     /// Say what this host can measure and what to change.
     #[command(
         after_help = "Example:\n  hil-runtime doctor --strict   # exit code 78 when something must be fixed"
@@ -216,6 +228,8 @@ pub enum Command {
         #[arg(long)]
         json: bool,
     },
+    /// Look at the wire without taking part: capture, analyse, compare with a run.
+    Probe(ProbeArgs),
     /// List the case studies with their channels and parameters.
     #[command(after_help = "Example:\n  hil-runtime cases")]
     Cases,

@@ -20,6 +20,8 @@ use crate::console::Console;
 use crate::doctor::{self, DoctorRequest, StampCapabilities};
 use crate::face;
 use crate::gateway;
+use crate::probe;
+use crate::process::emulation_room::check_emulation;
 use crate::process::{component, own_program};
 use crate::registry::Registry;
 use crate::report::summary::RunSummary;
@@ -28,6 +30,7 @@ use crate::run_folder::RunFolder;
 use crate::signals::{EXIT_INTERRUPTED, Signals};
 use crate::supervisor::{self, Outcome, PeerError, RunError, RunOptions, RunResult};
 use crate::topology::{self, HOST_VARIABLE, HostChoice, MachineIdentity, Topology, which_host};
+use crate::trace;
 
 /// Exit codes, as `--help` lists them (after `sysexits.h`, which systemd knows).
 mod exit {
@@ -81,6 +84,11 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
         Command::Calibrate(args) => case_work::calibrate(args, registry),
         Command::Replay { run, json } => case_work::replay(&run, json, registry, console),
         Command::Report { run, json } => show_report(&run, json, console),
+        Command::Trace { command } => match trace::work::work(command, columns(), console) {
+            trace::work::End::Done => exit::RAN,
+            trace::work::End::Failed => exit::FAILED,
+            trace::work::End::Refused => exit::USAGE,
+        },
         Command::Doctor { strict, json } => {
             let worst = examine(json, console);
             if strict && worst == doctor::State::Problem {
@@ -89,6 +97,7 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
                 exit::RAN
             }
         }
+        Command::Probe(args) => probe::run(&args, console),
         Command::Cases => {
             console.result(&cases::list(registry));
             exit::RAN
@@ -139,13 +148,12 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
     let Some(topology) = load(path, &args.overrides, registry, console) else {
         return exit::USAGE;
     };
+    if let Err(error) = trace::source::check(&topology) {
+        console.error(&error.to_string());
+        return exit::USAGE;
+    }
     if args.check {
-        console.result(&format!(
-            "{}: the file is valid; it comes to\n\n{}",
-            path.display(),
-            topology.to_toml()
-        ));
-        return exit::RAN;
+        return show_check(path, &topology, console);
     }
     let hosts = match hosts_here(&topology, args.host.as_deref()) {
         Ok(hosts) => hosts,
@@ -196,6 +204,24 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
     }
 }
 
+/// What the file comes to, or why no run of it can be what it says.
+fn show_check(path: &Path, topology: &Topology, console: &mut Console) -> u8 {
+    if let Err(error) = check_emulation(topology) {
+        console.error(&format!(
+            "{}: the file is valid and can be simulated, but no gateway can keep its emulated \
+             link: {error}",
+            path.display()
+        ));
+        return exit::USAGE;
+    }
+    console.result(&format!(
+        "{}: the file is valid; it comes to\n\n{}",
+        path.display(),
+        topology.to_toml()
+    ));
+    exit::RAN
+}
+
 /// Why a run does not end with exit code 0, for those who do not read its report.
 fn complaint(result: &RunResult) -> String {
     let is_incomplete = result.has_gaps() && exit_code(&result.outcome) == exit::RAN;
@@ -213,6 +239,7 @@ fn exit_code_of_error(error: &RunError) -> u8 {
             exit::PEER_ABSENT
         }
         RunError::Folder { .. }
+        | RunError::Emulation(_)
         | RunError::Peer(
             PeerError::Mismatch { .. } | PeerError::Listen { .. } | PeerError::Own { .. },
         ) => exit::USAGE,

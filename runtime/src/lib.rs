@@ -20,17 +20,21 @@
 //! 5. [`realtime`], [`clock`], [`wait`], [`host_facts`], [`doctor`]: the machine.
 
 mod analysis;
+pub mod card_clock;
 mod cases;
 pub mod channel;
 pub mod cli;
 pub mod clock;
+pub mod clock_discipline;
 mod command;
 pub mod console;
 pub mod doctor;
 pub mod face;
 pub mod gateway;
 pub mod host_facts;
+pub mod probe;
 pub mod process;
+pub mod radio;
 pub mod realtime;
 pub mod record;
 pub mod registry;
@@ -43,6 +47,7 @@ mod simulate;
 mod study;
 pub mod supervisor;
 pub mod topology;
+pub mod trace;
 pub mod wait;
 
 use std::process::ExitCode;

@@ -4,7 +4,7 @@
 use core::fmt::Debug;
 use std::fs;
 
-use hil_models::case_study::{CaseStudy, ChannelSpec, ParameterError, Score};
+use hil_models::case_study::{CaseStudy, ChannelSpec, ErrorSeries, ParameterError, Score};
 use hil_models::component::Role;
 use hil_models::plot::PlotSeries;
 use hil_models::replay::Replay;
@@ -21,6 +21,9 @@ pub trait Case: Debug {
 
     /// See [`CaseStudy::score`].
     fn score(&self, log: &RunLog) -> Score;
+
+    /// See [`CaseStudy::errors`].
+    fn errors(&self, log: &RunLog) -> Vec<ErrorSeries>;
 
     /// See [`CaseStudy::series`].
     fn series(&self, log: &RunLog) -> Vec<PlotSeries>;
@@ -55,6 +58,10 @@ impl<C: CaseStudy> Case for Erased<C> {
 
     fn score(&self, log: &RunLog) -> Score {
         self.0.score(log)
+    }
+
+    fn errors(&self, log: &RunLog) -> Vec<ErrorSeries> {
+        self.0.errors(log)
     }
 
     fn series(&self, log: &RunLog) -> Vec<PlotSeries> {

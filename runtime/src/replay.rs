@@ -143,7 +143,11 @@ fn has_one_clock(folder: &RunFolder) -> bool {
     let summary = fs::read_to_string(folder.summary())
         .ok()
         .and_then(|text| RunSummary::from_json(&text).ok());
-    summary.is_some_and(|summary| !summary.score_events.clocks_differ)
+    // Records are replayed as they were taken: aligned clocks are two clocks still.
+    summary.is_some_and(|summary| {
+        let clocks = summary.clocks.as_ref();
+        clocks.map_or(!summary.score_events.clocks_differ, |one| one.has_one_clock)
+    })
 }
 
 /// What is missing of the records and not told by the case already. A role that tells the record

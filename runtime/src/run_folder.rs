@@ -16,6 +16,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 /// | `events.log` | what happened to the robot, one line each |
 /// | `series/*.csv` | what the case has to plot; `series/README.md` explains the columns |
 /// | `report.json` | of a run in virtual time, every figure |
+/// | `traces/*.trace` | what each link did to every message; `hil-runtime trace` reads them |
 /// | `records/*.rec` | one fixed-size record per message and stage |
 /// | `cards/*.json` | what each component was told it is |
 /// | `launch/*.json` | how each process was started here |
@@ -126,6 +127,11 @@ impl RunFolder {
     /// What the case has to plot.
     pub fn series(&self) -> PathBuf {
         self.root.join("series")
+    }
+
+    /// What the links did to every message, one file per channel that crossed one.
+    pub fn traces(&self) -> PathBuf {
+        self.root.join("traces")
     }
 
     /// The report as printed, without colours.

@@ -2,6 +2,8 @@
 //! links. It starts no process and opens no socket.
 
 mod events;
+mod link_figures;
+mod network;
 mod watched;
 
 use core::fmt::Write;
@@ -11,20 +13,25 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use hil_models::case_study::Score;
+use hil_models::link::LinkModel;
+use hil_models::link::trace::{ReplayCounts, ReplayTally, TraceMatch};
 use hil_models::measure::account::OutageFigures;
+use hil_models::plot::PlotSeries;
 use hil_models::simulation::{Carrier, Simulation, SimulationResult};
 
 use crate::analysis::outages::OutageStory;
 use crate::process::launch::EmulationLaunch;
 use crate::registry::{Case, Registry};
 use crate::report::event_log;
+use crate::report::network::NetworkReport;
 use crate::report::score_event::ScoreEvents;
 use crate::report::summary::ScoreMetric;
 use crate::report::terminal::{self, Style};
 use crate::run_folder::RunFolder;
 use crate::series;
-use crate::topology::{Program, Topology};
+use crate::topology::{Crossing, Program, Topology};
 
+use self::link_figures::LinkFigures;
 use self::watched::Watch;
 
 /// What the outcome is rendered as.
@@ -59,9 +66,16 @@ pub(crate) struct Simulated {
     case: Box<dyn Case>,
     result: SimulationResult,
     score: Score,
+    /// Of every channel that replays a trace, what it met.
+    replays: BTreeMap<String, ReplayTally>,
     /// Of every channel that a link model carried.
     outages: Vec<OutageStory>,
+    /// What each model was asked for and did, by channel.
+    links: Vec<(String, LinkFigures)>,
     events: ScoreEvents,
+    /// `None` when no link model carried anything.
+    network: Option<NetworkReport>,
+    network_series: Vec<PlotSeries>,
 }
 
 /// Runs the topology's case in virtual time.
@@ -87,9 +101,15 @@ pub(crate) fn simulate(
     }
     let mut watches = Vec::new();
     let mut carriers: BTreeMap<String, Box<dyn Carrier>> = BTreeMap::new();
-    for (name, carrier) in link_models(topology).map_err(refused)? {
-        let (carrier, watch) = Watch::over(carrier);
-        watches.push((name.clone(), watch));
+    let mut replays = BTreeMap::new();
+    for (name, emulation) in emulations(topology).map_err(refused)? {
+        // Virtual time begins with the run.
+        let link = emulation
+            .model(&name)
+            .map_err(|error| refused(error.to_string()))?;
+        replays.extend(link.replay_tally().map(|tally| (name.clone(), tally)));
+        let (carrier, watch) = Watch::over(link);
+        watches.push((name.clone(), emulation, watch));
         carriers.insert(name, carrier);
     }
     let roles = entry
@@ -103,31 +123,47 @@ pub(crate) fn simulate(
         .map_err(|error| refused(error.to_string()))?;
     let score = case.score(&result.log);
     let duration = topology.run().duration;
+    let links = watches.iter().map(|(name, emulation, watch)| {
+        let (words, loss_ratio) = (emulation.describe(), emulation.loss_ratio());
+        (name.clone(), watch.figures(&words, loss_ratio))
+    });
+    let links = links.collect();
     let outages: Vec<_> = watches
-        .into_iter()
-        .map(|(name, watch)| events::story(name, watch.outages(), duration))
+        .iter()
+        .map(|(name, _, watch)| events::story(name.clone(), watch.outages(), duration))
         .collect();
+    let mut events = events::explained(&score, entry.channels, &outages, &result.log);
+    let errors = case.errors(&result.log);
+    let watches = watches.into_iter().map(|(name, _, watch)| (name, watch));
+    let (network, network_series) = network::of_simulation(
+        topology,
+        watches.collect(),
+        &result.log,
+        (errors, &mut events),
+    )
+    .unzip();
     Ok(Simulated {
         topology_name: topology.name().to_owned(),
         duration_s: duration.as_secs_f64(),
         seed: topology.run().seed,
-        events: events::explained(&score, entry.channels, &outages, &result.log),
+        events,
+        network,
+        network_series: network_series.unwrap_or_default(),
         case,
         result,
         score,
+        replays,
         outages,
+        links,
     })
 }
 
-/// A channel's name and what carries it.
-type NamedCarrier = (String, Box<dyn Carrier>);
-
-/// The link models of the channels that cross a link.
-fn link_models(topology: &Topology) -> Result<Vec<NamedCarrier>, String> {
-    let mut carriers: Vec<NamedCarrier> = Vec::new();
-    for crossing in topology.crossings() {
+/// What the links do to the channels that cross one, by the channel's name.
+fn emulations(topology: &Topology) -> Result<Vec<(String, EmulationLaunch)>, String> {
+    let seed = topology.run().seed;
+    let emulation = |crossing: Crossing<'_>| {
         let name = &crossing.channel.name;
-        let impairment = crossing.impairment.ok_or_else(|| {
+        let emulation = EmulationLaunch::of(&crossing, seed).ok_or_else(|| {
             format!(
                 "channel {name} crosses link {} via {}, whose delay only a real run shows; use \
                  via = \"emulated\" to simulate it",
@@ -135,18 +171,9 @@ fn link_models(topology: &Topology) -> Result<Vec<NamedCarrier>, String> {
                 crossing.link.via.word()
             )
         })?;
-        let emulation = EmulationLaunch {
-            delay: impairment.delay,
-            loss_ratio: impairment.loss_ratio,
-            outages: crossing.outages.unwrap_or_default(),
-            link: crossing.link.name.clone(),
-            seed: topology.run().seed,
-        };
-        // Virtual time begins with the run.
-        let link = emulation.model(name).map_err(|error| error.to_string())?;
-        carriers.push((name.clone(), Box::new(link)));
-    }
-    Ok(carriers)
+        Ok((name.clone(), emulation))
+    };
+    topology.crossings().map(emulation).collect()
 }
 
 /// Makes sure that nothing is in the way of the files in `folder`, before anything is computed.
@@ -196,7 +223,8 @@ impl Simulated {
         ] {
             fs::write(&path, text).map_err(|error| failed(path, error))?;
         }
-        let made = self.case.series(&self.result.log);
+        let mut made = self.case.series(&self.result.log);
+        made.extend(self.network_series.iter().cloned());
         series::write(&files.series(), made)
             .map_err(|error| SimulateError::Output(error.to_string()))
     }
@@ -219,6 +247,15 @@ impl Simulated {
         for (name, count) in &self.result.recorded_counts {
             let _infallible = writeln!(text, "  {name:<18} recorded  {count:>8}");
         }
+        if !self.links.is_empty() {
+            text.push_str("\nLink models, asked and done:\n");
+        }
+        for (name, figures) in &self.links {
+            text.push_str(&figures.page(name));
+        }
+        for (name, tally) in &self.replays {
+            text.push_str(&replay_line(name, &tally.counts()));
+        }
         for (name, figures) in self.outage_figures() {
             text.push_str(&terminal::render_outages(name, &figures, columns, style));
         }
@@ -228,6 +265,14 @@ impl Simulated {
             columns,
             style,
         ));
+        if let Some(report) = &self.network {
+            text.push_str(&terminal::render_network(
+                report,
+                &self.events,
+                columns,
+                style,
+            ));
+        }
         text
     }
 
@@ -241,15 +286,22 @@ impl Simulated {
             ((*name).to_owned(), counts)
         });
         let outages: BTreeMap<&str, OutageFigures> = self.outage_figures().collect();
+        let replays = self.replays.iter();
+        let replays: BTreeMap<&str, ReplayCounts> = replays
+            .map(|(name, tally)| (name.as_str(), tally.counts()))
+            .collect();
         let document = serde_json::json!({
             "name": self.topology_name,
             "seed": self.seed,
             "duration_s": self.duration_s,
             "channels": channels.collect::<serde_json::Map<_, _>>(),
             "recorded_counts": self.result.recorded_counts,
+            "links": self.links.iter().cloned().collect::<BTreeMap<_, _>>(),
             "outages": outages,
+            "trace_replays": replays,
             "score": self.score,
             "score_events": self.events,
+            "network": self.network,
         });
         format!("{document:#}\n")
     }
@@ -258,6 +310,39 @@ impl Simulated {
         let stories = self.outages.iter();
         stories.filter_map(|story| Some((story.channel.as_str(), story.figures()?)))
     }
+}
+
+/// What a channel met of its trace.
+fn replay_line(name: &str, counts: &ReplayCounts) -> String {
+    let mut text = format!(
+        "  {name:<18} met {} of {} records of its trace: {} delivered, {} lost",
+        counts.met_count, counts.record_count, counts.delivered_count, counts.lost_count
+    );
+    let how = match counts.matching {
+        TraceMatch::Index => "message by message",
+        TraceMatch::Time => "by time",
+        TraceMatch::Tick => "tick by tick",
+    };
+    let _infallible = write!(text, ", {how}");
+    for (count, what) in [
+        (counts.unknown_count, "of unknown fate, taken as lost"),
+        (
+            counts.unpublished_count,
+            "at ticks without a record, taken as lost",
+        ),
+        (counts.repeated_count, "at a tick for the second time"),
+        (counts.beyond_end_count, "after its end"),
+        (
+            counts.negative_delay_count,
+            "with a delay below zero, taken as zero",
+        ),
+    ] {
+        if count > 0 {
+            let _infallible = write!(text, ", {count} {what}");
+        }
+    }
+    text.push('\n');
+    text
 }
 
 /// Width of `report.txt`.

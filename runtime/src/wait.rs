@@ -46,6 +46,17 @@ impl Pause {
     }
 }
 
+/// What to do at `now` for something that must happen at `due`, neither before nor after: sleep
+/// until shortly before, then spin. The kernel alone would be a wake-up latency late.
+pub fn release(now: Instant, due: Instant) -> Pause {
+    let spin_from = earlier(due, SPIN_LEAD);
+    if spin_from <= now {
+        Pause::Spin
+    } else {
+        Pause::Sleep(spin_from.min(now + WAIT_MAX))
+    }
+}
+
 /// The waiting of one thread.
 #[derive(Debug, Clone)]
 pub struct WaitStrategy {
@@ -129,6 +140,20 @@ mod tests {
             Pause::Sleep(now + WAIT_MAX)
         );
         assert_eq!(learnt(WaitMode::Spin).pause(now, Some(due)), Pause::Spin);
+    }
+
+    #[test]
+    fn a_release_is_slept_for_until_shortly_before_and_then_spun_for() {
+        let due = Instant::from_ns(20 * MS);
+        let spin_from = Instant::from_ns(20 * MS - 90_000);
+        let early = Instant::from_ns(10 * MS);
+        assert_eq!(release(early, due), Pause::Sleep(spin_from));
+        for now in [spin_from, due, Instant::from_ns(21 * MS)] {
+            assert_eq!(release(now, due), Pause::Spin);
+        }
+        // However far it is, an order to stop is seen.
+        let far = Instant::from_ns(900 * MS);
+        assert_eq!(release(early, far), Pause::Sleep(early + WAIT_MAX));
     }
 
     #[test]

@@ -52,9 +52,21 @@ impl Lab {
     /// # Errors
     /// The first set-up command that failed, with its words.
     pub fn two_hosts() -> Result<Self, String> {
+        Self::with_clock_ahead(None)
+    }
+
+    /// As [`Lab::two_hosts`]; with `ahead_s`, host 1 has a time namespace of its own whose
+    /// monotonic clock is exactly that many seconds ahead.
+    ///
+    /// # Errors
+    /// As [`Lab::two_hosts`].
+    pub fn with_clock_ahead(ahead_s: Option<u32>) -> Result<Self, String> {
         namespace::sweep_stale();
         let names = namespace::fresh_names();
-        let hosts = [LabHost::start(&names[0], 0)?, LabHost::start(&names[1], 1)?];
+        let hosts = [
+            LabHost::start(&names[0], 0, None)?,
+            LabHost::start(&names[1], 1, ahead_s)?,
+        ];
         namespace::join(&names, INTERFACE)?;
         for host in &hosts {
             host.bring_up()?;
@@ -67,13 +79,21 @@ impl Lab {
     /// # Panics
     /// When building fails in spite of the rights, and in CI (`CI` is set) when they are missing:
     /// a gate that skips its main test is no gate.
-    #[allow(clippy::print_stderr, reason = "a test that is skipped must say so")]
     pub fn two_hosts_or_skip() -> Option<Self> {
+        Self::with_clock_ahead_or_skip(None)
+    }
+
+    /// [`Lab::with_clock_ahead`], or `None` as [`Lab::two_hosts_or_skip`].
+    ///
+    /// # Panics
+    /// As [`Lab::two_hosts_or_skip`].
+    #[allow(clippy::print_stderr, reason = "a test that is skipped must say so")]
+    pub fn with_clock_ahead_or_skip(ahead_s: Option<u32>) -> Option<Self> {
         if let Err(reason) = require_privileges() {
             eprintln!("skipped: {reason}");
             return None;
         }
-        Some(Self::two_hosts().unwrap_or_else(|reason| panic!("no lab: {reason}")))
+        Some(Self::with_clock_ahead(ahead_s).unwrap_or_else(|reason| panic!("no lab: {reason}")))
     }
 
     /// Host 0 (the controller's, by convention) or host 1 (the robot's).
@@ -90,6 +110,7 @@ impl Lab {
 pub struct LabHost {
     namespace: String,
     address: Ipv4Addr,
+    has_own_clock: bool,
     holder: Child,
 }
 
@@ -115,6 +136,7 @@ impl LabHost {
         command
             .arg("--target")
             .arg(self.holder.id().to_string())
+            .args(self.has_own_clock.then_some("--time"))
             .args([
                 "--mount",
                 "--net",
@@ -186,10 +208,15 @@ impl LabHost {
         names
     }
 
-    fn start(name: &str, index: usize) -> Result<Self, String> {
+    fn start(name: &str, index: usize, ahead_s: Option<u32>) -> Result<Self, String> {
         namespace::add(name)?;
-        let spawned = Command::new("ip")
-            .args(["netns", "exec", name])
+        let mut command = Command::new("ip");
+        command.args(["netns", "exec", name]);
+        if let Some(ahead_s) = ahead_s {
+            let ahead_s = ahead_s.to_string();
+            command.args(["unshare", "--time", "--monotonic", &ahead_s]);
+        }
+        let spawned = command
             .args(["unshare", "--mount", "--propagation", "private"])
             .args(["sh", "-c", HOLDER_SCRIPT])
             .stdin(Stdio::piped())
@@ -207,6 +234,7 @@ impl LabHost {
         let mut host = Self {
             namespace: name.to_owned(),
             address: ADDRESSES[index],
+            has_own_clock: ahead_s.is_some(),
             holder,
         };
         host.wait_until_ready()?;

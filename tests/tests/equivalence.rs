@@ -150,7 +150,7 @@ impl Carrier for Hop {
         let gateway_now = now + LEAD;
         // What was due before the message.
         self.exchange(gateway_now, Fate::Lost, &mut |_, _, _| {});
-        let fate = self.link.offer(now, payload.len());
+        let fate = LinkModel::offer(&mut self.link, now, payload.len());
         self.counts.borrow_mut().messages += 1;
         let staged = self.egress.on_local(gateway_now, envelope, payload);
         assert_eq!(staged, Ok(()), "message {} at {now}", envelope.sequence);
@@ -183,7 +183,7 @@ impl Carrier for Modelled {
         payload: &[u8],
         deliver: &mut dyn FnMut(Instant, Envelope, &[u8]),
     ) {
-        if let Fate::Delivered(at) = self.0.offer(now, payload.len()) {
+        if let Fate::Delivered(at) = LinkModel::offer(&mut self.0, now, payload.len()) {
             deliver(at, *envelope, payload);
         }
     }

@@ -110,7 +110,14 @@ fn a_live_run_loses_the_spans_that_virtual_time_loses() {
     let output = simulated.arg("--json").output().unwrap();
     assert!(output.status.success(), "{output:?}");
     let virtual_time: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    let live = serde_json::to_value(summary.network.as_ref().unwrap()).unwrap();
+    assert_the_error_follows_the_silence(&live, &virtual_time["network"]);
     for name in CHANNELS {
+        assert_the_report_shows_what_preceded_what(&live, name);
+        assert_the_report_shows_what_preceded_what(&virtual_time["network"], name);
+        let file = format!("series/network-{}.csv", name.replace('/', "-"));
+        let table = fs::read_to_string(files.root().join(file)).unwrap();
+        assert!(table.lines().count() > 100, "{table}");
         let account = account(&summary, name);
         println!("{}", describe(name, account));
         assert_eq!(channel(&summary, name).link, LinkKind::Emulated);
@@ -156,4 +163,54 @@ fn a_live_run_loses_the_spans_that_virtual_time_loses() {
         let told = facts.filter(|fact| fact.value.contains("2400 outages per hour of 300 ms"));
         assert_eq!(told.count(), 1);
     }
+}
+
+fn assert_the_error_follows_the_silence(live: &serde_json::Value, simulated: &serde_json::Value) {
+    for (name, network) in [("live", live), ("virtual", simulated)] {
+        let pair = pair_of(network, "shuttle/command");
+        println!("{name}: {pair}");
+        let of = |key: &str| pair[key].as_f64().unwrap();
+        // The cart drives on as it was told last until the silence is over.
+        assert!((0.0..=1.0).contains(&of("lag_s")), "{pair}");
+        assert!(of("coefficient") > 0.15, "{pair}");
+    }
+    // The same figure each time: virtual time depends on nothing but the seed.
+    let pair = pair_of(simulated, "shuttle/command");
+    assert!(pair["p_family"].as_f64().unwrap() <= 0.05, "{pair}");
+}
+
+/// `account` closes; what is shown here is what the report makes of it: which outage went before
+/// the robot's error, and how long after it the error came.
+fn assert_the_report_shows_what_preceded_what(network: &serde_json::Value, name: &str) {
+    let figures = network["channels"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .find(|one| one["channel"] == name)
+        .unwrap();
+    let figures = &figures["figures"];
+    let delay_ns = figures["delay"]["p50"]["value_ns"].as_i64().unwrap();
+    assert!(delay_ns >= 5_000_000, "{figures}");
+    let loss = &figures["loss"];
+    let bound = |which: &str| loss["interval"][which].as_f64().unwrap();
+    let ratio = loss["ratio"].as_f64().unwrap();
+    assert!(
+        0.0 < bound("low") && bound("low") < ratio && ratio < bound("high"),
+        "{loss}"
+    );
+    // Outages are few: they tell as much as few independent messages would.
+    assert!(loss["effective_count"].as_f64().unwrap() < 200.0, "{loss}");
+    let events = network["events"].as_array().unwrap().iter();
+    let outages = events.filter(|one| one["channel"] == name && one["kind"] == "outage");
+    assert!(outages.count() >= 3, "{}", network["events"]);
+}
+
+/// The tested pair of the cart's speed and the silence on `name`.
+fn pair_of<'a>(network: &'a serde_json::Value, name: &str) -> &'a serde_json::Value {
+    let pairs = network["correlation"]["pairs"].as_array().unwrap();
+    let wanted = |one: &&serde_json::Value| {
+        let is_speed = one["robot"] == "error of the cart's speed";
+        is_speed && one["network"] == "silence" && one["channel"] == name
+    };
+    pairs.iter().find(wanted).unwrap()
 }

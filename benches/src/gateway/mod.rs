@@ -7,6 +7,7 @@
 //! - [`turns`]: which case the far thread answers.
 //! - [`applications`]: a party per thread, as in a run.
 //! - [`stages`]: a hop taken apart in one thread.
+//! - [`tap`]: a probe at both ends, while wanted.
 //! - [`segments`]: where the time of a hop went.
 //! - [`parties`]: processor time and wake-ups of threads; [`verdict`]: aims met and missed.
 
@@ -19,5 +20,6 @@ pub mod parties;
 pub mod segments;
 pub mod side;
 pub mod stages;
+pub mod tap;
 pub mod turns;
 pub mod verdict;

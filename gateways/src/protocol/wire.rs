@@ -183,7 +183,7 @@ impl Header {
         write(buffer, 68, 0_u32.to_le_bytes());
     }
 
-    fn decode(bytes: &[u8]) -> Result<Self, Refusal> {
+    pub(crate) fn decode(bytes: &[u8]) -> Result<Self, Refusal> {
         let Some(prefix) = Prefix::decode(bytes) else {
             let known = bytes.len() < 4 || u32_at(bytes, 0) == MAGIC;
             return Err(if known {

@@ -6,6 +6,7 @@ use std::os::fd::BorrowedFd;
 
 use hil_models::time::Instant;
 
+use super::radio::RadioReport;
 use super::tcp::StreamFigures;
 use super::{
     DatagramReceiver, DatagramSender, Received, ReceiverCounters, SendRefusal, SenderCounters,
@@ -19,6 +20,10 @@ impl<S: DatagramSender + ?Sized> DatagramSender for Box<S> {
 
     fn next_stamp(&mut self) -> Option<TransmitStamp> {
         (**self).next_stamp()
+    }
+
+    fn next_radio_report(&mut self) -> Option<RadioReport> {
+        (**self).next_radio_report()
     }
 
     fn receive(&mut self, buffer: &mut [u8]) -> io::Result<Option<Received>> {
@@ -57,6 +62,19 @@ impl<R: DatagramReceiver + ?Sized> DatagramReceiver for Box<R> {
 
     fn reply(&mut self, datagram: &[u8], to: SocketAddr) -> Result<(), SendRefusal> {
         (**self).reply(datagram, to)
+    }
+
+    fn reply_stamped(
+        &mut self,
+        now: Instant,
+        datagram: &[u8],
+        to: SocketAddr,
+    ) -> Result<(), SendRefusal> {
+        (**self).reply_stamped(now, datagram, to)
+    }
+
+    fn take_reply_stamp(&mut self, now: Instant) -> Option<i64> {
+        (**self).take_reply_stamp(now)
     }
 
     fn next_due(&self) -> Option<Instant> {

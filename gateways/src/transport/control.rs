@@ -17,6 +17,8 @@ const HEADER_BYTES: usize = 16;
 const ALIGNMENT_BYTES: usize = 8;
 /// `SO_TIMESTAMPING_NEW`, the variant with 64-bit seconds; same bytes on a 64-bit kernel.
 const SCM_TIMESTAMPING_NEW: i32 = 65;
+/// `SCM_WIFI_STATUS` of `asm-generic/socket.h`, the value of `SO_WIFI_STATUS`.
+pub(super) const SCM_WIFI_STATUS: i32 = 41;
 /// `IPV6_RECVERR` as a control message type.
 const IPV6_RECVERR: i32 = libc::IPV6_RECVERR;
 /// `ee_info` of a stamp taken on the way to the wire (`SCM_TSTAMP_SND`).
@@ -84,6 +86,11 @@ pub(super) struct ControlData {
     pub drop_count: Option<u32>,
     /// What an entry of the error queue is about.
     pub extended_error: Option<ExtendedError>,
+    /// A radio's word on an earlier datagram (`SCM_WIFI_STATUS`): the peer radio acknowledged it,
+    /// or not. Such an entry has the origin of a transmit stamp and is none.
+    pub is_acknowledged: Option<bool>,
+    /// Traffic class the datagram arrived with (`IP_TOS`, `IPV6_TCLASS`).
+    pub traffic_class: Option<u8>,
     /// A message was cut off or its length or content impossible; what came before it counts.
     pub is_damaged: bool,
 }
@@ -113,6 +120,16 @@ impl ControlData {
                 Some(count) => self.drop_count = Some(count),
                 None => self.is_damaged = true,
             },
+            (libc::SOL_SOCKET, SCM_WIFI_STATUS) => match u32_at(payload, 0) {
+                Some(status) => self.is_acknowledged = Some(status != 0),
+                None => self.is_damaged = true,
+            },
+            (libc::SOL_IP, libc::IP_TOS) | (libc::SOL_IPV6, libc::IPV6_TCLASS) => {
+                match decode_class(payload) {
+                    Some(class) => self.traffic_class = Some(class),
+                    None => self.is_damaged = true,
+                }
+            }
             (libc::SOL_IP, libc::IP_RECVERR) | (libc::SOL_IPV6, IPV6_RECVERR) => {
                 match decode_extended_error(payload) {
                     Some(error) => self.extended_error = Some(error),
@@ -176,6 +193,14 @@ fn decode_time(payload: &[u8], offset: usize) -> Option<Option<i64>> {
         .checked_mul(1_000_000_000)?
         .checked_add(nanoseconds)?;
     Some((total_ns != 0).then_some(total_ns))
+}
+
+/// IPv4 gives one byte, IPv6 an `int`.
+fn decode_class(payload: &[u8]) -> Option<u8> {
+    match payload {
+        [class] => Some(*class),
+        _ => u8::try_from(u32_at(payload, 0)?).ok(),
+    }
 }
 
 fn decode_extended_error(payload: &[u8]) -> Option<ExtendedError> {
@@ -271,10 +296,49 @@ mod tests {
         assert_eq!(data.stamps.hardware_ns, Some(9_000_000_001));
     }
 
+    /// A radio's report as Linux 6.1 builds it: the origin of a stamp, number 0, a status.
+    fn radio_report(status: u32) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        let status = status.to_ne_bytes();
+        push(&mut bytes, libc::SOL_SOCKET, SCM_WIFI_STATUS, &status);
+        let entry = error(42, libc::SO_EE_ORIGIN_TIMESTAMPING, STAMP_OF_SEND, 0);
+        push(&mut bytes, libc::SOL_IP, libc::IP_RECVERR, &entry);
+        bytes
+    }
+
+    #[test]
+    fn a_report_of_the_radio_is_told_from_the_stamp_it_looks_like() {
+        for (status, expected) in [(1, true), (0, false)] {
+            let data = ControlData::decode(&radio_report(status));
+            assert_eq!(data.is_acknowledged, Some(expected));
+            assert_eq!(data.stamps, KernelStamps::default());
+            assert!(!data.is_damaged);
+        }
+        let stamp = ControlData::decode(&transmit_report());
+        assert_eq!(stamp.is_acknowledged, None);
+        let mut cut = Vec::new();
+        push(&mut cut, libc::SOL_SOCKET, SCM_WIFI_STATUS, &[1, 0]);
+        assert!(ControlData::decode(&cut).is_damaged);
+    }
+
+    #[test]
+    fn the_traffic_class_of_both_families_is_read() {
+        let mut bytes = Vec::new();
+        push(&mut bytes, libc::SOL_IP, libc::IP_TOS, &[0xb8]);
+        assert_eq!(ControlData::decode(&bytes).traffic_class, Some(0xb8));
+        let mut bytes = Vec::new();
+        let class = 0xc0_i32.to_ne_bytes();
+        push(&mut bytes, libc::SOL_IPV6, libc::IPV6_TCLASS, &class);
+        assert_eq!(ControlData::decode(&bytes).traffic_class, Some(0xc0));
+        let mut bytes = Vec::new();
+        push(&mut bytes, libc::SOL_IP, libc::IP_TOS, &[]);
+        assert!(ControlData::decode(&bytes).is_damaged);
+    }
+
     #[test]
     fn unknown_messages_are_passed_over_and_the_drop_count_is_found_behind_them() {
         let mut bytes = Vec::new();
-        push(&mut bytes, libc::SOL_IP, libc::IP_TOS, &[0x2e]);
+        push(&mut bytes, libc::SOL_IP, libc::IP_TTL, &[0x2e]);
         push(
             &mut bytes,
             libc::SOL_SOCKET,
@@ -357,7 +421,10 @@ mod tests {
         };
         let mut damaged_count = 0;
         for _ in 0..100_000 {
-            let mut bytes = transmit_report();
+            let mut bytes = match pick(2) {
+                0 => transmit_report(),
+                _ => radio_report(1),
+            };
             for _ in 0..=pick(4) {
                 let index = pick(bytes.len());
                 bytes[index] = u8::try_from(pick(256)).unwrap();

@@ -10,7 +10,7 @@ use std::io;
 use std::net::SocketAddr;
 use std::os::fd::BorrowedFd;
 
-use hil_models::link::{Fate, LinkModel};
+use hil_models::link::LinkModel;
 use hil_models::time::Instant;
 
 use super::tcp::StreamFigures;
@@ -27,6 +27,9 @@ pub struct EmulatedSettings {
     /// milliseconds if the thread was held up in between, and a datagram would be early by as
     /// much. `None` trusts `now`, as virtual time does.
     pub clock: Option<fn() -> Instant>,
+    /// Which message of its channel a datagram belongs to; `None` where nobody can tell. Only a
+    /// recorded trace asks.
+    pub number_of: Option<NumberOf>,
 }
 
 impl Default for EmulatedSettings {
@@ -36,9 +39,13 @@ impl Default for EmulatedSettings {
             capacity_count: 1024,
             datagram_bytes_max: 1472,
             clock: None,
+            number_of: None,
         }
     }
 }
+
+/// Reads which message of its channel a datagram belongs to.
+pub type NumberOf = fn(&[u8]) -> Option<u64>;
 
 /// Position in the order of delivery: due first, then arrival, and the buffer that holds it.
 type Position = Reverse<(Instant, u64, usize)>;
@@ -50,6 +57,7 @@ pub struct EmulatedReceiver<R> {
     is_exempt: fn(&[u8]) -> bool,
     datagram_bytes_max: usize,
     clock: Option<fn() -> Instant>,
+    number_of: Option<NumberOf>,
     /// One buffer per place and a last one for arrivals that find no place.
     storage: Box<[u8]>,
     held: Box<[Option<Received>]>,
@@ -76,6 +84,7 @@ impl<R: DatagramReceiver> EmulatedReceiver<R> {
             capacity_count,
             datagram_bytes_max,
             clock,
+            number_of,
         } = settings;
         assert!(
             capacity_count > 0 && datagram_bytes_max > 0,
@@ -88,6 +97,7 @@ impl<R: DatagramReceiver> EmulatedReceiver<R> {
             is_exempt,
             datagram_bytes_max,
             clock,
+            number_of,
             storage: storage.into_boxed_slice(),
             held: vec![None; capacity_count].into_boxed_slice(),
             free: (0..capacity_count).rev().collect(),
@@ -131,18 +141,38 @@ impl<R: DatagramReceiver> EmulatedReceiver<R> {
         let arrived = self.newest_arrival;
         let start = place * self.datagram_bytes_max;
         let datagram = &self.storage[start..start + received.length_bytes];
-        let due = if (self.is_exempt)(datagram) {
-            arrived
-        } else {
-            // The model is asked even when there is no room, so that the fate of the n-th
-            // datagram does not depend on how full we were.
-            let Fate::Delivered(due) = self.link.offer(arrived, received.length_bytes) else {
-                self.counters.link_lost_count += 1;
-                return;
-            };
-            received.emulated = Some(EmulatedDelay { arrived, due });
-            due
+        if (self.is_exempt)(datagram) {
+            self.hold(received, place, arrived);
+            return;
+        }
+        // The model is asked even when there is no room, so that the fate of the n-th datagram
+        // does not depend on how full we were.
+        let number = self.number_of.and_then(|number_of| number_of(datagram));
+        let fate = match number {
+            Some(number) => self
+                .link
+                .offer_numbered(arrived, received.length_bytes, number),
+            None => self.link.offer(arrived, received.length_bytes),
         };
+        let Some(due) = fate.arrival() else {
+            self.counters.link_lost_count += 1;
+            return;
+        };
+        received.emulated = Some(EmulatedDelay { arrived, due });
+        self.hold(received, place, due);
+        if let Some(due) = fate.second_arrival() {
+            let copy = self.free.last().copied().unwrap_or(self.held.len());
+            self.storage.copy_within(
+                start..start + received.length_bytes,
+                copy * self.datagram_bytes_max,
+            );
+            received.emulated = Some(EmulatedDelay { arrived, due });
+            self.hold(received, copy, due);
+        }
+    }
+
+    /// Keeps the datagram in `place` until `due`, if that is a place.
+    fn hold(&mut self, received: Received, place: usize, due: Instant) {
         let Some(slot) = self.held.get_mut(place) else {
             self.counters.link_overflow_count += 1;
             return;
@@ -180,6 +210,19 @@ impl<R: DatagramReceiver> DatagramReceiver for EmulatedReceiver<R> {
         self.inner.reply(datagram, to)
     }
 
+    fn reply_stamped(
+        &mut self,
+        now: Instant,
+        datagram: &[u8],
+        to: SocketAddr,
+    ) -> Result<(), SendRefusal> {
+        self.inner.reply_stamped(now, datagram, to)
+    }
+
+    fn take_reply_stamp(&mut self, now: Instant) -> Option<i64> {
+        self.inner.take_reply_stamp(now)
+    }
+
     fn next_due(&self) -> Option<Instant> {
         let own = self.order.peek().map(|&Reverse((due, _, _))| due);
         match (own, self.inner.next_due()) {
@@ -211,6 +254,7 @@ impl<R: DatagramReceiver> DatagramReceiver for EmulatedReceiver<R> {
             truncated_count: own.truncated_count,
             link_lost_count: inner.link_lost_count + own.link_lost_count,
             link_overflow_count: inner.link_overflow_count + own.link_overflow_count,
+            link_loss_causes: self.link.loss_causes().or(inner.link_loss_causes),
             ..inner
         }
     }
@@ -229,167 +273,5 @@ impl<R: fmt::Debug> fmt::Debug for EmulatedReceiver<R> {
 }
 
 #[cfg(test)]
-mod tests {
-    use core::time::Duration;
-
-    use hil_models::link::bernoulli::BernoulliLink;
-    use hil_models::random::RandomStream;
-
-    use super::*;
-    use crate::transport::DatagramSender;
-    use crate::transport::queue::{QueueReceiver, QueueSender, QueueSettings, queue_pair};
-
-    const MS: i64 = 1_000_000;
-
-    /// Delays the n-th datagram by the n-th of these milliseconds; a negative one loses it.
-    #[derive(Debug)]
-    struct Listed(Vec<i64>);
-
-    impl LinkModel for Listed {
-        fn offer(&mut self, now: Instant, _length_bytes: usize) -> Fate {
-            match self.0.remove(0) {
-                ms if ms < 0 => Fate::Lost,
-                ms => Fate::Delivered(now + Duration::from_millis(ms.unsigned_abs())),
-            }
-        }
-    }
-
-    fn emulated(
-        link: impl LinkModel + 'static,
-        capacity_count: usize,
-    ) -> (QueueSender, EmulatedReceiver<QueueReceiver>) {
-        let (sender, inner) = queue_pair(&QueueSettings::default());
-        let settings = EmulatedSettings {
-            capacity_count,
-            datagram_bytes_max: 16,
-            clock: None,
-        };
-        let is_handshake = |datagram: &[u8]| datagram.first() == Some(&b'h');
-        let receiver = EmulatedReceiver::new(inner, Box::new(link), is_handshake, settings);
-        (sender, receiver)
-    }
-
-    fn take(receiver: &mut impl DatagramReceiver, now: Instant) -> Option<(u8, Received)> {
-        let mut buffer = [0; 16];
-        let arrival = receiver.receive(now, &mut buffer).unwrap()?;
-        Some((buffer[0], arrival))
-    }
-
-    #[test]
-    fn a_caller_that_was_held_up_does_not_make_a_datagram_early() {
-        let (mut sender, inner) = queue_pair(&QueueSettings::default());
-        let stream = RandomStream::new(1, "late caller");
-        let delay = Duration::from_millis(50);
-        let link = BernoulliLink::new(delay, 0.0, stream).unwrap();
-        let settings = EmulatedSettings {
-            clock: Some(|| Instant::from_ns(8_000_000)),
-            ..EmulatedSettings::default()
-        };
-        let mut receiver = EmulatedReceiver::new(inner, Box::new(link), |_| false, settings);
-        sender.send(b"x").unwrap();
-        let mut buffer = [0; 8];
-        assert!(
-            receiver
-                .receive(Instant::ZERO, &mut buffer)
-                .unwrap()
-                .is_none()
-        );
-        assert_eq!(receiver.next_due(), Some(Instant::from_ns(58_000_000)));
-    }
-
-    #[test]
-    fn datagrams_come_when_due_in_due_order_and_say_how_long_they_were_held() {
-        let (mut sender, mut receiver) = emulated(Listed(vec![30, -1, 10, 10]), 8);
-        for byte in 0..4 {
-            sender.send(&[byte]).unwrap();
-        }
-        let start = Instant::from_ns(5 * MS);
-        assert_eq!(take(&mut receiver, start), None);
-        assert_eq!(receiver.next_due(), Some(Instant::from_ns(15 * MS)));
-        assert_eq!(take(&mut receiver, Instant::from_ns(15 * MS - 1)), None);
-        let now = Instant::from_ns(40 * MS);
-        let order: Vec<_> = core::iter::from_fn(|| take(&mut receiver, now)).collect();
-        assert_eq!(
-            order.iter().map(|(byte, _)| *byte).collect::<Vec<_>>(),
-            [2, 3, 0]
-        );
-        let delay = order[2].1.emulated.unwrap();
-        assert_eq!(
-            (delay.arrived, delay.due),
-            (start, Instant::from_ns(35 * MS))
-        );
-        assert_eq!(receiver.counters().link_lost_count, 1);
-        assert_eq!((receiver.next_due(), receiver.held_count()), (None, 0));
-    }
-
-    #[test]
-    fn a_full_link_drops_and_counts_and_recovers() {
-        let (mut sender, mut receiver) = emulated(Listed(vec![10; 8]), 2);
-        for byte in 0..5 {
-            sender.send(&[byte]).unwrap();
-            assert_eq!(take(&mut receiver, Instant::ZERO), None);
-        }
-        assert_eq!(receiver.counters().link_overflow_count, 3);
-        let due = Instant::from_ns(10 * MS);
-        assert_eq!(take(&mut receiver, due).unwrap().0, 0);
-        assert_eq!(take(&mut receiver, due).unwrap().0, 1);
-        sender.send(&[9]).unwrap();
-        assert_eq!(take(&mut receiver, due), None);
-        assert_eq!(take(&mut receiver, Instant::from_ns(20 * MS)).unwrap().0, 9);
-    }
-
-    #[test]
-    fn exempt_datagrams_pass_at_once_and_change_no_fate() {
-        let (mut sender, mut receiver) = emulated(Listed(vec![10, -1]), 8);
-        sender.send(b"1").unwrap();
-        sender.send(b"hello").unwrap();
-        sender.send(b"2").unwrap();
-        let (byte, arrival) = take(&mut receiver, Instant::ZERO).unwrap();
-        assert_eq!((byte, arrival.emulated), (b'h', None));
-        assert_eq!(
-            take(&mut receiver, Instant::from_ns(10 * MS)).unwrap().0,
-            b'1'
-        );
-        assert_eq!(receiver.counters().link_lost_count, 1);
-    }
-
-    #[test]
-    fn equal_seeds_lose_the_same_datagrams() {
-        let survivors = |seed| {
-            let stream = RandomStream::new(seed, "link");
-            let link = BernoulliLink::new(Duration::from_millis(3), 0.3, stream).unwrap();
-            let (mut sender, mut receiver) = emulated(link, 8);
-            let mut seen = Vec::new();
-            for byte in 0..200 {
-                sender.send(&[byte]).unwrap();
-                let now = Instant::from_ns(i64::from(byte) * MS);
-                seen.extend(take(&mut receiver, now).map(|(byte, _)| byte));
-            }
-            seen
-        };
-        assert_eq!(survivors(4), survivors(4));
-        assert_ne!(survivors(4), survivors(5));
-        assert!((100..180).contains(&survivors(4).len()));
-    }
-
-    #[test]
-    fn a_clock_that_goes_back_does_not_reach_the_model() {
-        #[derive(Debug)]
-        struct Strict(Instant);
-        impl LinkModel for Strict {
-            fn offer(&mut self, now: Instant, _length_bytes: usize) -> Fate {
-                assert!(now >= self.0, "offers come in order");
-                self.0 = now;
-                Fate::Delivered(now)
-            }
-        }
-        let (mut sender, mut receiver) = emulated(Strict(Instant::ZERO), 8);
-        for now in [7, 3, 9] {
-            sender.send(&[now]).unwrap();
-            take(&mut receiver, Instant::from_ns(i64::from(now)));
-        }
-        // The second came in at 7, so at 3 it was not due yet.
-        assert_eq!(receiver.counters().received_count, 2);
-        assert_eq!(receiver.held_count(), 1);
-    }
-}
+#[path = "emulated_tests.rs"]
+mod tests;

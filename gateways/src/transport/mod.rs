@@ -4,6 +4,7 @@
 //! - [`udp`]: the real network, with separate sockets for sending and receiving.
 //! - [`tcp`]: the real network as a stream, with what it costs in waiting.
 //! - [`udp_server`]: one socket that hears anyone and answers, for foreign protocols.
+//! - [`radio`]: whether the peer radio acknowledged each datagram.
 //! - [`queue`]: an in-process pair, for tests.
 //! - [`emulated`]: any receiver behind a link model.
 //! - [`timestamping`] and [`probe`]: what the kernel and the network card can stamp, and whether
@@ -13,14 +14,22 @@
 //! A refused send or a report of the network is a state the caller sees, never an exit.
 
 mod boxed;
+pub mod card_arming;
+pub mod card_clock;
 pub mod clock_pair;
 mod control;
+mod counters;
 pub mod emulated;
+pub mod interface;
+pub mod packet_ring;
 pub mod probe;
 pub mod queue;
+pub mod radio;
+mod reply_stamps;
 pub mod tcp;
 pub mod timestamping;
 pub mod udp;
+mod udp_receiver;
 pub mod udp_server;
 mod udp_socket;
 
@@ -28,6 +37,8 @@ mod udp_socket;
 mod conformance_tests;
 #[cfg(test)]
 mod host_tests;
+#[cfg(test)]
+mod reply_stamp_tests;
 #[cfg(test)]
 mod trap_tests;
 
@@ -39,6 +50,8 @@ use std::os::fd::BorrowedFd;
 use hil_models::time::Instant;
 use thiserror::Error;
 
+pub use counters::{ReceiverCounters, SenderCounters};
+use radio::RadioReport;
 use tcp::StreamFigures;
 
 /// The stamps the kernel attached to one datagram.
@@ -163,151 +176,6 @@ impl SendRefusal {
     }
 }
 
-/// Everything a sender counts since it was opened.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct SenderCounters {
-    /// Datagrams the transport took.
-    pub sent_count: u64,
-    /// Sends refused with [`SendRefusal::PeerRefused`].
-    pub peer_refused_count: u64,
-    /// Sends refused with [`SendRefusal::Unreachable`].
-    pub unreachable_count: u64,
-    /// Sends refused with [`SendRefusal::QueueFull`].
-    pub queue_full_count: u64,
-    /// Sends refused with [`SendRefusal::TooLong`].
-    pub too_long_count: u64,
-    /// Sends refused with [`SendRefusal::NotConnected`].
-    pub not_connected_count: u64,
-    /// Sends refused with [`SendRefusal::Other`].
-    pub other_refusal_count: u64,
-    /// Transmit stamps handed out.
-    pub stamp_count: u64,
-    /// Transmit stamps that named no datagram of this sender, dropped.
-    pub unmatched_stamp_count: u64,
-    /// Transmit stamps dropped because nobody fetched them in time; known for a queue only, the
-    /// kernel does not tell.
-    pub stamp_overflow_count: u64,
-    /// Reports of the network (ICMP) about earlier datagrams, swallowed.
-    pub network_report_count: u64,
-    /// Reports of this host's stack about earlier datagrams (for instance their length),
-    /// swallowed.
-    pub local_report_count: u64,
-    /// Entries of the error queue that could not be read or understood, dropped.
-    pub undecodable_report_count: u64,
-    /// Replies received from the peer.
-    pub reply_count: u64,
-    /// Replies the kernel dropped because the receive buffer was full (`SO_RXQ_OVFL`). Known as
-    /// of the newest reply received.
-    pub kernel_drop_count: u64,
-    /// What the newest network or local report said.
-    pub newest_report: Option<SendRefusal>,
-}
-
-impl SenderCounters {
-    /// Every counter with its name, in the order above.
-    pub fn iter(&self) -> impl Iterator<Item = (&'static str, u64)> + use<> {
-        [
-            ("sent_count", self.sent_count),
-            ("peer_refused_count", self.peer_refused_count),
-            ("unreachable_count", self.unreachable_count),
-            ("queue_full_count", self.queue_full_count),
-            ("too_long_count", self.too_long_count),
-            ("not_connected_count", self.not_connected_count),
-            ("other_refusal_count", self.other_refusal_count),
-            ("stamp_count", self.stamp_count),
-            ("unmatched_stamp_count", self.unmatched_stamp_count),
-            ("stamp_overflow_count", self.stamp_overflow_count),
-            ("network_report_count", self.network_report_count),
-            ("local_report_count", self.local_report_count),
-            ("undecodable_report_count", self.undecodable_report_count),
-            ("reply_count", self.reply_count),
-            ("kernel_drop_count", self.kernel_drop_count),
-        ]
-        .into_iter()
-    }
-}
-
-impl SenderCounters {
-    pub(crate) fn count_refusal(&mut self, refusal: SendRefusal) {
-        let counter = match refusal {
-            SendRefusal::PeerRefused => &mut self.peer_refused_count,
-            SendRefusal::Unreachable { .. } => &mut self.unreachable_count,
-            SendRefusal::QueueFull { .. } => &mut self.queue_full_count,
-            SendRefusal::TooLong { .. } => &mut self.too_long_count,
-            SendRefusal::NotConnected => &mut self.not_connected_count,
-            SendRefusal::Other { .. } => &mut self.other_refusal_count,
-        };
-        *counter += 1;
-    }
-
-    /// Sends refused, whatever the reason.
-    pub fn refused_count(&self) -> u64 {
-        self.peer_refused_count
-            + self.unreachable_count
-            + self.queue_full_count
-            + self.too_long_count
-            + self.not_connected_count
-            + self.other_refusal_count
-    }
-}
-
-/// Everything a receiver counts since it was opened.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct ReceiverCounters {
-    /// Datagrams handed to the caller.
-    pub received_count: u64,
-    /// Of those, with a software stamp. Divided by `received_count` it is the stamp coverage.
-    pub software_stamp_count: u64,
-    /// Of those, with a hardware stamp.
-    pub hardware_stamp_count: u64,
-    /// Of those, cut off because the buffer was too short.
-    pub truncated_count: u64,
-    /// Of those, with control data that was cut off or damaged, so stamps may be missing.
-    pub damaged_control_count: u64,
-    /// Datagrams without a readable source address, dropped.
-    pub sourceless_count: u64,
-    /// Datagrams the kernel dropped because the receive buffer was full (`SO_RXQ_OVFL`). Known
-    /// as of the newest datagram received: drops after it show with the next one.
-    pub kernel_drop_count: u64,
-    /// Replies the transport took.
-    pub reply_count: u64,
-    /// Replies it refused.
-    pub reply_refused_count: u64,
-    /// Datagrams the link model lost.
-    pub link_lost_count: u64,
-    /// Datagrams dropped because the emulation already held as many as it may.
-    pub link_overflow_count: u64,
-}
-
-impl ReceiverCounters {
-    /// Every counter with its name, in the order above.
-    pub fn iter(&self) -> impl Iterator<Item = (&'static str, u64)> + use<> {
-        [
-            ("received_count", self.received_count),
-            ("software_stamp_count", self.software_stamp_count),
-            ("hardware_stamp_count", self.hardware_stamp_count),
-            ("truncated_count", self.truncated_count),
-            ("damaged_control_count", self.damaged_control_count),
-            ("sourceless_count", self.sourceless_count),
-            ("kernel_drop_count", self.kernel_drop_count),
-            ("reply_count", self.reply_count),
-            ("reply_refused_count", self.reply_refused_count),
-            ("link_lost_count", self.link_lost_count),
-            ("link_overflow_count", self.link_overflow_count),
-        ]
-        .into_iter()
-    }
-}
-
-impl ReceiverCounters {
-    pub(crate) fn count_received(&mut self, received: &Received) {
-        self.received_count += 1;
-        self.truncated_count += u64::from(received.is_truncated);
-        self.software_stamp_count += u64::from(received.stamps.software_ns.is_some());
-        self.hardware_stamp_count += u64::from(received.stamps.hardware_ns.is_some());
-    }
-}
-
 /// The sending end of a transport: towards one peer, with stamps and the peer's replies coming
 /// back. Nothing here blocks.
 ///
@@ -336,6 +204,12 @@ pub trait DatagramSender: Debug + Send {
     /// kernel charges unfetched stamps to the receive buffer, so a sender that is never drained
     /// hears no replies. Reports of the network are swallowed and counted on the way.
     fn next_stamp(&mut self) -> Option<TransmitStamp>;
+
+    /// The next report of the radio that [`DatagramSender::next_stamp`] found on its way; call it
+    /// until `None` after that. A transport without a radio has none.
+    fn next_radio_report(&mut self) -> Option<RadioReport> {
+        None
+    }
 
     /// The next reply of the peer, if one has arrived.
     ///
@@ -378,12 +252,33 @@ pub trait DatagramReceiver: Debug + Send {
     /// When the transport itself is broken; a bad or foreign datagram is not an error.
     fn receive(&mut self, now: Instant, buffer: &mut [u8]) -> io::Result<Option<Received>>;
 
-    /// Sends `datagram` back to `to`, the source of an earlier datagram. Replies get no transmit
-    /// stamp: stamps would compete with arrivals for the receive buffer.
+    /// Sends `datagram` back to `to`, the source of an earlier datagram, without a transmit stamp:
+    /// stamps would compete with arrivals for the receive buffer.
     ///
     /// # Errors
     /// The state that kept it from leaving; it is counted.
     fn reply(&mut self, datagram: &[u8], to: SocketAddr) -> Result<(), SendRefusal>;
+
+    /// As [`DatagramReceiver::reply`], and asks for the stamp of its departure, where the
+    /// transport has stamps. It is for few replies, as each costs system calls.
+    ///
+    /// # Errors
+    /// As [`DatagramReceiver::reply`].
+    fn reply_stamped(
+        &mut self,
+        _now: Instant,
+        datagram: &[u8],
+        to: SocketAddr,
+    ) -> Result<(), SendRefusal> {
+        self.reply(datagram, to)
+    }
+
+    /// When the newest stamped reply left, nanoseconds of this host's `CLOCK_REALTIME`; once, and
+    /// `None` while it has not come. Call it after the reply and whenever nothing arrived; it
+    /// makes a system call only while a stamp may be there.
+    fn take_reply_stamp(&mut self, _now: Instant) -> Option<i64> {
+        None
+    }
 
     /// When a datagram held back by a link model is due; `None` when none is held. A wait for
     /// [`DatagramReceiver::poll_fd`] must end then.

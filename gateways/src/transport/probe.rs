@@ -14,12 +14,15 @@ use nix::poll::{PollFd, PollFlags, ppoll};
 use thiserror::Error;
 
 use super::clock_pair::monotonic_now;
-use super::timestamping::{TimestampCapabilities, TimestampMode, interface_with_address};
+use super::interface::interface_with_address;
+use super::timestamping::{TimestampCapabilities, TimestampMode};
 use super::udp::{UdpError, UdpReceiver, UdpSender, UdpSettings};
 use super::{DatagramReceiver, DatagramSender, SendRefusal, TransmitStage, TxToken};
 
 /// How long one probe datagram may take to come back with its stamps.
 const STAMP_WAIT: Duration = Duration::from_millis(20);
+/// The same for a card's stamp, which the driver fetches from a worker.
+const CARD_STAMP_WAIT: Duration = Duration::from_millis(100);
 /// Pause after a probe that came without a stamp: time for the kernel's worker.
 const RETRY_PAUSE: Duration = Duration::from_millis(2);
 /// What a probe datagram contains; no gateway takes it for one of its own.
@@ -303,7 +306,12 @@ fn collect_stamps(
         mode == TimestampMode::Hardware,
     ];
     let mut seen = [false; 3];
-    let end = monotonic_now()? + STAMP_WAIT;
+    let patience = if mode == TimestampMode::Hardware {
+        CARD_STAMP_WAIT
+    } else {
+        STAMP_WAIT
+    };
+    let end = monotonic_now()? + patience;
     loop {
         while let Some(stamp) = sender.next_stamp() {
             if stamp.token != token {

@@ -8,7 +8,7 @@
 use core::ffi::{c_char, c_int, c_ulong};
 use core::mem;
 use std::io;
-use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, SocketAddrV4, SocketAddrV6};
+use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr, SocketAddrV4, SocketAddrV6};
 use std::os::fd::{AsFd, AsRawFd, BorrowedFd};
 
 use nix::sys::socket::{TimestampingFlag, setsockopt, sockopt};
@@ -25,11 +25,16 @@ pub enum TimestampMode {
     /// driver gives none, as on Wi-Fi.
     Scheduled,
     /// Software and network card stamps. The card must be set up for it, see
-    /// [`HardwareStamping::request`].
+    /// [`super::card_arming`].
     Hardware,
 }
 
 impl TimestampMode {
+    /// True where the driver is to stamp what leaves, and not known never to.
+    pub(super) const fn stamps_departures(self) -> bool {
+        matches!(self, Self::Software | Self::Hardware)
+    }
+
     /// What a receiver asks for. Never transmit stamps: unfetched ones would take the room of
     /// arrivals.
     fn receive_flags(self) -> TimestampingFlag {
@@ -86,13 +91,21 @@ pub(super) fn restart_send_count(socket: &impl AsFd, mode: TimestampMode) -> io:
     arm_transmit(socket, mode)
 }
 
-/// Asks for the stamps of `mode` on a receiving socket.
+/// Asks for the stamps of `mode` on a receiving socket, and how to bring those of replies that ask
+/// for one themselves: with their number, counted from 0 here, and no copy.
 pub(super) fn arm_receive(socket: &impl AsFd, mode: TimestampMode) -> io::Result<()> {
-    Ok(setsockopt(
-        socket,
-        sockopt::Timestamping,
-        &mode.receive_flags(),
-    )?)
+    let mut flags = mode.receive_flags();
+    if mode.stamps_departures() {
+        flags |= TimestampingFlag::SOF_TIMESTAMPING_OPT_ID
+            | TimestampingFlag::SOF_TIMESTAMPING_OPT_TSONLY;
+    }
+    Ok(setsockopt(socket, sockopt::Timestamping, &flags)?)
+}
+
+/// Makes the kernel count the next reply that asks for a stamp as 0 again.
+pub(super) fn restart_reply_count(socket: &impl AsFd, mode: TimestampMode) -> io::Result<()> {
+    setsockopt(socket, sockopt::Timestamping, &mode.receive_flags())?;
+    arm_receive(socket, mode)
 }
 
 /// Room for the control messages of one datagram: stamps, drop count, an error report and more
@@ -321,47 +334,75 @@ impl TimestampCapabilities {
     }
 }
 
-/// How a network card is set up to stamp (`struct hwtstamp_config` of `linux/net_tstamp.h`).
-/// This is a setting of the card, shared by all its users such as a PTP daemon.
+/// How a network card is set up to stamp (`struct hwtstamp_config` of `linux/net_tstamp.h`), in the
+/// kernel's own numbers so that it can be put back as it was. This is a setting of the card, shared
+/// by all its users such as a PTP daemon.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct HardwareStamping {
-    /// The card stamps what leaves (`HWTSTAMP_TX_ON`).
-    pub is_transmit_on: bool,
+    /// `HWTSTAMP_FLAG_*`: 1 where a bonded interface answers for the card that is active.
+    pub flags: i32,
+    /// How it stamps what leaves, one of `HWTSTAMP_TX_*`: 0 not, 1 on, 2 and 3 on with one-step PTP
+    /// messages.
+    pub transmit_type: i32,
     /// Which arrivals it stamps: 0 none, 1 all, else one of `HWTSTAMP_FILTER_*`.
     pub receive_filter: i32,
 }
 
 impl HardwareStamping {
+    /// Everything off (`HWTSTAMP_TX_OFF`, `HWTSTAMP_FILTER_NONE`).
+    pub const OFF: Self = Self {
+        flags: 0,
+        transmit_type: libc::HWTSTAMP_TX_OFF.cast_signed(),
+        receive_filter: libc::HWTSTAMP_FILTER_NONE.cast_signed(),
+    };
+
+    /// The card stamps what leaves: all types but `HWTSTAMP_TX_OFF` do.
+    pub const fn is_transmit_on(&self) -> bool {
+        self.transmit_type != Self::OFF.transmit_type
+    }
+
+    /// This setting with transmit stamps: a type that gives them, such as one-step PTP, stays.
+    #[must_use]
+    pub const fn with_transmit(self) -> Self {
+        if self.is_transmit_on() {
+            return self;
+        }
+        Self {
+            transmit_type: libc::HWTSTAMP_TX_ON.cast_signed(),
+            ..self
+        }
+    }
+
     /// How the card behind `interface` is set up now (`SIOCGHWTSTAMP`).
     ///
     /// # Errors
-    /// `EOPNOTSUPP` when it cannot stamp, as on loopback, veth and virtio.
+    /// `EOPNOTSUPP` when it cannot stamp, as on loopback, veth and virtio, or does not say.
     pub fn query(interface: &str) -> io::Result<Self> {
-        Self::exchange(interface, libc::SIOCGHWTSTAMP, (0, 0))
+        Self::OFF.exchange(interface, libc::SIOCGHWTSTAMP)
     }
 
-    /// Asks the card to stamp everything (`SIOCSHWTSTAMP`) and says what it settled for. Needs
-    /// `CAP_NET_ADMIN` and changes the card for all its users.
+    /// Sets the card up (`SIOCSHWTSTAMP`) and says what it settled for. Needs `CAP_NET_ADMIN` and
+    /// changes the card for all its users; [`super::card_arming`] also puts it back.
     ///
     /// # Errors
-    /// `EOPNOTSUPP` when it cannot stamp, `ERANGE` when it cannot stamp all arrivals, `EPERM`.
-    pub fn request(interface: &str) -> io::Result<Self> {
-        let wanted = (libc::HWTSTAMP_TX_ON, libc::HWTSTAMP_FILTER_ALL);
-        Self::exchange(interface, libc::SIOCSHWTSTAMP, wanted)
+    /// `EOPNOTSUPP` when it cannot stamp, `ERANGE` when it does not have that filter, `EPERM`.
+    pub fn set(interface: &str, wanted: Self) -> io::Result<Self> {
+        wanted.exchange(interface, libc::SIOCSHWTSTAMP)
     }
 
     #[allow(unsafe_code, reason = "no crate wraps SIOCGHWTSTAMP and SIOCSHWTSTAMP")]
-    fn exchange(interface: &str, request: c_ulong, wanted: (u32, u32)) -> io::Result<Self> {
+    fn exchange(self, interface: &str, request: c_ulong) -> io::Result<Self> {
         let mut config = libc::hwtstamp_config {
-            flags: 0,
-            tx_type: wanted.0.cast_signed(),
-            rx_filter: wanted.1.cast_signed(),
+            flags: self.flags,
+            tx_type: self.transmit_type,
+            rx_filter: self.receive_filter,
         };
         let data = (&raw mut config).cast();
         // SAFETY: both requests read and write one `hwtstamp_config`, which `config` is.
         unsafe { device_request(interface, request, data) }?;
         Ok(Self {
-            is_transmit_on: config.tx_type != libc::HWTSTAMP_TX_OFF.cast_signed(),
+            flags: config.flags,
+            transmit_type: config.tx_type,
             receive_filter: config.rx_filter,
         })
     }
@@ -394,23 +435,6 @@ unsafe fn device_request(interface: &str, request: c_ulong, data: *mut c_char) -
     } else {
         Err(io::Error::last_os_error())
     }
-}
-
-/// The interface that has `address`; `None` when this host has no such address.
-///
-/// # Errors
-/// When the kernel does not list the interfaces.
-pub fn interface_with_address(address: IpAddr) -> io::Result<Option<String>> {
-    let has_address = |entry: &nix::ifaddrs::InterfaceAddress| {
-        let Some(storage) = entry.address.as_ref() else {
-            return false;
-        };
-        let v4 = storage.as_sockaddr_in().map(|a| IpAddr::V4(a.ip()));
-        let v6 = storage.as_sockaddr_in6().map(|a| IpAddr::V6(a.ip()));
-        v4.or(v6) == Some(address)
-    };
-    let mut entries = nix::ifaddrs::getifaddrs()?;
-    Ok(entries.find(has_address).map(|entry| entry.interface_name))
 }
 
 #[cfg(test)]
@@ -455,7 +479,7 @@ mod tests {
         assert!(!claims.tx_hardware && !claims.rx_hardware);
         let refusal = HardwareStamping::query("lo").unwrap_err();
         assert_eq!(refusal.raw_os_error(), Some(libc::EOPNOTSUPP));
-        assert!(HardwareStamping::request("lo").is_err());
+        assert!(HardwareStamping::set("lo", HardwareStamping::OFF).is_err());
     }
 
     #[test]
@@ -463,14 +487,5 @@ mod tests {
         for name in ["", "no-such-device", "a-name-longer-than-the-kernel-allows"] {
             assert!(TimestampCapabilities::query(name).is_err(), "{name}");
         }
-    }
-
-    #[test]
-    fn the_interface_of_an_address_is_found() {
-        let loopback = IpAddr::V4(Ipv4Addr::LOCALHOST);
-        let found = interface_with_address(loopback).unwrap();
-        assert_eq!(found.as_deref(), Some("lo"));
-        let foreign = IpAddr::V4(Ipv4Addr::new(203, 0, 113, 77));
-        assert_eq!(interface_with_address(foreign).unwrap(), None);
     }
 }

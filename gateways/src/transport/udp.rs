@@ -6,20 +6,19 @@ use std::io;
 use std::net::SocketAddr;
 use std::os::fd::{AsFd, BorrowedFd};
 
-use hil_models::time::Instant;
 use nix::sys::socket::{setsockopt, sockopt};
 use socket2::{SockAddr, Socket};
 
-use super::control::{ControlData, QueueEntry};
+use super::control::{ControlData, QueueEntry, SCM_WIFI_STATUS};
+use super::radio::{RETURNED_BYTES, RadioLedger, RadioReport};
 use super::timestamping::{
-    MessageReader, Queue, TimestampMode, arm_receive, arm_transmit, int_option, restart_send_count,
+    MessageReader, Queue, TimestampMode, arm_transmit, int_option, restart_send_count,
+    set_int_option,
 };
+pub use super::udp_receiver::UdpReceiver;
 pub use super::udp_socket::{GrantedOptions, UdpError, UdpSettings};
 use super::udp_socket::{bind, granted_options, local_address, open_socket, refuse};
-use super::{
-    DatagramReceiver, DatagramSender, Received, ReceiverCounters, SendRefusal, SenderCounters,
-    TransmitStamp, TxToken,
-};
+use super::{DatagramSender, Received, SendRefusal, SenderCounters, TransmitStamp, TxToken};
 
 /// `IPV6_MTU` of `linux/in6.h`.
 const IPV6_MTU: i32 = 24;
@@ -27,7 +26,7 @@ const IPV6_MTU: i32 = 24;
 /// up the sending thread.
 const DRAIN_COUNT_MAX: u32 = 256;
 /// Pending reports that one receive call passes over at most; each costs one system call.
-const RECEIVE_ATTEMPT_COUNT_MAX: u32 = 8;
+pub(super) const RECEIVE_ATTEMPT_COUNT_MAX: u32 = 8;
 
 /// The largest packet the path to the peer is known to take.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -54,6 +53,8 @@ pub struct UdpSender {
     mode: TimestampMode,
     /// The token of the send that the kernel counts as 0; `None` when its count is unknown.
     first_token: Option<TxToken>,
+    /// Where the radio is asked.
+    radio: Option<Box<RadioLedger>>,
 }
 
 impl UdpSender {
@@ -98,7 +99,14 @@ impl UdpSender {
             format!("{:?}", settings.timestamps),
             armed,
         )?;
+        let mut radio = None;
+        if settings.wants_radio_reports {
+            let asked = set_int_option(&socket, libc::SOL_SOCKET, SCM_WIFI_STATUS, 1);
+            refuse("SO_WIFI_STATUS", 1, asked)?;
+            radio = Some(Box::new(RadioLedger::new()));
+        }
         Ok(Self {
+            radio,
             granted: granted_options(&socket, settings)?,
             socket,
             peer: settings.peer,
@@ -168,6 +176,22 @@ impl UdpSender {
         self.first_token = restarted.then_some(TxToken(sent_modulo(self.counters.sent_count)));
     }
 
+    /// Matches a radio's report to its send by the packet it brought back.
+    fn absorb_report(&mut self, packet: &[u8], is_acknowledged: bool) {
+        let Some(radio) = &mut self.radio else {
+            self.counters.undecodable_report_count += 1;
+            return;
+        };
+        let matched = radio.settle(packet, is_acknowledged);
+        self.counters.radio_overflow_count = radio.overflow_count;
+        let counter = match matched {
+            None => &mut self.counters.radio_unmatched_count,
+            Some(report) if report.is_acknowledged => &mut self.counters.radio_acknowledged_count,
+            Some(_) => &mut self.counters.radio_unacknowledged_count,
+        };
+        *counter += 1;
+    }
+
     /// Sorts one entry of the error queue; a stamp of one of our sends is handed on.
     fn absorb_entry(&mut self, data: &ControlData) -> Option<TransmitStamp> {
         let entry = data.extended_error.map(|error| error.entry());
@@ -214,6 +238,9 @@ impl UdpSender {
             Ok(_) => {
                 let token = TxToken(sent_modulo(self.counters.sent_count));
                 self.counters.sent_count += 1;
+                if let Some(radio) = &mut self.radio {
+                    radio.note(datagram, token);
+                }
                 Ok(token)
             }
             Err(error) => {
@@ -246,14 +273,23 @@ impl DatagramSender for UdpSender {
     }
 
     fn next_stamp(&mut self) -> Option<TransmitStamp> {
+        let mut packet = [0; RETURNED_BYTES];
+        // Only a radio's reports bring something back.
+        let room = if self.radio.is_some() {
+            packet.len()
+        } else {
+            0
+        };
         for _ in 0..DRAIN_COUNT_MAX {
             match self
                 .reader
-                .read(self.socket.as_fd(), &mut [], Queue::Errors)
+                .read(self.socket.as_fd(), &mut packet[..room], Queue::Errors)
             {
-                Ok(Some(_)) => {
+                Ok(Some(message)) => {
                     let data = ControlData::decode(self.reader.control());
-                    if let Some(stamp) = self.absorb_entry(&data) {
+                    if let Some(is_acknowledged) = data.is_acknowledged {
+                        self.absorb_report(&packet[..message.length_bytes], is_acknowledged);
+                    } else if let Some(stamp) = self.absorb_entry(&data) {
                         return Some(stamp);
                     }
                 }
@@ -265,6 +301,10 @@ impl DatagramSender for UdpSender {
             }
         }
         None
+    }
+
+    fn next_radio_report(&mut self) -> Option<RadioReport> {
+        self.radio.as_mut()?.take()
     }
 
     fn receive(&mut self, buffer: &mut [u8]) -> io::Result<Option<Received>> {
@@ -318,117 +358,6 @@ fn is_broken(error: &io::Error) -> bool {
     error
         .raw_os_error()
         .is_none_or(|errno| ours.contains(&errno))
-}
-
-/// The receiving socket, open to anyone.
-#[derive(Debug)]
-pub struct UdpReceiver {
-    socket: Socket,
-    reader: MessageReader,
-    counters: ReceiverCounters,
-    /// The kernel's drop count at the newest datagram, modulo 2^32.
-    kernel_drop_count: u32,
-    granted: GrantedOptions,
-}
-
-impl UdpReceiver {
-    /// Opens and binds the socket.
-    ///
-    /// # Errors
-    /// When the settings contradict themselves or the kernel refuses a step.
-    pub fn open(settings: &UdpSettings) -> Result<Self, UdpError> {
-        let socket = open_socket(settings)?;
-        // Before the socket can receive, so that no datagram comes without.
-        let armed = arm_receive(&socket, settings.timestamps);
-        refuse(
-            "SO_TIMESTAMPING",
-            format!("{:?}", settings.timestamps),
-            armed,
-        )?;
-        let drops = setsockopt(&socket, sockopt::RxqOvfl, &1);
-        refuse("SO_RXQ_OVFL", 1, drops.map_err(io::Error::from))?;
-        bind(&socket, settings.local)?;
-        Ok(Self {
-            granted: granted_options(&socket, settings)?,
-            socket,
-            reader: MessageReader::new(),
-            counters: ReceiverCounters::default(),
-            kernel_drop_count: 0,
-        })
-    }
-
-    /// What the kernel granted.
-    pub fn granted(&self) -> GrantedOptions {
-        self.granted
-    }
-
-    /// Where it listens, with the port the kernel chose.
-    ///
-    /// # Errors
-    /// When the kernel does not tell.
-    pub fn local_address(&self) -> io::Result<SocketAddr> {
-        local_address(&self.socket)
-    }
-}
-
-impl DatagramReceiver for UdpReceiver {
-    fn receive(&mut self, _now: Instant, buffer: &mut [u8]) -> io::Result<Option<Received>> {
-        for _ in 0..RECEIVE_ATTEMPT_COUNT_MAX {
-            let read = self
-                .reader
-                .read(self.socket.as_fd(), buffer, Queue::Arrivals)?;
-            let Some(message) = read else { return Ok(None) };
-            let data = ControlData::decode(self.reader.control());
-            if let Some(count) = data.drop_count {
-                let new_count = count.wrapping_sub(self.kernel_drop_count);
-                self.counters.kernel_drop_count += u64::from(new_count);
-                self.kernel_drop_count = count;
-            }
-            let Some(source) = message.source else {
-                self.counters.sourceless_count += 1;
-                continue;
-            };
-            let received = Received {
-                length_bytes: message.length_bytes,
-                is_truncated: message.is_truncated,
-                source,
-                stamps: data.stamps,
-                emulated: None,
-            };
-            let is_damaged = data.is_damaged || message.is_control_truncated;
-            self.counters.damaged_control_count += u64::from(is_damaged);
-            self.counters.count_received(&received);
-            return Ok(Some(received));
-        }
-        Ok(None)
-    }
-
-    fn reply(&mut self, datagram: &[u8], to: SocketAddr) -> Result<(), SendRefusal> {
-        let address = SockAddr::from(to);
-        let flags = libc::MSG_DONTWAIT;
-        match self.socket.send_to_with_flags(datagram, &address, flags) {
-            Ok(_) => {
-                self.counters.reply_count += 1;
-                Ok(())
-            }
-            Err(error) => {
-                self.counters.reply_refused_count += 1;
-                Err(SendRefusal::from_io(&error, datagram.len()))
-            }
-        }
-    }
-
-    fn next_due(&self) -> Option<Instant> {
-        None
-    }
-
-    fn poll_fd(&self) -> Option<BorrowedFd<'_>> {
-        Some(self.socket.as_fd())
-    }
-
-    fn counters(&self) -> ReceiverCounters {
-        self.counters
-    }
 }
 
 /// The number of the next send as the kernel counts it, modulo 2^32.

@@ -37,6 +37,9 @@ pub struct UdpSettings {
     pub receive_buffer_bytes: Option<usize>,
     /// Which stamps to ask for.
     pub timestamps: TimestampMode,
+    /// Ask the radio which datagrams the peer radio acknowledged (`SO_WIFI_STATUS`). An interface
+    /// that is not wireless reports nothing.
+    pub wants_radio_reports: bool,
 }
 
 impl UdpSettings {
@@ -51,6 +54,7 @@ impl UdpSettings {
             send_buffer_bytes: None,
             receive_buffer_bytes: None,
             timestamps: TimestampMode::Software,
+            wants_radio_reports: false,
         }
     }
 }

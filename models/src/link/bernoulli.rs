@@ -60,7 +60,7 @@ mod tests {
         for index in 0..100_000 {
             match link.offer(Instant::from_ns(index), 64) {
                 Fate::Lost => lost += 1,
-                Fate::Delivered(at) => assert_eq!(at.as_ns(), index + 50_000_000),
+                fate => assert_eq!(fate.arrival().unwrap().as_ns(), index + 50_000_000),
             }
         }
         // Five standard deviations of Binomial(100 000, 0.1).

@@ -22,6 +22,17 @@ impl<A: LinkModel, B: LinkModel> LinkModel for InSeries<A, B> {
     fn offer(&mut self, now: Instant, length_bytes: usize) -> Fate {
         match self.first.offer(now, length_bytes) {
             Fate::Delivered(at) => self.second.offer(at, length_bytes),
+            // The copy meets what the original meets: the second link is asked in order of time.
+            Fate::Duplicated { first, second } => {
+                let lag = second.saturating_duration_since(first);
+                match self.second.offer(first, length_bytes).arrival() {
+                    Some(at) => Fate::Duplicated {
+                        first: at,
+                        second: at + lag,
+                    },
+                    None => Fate::Lost,
+                }
+            }
             Fate::Lost => {
                 // Asked all the same: what it draws for the n-th message must not depend on which
                 // ones the first lost.

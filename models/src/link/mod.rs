@@ -2,12 +2,26 @@
 //! stream. They carry no bytes; virtual time and `via = "emulated"` ask them for each message.
 
 pub mod bernoulli;
+pub mod chain;
+#[cfg(test)]
+mod chain_tests;
+pub mod delay;
 pub mod impaired;
 pub mod in_series;
+pub mod loss;
 pub mod outages;
+pub mod rate;
+pub mod reordering;
+pub mod spec;
+pub mod trace;
+mod trace_ticks;
+pub mod wifi;
 
 use core::fmt::Debug;
 
+use serde::{Deserialize, Serialize};
+
+use self::trace::ReplayTally;
 use crate::time::Instant;
 
 /// What happens to one offered message.
@@ -15,8 +29,33 @@ use crate::time::Instant;
 pub enum Fate {
     /// It arrives at this instant, never before it was offered.
     Delivered(Instant),
+    /// It arrives at `first` and once more at `second`, which is never earlier.
+    Duplicated {
+        /// Its first arrival.
+        first: Instant,
+        /// Its second.
+        second: Instant,
+    },
     /// It does not arrive.
     Lost,
+}
+
+impl Fate {
+    /// When it arrives first; `None` when it is lost.
+    pub const fn arrival(self) -> Option<Instant> {
+        match self {
+            Self::Delivered(at) | Self::Duplicated { first: at, .. } => Some(at),
+            Self::Lost => None,
+        }
+    }
+
+    /// When it arrives a second time; `None` when it does not.
+    pub const fn second_arrival(self) -> Option<Instant> {
+        match self {
+            Self::Duplicated { second, .. } => Some(second),
+            Self::Delivered(_) | Self::Lost => None,
+        }
+    }
 }
 
 /// A one-directional link.
@@ -24,6 +63,70 @@ pub trait LinkModel: Debug + Send {
     /// Offers a message of `length_bytes` at `now` and decides its fate. Calls come in
     /// non-decreasing `now`.
     fn offer(&mut self, now: Instant, length_bytes: usize) -> Fate;
+
+    /// As [`LinkModel::offer`], told which message of its channel it is, counted from 0: what a
+    /// recorded trace goes by. To other models it is one message like the next.
+    fn offer_numbered(&mut self, now: Instant, length_bytes: usize, number: u64) -> Fate {
+        let _ = number;
+        self.offer(now, length_bytes)
+    }
+
+    /// What the replay of a trace met so far; `None` for a model that replays none.
+    fn replay_tally(&self) -> Option<ReplayTally> {
+        None
+    }
+
+    /// What the messages lost so far were lost to; `None` for a model that does not tell causes
+    /// apart.
+    fn loss_causes(&self) -> Option<LossCauses> {
+        None
+    }
+}
+
+impl<L: LinkModel + ?Sized> LinkModel for Box<L> {
+    fn offer(&mut self, now: Instant, length_bytes: usize) -> Fate {
+        (**self).offer(now, length_bytes)
+    }
+
+    fn offer_numbered(&mut self, now: Instant, length_bytes: usize, number: u64) -> Fate {
+        (**self).offer_numbered(now, length_bytes, number)
+    }
+
+    fn replay_tally(&self) -> Option<ReplayTally> {
+        (**self).replay_tally()
+    }
+
+    fn loss_causes(&self) -> Option<LossCauses> {
+        (**self).loss_causes()
+    }
+}
+
+/// What a link lost messages to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct LossCauses {
+    /// To outages.
+    pub outage_count: u64,
+    /// By chance.
+    pub chance_count: u64,
+    /// To a full queue.
+    pub queue_count: u64,
+}
+
+impl LossCauses {
+    /// These and others.
+    #[must_use]
+    pub const fn plus(self, other: Self) -> Self {
+        Self {
+            outage_count: self.outage_count + other.outage_count,
+            chance_count: self.chance_count + other.chance_count,
+            queue_count: self.queue_count + other.queue_count,
+        }
+    }
+
+    /// All of them.
+    pub const fn total(self) -> u64 {
+        self.outage_count + self.chance_count + self.queue_count
+    }
 }
 
 /// The shared-memory channel of one host in virtual time: everything arrives at once.

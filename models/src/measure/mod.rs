@@ -1,10 +1,15 @@
 //! Measures: from raw stamps to segments, histograms and intervals. It opens no file.
 //!
 //! [`record`] is what processes write, [`account`] joins it into one latency account per channel,
-//! [`histogram`] and [`statistics`] turn samples into figures with intervals.
+//! [`network`] says in the field's terms what the network did, [`correlation`] asks whether the
+//! robot followed, [`histogram`] and [`statistics`] turn samples into figures with intervals.
 
 pub mod account;
+pub mod card_clock;
+pub mod correlation;
 pub mod histogram;
+pub mod network;
+pub mod radio;
 pub mod record;
 pub(crate) mod series;
 pub(crate) mod special;

@@ -60,7 +60,7 @@ pub struct EgressRecord {
     pub epoch: u32,
     /// The gateway's start.
     pub session: u32,
-    /// [`EgressRecord::REFUSED_BY_KERNEL`] or 0.
+    /// Bits below.
     pub flags: u32,
     /// Datagrams this message took.
     pub fragment_count: u32,
@@ -70,6 +70,13 @@ impl EgressRecord {
     /// It did not leave this host whole: the kernel refused it, or the gateway had nobody to send
     /// it to.
     pub const REFUSED_BY_KERNEL: u32 = 1;
+    /// `tx_software_ns` was taken before the queueing discipline (`SCM_TSTAMP_SCHED`): the driver
+    /// stamps no departures, as wireless ones do not.
+    pub const STAMPED_BEFORE_QUEUE: u32 = 2;
+    /// The radio reported that the peer radio acknowledged the last fragment (`SO_WIFI_STATUS`).
+    pub const RADIO_ACKNOWLEDGED: u32 = 4;
+    /// The radio reported that the peer radio did not acknowledge the last fragment.
+    pub const RADIO_UNACKNOWLEDGED: u32 = 8;
 }
 
 /// A gateway received a message from the network.
@@ -94,6 +101,12 @@ pub struct IngressRecord {
     pub forwarded_ns: i64,
     /// Real-time minus monotonic clock, read as a pair next to this message.
     pub realtime_offset_ns: i64,
+    /// When an emulated link took the datagram that completed the message, this host's monotonic
+    /// clock; [`UNAVAILABLE`] on a real link.
+    pub emulated_ns: i64,
+    /// When the model of that link let it arrive, this host's monotonic clock: `received_ns` is
+    /// later by what the host needed to notice. [`UNAVAILABLE`] on a real link.
+    pub due_ns: i64,
     /// The producer's start.
     pub epoch: u32,
     /// The sending gateway's start.
@@ -111,6 +124,35 @@ impl IngressRecord {
     pub const DUPLICATE: u32 = 2;
     /// Older than the sequence window; not published.
     pub const LATE: u32 = 4;
+}
+
+/// A clock exchange of a sending gateway with its peer (four stamps, as in NTP, RFC 5905 section
+/// 8). An exchange appears again when a better stamp of it came later; the last one counts.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+#[repr(C)]
+pub struct RoundTripRecord {
+    /// Number of the request.
+    pub sequence: u64,
+    /// Request left, this host's monotonic clock.
+    pub t1_ns: i64,
+    /// Request arrived, the *peer's* monotonic clock.
+    pub t2_ns: i64,
+    /// Response left, the *peer's* monotonic clock.
+    pub t3_ns: i64,
+    /// Response arrived, this host's monotonic clock.
+    pub t4_ns: i64,
+    /// The sending gateway's start.
+    pub session: u32,
+    /// Kind of t1, t2, t3 and t4: 0 application, 1 kernel software, 2 network card.
+    pub sources: [u8; 4],
+}
+
+impl RoundTripRecord {
+    /// Time under way, both directions together: `(t4 - t1) - (t3 - t2)`.
+    pub const fn rtt_ns(&self) -> i64 {
+        let whole = self.t4_ns.saturating_sub(self.t1_ns);
+        whole.saturating_sub(self.t3_ns.saturating_sub(self.t2_ns))
+    }
 }
 
 /// A transmit stamp the sender reported in a later datagram, for a receiver that cannot read the

@@ -68,7 +68,7 @@ pub mod swing;
 #[cfg(test)]
 mod tests;
 
-use crate::case_study::{CaseStudy, ChannelSpec, ParameterError, Score};
+use crate::case_study::{CaseStudy, ChannelSpec, ErrorSeries, ParameterError, Score};
 use crate::component::{Role, into_role};
 use crate::egm::messages::{
     EgmArrival, EgmCommand, EgmEvent, EgmFeedback, MotionArrival, MotionRequest, MotionResponse,
@@ -201,6 +201,10 @@ impl CaseStudy for Teleoperation {
 
     fn score(&self, log: &RunLog) -> Score {
         score::score(self, log)
+    }
+
+    fn errors(&self, log: &RunLog) -> Vec<ErrorSeries> {
+        score::errors(log)
     }
 
     fn series(&self, log: &RunLog) -> Vec<PlotSeries> {

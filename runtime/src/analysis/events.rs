@@ -5,8 +5,9 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use hil_models::case_study::{ChannelSpec, MessageRef, Score, ScoreEvent};
 use hil_models::measure::account::{Happening, MessageFate, MessageStory, Side};
-use hil_models::time::Instant;
+use hil_models::time::{Instant, RemoteInstant};
 
+use super::clocks::HostClocks;
 use super::outages::OutageStory;
 use super::records::RunRecords;
 use crate::report::score_event::{EventOutage, ExplainedEvent, ExplainedMessage, ScoreEvents};
@@ -32,7 +33,7 @@ pub(super) fn explained(
     let ways = wanted.iter().filter_map(|(name, wanted)| {
         let channel = topology.channel(name)?;
         let way = Way {
-            start: start_of(run, channel),
+            start: start_of(run, channel, records.clocks()),
             stories: if channel.is_recorded_only() {
                 BTreeMap::new()
             } else {
@@ -48,41 +49,40 @@ pub(super) fn explained(
     ScoreEvents {
         events: events
             .map(|event| ExplainedEvent {
-                outages: outages_before(event, run, (specs, outages), &ways),
-                ..explain(event, run, &ways)
+                outages: outages_before(event, (run, records.clocks()), (specs, outages), &ways),
+                ..explain(event, run, (records.clocks(), &ways))
             })
             .collect(),
         dropped_count: score.events_dropped_count,
-        clocks_differ: !result.has_one_clock,
+        clocks_differ: !records.clocks().are_aligned(result.spans.keys()),
     }
 }
 
 /// Start of the run on the clock of the channel's producer. Hosts begin milliseconds apart; where
-/// they read one clock, one beginning holds for all, lest an effect come before its cause.
+/// their clocks are aligned, one beginning holds for all, lest an effect come before its cause.
 pub(super) fn start_of(
     (topology, result): (&Topology, &RunResult),
     channel: &Channel,
+    clocks: &HostClocks,
 ) -> Option<Instant> {
-    let host = &topology.process(&channel.from)?.host;
-    let starts = || result.spans.values().map(|span| span.0);
-    let own = result.spans.get(host).map(|span| span.0);
-    own.and_then(|own| {
-        if result.has_one_clock {
-            starts().min()
-        } else {
-            Some(own)
-        }
-    })
+    start_on(result, &topology.process(&channel.from)?.host, clocks)
+}
+
+/// Start of the run on the clock of `host`; see [`start_of`].
+pub(super) fn start_on(result: &RunResult, host: &str, clocks: &HostClocks) -> Option<Instant> {
+    let own = result.spans.get(host).map(|span| span.0)?;
+    let starts = result.spans.iter().map(|(host, span)| (host, span.0));
+    clocks.earliest_on(host, starts).or(Some(own))
 }
 
 fn explain(
     event: &ScoreEvent,
     run: (&Topology, &RunResult),
-    ways: &BTreeMap<&str, Way<'_>>,
+    (clocks, ways): (&HostClocks, &BTreeMap<&str, Way<'_>>),
 ) -> ExplainedEvent {
     let clock_of = run.0.channel(event.clock_of);
     let process = clock_of.and_then(|channel| run.0.process(&channel.from));
-    let start = clock_of.and_then(|channel| start_of(run, channel));
+    let start = clock_of.and_then(|channel| start_of(run, channel, clocks));
     let messages = event.messages.iter().map(|message| {
         ways.get(message.channel).map_or_else(
             || unavailable(message, "the run has no such channel"),
@@ -95,6 +95,7 @@ fn explain(
         severity: event.severity,
         what: event.what.clone(),
         outages: Vec::new(),
+        network: None,
         messages: messages.collect(),
         messages_dropped_count: event.messages_dropped_count,
     }
@@ -103,7 +104,7 @@ fn explain(
 /// What the channels that `event` concerns went through when it happened.
 fn outages_before(
     event: &ScoreEvent,
-    (topology, result): (&Topology, &RunResult),
+    ((topology, _), clocks): ((&Topology, &RunResult), &HostClocks),
     (specs, stories): (&[ChannelSpec], &[OutageStory]),
     ways: &BTreeMap<&str, Way<'_>>,
 ) -> Vec<EventOutage> {
@@ -117,19 +118,23 @@ fn outages_before(
         let channel = topology.channel(spec.name)?;
         let is_here = |process: &str| host_of(process) == Some(here);
         let is_consumers = channel.to.as_deref().is_some_and(is_here);
-        let is_producers = result.has_one_clock || is_here(&channel.from);
+        let on_producers_clock = host_of(&channel.from).and_then(|producers| {
+            let remote = RemoteInstant::from_ns(event.at.as_ns());
+            let (at, _) = clocks.path(here, producers).localise(remote)?;
+            Some((at, Side::Producer))
+        });
         let lost_published_ns = ways
             .get(spec.name)
             .map_or_else(Vec::new, |way| way.lost_published_ns(event));
         // A time compares only with times of its own clock.
         let sides = [
-            is_consumers.then_some(Side::Consumer),
-            is_producers.then_some(Side::Producer),
+            is_consumers.then_some((event.at, Side::Consumer)),
+            on_producers_clock,
         ];
         let mut sides = sides.into_iter().flatten().map(Some).chain([None]);
-        sides.find_map(|side| {
+        sides.find_map(|at| {
             story.before(&Happening {
-                at: side.map(|side| (event.at, side)),
+                at,
                 lost_published_ns: &lost_published_ns,
             })
         })
@@ -195,7 +200,15 @@ impl Way<'_> {
         match story.fate {
             MessageFate::Taken => {
                 let how = match story.delay_ns {
-                    Some(ns) => format!("delivered after {}", duration_s(ns as f64 * 1e-9)),
+                    Some(ns) => {
+                        let bound = match story.delay_bound_ns {
+                            Some(bound_ns) if bound_ns > 0 => {
+                                [" ±", &duration_s(bound_ns as f64 * 1e-9)].concat()
+                            }
+                            _ => String::new(),
+                        };
+                        format!("delivered after {}{bound}", duration_s(ns as f64 * 1e-9))
+                    }
                     None => "delivered; delay unavailable: clocks not aligned".to_owned(),
                 };
                 let overtaken = if story.is_overtaken {

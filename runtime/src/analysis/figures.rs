@@ -8,6 +8,7 @@ use hil_models::time::Instant;
 
 use super::records::RunRecords;
 use crate::realtime::GrantOutcome;
+use crate::report::emulation::EmulationFigures;
 use crate::report::summary::{
     ChannelSummary, CountByName, DirectionSummary, Fact, LinkKind, Outcome, ProcessSummary,
     RealtimeFacts, RunEvent, RunFacts,
@@ -15,6 +16,9 @@ use crate::report::summary::{
 use crate::supervisor::event::{Event, ProcessStory};
 use crate::supervisor::{self, RunResult};
 use crate::topology::{Channel, Topology, Via};
+
+/// What a receiving gateway calls the datagrams that its emulated link had no room for.
+const OVERFLOW_COUNTER: &str = "socket: link_overflow_count";
 
 pub(super) fn run_facts(
     topology: &Topology,
@@ -178,6 +182,11 @@ pub(super) fn channel_summary(
             })
         })
         .collect();
+    let overflow_count = directions
+        .iter()
+        .flat_map(|direction| &direction.counters)
+        .find(|counter| counter.name == OVERFLOW_COUNTER)
+        .map(|counter| counter.count);
     ChannelSummary {
         name: channel.name.clone(),
         from: channel.from.clone(),
@@ -192,6 +201,7 @@ pub(super) fn channel_summary(
         account: (records.has(&channel.name) && !channel.is_recorded_only())
             .then(|| records.account(topology, result, channel)),
         outages: None,
+        emulation: EmulationFigures::of(records.arrivals(&channel.name), overflow_count),
         recorded: channel
             .is_recorded_only()
             .then(|| records.recorded(&channel.name))

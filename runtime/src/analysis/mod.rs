@@ -1,10 +1,14 @@
 //! From the records of a finished run to its summary: reads the record files, draws up the
 //! account of each channel, and lets the case score what the robot did.
 
+mod cards;
+mod clocks;
 mod events;
 mod faces;
 mod figures;
+pub(crate) mod network;
 pub(crate) mod outages;
+mod radio;
 pub(crate) mod records;
 
 use std::fs;
@@ -13,7 +17,9 @@ use std::path::{Path, PathBuf};
 
 use hil_models::case_study::Score;
 use hil_models::measure::account::MessageFate;
+use hil_models::plot::PlotSeries;
 
+use clocks::HostClocks;
 use figures::{channel_summary, process_summary, realtime_facts, run_event, run_facts};
 use outages::OutageStory;
 use records::RunRecords;
@@ -25,6 +31,7 @@ use crate::report::terminal::{self, Style};
 use crate::series;
 use crate::supervisor::RunResult;
 use crate::topology::Topology;
+use crate::trace::capture;
 
 /// Why no summary could be made.
 #[derive(Debug, thiserror::Error)]
@@ -53,6 +60,8 @@ pub(crate) fn conclude(
     if !result.has_one_clock {
         records.set_clocks_differ();
     }
+    let clocks = HostClocks::of(topology, result, &records);
+    records.set_clocks(clocks);
     let mut summary = RunSummary::new(run_facts(topology, result, topology_file, command_line));
     summary.host_facts = result
         .facts
@@ -63,6 +72,7 @@ pub(crate) fn conclude(
     for process in &result.processes {
         summary.processes.push(process_summary(process));
     }
+    summary.clocks = Some(records.clocks().section().clone());
     summary.realtime = realtime_facts(&result.processes);
     summary.events = result
         .events
@@ -74,7 +84,9 @@ pub(crate) fn conclude(
         .iter()
         .map(|channel| channel_summary(topology, result, channel, &records))
         .collect();
+    capture::write(&mut summary, (topology, result), &records);
     summary.faces = faces::face_summaries(topology, result, &records);
+    summary.hardware_stamps = cards::hardware_stamps(topology, result, &records);
     let outages = add_outages(&mut summary, (topology, result), &records);
     let case = registry.make_case(topology)?;
     let (specs, score) = match &case {
@@ -89,10 +101,20 @@ pub(crate) fn conclude(
         &summary.channels,
         (specs, &outages),
     );
+    let errors = case.as_ref().map(|(_, case)| case.errors(records.log()));
+    let network = network::of_run(
+        (topology, result),
+        &records,
+        errors.unwrap_or_default(),
+        (&mut summary.score_events, &mut summary.warnings),
+    );
+    let (network, network_series) = network.unzip();
+    summary.network = network;
+    radio::add(&mut summary, (topology, result), &records);
     add_warnings(&mut summary, result, &records);
-    if let Some((_, case)) = case {
-        write_series(&mut summary, result, case.as_ref(), records);
-    }
+    let case = case.as_ref().map(|(_, case)| case.as_ref());
+    let network_series = network_series.unwrap_or_default();
+    write_series(&mut summary, result, (case, network_series), records);
     let path = result.folder.events();
     let text = event_log::text(&summary.run.name, &summary.score_events);
     fs::write(&path, text).map_err(|source| AnalysisError::Write { path, source })?;
@@ -122,14 +144,15 @@ fn add_outages(
     stories
 }
 
-/// Writes what the case has to plot. A run whose plots cannot be written has its report still.
+/// Writes what the case and the network have to plot. A run whose plots cannot be written has its report still.
 fn write_series(
     summary: &mut RunSummary,
     result: &RunResult,
-    case: &dyn Case,
+    (case, network): (Option<&dyn Case>, Vec<PlotSeries>),
     records: RunRecords,
 ) {
-    let made = case.series(records.log());
+    let mut made = case.map_or_else(Vec::new, |case| case.series(records.log()));
+    made.extend(network);
     // They are as large as the messages; only one of the two need be in memory.
     drop(records);
     match series::write(&result.folder.series(), made) {
@@ -168,13 +191,7 @@ fn add_warnings(summary: &mut RunSummary, result: &RunResult, records: &RunRecor
             ));
         }
     }
-    if !result.has_one_clock {
-        summary.warnings.push(
-            "clocks not aligned: no figure crosses from one host to the other; segments on one \
-             host and round trips are given"
-                .to_owned(),
-        );
-    }
+    summary.warnings.extend(records.clocks().warnings());
 }
 
 /// Width of `report.txt`.

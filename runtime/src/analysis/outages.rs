@@ -44,7 +44,7 @@ impl OutageStory {
         Some(Self {
             channel: channel.name.clone(),
             outages: records.outages(run, channel),
-            start: start_of(run, channel),
+            start: start_of(run, channel, records.clocks()),
             end: result.spans.get(host).map(|span| span.1),
             interrupted: records.interrupted(run, channel),
             is_partial,

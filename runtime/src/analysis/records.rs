@@ -8,21 +8,34 @@ use std::time::Duration;
 
 use hil_models::measure::account::{
     AccountContext, ChannelAccount, ChannelPath, ChannelRecords, FLIGHT_TIME_MAX, Interruption,
-    MessageStory, Outage, PathProcess, RunSpan, account, outages, stories,
+    MessageStory, ORDER_TOLERANCE_NS, Outage, PathProcess, RunSpan, TooManyMessages, TraceChannel,
+    account, link_trace, outages, stories,
+};
+use hil_models::measure::card_clock::{CardClockRecord, CardTimeline};
+use hil_models::measure::radio::{
+    RadioFigures, TransmitStampFigures, radio_figures, transmit_stamps,
 };
 use hil_models::measure::record::{
-    EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, TakenRecord,
+    EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
 };
 use hil_models::run_log::{LoggedMessage, RunLog};
-use hil_models::time::{Alignment, Instant};
+use hil_models::time::Instant;
+use hil_models::trace::TraceRecord;
 
 use super::AnalysisError;
+use super::clocks::HostClocks;
 use crate::face::record::{FaceReceivedRecord, FaceSentRecord};
+use crate::process::launch::EmulationLaunch;
+use crate::radio::record::RadioRecord;
 use crate::record::{RecordFile, RecordFileError, RecordKind};
 use crate::report::summary::RecordedFigures;
 use crate::supervisor::RunResult;
 use crate::supervisor::plan::gateway_name;
 use crate::topology::{Channel, Topology};
+
+/// Share of the messages of an emulated link that are not under way for longer than is allowed for:
+/// at the end of a run, what is younger may still arrive.
+const FLIGHT_QUANTILE: f64 = 0.9999;
 
 /// All records of one channel.
 #[derive(Debug, Default)]
@@ -32,7 +45,7 @@ pub(crate) struct ChannelFiles {
     ingress: Option<Vec<IngressRecord>>,
     follow_up: Option<Vec<FollowUpRecord>>,
     taken: Option<Vec<TakenRecord>>,
-    round_trips_ns: Vec<i64>,
+    round_trips: BTreeMap<(u32, u64), RoundTripRecord>,
     face_sent: Vec<FaceSentRecord>,
     face_received: Vec<FaceReceivedRecord>,
 }
@@ -41,7 +54,11 @@ pub(crate) struct ChannelFiles {
 #[derive(Debug, Default)]
 pub(crate) struct RunRecords {
     channels: BTreeMap<String, ChannelFiles>,
+    cards: BTreeMap<String, Vec<CardClockRecord>>,
     log: RunLog,
+    clocks: HostClocks,
+    /// Records of radios, by `<process>/<interface>`.
+    pub(super) radios: BTreeMap<String, Vec<RadioRecord>>,
     /// Files that could not be read, with the reason.
     pub(crate) problems: Vec<String>,
 }
@@ -55,6 +72,16 @@ impl RunRecords {
     }
 
     fn add(&mut self, file: &RecordFile) {
+        if file.header.kind == RecordKind::CardClock {
+            let card = self.cards.entry(file.header.channel.clone()).or_default();
+            card.extend(file.records::<CardClockRecord>());
+            return;
+        }
+        if file.header.kind == RecordKind::Radio {
+            let radio = self.radios.entry(file.header.channel.clone());
+            radio.or_default().extend(file.records::<RadioRecord>());
+            return;
+        }
         let channel = self
             .channels
             .entry(file.header.channel.clone())
@@ -66,9 +93,10 @@ impl RunRecords {
             RecordKind::Ingress => extend(&mut channel.ingress, file.records()),
             RecordKind::FollowUp => extend(&mut channel.follow_up, file.records()),
             RecordKind::RoundTrip => {
-                channel
-                    .round_trips_ns
-                    .extend(file.records::<[i64; 2]>().map(|[rtt, _]| rtt));
+                let records = file.records::<RoundTripRecord>();
+                // An exchange whose stamps were bettered later is there twice.
+                let of = |one: RoundTripRecord| ((one.session, one.sequence), one);
+                channel.round_trips.extend(records.map(of));
             }
             RecordKind::FaceSent => channel.face_sent.extend(file.records::<FaceSentRecord>()),
             RecordKind::FaceReceived => {
@@ -76,7 +104,22 @@ impl RunRecords {
                 channel.face_received.extend(records);
             }
             RecordKind::Message => file.append_messages(&mut self.log),
+            // They belong to no channel, see above.
+            RecordKind::CardClock | RecordKind::Radio => {}
         }
+    }
+
+    /// The clock of a card, as [`crate::card_clock`] names it; `None` when it was not read.
+    pub(super) fn card_timeline(&self, card: &str) -> Option<CardTimeline> {
+        self.cards.get(card).map(|pairs| CardTimeline::new(pairs))
+    }
+
+    /// What the gateways recorded of `channel`: what they sent and what they received.
+    pub(super) fn of_gateways(&self, channel: &str) -> (&[EgressRecord], &[IngressRecord]) {
+        let files = self.channels.get(channel);
+        let egress = files.and_then(|files| files.egress.as_deref());
+        let ingress = files.and_then(|files| files.ingress.as_deref());
+        (egress.unwrap_or_default(), ingress.unwrap_or_default())
     }
 
     /// See [`RunLog::set_clocks_differ`].
@@ -84,9 +127,64 @@ impl RunRecords {
         self.log.set_clocks_differ();
     }
 
+    /// Relates the hosts' clocks; until then none are aligned.
+    pub(super) fn set_clocks(&mut self, clocks: HostClocks) {
+        self.clocks = clocks;
+    }
+
+    /// How the hosts' clocks relate.
+    pub(super) const fn clocks(&self) -> &HostClocks {
+        &self.clocks
+    }
+
+    /// The clock exchanges of the gateways of `channel`.
+    pub(super) fn round_trips(&self, channel: &str) -> impl Iterator<Item = &RoundTripRecord> {
+        let files = self.channels.get(channel);
+        files
+            .into_iter()
+            .flat_map(|files| files.round_trips.values())
+    }
+
+    /// Real-time minus monotonic clock of `host` as its gateways noted it; `None` when none did, or
+    /// the clock was stepped.
+    pub(super) fn realtime_offset_ns(&self, topology: &Topology, host: &str) -> Option<i64> {
+        let is_here = |process: &str| {
+            topology
+                .process(process)
+                .is_some_and(|one| one.host == host)
+        };
+        let mut ends: Option<(i64, i64)> = None;
+        for channel in topology.channels() {
+            let Some(files) = self.channels.get(&channel.name) else {
+                continue;
+            };
+            let sent = files.egress.iter().flatten();
+            let sent = sent.map(|record| record.realtime_offset_ns);
+            let sent = sent.filter(|_| is_here(&channel.from));
+            let is_receiver = channel.to.as_deref().is_some_and(is_here);
+            let received = files.ingress.iter().flatten();
+            let received = received.map(|record| record.realtime_offset_ns);
+            let received = received.filter(|_| is_receiver);
+            for offset_ns in sent.chain(received) {
+                let (lowest, highest) = ends.unwrap_or((offset_ns, offset_ns));
+                ends = Some((lowest.min(offset_ns), highest.max(offset_ns)));
+            }
+        }
+        let (lowest, highest) = ends?;
+        let width_ns = highest.saturating_sub(lowest);
+        (width_ns <= ORDER_TOLERANCE_NS).then_some(lowest + width_ns / 2)
+    }
+
     /// True when anything was recorded of `channel`.
     pub(super) fn has(&self, channel: &str) -> bool {
         self.channels.contains_key(channel)
+    }
+
+    /// What the receiving gateway of `channel` noted of each datagram; empty when it left nothing.
+    pub(super) fn arrivals(&self, channel: &str) -> &[IngressRecord] {
+        let files = self.channels.get(channel);
+        let records = files.and_then(|files| files.ingress.as_deref());
+        records.unwrap_or_default()
     }
 
     /// Every message of the run.
@@ -130,6 +228,17 @@ impl RunRecords {
         self.consult((topology, result), channel, account)
     }
 
+    /// Where the messages of `channel` were stamped, and what the radio said of them.
+    pub(super) fn radio_figures(
+        &self,
+        run: (&Topology, &RunResult),
+        channel: &Channel,
+    ) -> (Option<TransmitStampFigures>, Option<RadioFigures>) {
+        self.consult(run, channel, |records, _| {
+            (records.egress.map(transmit_stamps), radio_figures(records))
+        })
+    }
+
     /// What became of the `wanted` messages of `channel`, by start of the producer and number.
     pub(super) fn stories(
         &self,
@@ -159,8 +268,23 @@ impl RunRecords {
         })
     }
 
+    /// What the link of `channel` did to every message.
+    ///
+    /// # Errors
+    /// When there are more than a trace holds.
+    pub(crate) fn link_trace(
+        &self,
+        run: (&Topology, &RunResult),
+        channel: &Channel,
+        traced: TraceChannel,
+    ) -> Result<Vec<TraceRecord>, TooManyMessages> {
+        self.consult(run, channel, |records, context| {
+            link_trace(records, context, traced)
+        })
+    }
+
     /// Asks something of the records of `channel` and of what the run knows about its way.
-    fn consult<T>(
+    pub(super) fn consult<T>(
         &self,
         (topology, result): (&Topology, &RunResult),
         channel: &Channel,
@@ -174,22 +298,31 @@ impl RunRecords {
             Some(RunSpan { start, end })
         };
         let crossing = topology.crossing(channel);
+        let cards_share_clock = crossing
+            .as_ref()
+            .is_some_and(|crossing| super::cards::share_a_clock(result, crossing));
         let path = if crossing.is_some() {
-            let alignment = result.has_one_clock.then_some(Alignment::SAME_CLOCK);
-            ChannelPath::Gateway { alignment }
+            let host_of = |process: Option<&str>| Some(&topology.process(process?)?.host);
+            let hosts = host_of(Some(&channel.from)).zip(host_of(channel.to.as_deref()));
+            hosts.map_or(ChannelPath::Gateway { alignment: None }, |(from, to)| {
+                self.clocks.path(from, to)
+            })
         } else {
             ChannelPath::SharedMemory
         };
         // A link that delays on purpose keeps messages under way for that much longer.
         let delay = crossing
-            .and_then(|crossing| crossing.impairment)
-            .map(|one| one.delay);
+            .and_then(|crossing| EmulationLaunch::of(&crossing, topology.run().seed))
+            .map(|emulation| emulation.flight_time(FLIGHT_QUANTILE));
+        let round_trips = files.round_trips.values();
+        let round_trips_ns: Vec<i64> = round_trips.map(RoundTripRecord::rtt_ns).collect();
         let context = AccountContext {
             interruptions: &interruptions,
             producer_run: span_of(&channel.from),
             consumer_run: channel.to.as_deref().and_then(span_of),
             flight_time_max: FLIGHT_TIME_MAX + delay.unwrap_or(Duration::ZERO),
-            round_trips_ns: &files.round_trips_ns,
+            cards_share_clock,
+            round_trips_ns: &round_trips_ns,
             seed: topology.run().seed,
             ..AccountContext::new(path)
         };

@@ -5,6 +5,7 @@ use std::hint::black_box;
 
 use super::{Finding, State};
 use crate::clock::MonotonicClock;
+use crate::clock_discipline::HostDiscipline;
 use crate::host_facts::{Fact, HostFiles};
 use crate::realtime::{ClockDiscipline, clock_discipline};
 
@@ -18,6 +19,7 @@ pub(crate) fn examine(files: &HostFiles) -> Vec<Finding> {
         clocksource(files),
         read_cost(cheapest_read_ns()),
         synchronisation(),
+        reference(),
     ]
 }
 
@@ -87,6 +89,32 @@ fn synchronisation() -> Finding {
     }
 }
 
+/// What one-way figures to another host could rest on besides clock exchanges.
+fn reference() -> Finding {
+    let (id, title) = ("clock_reference", "Reference of the time of day");
+    match HostDiscipline::gather() {
+        Ok(found) => judge_reference(&found),
+        Err(why) => Finding::unknown(id, title, &why),
+    }
+}
+
+fn judge_reference(found: &HostDiscipline) -> Finding {
+    let (id, title) = ("clock_reference", "Reference of the time of day");
+    if let Some((reference, bound_ns)) = found.reference.as_ref().zip(found.bound_ns) {
+        let value = format!("{reference}, within ±{} us", bound_ns.div_ceil(1_000));
+        return Finding::good(id, title, value).because(found.basis.clone());
+    }
+    Finding::note(id, title, found.basis.clone())
+        .because(
+            "the bound of one-way delays to another host is then half the smallest round trip of \
+             the gateways' clock exchanges, plus what the clocks may drift between them",
+        )
+        .fixed_by(
+            "keep both hosts on one reference with chronyd or ptp4l if that is not tight enough, \
+             best over a wired link",
+        )
+}
+
 fn judge_discipline(discipline: &ClockDiscipline) -> Finding {
     let (id, title) = ("clock_synchronisation", "Time of day against a reference");
     let value = format!(
@@ -140,6 +168,27 @@ mod tests {
             assert_eq!(read_cost(cost_ns).state, expected);
         }
         assert!(cheapest_read_ns() > 0.0);
+    }
+
+    #[test]
+    fn only_a_reference_with_a_bound_is_good() {
+        let mut found = HostDiscipline {
+            is_kernel_synchronised: true,
+            kernel_max_error_us: 0,
+            kernel_estimated_error_us: 0,
+            frequency_ppb: 0,
+            reference: None,
+            bound_ns: None,
+            basis: "neither chronyd nor ptp4l runs here".to_owned(),
+        };
+        let finding = judge_reference(&found);
+        assert_eq!(finding.state, State::Note);
+        assert_eq!(finding.value, found.basis);
+        found.reference = Some("ptp 00a069.fffe.0b552d".to_owned());
+        found.bound_ns = Some(9_620);
+        let finding = judge_reference(&found);
+        assert_eq!(finding.state, State::Good);
+        assert_eq!(finding.value, "ptp 00a069.fffe.0b552d, within ±10 us");
     }
 
     #[test]

@@ -5,11 +5,13 @@
 //! One file per subject: clocks, processors, privileges, wake-ups, shared memory and
 //! network; each is a function from the kernel's files to findings.
 
+mod card;
 mod clocks;
 mod finding;
 mod network;
 mod privileges;
 mod processors;
+mod radio;
 mod render;
 mod shared_memory;
 mod wakeup;
@@ -22,6 +24,7 @@ use serde::{Deserialize, Serialize};
 pub use self::finding::{Finding, State};
 pub use self::network::{StampCapabilities, StampCapabilityQuery};
 pub use self::wakeup::WakeupMeasurement;
+use crate::card_clock::probing::probe_card;
 use crate::host_facts::{HostFacts, HostFiles};
 
 /// What to examine.
@@ -89,11 +92,16 @@ impl DoctorReport {
 
 /// Examines this host. Takes [`DoctorRequest::wakeup_duration`] and a fraction of a second.
 ///
+/// A network card with a clock of its own is asked for stamps, sent a few datagrams through and put
+/// back as it was; that takes another half second for each.
+///
 /// `stamps` answers which timestamps an interface claims; the gateways own that system call.
 pub fn examine(request: &DoctorRequest, stamps: &dyn StampCapabilityQuery) -> DoctorReport {
     let files = &request.files;
     let mut findings = Vec::new();
     findings.extend(network::examine(files, &request.interfaces, stamps));
+    findings.extend(card::examine(&request.interfaces, stamps, &probe_card));
+    findings.extend(radio::examine(&request.interfaces));
     findings.extend(clocks::examine(files));
     findings.extend(processors::examine(files, &request.pinned_cpus));
     findings.extend(privileges::examine(files));

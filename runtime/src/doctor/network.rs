@@ -88,7 +88,7 @@ pub(crate) fn examine(
 }
 
 /// The interfaces of this network namespace with their flags, sorted by name.
-fn interfaces() -> Result<BTreeMap<String, InterfaceFlags>, String> {
+pub(super) fn interfaces() -> Result<BTreeMap<String, InterfaceFlags>, String> {
     let addresses = getifaddrs().map_err(|errno| format!("getifaddrs: {errno}"))?;
     Ok(addresses
         .map(|address| (address.interface_name, address.flags))
@@ -136,8 +136,8 @@ fn judge(finding: Finding, capabilities: StampCapabilities, is_wireless: bool) -
     if is_wireless {
         return worsen(finding)
             .because(
-                "wireless drivers give no software transmit stamp whatever they claim, so a report \
-                 shows the time from handing over to the receive stamp as one segment",
+                "wireless drivers stamp no departures whatever they claim, so a run asks for the \
+                 stamp before the queue instead and for the radio's acknowledgements",
             )
             .fixed_by("none needed; the report says which stamps there were");
     }

@@ -19,7 +19,8 @@ use super::{FaceError, Gate};
 use crate::channel::Domain;
 use crate::clock::MonotonicClock;
 use crate::gateway::GatewayError;
-use crate::gateway::process::{PROBE_BOUND, arm_and_describe, wait_until_open};
+use crate::gateway::arming::arm_and_describe;
+use crate::gateway::process::{PROBE_BOUND, wait_until_open};
 use crate::gateway::socket::timestamp_mode;
 use crate::process::launch::read;
 use crate::process::pipe::{ChannelProgress, FaceReport, FromProcess, Orders, ProcessReport, say};
@@ -51,7 +52,7 @@ fn prepare_and_live(path: &Path) -> Result<(), FaceError> {
     let domain = Arc::new(Domain::open(&launch.domain.parse()?)?);
     let gate = Arc::new(Gate::default());
     // Held until the end, so that the kernel never switches receive stamps off in between.
-    let (_sentinel, stamp_facts) = arm_and_describe(probe_settings(&launch));
+    let armed = arm_and_describe(probe_settings(&launch));
     let mut recorder = Recorder::new(&launch.records, &launch.process, launch.instance);
     let mut opened = Vec::new();
     for arm in &launch.face.arms {
@@ -81,7 +82,7 @@ fn prepare_and_live(path: &Path) -> Result<(), FaceError> {
     }
     gate.close();
     let spare_report = spare.join().map_err(|_panic| GatewayError::Panicked)?;
-    finish(threads, recorder, &stamp_facts).and(spare_report)
+    finish(threads, recorder, &armed.facts).and(spare_report)
 }
 
 fn probe_settings(launch: &FaceLaunch) -> Option<ProbeSettings> {

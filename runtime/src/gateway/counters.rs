@@ -1,6 +1,7 @@
 //! The counters of one channel direction under the names a report prints. It counts nothing itself.
 
 use hil_gateways::protocol::{PeerState, RefusalCounts};
+use hil_gateways::transport::ReceiverCounters;
 
 use super::egress::Egress;
 use super::ingress::Ingress;
@@ -57,6 +58,21 @@ fn refusals(counts: &RefusalCounts) -> impl Iterator<Item = (String, u64)> {
     named("refused: ", counts.iter())
 }
 
+/// Whether the sender's mark survived the way; `None` where nothing arrived to tell.
+pub(super) fn mark_fact(dscp: u8, counters: &ReceiverCounters) -> Option<(String, String)> {
+    let (kept, changed) = (counters.mark_kept_count, counters.mark_changed_count);
+    let text = match (kept, changed, counters.newest_other_dscp) {
+        (0, 0, _) => return None,
+        (_, 0, _) => format!("dscp {dscp} on all {kept} datagrams that arrived"),
+        (_, _, other) => {
+            let other = other.map_or_else(String::new, |dscp| format!(" (the newest {dscp})"));
+            let total = kept + changed;
+            format!("{changed} of {total} datagrams arrived with another dscp than {dscp}{other}")
+        }
+    };
+    Some(("mark".to_owned(), text))
+}
+
 /// Everything a sending direction counted.
 pub(super) fn of_egress(egress: &Egress) -> Vec<(String, u64)> {
     let steps = ("clock_step_count", egress.line.clock_step_count());
@@ -80,4 +96,22 @@ pub(super) fn of_ingress(ingress: &Ingress) -> Vec<(String, u64)> {
         .chain(named("", [steps, foreign]))
         .chain(refusals(bridge.refusals()))
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_mark_is_kept_changed_or_unknown() {
+        let mut counters = ReceiverCounters::default();
+        assert_eq!(mark_fact(46, &counters), None);
+        counters.mark_kept_count = 9;
+        let words = |counters: &ReceiverCounters| mark_fact(46, counters).unwrap().1;
+        assert_eq!(words(&counters), "dscp 46 on all 9 datagrams that arrived");
+        counters.mark_changed_count = 1;
+        counters.newest_other_dscp = Some(0);
+        let expected = "1 of 10 datagrams arrived with another dscp than 46 (the newest 0)";
+        assert_eq!(words(&counters), expected);
+    }
 }

@@ -8,14 +8,15 @@ use std::time::Duration;
 
 use hil_gateways::protocol::{EgressBridge, EgressSettings, IngressBridge, IngressSettings};
 use hil_gateways::transport::tcp::ConnectionTally;
-use hil_gateways::transport::timestamping::TimestampMode;
 use hil_gateways::transport::{DatagramReceiver, DatagramSender};
-use hil_models::measure::record::{EgressRecord, FollowUpRecord, IngressRecord};
+use hil_models::measure::record::{EgressRecord, FollowUpRecord, IngressRecord, RoundTripRecord};
 
-use super::egress::{Armed, Attention, Egress, Line};
+use super::egress::{Attention, Egress};
 use super::ingress::{Ingress, Notes};
 use super::kernel_clock::KernelClock;
+use super::line::Line;
 use super::socket::{Ends, OpenSocket, stamps_of};
+use super::stamp_plan::StampPlan;
 use super::{GatewayError, Surroundings};
 use super::{counters, stream};
 use crate::channel::{RawInput, RawOutput, Waiter};
@@ -39,6 +40,7 @@ pub struct Opened {
     sinks: Sinks,
     count: Arc<AtomicU64>,
     is_established: Arc<AtomicBool>,
+    plan: StampPlan,
 }
 
 /// A direction at work.
@@ -64,13 +66,28 @@ pub fn open<'a>(
     recorder: &mut Recorder,
     start: &RunStart,
 ) -> Result<(&'a DirectionLaunch, Opened), GatewayError> {
+    let plan = StampPlan::asked(stamps_of(&launch.socket));
+    open_with(launch, recorder, start, plan)
+}
+
+/// As [`open`], with what a probe found of the interface.
+///
+/// # Errors
+/// As [`open`].
+pub fn open_with<'a>(
+    launch: &'a DirectionLaunch,
+    recorder: &mut Recorder,
+    start: &RunStart,
+    plan: StampPlan,
+) -> Result<(&'a DirectionLaunch, Opened), GatewayError> {
     let sinks = open_sinks(launch, recorder)?;
-    let socket = OpenSocket::open(launch, start)?;
+    let socket = OpenSocket::open(launch, start, plan)?;
     Ok((
         launch,
         Opened {
             socket,
             sinks,
+            plan,
             count: Arc::default(),
             // A receiver has nobody to wait for: it takes what comes.
             is_established: Arc::new(AtomicBool::new(launch.side == Side::Ingress)),
@@ -84,7 +101,7 @@ fn open_sinks(launch: &DirectionLaunch, recorder: &mut Recorder) -> Result<Sinks
     Ok(match launch.side {
         Side::Egress => (
             sink(RecordKind::Egress, size_of::<EgressRecord>())?,
-            sink(RecordKind::RoundTrip, 2 * size_of::<i64>())?,
+            sink(RecordKind::RoundTrip, size_of::<RoundTripRecord>())?,
         ),
         Side::Ingress => (
             sink(RecordKind::Ingress, size_of::<IngressRecord>())?,
@@ -124,7 +141,7 @@ impl Opened {
                 (sender, datagram_bytes_max),
                 self.sinks,
                 (self.count, self.is_established),
-                (launch, surroundings),
+                (launch, surroundings, self.plan),
             )?)),
             Ends::Receiver(receiver) => Way::Ingress(Box::new(ingress(
                 receiver,
@@ -141,7 +158,7 @@ fn egress(
     (sender, datagram_max_bytes): (Box<dyn DatagramSender>, usize),
     sinks: Sinks,
     (count, is_established): (Arc<AtomicU64>, Arc<AtomicBool>),
-    (launch, around): (&DirectionLaunch, &Surroundings),
+    (launch, around, plan): (&DirectionLaunch, &Surroundings, StampPlan),
 ) -> Result<Egress, GatewayError> {
     let bridge = EgressBridge::new(EgressSettings {
         channel: Surroundings::identity(launch),
@@ -151,11 +168,6 @@ fn egress(
         datagram_max_bytes,
         sync_period: SYNC_PERIOD,
     })?;
-    let mode = stamps_of(&launch.socket);
-    let armed = Armed {
-        software: mode != TimestampMode::Off,
-        hardware: mode == TimestampMode::Hardware,
-    };
     let waiter = (launch.wait != WaitMode::Spin)
         .then(|| Waiter::open(&around.domain, &[launch.channel.as_str()]))
         .transpose()?;
@@ -163,7 +175,7 @@ fn egress(
         input: RawInput::open(&around.domain, &launch.channel, launch.depth)?,
         waiter,
         bridge,
-        line: Line::new(sender, sinks, around.session, armed)?,
+        line: Line::new(sender, sinks, around.session, plan)?,
         wait: WaitStrategy::new(launch.wait),
         sent: count,
         stop: Arc::clone(&around.stop),
@@ -201,6 +213,7 @@ fn ingress(
         stop: Arc::clone(&around.stop),
         foreign_count: 0,
         clock: KernelClock::read()?,
+        response: None,
         buffer: vec![0; usize::from(u16::MAX)].into_boxed_slice(),
     })
 }
@@ -257,6 +270,12 @@ impl Direction {
             ),
         };
         let mut facts = self.facts.clone();
+        if let Way::Ingress(ingress) = &self.way
+            && launch.socket.dscp > 0
+        {
+            let counters = ingress.receiver.counters();
+            facts.extend(counters::mark_fact(launch.socket.dscp, &counters));
+        }
         if let Some(figures) = stream {
             counters.extend(stream::counters(&figures));
             facts.extend(stream::facts(&figures, launch.side));

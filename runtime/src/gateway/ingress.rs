@@ -7,6 +7,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use hil_gateways::protocol::ingress::{FollowUp, MessageInfo};
 use hil_gateways::protocol::sequence::Order;
+use hil_gateways::protocol::wire::Kind;
 use hil_gateways::protocol::{Delivery, Disposition, IngressBridge};
 use hil_gateways::transport::{DatagramReceiver, Received};
 use hil_models::measure::record::{FollowUpRecord, IngressRecord, UNAVAILABLE};
@@ -18,7 +19,7 @@ use super::{GatewayError, poll_descriptors};
 use crate::channel::{ChannelError, RawOutput};
 use crate::clock::MonotonicClock;
 use crate::record::RecordSink;
-use crate::wait::{Pause, WaitStrategy};
+use crate::wait::{Pause, WaitStrategy, release};
 
 /// Everything the thread works with.
 #[derive(Debug)]
@@ -36,7 +37,16 @@ pub(crate) struct Ingress {
     /// Datagrams from an address that is not the peer's, dropped unread.
     pub(crate) foreign_count: u64,
     pub(crate) clock: KernelClock,
+    /// The clock response whose departure the kernel is to stamp.
+    pub(crate) response: Option<Response>,
     pub(crate) buffer: Box<[u8]>,
+}
+
+/// A clock response that left.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Response {
+    sequence: u64,
+    handed: Instant,
 }
 
 /// Where the thread's records go.
@@ -56,6 +66,7 @@ struct Arrival {
 
 impl Arrival {
     fn record(&self, message: &MessageInfo, forwarded_ns: i64, flags: u32) -> IngressRecord {
+        let emulated = self.received.emulated;
         IngressRecord {
             sequence: message.sequence,
             published_ns: message.published.as_ns(),
@@ -65,6 +76,8 @@ impl Arrival {
             received_ns: self.at.as_ns(),
             forwarded_ns,
             realtime_offset_ns: self.offset_ns,
+            emulated_ns: emulated.map_or(UNAVAILABLE, |delay| delay.arrived.as_ns()),
+            due_ns: emulated.map_or(UNAVAILABLE, |delay| delay.due.as_ns()),
             epoch: message.epoch,
             session: message.session,
             flags,
@@ -100,6 +113,7 @@ impl Ingress {
         }
         let now = MonotonicClock::now();
         self.bridge.on_wakeup(now);
+        self.take_response_stamp(now);
         self.receiver.attend(now);
         self.clock.refresh(now);
         Ok(false)
@@ -157,17 +171,53 @@ impl Ingress {
 
     /// Sends the replies that are due; a reply that cannot leave is counted by the transport.
     fn answer(&mut self) {
-        while let Some(reply) = self.bridge.poll_transmit(MonotonicClock::now()) {
+        loop {
+            let now = MonotonicClock::now();
+            let Some(reply) = self.bridge.poll_transmit(now) else {
+                return;
+            };
             let to = reply.destination.unwrap_or(self.peer);
-            let _counted = self.receiver.reply(reply.datagram, to).is_err();
+            if reply.kind != Kind::SyncResponse {
+                let _counted = self.receiver.reply(reply.datagram, to).is_err();
+                continue;
+            }
+            let sent = self.receiver.reply_stamped(now, reply.datagram, to);
+            self.response = sent.is_ok().then_some(Response {
+                sequence: reply.sequence,
+                handed: now,
+            });
+            self.take_response_stamp(now);
+        }
+    }
+
+    /// Takes the kernel's stamp of the newest clock response, if it has come; it rides on the next.
+    fn take_response_stamp(&mut self, now: Instant) {
+        let Some(realtime_ns) = self.receiver.take_reply_stamp(now) else {
+            return;
+        };
+        if let Some(response) = self.response.take() {
+            let left_ns = realtime_ns - self.clock.offset_ns();
+            self.bridge.on_transmit_stamp(
+                Kind::SyncResponse,
+                response.sequence,
+                left_ns.saturating_sub(response.handed.as_ns()),
+            );
         }
     }
 
     /// Waits for a datagram or an appointment.
     pub(crate) fn rest(&mut self) -> Result<(), GatewayError> {
-        let dues = [self.bridge.next_wakeup(), self.receiver.next_due()];
-        let due = dues.into_iter().flatten().min();
-        match self.wait.pause(MonotonicClock::now(), due) {
+        let now = MonotonicClock::now();
+        let due = self.receiver.next_due();
+        let pause = if self.is_emulated {
+            // A link model's delay is a promise; the bridge's appointments are not.
+            let pause = self.wait.pause(now, self.bridge.next_wakeup());
+            due.map_or(pause, |due| pause.sooner(release(now, due)))
+        } else {
+            let dues = [self.bridge.next_wakeup(), due];
+            self.wait.pause(now, dues.into_iter().flatten().min())
+        };
+        match pause {
             Pause::Spin => core::hint::spin_loop(),
             Pause::Sleep(until) => {
                 poll_descriptors(self.receiver.poll_fd().into_iter(), until)?;

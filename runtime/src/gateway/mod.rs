@@ -6,14 +6,17 @@
 //! - [`direction`]: one direction from its launch description to its final counters.
 //! - `egress`: shared memory to network; `ingress`: network to shared memory.
 
+pub(crate) mod arming;
 mod connection;
 mod counters;
 pub mod direction;
 pub(crate) mod egress;
 pub(crate) mod ingress;
 pub(crate) mod kernel_clock;
+mod line;
 pub(crate) mod process;
 pub(crate) mod socket;
+pub mod stamp_plan;
 mod stream;
 
 use std::fs::File;
@@ -25,7 +28,6 @@ use std::sync::atomic::AtomicBool;
 use hil_gateways::protocol::body::HelloStatus;
 use hil_gateways::protocol::{ChannelIdentity, SettingsError};
 use hil_gateways::transport::udp::UdpError;
-use hil_models::case_study::ParameterError;
 use hil_models::time::Instant;
 use nix::errno::Errno;
 use nix::poll::{PollFd, PollFlags, ppoll};
@@ -33,7 +35,7 @@ use nix::sys::time::TimeSpec;
 
 use crate::channel::{ChannelError, Domain, DomainError, clock_id};
 use crate::clock::MonotonicClock;
-use crate::process::launch::{DirectionLaunch, LaunchError};
+use crate::process::launch::{DirectionLaunch, EmulationError, LaunchError};
 use crate::record::RecordFileError;
 
 /// Why a gateway cannot go on.
@@ -57,9 +59,9 @@ pub enum GatewayError {
     /// The bridge refused its settings.
     #[error(transparent)]
     Settings(#[from] SettingsError),
-    /// A link model refused its parameters.
+    /// A link model refused its parameters or its trace.
     #[error("emulated link: {0}")]
-    Emulation(#[from] ParameterError),
+    Emulation(#[from] EmulationError),
     /// The clocks.
     #[error("cannot read the clocks: {0}")]
     Clock(io::Error),

@@ -10,25 +10,19 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use hil_gateways::transport::probe::{
-    Availability, ProbeReport, ProbeSettings, Sentinel, arm_and_probe,
-};
-use hil_gateways::transport::timestamping::{HardwareStamping, TimestampMode};
-
 use super::connection::Connection;
 use super::direction::{self, Opened};
-use super::socket::stamps_of;
-use super::{GatewayError, Surroundings};
+use super::{GatewayError, Surroundings, arming};
 use crate::channel::Domain;
 use crate::clock::MonotonicClock;
-use crate::process::launch::{DirectionLaunch, GatewayLaunch, Side, Transport, read};
+use crate::process::launch::{DirectionLaunch, GatewayLaunch, Side, read};
 use crate::process::pipe::{
     ChannelProgress, DirectionReport, FromProcess, Orders, ProcessReport, say,
 };
 use crate::process::usage::add_usage;
+use crate::radio::sampler::Sampler;
 use crate::realtime::{self, RealtimeGrant, SpinAdvice};
 use crate::record::Recorder;
-use crate::topology::Timestamps;
 use crate::wait::WaitMode;
 
 const PROGRESS_PERIOD: Duration = Duration::from_millis(250);
@@ -54,19 +48,22 @@ fn prepare_and_live(path: &Path) -> Result<(), GatewayError> {
     let launch: GatewayLaunch = read(path)?;
     let domain = Domain::open(&launch.domain.parse()?)?;
     let surroundings = Arc::new(Surroundings::new(domain)?);
-    // Held until the end, so that the kernel never switches receive stamps off in between.
-    let (_sentinel, stamp_facts) = arm_stamps(&launch);
+    let mut armed = arming::arm(&launch);
     warn_of_shared_cpus(&launch);
     let mut recorder = Recorder::new(&launch.records, &launch.process, launch.instance);
     let mut opened = Vec::new();
     for direction in &launch.directions {
-        opened.push(direction::open(
+        opened.push(direction::open_with(
             direction,
             &mut recorder,
             &orders.run_start(),
+            armed.plan(direction),
         )?);
     }
+    let sampler = armed.prepare_sampler(&launch.process, &mut recorder);
     recorder.start().map_err(GatewayError::Thread)?;
+    let stop = Arc::clone(&surroundings.stop);
+    let sampler = sampler.map(|one| one.start(stop)).transpose()?;
     let counters: Vec<Counter> = opened
         .iter()
         .map(|(launch, one)| counter(launch, one))
@@ -92,7 +89,8 @@ fn prepare_and_live(path: &Path) -> Result<(), GatewayError> {
         watch(&orders, &threads, (&counters, &established), &mut watched);
     }
     surroundings.stop.store(true, Ordering::Release);
-    finish(threads, recorder, &stamp_facts)
+    armed.facts.extend(sampler.map(Sampler::finish));
+    finish(threads, recorder, &armed.facts)
 }
 
 /// Says when every direction is ready and how many messages passed, until told to stop or a
@@ -268,71 +266,4 @@ fn warn_of_shared_cpus(launch: &GatewayLaunch) {
         );
         say(&FromProcess::Warning(text));
     }
-}
-
-/// Switches kernel stamps on and finds out whether they really come.
-fn arm_stamps(launch: &GatewayLaunch) -> (Option<Sentinel>, Vec<(String, String)>) {
-    let mut sockets = launch.directions.iter().map(|one| one.socket.transport);
-    if sockets.any(|transport| transport == Transport::Tcp) {
-        let why = "unavailable over TCP: the kernel stamps bytes of a stream, not messages";
-        return (None, vec![("kernel stamps".to_owned(), why.to_owned())]);
-    }
-    let mut directions = launch.directions.iter();
-    let stamped = directions.find(|one| one.socket.timestamps != Timestamps::Off);
-    arm_and_describe(stamped.map(|direction| ProbeSettings {
-        timestamps: stamps_of(&direction.socket),
-        interface: direction.socket.interface.clone(),
-        transmit_target: Some(direction::probe_target(direction)),
-        proof_count: 5,
-        bound: PROBE_BOUND,
-    }))
-}
-
-/// As [`arm_stamps`], of what is to be probed; `None` where no stamps are asked for.
-pub(crate) fn arm_and_describe(
-    settings: Option<ProbeSettings>,
-) -> (Option<Sentinel>, Vec<(String, String)>) {
-    let fact = |text: String| vec![("kernel stamps".to_owned(), text)];
-    let Some(settings) = settings else {
-        return (None, fact("switched off in the topology".to_owned()));
-    };
-    let card = (settings.timestamps == TimestampMode::Hardware)
-        .then(|| switch_card_on(settings.interface.as_deref()));
-    match arm_and_probe(&settings) {
-        Ok((report, sentinel)) => {
-            let mut facts = fact(describe_probe(&report));
-            facts.extend(card.map(|text| ("network card stamps".to_owned(), text)));
-            (Some(sentinel), facts)
-        }
-        Err(error) => (None, fact(format!("unavailable: {error}"))),
-    }
-}
-
-/// A card stamps nothing until it is told to; says what it settled for.
-fn switch_card_on(interface: Option<&str>) -> String {
-    let Some(interface) = interface else {
-        return "unavailable: the host names no interface in the topology".to_owned();
-    };
-    match HardwareStamping::request(interface) {
-        Ok(settled) => format!(
-            "switched on for {interface}: transmit {}, receive filter {}",
-            settled.is_transmit_on, settled.receive_filter
-        ),
-        Err(error) => format!("unavailable: {interface} cannot be switched on: {error}"),
-    }
-}
-
-fn describe_probe(report: &ProbeReport) -> String {
-    let word = |availability| match availability {
-        Availability::Seen => "seen",
-        Availability::ClaimedButNotSeen => "claimed by the driver, not seen",
-        Availability::NotOffered => "unavailable",
-    };
-    format!(
-        "probe of {:.1} ms: receive software {}, transmit software {}, transmit hardware {}",
-        report.waited_ns as f64 * 1e-6,
-        word(report.rx_software),
-        word(report.tx_software),
-        word(report.tx_hardware)
-    )
 }

@@ -1,6 +1,7 @@
 //! The socket of one channel direction: opened as its launch description says, behind a link model
 //! where it has one, with what the kernel granted. It moves no message.
 
+use std::fs;
 use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::Duration;
@@ -14,20 +15,23 @@ use hil_gateways::transport::tcp::{
 use hil_gateways::transport::timestamping::TimestampMode;
 use hil_gateways::transport::udp::{GrantedOptions, PathMtu, UdpReceiver, UdpSender, UdpSettings};
 use hil_gateways::transport::{DatagramReceiver, DatagramSender};
-use hil_models::link::{Fate, LinkModel};
+use hil_models::link::{Fate, LinkModel, LossCauses};
 use hil_models::time::Instant;
 
 use super::GatewayError;
+use super::stamp_plan::StampPlan;
 use crate::clock::MonotonicClock;
-use crate::process::launch::{DirectionLaunch, EmulationLaunch, Side, SocketLaunch, Transport};
+use crate::process::emulation_room::EmulationRoom;
+use crate::process::launch::{
+    DirectionLaunch, EmulationError, EmulationLaunch, Side, SocketLaunch, Transport,
+};
 use crate::process::pipe::RunStart;
+use crate::radio::category;
 use crate::topology::Timestamps;
 
 /// IP and UDP headers of a datagram.
 const IPV4_HEADERS: usize = 20 + 8;
 const IPV6_HEADERS: usize = 40 + 8;
-/// Most datagrams an emulated link holds during an outage.
-const HELD_COUNT_MAX: usize = 16_384;
 
 /// A direction's socket and what is known of it.
 #[derive(Debug)]
@@ -48,23 +52,30 @@ pub(super) enum Ends {
 
 impl OpenSocket {
     /// Opens it; call it from a thread of normal priority.
-    pub(super) fn open(launch: &DirectionLaunch, start: &RunStart) -> Result<Self, GatewayError> {
-        let settings = udp_settings(launch);
+    pub(super) fn open(
+        launch: &DirectionLaunch,
+        start: &RunStart,
+        plan: StampPlan,
+    ) -> Result<Self, GatewayError> {
+        let settings = udp_settings(launch, plan);
         match launch.socket.transport {
-            Transport::Udp => Self::open_udp(&settings, launch, start),
+            Transport::Udp => Self::open_udp(&settings, (launch, plan), start),
             Transport::Tcp => Self::open_tcp(&settings, launch),
         }
     }
 
     fn open_udp(
         settings: &UdpSettings,
-        launch: &DirectionLaunch,
+        (launch, plan): (&DirectionLaunch, StampPlan),
         start: &RunStart,
     ) -> Result<Self, GatewayError> {
         let (ends, mut facts) = match launch.side {
             Side::Egress => {
                 let sender = UdpSender::open(settings)?;
                 let mut facts = socket_facts(settings, sender.granted());
+                if plan.asks_radio {
+                    facts.push(access_category(sender.granted()));
+                }
                 let mtu = sender.path_mtu();
                 let configured = launch.socket.path_mtu_bytes;
                 let text = format!("{} bytes, {configured} configured", mtu.packet_bytes);
@@ -83,6 +94,10 @@ impl OpenSocket {
                 "link model behind the socket, part of RX stamp → received by gateway".to_owned(),
                 emulation.describe(),
             ));
+            if launch.side == Side::Ingress {
+                let room = room(emulation, launch)?;
+                facts.push(("room of the link model".to_owned(), room.to_string()));
+            }
         }
         Ok(Self {
             ends,
@@ -127,7 +142,7 @@ impl OpenSocket {
     }
 }
 
-fn udp_settings(launch: &DirectionLaunch) -> UdpSettings {
+fn udp_settings(launch: &DirectionLaunch, plan: StampPlan) -> UdpSettings {
     let socket = &launch.socket;
     UdpSettings {
         local: launch.local,
@@ -138,7 +153,8 @@ fn udp_settings(launch: &DirectionLaunch) -> UdpSettings {
         priority: socket.priority,
         send_buffer_bytes: Some(socket.send_buffer_bytes),
         receive_buffer_bytes: Some(socket.receive_buffer_bytes),
-        timestamps: stamps_of(socket),
+        timestamps: plan.mode,
+        wants_radio_reports: plan.asks_radio,
     }
 }
 
@@ -157,6 +173,13 @@ pub(crate) const fn timestamp_mode(asked: Timestamps) -> TimestampMode {
         Timestamps::Software => TimestampMode::Software,
         Timestamps::Hardware => TimestampMode::Hardware,
     }
+}
+
+/// Where this direction stands when stations contend for the air.
+fn access_category(granted: GrantedOptions) -> (String, String) {
+    let release = fs::read_to_string("/proc/sys/kernel/osrelease").unwrap_or_default();
+    let text = category::describe(granted.priority, granted.dscp, release.trim());
+    ("access category".to_owned(), text)
 }
 
 fn socket_facts(settings: &UdpSettings, granted: GrantedOptions) -> Vec<(String, String)> {
@@ -184,23 +207,18 @@ fn socket_facts(settings: &UdpSettings, granted: GrantedOptions) -> Vec<(String,
     facts
 }
 
-/// Room for everything that is under way at once, up to 4000 datagrams per second, and for what
-/// eight mean outages hold back of 1000 per second.
-fn emulated_capacity(emulation: &EmulationLaunch) -> usize {
-    let outages = &emulation.outages;
-    let held_s = if outages.is_active() && outages.buffered {
-        8.0 * outages.mean_s
-    } else {
-        0.0
-    };
-    #[expect(
-        clippy::cast_possible_truncation,
-        clippy::cast_sign_loss,
-        reason = "a checked mean is at most an hour, and what is above the bound is cut"
-    )]
-    let held_count = ((1000.0 * held_s) as usize).min(HELD_COUNT_MAX);
-    let under_way = emulation.delay.as_millis() as usize * 4;
-    EmulatedSettings::default().capacity_count + under_way + held_count
+fn room(
+    emulation: &EmulationLaunch,
+    launch: &DirectionLaunch,
+) -> Result<EmulationRoom, EmulationError> {
+    Ok(emulation.room(launch.size_bytes)?)
+}
+
+/// The longest datagram of the channel: as long as a message needs, with room for the greetings and
+/// clock exchanges that share its socket, and no longer than the path takes.
+fn held_bytes_max(launch: &DirectionLaunch) -> usize {
+    let message = launch.size_bytes + wire::HEADER_BYTES + wire::TAG_BYTES;
+    message.max(512).min(launch.socket.path_mtu_bytes)
 }
 
 /// Puts the receiver behind the launch's link model, if it has one. Greetings and clock exchanges
@@ -218,9 +236,10 @@ fn emulate(
         start: start.clone(),
     };
     let settings = EmulatedSettings {
-        capacity_count: emulated_capacity(emulation),
-        datagram_bytes_max: launch.socket.path_mtu_bytes,
+        capacity_count: room(emulation, launch)?.capacity_count,
+        datagram_bytes_max: held_bytes_max(launch),
         clock: Some(MonotonicClock::now),
+        number_of: Some(message_number),
     };
     let is_exempt =
         |bytes: &[u8]| wire::decode(bytes).is_ok_and(|datagram| datagram.header.kind != Kind::Data);
@@ -232,6 +251,12 @@ fn emulate(
     )))
 }
 
+/// Which message of its channel a datagram carries, or a part of.
+fn message_number(bytes: &[u8]) -> Option<u64> {
+    let header = wire::decode(bytes).ok()?.header;
+    (header.kind == Kind::Data).then_some(header.sequence)
+}
+
 /// A link on a clock that reads zero when the run starts, as it does in virtual time; before the
 /// start it stands still. A gateway that is started again thus goes on where it was.
 #[derive(Debug)]
@@ -240,17 +265,38 @@ struct SinceStart<L> {
     start: RunStart,
 }
 
-impl<L: LinkModel> LinkModel for SinceStart<L> {
-    fn offer(&mut self, now: Instant, length_bytes: usize) -> Fate {
+impl<L: LinkModel> SinceStart<L> {
+    /// Asks the link on its own clock.
+    fn ask(&mut self, now: Instant, offer: impl FnOnce(&mut L, Instant) -> Fate) -> Fate {
         let elapsed = self
             .start
             .get()
             .map_or(Duration::ZERO, |start| now.saturating_duration_since(start));
         let offered = Instant::ZERO + elapsed;
-        match self.link.offer(offered, length_bytes) {
+        match offer(&mut self.link, offered) {
             Fate::Delivered(at) => Fate::Delivered(now + at.saturating_duration_since(offered)),
+            Fate::Duplicated { first, second } => Fate::Duplicated {
+                first: now + first.saturating_duration_since(offered),
+                second: now + second.saturating_duration_since(offered),
+            },
             Fate::Lost => Fate::Lost,
         }
+    }
+}
+
+impl<L: LinkModel> LinkModel for SinceStart<L> {
+    fn loss_causes(&self) -> Option<LossCauses> {
+        self.link.loss_causes()
+    }
+
+    fn offer(&mut self, now: Instant, length_bytes: usize) -> Fate {
+        self.ask(now, |link, at| link.offer(at, length_bytes))
+    }
+
+    fn offer_numbered(&mut self, now: Instant, length_bytes: usize, number: u64) -> Fate {
+        self.ask(now, |link, at| {
+            link.offer_numbered(at, length_bytes, number)
+        })
     }
 }
 
@@ -270,21 +316,26 @@ fn datagram_bytes_max(launch: &DirectionLaunch, path: PathMtu) -> usize {
 #[cfg(test)]
 mod tests {
     use hil_models::link::outages::{Outage, OutageSchedule, Outages};
+    use hil_models::link::spec::{LinkSpec, Way};
     use hil_models::random::RandomStream;
 
     use super::*;
 
     fn emulation(per_hour: f64) -> EmulationLaunch {
+        let outages = Outages {
+            mean_s: 0.5,
+            per_hour,
+            buffered: false,
+        };
         EmulationLaunch {
-            delay: Duration::from_millis(5),
-            loss_ratio: 0.0,
-            outages: Outages {
-                mean_s: 0.5,
-                per_hour,
-                buffered: false,
+            spec: LinkSpec {
+                outages,
+                ..LinkSpec::fixed(Duration::from_millis(5), 0.0)
             },
             link: "hop".to_owned(),
+            way: Way::Forward,
             seed: 3,
+            trace: None,
         }
     }
 
@@ -336,20 +387,9 @@ mod tests {
             let name = format!("links.{link}.outages");
             let stream = RandomStream::new(emulation.seed, &name);
             let mut schedule =
-                OutageSchedule::new(emulation.outages, stream, Instant::ZERO).unwrap();
+                OutageSchedule::new(emulation.spec.outages, stream, Instant::ZERO).unwrap();
             schedule.next().unwrap()
         };
         assert_ne!(first("hop"), first("wire"));
-    }
-
-    #[test]
-    fn a_held_outage_has_room_and_none_has_more_than_the_bound() {
-        let mut held = emulation(100.0);
-        let lossy = emulated_capacity(&held);
-        assert_eq!(lossy, 1024 + 20);
-        held.outages.buffered = true;
-        assert_eq!(emulated_capacity(&held), lossy + 4_000);
-        held.outages.mean_s = 30.0;
-        assert_eq!(emulated_capacity(&held), lossy + HELD_COUNT_MAX);
     }
 }

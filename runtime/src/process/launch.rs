@@ -8,16 +8,15 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use hil_models::case_study::ParameterError;
-use hil_models::link::bernoulli::BernoulliLink;
-use hil_models::link::in_series::InSeries;
-use hil_models::link::outages::{OutageLink, Outages};
-use hil_models::random::RandomStream;
-use hil_models::time::Instant;
+use hil_models::link::LinkModel;
+use hil_models::link::spec::{LinkPlace, LinkSpec, Way};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
+use super::emulation_room::EmulationRoom;
 use crate::realtime::RealtimeRequest;
-use crate::topology::Timestamps;
+use crate::topology::{Crossing, Direction, Timestamps};
+use crate::trace::source::{TraceFileError, TraceLaunch};
 use crate::wait::WaitMode;
 
 /// How to start one component here.
@@ -130,68 +129,101 @@ pub struct SocketLaunch {
     pub timestamps: Timestamps,
 }
 
-/// A static link model (seed paper, section II.B), and outages.
+/// A link model in front of a receiver: what makes it the same model live and in virtual time.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EmulationLaunch {
-    /// Fixed one-way delay.
-    pub delay: Duration,
-    /// Probability of a loss, 0..=1.
-    pub loss_ratio: f64,
-    /// When nothing gets through.
-    pub outages: Outages,
-    /// Name of the link: its outages are those of all its channels, both ways.
+    /// What the link does in this direction.
+    pub spec: LinkSpec,
+    /// Name of the link: what all its channels share, they share by it.
     pub link: String,
+    /// Which way on it.
+    pub way: Way,
     /// Seed of the run.
     pub seed: u64,
+    /// A recorded trace; with it the channel meets nothing of `spec`.
+    pub trace: Option<TraceLaunch>,
+}
+
+/// Why a link cannot be emulated.
+#[derive(Debug, thiserror::Error)]
+pub enum EmulationError {
+    /// A number is outside its range.
+    #[error(transparent)]
+    Parameter(#[from] ParameterError),
+    /// The trace cannot be replayed.
+    #[error(transparent)]
+    Trace(#[from] TraceFileError),
 }
 
 impl EmulationLaunch {
-    /// The model of one channel, on a clock that reads zero when the run starts: live and in
-    /// virtual time the same.
+    /// What the link of `crossing` does to it; `None` on a real hop.
+    pub fn of(crossing: &Crossing<'_>, seed: u64) -> Option<Self> {
+        Some(Self {
+            spec: crossing.spec?.clone(),
+            link: crossing.link.name.clone(),
+            way: match crossing.direction {
+                Direction::Forward => Way::Forward,
+                Direction::Backward => Way::Backward,
+            },
+            seed,
+            trace: crossing
+                .link
+                .emulation()
+                .and_then(|emulation| emulation.trace.as_ref()?.launch(&crossing.channel.name)),
+        })
+    }
+
+    /// The model of one channel, on a clock that reads zero when the run starts.
     ///
     /// # Errors
-    /// When a number is outside its range.
-    pub fn model(
-        &self,
-        channel: &str,
-    ) -> Result<InSeries<OutageLink, BernoulliLink>, ParameterError> {
-        // The link's own stream, so that all its channels fail together and no other link with them.
-        let outages = RandomStream::new(self.seed, &format!("links.{}.outages", self.link));
-        let losses = RandomStream::new(self.seed, channel);
-        Ok(InSeries::new(
-            OutageLink::new(self.outages, outages, Instant::ZERO)?,
-            BernoulliLink::new(self.delay, self.loss_ratio, losses)?,
-        ))
+    /// When a number is outside its range, or the trace cannot be replayed.
+    pub fn model(&self, channel: &str) -> Result<Box<dyn LinkModel>, EmulationError> {
+        if let Some(trace) = &self.trace {
+            return Ok(Box::new(trace.model()?));
+        }
+        let model = self.spec.build(&LinkPlace {
+            seed: self.seed,
+            link: &self.link,
+            channel,
+            way: self.way,
+        })?;
+        Ok(model)
+    }
+
+    /// How long all but a share of 1 - `quantile` of the messages are under way at most.
+    pub fn flight_time(&self, quantile: f64) -> Duration {
+        let traced = self.trace.as_ref().and_then(TraceLaunch::delay_max);
+        traced.unwrap_or_else(|| self.spec.flight_time(quantile))
+    }
+
+    /// Room for what the model holds of a channel of messages of `message_bytes`.
+    ///
+    /// # Errors
+    /// When a gateway cannot hold that much.
+    pub fn room(&self, message_bytes: usize) -> Result<EmulationRoom, ParameterError> {
+        let traced = self.trace.as_ref().and_then(TraceLaunch::delay_max);
+        let traced = traced.map(|longest| LinkSpec::fixed(longest, 0.0));
+        let spec = traced.as_ref().unwrap_or(&self.spec);
+        EmulationRoom::of(spec, message_bytes).map_err(|error| {
+            let key = format!("links.{}.{}", self.link, error.key);
+            ParameterError::new(&key, error.problem)
+        })
+    }
+
+    /// Share of the messages that the loss law loses in the long run; `None` for a trace, which has
+    /// none.
+    pub fn loss_ratio(&self) -> Option<f64> {
+        let is_traced = self.trace.is_some();
+        (!is_traced).then(|| self.spec.loss.loss_ratio())
     }
 
     /// The model in words.
     pub fn describe(&self) -> String {
-        let mut text = format!(
-            "{} ms delay, loss ratio {}",
-            self.delay.as_secs_f64() * 1e3,
-            self.loss_ratio
-        );
-        let Outages {
-            mean_s,
-            per_hour,
-            buffered,
-        } = self.outages;
-        if self.outages.is_active() {
-            let what = if buffered {
-                "which hold everything until they end"
-            } else {
-                "which lose everything"
-            };
-            let mean_ms = mean_s * 1e3;
-            let words = format!(
-                ", {per_hour} outages per hour of {mean_ms} ms on average, {what}, on all channels \
-                 of {} both ways, counted from the start of the run",
-                self.link
-            );
-            text.push_str(&words);
+        match &self.trace {
+            Some(trace) => trace.describe(),
+            None => self.spec.describe(),
         }
-        text
     }
 }
 

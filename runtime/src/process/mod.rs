@@ -2,6 +2,7 @@
 //! process itself. The gateway process is in [`crate::gateway`].
 
 pub(crate) mod component;
+pub mod emulation_room;
 pub mod launch;
 pub(crate) mod own_program;
 pub mod pipe;

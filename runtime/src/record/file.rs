@@ -15,13 +15,15 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use bytemuck::Pod;
+use hil_models::measure::card_clock::CardClockRecord;
 use hil_models::measure::record::{
-    EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, TakenRecord,
+    EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
 };
 use hil_models::message::Envelope;
 use hil_models::run_log::RunLog;
 
 use crate::face::record::{FaceReceivedRecord, FaceSentRecord};
+use crate::radio::record::RadioRecord;
 
 const MAGIC: &[u8; 8] = b"HILREC01";
 /// Size of the file header.
@@ -44,17 +46,21 @@ pub enum RecordKind {
     FollowUp,
     /// Messages: an [`Envelope`] and the payload.
     Message,
-    /// Round trips in nanoseconds (i64) with the instant they ended (i64), of a sending gateway.
+    /// [`RoundTripRecord`]s of a sending gateway.
     RoundTrip,
     /// [`FaceSentRecord`]s of a face: datagrams to a foreign program.
     FaceSent,
     /// [`FaceReceivedRecord`]s of a face: datagrams of a foreign program.
     FaceReceived,
+    /// [`CardClockRecord`]s of a supervisor; the channel is `<host>/<interface>` of the card.
+    CardClock,
+    /// [`RadioRecord`]s of a gateway on a wireless hop; the channel is `<process>/<interface>`.
+    Radio,
 }
 
 impl RecordKind {
     /// Every kind, with the number that stands for it in the header and its name in file names.
-    const ALL: [(Self, u32, &'static str); 9] = [
+    const ALL: [(Self, u32, &'static str); 11] = [
         (Self::Published, 1, "published"),
         (Self::Taken, 2, "taken"),
         (Self::Egress, 3, "egress"),
@@ -64,6 +70,8 @@ impl RecordKind {
         (Self::RoundTrip, 7, "round-trip"),
         (Self::FaceSent, 8, "face-sent"),
         (Self::FaceReceived, 9, "face-received"),
+        (Self::CardClock, 10, "card-clock"),
+        (Self::Radio, 15, "radio"),
     ];
 
     fn row(self) -> (Self, u32, &'static str) {
@@ -88,9 +96,11 @@ impl RecordKind {
             Self::Egress => Some(size_of::<EgressRecord>()),
             Self::Ingress => Some(size_of::<IngressRecord>()),
             Self::FollowUp => Some(size_of::<FollowUpRecord>()),
-            Self::RoundTrip => Some(2 * size_of::<i64>()),
+            Self::RoundTrip => Some(size_of::<RoundTripRecord>()),
             Self::FaceSent => Some(size_of::<FaceSentRecord>()),
             Self::FaceReceived => Some(size_of::<FaceReceivedRecord>()),
+            Self::CardClock => Some(size_of::<CardClockRecord>()),
+            Self::Radio => Some(size_of::<RadioRecord>()),
             Self::Message => None,
         }
     }
@@ -116,6 +126,21 @@ pub enum RecordFileError {
         offset: usize,
         /// What is wrong.
         problem: &'static str,
+    },
+    /// The records are laid out in another way than this program's.
+    #[error(
+        "record file {path}, byte 12: {kind} records of {found_bytes} bytes, where this program \
+         has {expected}; written by another version of hil-runtime?"
+    )]
+    OtherLayout {
+        /// The file.
+        path: PathBuf,
+        /// Of what, as in file names.
+        kind: &'static str,
+        /// Size of one record as the header says it.
+        found_bytes: u32,
+        /// Size or sizes this program knows.
+        expected: String,
     },
 }
 
@@ -183,12 +208,23 @@ impl RecordHeader {
         let kind = RecordKind::from_number(word(8))
             .ok_or_else(|| malformed(path, 8, "unknown record kind"))?;
         let record_bytes = word(12);
-        let fits = match kind.record_bytes() {
-            Some(size) => record_bytes as usize == size,
-            None => record_bytes as usize >= size_of::<Envelope>(),
-        };
+        let least = size_of::<Envelope>();
+        let (fits, expected) = kind.record_bytes().map_or_else(
+            || {
+                (
+                    record_bytes as usize >= least,
+                    format!("at least {least} bytes"),
+                )
+            },
+            |size| (record_bytes as usize == size, format!("{size} bytes")),
+        );
         if !fits {
-            return Err(malformed(path, 12, "the record size does not fit the kind"));
+            return Err(RecordFileError::OtherLayout {
+                path: path.to_owned(),
+                kind: kind.row().2,
+                found_bytes: record_bytes,
+                expected,
+            });
         }
         let name = header[32..].split(|byte| *byte == 0).next().unwrap_or(&[]);
         let channel = str::from_utf8(name)
@@ -318,6 +354,29 @@ mod tests {
         let file = RecordFile::parse(Path::new("x"), bytes).unwrap();
         assert_eq!(file.records::<PublishedRecord>().count(), 2);
         assert_eq!(file.truncated_bytes, size_of::<PublishedRecord>() - 5);
+    }
+
+    #[test]
+    fn a_file_of_another_layout_names_both_sizes_and_where_it_comes_from() {
+        let mut bytes = sample();
+        bytes[12] += 8;
+        let error = RecordFile::parse(Path::new("x"), bytes).unwrap_err();
+        let size = size_of::<PublishedRecord>();
+        let expected = format!(
+            "record file x, byte 12: published records of {} bytes, where this program has {size} \
+             bytes; written by another version of hil-runtime?",
+            size + 8
+        );
+        assert_eq!(error.to_string(), expected);
+        let mut bytes = sample();
+        bytes[8] = 6;
+        bytes[12..16].copy_from_slice(&1_u32.to_le_bytes());
+        let error = RecordFile::parse(Path::new("x"), bytes).unwrap_err();
+        let text = error.to_string();
+        assert!(
+            text.contains("message records of 1 bytes, where this program has at least"),
+            "{text}"
+        );
     }
 
     #[test]

@@ -32,6 +32,11 @@ pub enum NetworkVerdict {
     NoForeignProgram,
     /// A channel went over an emulated link, whatever carried the others.
     EmulatedLink,
+    /// The host could not keep an emulated link: the run says nothing about its model either.
+    EmulationNotKept {
+        /// The channels concerned.
+        channels: Vec<String>,
+    },
     /// The host kept its ticks: what remains is the network's.
     NetworkResult,
     /// A process skipped too many ticks: the run says nothing about the network.
@@ -70,6 +75,7 @@ impl Assessment {
     pub fn of(summary: &RunSummary) -> Self {
         let overruns: Vec<Overrun> = summary.processes.iter().filter_map(overrun).collect();
         let mut warnings: Vec<String> = overruns.iter().map(overrun_warning).collect();
+        warnings.extend(summary.channels.iter().filter_map(emulation_warning));
         warnings.extend(summary.warnings.iter().cloned());
         warnings.extend(summary.faces.iter().flat_map(face_warnings::face_warnings));
         warnings.extend(summary.processes.iter().flat_map(process_warnings));
@@ -106,6 +112,10 @@ fn verdict(summary: &RunSummary, overruns: Vec<Overrun>) -> NetworkVerdict {
         NetworkVerdict::HostOverran {
             processes: overruns,
         }
+    } else if !unkept(summary).is_empty() {
+        NetworkVerdict::EmulationNotKept {
+            channels: unkept(summary),
+        }
     } else if summary.processes.iter().any(is_silent) || !summary.processes.iter().any(has_ticks) {
         NetworkVerdict::TicksUnknown
     } else if has(LinkKind::Emulated) {
@@ -117,6 +127,35 @@ fn verdict(summary: &RunSummary, overruns: Vec<Overrun>) -> NetworkVerdict {
     } else {
         NetworkVerdict::ForeignProgram
     }
+}
+
+/// The channels whose emulated link the host could not keep.
+fn unkept(summary: &RunSummary) -> Vec<String> {
+    let is_unkept = |channel: &&ChannelSummary| {
+        let figures = channel.emulation.as_ref();
+        figures.is_some_and(|figures| !figures.is_kept())
+    };
+    let channels = summary.channels.iter().filter(is_unkept);
+    channels.map(|channel| channel.name.clone()).collect()
+}
+
+fn emulation_warning(channel: &ChannelSummary) -> Option<String> {
+    let figures = channel
+        .emulation
+        .as_ref()
+        .filter(|figures| !figures.is_kept())?;
+    let ms = |ns: i64| ns as f64 * 1e-6;
+    let dropped = figures.overflow_count.filter(|count| *count > 0);
+    let dropped = dropped.map_or_else(String::new, |count| {
+        format!(", and {} found no room", grouped(count))
+    });
+    Some(format!(
+        "the host could not keep the emulated link: {} had its datagrams {:.3} ms late at p99, where \
+         {:.3} ms are allowed{dropped}; neither network nor model is to blame for that",
+        channel.name,
+        ms(figures.scheduling_error.p99_ns),
+        ms(figures.error_max_ns),
+    ))
 }
 
 fn refused_warning(refused: &Fact) -> String {

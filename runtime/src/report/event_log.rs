@@ -12,7 +12,8 @@ use super::terminal::JOINT;
 pub(crate) fn text(name: &str, all: &ScoreEvents) -> String {
     let mut text = format!("# {}\n", one_line(name));
     text.push_str(
-        "# seconds since the start of the run, severity, what happened | outages beside it\n",
+        "# seconds since the start of the run, severity, what happened | outages beside it, then \
+         events of the network before it, nearest first\n",
     );
     if all.clocks_differ {
         text.push_str("# clocks are not aligned: times of different hosts do not compare\n");
@@ -48,6 +49,12 @@ fn line(event: &ExplainedEvent, clocks_differ: bool) -> String {
         line.push_str(" | ");
         line.push_str(&outage.words);
     }
+    if let Some(network) = event.network.as_ref().filter(|one| one.events.is_empty()) {
+        line.push_str(&[" | ", &network.nothing_words()].concat());
+    }
+    for one in event.network_beside() {
+        line.push_str(&[" | ", &one.words].concat());
+    }
     one_line(&line)
 }
 
@@ -60,6 +67,7 @@ fn one_line(text: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::report::network::ForegoingNetwork;
     use crate::report::score_event::EventOutage;
     use hil_models::measure::account::Standing;
 
@@ -70,6 +78,7 @@ mod tests {
             severity,
             what: what.to_owned(),
             outages: Vec::new(),
+            network: None,
             messages: Vec::new(),
             messages_dropped_count: 0,
         }
@@ -98,7 +107,8 @@ mod tests {
             clocks_differ: false,
         };
         let lines =
-            "# seconds since the start of the run, severity, what happened | outages beside it
+            "# seconds since the start of the run, severity, what happened | outages beside it, then \
+             events of the network before it, nearest first
              - notice   hold began
      42.204000 incident session 3 ended by itself | outage of 1.84 s on egm/right/command
 # 7 more events found no room in the score
@@ -106,6 +116,15 @@ mod tests {
         assert_eq!(text("run", &all), format!("# run\n{lines}"));
         all.clocks_differ = true;
         assert!(text("run", &all).contains("hold began (clock of robot-pc)\n"));
+        all.events[0].network = Some(ForegoingNetwork {
+            foregoing_s: 5.0,
+            events: Vec::new(),
+            more_count: 0,
+            lost_count: 3,
+        });
+        let words = "hold began (clock of robot-pc) | nothing of note on any channel in the 5.00 s \
+                     before (only single losses, 3 messages)\n";
+        assert!(text("run", &all).contains(words), "{}", text("run", &all));
         let nothing = text("run", &ScoreEvents::default());
         assert!(nothing.ends_with("# nothing happened\n"));
     }

@@ -2,9 +2,13 @@
 //! rendering for a terminal. It measures nothing and prints nothing; the caller writes the text.
 
 pub mod assessment;
+pub mod clock_summary;
+pub mod emulation;
 pub(crate) mod event_log;
 pub mod face;
 mod face_warnings;
+pub mod network;
+pub mod radio;
 pub mod score_event;
 pub mod summary;
 pub mod terminal;
@@ -13,5 +17,7 @@ pub mod terminal;
 mod sample;
 #[cfg(test)]
 mod sample_events;
+#[cfg(test)]
+mod sample_network;
 #[cfg(test)]
 mod sample_records;

@@ -10,6 +10,7 @@ use hil_models::time::Alignment;
 use super::assessment::{Assessment, NetworkVerdict};
 use super::face::{Answers, FaceSummary};
 use super::sample_events::{few_events, many_events, recorded_channel};
+use super::sample_network::network;
 use super::sample_records::Files;
 use super::summary::{
     ChannelSummary, CountByName, DirectionSummary, Fact, LinkKind, Outcome, ProcessSummary,
@@ -81,6 +82,7 @@ fn channel(
         link,
         account: Some(account),
         outages: None,
+        emulation: None,
         recorded: None,
         refusals: Vec::new(),
         directions: Vec::new(),
@@ -122,6 +124,8 @@ fn full() -> RunSummary {
     killed.restart_count = 1;
     killed.cpu_time_s = None;
     killed.exit = "first killed by signal 9, then ended by itself, code 0".to_owned();
+    let mut score_events = few_events();
+    let network = network(["arm/command", "arm/status"], &mut score_events);
     RunSummary {
         host_facts: vec![
             Fact::new("processor", "2 × a virtual core"),
@@ -157,7 +161,8 @@ fn full() -> RunSummary {
             ),
             metric("tracking lag", None, "s", "no swing was complete"),
         ],
-        score_events: few_events(),
+        score_events,
+        network: Some(network),
         ..RunSummary::new(run_facts())
     }
 }
@@ -187,6 +192,7 @@ fn awkward() -> RunSummary {
     summary.score[0].value = Some(-123_456_789.123);
     summary.events[0].what.clone_from(&long);
     summary.score_events = many_events(&long);
+    summary.network = Some(network([&long, "arm/status"], &mut summary.score_events));
     summary
 }
 
@@ -210,6 +216,7 @@ fn empty() -> RunSummary {
             link: LinkKind::Udp,
             account,
             outages: None,
+            emulation: None,
             recorded: None,
             refusals: Vec::new(),
             directions: Vec::new(),

@@ -35,6 +35,7 @@ fn event(
         severity,
         what: what.to_owned(),
         outages: Vec::new(),
+        network: None,
         messages,
         messages_dropped_count: 0,
     }
@@ -113,6 +114,7 @@ pub(super) fn recorded_channel() -> ChannelSummary {
         link: LinkKind::RecordOnly,
         account: None,
         outages: None,
+        emulation: None,
         recorded: Some(RecordedFigures {
             message_count: 12_345,
             missing_count: 0,
@@ -122,7 +124,7 @@ pub(super) fn recorded_channel() -> ChannelSummary {
     }
 }
 
-fn summary(channel: ChannelSummary) -> RunSummary {
+pub(super) fn summary(channel: ChannelSummary) -> RunSummary {
     let mut summary = RunSummary::new(RunFacts {
         name: "fleet".to_owned(),
         case: "fleet".to_owned(),
@@ -184,7 +186,7 @@ fn one_emulated_link_among_real_ones_makes_no_network_result() {
     assert_eq!(Assessment::of(&run).network, NetworkVerdict::NetworkResult);
 }
 
-fn ticking() -> ProcessSummary {
+pub(super) fn ticking() -> ProcessSummary {
     ProcessSummary {
         name: "robots".to_owned(),
         host: "robot-pc".to_owned(),

@@ -85,6 +85,8 @@ impl Files {
             forwarded_ns,
             // Two reads of one clock pair differ by a little; one pair was read across a step.
             realtime_offset_ns: REALTIME_NS + if sequence == 4_000 { 7_000 } else { 40 },
+            emulated_ns: UNAVAILABLE,
+            due_ns: UNAVAILABLE,
             epoch: 1,
             session: 9,
             flags: 0,

@@ -3,7 +3,10 @@
 
 use hil_models::case_study::Severity;
 use hil_models::measure::account::{MessageFate, Standing};
+use hil_models::measure::network::NetworkEventKind;
 use serde::{Deserialize, Serialize};
+
+use super::network::{ForegoingEvent, ForegoingNetwork};
 
 /// The events of a run's score.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -33,10 +36,27 @@ pub struct ExplainedEvent {
     /// outage.
     #[serde(default)]
     pub outages: Vec<EventOutage>,
+    /// What happened on any network in the seconds before; `None` when the run crossed none, or
+    /// the event has no time.
+    #[serde(default)]
+    pub network: Option<ForegoingNetwork>,
     /// The messages concerned.
     pub messages: Vec<ExplainedMessage>,
     /// Messages the event had no room for.
     pub messages_dropped_count: u64,
+}
+
+impl ExplainedEvent {
+    /// What came before it on any network, without outages that [`Self::outages`] tell of.
+    pub(crate) fn network_beside(&self) -> Vec<&ForegoingEvent> {
+        let is_told = |one: &&ForegoingEvent| {
+            let is_outage = matches!(one.event.kind, NetworkEventKind::Outage { .. });
+            let mut outages = self.outages.iter();
+            is_outage && outages.any(|outage| outage.channel == one.event.channel)
+        };
+        let network = self.network.iter().flat_map(|network| &network.events);
+        network.filter(|one| !is_told(one)).collect()
+    }
 }
 
 /// What a channel went through when an event happened: the outage that has most to do with it.

@@ -13,8 +13,13 @@ use hil_models::measure::account::{ChannelAccount, OutageFigures};
 use serde::{Deserialize, Serialize};
 
 use super::assessment::Assessment;
+use super::clock_summary::ClockSection;
+use super::emulation::EmulationFigures;
 use super::face::FaceSummary;
+use super::network::NetworkReport;
+use super::radio::RadioReport;
 use super::score_event::ScoreEvents;
+use crate::card_clock::figures::HardwareStamps;
 
 /// Version of the `summary.json` layout.
 pub const SCHEMA_VERSION: u32 = 1;
@@ -30,6 +35,9 @@ pub struct RunSummary {
     pub host_facts: Vec<Fact>,
     /// What real-time settings the kernel granted and refused.
     pub realtime: RealtimeFacts,
+    /// How the hosts' clocks relate, and what that rests on.
+    #[serde(default)]
+    pub clocks: Option<ClockSection>,
     /// The processes of the run.
     pub processes: Vec<ProcessSummary>,
     /// What happened, in order of time.
@@ -39,11 +47,21 @@ pub struct RunSummary {
     /// Arms that went through a face to a foreign program.
     #[serde(default)]
     pub faces: Vec<FaceSummary>,
+    /// What the network cards stamped; `None` unless hardware stamps were asked for.
+    #[serde(default)]
+    pub hardware_stamps: Option<HardwareStamps>,
+    /// What the radios of wireless hops said, and where messages were stamped.
+    #[serde(default)]
+    pub radio: RadioReport,
     /// What the robot did.
     pub score: Vec<ScoreMetric>,
     /// What happened to the robot, and what the network had done to the messages concerned.
     #[serde(default)]
     pub score_events: ScoreEvents,
+    /// The network in the field's terms, and on one axis with the robot; `None` when no channel
+    /// crossed one.
+    #[serde(default)]
+    pub network: Option<NetworkReport>,
     /// Anything else a reader must know; [`Assessment::warnings`] come on top.
     pub warnings: Vec<String>,
 }
@@ -56,12 +74,16 @@ impl RunSummary {
             run,
             host_facts: Vec::new(),
             realtime: RealtimeFacts::default(),
+            clocks: None,
             processes: Vec::new(),
             events: Vec::new(),
             channels: Vec::new(),
             faces: Vec::new(),
+            hardware_stamps: None,
+            radio: RadioReport::default(),
             score: Vec::new(),
             score_events: ScoreEvents::default(),
+            network: None,
             warnings: Vec::new(),
         }
     }
@@ -308,6 +330,10 @@ pub struct ChannelSummary {
     /// recorded.
     #[serde(default)]
     pub outages: Option<OutageFigures>,
+    /// How well the hosts kept its emulated link; `None` on every other link, or when no message
+    /// came through it.
+    #[serde(default)]
+    pub emulation: Option<EmulationFigures>,
     /// What was recorded of a channel that is only recorded; `None` when nothing was.
     #[serde(default)]
     pub recorded: Option<RecordedFigures>,

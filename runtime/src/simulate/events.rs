@@ -39,6 +39,7 @@ pub(super) fn explained(
             severity: event.severity,
             what: event.what.clone(),
             outages: outages_before(event, channels, stories, log),
+            network: None,
             messages: messages.collect(),
             messages_dropped_count: event.messages_dropped_count,
         }

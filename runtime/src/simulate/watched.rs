@@ -1,24 +1,37 @@
-//! A carrier in virtual time under watch: what it loses is noted as outages. It changes nothing of
-//! what the carrier does, and asks it nothing.
+//! A link model in virtual time under watch: what it does is counted, what becomes of each message is
+//! noted, and what it loses as outages. It changes nothing of what the model does.
 
 use std::cell::RefCell;
 use std::rc::Rc;
 
+use hil_gateways::protocol::wire;
+use hil_models::link::LinkModel;
 use hil_models::measure::account::{Outage, OutageFinder};
+use hil_models::measure::network::{Crossing, Passage};
 use hil_models::message::Envelope;
 use hil_models::simulation::Carrier;
 use hil_models::time::Instant;
 
-/// The outages of a carrier, to be asked for when it is done.
+use super::link_figures::{LinkFigures, LinkTally};
+
+/// What a link model did, to be asked for when it is done.
 #[derive(Debug, Clone)]
-pub(super) struct Watch(Rc<RefCell<OutageFinder>>);
+pub(super) struct Watch(Rc<RefCell<Seen>>);
+
+#[derive(Debug, Default)]
+struct Seen {
+    outages: OutageFinder,
+    tally: LinkTally,
+    passages: Vec<Passage>,
+    duplicated_count: u64,
+}
 
 impl Watch {
-    /// `carrier`, which will carry as before, and the watch over it.
-    pub(super) fn over(carrier: Box<dyn Carrier>) -> (Box<dyn Carrier>, Self) {
+    /// A carrier of what `link` lets through, and the watch over it.
+    pub(super) fn over(link: Box<dyn LinkModel>) -> (Box<dyn Carrier>, Self) {
         let watch = Self(Rc::default());
         let watched = Watched {
-            carrier,
+            link,
             watch: watch.clone(),
         };
         (Box::new(watched), watch)
@@ -26,13 +39,24 @@ impl Watch {
 
     /// What was lost so far.
     pub(super) fn outages(&self) -> Vec<Outage> {
-        self.0.take().finish()
+        core::mem::take(&mut self.0.borrow_mut().outages).finish()
+    }
+
+    /// What the model, which `model` describes, did so far.
+    pub(super) fn figures(&self, model: &str, requested_loss_ratio: Option<f64>) -> LinkFigures {
+        self.0.borrow().tally.figures(model, requested_loss_ratio)
+    }
+
+    /// The way of every message so far, and how many copies came on top.
+    pub(super) fn passages(&self) -> (Vec<Passage>, u64) {
+        let mut seen = self.0.borrow_mut();
+        (core::mem::take(&mut seen.passages), seen.duplicated_count)
     }
 }
 
 #[derive(Debug)]
 struct Watched {
-    carrier: Box<dyn Carrier>,
+    link: Box<dyn LinkModel>,
     watch: Watch,
 }
 
@@ -44,28 +68,48 @@ impl Carrier for Watched {
         payload: &[u8],
         deliver: &mut dyn FnMut(Instant, Envelope, &[u8]),
     ) {
-        let key = |envelope: &Envelope| (envelope.epoch, envelope.sequence);
-        let mut arrival: Option<Instant> = None;
-        self.carrier
-            .offer(now, envelope, payload, &mut |at, delivered, payload| {
-                if key(&delivered) == key(envelope) {
-                    arrival = Some(arrival.map_or(at, |known| known.min(at)));
-                }
-                deliver(at, delivered, payload);
-            });
-        let mut finder = self.watch.0.borrow_mut();
-        let published_ns = Some(now.as_ns());
-        match arrival {
-            Some(at) => finder.arrived(published_ns, Some(at.as_ns())),
-            None => finder.lost(envelope.sequence, 1, published_ns),
+        // The length that a gateway's model would be offered: a datagram, not a message.
+        let length_bytes = payload.len() + wire::HEADER_BYTES;
+        let fate = self
+            .link
+            .offer_numbered(now, length_bytes, envelope.sequence);
+        let arrivals = [fate.arrival(), fate.second_arrival()];
+        for at in arrivals.into_iter().flatten() {
+            deliver(at, *envelope, payload);
         }
+        let mut seen = self.watch.0.borrow_mut();
+        seen.tally.count(now, fate, self.link.loss_causes());
+        seen.duplicated_count += u64::from(fate.second_arrival().is_some());
+        seen.passages.push(passage(now, envelope, fate.arrival()));
+        let published_ns = Some(now.as_ns());
+        match fate.arrival() {
+            Some(at) => seen.outages.arrived(published_ns, Some(at.as_ns())),
+            None => seen.outages.lost(envelope.sequence, 1, published_ns),
+        }
+    }
+}
+
+fn passage(now: Instant, envelope: &Envelope, arrival: Option<Instant>) -> Passage {
+    Passage {
+        epoch_rank: envelope.epoch,
+        sequence: envelope.sequence,
+        count: 1,
+        offered_ns: Some(now.as_ns()),
+        received_ns: arrival.map(Instant::as_ns),
+        delay_ns: arrival.map(|at| at.ns_since(now)),
+        delay_bound_ns: 0,
+        crossing: if arrival.is_some() {
+            Crossing::Arrived
+        } else {
+            Crossing::LostByNetwork
+        },
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use hil_models::link::{Fate, LinkModel};
+    use hil_models::link::Fate;
 
     /// Down from 10 to 19 ms, otherwise 3 ms late.
     #[derive(Debug)]
@@ -83,7 +127,7 @@ mod tests {
     }
 
     #[test]
-    fn a_watch_sees_what_the_carrier_loses_and_changes_nothing() {
+    fn a_watch_sees_what_the_model_loses_and_changes_nothing() {
         let (mut carrier, watch) = Watch::over(Box::new(Down));
         let mut delivered_count = 0;
         for sequence in 0..30_u64 {
@@ -100,6 +144,10 @@ mod tests {
             });
         }
         assert_eq!(delivered_count, 20);
+        let (passages, duplicated_count) = watch.passages();
+        assert_eq!((passages.len(), duplicated_count), (30, 0));
+        assert_eq!(passages[9].delay_ns, Some(3_000_000));
+        assert_eq!(passages[10].crossing, Crossing::LostByNetwork);
         let outages = watch.outages();
         assert_eq!(outages.len(), 1);
         let found = outages[0];

@@ -1,9 +1,13 @@
 //! What happened during a run beside the messages: processes that died, restarted or complained,
 //! and what each said at its end. Plain data that hosts exchange.
 
+use std::collections::BTreeMap;
+
 use hil_models::time::Instant;
 use serde::{Deserialize, Serialize};
 
+use crate::card_clock::CardStory;
+use crate::clock_discipline::HostDiscipline;
 use crate::process::pipe::ProcessReport;
 
 /// One thing that happened.
@@ -56,6 +60,22 @@ pub struct HostStory {
     pub span: (Instant, Instant),
     /// What happened, in order of time.
     pub events: Vec<Event>,
+    /// Who steers the system clock; `None` when not even the kernel says.
+    #[serde(default)]
+    pub discipline: Option<HostDiscipline>,
     /// How the processes fared.
     pub processes: Vec<ProcessStory>,
+    /// What became of the network cards it armed.
+    #[serde(default)]
+    pub cards: Vec<CardStory>,
+}
+
+/// Who steers the system clock, by host.
+pub(super) fn disciplines(stories: &[HostStory]) -> BTreeMap<String, HostDiscipline> {
+    let told = stories.iter().flat_map(|story| {
+        let discipline = story.discipline.as_ref();
+        let hosts = story.hosts.iter();
+        hosts.filter_map(move |host| Some((host.clone(), discipline?.clone())))
+    });
+    told.collect()
 }

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use std::io;
 use std::path::PathBuf;
 
+use hil_models::case_study::ParameterError;
 use hil_models::time::Instant;
 
 use super::crew::CrewError;
@@ -12,7 +13,9 @@ use super::domains::DomainsError;
 use super::event::{Event, ProcessStory};
 use super::frame::{EndMeaning, PeerMessage};
 use super::meet::PeerError;
+use crate::card_clock::CardStory;
 use crate::channel::DomainError;
+use crate::clock_discipline::HostDiscipline;
 use crate::host_facts::HostFacts;
 use crate::run_folder::RunFolder;
 
@@ -50,6 +53,9 @@ pub enum RunError {
     /// A process cannot be started.
     #[error("{0}")]
     Start(String),
+    /// An emulated link asks for more than a gateway can hold.
+    #[error("the emulated link cannot be kept: {0}")]
+    Emulation(ParameterError),
 }
 
 impl From<CrewError> for RunError {
@@ -124,8 +130,13 @@ pub struct RunResult {
     pub events: Vec<Event>,
     /// How the processes of all hosts fared.
     pub processes: Vec<ProcessStory>,
+    /// What became of the network cards of all hosts; empty unless hardware stamps were asked
+    /// for.
+    pub cards: Vec<CardStory>,
     /// True when all hosts read one clock.
     pub has_one_clock: bool,
+    /// Who steers each host's system clock, of the hosts that told.
+    pub disciplines: BTreeMap<String, HostDiscipline>,
     /// Hosts that ran here.
     pub own_hosts: Vec<String>,
     /// What spoils the completeness of the report.

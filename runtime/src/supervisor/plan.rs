@@ -272,7 +272,6 @@ fn direction(crossing: &Crossing<'_>, side: Side, index: usize, seed: u64) -> Di
         Side::Egress => (sender, receiver, crossing.from_host),
         Side::Ingress => (receiver, sender, crossing.to_host),
     };
-    let emulation = crossing.impairment.filter(|_| side == Side::Ingress);
     DirectionLaunch {
         channel: channel.name.clone(),
         channel_id: channel.channel_id,
@@ -298,13 +297,7 @@ fn direction(crossing: &Crossing<'_>, side: Side, index: usize, seed: u64) -> Di
         },
         wait: wait_mode(hop.gateway.execution.wait),
         realtime: realtime(&hop.gateway.execution, index),
-        emulation: emulation.map(|impairment| EmulationLaunch {
-            delay: impairment.delay,
-            loss_ratio: impairment.loss_ratio,
-            outages: crossing.outages.unwrap_or_default(),
-            link: crossing.link.name.clone(),
-            seed,
-        }),
+        emulation: EmulationLaunch::of(crossing, seed).filter(|_| side == Side::Ingress),
     }
 }
 

@@ -11,7 +11,7 @@ use serde_json::json;
 
 use super::crew::{self, Crew, Verdict};
 use super::domains::Domains;
-use super::event::{Event, HostStory, ProcessStory};
+use super::event::{Event, HostStory, ProcessStory, disciplines};
 use super::exchange::exchange;
 use super::frame::{Frame, PeerHello, PeerMessage};
 use super::meet::{Meeting, meet};
@@ -19,10 +19,13 @@ use super::outcome::{Heard, Outcome, RunError, RunOptions, RunResult};
 use super::peer::{Peer, PeerEvent};
 use super::plan::plan;
 use super::progress_line;
+use crate::card_clock::CardWatch;
 use crate::channel::clock_id;
 use crate::clock::MonotonicClock;
+use crate::clock_discipline::HostDiscipline;
 use crate::console::Console;
 use crate::host_facts::HostFacts;
+use crate::process::emulation_room::check_emulation;
 use crate::run_folder::{RunFolder, utc_text};
 use crate::signals::Signals;
 use crate::topology::{Host, Topology};
@@ -58,8 +61,10 @@ pub fn run(
         .collect();
     let plan = plan(topology, &hosts);
     crew::find_programs(&plan.processes)?;
+    check_emulation(topology).map_err(RunError::Emulation)?;
     let folder = make_folder(topology, &hosts)?;
     let facts = HostFacts::gather();
+    let discipline = HostDiscipline::gather().ok();
     write_manifest(topology, options, &folder, &facts)?;
     let run = folder.root().to_string_lossy();
     let domains = Domains::create(&plan.hosts, options.domain_root.as_ref(), &run)?;
@@ -67,8 +72,11 @@ pub fn run(
     let peers = gather_peers(topology, &hosts, &domains, (signals, console))?;
     let here = clock_id()?;
     let crew = Crew::new(plan.processes, domains.addresses(), &folder)?;
+    // Before the gateways: they find out by sending what the cards deliver.
+    let cards = CardWatch::start(topology, &hosts, &folder.records());
     let mut session = Session {
         topology,
+        cards,
         is_first_host: topology
             .hosts()
             .first()
@@ -79,6 +87,7 @@ pub fn run(
         peers,
         signals,
         console,
+        discipline,
         cleaned: WallInstant::now(),
         greeted: WallInstant::now(),
         told: WallInstant::now(),
@@ -184,6 +193,7 @@ fn gather_peers(
 
 struct Session<'a> {
     topology: &'a Topology,
+    cards: CardWatch,
     is_first_host: bool,
     /// All hosts of the run read one clock.
     has_one_clock: bool,
@@ -193,6 +203,8 @@ struct Session<'a> {
     peers: Vec<Peer>,
     signals: &'a Signals,
     console: &'a mut Console,
+    /// Who steered the system clock before the run.
+    discipline: Option<HostDiscipline>,
     cleaned: WallInstant,
     greeted: WallInstant,
     told: WallInstant,
@@ -402,13 +414,16 @@ impl Session<'_> {
         (started, facts): (String, HostFacts),
     ) -> RunResult {
         let own_hosts: Vec<String> = self.domains.addresses().into_keys().collect();
+        let watch = core::mem::take(&mut self.cards);
+        let (cards, mut problems) = watch.finish();
         let own = HostStory {
             hosts: own_hosts.clone(),
             span,
             events: self.crew.events().to_vec(),
+            discipline: self.discipline(),
             processes: self.stories(),
+            cards,
         };
-        let mut problems = Vec::new();
         let mut stories = vec![own.clone()];
         if let Outcome::PeerLost(who) = &outcome {
             problems.push(format!("no records of the host that vanished ({who})"));
@@ -433,11 +448,13 @@ impl Session<'_> {
             story.hosts.iter().map(move |host| (host.clone(), span))
         });
         let spans: BTreeMap<String, (Instant, Instant)> = spans.collect();
+        let disciplines = disciplines(&stories);
         let mut events: Vec<Event> = stories.iter().flat_map(|one| one.events.clone()).collect();
         // Each host counts from its own start of the run.
         let since_start =
             |event: &Event| spans.get(&event.host).map(|span| event.at.ns_since(span.0));
         events.sort_by_key(since_start);
+        let cards = stories.iter().flat_map(|one| one.cards.clone()).collect();
         let processes = stories.into_iter().flat_map(|one| one.processes).collect();
         RunResult {
             folder,
@@ -446,11 +463,19 @@ impl Session<'_> {
             started,
             events,
             processes,
+            cards,
             has_one_clock,
+            disciplines,
             own_hosts,
             problems,
             facts,
         }
+    }
+
+    /// Who steered this host's system clock, before and after.
+    fn discipline(&self) -> Option<HostDiscipline> {
+        let before = self.discipline.clone()?;
+        Some(before.worse(HostDiscipline::gather().ok()?))
     }
 
     fn stories(&self) -> Vec<ProcessStory> {

@@ -1,13 +1,13 @@
 //! What a `[links.<name>]` table says by itself; see `file`.
 
-use hil_models::link::outages::Outages;
-
 use super::errors::{Fault, Place};
 use super::file::{read_execution, read_on_exit};
+use super::file_impairments::{EMULATION_KEYS, read_emulation};
 use super::limits;
 use super::model::{Execution, OnExit, Scheduling, Wait};
-use super::model_links::{Emulation, Gateway, Hop, Impairment, Timestamps, Via};
+use super::model_links::{Gateway, Hop, Timestamps, Via};
 use super::reader::{At, Reader};
+use super::units::format_duration;
 
 #[derive(Debug)]
 pub(super) struct LinkEntry {
@@ -46,9 +46,6 @@ const HOP_KEYS: &[&str] = &[
     "gateway",
 ];
 
-/// Keys that only an emulated link has.
-const EMULATION_KEYS: &[&str] = &["delay", "loss_ratio", "forward", "backward", "outages"];
-
 impl LinkEntry {
     pub(super) fn read(name: String, mut reader: Reader<'_>) -> Self {
         let kind = reader.word("via", KINDS);
@@ -70,6 +67,9 @@ impl LinkEntry {
                        the kernel could stamp; leave it out, or write \"off\"";
             reader.refuse_present(&["timestamps"], why);
         }
+        if matches!(kind, Some(Kind::Emulated)) {
+            refuse_slack(&reader, &hop.gateway.execution);
+        }
         let emulation = read_emulation(&mut reader);
         let via = kind.map(|kind| match kind {
             Kind::SharedMemory => {
@@ -79,7 +79,7 @@ impl LinkEntry {
             }
             Kind::Udp => Via::Udp(hop),
             Kind::Tcp => Via::Tcp(hop),
-            Kind::Emulated => Via::Emulated(hop, emulation),
+            Kind::Emulated => Via::Emulated(hop, Box::new(emulation)),
         });
         if matches!(via, Some(Via::SharedMemory | Via::Udp(_) | Via::Tcp(_))) {
             let why = "needs via = \"emulated\": no real link can be told what to do";
@@ -94,6 +94,21 @@ impl LinkEntry {
         };
         reader.finish();
         entry
+    }
+}
+
+/// An emulated delay ends with a timer, which the kernel may fire later by the slack; real-time
+/// threads have none (prctl(2), `PR_SET_TIMERSLACK`).
+fn refuse_slack(reader: &Reader<'_>, execution: &Execution) {
+    let (slack, most) = (execution.timer_slack, limits::EMULATED_TIMER_SLACK_MAX);
+    if slack > most && execution.scheduling == Scheduling::Other {
+        let problem = format!(
+            "has a timer_slack of \"{}\", by which every delay of the emulated link could be late; \
+             at most \"{}\", or scheduling = \"fifo\"",
+            format_duration(slack),
+            format_duration(most)
+        );
+        reader.refuse("gateway", Fault::Inconsistent(problem));
     }
 }
 
@@ -158,59 +173,4 @@ fn read_gateway(reader: Option<Reader<'_>>) -> Gateway {
     };
     reader.finish();
     gateway
-}
-
-fn read_emulation(reader: &mut Reader<'_>) -> Emulation {
-    let none = Impairment {
-        delay: limits::LINK_DELAY.default,
-        loss_ratio: limits::LINK_LOSS_RATIO.default,
-    };
-    let both = read_impairment(reader, none);
-    let mut direction = |key| {
-        reader.table(key).map_or(both, |mut reader| {
-            let impairment = read_impairment(&mut reader, both);
-            reader.finish();
-            impairment
-        })
-    };
-    Emulation {
-        forward: direction("forward"),
-        backward: direction("backward"),
-        outages: read_outages(reader.table("outages")),
-    }
-}
-
-fn read_outages(reader: Option<Reader<'_>>) -> Outages {
-    let (mean, per_hour) = (&limits::LINK_OUTAGE_MEAN, &limits::LINK_OUTAGES_PER_HOUR);
-    let none = Outages {
-        mean_s: mean.default.as_secs_f64(),
-        per_hour: per_hour.default,
-        buffered: false,
-    };
-    let Some(mut reader) = reader else {
-        return none;
-    };
-    let read_mean = reader.duration("mean", mean);
-    let outages = Outages {
-        mean_s: read_mean.map_or(none.mean_s, |mean| mean.as_secs_f64()),
-        per_hour: reader.number("per_hour", per_hour).unwrap_or(none.per_hour),
-        buffered: reader.boolean("buffered").unwrap_or(none.buffered),
-    };
-    // Each number is within its own limits by now; what is left is what they say together.
-    if let Err(error) = outages.check() {
-        reader.refuse("per_hour", Fault::Inconsistent(error.problem));
-    }
-    reader.finish();
-    outages
-}
-
-fn read_impairment(reader: &mut Reader<'_>, default: Impairment) -> Impairment {
-    Impairment {
-        delay: reader
-            .duration("delay", &limits::LINK_DELAY)
-            .unwrap_or(default.delay),
-        loss_ratio: reader
-            .number("loss_ratio", &limits::LINK_LOSS_RATIO)
-            .unwrap_or(default.loss_ratio),
-    }
 }

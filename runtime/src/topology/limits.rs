@@ -44,6 +44,9 @@ pub(super) const FIFO_PRIORITY: Limit<i64> = limit(40, 1, 99);
 /// 0 would mean "the kernel's own default" of 50 us.
 pub(super) const TIMER_SLACK: Limit<Duration> =
     limit(Duration::from_micros(1), Duration::from_nanos(1), ms(1));
+/// Of a gateway on an emulated link: it sleeps until 90 us before a datagram is due and spins then,
+/// so a timer that is half of that late is still in time.
+pub(super) const EMULATED_TIMER_SLACK_MAX: Duration = Duration::from_micros(45);
 pub(super) const RESTART_LIMIT: Limit<i64> = limit(3, 1, 100);
 
 pub(super) const CHANNEL_DEPTH: Limit<i64> = limit(16, 1, 1_024);
@@ -62,7 +65,29 @@ pub(super) const LINK_BUFFER_BYTES: Limit<i64> = limit(212_992, 4_096, 67_108_86
 /// Smallest: what every IPv4 host must accept (RFC 791).
 pub(super) const LINK_PATH_MTU_BYTES: Limit<i64> = limit(1_500, 576, 65_535);
 pub(super) const LINK_DELAY: Limit<Duration> = limit(ms(0), ms(0), ms(10_000));
+/// Mean, median or deviation of a random delay. Without default.
+pub(super) const LINK_DELAY_SCALE: Limit<Duration> =
+    limit(ms(1), Duration::from_nanos(1), ms(10_000));
+/// Deviation of the logarithm of a log-normal delay. Without default.
+pub(super) const LINK_DELAY_SIGMA: Limit<f64> = limit(1.0, 0.001, 3.0);
+/// Exponent of the tail of a Pareto delay. Without default.
+pub(super) const LINK_DELAY_SHAPE: Limit<f64> = limit(2.0, 1.05, 100.0);
+/// Of a bin of an empirical delay. Without default.
+pub(super) const LINK_DELAY_WEIGHT: Limit<f64> = limit(1.0, 0.0, 1e12);
 pub(super) const LINK_LOSS_RATIO: Limit<f64> = limit(0.0, 0.0, 1.0);
+/// Of the bad state of a link with bursts of loss.
+pub(super) const LINK_BAD_LOSS_RATIO: Limit<f64> = limit(1.0, 0.0, 1.0);
+/// Probability that such a link changes its state with a message. Without default.
+pub(super) const LINK_STEP: Limit<f64> = limit(0.5, 1e-9, 1.0);
+/// Mean time that such a link stays in a state. Without default.
+pub(super) const LINK_STATE_MEAN: Limit<Duration> =
+    limit(ms(100), Duration::from_micros(1), ms(3_600_000));
+/// Without default: a bottleneck says how narrow it is.
+pub(super) const LINK_RATE_BITS_PER_SECOND: Limit<i64> = limit(10_000_000, 1_000, 100_000_000_000);
+/// A hundred full Ethernet frames.
+pub(super) const LINK_QUEUE_BYTES: Limit<i64> = limit(150_000, 64, 67_108_864);
+/// IPv4 and UDP headers by default.
+pub(super) const LINK_OVERHEAD_BYTES: Limit<i64> = limit(28, 0, 1_000);
 /// Mean length of an outage.
 pub(super) const LINK_OUTAGE_MEAN: Limit<Duration> = limit(ms(500), ms(1), ms(3_600_000));
 /// None by default. Together with the mean length they may take up 95 % of the time.
@@ -142,6 +167,9 @@ mod tests {
             LINK_SOCKET_PRIORITY,
             LINK_BUFFER_BYTES,
             LINK_PATH_MTU_BYTES,
+            LINK_RATE_BITS_PER_SECOND,
+            LINK_QUEUE_BYTES,
+            LINK_OVERHEAD_BYTES,
             EGM_AXES,
             EGM_ROBOTWARE,
         ] {
@@ -153,11 +181,22 @@ mod tests {
             RUN_PEER_TIMEOUT,
             TIMER_SLACK,
             LINK_DELAY,
+            LINK_DELAY_SCALE,
+            LINK_STATE_MEAN,
             LINK_OUTAGE_MEAN,
         ] {
             assert!(limit.allows(&limit.default), "{limit:?}");
         }
-        assert!(LINK_LOSS_RATIO.allows(&LINK_LOSS_RATIO.default));
+        for limit in [
+            LINK_LOSS_RATIO,
+            LINK_BAD_LOSS_RATIO,
+            LINK_STEP,
+            LINK_DELAY_SIGMA,
+            LINK_DELAY_SHAPE,
+            LINK_DELAY_WEIGHT,
+        ] {
+            assert!(limit.allows(&limit.default), "{limit:?}");
+        }
         assert!(EGM_SEND_HZ.allows(&EGM_SEND_HZ.default));
         assert!(LINK_OUTAGES_PER_HOUR.allows(&LINK_OUTAGES_PER_HOUR.default));
         assert!(!LINK_LOSS_RATIO.allows(&f64::NAN));

@@ -17,7 +17,10 @@ mod check_face;
 mod errors;
 mod face;
 mod file;
+mod file_impairments;
 mod file_links;
+mod file_trace;
+mod file_wifi;
 mod host;
 mod known;
 mod layers;
@@ -26,6 +29,7 @@ mod model;
 mod model_links;
 mod reader;
 mod resolved;
+mod resolved_impairments;
 mod suggest;
 mod tree;
 mod units;
@@ -44,7 +48,7 @@ pub use model::{
     Case, Channel, ChannelPorts, Crossing, Direction, Execution, Host, MessageLayout, OnExit,
     Process, Program, Run, Scheduling, Topology, Wait,
 };
-pub use model_links::{Emulation, Gateway, Hop, Impairment, Link, Timestamps, Via};
+pub use model_links::{Emulation, Gateway, Hop, Link, Timestamps, Via};
 
 use check::Needs;
 use errors::Place;
@@ -146,6 +150,7 @@ fn read_and_check(
         let file = file::read(&table, top, &layers.faults);
         check::check(file, known, needs, &layers.faults)
     };
+    let topology = topology.with_traces_beside(path);
     if layers.faults.is_empty() {
         Ok(topology)
     } else {

@@ -6,10 +6,10 @@ use core::time::Duration;
 use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
-use hil_models::link::outages::Outages;
+use hil_models::link::spec::LinkSpec;
 use hil_models::message::type_hash;
 
-use super::model_links::{Hop, Impairment, Link};
+use super::model_links::{Hop, Link};
 
 use super::face::EgmFace;
 
@@ -272,9 +272,7 @@ pub struct Crossing<'a> {
     /// Its way on the link.
     pub direction: Direction,
     /// What the emulation does to it; `None` on a real hop.
-    pub impairment: Option<Impairment>,
-    /// When the emulation lets nothing through, both ways; `None` on a real hop.
-    pub outages: Option<Outages>,
+    pub spec: Option<&'a LinkSpec>,
 }
 
 impl Topology {
@@ -365,9 +363,9 @@ impl Topology {
             Direction::Backward
         };
         let emulation = link.emulation();
-        let impairment = emulation.map(|emulation| match direction {
-            Direction::Forward => emulation.forward,
-            Direction::Backward => emulation.backward,
+        let spec = emulation.map(|emulation| match direction {
+            Direction::Forward => &emulation.forward,
+            Direction::Backward => &emulation.backward,
         });
         Some(Crossing {
             channel,
@@ -377,8 +375,7 @@ impl Topology {
             from_host,
             to_host,
             direction,
-            impairment,
-            outages: emulation.map(|emulation| emulation.outages),
+            spec,
         })
     }
 }

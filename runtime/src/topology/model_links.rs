@@ -2,12 +2,13 @@
 //! no file and opens no socket.
 
 use core::fmt;
-use core::time::Duration;
+use std::path::Path;
 
-use hil_models::link::outages::Outages;
+use hil_models::link::spec::LinkSpec;
 use serde::{Deserialize, Serialize};
 
-use super::model::{Execution, OnExit, words};
+use super::model::{Execution, OnExit, Topology, words};
+use crate::trace::source::{BaseFolder, TraceSource};
 
 /// One `[links.<name>]`.
 #[derive(Debug, Clone, PartialEq)]
@@ -19,6 +20,21 @@ pub struct Link {
     /// Its two hosts; forward is from the first to the second. `None` while no channel uses it
     /// and the file does not say.
     pub between: Option<[String; 2]>,
+}
+
+impl Topology {
+    /// The same with its traces looked for beside the file at `path`.
+    pub(super) fn with_traces_beside(mut self, path: &Path) -> Self {
+        let folder = path.parent().unwrap_or(Path::new(""));
+        for link in &mut self.links {
+            if let Via::Emulated(_, emulation) = &mut link.via
+                && let Some(trace) = &mut emulation.trace
+            {
+                trace.base = BaseFolder(folder.to_owned());
+            }
+        }
+        self
+    }
 }
 
 impl Link {
@@ -46,7 +62,7 @@ pub enum Via {
     /// One TCP connection per channel over the real network.
     Tcp(Hop),
     /// UDP datagrams behind a model of a network.
-    Emulated(Hop, Emulation),
+    Emulated(Hop, Box<Emulation>),
 }
 
 impl Via {
@@ -111,24 +127,16 @@ pub enum Timestamps {
     Hardware,
 }
 
-/// What an emulated link does, in each direction.
-#[derive(Debug, Clone, Copy, PartialEq)]
+/// What an emulated link does, in each direction. Outages strike both at once and are those of
+/// either.
+#[derive(Debug, Clone, PartialEq)]
 pub struct Emulation {
     /// From the first host of [`Link::between`] to the second.
-    pub forward: Impairment,
+    pub forward: LinkSpec,
     /// From the second to the first.
-    pub backward: Impairment,
-    /// When nothing gets through, on all channels of the link and both ways at once.
-    pub outages: Outages,
-}
-
-/// The static network model of one direction.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Impairment {
-    /// Fixed one-way delay.
-    pub delay: Duration,
-    /// Probability that a datagram is lost, 0..=1.
-    pub loss_ratio: f64,
+    pub backward: LinkSpec,
+    /// Recorded traces: a channel that has one meets nothing of the above.
+    pub trace: Option<TraceSource>,
 }
 
 words!(Timestamps { Off = "off", Software = "software", Hardware = "hardware" });

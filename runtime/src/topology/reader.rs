@@ -56,6 +56,12 @@ impl<'t> Reader<'t> {
         self.table.contains_key(key)
     }
 
+    /// True when `key` is a table; does not make the key known.
+    pub(super) fn is_table(&self, key: &str) -> bool {
+        let node = self.table.get(key);
+        node.is_some_and(|node| matches!(node.value, Value::Table(_)))
+    }
+
     /// Notes that each present key of `keys` does not belong here, and why.
     pub(super) fn refuse_present(&self, keys: &[&'static str], why: &str) {
         for key in keys {
@@ -159,6 +165,10 @@ impl<'t> Reader<'t> {
     /// A number within `limit`; integers are numbers.
     pub(super) fn number(&mut self, key: &'static str, limit: &Limit<f64>) -> Option<f64> {
         let node = self.node(key)?;
+        self.number_of(key, node, limit)
+    }
+
+    fn number_of(&self, key: &str, node: &Node, limit: &Limit<f64>) -> Option<f64> {
         let number = match &node.value {
             Value::Number(number) => *number,
             Value::Integer(integer) => *integer as f64,
@@ -171,6 +181,34 @@ impl<'t> Reader<'t> {
         None
     }
 
+    /// An array of numbers within `limit`.
+    pub(super) fn numbers(&mut self, key: &'static str, limit: &Limit<f64>) -> Option<Vec<f64>> {
+        let node = self.node(key)?;
+        let Value::Array(items) = &node.value else {
+            return self.wrong_type(key, node, "an array of numbers");
+        };
+        let items = items.iter().map(|item| self.number_of(key, item, limit));
+        all_of(items)
+    }
+
+    /// An array of durations within `limit`.
+    pub(super) fn durations(
+        &mut self,
+        key: &'static str,
+        limit: &Limit<Duration>,
+    ) -> Option<Vec<Duration>> {
+        let node = self.node(key)?;
+        let Value::Array(items) = &node.value else {
+            return self.wrong_type(
+                key,
+                node,
+                "an array of durations, e.g. [\"1 ms\", \"2 ms\"]",
+            );
+        };
+        let items = items.iter().map(|item| self.duration_of(key, item, limit));
+        all_of(items)
+    }
+
     /// A duration within `limit`, written with its unit.
     pub(super) fn duration(
         &mut self,
@@ -178,19 +216,23 @@ impl<'t> Reader<'t> {
         limit: &Limit<Duration>,
     ) -> Option<Duration> {
         let node = self.node(key)?;
+        self.duration_of(key, node, limit)
+    }
+
+    fn duration_of(&self, key: &str, node: &Node, limit: &Limit<Duration>) -> Option<Duration> {
         let Value::Text(text) = &node.value else {
             return self.wrong_type(key, node, "a string with a duration, e.g. \"20 ms\"");
         };
         match parse_duration(text) {
             Ok(duration) if limit.allows(&duration) => return Some(duration),
             Ok(_) => self.out_of_range(key, node, &format!("\"{text}\""), limit),
-            Err(error) => self.refuse(
-                key,
-                Fault::Duration {
+            Err(error) => {
+                let fault = Fault::Duration {
                     value: text.clone(),
                     reason: error.to_string(),
-                },
-            ),
+                };
+                self.faults.add(self.path_of(key), Some(node.place), fault);
+            }
         }
         None
     }
@@ -260,8 +302,20 @@ impl<'t> Reader<'t> {
 
     /// A table; the caller ends it with [`Reader::finish`].
     pub(super) fn table(&mut self, key: &'static str) -> Option<Reader<'t>> {
+        self.table_or(key, "a table")
+    }
+
+    /// As [`Reader::table`], with words of its own for anything else.
+    pub(super) fn table_or(
+        &mut self,
+        key: &'static str,
+        expected: &'static str,
+    ) -> Option<Reader<'t>> {
         let node = self.node(key)?;
-        self.table_of(key, node)
+        if matches!(node.value, Value::Table(_)) {
+            return self.table_of(key, node);
+        }
+        self.wrong_type(key, node, expected)
     }
 
     fn table_of(&self, key: &str, node: &'t Node) -> Option<Reader<'t>> {
@@ -313,6 +367,12 @@ impl<'t> Reader<'t> {
             self.faults.add(path, Some(node.key_place), fault);
         }
     }
+}
+
+/// All of them, each asked for, so that every fault is noted.
+fn all_of<T>(items: impl Iterator<Item = Option<T>>) -> Option<Vec<T>> {
+    let read: Vec<Option<T>> = items.collect();
+    read.into_iter().collect()
 }
 
 fn is_name(name: &str, may_have_slashes: bool) -> bool {

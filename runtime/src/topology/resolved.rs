@@ -3,12 +3,14 @@
 
 use core::time::Duration;
 
-use hil_models::link::outages::Outages;
 use serde::Serialize;
 use toml::{Table, Value};
 
+use super::file_trace::resolved_trace;
+use super::file_wifi::resolved_wifi;
 use super::model::{Channel, Execution, Host, OnExit, Process, Program, Scheduling, Topology};
-use super::model_links::{Gateway, Hop, Impairment, Link, Via};
+use super::model_links::{Gateway, Hop, Link, Via};
+use super::resolved_impairments::{resolved_outages, resolved_spec};
 use super::units::format_duration;
 
 impl Topology {
@@ -80,7 +82,7 @@ impl Serialize for Topology {
     }
 }
 
-fn put(table: &mut Table, key: &str, value: impl Into<Value>) {
+pub(super) fn put(table: &mut Table, key: &str, value: impl Into<Value>) {
     table.insert(key.to_owned(), value.into());
 }
 
@@ -91,12 +93,12 @@ fn put_named(table: &mut Table, key: &str, tables: impl Iterator<Item = (String,
     put(table, key, named);
 }
 
-fn duration(duration: Duration) -> Value {
+pub(super) fn duration(duration: Duration) -> Value {
     Value::String(format_duration(duration))
 }
 
 /// Every integer of a checked topology came from a TOML integer.
-fn integer(value: impl TryInto<i64>) -> Value {
+pub(super) fn integer(value: impl TryInto<i64>) -> Value {
     let value = value.try_into().ok();
     Value::Integer(value.expect("limits keep every number within 64 bits"))
 }
@@ -204,17 +206,18 @@ fn resolved_link(link: &Link) -> Table {
         Via::Udp(hop) | Via::Tcp(hop) => put_hop(&mut table, hop),
         Via::Emulated(hop, emulation) => {
             put_hop(&mut table, hop);
-            put(
-                &mut table,
-                "forward",
-                resolved_impairment(emulation.forward),
-            );
-            put(
-                &mut table,
-                "backward",
-                resolved_impairment(emulation.backward),
-            );
-            put(&mut table, "outages", resolved_outages(emulation.outages));
+            put(&mut table, "forward", resolved_spec(&emulation.forward));
+            put(&mut table, "backward", resolved_spec(&emulation.backward));
+            // A radio has outages of its own, and the link then has none beside them.
+            if let Some(wifi) = &emulation.forward.wifi {
+                put(&mut table, "wifi", resolved_wifi(wifi));
+            } else {
+                let outages = resolved_outages(emulation.forward.outages);
+                put(&mut table, "outages", outages);
+            }
+            if let Some(trace) = &emulation.trace {
+                put(&mut table, "trace", resolved_trace(trace));
+            }
         }
     }
     table
@@ -241,21 +244,5 @@ fn resolved_gateway(gateway: &Gateway) -> Table {
     let mut table = Table::new();
     put_execution(&mut table, &gateway.execution);
     put_on_exit(&mut table, gateway.on_exit);
-    table
-}
-
-fn resolved_outages(outages: Outages) -> Table {
-    let mut table = Table::new();
-    let mean = Duration::from_secs_f64(outages.mean_s);
-    put(&mut table, "mean", duration(mean));
-    put(&mut table, "per_hour", outages.per_hour);
-    put(&mut table, "buffered", outages.buffered);
-    table
-}
-
-fn resolved_impairment(impairment: Impairment) -> Table {
-    let mut table = Table::new();
-    put(&mut table, "delay", duration(impairment.delay));
-    put(&mut table, "loss_ratio", impairment.loss_ratio);
     table
 }

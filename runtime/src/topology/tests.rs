@@ -6,10 +6,12 @@ mod faulty;
 mod fleet;
 mod hosts;
 mod layers;
+mod links;
 mod misspelt;
 mod mutation;
 mod recorded;
 mod relations;
+mod wifi;
 
 use core::time::Duration;
 use std::path::{Path, PathBuf};
@@ -18,6 +20,9 @@ use bytemuck::{Pod, Zeroable};
 use hil_models::case_study::{CaseStudy, ChannelSpec, ParameterError, Score};
 use hil_models::component::Role;
 use hil_models::fleet::Fleet;
+use hil_models::link::delay::DelayLaw;
+use hil_models::link::loss::LossLaw;
+use hil_models::link::spec::LinkSpec;
 use hil_models::message::Message;
 use hil_models::run_log::RunLog;
 use hil_models::shuttle::{Shuttle, ShuttleParameters};
@@ -117,6 +122,9 @@ const SHIPPED: &[&str] = &[
     "split.toml",
     "emulated.toml",
     "outages.toml",
+    "static-cells.toml",
+    "bad-link.toml",
+    "wifi6.toml",
     "egm-client.toml",
     "egm-robot.toml",
     "shuttle-local.toml",
@@ -298,19 +306,14 @@ fn every_key_of_a_channel_and_its_link_reaches_the_checked_topology() {
         }
     );
     let delay = Duration::from_millis(50);
-    let backward = Impairment {
-        delay,
-        loss_ratio: 0.0,
+    let outages = command.spec.unwrap().outages;
+    let expected = |loss_ratio| LinkSpec {
+        outages,
+        ..LinkSpec::fixed(delay, loss_ratio)
     };
-    assert_eq!(command.impairment, Some(backward));
-    assert_eq!(
-        status.impairment,
-        Some(Impairment {
-            delay,
-            loss_ratio: 0.1
-        })
-    );
-    assert_eq!(image.impairment, None);
+    assert_eq!(command.spec, Some(&expected(0.0)));
+    assert_eq!(status.spec, Some(&expected(0.1)));
+    assert_eq!(image.spec, None);
     assert_eq!(image.from_host.name, "robot-pc");
     assert_eq!(
         command.hop.gateway.execution.scheduling,
@@ -429,9 +432,9 @@ fn overrides_need_no_quotes_and_the_last_one_wins() {
         ],
     );
     let crossing = topology.crossings().next().unwrap();
-    let impairment = crossing.impairment.unwrap();
-    assert_eq!(impairment.delay, Duration::from_millis(10));
-    assert!((impairment.loss_ratio - 0.5).abs() < f64::EPSILON);
+    let spec = crossing.spec.unwrap();
+    assert_eq!(spec.delay, DelayLaw::fixed(Duration::from_millis(10)));
+    assert_eq!(spec.loss, LossLaw::bernoulli(0.5));
     assert_eq!(crossing.channel.depth, 2);
     assert_eq!(topology.process("robot").unwrap().execution.cpus, [1, 2]);
 }

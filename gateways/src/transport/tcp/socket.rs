@@ -39,6 +39,7 @@ impl TcpSettings {
             send_buffer_bytes: self.send_buffer_bytes,
             receive_buffer_bytes: self.receive_buffer_bytes,
             timestamps: TimestampMode::Off,
+            wants_radio_reports: false,
         }
     }
 }

@@ -2,12 +2,15 @@
 //! none of them.
 
 use crate::fleet::coordinator::parameters::CoordinatorMode;
-use crate::fleet::experiment::published::{Condition, HARBOR, PublishedRow, WAREHOUSE};
+use crate::fleet::experiment::published::{
+    Condition, HARBOR, LONG_RANGE, PublishedRow, SHORT_RANGE, WAREHOUSE,
+};
 use crate::fleet::experiment::setup::{Links, Setup, StatusPath};
 use crate::fleet::messages::MessageOrder;
 use crate::fleet::robot::TrackerKind;
 use crate::fleet::scenario::Scenario;
 use crate::link::impaired::{DelayLaw, Impairments};
+use crate::link::wifi::WifiPreset;
 
 /// Scenarios of the paper's tables.
 pub(crate) const SCENARIOS: [Scenario; 2] = [Scenario::Harbor, Scenario::Warehouse];
@@ -113,12 +116,15 @@ pub(crate) fn published_cells(base: &Setup, law: DelayLaw) -> Vec<Cell> {
     let mut cells = Vec::new();
     for scenario in SCENARIOS {
         for row in published_rows(scenario) {
-            let Condition::Static {
-                loss_ratio,
-                delay_ms,
-            } = row.condition
-            else {
-                continue;
+            let (loss_ratio, delay_ms) = match row.condition {
+                Condition::Static {
+                    loss_ratio,
+                    delay_ms,
+                } => (loss_ratio, delay_ms),
+                Condition::HardwareInTheLoop(network) => {
+                    cells.extend(wifi_cell(base, scenario, (*row, network)));
+                    continue;
+                }
             };
             let copies: &[u32] = if loss_ratio > 0.0 { &[1, 3] } else { &[1] };
             cells.extend(copies.iter().map(|&copies| Cell {
@@ -159,9 +165,34 @@ fn original(
         status_path: StatusPath::Bypass,
         commands: channel,
         status: channel,
+        wifi: None,
         status_keeps_order: true,
     };
     setup
+}
+
+/// A row over a radio beside the model of that radio: the original's rules, status over the network,
+/// steps of nominal length, and a coordinator that knows of no delay. `None` for a wire.
+fn wifi_cell(
+    base: &Setup,
+    scenario: Scenario,
+    (row, network): (PublishedRow, &str),
+) -> Option<Cell> {
+    let preset = match network {
+        SHORT_RANGE => WifiPreset::ShortRange,
+        LONG_RANGE => WifiPreset::LongRange,
+        _ => return None,
+    };
+    let mut setup = original(base, (0.0, DelayLaw::Constant), (0.0, 1));
+    setup.robot.step_inflation = false;
+    setup.links.status_path = StatusPath::Network;
+    setup.links.wifi = Some(preset.spec());
+    Some(Cell {
+        scenario,
+        place: Place::Published { row, copies: 1 },
+        setup,
+        demand: Demand::None,
+    })
 }
 
 /// What our figures must come to, from the published ones and a prototype of the algorithm.
@@ -320,8 +351,9 @@ mod tests {
     fn every_static_row_of_both_tables_has_its_cells_and_every_name_is_its_own() {
         let base = Setup::default();
         let published = published_cells(&base, DelayLaw::Constant);
-        // Per scenario 4 rows without loss and 4 with, the latter twice; then the variants.
-        assert_eq!(published.len(), 2 * (4 + 8) + 4);
+        // Per scenario 4 rows without loss and 4 with, the latter twice, and 2 over a radio; then the
+        // variants.
+        assert_eq!(published.len(), 2 * (4 + 8 + 2) + 4);
         let mechanisms = mechanism_cells(&base);
         assert_eq!(mechanisms.len(), 13 * 4);
         let cells = published.iter().chain(&mechanisms);

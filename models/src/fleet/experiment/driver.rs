@@ -8,6 +8,7 @@ use crate::case_study::ParameterError;
 use crate::fleet::controller::coordinator_of;
 use crate::fleet::coordinator::Coordinator;
 use crate::fleet::experiment::agenda::Agenda;
+use crate::fleet::experiment::path::Path;
 use crate::fleet::experiment::post::{Letter, Post, Rank};
 use crate::fleet::experiment::setup::{Setup, StatusPath};
 use crate::fleet::experiment::tally::FleetTally;
@@ -16,7 +17,8 @@ use crate::fleet::referee::{Incident, Referee, SCAN_PERIOD};
 use crate::fleet::robot::{Robot, RobotParameters};
 use crate::fleet::robots::robot_stream;
 use crate::fleet::scenario::Scene;
-use crate::link::impaired::ImpairedLink;
+use crate::link::impaired::LinkCounts;
+use crate::link::spec::Way;
 use crate::random::RandomStream;
 use crate::time::Instant;
 
@@ -40,8 +42,8 @@ pub struct Experiment {
 #[derive(Debug)]
 struct Network {
     status_path: StatusPath,
-    commands: ImpairedLink,
-    status: ImpairedLink,
+    commands: Path,
+    status: Path,
     post: Post,
     /// Per robot, the newest state that arrived; `None` where states may overtake each other.
     newest_status: Option<Vec<u32>>,
@@ -82,10 +84,6 @@ impl Experiment {
             .map(|robot| robot_of(scene, &setup.robot, (seed, robot)))
             .collect();
         let links = &setup.links;
-        let stalls = || RandomStream::new(seed, "fleet stalls");
-        let link = |impairments, name| {
-            ImpairedLink::new(impairments, RandomStream::new(seed, name), stalls())
-        };
         let status_count = links.status_keeps_order.then_some(scene.starts.len());
         Ok(Self {
             now: Instant::ZERO,
@@ -95,8 +93,8 @@ impl Experiment {
             referee: Referee::new(scene, 1),
             network: Network {
                 status_path: links.status_path,
-                commands: link(links.commands, "fleet commands")?,
-                status: link(links.status, "fleet status")?,
+                commands: Path::new(links, Way::Forward, seed)?,
+                status: Path::new(links, Way::Backward, seed)?,
                 post: Post::default(),
                 newest_status: status_count.map(|count| vec![0; count]),
                 superseded_count: 0,
@@ -292,8 +290,9 @@ impl Experiment {
         &self.referee
     }
 
-    pub(crate) fn links(&self) -> [&ImpairedLink; 2] {
-        [&self.network.commands, &self.network.status]
+    /// What became of commands and of states on their way.
+    pub(crate) fn link_counts(&self) -> [LinkCounts; 2] {
+        [self.network.commands.counts(), self.network.status.counts()]
     }
 
     pub(crate) fn superseded_count(&self) -> u64 {
@@ -305,7 +304,8 @@ impl Network {
     /// Sends a command to its robot.
     fn command(&mut self, now: Instant, letter: Letter) {
         let Self { commands, post, .. } = self;
-        commands.offer(now, &mut |at| post.post(at, letter));
+        let length_bytes = letter.length_bytes();
+        commands.offer(now, length_bytes, &mut |at| post.post(at, letter));
     }
 
     /// Sends a state to the coordinator, unless that reads the robots itself.
@@ -314,7 +314,9 @@ impl Network {
             return;
         }
         let Self { status, post, .. } = self;
-        status.offer(now, &mut |at| post.post(at, Letter::State(state)));
+        let letter = Letter::State(state);
+        let length_bytes = letter.length_bytes();
+        status.offer(now, length_bytes, &mut |at| post.post(at, letter));
     }
 
     /// False for a state that a newer one has deleted from the queue on its way. Dropping it on

@@ -6,6 +6,7 @@ mod agenda;
 mod cells;
 mod driver;
 mod judgement;
+mod path;
 mod post;
 pub mod published;
 mod report;

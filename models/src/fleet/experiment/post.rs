@@ -7,6 +7,9 @@ use std::collections::BinaryHeap;
 use crate::fleet::messages::{Authority, Mission, State};
 use crate::time::Instant;
 
+/// Header of a datagram between gateways; only a radio's airtime depends on it.
+const HEADER_BYTES: usize = 72;
+
 /// A message under way.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Letter {
@@ -19,6 +22,16 @@ pub(crate) enum Letter {
 }
 
 impl Letter {
+    /// Bytes of the message behind our datagram's header.
+    pub(crate) const fn length_bytes(&self) -> usize {
+        HEADER_BYTES
+            + match self {
+                Self::State(_) => size_of::<State>(),
+                Self::Authority(_) => size_of::<Authority>(),
+                Self::Mission(_) => size_of::<Mission>(),
+            }
+    }
+
     /// At one instant, ports are served in the order in which an endpoint polls them.
     const fn rank(&self) -> Rank {
         match self {

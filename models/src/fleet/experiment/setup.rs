@@ -7,6 +7,7 @@ use crate::fleet::coordinator::parameters::CoordinatorParameters;
 use crate::fleet::mission::MissionParameters;
 use crate::fleet::robot::RobotParameters;
 use crate::link::impaired::Impairments;
+use crate::link::wifi::WifiSpec;
 
 /// How the coordinator learns what the robots do.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -25,6 +26,8 @@ pub enum StatusPath {
 pub struct Links {
     /// Whether states go over the network at all.
     pub status_path: StatusPath,
+    /// A radio, commands forward and states backward, in place of both impairments.
+    pub wifi: Option<WifiSpec>,
     /// What authorities and missions meet.
     pub commands: Impairments,
     /// What states meet.
@@ -57,6 +60,9 @@ impl Setup {
         self.robot.check()?;
         self.coordinator.check()?;
         self.missions.check()?;
+        if let Some(wifi) = &self.links.wifi {
+            wifi.check()?;
+        }
         self.links.commands.check()?;
         self.links.status.check()?;
         let overrun_s = self.overrun_max_s;

@@ -6,7 +6,7 @@ use crate::fleet::experiment::driver::Experiment;
 use crate::fleet::referee::Tally;
 use crate::fleet::robot::RobotCounters;
 use crate::fleet::scenario::Scene;
-use crate::link::impaired::{ImpairedLink, LinkCounts};
+use crate::link::impaired::LinkCounts;
 use crate::measure::statistics::clopper_pearson;
 use crate::time::Instant;
 
@@ -55,7 +55,7 @@ const COLLIDED_MAX: usize = 8;
 
 impl FleetTally {
     pub(crate) fn of(experiment: &Experiment) -> Self {
-        let [commands, status] = experiment.links().map(ImpairedLink::counts);
+        let [commands, status] = experiment.link_counts();
         let mut robots = RobotCounters::default();
         for robot in experiment.robots() {
             robots.add(robot.counters());

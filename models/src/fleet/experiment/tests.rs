@@ -33,12 +33,12 @@ fn parameters(scenario: Scenario, tracker: TrackerKind) -> FleetParameters {
     }
 }
 
-fn setup_of(parameters: &FleetParameters, links: Links) -> Setup {
+fn setup_of(parameters: &FleetParameters, links: &Links) -> Setup {
     Setup {
         robot: parameters.robot.clone(),
         coordinator: parameters.coordinator.clone(),
         missions: parameters.missions,
-        links,
+        links: *links,
         overrun_max_s: 0.0,
     }
 }
@@ -50,7 +50,7 @@ fn scene_of(parameters: &FleetParameters) -> Scene {
 /// Truth of the fast driver.
 fn fast(
     parameters: &FleetParameters,
-    links: Links,
+    links: &Links,
     seed: u64,
     run_s: i64,
 ) -> (Vec<Truth>, FleetTally) {
@@ -90,7 +90,7 @@ fn on_a_perfect_link_both_drivers_move_the_robots_alike_to_the_bit() {
         for tracker in [TrackerKind::Exact, TrackerKind::LegacyRk4] {
             let parameters = parameters(scenario, tracker);
             for seed in [1, 2] {
-                let (truth, tally) = fast(&parameters, Links::default(), seed, 600);
+                let (truth, tally) = fast(&parameters, &Links::default(), seed, 600);
                 let mut expected = generic(&parameters, seed, 600);
                 expected.retain(|record| record.at_ns < 600_000_000_000);
                 assert!(tally.referee.missions_done_count > 10, "{scenario:?}");
@@ -112,7 +112,7 @@ fn equal_seeds_give_equal_runs_and_unequal_ones_do_not() {
     let mut links = Links::default();
     links.commands.loss_ratio = 0.2;
     links.status.loss_ratio = 0.2;
-    let run = |seed| fast(&parameters, links, seed, 300);
+    let run = |seed| fast(&parameters, &links, seed, 300);
     assert_eq!(run(4), run(4));
     assert_ne!(run(4).0, run(5).0);
 }
@@ -125,7 +125,7 @@ fn links_lose_delay_and_repeat_what_they_are_told_to() {
     links.status.duplicate_ratio = 0.1;
     links.status.duplicate_lag_ms = 100.0;
     links.commands.delay_ms = 40.0;
-    let (_, tally) = fast(&parameters, links, 1, 300);
+    let (_, tally) = fast(&parameters, &links, 1, 300);
     let lost = tally.status.lost_count as f64 / tally.status.offered_count as f64;
     assert!((lost - 0.5).abs() < 0.05, "{lost}");
     assert!(tally.status.duplicated_count > 0);
@@ -139,11 +139,11 @@ fn states_that_keep_order_are_deleted_by_newer_ones() {
     let mut links = Links::default();
     links.status.hold_ratio = 0.2;
     links.status.hold_ms = 200.0;
-    let (_, free) = fast(&parameters, links, 1, 300);
+    let (_, free) = fast(&parameters, &links, 1, 300);
     assert!(free.coordinator.states_reordered > 0);
     assert_eq!(free.superseded_count, 0);
     links.status_keeps_order = true;
-    let (_, kept) = fast(&parameters, links, 1, 300);
+    let (_, kept) = fast(&parameters, &links, 1, 300);
     assert_eq!(kept.coordinator.states_reordered, 0);
     assert!(kept.superseded_count > 0);
 }
@@ -155,7 +155,7 @@ fn a_bypassed_status_path_sends_no_state() {
         status_path: StatusPath::Bypass,
         ..Links::default()
     };
-    let (_, tally) = fast(&parameters, links, 1, 600);
+    let (_, tally) = fast(&parameters, &links, 1, 600);
     assert_eq!(tally.status.offered_count, 0);
     assert!(tally.referee.missions_done_count > 10);
     assert!(tally.section_count() > 5);
@@ -171,7 +171,7 @@ fn the_robot_that_yields_stops_waits_and_enters_when_the_closed_form_says() {
         status_path: StatusPath::Bypass,
         ..Links::default()
     };
-    let (truth, tally) = fast(&parameters, links, 1, 60);
+    let (truth, tally) = fast(&parameters, &links, 1, 60);
     let scene = scene_of(&parameters);
     let (speed, acceleration) = (2.0, 1.0);
     let of = |robot| {

@@ -4,16 +4,16 @@
 use super::figures::{Gap, InterruptionFigures};
 use super::join::{Join, Joined, Key, stamp};
 use super::stage::{MessageFate, Side};
-use super::{AccountContext, ChannelRecords, Interruption, PathProcess, RunSpan};
+use super::{AccountContext, ChannelPath, ChannelRecords, Interruption, PathProcess, RunSpan};
 use crate::measure::record::{EgressRecord, IngressRecord};
-use crate::time::{Alignment, Instant, RemoteInstant, duration_ns};
+use crate::time::{Instant, RemoteInstant, duration_ns};
 
 /// Judges messages in key order.
 #[derive(Debug)]
 pub(super) struct Judge<'a> {
     files: ChannelRecords<'a>,
     is_gateway: bool,
-    alignment: Option<Alignment>,
+    path: ChannelPath<'a>,
     last_egress: Option<Key>,
     last_taken: Option<Key>,
     producer_end_ns: Option<i64>,
@@ -34,18 +34,26 @@ impl<'a> Judge<'a> {
         context: &AccountContext<'a>,
         join: &Join<'_>,
     ) -> Self {
-        let alignment = context.path.alignment();
+        let path = context.path;
         let end = |run: Option<RunSpan>| run.map(|run| run.end.as_ns());
         let (producer_end, consumer_end) = (end(context.producer_run), end(context.consumer_run));
-        let to_producer = |ns: i64| Some(ns.saturating_sub(alignment?.offset_ns));
+        // A converted end counts from as early as it may have been.
+        let to_producer = |ns: i64| {
+            let (end, bound_ns) = path.to_remote(Instant::from_ns(ns))?;
+            Some(end.as_ns().saturating_sub_unsigned(bound_ns))
+        };
+        let to_consumer = |ns: i64| {
+            let (end, bound_ns) = path.localise(RemoteInstant::from_ns(ns))?;
+            Some(end.as_ns().saturating_sub_unsigned(bound_ns))
+        };
         Self {
             files: *records,
             is_gateway: context.path.is_gateway(),
-            alignment,
+            path,
             last_egress: join.last_egress(),
             last_taken: join.last_taken(),
             producer_end_ns: producer_end.or_else(|| to_producer(consumer_end?)),
-            consumer_end_ns: consumer_end.or_else(|| localise(alignment, producer_end?)),
+            consumer_end_ns: consumer_end.or_else(|| to_consumer(producer_end?)),
             flight_ns: duration_ns(context.flight_time_max),
             interruptions: context.interruptions,
             lost_counts: vec![0; context.interruptions.len()],
@@ -201,12 +209,14 @@ impl<'a> Judge<'a> {
     /// True when the message was last seen while the process was down, or shortly before and
     /// nothing recorded says that it got lost otherwise.
     fn is_hit(&self, fate: MessageFate, place: Place, interruption: &Interruption) -> bool {
-        let (seen_ns, is_exact) = match self.position(place, interruption.place.side()) {
-            Position::Exact(seen_ns) => (seen_ns, true),
-            Position::After(seen_ns) => (seen_ns, false),
+        let (seen_ns, bound_ns, is_exact) = match self.position(place, interruption.place.side()) {
+            Position::Exact(seen_ns) => (seen_ns, 0, true),
+            Position::Within(seen_ns, bound_ns) => (seen_ns, bound_ns, true),
+            Position::After(seen_ns) => (seen_ns, 0, false),
             Position::Unknown => return false,
         };
-        let (from_ns, until_ns) = (interruption.from.as_ns(), interruption.until.as_ns());
+        let from_ns = interruption.from.as_ns().saturating_sub_unsigned(bound_ns);
+        let until_ns = interruption.until.as_ns().saturating_add_unsigned(bound_ns);
         if (from_ns..=until_ns).contains(&seen_ns) {
             return true;
         }
@@ -227,16 +237,19 @@ impl<'a> Judge<'a> {
     fn position(&self, place: Place, side: Side) -> Position {
         let (exact_ns, previous_ns) = match side {
             Side::Producer => (place.producer_ns, self.previous_producer_ns),
-            Side::Consumer => {
-                let localised = || localise(self.alignment, place.producer_ns?);
-                (
-                    place.consumer_ns.or_else(localised),
-                    self.previous_consumer_ns,
-                )
-            }
+            Side::Consumer => (place.consumer_ns, self.previous_consumer_ns),
         };
-        match (exact_ns, previous_ns) {
-            (Some(exact_ns), _) => Position::Exact(exact_ns),
+        let localised = || {
+            let remote = RemoteInstant::from_ns(place.producer_ns?);
+            self.path
+                .localise(remote)
+                .filter(|_| side == Side::Consumer)
+        };
+        if let Some(exact_ns) = exact_ns {
+            return Position::Exact(exact_ns);
+        }
+        match (localised(), previous_ns) {
+            (Some((seen, bound_ns)), _) => Position::Within(seen.as_ns(), bound_ns),
             (None, Some(previous_ns)) => Position::After(previous_ns),
             (None, None) => Position::Unknown,
         }
@@ -247,14 +260,11 @@ impl<'a> Judge<'a> {
 #[derive(Debug, Clone, Copy)]
 enum Position {
     Exact(i64),
+    /// By another host's clock, within so many nanoseconds.
+    Within(i64, u64),
     /// Only that it followed a message seen then.
     After(i64),
     Unknown,
-}
-
-fn localise(alignment: Option<Alignment>, producer_ns: i64) -> Option<i64> {
-    let here: Instant = alignment?.localise(RemoteInstant::from_ns(producer_ns));
-    Some(here.as_ns())
 }
 
 /// The last instants at which a message was seen on each host.

@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use super::stage::{MessageFate, Stage};
+use crate::clock::BoundFigures;
 use crate::measure::histogram::Distribution;
 use crate::measure::statistics::{CONFIDENCE, Interval, IntervalNs, wilson};
 
@@ -97,6 +98,10 @@ pub struct SegmentFigures {
     pub is_combined: bool,
     /// Its durations.
     pub distribution: Distribution,
+    /// How far its durations may be off because it ends on another host's clock than it began on;
+    /// `None` within one host.
+    #[serde(default)]
+    pub bound: Option<BoundFigures>,
 }
 
 impl SegmentFigures {
@@ -117,6 +122,9 @@ pub struct EndToEnd {
     pub p99_interval: Option<IntervalNs>,
     /// Largest error from clock alignment, nanoseconds; 0 on one clock.
     pub alignment_bound_ns: Option<u64>,
+    /// Errors from clock alignment over all messages; zero on one clock.
+    #[serde(default)]
+    pub bound: Option<BoundFigures>,
 }
 
 /// Whether published-to-taken equals the sum of the segments, message by message.
@@ -158,6 +166,13 @@ pub struct ClosingFigures {
     pub negative_segment_count: u64,
     /// Not closed because of the residual alone.
     pub residual_count: u64,
+    /// Not checked because a clock was stepped about when the message was published.
+    #[serde(default)]
+    pub unaligned_count: u64,
+    /// True when stamps of one host were converted to the other's clock first: then an error of
+    /// either host's real-time offset cancels out, and the check proves that much less.
+    #[serde(default)]
+    pub is_converted: bool,
     /// Largest residual that closes, nanoseconds.
     pub residual_limit_ns: i64,
     /// End-to-end minus sum of segments, magnitude.

@@ -8,12 +8,19 @@
 //! monotonic clock with the offset each gateway read at its own time. So the sum of segments
 //! equals end-to-end only when records, stamps and both offsets agree: the closing check can
 //! fail, which is what makes it worth printing.
+//!
+//! Between hosts whose clocks are only aligned, raw stamps do not compare: the wire segment is of
+//! converted ones, in which the offsets of the gateways cancel out of the sum. The check proves
+//! less then: that records belong together, that no stage lies before its predecessor by more than
+//! the alignment's bound, and that no clock stepped while a message was under way. It cannot prove
+//! the alignment; the bound beside each figure that crosses hosts says how far that may be off.
 
 mod fate;
 mod figures;
 mod gaps;
 mod join;
 mod outage;
+mod passage;
 #[cfg(test)]
 mod random_fates;
 mod segments;
@@ -23,6 +30,7 @@ mod story;
 mod synthetic;
 #[cfg(test)]
 mod tests;
+mod trace;
 
 use core::time::Duration;
 
@@ -34,15 +42,18 @@ pub use outage::{
     Foregoing, Happening, LongestOutage, OUTAGE_EFFECT_MAX, Outage, OutageClass, OutageFigures,
     OutageFinder, Standing, foregoing, outages,
 };
+pub use passage::passages;
 pub use stage::{MessageFate, Side, Stage};
 pub use story::{MessageStory, stories};
+pub use trace::{TRACE_MESSAGES_MAX, TooManyMessages, TraceChannel, link_trace};
 
+use crate::clock::ClockMap;
 use crate::measure::histogram::LatencyHistogram;
 use crate::measure::record::{
     EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, TakenRecord,
 };
 use crate::random::RandomStream;
-use crate::time::{Alignment, Instant};
+use crate::time::{Alignment, Instant, RemoteInstant};
 
 /// Largest difference between end-to-end and the sum of segments for a message that closes.
 pub const RESIDUAL_LIMIT_NS: i64 = 1_000;
@@ -73,7 +84,7 @@ pub struct ChannelRecords<'a> {
 
 impl ChannelRecords<'_> {
     /// Those that a channel carried so can have.
-    fn on(self, path: ChannelPath) -> Self {
+    fn on(self, path: ChannelPath<'_>) -> Self {
         if path.is_gateway() {
             return self;
         }
@@ -87,8 +98,8 @@ impl ChannelRecords<'_> {
 }
 
 /// How a channel gets from its producer to its consumer.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum ChannelPath {
+#[derive(Debug, Clone, Copy)]
+pub enum ChannelPath<'a> {
     /// Shared memory of one host.
     SharedMemory,
     /// A gateway pair.
@@ -97,18 +108,63 @@ pub enum ChannelPath {
         /// machine, `None` when the clocks are not aligned.
         alignment: Option<Alignment>,
     },
+    /// A gateway pair between hosts whose clocks are related differently at each instant.
+    Mapped {
+        /// From the producer's host clock to the consumer's.
+        map: &'a ClockMap,
+    },
 }
 
-impl ChannelPath {
-    const fn alignment(self) -> Option<Alignment> {
+impl ChannelPath<'_> {
+    /// An instant of the producer's host on the clock of the consumer's, with the largest error of
+    /// the conversion in nanoseconds; `None` when the clocks are not aligned, or not then.
+    pub fn localise(self, remote: RemoteInstant) -> Option<(Instant, u64)> {
         match self {
-            Self::SharedMemory => Some(Alignment::SAME_CLOCK),
-            Self::Gateway { alignment } => alignment,
+            Self::SharedMemory => Some((Alignment::SAME_CLOCK.localise(remote), 0)),
+            Self::Gateway { alignment } => {
+                let alignment = alignment?;
+                Some((alignment.localise(remote), alignment.bound_ns))
+            }
+            Self::Mapped { map } => {
+                let localised = map.localise(remote)?;
+                Some((localised.instant, localised.bound_ns()))
+            }
+        }
+    }
+
+    /// An instant of the consumer's host on the clock of the producer's, with the largest error.
+    pub fn to_remote(self, local: Instant) -> Option<(RemoteInstant, u64)> {
+        let shifted = |alignment: Alignment| {
+            let remote_ns = local.as_ns().saturating_sub(alignment.offset_ns);
+            (RemoteInstant::from_ns(remote_ns), alignment.bound_ns)
+        };
+        match self {
+            Self::SharedMemory => Some(shifted(Alignment::SAME_CLOCK)),
+            Self::Gateway { alignment } => alignment.map(shifted),
+            Self::Mapped { map } => map.to_remote(local),
+        }
+    }
+
+    /// True when instants of the two hosts compare at all.
+    pub const fn is_aligned(self) -> bool {
+        match self {
+            Self::SharedMemory => true,
+            Self::Gateway { alignment } => alignment.is_some(),
+            Self::Mapped { map } => map.figures().bound.is_some(),
+        }
+    }
+
+    /// True when both ends read one clock, so that raw kernel stamps compare.
+    pub fn has_one_clock(self) -> bool {
+        match self {
+            Self::SharedMemory => true,
+            Self::Gateway { alignment } => alignment == Some(Alignment::SAME_CLOCK),
+            Self::Mapped { .. } => false,
         }
     }
 
     const fn is_gateway(self) -> bool {
-        matches!(self, Self::Gateway { .. })
+        !matches!(self, Self::SharedMemory)
     }
 }
 
@@ -163,7 +219,7 @@ pub struct RunSpan {
 #[derive(Debug, Clone, Copy)]
 pub struct AccountContext<'a> {
     /// How the channel is carried.
-    pub path: ChannelPath,
+    pub path: ChannelPath<'a>,
     /// Interruptions of processes on this channel's way.
     pub interruptions: &'a [Interruption],
     /// The run on the producer's host clock, if known.
@@ -184,7 +240,7 @@ pub struct AccountContext<'a> {
 
 impl<'a> AccountContext<'a> {
     /// The context of a channel about whose run nothing else is known.
-    pub const fn new(path: ChannelPath) -> Self {
+    pub const fn new(path: ChannelPath<'a>) -> Self {
         Self {
             path,
             interruptions: &[],

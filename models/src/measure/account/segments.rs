@@ -4,12 +4,13 @@
 use super::figures::{Closing, ClosingFigures, Coverage, EndToEnd, SegmentFigures, StampCoverage};
 use super::join::{Joined, stamp};
 use super::stage::{Side, Stage};
-use super::{AccountContext, ChannelRecords, ORDER_TOLERANCE_NS, RESIDUAL_LIMIT_NS};
+use super::{AccountContext, ChannelPath, ChannelRecords, ORDER_TOLERANCE_NS, RESIDUAL_LIMIT_NS};
+use crate::clock::BoundFigures;
 use crate::measure::histogram::{Distribution, LatencyHistogram};
 use crate::measure::record::EgressRecord;
 use crate::measure::statistics::{CONFIDENCE, block_bootstrap_quantile};
 use crate::random::RandomStream;
-use crate::time::{Alignment, RemoteInstant};
+use crate::time::RemoteInstant;
 
 pub(super) const NOT_ALIGNED: &str = "clocks not aligned";
 const NO_CONSUMER: &str = "the consumer's records are not at hand";
@@ -101,33 +102,38 @@ impl Timeline {
 pub(super) struct SegmentBook<'a> {
     files: ChannelRecords<'a>,
     is_gateway: bool,
-    alignment: Option<Alignment>,
+    path: ChannelPath<'a>,
     cards_share_clock: bool,
     /// By first and last stage of the segment.
     segments: Vec<Option<LatencyHistogram>>,
+    /// Of the segments that cross from host to host: how far each length may be off.
+    bounds_ns: Vec<Vec<u64>>,
     mark_counts: [u64; Stage::COUNT],
     hardware: LatencyHistogram,
     end_to_end: LatencyHistogram,
     end_to_end_ns: Vec<i64>,
+    end_to_end_bounds_ns: Vec<u64>,
     residual: LatencyHistogram,
     closing: ClosingFigures,
     coverage: StampCoverage,
 }
 
 impl<'a> SegmentBook<'a> {
-    pub(super) fn new(records: &ChannelRecords<'a>, context: &AccountContext<'_>) -> Self {
+    pub(super) fn new(records: &ChannelRecords<'a>, context: &AccountContext<'a>) -> Self {
         let covers = |is_known: bool| is_known.then(Coverage::default);
         let (egress, ingress) = (records.egress.is_some(), records.ingress.is_some());
         Self {
             files: *records,
             is_gateway: context.path.is_gateway(),
-            alignment: context.path.alignment(),
+            path: context.path,
             cards_share_clock: context.cards_share_clock,
             segments: vec![None; Stage::COUNT * Stage::COUNT],
+            bounds_ns: vec![Vec::new(); Stage::COUNT * Stage::COUNT],
             mark_counts: [0; Stage::COUNT],
             hardware: LatencyHistogram::default(),
             end_to_end: LatencyHistogram::default(),
             end_to_end_ns: Vec::new(),
+            end_to_end_bounds_ns: Vec::new(),
             residual: LatencyHistogram::default(),
             closing: ClosingFigures {
                 checked_count: 0,
@@ -136,6 +142,8 @@ impl<'a> SegmentBook<'a> {
                 missing_stage_count: 0,
                 negative_segment_count: 0,
                 residual_count: 0,
+                unaligned_count: 0,
+                is_converted: !context.path.has_one_clock(),
                 residual_limit_ns: RESIDUAL_LIMIT_NS,
                 residual: Distribution::unavailable("no message was taken"),
             },
@@ -161,41 +169,36 @@ impl<'a> SegmentBook<'a> {
             self.mark_counts[mark.stage.index()] += 1;
         }
         for (from, to) in timeline.pairs() {
-            let Some(length_ns) = self.difference(from, to) else {
+            let Some((length_ns, bound_ns)) = self.difference(from, to) else {
                 continue;
             };
             let cell = from.stage.index() * Stage::COUNT + to.stage.index();
             let histogram = self.segments[cell].get_or_insert_with(LatencyHistogram::default);
             histogram.record(length_ns);
             sum_ns = sum_ns.saturating_add(length_ns);
-            is_ordered &= length_ns >= -self.tolerance_ns(from, to);
+            if from.stage.side() != to.stage.side() {
+                self.bounds_ns[cell].push(bound_ns);
+            }
+            is_ordered &= length_ns >= -ORDER_TOLERANCE_NS.saturating_add_unsigned(bound_ns);
         }
         self.count_hardware(joined);
         self.close(joined, &timeline, (sum_ns, is_ordered));
     }
 
-    /// On one clock, two kernel stamps are compared raw, so that an error in either host's
-    /// offset shows as a residual instead of cancelling out.
-    fn difference(&self, from: Mark, to: Mark) -> Option<i64> {
+    /// A length and how far it may be off. On one clock, two kernel stamps are compared raw, so
+    /// that an error in either host's offset shows as a residual instead of cancelling out.
+    fn difference(&self, from: Mark, to: Mark) -> Option<(i64, u64)> {
         if from.stage.side() == to.stage.side() {
-            return Some(to.host_ns.saturating_sub(from.host_ns));
+            return Some((to.host_ns.saturating_sub(from.host_ns), 0));
         }
-        let alignment = self.alignment?;
-        if alignment == Alignment::SAME_CLOCK
+        if self.path.has_one_clock()
             && let Some((sent_ns, received_ns)) = from.raw_ns.zip(to.raw_ns)
         {
-            return Some(received_ns.saturating_sub(sent_ns));
+            return Some((received_ns.saturating_sub(sent_ns), 0));
         }
-        let local = alignment.localise(RemoteInstant::from_ns(from.host_ns));
-        Some(to.host_ns.saturating_sub(local.as_ns()))
-    }
-
-    fn tolerance_ns(&self, from: Mark, to: Mark) -> i64 {
-        let bound_ns = match self.alignment {
-            Some(alignment) if from.stage.side() != to.stage.side() => alignment.bound_ns,
-            _ => 0,
-        };
-        ORDER_TOLERANCE_NS.saturating_add_unsigned(bound_ns)
+        let remote = RemoteInstant::from_ns(from.host_ns);
+        let (local, bound_ns) = self.path.localise(remote)?;
+        Some((to.host_ns.saturating_sub(local.as_ns()), bound_ns))
     }
 
     fn close(
@@ -204,16 +207,22 @@ impl<'a> SegmentBook<'a> {
         timeline: &Timeline,
         (sum_ns, is_ordered): (i64, bool),
     ) {
-        let Some((taken, alignment)) = joined.taken.zip(self.alignment) else {
+        let Some(taken) = joined.taken.filter(|_| self.path.is_aligned()) else {
             return;
         };
+        let published = stamp(taken.published_ns)
+            .map(|published_ns| self.path.localise(RemoteInstant::from_ns(published_ns)));
+        if published == Some(None) {
+            self.closing.unaligned_count += 1;
+            return;
+        }
         self.closing.checked_count += 1;
-        let ends = stamp(taken.taken_ns).zip(stamp(taken.published_ns));
-        let residual_ns = ends.map(|(taken_ns, published_ns)| {
-            let published = alignment.localise(RemoteInstant::from_ns(published_ns));
+        let ends = stamp(taken.taken_ns).zip(published.flatten());
+        let residual_ns = ends.map(|(taken_ns, (published, bound_ns))| {
             let end_to_end_ns = taken_ns.saturating_sub(published.as_ns());
             self.end_to_end.record(end_to_end_ns);
             self.end_to_end_ns.push(end_to_end_ns);
+            self.end_to_end_bounds_ns.push(bound_ns);
             end_to_end_ns.saturating_sub(sum_ns).saturating_abs()
         });
         if let Some(residual_ns) = residual_ns {
@@ -321,18 +330,20 @@ impl<'a> SegmentBook<'a> {
                     || Distribution::unavailable(&self.reason(from, to)),
                     |histogram| histogram.distribution(NOT_ALIGNED),
                 );
+                let cell = from.index() * Stage::COUNT + to.index();
                 SegmentFigures {
                     from,
                     to,
                     is_combined,
                     distribution,
+                    bound: BoundFigures::of(self.bounds_ns[cell].clone()),
                 }
             })
             .collect()
     }
 
     fn reason(&self, from: Stage, to: Stage) -> String {
-        if from.side() != to.side() && self.alignment.is_none() {
+        if from.side() != to.side() && !self.path.is_aligned() {
             return NOT_ALIGNED.to_owned();
         }
         for stage in [from, to] {
@@ -371,17 +382,20 @@ impl<'a> SegmentBook<'a> {
     }
 
     pub(super) fn end_to_end(&self, random: &mut RandomStream) -> EndToEnd {
-        let reason = match (self.alignment, self.files.taken.is_some()) {
-            (None, _) => NOT_ALIGNED,
+        let reason = match (self.path.is_aligned(), self.files.taken.is_some()) {
+            (false, _) => NOT_ALIGNED,
             (_, false) => NO_CONSUMER,
             _ => "no message was taken",
         };
         let samples = &self.end_to_end_ns;
+        let bound = BoundFigures::of(self.end_to_end_bounds_ns.clone());
+        let exact = self.path.has_one_clock().then_some(0);
         EndToEnd {
             distribution: self.end_to_end.distribution(reason),
             p50_interval: block_bootstrap_quantile(samples, 0.5, CONFIDENCE, random),
             p99_interval: block_bootstrap_quantile(samples, 0.99, CONFIDENCE, random),
-            alignment_bound_ns: self.alignment.map(|alignment| alignment.bound_ns),
+            alignment_bound_ns: bound.map(|bound| bound.largest_ns).or(exact),
+            bound,
         }
     }
 
@@ -389,8 +403,8 @@ impl<'a> SegmentBook<'a> {
         let unavailable = |reason: &str| Closing::Unavailable {
             reason: reason.to_owned(),
         };
-        match (self.alignment, self.files.taken.is_some()) {
-            (None, _) => unavailable(NOT_ALIGNED),
+        match (self.path.is_aligned(), self.files.taken.is_some()) {
+            (false, _) => unavailable(NOT_ALIGNED),
             (_, false) => unavailable(NO_CONSUMER),
             _ => Closing::Checked(ClosingFigures {
                 residual: self.residual.distribution("no message was taken"),

@@ -22,6 +22,8 @@ pub struct MessageStory {
     /// Published to taken, nanoseconds; `None` for a message that was not taken, and between
     /// hosts whose clocks are not aligned.
     pub delay_ns: Option<i64>,
+    /// How far `delay_ns` may be off because two hosts' clocks are in it; zero on one clock.
+    pub delay_bound_ns: Option<u64>,
     /// A later message of the channel came before it.
     pub is_overtaken: bool,
     /// Index of the interruption that cost it, when it was lost in one.
@@ -45,10 +47,12 @@ pub fn stories(
         let Some(key) = key(&joined).filter(|key| wanted.contains(key)) else {
             continue;
         };
+        let delay = delay(&joined, context);
         let story = MessageStory {
             fate,
             published_ns: published_ns(&joined),
-            delay_ns: delay_ns(&joined, context),
+            delay_ns: delay.map(|(delay_ns, _)| delay_ns),
+            delay_bound_ns: delay.map(|(_, bound_ns)| bound_ns),
             is_overtaken: joined
                 .ingress
                 .is_some_and(|ingress| ingress.flags & IngressRecord::REORDERED != 0),
@@ -82,14 +86,12 @@ pub(super) fn published_ns(joined: &Joined<'_>) -> Option<i64> {
     stamps.into_iter().flatten().find_map(stamp)
 }
 
-fn delay_ns(joined: &Joined<'_>, context: &AccountContext<'_>) -> Option<i64> {
+fn delay(joined: &Joined<'_>, context: &AccountContext<'_>) -> Option<(i64, u64)> {
     let taken = joined.taken?;
     let (published_ns, taken_ns) = (stamp(taken.published_ns)?, stamp(taken.taken_ns)?);
-    let published = context
-        .path
-        .alignment()?
-        .localise(RemoteInstant::from_ns(published_ns));
-    Some(taken_ns.saturating_sub(published.as_ns()))
+    let remote = RemoteInstant::from_ns(published_ns);
+    let (published, bound_ns) = context.path.localise(remote)?;
+    Some((taken_ns.saturating_sub(published.as_ns()), bound_ns))
 }
 
 #[cfg(test)]

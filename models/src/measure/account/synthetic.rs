@@ -155,6 +155,8 @@ fn arrived(message: Written) -> IngressRecord {
         received_ns: message.published_ns + RECEIVED_NS,
         forwarded_ns: message.published_ns + FORWARDED_NS,
         realtime_offset_ns: REALTIME_NS,
+        emulated_ns: UNAVAILABLE,
+        due_ns: UNAVAILABLE,
         epoch: message.epoch,
         session: 41,
         flags: 0,

@@ -4,6 +4,7 @@ use core::time::Duration;
 
 use crate::egm::parameters::{ControllerSettings, QueuePolicy, RestartPolicy};
 use crate::link::outages::Outages;
+use crate::link::wifi::WifiPreset;
 use crate::teleoperation::experiment::drive::{Channel, Sending, Setup};
 use crate::teleoperation::{SendPolicy, Teleoperation};
 
@@ -44,6 +45,18 @@ pub(crate) const LONG_RANGE: Outages = Outages {
     mean_s: 0.5,
     per_hour: 300.0,
     buffered: false,
+};
+
+/// 0.008 of the loops, and where our mean must lie.
+const SHORT_RANGE_PUBLISHED: Expected = Expected::Published {
+    lost: 7,
+    mean: (0.006, 0.011),
+};
+
+/// 0.03 of the loops.
+const LONG_RANGE_PUBLISHED: Expected = Expected::Published {
+    lost: 27,
+    mean: (0.022, 0.035),
 };
 
 /// Longer than any run.
@@ -96,6 +109,7 @@ pub(crate) fn base(case: &Teleoperation) -> Setup {
 pub(crate) fn conditions(base: &Setup) -> Vec<Condition> {
     let mut rows = static_rows(base);
     rows.extend(outage_rows(base));
+    rows.extend(wifi_rows(base));
     rows.extend(queue_rows(base));
     rows.extend(policy_rows(base));
     rows
@@ -149,7 +163,6 @@ fn under(base: &Setup, outages: Outages, change: impl FnOnce(&mut Setup)) -> Set
 }
 
 fn outage_rows(base: &Setup) -> Vec<Condition> {
-    let published = |lost, mean| Expected::Published { lost, mean };
     let holding = |setup: &mut Setup| without_time_out(&mut setup.settings);
     let long = |per_hour| Outages {
         mean_s: 2.0,
@@ -161,13 +174,13 @@ fn outage_rows(base: &Setup) -> Vec<Condition> {
             "short-range",
             text_of(&SHORT_RANGE),
             under(base, SHORT_RANGE, |_| {}),
-            published(7, (0.006, 0.011)),
+            SHORT_RANGE_PUBLISHED,
         ),
         row(
             "long-range",
             text_of(&LONG_RANGE),
             under(base, LONG_RANGE, |_| {}),
-            published(27, (0.022, 0.035)),
+            LONG_RANGE_PUBLISHED,
         ),
         row(
             "hold-30",
@@ -182,6 +195,24 @@ fn outage_rows(base: &Setup) -> Vec<Condition> {
             Expected::Open,
         ),
     ]
+}
+
+/// The Wi-Fi 6 model, whose outages were fitted to the published rates.
+fn wifi_rows(base: &Setup) -> [Condition; 2] {
+    let ranges = [
+        (WifiPreset::ShortRange, SHORT_RANGE_PUBLISHED),
+        (WifiPreset::LongRange, LONG_RANGE_PUBLISHED),
+    ];
+    ranges.map(|(preset, expected)| {
+        let spec = preset.spec();
+        let text = format!(
+            "Wi-Fi 6 model, {} m; {}",
+            spec.distance_m,
+            text_of(&spec.outages)
+        );
+        let setup = changed(base, |setup| setup.channel = Channel::Wifi(preset));
+        row(preset.name(), text, setup, expected)
+    })
 }
 
 /// What the queue makes of messages that are late instead of lost.

@@ -9,6 +9,8 @@ use crate::egm::messages::{EgmEvent, EgmEventKind, EgmStartParameters, SessionSt
 use crate::egm::parameters::ControllerSettings;
 use crate::link::bernoulli::BernoulliLink;
 use crate::link::outages::{OutageLink, Outages};
+use crate::link::spec::Way;
+use crate::link::wifi::{WifiLink, WifiPreset};
 use crate::link::{Fate, LinkModel, PerfectLink};
 use crate::measure::series::Sample;
 use crate::random::RandomStream;
@@ -28,6 +30,8 @@ pub(crate) enum Channel {
     Loss(f64),
     /// Outages of both ways together.
     Outages(Outages),
+    /// The Wi-Fi 6 model, both ways in the same fades and outages.
+    Wifi(WifiPreset),
 }
 
 /// When commands are sent.
@@ -146,8 +150,8 @@ impl<'a> Run<'a> {
     fn new(trajectory: &'a Trajectory, setup: &'a Setup, seed: u64) -> Self {
         Self {
             arm: requested(&setup.settings),
-            forward: link(setup.channel, seed, "commands"),
-            backward: link(setup.channel, seed, "feedback"),
+            forward: link(setup.channel, seed, Way::Forward),
+            backward: link(setup.channel, seed, Way::Backward),
             next_send_ns: trajectory.begin_ns(),
             answers: VecDeque::with_capacity(4096),
             in_flight: VecDeque::with_capacity(4096),
@@ -225,11 +229,15 @@ impl<'a> Run<'a> {
     }
 }
 
-/// No link here looks at the length.
+/// A command or a feedback of one arm with our datagram's header; only the radio looks at it.
 const MESSAGE_BYTES: usize = 100;
 
 /// One direction; outages of both directions come from one stream.
-fn link(channel: Channel, seed: u64, direction: &str) -> Box<dyn LinkModel> {
+fn link(channel: Channel, seed: u64, way: Way) -> Box<dyn LinkModel> {
+    let direction = match way {
+        Way::Forward => "commands",
+        Way::Backward => "feedback",
+    };
     match channel {
         Channel::Perfect => Box::new(PerfectLink),
         Channel::Loss(ratio) => {
@@ -242,11 +250,21 @@ fn link(channel: Channel, seed: u64, direction: &str) -> Box<dyn LinkModel> {
             let link = OutageLink::new(outages, stream, Instant::ZERO);
             Box::new(link.expect("outages are checked before they are driven"))
         }
+        Channel::Wifi(preset) => {
+            let (own, shared) = (
+                RandomStream::new(seed, direction),
+                RandomStream::new(seed, RADIO_STREAM),
+            );
+            let link = WifiLink::new(&preset.spec(), way, own, shared);
+            Box::new(link.expect("presets are sound"))
+        }
     }
 }
 
 /// Name of the stream of outages.
 pub(crate) const OUTAGE_STREAM: &str = "outages";
+/// Name of the stream of what both ways of a radio meet.
+const RADIO_STREAM: &str = "radio";
 
 /// What the arm told.
 #[derive(Debug, Default)]

@@ -10,6 +10,7 @@ use super::trajectory::Trajectory;
 use super::{Calibration, MotionLossStudy};
 use crate::case_study::CaseStudy;
 use crate::link::outages::{OutageLink, Outages};
+use crate::link::wifi::WifiPreset;
 use crate::random::RandomStream;
 use crate::simulation::{Carrier, Simulation};
 use crate::study::{Study, into_batch};
@@ -148,19 +149,28 @@ fn the_outages_of_both_ranges_reproduce_the_published_rates() {
     // plays the published 890.
     let case = case(|_| {});
     let trajectory = Trajectory::new(&case, 148).unwrap();
-    let mean = |outages| {
-        let setup = changed(&base(&case), |setup| {
-            setup.channel = Channel::Outages(outages);
-        });
+    let mean = |channel| {
+        let setup = changed(&base(&case), |setup| setup.channel = channel);
         let runs = (0..36).map(|replica| {
             let run = drive(&trajectory, &setup, seed_of(5, replica), &mut |_| true);
             run.unwrap().loss_ratio()
         });
         runs.sum::<f64>() / 36.0
     };
-    let (short, long) = (mean(SHORT_RANGE), mean(LONG_RANGE));
-    assert!((0.005..0.012).contains(&short), "{short}");
-    assert!((0.020..0.037).contains(&long), "{long}");
+    for channel in [
+        Channel::Outages(SHORT_RANGE),
+        Channel::Wifi(WifiPreset::ShortRange),
+    ] {
+        let short = mean(channel);
+        assert!((0.005..0.012).contains(&short), "{channel:?}: {short}");
+    }
+    for channel in [
+        Channel::Outages(LONG_RANGE),
+        Channel::Wifi(WifiPreset::LongRange),
+    ] {
+        let long = mean(channel);
+        assert!((0.020..0.037).contains(&long), "{channel:?}: {long}");
+    }
 }
 
 #[test]
@@ -169,9 +179,10 @@ fn a_study_names_its_conditions_and_refuses_a_filter_without_any() {
         parameters.tables.loops = 5;
         parameters.tables.conditions = vec!["range".to_owned()];
     });
-    assert_eq!(named.task_count(), 24);
+    assert_eq!(named.task_count(), 48);
     assert_eq!(named.label(0), "short-range");
     assert_eq!(named.label(23), "long-range");
+    assert_eq!(named.label(47), "wifi6-long-range");
     let error = MotionLossStudy::new(&case(|parameters| {
         parameters.tables.conditions = vec!["loss".to_owned(), "short range".to_owned()];
     }))
@@ -198,7 +209,7 @@ fn names_of_conditions_are_unique_and_the_published_ones_are_judged() {
         rows.iter()
             .filter(|row| is_published(&row.expected))
             .count(),
-        2
+        4
     );
 }
 

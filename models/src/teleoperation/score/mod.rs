@@ -16,7 +16,7 @@ pub(crate) mod sessions;
 #[cfg(test)]
 mod tests;
 
-use crate::case_study::{Metric, Score};
+use crate::case_study::{ErrorSeries, Metric, Score};
 use crate::egm::messages::{EgmCommand, EgmFeedback};
 use crate::measure::series::{Estimate, Sample, lag_s, peak_to_peak};
 use crate::measure::statistics::{CONFIDENCE, poisson};
@@ -35,6 +35,11 @@ pub(crate) fn series(case: &Teleoperation, log: &RunLog) -> Vec<PlotSeries> {
     let mut series = plots::series(log);
     series.extend(plots::motion_loops(&Run::read(case, log)));
     series
+}
+
+/// The joint error of the right arm over time.
+pub(crate) fn errors(log: &RunLog) -> Vec<ErrorSeries> {
+    plots::joint_error_over_time(log)
 }
 
 /// Scores a run.

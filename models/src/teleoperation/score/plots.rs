@@ -1,6 +1,7 @@
 //! The seed paper's Figures 6 to 11 from a run log: what the human did, where the tool went, joints
 //! and their error. Columns of numbers; it draws nothing.
 
+use crate::case_study::ErrorSeries;
 use crate::egm::messages::{EgmCommand, EgmFeedback};
 use crate::plot::{PlotColumn, PlotSeries};
 use crate::run_log::RunLog;
@@ -38,6 +39,26 @@ pub(crate) fn series(log: &RunLog) -> Vec<PlotSeries> {
         joint_error(log, rows, (robot, shift)),
     ];
     all.into_iter().flatten().collect()
+}
+
+/// The largest error of any joint of the right arm at each feedback, newest command sent by then
+/// minus measured.
+pub(crate) fn joint_error_over_time(log: &RunLog) -> Vec<ErrorSeries> {
+    let record = Record::read(log);
+    let shift = (!log.has_one_clock()).then_some(record.shift_ns);
+    let samples = paired(log, shift).filter_map(|(at, feedback, command)| {
+        let desired = desired_rad(Some(command?));
+        let joints = desired.iter().zip(&feedback.measured_rad);
+        let errors = joints.map(|(desired, measured)| (desired - measured).abs());
+        let largest = errors.fold(0.0, f64::max);
+        largest.is_finite().then_some((at, largest))
+    });
+    vec![ErrorSeries {
+        label: "joint error of the right arm",
+        unit: "rad",
+        clock_of: EGM_RIGHT_FEEDBACK,
+        samples: samples.collect(),
+    }]
 }
 
 /// What became of every motion loop; `None` without a whole one.

@@ -8,6 +8,7 @@ use hil_models::measure::histogram::{Distribution, LatencySummary};
 use hil_models::measure::statistics::IntervalNs;
 
 use super::canvas::{Canvas, INDENT, Tone, bar, left, right};
+use super::clocks;
 use super::units::{duration, grouped, percent};
 use crate::report::summary::{ChannelSummary, CountByName, RecordedFigures};
 
@@ -43,6 +44,9 @@ pub(super) fn channel(canvas: &mut Canvas, channel: &ChannelSummary) {
         stamps(canvas, account);
         round_trip(canvas, &account.round_trip);
         losses(canvas, account);
+    }
+    if let Some(figures) = &channel.emulation {
+        super::emulation::emulation(canvas, figures);
     }
     if let Some(figures) = &channel.outages {
         super::outages::outages(canvas, figures);
@@ -194,6 +198,7 @@ fn waterfall(canvas: &mut Canvas, account: &ChannelAccount) {
         (0.0, 0.0),
     );
     intervals(canvas, account);
+    clocks::one_way(canvas, account);
     for segment in combined {
         let count = segment
             .distribution
@@ -320,10 +325,17 @@ fn closing_words(figures: &ClosingFigures) -> Option<(Tone, String)> {
             figures.closed_combined_count,
             "closed with a combined segment",
         ),
+        (
+            figures.unaligned_count,
+            "not checked, published about a clock step",
+        ),
     ] {
         if count > 0 {
             text.push_str(&["; ", &grouped(count), " ", words].concat());
         }
+    }
+    if figures.is_converted {
+        text.push_str("; of converted stamps: proves records and order, not the alignment");
     }
     let is_whole = figures.closed_count == figures.checked_count;
     Some((if is_whole { Tone::Good } else { Tone::Plain }, text))

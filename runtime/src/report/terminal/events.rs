@@ -5,12 +5,14 @@ use hil_models::case_study::Severity;
 use hil_models::measure::account::MessageFate;
 
 use super::canvas::{Canvas, INDENT, Tone, shortened};
-use super::units::{grouped, seconds};
+use super::units::{duration_s, grouped, seconds};
 use crate::report::score_event::{ExplainedEvent, ExplainedMessage, ScoreEvents};
 
 /// Events on the page, and messages of each; all of them are in the summary.
 const SHOWN_COUNT: usize = 12;
 const MESSAGES_SHOWN_COUNT: usize = 6;
+/// Events of the network shown beside each.
+const NETWORK_SHOWN_COUNT: usize = 3;
 
 /// Columns of an event's time, of a message's name, and the margin of messages.
 const TIME_WIDTH: usize = 14;
@@ -92,6 +94,7 @@ fn one_event(canvas: &mut Canvas, event: &ExplainedEvent, clocks_differ: bool) {
     for outage in &event.outages {
         canvas.paragraph(MESSAGE_MARGIN, Tone::Caution, &outage.words);
     }
+    network_before(canvas, event);
     for message in event.messages.iter().take(MESSAGES_SHOWN_COUNT) {
         let tone = match message.fate {
             None | Some(MessageFate::UnknownPeerRecordsUnavailable) => Tone::Faint,
@@ -105,6 +108,30 @@ fn one_event(canvas: &mut Canvas, event: &ExplainedEvent, clocks_differ: bool) {
     let more = hidden.saturating_add(event.messages_dropped_count);
     if more > 0 {
         let text = format!("and {} more messages", grouped(more));
+        canvas.paragraph(MESSAGE_MARGIN, Tone::Faint, &text);
+    }
+}
+
+/// What the network went through before `event`, unless an outage above says so already.
+fn network_before(canvas: &mut Canvas, event: &ExplainedEvent) {
+    let Some(network) = &event.network else {
+        return;
+    };
+    if network.events.is_empty() {
+        canvas.paragraph(MESSAGE_MARGIN, Tone::Faint, &network.nothing_words());
+        return;
+    }
+    let rest = event.network_beside();
+    for one in rest.iter().take(NETWORK_SHOWN_COUNT) {
+        canvas.paragraph(MESSAGE_MARGIN, Tone::Caution, &one.words);
+    }
+    let hidden = rest.len().saturating_sub(NETWORK_SHOWN_COUNT) as u64 + network.more_count;
+    if hidden > 0 {
+        let window = duration_s(network.foregoing_s);
+        let text = format!(
+            "and {} more on the network in the {window} before",
+            grouped(hidden)
+        );
         canvas.paragraph(MESSAGE_MARGIN, Tone::Faint, &text);
     }
 }

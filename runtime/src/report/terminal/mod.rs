@@ -1,22 +1,31 @@
 //! Renders a summary for a terminal of 80 to 120 columns. It returns text; the caller prints it.
 
 mod canvas;
+mod cards;
 mod channel;
+mod clocks;
+mod emulation;
 mod events;
 mod face;
+mod network;
 mod outages;
+mod radio;
 mod tables;
+mod timeline;
+mod trace;
 mod units;
 
 pub use canvas::Style;
 pub(crate) use canvas::{shortened, wrapped};
-pub(crate) use units::{JOINT, duration_s, grouped, percent, seconds};
+pub(crate) use trace::{render_fit, render_trace, render_trace_plots};
+pub(crate) use units::{JOINT, duration, duration_s, grouped, percent, seconds};
 
 use hil_models::measure::account::OutageFigures;
 
 use canvas::{Canvas, INDENT, Tone};
 
 use super::assessment::{Assessment, NetworkVerdict, SKIPPED_TICK_RATIO_MAX};
+use super::network::NetworkReport;
 use super::score_event::ScoreEvents;
 use super::summary::{Outcome, RunSummary, ScoreMetric};
 
@@ -28,12 +37,23 @@ pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> Strin
     verdict(&mut canvas, summary, &assessment);
     tables::score(&mut canvas, &summary.score);
     events::score_events(&mut canvas, &summary.score_events);
+    if let Some(report) = &summary.network {
+        network_sections(&mut canvas, report, &summary.score_events);
+    }
     for channel in &summary.channels {
         channel::channel(&mut canvas, channel);
+        radio::channel(&mut canvas, summary.radio.channel(&channel.name));
     }
     for face in &summary.faces {
         face::face(&mut canvas, face);
     }
+    if let Some(stamps) = &summary.hardware_stamps {
+        cards::hardware_stamps(&mut canvas, stamps);
+    }
+    if let Some(section) = &summary.clocks {
+        clocks::clocks(&mut canvas, section);
+    }
+    radio::hops(&mut canvas, &summary.radio);
     tables::processes(&mut canvas, &summary.processes);
     tables::events(&mut canvas, &summary.events);
     tables::realtime(&mut canvas, &summary.realtime);
@@ -54,6 +74,25 @@ pub fn render_score(
     let mut canvas = Canvas::new(width_columns, style);
     tables::score(&mut canvas, score);
     events::score_events(&mut canvas, events);
+    canvas.finish()
+}
+
+/// The network of a run and how the robot stood to it.
+fn network_sections(canvas: &mut Canvas, report: &NetworkReport, events: &ScoreEvents) {
+    timeline::timeline(canvas, &report.timeline);
+    network::what_preceded_what(canvas, report, events);
+    network::network(canvas, report);
+}
+
+/// The network of a run alone, as [`render`] shows it.
+pub fn render_network(
+    report: &NetworkReport,
+    events: &ScoreEvents,
+    width_columns: usize,
+    style: Style,
+) -> String {
+    let mut canvas = Canvas::new(width_columns, style);
+    network_sections(&mut canvas, report, events);
     canvas.finish()
 }
 
@@ -124,6 +163,14 @@ fn network_words(verdict: &NetworkVerdict) -> (Tone, String) {
                  skipped more than {limit} of its ticks"
             );
             (Tone::Good, text)
+        }
+        NetworkVerdict::EmulationNotKept { channels } => {
+            let text = format!(
+                "NOT a network result, nor one about the link model: the host could not keep the \
+                 emulated link of {}; repeat on an idle host or at a lower rate",
+                channels.join(", ")
+            );
+            (Tone::Bad, text)
         }
         NetworkVerdict::NoNetwork => {
             let text = "no channel went over a network; nothing here says anything about one";

@@ -155,7 +155,7 @@ fn the_emulated_fleet_loses_commands_and_nothing_else() {
     let emulated = load_small("fleet-emulated.toml");
     let ratios: Vec<_> = emulated
         .crossings()
-        .map(|crossing| crossing.impairment.unwrap().loss_ratio)
+        .map(|crossing| crossing.spec.unwrap().loss.loss_ratio())
         .collect();
     assert_eq!(ratios.len(), 3);
     for (ratio, expected) in ratios.iter().zip([0.1, 0.1, 0.0]) {

@@ -174,7 +174,7 @@ fn a_link_over_tcp_has_ports_and_a_hop_and_no_model() {
         .unwrap();
     assert!(matches!(image.link.via, Via::Tcp(_)));
     assert_eq!((image.ports.sender, image.ports.receiver), (9000, 9001));
-    assert_eq!((image.impairment, image.outages), (None, None));
+    assert_eq!(image.spec, None);
     assert_eq!(image.hop.timestamps, Timestamps::Off);
     let written = topology.to_toml();
     let again = parse("again.toml", &written, &[], &known()).unwrap();
@@ -195,15 +195,12 @@ fn the_outages_of_a_link_are_those_of_both_ways() {
         buffered: true,
     };
     for crossing in topology.crossings().take(2) {
-        assert_eq!(crossing.outages, Some(expected));
+        assert_eq!(crossing.spec.unwrap().outages, expected);
     }
     let quiet = EVERYTHING.replace("outages = {", "# outages = {");
     let quiet = parse_good(&quiet);
-    let outages = quiet
-        .crossings()
-        .next()
-        .and_then(|crossing| crossing.outages);
-    assert!(outages.is_some_and(|outages| !outages.is_active()));
+    let spec = quiet.crossings().next().and_then(|crossing| crossing.spec);
+    assert!(spec.is_some_and(|spec| !spec.outages.is_active()));
 }
 
 fn check_with_refusal(table: &toml::Table, seed: u64) -> Result<toml::Table, Vec<ParameterFault>> {

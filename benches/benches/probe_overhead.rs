@@ -1,0 +1,251 @@
+//! What a probe at both ends costs the gateways it watches: round trips between gateways, and one
+//! hop at 1 kHz, each alone and tapped in every round, so that ratios are of neighbours in time. Not
+//! a test: it states the aim and whether it was met, and ends with code 0.
+//!
+//! `cargo bench -p hil-benches --bench probe_overhead -- [--rounds N]`, about 40 s. Namespaces,
+//! taps and real-time priority take root; without, it says what is missing.
+#![allow(clippy::print_stdout, reason = "a bench prints its result")]
+
+use std::cell::{Cell, RefCell};
+use std::process::ExitCode;
+use std::thread::Thread;
+use std::time::Duration;
+
+use hil_benches::gateway::cases::{CasePlan, Kind, PERIOD, case_plans};
+use hil_benches::gateway::ends::{NearEnd, Setup};
+use hil_benches::gateway::hosts::SetupError;
+use hil_benches::gateway::parties::{MachineTime, PRIORITY, Party, stolen_text};
+use hil_benches::gateway::tap::Drainer;
+use hil_benches::gateway::turns::{STOP, Turns, pace, ping};
+use hil_benches::gateway::verdict::Verdict;
+use hil_benches::{Case, Comparison, HostFacts, compare, json_line, table};
+use serde_json::json;
+
+const BENCH: &str = "probe_overhead";
+/// Tapped against alone, median and 99th percentile.
+const RATIO_MAX: f64 = 1.02;
+const SLICE: Duration = Duration::from_millis(60);
+const PACED_SLICE: Duration = Duration::from_millis(240);
+
+/// What is measured: title of the case, names of its two rows.
+const MEASURED: [(&str, [&str; 2]); 4] = [
+    (
+        "gateways block 64 B stamps",
+        ["gateways block, alone", "gateways block, tapped"],
+    ),
+    (
+        "gateways spin 64 B stamps",
+        ["gateways spin, alone", "gateways spin, tapped"],
+    ),
+    (
+        "one hop spin 64 B 1 kHz",
+        ["one hop spin 1 kHz, alone", "one hop spin 1 kHz, tapped"],
+    ),
+    (
+        "one hop block 64 B 1 kHz",
+        ["one hop block 1 kHz, alone", "one hop block 1 kHz, tapped"],
+    ),
+];
+
+/// Those measured, each after the case whose gateways it shares.
+fn plans(cpu_count: usize) -> Vec<CasePlan> {
+    let all = case_plans(cpu_count);
+    let mut kept = Vec::new();
+    for (index, case) in all.iter().enumerate() {
+        if MEASURED.iter().any(|(title, _)| *title == case.title) {
+            if matches!(case.kind, Kind::BetweenGateways) {
+                kept.push(all[index - 1]);
+            }
+            kept.push(*case);
+        }
+    }
+    kept
+}
+
+/// One case for one round.
+fn measure(
+    (end, index): (&mut NearEnd, usize),
+    (turns, far): (&Turns, &Thread),
+    far_party: &Party,
+    count: &mut u64,
+) -> Vec<u64> {
+    match end {
+        NearEnd::Gateway(shared, column) => shared.column(*column, |case, side| {
+            ping((turns, far), case, side, (count, SLICE))
+        }),
+        NearEnd::Hop { side, noted, .. } => {
+            let listening = (far_party, noted.as_ref());
+            let time = (PACED_SLICE, PERIOD);
+            pace((turns, far), index, side.as_mut(), time, listening).0
+        }
+        NearEnd::PingPong(_) | NearEnd::Applications(_) => Vec::new(),
+    }
+}
+
+/// What the taps saw, over all rounds.
+#[derive(Debug, Default)]
+struct Tapped {
+    matched_count: Cell<u64>,
+    dropped_count: Cell<u64>,
+    refusal: RefCell<Option<String>>,
+}
+
+fn run(
+    setup: &mut Setup,
+    cases: &[CasePlan],
+    (drainer, tapped): (&Drainer, &Tapped),
+    round_count: usize,
+) -> Comparison {
+    let Setup {
+        hosts,
+        near,
+        turns,
+        far,
+        far_party,
+        ..
+    } = setup;
+    let far = far.thread().clone();
+    let (turns, far_party): (&Turns, &Party) = (turns, far_party);
+    let network = &hosts.network;
+    let near = RefCell::new(near);
+    let count = Cell::new(0);
+    let once = |index: usize| {
+        let mut number = count.get();
+        let mut near = near.borrow_mut();
+        let found = measure(
+            (&mut near[index], index),
+            (turns, &far),
+            far_party,
+            &mut number,
+        );
+        count.set(number);
+        found
+    };
+    let under_tap = |index: usize| match drainer.while_tapped(network, || once(index)) {
+        Ok((samples, counters)) => {
+            tapped
+                .matched_count
+                .set(tapped.matched_count.get() + counters.matched_count);
+            tapped
+                .dropped_count
+                .set(tapped.dropped_count.get() + counters.dropped_count);
+            samples
+        }
+        Err(error) => {
+            *tapped.refusal.borrow_mut() = Some(error.to_string());
+            Vec::new()
+        }
+    };
+    let mut rounds: Vec<(&'static str, Round<'_>)> = Vec::new();
+    for (title, names) in MEASURED {
+        let index = cases.iter().position(|case| case.title == title);
+        let Some(index) = index else { continue };
+        let (once, under_tap) = (&once, &under_tap);
+        rounds.push((names[0], Box::new(move || once(index))));
+        rounds.push((names[1], Box::new(move || under_tap(index))));
+    }
+    let mut contestants: Vec<Case<'_>> = rounds
+        .iter_mut()
+        .map(|(name, round)| Case {
+            name,
+            round: round.as_mut(),
+        })
+        .collect();
+    let mut floor = || turns.floor(&far, SLICE);
+    compare(round_count, &mut floor, &mut contestants)
+}
+
+/// One slice of a contestant: its samples, nanoseconds.
+type Round<'a> = Box<dyn FnMut() -> Vec<u64> + 'a>;
+
+fn report(outcome: &Comparison) {
+    let references: Vec<usize> = (0..outcome.rows.len()).map(|index| index & !1).collect();
+    for (row, reference) in outcome.rows.iter().zip(&references) {
+        println!(
+            "{}",
+            json_line(BENCH, outcome, row, &outcome.rows[*reference])
+        );
+    }
+    println!(
+        "\nround trips (one way for `one hop`); the reference of a tapped row is the one above"
+    );
+    println!("{}", table(outcome, &references));
+    for pair in outcome.rows.chunks_exact(2) {
+        let ratios = [
+            ("p50", pair[1].p50_ratio_to(&pair[0])),
+            ("p99", pair[1].p99_ratio_to(&pair[0])),
+        ];
+        for (name, ratio) in ratios {
+            let quartiles = ratio.map_or(String::new(), |ratio| {
+                let (low, high) = (ratio.lower_quartile, ratio.upper_quartile);
+                format!(" (quartiles {low:.3} to {high:.3})")
+            });
+            let verdict = Verdict {
+                name: format!("{} {name}{quartiles}", pair[1].name),
+                measured: ratio.map(|ratio| ratio.median),
+                aim_max: RATIO_MAX,
+                note: "x".to_owned(),
+            };
+            println!("{}", verdict.text());
+            println!("{}", verdict.json_line(BENCH));
+        }
+    }
+}
+
+fn measure_all(cpu_count: usize) -> Result<(), SetupError> {
+    let mut arguments = std::env::args().skip_while(|argument| argument != "--rounds");
+    let given = arguments.nth(1).and_then(|text| text.parse().ok());
+    let cases = plans(cpu_count);
+    let drainer = Drainer::start();
+    let mut setup = Setup::open(&cases, cpu_count)?;
+    let facts = HostFacts::read(&format!(
+        "near host on cpu 0, far host on cpu 1, SCHED_FIFO {PRIORITY} asked for, probe free"
+    ));
+    let network = setup.hosts.network.note().to_owned();
+    println!(
+        "{}",
+        json!({"bench": BENCH, "host": facts.to_json(), "network": network})
+    );
+    println!(
+        "network: {network}; load {} at the start; policy {}; governor {}",
+        facts.load_average, facts.scheduling_policy, facts.governor
+    );
+    let before = MachineTime::read();
+    let tapped = Tapped::default();
+    let outcome = run(&mut setup, &cases, (&drainer, &tapped), given.unwrap_or(40));
+    println!("{}", stolen_text(before, MachineTime::read()));
+    if let Some(refusal) = tapped.refusal.borrow().as_ref() {
+        println!("no tap: {refusal}");
+    }
+    report(&outcome);
+    println!(
+        "tapped {} datagrams, {} dropped; messages lost: {}",
+        tapped.matched_count.get(),
+        tapped.dropped_count.get(),
+        setup.turns.lost_count()
+    );
+    setup.turns.give(STOP, &[setup.far.thread().clone()]);
+    let refused_far = setup.far.join().unwrap_or_default();
+    setup.near.clear();
+    drainer.finish();
+    for refusal in setup.refusals.iter().chain(&refused_far) {
+        println!("refused by the kernel: {refusal}");
+    }
+    println!("records dropped: {}", setup.hosts.finish_recording());
+    for left in setup.hosts.remove() {
+        println!("left behind: {left}");
+    }
+    Ok(())
+}
+
+fn main() -> ExitCode {
+    let cpu_count = std::thread::available_parallelism().map_or(1, Into::into);
+    if cpu_count < 2 {
+        println!("{BENCH}: not measurable here: {cpu_count} processor, 2 hosts that want one each");
+        return ExitCode::SUCCESS;
+    }
+    if let Err(error) = measure_all(cpu_count) {
+        println!("{BENCH}: not measurable here: {error}");
+    }
+    ExitCode::SUCCESS
+}

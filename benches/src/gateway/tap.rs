@@ -1,0 +1,110 @@
+//! A probe at both ends of the wire for as long as it is wanted: the product's rings, filter and
+//! writer, drained as `hil-runtime probe` drains them, by an ordinary thread. It measures nothing.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver, Sender, channel};
+use std::thread::{self, JoinHandle};
+use std::time::Duration;
+
+use hil_gateways::capture::flow::FlowFilter;
+use hil_gateways::capture::writer::{self, PacketToWrite};
+use hil_gateways::transport::packet_ring::{PacketRing, RingCounters, RingSettings};
+use hil_tests::lab::INTERFACE;
+
+use super::hosts::SetupError;
+use super::network::Network;
+
+/// As in the product.
+const LOOK_PERIOD: Duration = Duration::from_millis(20);
+
+/// The thread that drains; made before any thread claims a processor, whose priority and pinning
+/// it would inherit.
+#[derive(Debug)]
+pub struct Drainer {
+    rings: Sender<[PacketRing; 2]>,
+    counts: Receiver<RingCounters>,
+    is_wanted: Arc<AtomicBool>,
+    thread: JoinHandle<()>,
+}
+
+impl Drainer {
+    /// Starts the thread; it sleeps until there are rings.
+    pub fn start() -> Self {
+        let (rings, incoming) = channel::<[PacketRing; 2]>();
+        let (done, counts) = channel();
+        let is_wanted = Arc::new(AtomicBool::new(false));
+        let thread = thread::spawn({
+            let is_wanted = Arc::clone(&is_wanted);
+            move || {
+                for mut pair in incoming {
+                    let mut file = Vec::new();
+                    while is_wanted.load(Ordering::Acquire) {
+                        for ring in &mut pair {
+                            drain(ring, &mut file);
+                        }
+                        thread::sleep(LOOK_PERIOD);
+                    }
+                    let mut sum = RingCounters::default();
+                    for one in pair.iter_mut().filter_map(|ring| ring.counters().ok()) {
+                        sum.matched_count += one.matched_count;
+                        sum.dropped_count += one.dropped_count;
+                    }
+                    if done.send(sum).is_err() {
+                        return;
+                    }
+                }
+            }
+        });
+        Self {
+            rings,
+            counts,
+            is_wanted,
+            thread,
+        }
+    }
+
+    /// Taps both hosts while `work` runs; gives what it gave, and what the kernel counted.
+    ///
+    /// # Errors
+    /// When a host cannot be tapped.
+    pub fn while_tapped<T>(
+        &self,
+        network: &Network,
+        work: impl FnOnce() -> T,
+    ) -> Result<(T, RingCounters), SetupError> {
+        let flows = [FlowFilter::hil()];
+        let settings = RingSettings {
+            snap_bytes: u32::try_from(flows[0].snap_bytes())?,
+            ring_bytes: 8 << 20,
+        };
+        let open = |host| network.on(host, || PacketRing::open(INTERFACE, &flows, &settings));
+        let pair = [open(0)?, open(1)?];
+        self.is_wanted.store(true, Ordering::Release);
+        let sent = self.rings.send(pair);
+        sent.map_err(|_left| "the draining thread has ended")?;
+        let outcome = work();
+        self.is_wanted.store(false, Ordering::Release);
+        Ok((outcome, self.counts.recv()?))
+    }
+
+    /// Ends the thread.
+    pub fn finish(self) {
+        drop(self.rings);
+        let _ended = self.thread.join().is_ok();
+    }
+}
+
+fn drain(ring: &mut PacketRing, file: &mut Vec<u8>) {
+    while ring.next_packet(|packet| {
+        let packet = PacketToWrite {
+            interface_index: 0,
+            stamp_ns: packet.stamp_ns,
+            original_bytes: packet.original_bytes,
+            direction: packet.direction,
+            data: [packet.data, &[]],
+        };
+        writer::packet(file, &packet);
+    }) {}
+    file.clear();
+}

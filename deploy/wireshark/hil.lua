@@ -1,0 +1,209 @@
+-- Wireshark dissector of hil-runtime's datagrams, version 1 of the wire format
+-- (gateways/src/protocol/wire.rs and body.rs). It recognises them by their magic number on any UDP
+-- port and judges nothing that the gateways would judge from state.
+--
+-- Use: copy to ~/.local/lib/wireshark/plugins/, or: tshark -X lua_script:deploy/wireshark/hil.lua
+
+local hil = Proto("hil", "hil-runtime datagram")
+
+local HEADER_BYTES = 72
+local TAG_BYTES = 16
+local UNKNOWN_TIME = "-9223372036854775808"
+local kinds = {
+    [1] = "DATA", [2] = "SYNC_REQ", [3] = "SYNC_RSP",
+    [4] = "HELLO", [5] = "HELLO_ACK", [6] = "BYE",
+}
+local statuses = {
+    [0] = "accepted", [1] = "message types differ", [2] = "size or alignment differ",
+    [3] = "one shared-memory domain", [4] = "unknown channel", [5] = "versions differ",
+    [6] = "greet again",
+}
+local sources = { [0] = "application", [1] = "kernel software", [2] = "hardware" }
+
+local f = {
+    magic = ProtoField.string("hil.magic", "Magic"),
+    version = ProtoField.uint8("hil.version", "Version"),
+    kind = ProtoField.uint8("hil.kind", "Kind", base.DEC, kinds),
+    flags = ProtoField.uint16("hil.flags", "Flags", base.HEX),
+    authenticated = ProtoField.bool("hil.flags.authenticated", "Authenticated", 16, nil, 0x0001),
+    session = ProtoField.uint32("hil.session", "Session", base.HEX),
+    channel = ProtoField.uint16("hil.channel", "Channel"),
+    header_len = ProtoField.uint16("hil.header_len", "Header length"),
+    sequence = ProtoField.uint64("hil.sequence", "Sequence"),
+    type_hash = ProtoField.uint64("hil.type_hash", "Message type hash", base.HEX),
+    published = ProtoField.int64("hil.published_ns", "Published (sender's monotonic, ns)"),
+    handed = ProtoField.int64("hil.handed_ns", "Handed to kernel (sender's monotonic, ns)"),
+    follow_up_sequence = ProtoField.uint32("hil.follow_up.sequence", "Follow-up for sequence, low half"),
+    follow_up_delta = ProtoField.uint32("hil.follow_up.delta_ns", "Follow-up: handed to transmit stamp (ns)"),
+    total_len = ProtoField.uint32("hil.total_len", "Message or body length"),
+    fragment_index = ProtoField.uint16("hil.fragment.index", "Fragment"),
+    fragment_count = ProtoField.uint16("hil.fragment.count", "Fragments"),
+    epoch = ProtoField.uint32("hil.epoch", "Epoch (producer's start)", base.HEX),
+    reserved = ProtoField.bytes("hil.reserved", "Reserved"),
+    payload = ProtoField.bytes("hil.payload", "Payload"),
+    tag = ProtoField.bytes("hil.tag", "Authentication tag"),
+
+    hello_domain = ProtoField.bytes("hil.hello.domain", "Shared-memory domain"),
+    hello_clock = ProtoField.uint64("hil.hello.clock_id", "Clock", base.HEX),
+    hello_size = ProtoField.uint32("hil.hello.size_max_bytes", "Largest payload"),
+    hello_alignment = ProtoField.uint32("hil.hello.alignment_bytes", "Alignment"),
+    hello_channel = ProtoField.string("hil.hello.channel_name", "Channel name"),
+    hello_type = ProtoField.string("hil.hello.type_name", "Type name"),
+
+    ack_status = ProtoField.uint8("hil.ack.status", "Status", base.DEC, statuses),
+    ack_session = ProtoField.uint32("hil.ack.session", "Answering session", base.HEX),
+    ack_clock = ProtoField.uint64("hil.ack.clock_id", "Clock", base.HEX),
+    ack_domain = ProtoField.bytes("hil.ack.domain", "Shared-memory domain"),
+    ack_answers = ProtoField.int64("hil.ack.answers_handed_ns", "Answers the datagram handed at (ns)"),
+
+    t1 = ProtoField.int64("hil.sync.t1_ns", "t1: request handed (requester's monotonic, ns)"),
+    t2 = ProtoField.int64("hil.sync.t2_ns", "t2: request arrived (responder's monotonic, ns)"),
+    t3 = ProtoField.int64("hil.sync.t3_ns", "t3: response handed (responder's monotonic, ns)"),
+    newest = ProtoField.uint64("hil.sync.newest", "Newest sequence received"),
+    bitmap = ProtoField.bytes("hil.sync.bitmap", "Received, newest - i at bit i"),
+    window_epoch = ProtoField.uint32("hil.sync.epoch", "Epoch of the window", base.HEX),
+    sync_count = ProtoField.uint32("hil.sync.received_count", "Requests received"),
+    t2_source = ProtoField.uint8("hil.sync.t2_source", "Source of t2", base.DEC, sources),
+    window_valid = ProtoField.uint8("hil.sync.window_valid", "Window valid"),
+}
+hil.fields = f
+
+local e = {
+    version = ProtoExpert.new("hil.expert.version", "Version is not 1: only the first 16 bytes are known",
+        expert.group.UNDECODED, expert.severity.WARN),
+    malformed = ProtoExpert.new("hil.expert.malformed", "Lengths or reserved bytes are not as they must be",
+        expert.group.MALFORMED, expert.severity.ERROR),
+}
+hil.experts = e
+
+local function dissect_hello(body, tree)
+    if body:len() < 42 then return false end
+    tree:add(f.hello_domain, body(0, 16))
+    tree:add_le(f.hello_clock, body(16, 8))
+    tree:add_le(f.hello_size, body(24, 4))
+    tree:add_le(f.hello_alignment, body(28, 4))
+    tree:add(f.reserved, body(32, 8))
+    local at = 40
+    for _, field in ipairs({ f.hello_channel, f.hello_type }) do
+        if at >= body:len() then return false end
+        local length = body(at, 1):uint()
+        if length == 0 or at + 1 + length > body:len() then return false end
+        tree:add(field, body(at + 1, length))
+        at = at + 1 + length
+    end
+    return at == body:len()
+end
+
+local function dissect_hello_ack(body, tree)
+    if body:len() ~= 40 then return false end
+    tree:add(f.ack_status, body(0, 1))
+    tree:add(f.reserved, body(1, 3))
+    tree:add_le(f.ack_session, body(4, 4))
+    tree:add_le(f.ack_clock, body(8, 8))
+    tree:add(f.ack_domain, body(16, 16))
+    tree:add_le(f.ack_answers, body(32, 8))
+    return true
+end
+
+local function dissect_sync_response(body, tree)
+    if body:len() ~= 80 then return false end
+    tree:add_le(f.t1, body(0, 8))
+    tree:add_le(f.t2, body(8, 8))
+    tree:add_le(f.t3, body(16, 8))
+    tree:add_le(f.newest, body(24, 8))
+    tree:add(f.bitmap, body(32, 32))
+    tree:add_le(f.window_epoch, body(64, 4))
+    tree:add_le(f.sync_count, body(68, 4))
+    tree:add(f.t2_source, body(72, 1))
+    tree:add(f.window_valid, body(73, 1))
+    tree:add(f.reserved, body(74, 6))
+    return true
+end
+
+local function dissect_body(kind, body, tree)
+    if kind == 1 then
+        if body:len() > 0 then tree:add(f.payload, body) end
+        return true
+    elseif kind == 2 then
+        tree:add(f.reserved, body)
+        return body:len() == 80
+    elseif kind == 3 then
+        return dissect_sync_response(body, tree)
+    elseif kind == 4 then
+        return dissect_hello(body, tree)
+    elseif kind == 5 then
+        return dissect_hello_ack(body, tree)
+    end
+    return false
+end
+
+function hil.dissector(buffer, pinfo, root)
+    if buffer:len() < 16 then return 0 end
+    pinfo.cols.protocol = "HIL"
+    local tree = root:add(hil, buffer())
+    local kind = buffer(5, 1):uint()
+    local name = kinds[kind] or ("kind " .. kind)
+    tree:add(f.magic, buffer(0, 4))
+    tree:add(f.version, buffer(4, 1))
+    tree:add(f.kind, buffer(5, 1))
+    tree:add_le(f.flags, buffer(6, 2)):add_le(f.authenticated, buffer(6, 2))
+    tree:add_le(f.session, buffer(8, 4))
+    tree:add_le(f.channel, buffer(12, 2))
+    tree:add_le(f.header_len, buffer(14, 2))
+    local channel = buffer(12, 2):le_uint()
+    if buffer(4, 1):uint() ~= 1 then
+        tree:add_proto_expert_info(e.version)
+        pinfo.cols.info = name .. " channel " .. channel .. " of another version"
+        return buffer:len()
+    end
+    if buffer:len() < HEADER_BYTES then
+        -- A probe keeps no less than the header, so this is not one of ours.
+        tree:add_proto_expert_info(e.malformed)
+        return buffer:len()
+    end
+    local sequence = buffer(16, 8):le_uint64()
+    tree:add_le(f.sequence, buffer(16, 8))
+    tree:add_le(f.type_hash, buffer(24, 8))
+    local published = tree:add_le(f.published, buffer(32, 8))
+    if tostring(buffer(32, 8):le_int64()) == UNKNOWN_TIME then published:append_text(" (unknown)") end
+    tree:add_le(f.handed, buffer(40, 8))
+    if buffer(52, 4):le_uint() ~= 0xffffffff then
+        tree:add_le(f.follow_up_sequence, buffer(48, 4))
+        tree:add_le(f.follow_up_delta, buffer(52, 4))
+    end
+    tree:add_le(f.total_len, buffer(56, 4))
+    tree:add_le(f.fragment_index, buffer(60, 2))
+    tree:add_le(f.fragment_count, buffer(62, 2))
+    tree:add_le(f.epoch, buffer(64, 4))
+    tree:add(f.reserved, buffer(68, 4))
+
+    local body_end = buffer:len()
+    -- A capture may hold less than the wire did: then the end of the buffer is no tag.
+    local is_cut = buffer:len() < buffer:reported_len()
+    if bit.band(buffer(6, 2):le_uint(), 1) == 1 and not is_cut and body_end >= HEADER_BYTES + TAG_BYTES then
+        body_end = body_end - TAG_BYTES
+        tree:add(f.tag, buffer(body_end, TAG_BYTES))
+    end
+    local is_sound = true
+    if body_end > HEADER_BYTES then
+        is_sound = dissect_body(kind, buffer(HEADER_BYTES, body_end - HEADER_BYTES), tree)
+    elseif kind ~= 1 and kind ~= 6 then
+        is_sound = false
+    end
+    if buffer(14, 2):le_uint() ~= HEADER_BYTES or buffer(68, 4):le_uint() ~= 0 then is_sound = false end
+    if not is_sound and not is_cut then tree:add_proto_expert_info(e.malformed) end
+
+    local info = name .. " channel " .. channel .. " seq " .. tostring(sequence)
+    local count = buffer(62, 2):le_uint()
+    if count > 1 then info = info .. " piece " .. (buffer(60, 2):le_uint() + 1) .. "/" .. count end
+    pinfo.cols.info = info
+    return buffer:len()
+end
+
+local function heuristic(buffer, pinfo, root)
+    if buffer:len() < 16 or buffer(0, 4):string() ~= "HILG" then return false end
+    hil.dissector(buffer, pinfo, root)
+    return true
+end
+
+hil:register_heuristic("udp", heuristic)

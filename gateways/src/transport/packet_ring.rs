@@ -1,0 +1,500 @@
+//! The live tap of a probe: an `AF_PACKET` socket that copies packets of followed flows, both ways,
+//! with nanosecond kernel stamps into memory shared with the kernel (`TPACKET_V2`). It sends nothing
+//! and takes no part in any flow; what the packets mean is read by [`crate::capture`].
+//!
+//! Version 2 of the ring, not 3: version 3 hands over blocks, and where every block times out with
+//! one packet in it, it runs out of them. Nobody is woken for a packet unless somebody waits on the
+//! descriptor, which the kernel would do at the expense of the sender: look into the ring now and
+//! then instead. The ring holds what arrives in between, and the kernel counts what found no room.
+//!
+//! `unsafe` is allowed here because the ring is memory that the kernel writes, and three socket
+//! options take structures that no crate wraps.
+
+use core::ffi::{c_int, c_uint};
+use core::num::NonZeroUsize;
+use core::ptr::NonNull;
+use core::sync::atomic::{AtomicU32, Ordering};
+use std::io;
+use std::os::fd::{AsRawFd, FromRawFd, OwnedFd};
+
+use nix::net::if_::if_nametoindex;
+use nix::sys::mman::{MapFlags, ProtFlags, mmap, munmap};
+use nix::sys::socket::{getsockopt, setsockopt, sockopt};
+use thiserror::Error;
+
+use crate::capture::flow::FlowFilter;
+use crate::capture::program::compile;
+use crate::capture::{Direction, link_type};
+
+/// Smallest and largest ring, bytes.
+pub const RING_BYTES: core::ops::RangeInclusive<usize> = (1 << 16)..=(1 << 28);
+/// The kernel gives the ring in pieces of this size.
+const BLOCK_BYTES: usize = 1 << 16;
+/// Room in a frame before the packet: the kernel's header and address, and what aligns them.
+const FRAME_HEADER_BYTES: usize = 96;
+
+/// `ETH_P_ALL` and `AF_PACKET` as a link address has them, `PACKET_MR_PROMISC` below.
+const EVERY_PROTOCOL: u16 = 3;
+const PACKET_FAMILY: u16 = 17;
+const _: () = assert!(EVERY_PROTOCOL as c_int == libc::ETH_P_ALL);
+const _: () = assert!(PACKET_FAMILY as c_int == libc::AF_PACKET);
+const _: () = assert!(1 == libc::PACKET_MR_PROMISC);
+const NO_ADDRESS: libc::sockaddr_ll = libc::sockaddr_ll {
+    sll_family: 0,
+    sll_protocol: 0,
+    sll_ifindex: 0,
+    sll_hatype: 0,
+    sll_pkttype: 0,
+    sll_halen: 0,
+    sll_addr: [0; 8],
+};
+
+/// How a tap is opened.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct RingSettings {
+    /// Bytes kept of a packet, 64..=65536.
+    pub snap_bytes: u32,
+    /// Memory for packets that were not fetched yet; rounded up to a power of two.
+    pub ring_bytes: usize,
+}
+
+/// Why there is no tap.
+#[derive(Debug, Error)]
+pub enum RingError {
+    /// No such interface in this network namespace.
+    #[error("no interface `{interface}` here: {source}")]
+    Interface {
+        /// Its name.
+        interface: String,
+        /// What the kernel said.
+        source: io::Error,
+    },
+    /// The rights are missing.
+    #[error("a tap on `{interface}` needs CAP_NET_RAW (run as root, or grant the file the right)")]
+    Rights {
+        /// Its name.
+        interface: String,
+    },
+    /// A link layer whose packets could not be read.
+    #[error(
+        "interface `{interface}` has hardware type {hardware_type}; Ethernet, loopback and bare IP can be tapped"
+    )]
+    LinkLayer {
+        /// Its name.
+        interface: String,
+        /// `ARPHRD_...`.
+        hardware_type: u16,
+    },
+    /// A size that cannot be.
+    #[error("{what} of {value} bytes is outside {min}..={max}")]
+    Size {
+        /// Which size.
+        what: &'static str,
+        /// Its value.
+        value: usize,
+        /// Smallest.
+        min: usize,
+        /// Largest.
+        max: usize,
+    },
+    /// The kernel refused a step.
+    #[error("cannot tap `{interface}`: {step}: {source}")]
+    Refused {
+        /// Its name.
+        interface: String,
+        /// What was tried.
+        step: &'static str,
+        /// What the kernel said.
+        source: io::Error,
+    },
+}
+
+/// A packet in the ring.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct RingPacket<'a> {
+    /// Nanoseconds since 1970, this host's clock.
+    pub stamp_ns: u64,
+    /// True when the kernel stamped the packet as it came or left; otherwise only when the tap
+    /// saw it, some hundred nanoseconds later.
+    pub is_stamped_in_stack: bool,
+    /// Which way.
+    pub direction: Direction,
+    /// Length on the wire, without a VLAN tag that was taken out.
+    pub original_bytes: u32,
+    /// A VLAN tag that the kernel took out behind the addresses: type and tag.
+    pub vlan: Option<(u16, u16)>,
+    /// What was kept, from the link layer on.
+    pub data: &'a [u8],
+}
+
+/// What the kernel counted since the tap was opened.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct RingCounters {
+    /// Packets of the followed flows, dropped ones included.
+    pub matched_count: u64,
+    /// Of those, dropped because the ring was full.
+    pub dropped_count: u64,
+}
+
+/// See the module documentation.
+#[derive(Debug)]
+pub struct PacketRing {
+    socket: OwnedFd,
+    map: Mapping,
+    frame_bytes: usize,
+    frame_count: usize,
+    next_index: usize,
+    link_type: u16,
+    counters: RingCounters,
+}
+
+impl PacketRing {
+    /// Opens a tap on an interface of this network namespace. Packets are in it from now on.
+    ///
+    /// # Errors
+    /// See [`RingError`].
+    pub fn open(
+        interface: &str,
+        flows: &[FlowFilter],
+        settings: &RingSettings,
+    ) -> Result<Self, RingError> {
+        check("snap_bytes", settings.snap_bytes as usize, (64, 65_536))?;
+        let (least, most) = (*RING_BYTES.start(), *RING_BYTES.end());
+        check("ring_bytes", settings.ring_bytes, (least, most))?;
+        let index = if_nametoindex(interface).map_err(|errno| RingError::Interface {
+            interface: interface.to_owned(),
+            source: errno.into(),
+        })?;
+        let refused = |step: &'static str| {
+            move |source: io::Error| RingError::Refused {
+                interface: interface.to_owned(),
+                step,
+                source,
+            }
+        };
+        let socket = open_socket().map_err(|error| {
+            if error.kind() == io::ErrorKind::PermissionDenied {
+                RingError::Rights {
+                    interface: interface.to_owned(),
+                }
+            } else {
+                refused("socket")(error)
+            }
+        })?;
+        // Without a protocol it hears nothing yet, but tells the link layer.
+        bind(&socket, index, 0).map_err(refused("bind"))?;
+        let hardware_type = hardware_type(&socket).map_err(refused("getsockname"))?;
+        let unknown = || RingError::LinkLayer {
+            interface: interface.to_owned(),
+            hardware_type,
+        };
+        let link = link_of(hardware_type).ok_or_else(unknown)?;
+        let program = compile(link, flows, settings.snap_bytes).ok_or_else(unknown)?;
+        let version = tpacket_version();
+        set_option(&socket, libc::SOL_PACKET, libc::PACKET_VERSION, &version)
+            .map_err(refused("PACKET_VERSION"))?;
+        // Makes the kernel stamp packets in its stack even when no other socket asks for it.
+        setsockopt(&socket, sockopt::ReceiveTimestampns, &true)
+            .map_err(|errno| refused("SO_TIMESTAMPNS")(errno.into()))?;
+        attach(&socket, &program).map_err(refused("SO_ATTACH_FILTER"))?;
+        let frame_bytes = (FRAME_HEADER_BYTES + settings.snap_bytes as usize).next_power_of_two();
+        let block_bytes = BLOCK_BYTES.max(frame_bytes);
+        let ring_bytes = settings.ring_bytes.next_power_of_two().max(block_bytes);
+        let frame_count = ring_bytes / frame_bytes;
+        let request = libc::tpacket_req {
+            tp_block_size: narrow(block_bytes),
+            tp_block_nr: narrow(ring_bytes / block_bytes),
+            tp_frame_size: narrow(frame_bytes),
+            tp_frame_nr: narrow(frame_count),
+        };
+        set_option(&socket, libc::SOL_PACKET, libc::PACKET_RX_RING, &request)
+            .map_err(refused("PACKET_RX_RING"))?;
+        let map = Mapping::of(&socket, ring_bytes).map_err(refused("mmap"))?;
+        let everything = EVERY_PROTOCOL.to_be();
+        bind(&socket, index, everything).map_err(refused("bind"))?;
+        listen_to_all(&socket, index).map_err(refused("PACKET_ADD_MEMBERSHIP"))?;
+        Ok(Self {
+            socket,
+            map,
+            frame_bytes,
+            frame_count,
+            next_index: 0,
+            link_type: link,
+            counters: RingCounters::default(),
+        })
+    }
+
+    /// The link layer its packets begin with; see [`link_type`].
+    pub fn link_type(&self) -> u16 {
+        self.link_type
+    }
+
+    /// Packets it has room for.
+    pub fn frame_count(&self) -> usize {
+        self.frame_count
+    }
+
+    /// Hands the next packet to `take` and gives its room back; `false` when there is none.
+    ///
+    /// # Panics
+    /// When the kernel places a packet outside its frame.
+    #[allow(unsafe_code, reason = "the frame is memory shared with the kernel")]
+    pub fn next_packet(&mut self, take: impl FnOnce(&RingPacket<'_>)) -> bool {
+        let frame = self.map.at(self.next_index * self.frame_bytes);
+        // SAFETY: a frame is aligned to at least 4 bytes, lies within the mapping, begins with its
+        // status, and kernel and program touch that only atomically.
+        let status_cell = unsafe { AtomicU32::from_ptr(frame.as_ptr().cast()) };
+        let status = status_cell.load(Ordering::Acquire);
+        if status & libc::TP_STATUS_USER == 0 {
+            return false;
+        }
+        // SAFETY: with the user bit set the frame is ours and begins with a whole header.
+        let header: libc::tpacket2_hdr = unsafe { frame.cast().read() };
+        let address_at = size_of::<libc::tpacket2_hdr>().next_multiple_of(16);
+        // SAFETY: the frame is longer than header and address together.
+        let at = unsafe { frame.add(address_at) };
+        // SAFETY: the kernel writes the link address behind the aligned header.
+        let address: libc::sockaddr_ll = unsafe { at.cast().read_unaligned() };
+        let (from, length) = (usize::from(header.tp_mac), header.tp_snaplen as usize);
+        assert!(
+            from + length <= self.frame_bytes,
+            "packet at {from} of {length} bytes in a frame of {}",
+            self.frame_bytes
+        );
+        // SAFETY: `from` was checked to lie within the frame.
+        let start = unsafe { frame.add(from) };
+        // SAFETY: so were `length` bytes from there; the kernel leaves the frame alone until its
+        // status is set back, which happens after `take` has returned.
+        let data = unsafe { core::slice::from_raw_parts(start.as_ptr(), length) };
+        let has = |bit: u32| status & bit != 0;
+        take(&RingPacket {
+            stamp_ns: u64::from(header.tp_sec) * 1_000_000_000 + u64::from(header.tp_nsec),
+            is_stamped_in_stack: has(libc::TP_STATUS_TS_SOFTWARE),
+            direction: match address.sll_pkttype {
+                libc::PACKET_OUTGOING => Direction::Outbound,
+                _ => Direction::Inbound,
+            },
+            original_bytes: header.tp_len,
+            vlan: has(libc::TP_STATUS_VLAN_VALID).then_some({
+                let is_typed = has(libc::TP_STATUS_VLAN_TPID_VALID);
+                let tag_type = if is_typed {
+                    header.tp_vlan_tpid
+                } else {
+                    0x8100
+                };
+                (tag_type, header.tp_vlan_tci)
+            }),
+            data,
+        });
+        status_cell.store(libc::TP_STATUS_KERNEL, Ordering::Release);
+        self.next_index = (self.next_index + 1) % self.frame_count;
+        true
+    }
+
+    /// What has happened to the interface since it was last asked: `ENETDOWN` when it was taken down
+    /// or has gone. Packets come again if it does.
+    ///
+    /// # Errors
+    /// What happened.
+    pub fn check(&self) -> io::Result<()> {
+        // Reading sets the socket's error to zero.
+        match getsockopt(&self.socket, sockopt::SocketError)? {
+            0 => Ok(()),
+            errno => Err(io::Error::from_raw_os_error(errno)),
+        }
+    }
+
+    /// What the kernel counted until now.
+    ///
+    /// # Errors
+    /// When it does not say.
+    #[allow(unsafe_code, reason = "no crate wraps PACKET_STATISTICS")]
+    pub fn counters(&mut self) -> io::Result<RingCounters> {
+        let mut fresh = libc::tpacket_stats {
+            tp_packets: 0,
+            tp_drops: 0,
+        };
+        let mut length = option_length::<libc::tpacket_stats>();
+        let (pointer, descriptor) = ((&raw mut fresh).cast(), self.socket.as_raw_fd());
+        let (level, name) = (libc::SOL_PACKET, libc::PACKET_STATISTICS);
+        // SAFETY: the kernel writes at most `length` bytes at `pointer`, a live structure of that
+        // size.
+        let result = unsafe { libc::getsockopt(descriptor, level, name, pointer, &raw mut length) };
+        if result != 0 {
+            return Err(io::Error::last_os_error());
+        }
+        // Reading sets the kernel's counts to zero.
+        self.counters.matched_count += u64::from(fresh.tp_packets);
+        self.counters.dropped_count += u64::from(fresh.tp_drops);
+        Ok(self.counters)
+    }
+}
+
+fn check(what: &'static str, value: usize, (min, max): (usize, usize)) -> Result<(), RingError> {
+    if (min..=max).contains(&value) {
+        return Ok(());
+    }
+    Err(RingError::Size {
+        what,
+        value,
+        min,
+        max,
+    })
+}
+
+/// The capture link type of a kernel hardware type.
+const fn link_of(hardware_type: u16) -> Option<u16> {
+    match hardware_type {
+        libc::ARPHRD_ETHER | libc::ARPHRD_LOOPBACK => Some(link_type::ETHERNET),
+        libc::ARPHRD_NONE => Some(link_type::RAW),
+        _ => None,
+    }
+}
+
+const fn tpacket_version() -> c_int {
+    libc::tpacket_versions::TPACKET_V2 as c_int
+}
+
+fn narrow(value: usize) -> c_uint {
+    c_uint::try_from(value).expect("a ring is at most 256 MiB")
+}
+
+fn option_length<T>() -> libc::socklen_t {
+    libc::socklen_t::try_from(size_of::<T>()).expect("an option is a few bytes long")
+}
+
+#[allow(unsafe_code, reason = "nix opens packet sockets only with a protocol")]
+fn open_socket() -> io::Result<OwnedFd> {
+    let kind = libc::SOCK_RAW | libc::SOCK_CLOEXEC | libc::SOCK_NONBLOCK;
+    // SAFETY: the call takes three numbers.
+    let descriptor = unsafe { libc::socket(libc::AF_PACKET, kind, 0) };
+    if descriptor < 0 {
+        return Err(io::Error::last_os_error());
+    }
+    // SAFETY: the kernel has just given this descriptor, and nobody else knows it.
+    Ok(unsafe { OwnedFd::from_raw_fd(descriptor) })
+}
+
+#[allow(unsafe_code, reason = "nix cannot make a link address")]
+fn bind(socket: &OwnedFd, interface_index: c_uint, protocol_be: u16) -> io::Result<()> {
+    let mut address = NO_ADDRESS;
+    address.sll_family = PACKET_FAMILY;
+    address.sll_protocol = protocol_be;
+    address.sll_ifindex = c_int::try_from(interface_index).map_err(io::Error::other)?;
+    let length = option_length::<libc::sockaddr_ll>();
+    let pointer = (&raw const address).cast();
+    // SAFETY: the kernel reads `length` bytes at `pointer`, a live address of that size.
+    let result = unsafe { libc::bind(socket.as_raw_fd(), pointer, length) };
+    outcome(result)
+}
+
+/// The kernel's type of the interface a socket is bound to.
+#[allow(
+    unsafe_code,
+    reason = "nix refuses a link address shorter than its structure"
+)]
+fn hardware_type(socket: &OwnedFd) -> io::Result<u16> {
+    let mut address = NO_ADDRESS;
+    let mut length = option_length::<libc::sockaddr_ll>();
+    let pointer = (&raw mut address).cast();
+    // SAFETY: the kernel writes at most `length` bytes at `pointer`, a live address of that size.
+    let result = unsafe { libc::getsockname(socket.as_raw_fd(), pointer, &raw mut length) };
+    outcome(result)?;
+    Ok(address.sll_hatype)
+}
+
+#[allow(unsafe_code, reason = "no crate wraps the options of packet sockets")]
+fn set_option<T>(socket: &OwnedFd, level: c_int, name: c_int, value: &T) -> io::Result<()> {
+    let (pointer, length) = ((&raw const *value).cast(), option_length::<T>());
+    let descriptor = socket.as_raw_fd();
+    // SAFETY: the kernel reads `length` bytes at `pointer`, a live value of that size.
+    let result = unsafe { libc::setsockopt(descriptor, level, name, pointer, length) };
+    outcome(result)
+}
+
+/// Lets the card pass frames of other addresses, as on a mirror port, until the socket is closed.
+fn listen_to_all(socket: &OwnedFd, interface_index: c_uint) -> io::Result<()> {
+    let membership = libc::packet_mreq {
+        mr_ifindex: c_int::try_from(interface_index).map_err(io::Error::other)?,
+        mr_type: 1,
+        mr_alen: 0,
+        mr_address: [0; 8],
+    };
+    set_option(
+        socket,
+        libc::SOL_PACKET,
+        libc::PACKET_ADD_MEMBERSHIP,
+        &membership,
+    )
+}
+
+fn attach(socket: &OwnedFd, program: &[crate::capture::program::Instruction]) -> io::Result<()> {
+    let mut filter: Vec<libc::sock_filter> = program
+        .iter()
+        .map(|one| libc::sock_filter {
+            code: one.code,
+            jt: one.jump_true,
+            jf: one.jump_false,
+            k: one.k,
+        })
+        .collect();
+    let program = libc::sock_fprog {
+        len: u16::try_from(filter.len()).expect("sixteen flows take a few hundred instructions"),
+        filter: filter.as_mut_ptr(),
+    };
+    // The kernel copies the program before it returns.
+    set_option(socket, libc::SOL_SOCKET, libc::SO_ATTACH_FILTER, &program)
+}
+
+fn outcome(result: c_int) -> io::Result<()> {
+    if result == 0 {
+        Ok(())
+    } else {
+        Err(io::Error::last_os_error())
+    }
+}
+
+/// The ring's memory.
+#[derive(Debug)]
+struct Mapping {
+    start: NonNull<u8>,
+    length_bytes: usize,
+}
+
+#[allow(
+    unsafe_code,
+    reason = "a ring may be looked into by another thread than opened it"
+)]
+// SAFETY: the memory belongs to the process, not to a thread, and a mapping is never shared.
+unsafe impl Send for Mapping {}
+
+impl Mapping {
+    #[allow(unsafe_code, reason = "mapping memory is what this is for")]
+    fn of(socket: &OwnedFd, length_bytes: usize) -> io::Result<Self> {
+        let length = NonZeroUsize::new(length_bytes).ok_or(io::ErrorKind::InvalidInput)?;
+        let access = ProtFlags::PROT_READ | ProtFlags::PROT_WRITE;
+        // Populated now, so that no page is missing when the first packets come.
+        let flags = MapFlags::MAP_SHARED | MapFlags::MAP_POPULATE;
+        // SAFETY: a fresh mapping at an address of the kernel's choice overlaps nothing.
+        let start = unsafe { mmap(None, length, access, flags, socket, 0) }?;
+        Ok(Self {
+            start: start.cast(),
+            length_bytes,
+        })
+    }
+
+    #[allow(unsafe_code, reason = "a pointer into the mapping")]
+    fn at(&self, offset_bytes: usize) -> NonNull<u8> {
+        assert!(offset_bytes < self.length_bytes, "frame outside the ring");
+        // SAFETY: just checked to lie within the mapping.
+        unsafe { self.start.add(offset_bytes) }
+    }
+}
+
+impl Drop for Mapping {
+    #[allow(unsafe_code, reason = "see Mapping::of")]
+    fn drop(&mut self) {
+        // SAFETY: made by mmap with this length, and nothing points into it any more.
+        let _unmapped = unsafe { munmap(self.start.cast(), self.length_bytes) }.is_ok();
+    }
+}

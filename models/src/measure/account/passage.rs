@@ -1,0 +1,118 @@
+//! The way of every message over the network, from the same join and judgement as the account's.
+//! What the ways amount to is computed in [`crate::measure::network`].
+
+use super::fate::Judge;
+use super::join::{Join, Joined, stamp};
+use super::stage::MessageFate;
+use super::{AccountContext, ChannelRecords};
+use crate::measure::network::{Crossing, Passage};
+use crate::time::RemoteInstant;
+
+/// The passages of a channel, in the order of the producer's starts and sequence numbers. Time and
+/// memory grow with the number of records.
+pub fn passages(records: &ChannelRecords<'_>, context: &AccountContext<'_>) -> Vec<Passage> {
+    let records = records.on(context.path);
+    let join = Join::new(&records);
+    let mut judge = Judge::new(&records, context, &join);
+    join.map(|joined| {
+        let fate = judge.judge(&joined);
+        passage(&joined, fate, context)
+    })
+    .collect()
+}
+
+fn passage(joined: &Joined<'_>, fate: MessageFate, context: &AccountContext<'_>) -> Passage {
+    let crossing = match fate {
+        // What happened behind the receiving gateway is not the network's.
+        _ if joined.ingress.is_some() => Crossing::Arrived,
+        MessageFate::Taken | MessageFate::SupersededAtConsumer => Crossing::Arrived,
+        MessageFate::LostOnWire => Crossing::LostByNetwork,
+        MessageFate::InFlight
+        | MessageFate::Unexplained
+        | MessageFate::UnknownPeerRecordsUnavailable => Crossing::Unknown,
+        MessageFate::SupersededAtInput
+        | MessageFate::RefusedByKernel
+        | MessageFate::RefusedAtIngress
+        | MessageFate::Late
+        | MessageFate::Duplicate
+        | MessageFate::LostInInterruption => Crossing::LostByHost,
+    };
+    let handed_ns = joined
+        .egress
+        .and_then(|record| stamp(record.handed_ns))
+        .or_else(|| stamp(joined.ingress?.handed_ns));
+    let received_ns = joined.ingress.and_then(|record| stamp(record.received_ns));
+    let sent =
+        handed_ns.and_then(|handed_ns| context.path.localise(RemoteInstant::from_ns(handed_ns)));
+    let delay = sent.zip(received_ns);
+    Passage {
+        epoch_rank: joined.key.epoch_rank,
+        sequence: joined.key.sequence,
+        count: joined.count,
+        offered_ns: handed_ns.or_else(|| super::story::published_ns(joined)),
+        received_ns,
+        delay_ns: delay.map(|((sent, _), received_ns)| received_ns.saturating_sub(sent.as_ns())),
+        delay_bound_ns: delay.map_or(0, |((_, bound_ns), _)| bound_ns),
+        crossing,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::measure::account::ChannelPath;
+    use crate::measure::account::synthetic::{Files, HANDED_NS, RECEIVED_NS, at, same_clock};
+    use crate::time::Alignment;
+
+    #[test]
+    fn losses_of_the_host_are_kept_apart_from_those_of_the_network() {
+        use Crossing::{Arrived, LostByHost, LostByNetwork};
+        use MessageFate as Fate;
+        let mut files = Files::default();
+        for (sequence, fate) in (0_u64..).zip([
+            Fate::Taken,
+            Fate::LostOnWire,
+            Fate::SupersededAtInput,
+            Fate::RefusedByKernel,
+            Fate::Late,
+            Fate::SupersededAtConsumer,
+            Fate::Taken,
+        ]) {
+            files.write(at(7, sequence), fate);
+        }
+        let found = passages(&files.records(), &same_clock(1_000_000_000));
+        let crossings: Vec<_> = found.iter().map(|one| one.crossing).collect();
+        assert_eq!(
+            crossings,
+            [
+                Arrived,
+                LostByNetwork,
+                LostByHost,
+                LostByHost,
+                Arrived,
+                Arrived,
+                Arrived
+            ]
+        );
+        assert_eq!(found[0].delay_ns, Some(RECEIVED_NS - HANDED_NS));
+        assert_eq!(found[1].offered_ns, Some(at(7, 1).published_ns + HANDED_NS));
+        assert_eq!(found[2].offered_ns, Some(at(7, 2).published_ns));
+    }
+
+    #[test]
+    fn a_delay_between_hosts_needs_an_alignment_and_carries_its_bound() {
+        let files = Files::delivered(3);
+        let unaligned = AccountContext::new(ChannelPath::Gateway { alignment: None });
+        let found = passages(&files.records(), &unaligned);
+        assert!(found.iter().all(|one| one.delay_ns.is_none()));
+        assert!(found.iter().all(|one| one.received_ns.is_some()));
+        let alignment = Some(Alignment {
+            offset_ns: 500,
+            bound_ns: 70,
+        });
+        let aligned = AccountContext::new(ChannelPath::Gateway { alignment });
+        let found = passages(&files.records(), &aligned);
+        assert_eq!(found[1].delay_ns, Some(RECEIVED_NS - HANDED_NS - 500));
+        assert_eq!(found[1].delay_bound_ns, 70);
+    }
+}

@@ -1,0 +1,396 @@
+//! The textual form of a trace: lines `# key: value` for the header, then comma-separated values
+//! with the names of their columns first, as in RFC 4180 but without quoting. Text in, text out: it opens no file.
+
+use core::fmt::Write;
+
+use super::{
+    Trace, TraceArrival, TraceDirection, TraceFate, TraceHeader, TraceRecord, UNAVAILABLE_NS,
+    UNBOUNDED_NS,
+};
+
+/// The columns that are written, in order.
+pub const COLUMNS: [&str; 10] = [
+    "published_ns",
+    "departure_ns",
+    "fate",
+    "delay_ns",
+    "bound_ns",
+    "second_delay_ns",
+    "size_bytes",
+    "sequence",
+    "start",
+    "flags",
+];
+
+/// What is wrong with a text, and where. What stands before is whole.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("line {line}, byte {offset}: {what}")]
+pub struct CsvFault {
+    /// Line, from 1.
+    pub line: u64,
+    /// Offset of the line in the file.
+    pub offset: u64,
+    /// What is wrong there.
+    pub what: String,
+}
+
+/// What could be read.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct CsvDecoded {
+    /// Header and every row before the first fault.
+    pub trace: Trace,
+    /// The first fault; `None` when the text is whole.
+    pub fault: Option<CsvFault>,
+}
+
+/// The text of `trace`.
+pub fn encode(trace: &Trace) -> String {
+    let header = &trace.header;
+    let mut text = String::new();
+    let instant = |ns: i64| (ns != UNAVAILABLE_NS).then(|| ns.to_string());
+    let names = [
+        ("run", Some(one_line(&header.run))),
+        ("channel", Some(one_line(&header.channel))),
+        ("link", Some(one_line(&header.link))),
+        ("clock", Some(one_line(&header.clock))),
+        ("direction", Some(header.direction.word().to_owned())),
+        ("arrival", Some(header.arrival.word().to_owned())),
+        ("origin_ns", instant(header.origin_ns)),
+        ("duration_ns", instant(header.duration_ns)),
+        ("record_count", Some(trace.records.len().to_string())),
+    ];
+    for (key, value) in names {
+        if let Some(value) = value.filter(|value| !value.is_empty()) {
+            let _infallible = writeln!(text, "# {key}: {value}");
+        }
+    }
+    let _infallible = writeln!(text, "{}", COLUMNS.join(","));
+    for record in &trace.records {
+        let or_empty = |ns: i64| instant(ns).unwrap_or_default();
+        let bound = Some(record.bound_ns).filter(|bound| *bound != UNBOUNDED_NS);
+        let _infallible = writeln!(
+            text,
+            "{},{},{},{},{},{},{},{},{},{}",
+            record.published_ns,
+            record.departure_ns,
+            record.fate,
+            or_empty(record.delay_ns),
+            bound.map(|bound| bound.to_string()).unwrap_or_default(),
+            or_empty(record.second_delay_ns),
+            record.size_bytes,
+            record.sequence,
+            record.start,
+            record.flags
+        );
+    }
+    text
+}
+
+fn one_line(text: &str) -> String {
+    text.chars()
+        .map(|c| if c.is_control() { ' ' } else { c })
+        .collect()
+}
+
+/// Reads a text. Columns may stand in any order; needed are `published_ns` or `departure_ns`, and
+/// `fate` or `delay_ns`, where an empty delay is a loss. So two columns of any measurement make a
+/// trace.
+///
+/// # Errors
+/// Before the first row: no line with column names, or a line that cannot be used. Every later
+/// fault is beside what could be read.
+pub fn decode(text: &str) -> Result<CsvDecoded, CsvFault> {
+    let mut header = TraceHeader::new("");
+    let mut records: Vec<TraceRecord> = Vec::new();
+    let mut columns: Option<Columns> = None;
+    let mut promised: Option<u64> = None;
+    let (mut offset, mut line) = (0_u64, 0_u64);
+    let fail = |line, offset, what| CsvFault { line, offset, what };
+    for raw in text.split_inclusive('\n') {
+        let start = offset;
+        offset += raw.len() as u64;
+        line += 1;
+        let content = raw.trim_end_matches(['\n', '\r']);
+        if let Some(remark) = content.strip_prefix('#') {
+            match read_remark(remark, &mut header, &mut promised) {
+                Ok(()) => continue,
+                Err(what) if records.is_empty() => return Err(fail(line, start, what)),
+                Err(what) => {
+                    let fault = Some(fail(line, start, what));
+                    let trace = Trace { header, records };
+                    return Ok(CsvDecoded { trace, fault });
+                }
+            }
+        }
+        if content.trim().is_empty() {
+            continue;
+        }
+        let Some(known) = &columns else {
+            let found = Columns::read(content).map_err(|what| fail(line, start, what))?;
+            columns = Some(found);
+            continue;
+        };
+        let before_ns = records.last().map(|record| record.published_ns);
+        let index = records.len() as u64;
+        match known.record(content, index, before_ns) {
+            Ok(record) => records.push(record),
+            Err(what) => {
+                let fault = Some(fail(line, start, what));
+                let trace = Trace { header, records };
+                return Ok(CsvDecoded { trace, fault });
+            }
+        }
+    }
+    if columns.is_none() {
+        let what = format!("no line with column names, e.g. {}", COLUMNS.join(","));
+        return Err(fail(line + 1, offset, what));
+    }
+    let count = records.len() as u64;
+    let fault = promised
+        .filter(|promised| *promised != count)
+        .map(|promised| {
+            let what = format!("{count} records, record_count says {promised}");
+            fail(line + 1, offset, what)
+        });
+    let trace = Trace { header, records };
+    Ok(CsvDecoded { trace, fault })
+}
+
+/// `# key: value`; remarks that are none of ours say nothing.
+fn read_remark(
+    remark: &str,
+    header: &mut TraceHeader,
+    promised: &mut Option<u64>,
+) -> Result<(), String> {
+    let Some((key, value)) = remark.split_once(':') else {
+        return Ok(());
+    };
+    let (key, value) = (key.trim(), value.trim());
+    match key {
+        "run" => value.clone_into(&mut header.run),
+        "channel" => value.clone_into(&mut header.channel),
+        "link" => value.clone_into(&mut header.link),
+        "clock" => value.clone_into(&mut header.clock),
+        "direction" => {
+            let words = TraceDirection::ALL.map(TraceDirection::word);
+            header.direction = TraceDirection::ALL[word(key, value, &words)?];
+        }
+        "arrival" => {
+            let words = TraceArrival::ALL.map(TraceArrival::word);
+            header.arrival = TraceArrival::ALL[word(key, value, &words)?];
+        }
+        "origin_ns" => header.origin_ns = number(key, value)?,
+        "duration_ns" => header.duration_ns = number(key, value)?,
+        "record_count" => *promised = Some(number(key, value)?),
+        _ => {}
+    }
+    Ok(())
+}
+
+fn word(key: &str, value: &str, words: &[&str]) -> Result<usize, String> {
+    let found = words.iter().position(|word| *word == value);
+    found.ok_or_else(|| format!("{key} is \"{value}\", allowed are {}", words.join(", ")))
+}
+
+fn number<T: core::str::FromStr>(key: &str, value: &str) -> Result<T, String> {
+    let parsed = value.parse();
+    parsed
+        .map_err(|_not_a_number| format!("{key} is \"{value}\", expected a whole number in range"))
+}
+
+/// Where each column stands.
+#[derive(Debug)]
+struct Columns {
+    places: [Option<usize>; COLUMNS.len()],
+    count: usize,
+}
+
+impl Columns {
+    fn read(line: &str) -> Result<Self, String> {
+        let names: Vec<&str> = line.split(',').map(str::trim).collect();
+        for (index, name) in names.iter().enumerate() {
+            if names[..index].contains(name) {
+                return Err(format!("column {name} stands there twice"));
+            }
+        }
+        let places = COLUMNS.map(|wanted| names.iter().position(|name| *name == wanted));
+        let columns = Self {
+            places,
+            count: names.len(),
+        };
+        let has = |index: usize| columns.places[index].is_some();
+        if !(has(0) || has(1)) || !(has(2) || has(3)) {
+            return Err(format!(
+                "not the columns of a trace: \"{line}\"; needed are published_ns or departure_ns, \
+                 and fate or delay_ns"
+            ));
+        }
+        Ok(columns)
+    }
+
+    fn record(
+        &self,
+        line: &str,
+        index: u64,
+        before_ns: Option<i64>,
+    ) -> Result<TraceRecord, String> {
+        let cells: Vec<&str> = line.split(',').map(str::trim).collect();
+        if cells.len() != self.count {
+            let (found, expected) = (cells.len(), self.count);
+            return Err(format!("{found} values for {expected} columns"));
+        }
+        let cell = |column: usize| {
+            let text = cells[self.places[column]?];
+            (!text.is_empty()).then_some(text)
+        };
+        let published: Option<i64> = optional(cell(0), COLUMNS[0])?;
+        let departure: Option<i64> = optional(cell(1), COLUMNS[1])?;
+        let Some(published_ns) = published.or(departure) else {
+            return Err("neither published_ns nor departure_ns has a value".to_owned());
+        };
+        if let Some(before_ns) = before_ns.filter(|before_ns| published_ns < *before_ns) {
+            return Err(format!(
+                "published at {published_ns} ns, before the row before it at {before_ns} ns"
+            ));
+        }
+        let delay: Option<i64> = optional(cell(3), COLUMNS[3])?;
+        let words = TraceFate::ALL.map(TraceFate::word);
+        let fate = match cell(2) {
+            Some(text) => TraceFate::ALL[word(COLUMNS[2], text, &words)?],
+            None if delay.is_some() => TraceFate::Delivered,
+            None => TraceFate::LostInNetwork,
+        };
+        let is_early_loss = matches!(fate, TraceFate::LostInNetwork | TraceFate::LostBeforeLink);
+        if let Some(delay_ns) = delay.filter(|_| is_early_loss) {
+            return Err(format!(
+                "a delay of {delay_ns} ns for a message that is {fate}"
+            ));
+        }
+        let bound: Option<u64> = optional(cell(4), COLUMNS[4])?;
+        let flags = optional(cell(9), COLUMNS[9])?.unwrap_or(0);
+        if flags & !TraceRecord::FLAGS != 0 {
+            return Err(format!("flags are {flags}, allowed are 0..=31"));
+        }
+        Ok(TraceRecord {
+            published_ns,
+            departure_ns: departure.unwrap_or(published_ns),
+            delay_ns: delay.unwrap_or(UNAVAILABLE_NS),
+            bound_ns: bound.filter(|_| delay.is_some()).unwrap_or(UNBOUNDED_NS),
+            second_delay_ns: optional(cell(5), COLUMNS[5])?.unwrap_or(UNAVAILABLE_NS),
+            size_bytes: optional(cell(6), COLUMNS[6])?.unwrap_or(0),
+            sequence: optional(cell(7), COLUMNS[7])?.unwrap_or(index),
+            start: optional(cell(8), COLUMNS[8])?.unwrap_or(0),
+            fate,
+            flags,
+        })
+    }
+}
+
+fn optional<T: core::str::FromStr>(text: Option<&str>, name: &str) -> Result<Option<T>, String> {
+    text.map(|text| number(name, text)).transpose()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::random::RandomStream;
+
+    fn sample() -> Trace {
+        let mut header = TraceHeader::new("egm/right/command");
+        header.clock = "one clock".to_owned();
+        header.direction = TraceDirection::Backward;
+        header.duration_ns = 50;
+        let mut records = vec![
+            TraceRecord::published(0, 0, 40).delivered(7, 1),
+            TraceRecord::published(10, 1, 40),
+            TraceRecord::published(10, 2, 40).delivered(-3, 9),
+        ];
+        records[1].fate = TraceFate::LostInNetwork;
+        records[2].second_delay_ns = 12;
+        records[2].flags = 1;
+        Trace { header, records }
+    }
+
+    #[test]
+    fn a_trace_comes_back_as_it_was() {
+        let text = encode(&sample());
+        let golden = "# channel: egm/right/command\n# clock: one clock\n# direction: backward\n\
+                      # arrival: unknown\n# duration_ns: 50\n# record_count: 3\n\
+                      published_ns,departure_ns,fate,delay_ns,bound_ns,second_delay_ns,size_bytes,\
+                      sequence,start,flags\n\
+                      0,0,delivered,7,1,,40,0,0,0\n\
+                      10,10,lost-in-network,,,,40,1,0,0\n\
+                      10,10,delivered,-3,9,12,40,2,0,1\n";
+        assert_eq!(text, golden);
+        let decoded = decode(&text).unwrap();
+        assert_eq!((decoded.trace, decoded.fault), (sample(), None));
+    }
+
+    #[test]
+    fn two_columns_of_any_measurement_make_a_trace() {
+        let decoded = decode("delay_ns,host,departure_ns\r\n500,a,0\r\n,b,10\r\n").unwrap();
+        assert_eq!(decoded.fault, None);
+        let records = decoded.trace.records;
+        assert_eq!(records[0].delay(), Some(500));
+        assert_eq!(records[1].fate, TraceFate::LostInNetwork);
+        assert_eq!((records[1].published_ns, records[1].sequence), (10, 1));
+    }
+
+    #[test]
+    fn what_is_wrong_says_where_and_keeps_the_rest() {
+        let refused = |text: &str| decode(text).unwrap_err().to_string();
+        assert!(refused("").starts_with("line 1, byte 0: no line with column names"));
+        assert!(refused("a,b\n1,2\n").contains("not the columns of a trace"));
+        let start = "departure_ns,delay_ns\n5,1\n";
+        for (row, why) in [
+            ("4,1\n", "before the row before it"),
+            ("x,1\n", "expected a whole number"),
+            ("6\n", "1 values for 2 columns"),
+        ] {
+            let decoded = decode(&format!("{start}{row}")).unwrap();
+            let fault = decoded.fault.unwrap();
+            assert_eq!((fault.line, fault.offset), (3, start.len() as u64));
+            assert!(fault.what.contains(why), "{fault}");
+            assert_eq!(decoded.trace.records.len(), 1);
+        }
+        let text = encode(&sample());
+        let cut = &text[..text.len() - "10,10,delivered,-3,9,12,40,2,0,1\n".len()];
+        let fault = decode(cut).unwrap().fault.unwrap();
+        assert_eq!(fault.what, "2 records, record_count says 3");
+        assert_eq!(fault.offset, cut.len() as u64);
+    }
+
+    #[test]
+    fn a_bad_key_after_rows_keeps_the_rows() {
+        let text = "published_ns,delay_ns\n0,5\n10,6\n# direction: sideways\n20,7\n";
+        let decoded = decode(text).unwrap();
+        assert_eq!(decoded.trace.records.len(), 2);
+        let fault = decoded.fault.unwrap();
+        assert!(
+            fault.line == 4 && fault.what.contains("sideways"),
+            "{fault}"
+        );
+        let before = "published_ns,delay_ns\n# direction: sideways\n0,5\n";
+        assert_eq!(decode(before).unwrap_err().line, 2);
+    }
+
+    #[test]
+    fn mutated_texts_never_panic_and_keep_their_order() {
+        let (seed, good) = (9, encode(&sample()));
+        let mut random = RandomStream::new(seed, "csv mutations");
+        let mut below = |limit: usize| usize::try_from(random.next_u64() % limit as u64).unwrap();
+        for case in 0..100_000 {
+            let mut bytes = good.clone().into_bytes();
+            for _ in 0..=below(4) {
+                let at = below(bytes.len());
+                bytes[at] = b"0123456789,-#\n:xdelivrd\xff"[below(24)];
+            }
+            bytes.truncate(below(bytes.len()) + 1);
+            let text = String::from_utf8_lossy(&bytes);
+            if let Ok(decoded) = decode(&text) {
+                let order = decoded.trace.first_out_of_order();
+                assert_eq!(order, None, "seed {seed}, case {case}");
+            }
+        }
+    }
+}

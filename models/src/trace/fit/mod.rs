@@ -1,0 +1,194 @@
+//! Link models fitted to a trace, ranked, each with its goodness of fit and the lines of
+//! `[links.<name>]` that mean it. It says which it would take and by which rule; the choice is the
+//! reader's.
+
+mod chain;
+mod delay;
+mod goodness;
+mod loss;
+
+use serde::{Deserialize, Serialize};
+
+use super::Trace;
+use super::figures::{TraceFigures, known_losses};
+
+pub use goodness::ChiSquare;
+
+/// Below this probability of its own data a model is not taken.
+pub const REFUSED_BELOW: f64 = 0.05;
+
+/// One model of one property.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Fit {
+    /// Its name.
+    pub law: String,
+    /// How its parameters were found.
+    pub method: String,
+    /// Its parameters, in words.
+    pub parameters: String,
+    /// Numbers it has.
+    pub parameter_count: u32,
+    /// Natural logarithm of the likelihood of the trace; `None` for a law without a density.
+    pub log_likelihood: Option<f64>,
+    /// Akaike's criterion, 2 k - 2 ln L: smaller is better.
+    pub aic: Option<f64>,
+    /// Loss: burst lengths against those of the model.
+    pub bursts: Option<ChiSquare>,
+    /// Delay: largest difference of the two distribution functions (Kolmogorov and Smirnov).
+    pub ks_distance: Option<f64>,
+    /// Delay: its probability under the model, by a parametric bootstrap.
+    pub ks_probability: Option<f64>,
+    /// What to write into `[links.<name>]`.
+    pub toml: String,
+}
+
+impl Fit {
+    fn new(law: &str, method: &str, parameter_count: u32, log_likelihood: Option<f64>) -> Self {
+        Self {
+            law: law.to_owned(),
+            method: method.to_owned(),
+            parameters: String::new(),
+            parameter_count,
+            log_likelihood,
+            aic: log_likelihood.map(|ln| 2.0 * f64::from(parameter_count) - 2.0 * ln),
+            bursts: None,
+            ks_distance: None,
+            ks_probability: None,
+            toml: String::new(),
+        }
+    }
+
+    /// True when nothing tested speaks against it.
+    pub fn is_accepted(&self) -> bool {
+        let bursts = self.bursts.as_ref().map(|test| test.probability);
+        let tested = [bursts, self.ks_probability];
+        tested.into_iter().flatten().all(|p| p >= REFUSED_BELOW)
+    }
+}
+
+/// All models of one property, best first.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Ranking {
+    /// By Akaike's criterion; laws without one come last.
+    pub fits: Vec<Fit>,
+    /// The place of the one that would be taken; `None` when there is nothing to fit.
+    pub best: Option<usize>,
+    /// By which rule, or why there is none.
+    pub why: String,
+}
+
+impl Ranking {
+    fn none(why: &str) -> Self {
+        Self {
+            fits: Vec::new(),
+            best: None,
+            why: why.to_owned(),
+        }
+    }
+
+    fn sort(fits: &mut [Fit]) {
+        fits.sort_by(|a, b| {
+            let key = |fit: &Fit| fit.aic.unwrap_or(f64::INFINITY);
+            key(a).total_cmp(&key(b))
+        });
+    }
+}
+
+/// What models fit a trace.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct TraceFit {
+    /// Of its losses.
+    pub loss: Ranking,
+    /// Of its delays.
+    pub delay: Ranking,
+    /// What no model of these keeps.
+    pub remarks: Vec<String>,
+    /// Messages of known fate that were used.
+    pub loss_message_count: usize,
+    /// Delays that were used for the test of distribution.
+    pub tested_delay_count: usize,
+    /// Seed of the bootstrap.
+    pub seed: u64,
+}
+
+impl TraceFit {
+    /// Fits every law to `trace`; `seed` is that of the bootstrap.
+    pub fn of(trace: &Trace, seed: u64) -> Self {
+        let figures = TraceFigures::of(trace, seed);
+        let losses = known_losses(trace);
+        let delays_s: Vec<f64> = trace
+            .delays_ns()
+            .iter()
+            .map(|ns| *ns as f64 * 1e-9)
+            .collect();
+        let tested = delay::thinned(&delays_s);
+        let mut remarks = Vec::new();
+        if let Some(memory) = &figures.delay_memory {
+            let first = memory.coefficients.first().copied().unwrap_or(0.0);
+            if first.abs() > memory.independent_within {
+                remarks.push(format!(
+                    "successive delays are correlated ({first:.2} at lag 1, independent ones stay \
+                     within {:.2}); the delay laws draw each by itself. The trace keeps it.",
+                    memory.independent_within
+                ));
+            }
+        }
+        if figures.counts.lost_before_link_count + figures.counts.lost_after_link_count > 0 {
+            remarks.push(format!(
+                "{} messages were lost on the hosts, before or after the link; the loss laws count \
+                 them as lost.",
+                figures.counts.lost_before_link_count + figures.counts.lost_after_link_count
+            ));
+        }
+        if figures.counts.reordered_count + figures.counts.duplicated_count > 0 {
+            remarks.push(format!(
+                "{} messages came late and {} twice; no law here has that. The trace keeps it.",
+                figures.counts.reordered_count, figures.counts.duplicated_count
+            ));
+        }
+        if losses.len() > loss::ASCENT_MAX {
+            remarks.push(format!(
+                "the law of Gilbert and Elliott was sought in {} of {} messages, in stretches spread                  over the run; its likelihood, and all of the other loss laws, is of all.",
+                loss::ASCENT_MAX,
+                losses.len()
+            ));
+        }
+        Self {
+            loss: loss::rank(trace, &losses),
+            delay: delay::rank(&delays_s, &tested, seed),
+            remarks,
+            loss_message_count: losses.len(),
+            tested_delay_count: tested.len(),
+            seed,
+        }
+    }
+
+    /// `[links.<name>]` with the best laws.
+    pub fn toml(&self, link: &str) -> String {
+        let best = |ranking: &Ranking| {
+            let fit = ranking.best.map(|index| &ranking.fits[index]);
+            fit.map(|fit| fit.toml.replace("LINK", link))
+                .unwrap_or_default()
+        };
+        format!(
+            "[links.{link}]\nvia = \"emulated\"\n{}{}",
+            best(&self.delay),
+            best(&self.loss)
+        )
+    }
+}
+
+/// A time as a topology writes it, to the nanosecond.
+fn duration_text(seconds: f64) -> String {
+    let ns = (seconds.max(0.0) * 1e9).round();
+    if ns >= 1e6 {
+        format!("\"{} ms\"", ns / 1e6)
+    } else if ns >= 1e3 {
+        format!("\"{} us\"", ns / 1e3)
+    } else {
+        format!("\"{ns} ns\"")
+    }
+}
+
+#[cfg(test)]
+mod tests;

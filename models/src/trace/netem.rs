@@ -1,0 +1,99 @@
+//! A delay distribution in the form of Linux netem's tables (`tc qdisc ... distribution FILE`): 4096
+//! deviates of a distribution with mean 0 and standard deviation 1, ascending, times 8192
+//! (iproute2, `netem/maketable.c`). It is an export only, and keeps no order and no loss.
+
+use core::fmt::Write;
+
+use super::Trace;
+
+/// Deviates in a table.
+pub const TABLE_COUNT: usize = 4096;
+/// What a deviate of 1 is written as (`NETEM_DIST_SCALE`).
+const SCALE: f64 = 8192.0;
+
+/// A table with what belongs on the command line beside it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NetemTable {
+    /// The file.
+    pub text: String,
+    /// Mean delay, for `delay`.
+    pub mean_ns: f64,
+    /// Standard deviation, for its second argument.
+    pub deviation_ns: f64,
+}
+
+/// The table of the trace's delays; `None` below two delays, or when they do not vary.
+pub fn table(trace: &Trace) -> Option<NetemTable> {
+    let mut delays_ns = trace.delays_ns();
+    if delays_ns.len() < 2 {
+        return None;
+    }
+    delays_ns.sort_unstable();
+    let n = delays_ns.len() as f64;
+    let mean_ns = delays_ns.iter().map(|ns| *ns as f64).sum::<f64>() / n;
+    let squares = delays_ns.iter().map(|ns| (*ns as f64 - mean_ns).powi(2));
+    let deviation_ns = (squares.sum::<f64>() / (n - 1.0)).sqrt();
+    if deviation_ns <= 0.0 {
+        return None;
+    }
+    let mut text = format!(
+        "# delay distribution of {}: tc ... netem delay {:.0}us {:.0}us distribution FILE\n",
+        trace.header.channel,
+        mean_ns / 1e3,
+        deviation_ns / 1e3
+    );
+    for index in 0..TABLE_COUNT {
+        // The middle of each of 4096 equal shares.
+        let rank = (2 * index + 1) * delays_ns.len() / (2 * TABLE_COUNT);
+        let deviate = (delays_ns[rank] as f64 - mean_ns) / deviation_ns;
+        // The kernel holds 16 bits.
+        let written = (deviate * SCALE).round().clamp(-32_768.0, 32_767.0);
+        let end = if index % 8 == 7 { '\n' } else { ' ' };
+        let _infallible = write!(text, "{written}{end}");
+    }
+    Some(NetemTable {
+        text,
+        mean_ns,
+        deviation_ns,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::random::RandomStream;
+    use crate::trace::{TraceHeader, TraceRecord};
+
+    #[test]
+    fn the_table_has_mean_zero_and_deviation_one() {
+        let mut random = RandomStream::new(1, "netem");
+        let mut delivered = |index: u64| {
+            let delay_ns = 5_000_000 + i64::try_from(random.next_u64() % 2_000_000).unwrap();
+            TraceRecord::published(i64::try_from(index).unwrap(), index, 1).delivered(delay_ns, 0)
+        };
+        let trace = Trace {
+            header: TraceHeader::new("a/b"),
+            records: (0..10_000).map(&mut delivered).collect(),
+        };
+        let table = table(&trace).unwrap();
+        assert!((table.mean_ns - 6e6).abs() < 3e4, "{}", table.mean_ns);
+        let numbers = table.text.lines().skip(1).flat_map(str::split_whitespace);
+        let numbers: Vec<f64> = numbers.map(|number| number.parse().unwrap()).collect();
+        assert_eq!(numbers.len(), TABLE_COUNT);
+        assert!(numbers.is_sorted());
+        let mean = numbers.iter().sum::<f64>() / 4096.0;
+        let square = numbers.iter().map(|x| x * x).sum::<f64>() / 4096.0;
+        assert!(mean.abs() < 30.0, "{mean}");
+        assert!((square.sqrt() / SCALE - 1.0).abs() < 0.01, "{square}");
+    }
+
+    #[test]
+    fn a_constant_delay_has_no_table() {
+        let record = TraceRecord::published(0, 0, 1).delivered(5, 0);
+        let trace = Trace {
+            header: TraceHeader::new("a/b"),
+            records: vec![record; 9],
+        };
+        assert_eq!(table(&trace), None);
+    }
+}

@@ -1,0 +1,170 @@
+//! The form of Mahimahi's link shell (Netravali et al., USENIX ATC 2015): one line per opportunity
+//! to deliver 1500 bytes, its time in whole milliseconds; the file wraps at its last line. It tells
+//! of a link's rate and nothing else: what is lost on the way to and from it is stated by
+//! [`ENCODE_LOSS`] and [`DECODE_LOSS`]. Text in, text out.
+
+use core::fmt::Write;
+
+use super::csv::CsvFault;
+use super::{Trace, TraceFate, TraceHeader, TraceRecord};
+
+/// Bytes of one opportunity.
+pub const OPPORTUNITY_BYTES: u64 = 1500;
+
+const MS_NS: i64 = 1_000_000;
+
+/// What this form does not keep of a trace.
+pub const ENCODE_LOSS: &str = "kept: the millisecond of each arrival, one opportunity of 1500 bytes \
+     per message begun; not kept: delays, losses (they are times without an opportunity), sizes, \
+     order, copies, bounds";
+
+/// What a trace made of this form assumes.
+pub const DECODE_LOSS: &str = "one message of 1500 bytes is published and delivered at once at each \
+     opportunity: the trace has the rate of the link, and neither delay nor loss";
+
+/// The opportunities of `trace`: the arrivals of its delivered messages, from the first departure
+/// on. `None` when none has a known arrival.
+pub fn encode(trace: &Trace) -> Option<String> {
+    let origin_ns = trace.records.first()?.departure_ns;
+    let delivered = trace.records.iter();
+    let delivered = delivered.filter(|record| record.fate == TraceFate::Delivered);
+    let mut arrivals: Vec<(i64, u64)> = delivered
+        .filter_map(|record| {
+            let arrival_ns = record.departure_ns.saturating_add(record.delay()?);
+            let packets = u64::from(record.size_bytes).div_ceil(OPPORTUNITY_BYTES);
+            Some((arrival_ns.saturating_sub(origin_ns).max(0), packets.max(1)))
+        })
+        .collect();
+    if arrivals.is_empty() {
+        return None;
+    }
+    arrivals.sort_unstable();
+    let mut text = String::new();
+    for (at_ns, packets) in arrivals {
+        for _ in 0..packets {
+            let _infallible = writeln!(text, "{}", at_ns / MS_NS);
+        }
+    }
+    Some(text)
+}
+
+/// The trace of a text; see [`DECODE_LOSS`].
+///
+/// # Errors
+/// The first line that is no time or is earlier than the one before, and what could be read.
+pub fn decode(text: &str) -> (Trace, Option<CsvFault>) {
+    let mut records: Vec<TraceRecord> = Vec::new();
+    let mut header = TraceHeader::new("");
+    "opportunities of 1500 bytes, whole milliseconds".clone_into(&mut header.clock);
+    let (mut offset, mut line) = (0_u64, 0_u64);
+    let mut fault = None;
+    for raw in text.split_inclusive('\n') {
+        line += 1;
+        let content = raw.trim();
+        let start = offset;
+        offset += raw.len() as u64;
+        if content.is_empty() {
+            continue;
+        }
+        let before_ns = records.last().map_or(0, |record| record.published_ns);
+        match opportunity(content, before_ns) {
+            Ok(at_ns) => {
+                let sequence = records.len() as u64;
+                let size_bytes = u32::try_from(OPPORTUNITY_BYTES).unwrap_or(u32::MAX);
+                let record = TraceRecord::published(at_ns, sequence, size_bytes);
+                // A time of whole milliseconds is early by up to one.
+                records.push(record.delivered(0, MS_NS.unsigned_abs()));
+            }
+            Err(what) => {
+                let offset = start;
+                fault = Some(CsvFault { line, offset, what });
+                break;
+            }
+        }
+    }
+    if fault.is_none() && records.is_empty() {
+        let what = "no delivery opportunity".to_owned();
+        fault = Some(CsvFault { line, offset, what });
+    }
+    // The file wraps at its last line.
+    header.duration_ns = records.last().map_or(0, |record| record.published_ns);
+    (Trace { header, records }, fault)
+}
+
+fn opportunity(content: &str, before_ns: i64) -> Result<i64, String> {
+    let parsed: Result<i64, _> = content.parse();
+    let ms = parsed
+        .map_err(|_not_a_number| format!("\"{content}\" is no whole number of milliseconds"))?;
+    let at_ns = ms.checked_mul(MS_NS).filter(|ns| *ns >= 0);
+    let at_ns = at_ns.ok_or_else(|| format!("{ms} ms is outside 0..=9223372036854"))?;
+    if at_ns < before_ns {
+        return Err(format!("{ms} ms comes after {} ms", before_ns / MS_NS));
+    }
+    Ok(at_ns)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::random::RandomStream;
+
+    #[test]
+    fn opportunities_are_arrivals_in_whole_milliseconds() {
+        let at = |ms: i64, size| TraceRecord::published(ms * MS_NS, 0, size);
+        let mut lost = at(20, 64);
+        lost.fate = TraceFate::LostInNetwork;
+        let trace = Trace {
+            header: TraceHeader::new("a/b"),
+            records: vec![
+                at(10, 64).delivered(2_900_000, 0),
+                at(12, 3_001).delivered(500_000, 0),
+                lost,
+            ],
+        };
+        assert_eq!(encode(&trace).unwrap(), "2\n2\n2\n2\n");
+        let none = Trace {
+            records: vec![lost],
+            ..trace
+        };
+        assert_eq!(encode(&none), None);
+    }
+
+    #[test]
+    fn a_text_makes_a_trace_of_its_rate_that_writes_itself() {
+        let text = "0\n0\n4\n10\n";
+        let (trace, fault) = decode(text);
+        assert_eq!((fault, trace.records.len()), (None, 4));
+        assert_eq!(trace.header.duration_ns, 10 * MS_NS);
+        assert_eq!(trace.records[2].published_ns, 4 * MS_NS);
+        assert_eq!(encode(&trace).unwrap(), text);
+    }
+
+    #[test]
+    fn what_is_wrong_says_where_and_keeps_the_rest() {
+        for (row, why) in [("3\n", "3 ms comes after 5 ms"), ("x\n", "no whole number")] {
+            let (trace, fault) = decode(&format!("1\n5\n{row}7\n"));
+            let fault = fault.unwrap();
+            assert_eq!((trace.records.len(), fault.line, fault.offset), (2, 3, 4));
+            assert!(fault.what.contains(why), "{fault}");
+        }
+        assert_eq!(decode("\n").1.unwrap().what, "no delivery opportunity");
+    }
+
+    #[test]
+    fn mutated_texts_never_panic_and_keep_their_order() {
+        let seed = 4;
+        let mut random = RandomStream::new(seed, "opportunity mutations");
+        let mut below = |limit: usize| usize::try_from(random.next_u64() % limit as u64).unwrap();
+        for case in 0..100_000 {
+            let mut bytes = b"0\n3\n17\n17\n204\n99999\n".to_vec();
+            for _ in 0..=below(4) {
+                let at = below(bytes.len());
+                bytes[at] = b"0123456789\n-x "[below(14)];
+            }
+            bytes.truncate(below(bytes.len()) + 1);
+            let (trace, _) = decode(&String::from_utf8_lossy(&bytes));
+            let order = trace.first_out_of_order();
+            assert_eq!(order, None, "seed {seed}, case {case}");
+        }
+    }
+}

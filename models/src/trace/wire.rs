@@ -1,0 +1,434 @@
+//! The binary form of a trace: a header of 384 bytes and records of 64, all little-endian, each
+//! with its place and a check sum of its own. So damage is found where it is, and everything
+//! before it is kept. Bytes in, bytes out: it opens no file.
+
+use super::checksum::crc32;
+use super::fault::{EncodeError, FaultKind, TraceFault};
+use super::{
+    Trace, TraceArrival, TraceDirection, TraceFate, TraceHeader, TraceRecord, UNAVAILABLE_NS,
+    UNBOUNDED_NS,
+};
+
+/// First bytes of a trace.
+pub const MAGIC: [u8; 8] = *b"HILTRACE";
+/// The only version there is.
+pub const VERSION: u32 = 1;
+/// Bytes of the header.
+pub const HEADER_BYTES: usize = 384;
+/// Bytes of a record.
+pub const RECORD_BYTES: usize = 64;
+/// Most records a file may have: what a place of 32 bits can number.
+pub const RECORD_COUNT_MAX: u64 = u32::MAX as u64;
+
+const RUN_AT: usize = 56;
+const CHANNEL_AT: usize = RUN_AT + TraceHeader::RUN_BYTES;
+const LINK_AT: usize = CHANNEL_AT + TraceHeader::CHANNEL_BYTES;
+const CLOCK_AT: usize = LINK_AT + TraceHeader::LINK_BYTES;
+const HEADER_SUM_AT: usize = HEADER_BYTES - 4;
+const RECORD_SUM_AT: usize = RECORD_BYTES - 4;
+
+const _: () = assert!(CLOCK_AT + TraceHeader::CLOCK_BYTES <= HEADER_SUM_AT);
+
+/// What could be read.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Decoded {
+    /// Header and every record before the first fault.
+    pub trace: Trace,
+    /// The first fault; `None` when the file is whole.
+    pub fault: Option<TraceFault>,
+}
+
+/// The bytes of `trace`.
+///
+/// # Errors
+/// [`EncodeError`].
+pub fn encode(trace: &Trace) -> Result<Vec<u8>, EncodeError> {
+    if let Some(index) = trace.first_out_of_order() {
+        return Err(EncodeError::OutOfOrder { index });
+    }
+    let count = trace.records.len();
+    if count as u64 > RECORD_COUNT_MAX {
+        return Err(EncodeError::TooMany { count });
+    }
+    let mut bytes = Vec::with_capacity(HEADER_BYTES + count * RECORD_BYTES);
+    bytes.extend_from_slice(&encode_header(&trace.header, count as u64)?);
+    for (record, index) in trace.records.iter().zip(0_u32..) {
+        bytes.extend_from_slice(&encode_record(record, index));
+    }
+    Ok(bytes)
+}
+
+fn encode_header(header: &TraceHeader, count: u64) -> Result<[u8; HEADER_BYTES], EncodeError> {
+    let mut bytes = [0; HEADER_BYTES];
+    bytes[..8].copy_from_slice(&MAGIC);
+    put(&mut bytes, 8, &VERSION.to_le_bytes());
+    put(&mut bytes, 12, &to_u32(HEADER_BYTES).to_le_bytes());
+    put(&mut bytes, 16, &to_u32(RECORD_BYTES).to_le_bytes());
+    bytes[20] = header.direction as u8;
+    bytes[21] = header.arrival as u8;
+    put(&mut bytes, 24, &count.to_le_bytes());
+    put(&mut bytes, 32, &header.origin_ns.to_le_bytes());
+    put(&mut bytes, 40, &header.duration_ns.to_le_bytes());
+    let names = [
+        ("run", &header.run, RUN_AT, TraceHeader::RUN_BYTES),
+        (
+            "channel",
+            &header.channel,
+            CHANNEL_AT,
+            TraceHeader::CHANNEL_BYTES,
+        ),
+        ("link", &header.link, LINK_AT, TraceHeader::LINK_BYTES),
+        ("clock", &header.clock, CLOCK_AT, TraceHeader::CLOCK_BYTES),
+    ];
+    for (what, name, at, limit) in names {
+        let length = name.len();
+        if length > limit {
+            return Err(EncodeError::NameTooLong {
+                what,
+                length,
+                limit,
+            });
+        }
+        put(&mut bytes, at, name.as_bytes());
+    }
+    let sum = crc32(&bytes[..HEADER_SUM_AT]);
+    put(&mut bytes, HEADER_SUM_AT, &sum.to_le_bytes());
+    Ok(bytes)
+}
+
+fn encode_record(record: &TraceRecord, index: u32) -> [u8; RECORD_BYTES] {
+    let mut bytes = [0; RECORD_BYTES];
+    put(&mut bytes, 0, &record.published_ns.to_le_bytes());
+    put(&mut bytes, 8, &record.departure_ns.to_le_bytes());
+    put(&mut bytes, 16, &record.delay_ns.to_le_bytes());
+    put(&mut bytes, 24, &record.bound_ns.to_le_bytes());
+    put(&mut bytes, 32, &record.second_delay_ns.to_le_bytes());
+    put(&mut bytes, 40, &record.sequence.to_le_bytes());
+    put(&mut bytes, 48, &record.size_bytes.to_le_bytes());
+    put(&mut bytes, 52, &record.start.to_le_bytes());
+    bytes[54] = record.fate as u8;
+    bytes[55] = record.flags;
+    put(&mut bytes, 56, &index.to_le_bytes());
+    let sum = crc32(&bytes[..RECORD_SUM_AT]);
+    put(&mut bytes, RECORD_SUM_AT, &sum.to_le_bytes());
+    bytes
+}
+
+fn put(bytes: &mut [u8], at: usize, part: &[u8]) {
+    bytes[at..at + part.len()].copy_from_slice(part);
+}
+
+fn to_u32(size: usize) -> u32 {
+    u32::try_from(size).expect("the sizes of the format are small")
+}
+
+/// Reads a trace that is wholly in memory.
+///
+/// # Errors
+/// When not even the header can be read; every later fault is beside what could be.
+pub fn decode(bytes: &[u8]) -> Result<Decoded, TraceFault> {
+    let mut decoder = TraceDecoder::default();
+    let mut records = Vec::new();
+    let fault = decoder
+        .feed(bytes, &mut |record| records.push(record))
+        .and_then(|()| decoder.finish())
+        .err();
+    match (decoder.header, fault) {
+        (Some(header), fault) => Ok(Decoded {
+            trace: Trace { header, records },
+            fault,
+        }),
+        (None, Some(fault)) => Err(fault),
+        (None, None) => unreachable!("a decoder without a header does not finish"),
+    }
+}
+
+/// Reads a trace piece by piece; holds at most one header or record of it.
+#[derive(Debug, Default)]
+pub struct TraceDecoder {
+    header: Option<TraceHeader>,
+    record_count: u64,
+    /// Bytes of the part that is not whole yet.
+    held: Vec<u8>,
+    /// Of the first of them.
+    offset: u64,
+    read_count: u64,
+    before_ns: Option<i64>,
+    fault: Option<TraceFault>,
+}
+
+impl TraceDecoder {
+    /// The header, as soon as it was read.
+    pub fn header(&self) -> Option<&TraceHeader> {
+        self.header.as_ref()
+    }
+
+    /// Takes the next bytes and hands each record to `take`.
+    ///
+    /// # Errors
+    /// The first fault, also on every later call; the records handed out before are whole.
+    pub fn feed(
+        &mut self,
+        mut bytes: &[u8],
+        take: &mut dyn FnMut(TraceRecord),
+    ) -> Result<(), TraceFault> {
+        if let Some(fault) = &self.fault {
+            return Err(fault.clone());
+        }
+        loop {
+            if self.is_complete() && !bytes.is_empty() {
+                let count = bytes.len() as u64;
+                return self.fail(0, FaultKind::Trailing { count });
+            }
+            let wanted = if self.header.is_some() {
+                RECORD_BYTES
+            } else {
+                HEADER_BYTES
+            };
+            let missing = (wanted - self.held.len()).min(bytes.len());
+            let (next, rest) = bytes.split_at(missing);
+            self.held.extend_from_slice(next);
+            bytes = rest;
+            if self.held.len() < wanted {
+                return Ok(());
+            }
+            self.part(take)?;
+            self.offset += wanted as u64;
+            self.held.clear();
+        }
+    }
+
+    /// Says that there are no more bytes.
+    ///
+    /// # Errors
+    /// The fault found before, or that the trace is not whole.
+    pub fn finish(&mut self) -> Result<(), TraceFault> {
+        if let Some(fault) = &self.fault {
+            return Err(fault.clone());
+        }
+        if self.header.is_none() {
+            let found = self.held.len();
+            if !MAGIC.starts_with(&self.held[..found.min(MAGIC.len())]) {
+                let found = self.held[..found.min(MAGIC.len())].to_vec();
+                return self.fail(0, FaultKind::Foreign { found });
+            }
+            let what = FaultKind::Truncated {
+                found: found as u64,
+                expected: HEADER_BYTES as u64,
+                unit: "bytes of the header",
+            };
+            return self.fail(0, what);
+        }
+        if !self.is_complete() {
+            let what = FaultKind::Truncated {
+                found: self.read_count,
+                expected: self.record_count,
+                unit: "records",
+            };
+            return self.fail(0, what);
+        }
+        Ok(())
+    }
+
+    fn is_complete(&self) -> bool {
+        self.header.is_some() && self.read_count == self.record_count
+    }
+
+    fn part(&mut self, take: &mut dyn FnMut(TraceRecord)) -> Result<(), TraceFault> {
+        let held = core::mem::take(&mut self.held);
+        let outcome = if self.header.is_none() {
+            decode_header(&held).map(|(header, count)| {
+                self.header = Some(header);
+                self.record_count = count;
+            })
+        } else {
+            self.record(&held).map(|record| {
+                self.before_ns = Some(record.published_ns);
+                self.read_count += 1;
+                take(record);
+            })
+        };
+        self.held = held;
+        outcome.or_else(|(at, what)| self.fail(at, what))
+    }
+
+    fn record(&self, bytes: &[u8]) -> Result<TraceRecord, (u64, FaultKind)> {
+        check_sum(bytes, RECORD_SUM_AT, "record")?;
+        let expected = u32::try_from(self.read_count).unwrap_or(u32::MAX);
+        let found = u32_at(bytes, 56);
+        if found != expected {
+            return Err((56, FaultKind::Place { found, expected }));
+        }
+        let record = decode_record(bytes)?;
+        let published_ns = record.published_ns;
+        match self.before_ns {
+            Some(before_ns) if published_ns < before_ns => Err((
+                0,
+                FaultKind::Order {
+                    published_ns,
+                    before_ns,
+                },
+            )),
+            _ => Ok(record),
+        }
+    }
+
+    fn fail(&mut self, at: u64, what: FaultKind) -> Result<(), TraceFault> {
+        let offset = self.offset + at;
+        let fault = TraceFault { offset, what };
+        self.fault = Some(fault.clone());
+        Err(fault)
+    }
+}
+
+fn check_sum(bytes: &[u8], at: usize, part: &'static str) -> Result<(), (u64, FaultKind)> {
+    let (found, computed) = (u32_at(bytes, at), crc32(&bytes[..at]));
+    if found == computed {
+        return Ok(());
+    }
+    let what = FaultKind::CheckSum {
+        part,
+        found,
+        computed,
+    };
+    // The sum covers the whole part; which of its bytes is wrong it does not tell.
+    Err((0, what))
+}
+
+fn decode_header(bytes: &[u8]) -> Result<(TraceHeader, u64), (u64, FaultKind)> {
+    if bytes[..8] != MAGIC {
+        let found = bytes[..8].to_vec();
+        return Err((0, FaultKind::Foreign { found }));
+    }
+    let version = u32_at(bytes, 8);
+    if version != VERSION {
+        return Err((8, FaultKind::Version { found: version }));
+    }
+    check_sum(bytes, HEADER_SUM_AT, "header")?;
+    let (header, record) = (u32_at(bytes, 12), u32_at(bytes, 16));
+    if (header as usize, record as usize) != (HEADER_BYTES, RECORD_BYTES) {
+        return Err((12, FaultKind::Sizes { header, record }));
+    }
+    let count = u64::from_le_bytes(array_at(bytes, 24));
+    if count > RECORD_COUNT_MAX {
+        let (value, allowed) = (count, "0..=4294967295");
+        let field = "record_count";
+        let what = FaultKind::Field {
+            field,
+            value,
+            allowed,
+        };
+        return Err((24, what));
+    }
+    let header = TraceHeader {
+        run: text_at(bytes, "run", RUN_AT, TraceHeader::RUN_BYTES)?,
+        channel: text_at(bytes, "channel", CHANNEL_AT, TraceHeader::CHANNEL_BYTES)?,
+        link: text_at(bytes, "link", LINK_AT, TraceHeader::LINK_BYTES)?,
+        clock: text_at(bytes, "clock", CLOCK_AT, TraceHeader::CLOCK_BYTES)?,
+        direction: code(&TraceDirection::ALL, bytes, 20, "direction")?,
+        arrival: code(&TraceArrival::ALL, bytes, 21, "arrival")?,
+        origin_ns: i64::from_le_bytes(array_at(bytes, 32)),
+        duration_ns: i64::from_le_bytes(array_at(bytes, 40)),
+    };
+    Ok((header, count))
+}
+
+fn decode_record(bytes: &[u8]) -> Result<TraceRecord, (u64, FaultKind)> {
+    let record = TraceRecord {
+        published_ns: i64::from_le_bytes(array_at(bytes, 0)),
+        departure_ns: i64::from_le_bytes(array_at(bytes, 8)),
+        delay_ns: i64::from_le_bytes(array_at(bytes, 16)),
+        bound_ns: u64::from_le_bytes(array_at(bytes, 24)),
+        second_delay_ns: i64::from_le_bytes(array_at(bytes, 32)),
+        sequence: u64::from_le_bytes(array_at(bytes, 40)),
+        size_bytes: u32_at(bytes, 48),
+        start: u16::from_le_bytes(array_at(bytes, 52)),
+        fate: code(&TraceFate::ALL, bytes, 54, "fate")?,
+        flags: bytes[55],
+    };
+    check_record(&record)?;
+    Ok(record)
+}
+
+/// What the fields of a record say together.
+fn check_record(record: &TraceRecord) -> Result<(), (u64, FaultKind)> {
+    let field = |at, field, value, allowed| {
+        let what = FaultKind::Field {
+            field,
+            value,
+            allowed,
+        };
+        Err((at, what))
+    };
+    if record.flags & !TraceRecord::FLAGS != 0 {
+        return field(55, "flags", u64::from(record.flags), "0..=31");
+    }
+    if record.published_ns == UNAVAILABLE_NS {
+        return field(0, "published_ns", 1 << 63, "any instant");
+    }
+    let has_delay = record.delay_ns != UNAVAILABLE_NS;
+    if has_delay
+        && matches!(
+            record.fate,
+            TraceFate::LostInNetwork | TraceFate::LostBeforeLink
+        )
+    {
+        let delay = record.delay_ns.cast_unsigned();
+        return field(
+            16,
+            "delay_ns",
+            delay,
+            "none for a message that never arrived",
+        );
+    }
+    if !has_delay && record.bound_ns != UNBOUNDED_NS {
+        return field(24, "bound_ns", record.bound_ns, "none without a delay");
+    }
+    Ok(())
+}
+
+fn code<T: Copy>(
+    all: &[T],
+    bytes: &[u8],
+    at: usize,
+    field: &'static str,
+) -> Result<T, (u64, FaultKind)> {
+    let value = bytes[at];
+    let allowed = if all.len() == 5 { "0..=4" } else { "0..=2" };
+    let what = FaultKind::Field {
+        field,
+        value: u64::from(value),
+        allowed,
+    };
+    all.get(usize::from(value))
+        .copied()
+        .ok_or((at as u64, what))
+}
+
+fn text_at(
+    bytes: &[u8],
+    what: &'static str,
+    at: usize,
+    limit: usize,
+) -> Result<String, (u64, FaultKind)> {
+    let field = &bytes[at..at + limit];
+    let length = field.iter().position(|byte| *byte == 0).unwrap_or(limit);
+    match core::str::from_utf8(&field[..length]) {
+        Ok(text) => Ok(text.to_owned()),
+        Err(error) => Err(((at + error.valid_up_to()) as u64, FaultKind::Text { what })),
+    }
+}
+
+fn u32_at(bytes: &[u8], at: usize) -> u32 {
+    u32::from_le_bytes(array_at(bytes, at))
+}
+
+fn array_at<const N: usize>(bytes: &[u8], at: usize) -> [u8; N] {
+    let mut array = [0; N];
+    array.copy_from_slice(&bytes[at..at + N]);
+    array
+}
+
+#[cfg(test)]
+#[path = "wire_tests.rs"]
+mod tests;

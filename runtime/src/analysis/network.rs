@@ -1,0 +1,480 @@
+//! Network and robot of a run on one time axis: from the passages of each channel to figures,
+//! events, series and correlations, and to what came before each event of the score. Live runs
+//! and runs in virtual time come here alike; where passages come from is not known here.
+
+use std::collections::BTreeSet;
+
+use hil_models::case_study::{ErrorSeries, Severity};
+use hil_models::measure::account::{Side, passages};
+use hil_models::measure::correlation::{self, LagWindow};
+use hil_models::measure::network::{
+    NetworkBin, NetworkBins, NetworkContext, NetworkEvent, NetworkEventKind, NetworkFigures,
+    Passage, SeriesSpan, bin_width_ns, clock_steps, interruptions, network_events,
+};
+use hil_models::measure::record::IngressRecord;
+use hil_models::plot::PlotSeries;
+use hil_models::random::RandomStream;
+use hil_models::time::Instant;
+
+use super::events::{start_of, start_on};
+use super::records::RunRecords;
+use crate::report::network::{
+    ChannelNetwork, Correlation, CorrelationTests, FOREGOING_S, ForegoingEvent, ForegoingNetwork,
+    NetworkReport, TestedPair, TimedEvent, Timeline, TimelineRow,
+};
+use crate::report::score_event::ScoreEvents;
+use crate::supervisor::RunResult;
+use crate::topology::{Channel, Topology};
+
+/// Network events a summary keeps, and of those before one event of the score.
+const EVENTS_MAX: usize = 2_000;
+const FOREGOING_MAX: usize = 8;
+
+/// Steps of the timeline in a summary.
+const STEPS_MAX: usize = 120;
+
+/// Lags searched, seconds: bins and stamps are not exact, so the robot may seem to come first.
+const LEAD_MAX_S: f64 = 1.0;
+const LAG_MAX_S: f64 = FOREGOING_S;
+
+/// One channel over a network, ready to be put on the run's axis.
+pub(crate) struct ChannelPassages<'a> {
+    pub(crate) channel: &'a str,
+    pub(crate) hosts: [&'a str; 2],
+    pub(crate) passages: &'a [Passage],
+    /// What the passages alone do not show.
+    pub(crate) other_events: Vec<NetworkEvent>,
+    pub(crate) span: SeriesSpan,
+    pub(crate) context: NetworkContext<'a>,
+}
+
+/// What the robot did, on the run's axis.
+#[derive(Debug)]
+pub(crate) struct RobotSeries {
+    label: String,
+    unit: &'static str,
+    /// Seconds after the start of the run, and magnitude; in order of time.
+    samples: Vec<(f64, f64)>,
+}
+
+impl RobotSeries {
+    /// A case's error; `start` is that of the run on the clock of its samples.
+    pub(crate) fn of(errors: ErrorSeries, start: Instant) -> Self {
+        let samples = errors.samples.into_iter();
+        Self {
+            label: errors.label.to_owned(),
+            unit: errors.unit,
+            samples: samples
+                .map(|(at, value)| (at.seconds_since(start), value))
+                .collect(),
+        }
+    }
+
+    /// The events of a score that matter: one for each.
+    fn of_events(all: &ScoreEvents) -> Self {
+        let is_grave = |severity| severity > Severity::Notice;
+        let has_grave = all.events.iter().any(|event| is_grave(event.severity));
+        let chosen = all
+            .events
+            .iter()
+            .filter(|event| !has_grave || is_grave(event.severity));
+        let mut samples: Vec<_> = chosen
+            .filter_map(|event| Some((event.at_s?, 1.0)))
+            .collect();
+        samples.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let label = if has_grave {
+            "incidents and hazards"
+        } else {
+            "events of the score"
+        };
+        Self {
+            label: label.to_owned(),
+            unit: "1",
+            samples,
+        }
+    }
+
+    /// Per bin: how many, or the largest, which holds until there is another.
+    fn binned(&self, width_s: f64, count: usize, is_count: bool) -> Vec<f64> {
+        let mut bins = vec![None; count];
+        for (at_s, value) in &self.samples {
+            let Some(bin) = index_of(at_s / width_s).and_then(|index| bins.get_mut(index)) else {
+                continue;
+            };
+            let known: f64 = bin.unwrap_or(0.0);
+            *bin = Some(if is_count {
+                known + value
+            } else {
+                known.max(*value)
+            });
+        }
+        let mut held = 0.0;
+        let held_or = |bin: Option<f64>| {
+            held = bin.unwrap_or(if is_count { 0.0 } else { held });
+            held
+        };
+        bins.into_iter().map(held_or).collect()
+    }
+}
+
+#[allow(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "the value is checked to lie in 0..2^32"
+)]
+fn index_of(bin: f64) -> Option<usize> {
+    (0.0..4_294_967_296.0)
+        .contains(&bin)
+        .then_some(bin as usize)
+}
+
+/// A network under way of being put together, channel by channel, so that the passages of only
+/// one need be in memory.
+#[derive(Debug, Default)]
+pub(crate) struct NetworkBuilder {
+    channels: Vec<ChannelNetwork>,
+    events: Vec<TimedEvent>,
+    bins: Vec<(String, NetworkBins)>,
+    /// Processes whose time without them is told already.
+    told: BTreeSet<(String, i64)>,
+}
+
+impl NetworkBuilder {
+    pub(crate) fn add(&mut self, one: ChannelPassages<'_>) {
+        self.channels.push(ChannelNetwork {
+            channel: one.channel.to_owned(),
+            from_host: one.hosts[0].to_owned(),
+            to_host: one.hosts[1].to_owned(),
+            figures: NetworkFigures::of(one.passages, &one.context),
+        });
+        let mut events = network_events(one.passages);
+        events.extend(one.other_events);
+        for event in events {
+            self.add_event(one.channel, event, one.span);
+        }
+        let width_ns = bin_width_ns(one.span.duration_ns);
+        let bins = NetworkBins::of(one.passages, one.span, width_ns);
+        self.bins.push((one.channel.to_owned(), bins));
+    }
+
+    fn add_event(&mut self, channel: &str, event: NetworkEvent, span: SeriesSpan) {
+        if let NetworkEventKind::ProcessDown { process, .. } = &event.kind
+            && !self.told.insert((process.clone(), event.from.ns))
+        {
+            return;
+        }
+        let start_ns = match event.from.side {
+            Side::Producer => span.producer_start_ns,
+            Side::Consumer => span.consumer_start_ns,
+        };
+        let since_s = |ns: i64| ns.saturating_sub(start_ns) as f64 * 1e-9;
+        let end_s = span.duration_ns as f64 * 1e-9;
+        self.events.push(TimedEvent {
+            channel: channel.to_owned(),
+            from_s: since_s(event.from.ns),
+            until_s: event
+                .until_ns
+                .map(since_s)
+                .filter(|until_s| *until_s < end_s),
+            kind: event.kind,
+        });
+    }
+
+    /// The report, and the series of every channel; `None` when no channel crossed a network. Puts
+    /// beside every event of the score what came before it.
+    pub(crate) fn finish(
+        mut self,
+        score: &mut ScoreEvents,
+        errors: Vec<RobotSeries>,
+        (seed, clocks_differ): (u64, bool),
+    ) -> Option<(NetworkReport, Vec<PlotSeries>)> {
+        let (_, first) = self.bins.first()?;
+        let (width_s, count) = (first.width_ns as f64 * 1e-9, first.bins.len());
+        self.events.sort_by(|a, b| a.from_s.total_cmp(&b.from_s));
+        for event in &mut score.events {
+            event.network = event.at_s.map(|at_s| self.before(at_s));
+        }
+        let mut robot = vec![(RobotSeries::of_events(score), true)];
+        robot.extend(errors.into_iter().map(|one| (one, false)));
+        let robot: Vec<(RobotSeries, Vec<f64>)> = robot
+            .into_iter()
+            .map(|(one, is_count)| {
+                let bins = one.binned(width_s, count, is_count);
+                (one, bins)
+            })
+            .collect();
+        let run_s = count as f64 * width_s;
+        let dropped = self.events.len().saturating_sub(EVENTS_MAX);
+        let report = NetworkReport {
+            foregoing_s: FOREGOING_S,
+            foregoing_chance_ratio: covered_s(&self.events, run_s) / run_s,
+            clocks_differ,
+            timeline: timeline(&self.bins, &robot, width_s),
+            correlation: correlate(&self.bins, &robot, (width_s, seed)),
+            events: self.events.into_iter().take(EVENTS_MAX).collect(),
+            events_dropped_count: dropped as u64,
+            channels: self.channels,
+        };
+        let series = self.bins.iter().map(|(channel, bins)| {
+            let notes = vec![
+                format!(
+                    "bins of {width_s} s; a message belongs where it was handed to the network"
+                ),
+                "silence is seen from the receiver; an empty field had no message".to_owned(),
+            ];
+            bins.to_series(channel, notes)
+        });
+        Some((report, series.collect()))
+    }
+
+    /// What the network went through before `at_s`, nearest first.
+    fn before(&self, at_s: f64) -> ForegoingNetwork {
+        let mut found: Vec<(f64, &TimedEvent)> = self
+            .events
+            .iter()
+            .filter_map(|event| Some((event.over_for_s(at_s)?, event)))
+            .collect();
+        // Of those under way the one that began first weighs most.
+        found.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.from_s.total_cmp(&b.1.from_s)));
+        let lost = |bins: &NetworkBins| {
+            let width_s = bins.width_ns as f64 * 1e-9;
+            let first = index_of((at_s - FOREGOING_S).max(0.0) / width_s).unwrap_or(0);
+            let last = index_of(at_s / width_s).map_or(0, |last| last + 1);
+            let within = bins.bins.iter().take(last).skip(first);
+            within.map(|bin| bin.lost_count).sum::<u64>()
+        };
+        ForegoingNetwork {
+            foregoing_s: FOREGOING_S,
+            more_count: found.len().saturating_sub(FOREGOING_MAX) as u64,
+            events: found
+                .iter()
+                .take(FOREGOING_MAX)
+                .map(|(over_for_s, event)| ForegoingEvent::of(event, at_s, *over_for_s))
+                .collect(),
+            lost_count: self.bins.iter().map(|(_, bins)| lost(bins)).sum(),
+        }
+    }
+}
+
+/// How much of the run has an event in the time looked at before it.
+fn covered_s(events: &[TimedEvent], run_s: f64) -> f64 {
+    let (mut covered_s, mut until_s) = (0.0, 0.0_f64);
+    for event in events {
+        let from_s = event.from_s.clamp(until_s, run_s);
+        let end_s = event.until_s.map_or(run_s, |end_s| end_s + FOREGOING_S);
+        let end_s = end_s.clamp(from_s, run_s);
+        covered_s += end_s - from_s;
+        until_s = until_s.max(end_s);
+    }
+    covered_s
+}
+
+/// What is bad about a network, as one number per bin.
+const TROUBLES: [(&str, &str, &str); 3] = [
+    ("lost", "loss", "1"),
+    ("delay", "delay", "s"),
+    ("silence", "silence", "s"),
+];
+
+fn trouble(bin: &NetworkBin, index: usize) -> Option<f64> {
+    let seconds = |ns: i64| ns as f64 * 1e-9;
+    match index {
+        0 if bin.sent_count == 0 => None,
+        0 => Some(bin.lost_count as f64 / bin.sent_count as f64),
+        1 => bin.delay_max_ns.map(seconds),
+        _ => bin.silence_max_ns.map(seconds),
+    }
+}
+
+/// True for a channel with less than a message per bin: its silence is nobody's trouble, as nobody
+/// speaks.
+fn speaks_seldom(bins: &NetworkBins) -> bool {
+    let sent_count: u64 = bins.bins.iter().map(|bin| bin.sent_count).sum();
+    sent_count < bins.bins.len() as u64
+}
+
+type RobotBins = [(RobotSeries, Vec<f64>)];
+
+fn timeline(all: &[(String, NetworkBins)], robot: &RobotBins, width_s: f64) -> Timeline {
+    let count = all.first().map_or(0, |(_, bins)| bins.bins.len());
+    let per_step = count.div_ceil(STEPS_MAX).max(1);
+    let largest = |values: &[Option<f64>]| values.iter().flatten().copied().reduce(f64::max);
+    let row = |of: &str, what: &str, unit: &str, values: Vec<Option<f64>>| TimelineRow {
+        of: of.to_owned(),
+        what: what.to_owned(),
+        unit: unit.to_owned(),
+        values: values.chunks(per_step).map(largest).collect(),
+    };
+    let mut rows = Vec::new();
+    for (channel, bins) in all {
+        for (index, (what, _, unit)) in TROUBLES.iter().enumerate() {
+            if *what == "silence" && speaks_seldom(bins) {
+                continue;
+            }
+            let values = bins.bins.iter().map(|bin| trouble(bin, index));
+            rows.push(row(channel, what, unit, values.collect()));
+        }
+    }
+    for (one, bins) in robot {
+        let values = bins.iter().map(|value| Some(*value)).collect();
+        rows.push(row("robot", &one.label, one.unit, values));
+    }
+    Timeline {
+        step_s: per_step as f64 * width_s,
+        rows,
+    }
+}
+
+fn correlate(
+    all: &[(String, NetworkBins)],
+    robot: &RobotBins,
+    (width_s, seed): (f64, u64),
+) -> Correlation {
+    let mut names = Vec::new();
+    let mut causes = Vec::new();
+    for (channel, bins) in all {
+        for (index, (what, network, _)) in TROUBLES.iter().enumerate() {
+            if *what == "silence" && speaks_seldom(bins) {
+                continue;
+            }
+            let mut held = 0.0;
+            let values = bins.bins.iter().map(|bin| {
+                // What is unknown where nothing arrived goes on as it was.
+                held = trouble(bin, index).unwrap_or(held);
+                held
+            });
+            causes.push(values.collect());
+            names.push((channel, *network));
+        }
+    }
+    let effects: Vec<Vec<f64>> = robot.iter().map(|(_, bins)| bins.clone()).collect();
+    let in_bins = |seconds: f64| index_of((seconds / width_s).round()).unwrap_or(0);
+    let window = LagWindow {
+        lead_max: in_bins(LEAD_MAX_S),
+        lag_max: in_bins(LAG_MAX_S),
+    };
+    let mut random = RandomStream::new(seed, "measure.correlation.shuffles");
+    let tested = match correlation::family(&causes, &effects, window, &mut random) {
+        Ok(tested) => tested,
+        Err(error) => {
+            return Correlation::Unavailable {
+                reason: error.to_string(),
+            };
+        }
+    };
+    let mut pairs = Vec::new();
+    for ((one, _), row) in robot.iter().zip(&tested.pairs) {
+        for ((channel, network), pair) in names.iter().zip(row) {
+            pairs.extend(pair.map(|correlation| TestedPair {
+                channel: (*channel).clone(),
+                network: (*network).to_owned(),
+                robot: one.label.clone(),
+                lag_s: correlation.lag_bins as f64 * width_s,
+                correlation,
+            }));
+        }
+    }
+    let is_constant = |values: &[f64]| {
+        values
+            .windows(2)
+            .all(|pair| pair[0].total_cmp(&pair[1]).is_eq())
+    };
+    let of_network = names.iter().zip(&causes);
+    let constant_causes = of_network
+        .filter(|(_, values)| is_constant(values))
+        .map(|((channel, network), _)| format!("{network} on {channel}"));
+    let constant_effects = robot
+        .iter()
+        .filter(|(_, values)| is_constant(values))
+        .map(|(one, _)| one.label.clone());
+    Correlation::Tested(CorrelationTests {
+        bin_s: width_s,
+        lead_max_s: tested.window.lead_max as f64 * width_s,
+        lag_max_s: tested.window.lag_max as f64 * width_s,
+        shuffle_count: correlation::SHUFFLE_COUNT as u64,
+        seed,
+        constant: constant_effects.chain(constant_causes).collect(),
+        pairs,
+    })
+}
+
+/// Everything the records of a live run say of its network; see [`NetworkBuilder::finish`].
+pub(super) fn of_run(
+    run: (&Topology, &RunResult),
+    records: &RunRecords,
+    errors: Vec<ErrorSeries>,
+    (score, warnings): (&mut ScoreEvents, &mut Vec<String>),
+) -> Option<(NetworkReport, Vec<PlotSeries>)> {
+    let (topology, result) = run;
+    let mut builder = NetworkBuilder::default();
+    for channel in topology.channels() {
+        if topology.crossing(channel).is_some() && records.has(&channel.name) {
+            let added = add_channel(&mut builder, run, records, channel);
+            warnings.extend(added.err().map(|missing| {
+                let name = &channel.name;
+                format!("{name}: left out of the network's figures: {missing}")
+            }));
+        }
+    }
+    let errors = errors.into_iter().filter_map(|one| {
+        let start = start_of(run, topology.channel(one.clock_of)?, records.clocks())?;
+        Some(RobotSeries::of(one, start))
+    });
+    let seed = topology.run().seed;
+    let clocks_differ = !records.clocks().are_aligned(result.spans.keys());
+    builder.finish(score, errors.collect(), (seed, clocks_differ))
+}
+
+fn add_channel(
+    builder: &mut NetworkBuilder,
+    run: (&Topology, &RunResult),
+    records: &RunRecords,
+    channel: &Channel,
+) -> Result<(), String> {
+    let (topology, result) = run;
+    let to = channel.to.as_deref().ok_or("nobody receives it")?;
+    let hosts = [&channel.from, to].map(|process| {
+        let host = topology.process(process).map(|process| &process.host);
+        host.map_or("", |host| host.as_str())
+    });
+    let within = |host: &str| {
+        let span = start_on(result, host, records.clocks()).zip(result.spans.get(host));
+        let missing = || format!("when the run began and ended on host {host} is unavailable");
+        span.map(|(start, (_, end))| (start, *end))
+            .ok_or_else(missing)
+    };
+    let (producer_start, producer_end) = within(hosts[0])?;
+    let (consumer_start, consumer_end) = within(hosts[1])?;
+    let span = SeriesSpan {
+        producer_start_ns: producer_start.as_ns(),
+        consumer_start_ns: consumer_start.as_ns(),
+        duration_ns: producer_end
+            .ns_since(producer_start)
+            .max(consumer_end.ns_since(consumer_start)),
+    };
+    let payload_bytes = records.log().raw(&channel.name).first();
+    let payload_bytes = payload_bytes.map(|message| message.payload.len() as u64);
+    records.consult(run, channel, |files, context| {
+        let ways = passages(files, context);
+        let is_copy = |record: &&IngressRecord| record.flags & IngressRecord::DUPLICATE != 0;
+        let mut other_events = interruptions(context);
+        other_events.extend(clock_steps(files));
+        builder.add(ChannelPassages {
+            channel: &channel.name,
+            hosts,
+            passages: &ways,
+            other_events,
+            span,
+            context: NetworkContext {
+                run_ns: Some((span.producer_start_ns, producer_end.as_ns())),
+                payload_bytes,
+                duplicated_count: files
+                    .ingress
+                    .map(|ingress| ingress.iter().filter(is_copy).count() as u64),
+                round_trips_ns: context.round_trips_ns,
+                seed: context.seed,
+            },
+        });
+    });
+    Ok(())
+}

@@ -1,0 +1,139 @@
+//! What `chronyc -c tracking` prints: one line of comma-separated values (chronyc(1), "tracking").
+//! It runs nothing.
+
+use serde::{Deserialize, Serialize};
+
+/// The fields of `chronyc -c tracking` that bound the clock's error.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ChronyTracking {
+    /// Reference identifier and name or address of the source.
+    pub reference: String,
+    /// Hops from a reference clock; 0 when not synchronised.
+    pub stratum: u32,
+    /// System clock minus chronyd's idea of the time, seconds.
+    pub system_offset_s: f64,
+    /// Network delay to the stratum-1 source, seconds.
+    pub root_delay_s: f64,
+    /// Accumulated dispersion to it, seconds.
+    pub root_dispersion_s: f64,
+    /// `Normal`, `Insert second`, `Delete second` or `Not synchronised`.
+    pub leap_status: String,
+}
+
+/// Fields of the line.
+const FIELD_COUNT: usize = 14;
+
+impl ChronyTracking {
+    /// Reads the line.
+    ///
+    /// # Errors
+    /// In words, with the field and its text.
+    pub fn parse(text: &str) -> Result<Self, String> {
+        let line = text.lines().find(|line| !line.trim().is_empty());
+        let line = line.ok_or("an empty answer")?;
+        let fields: Vec<&str> = line.trim().split(',').collect();
+        if fields.len() != FIELD_COUNT {
+            let count = fields.len();
+            return Err(format!("{count} fields, {FIELD_COUNT} expected: {line:?}"));
+        }
+        let seconds = |index: usize, name: &str, lowest: f64| -> Result<f64, String> {
+            let text = fields[index];
+            let value: f64 = text
+                .parse()
+                .map_err(|error| format!("{name} {text:?}: {error}"))?;
+            // A day: a clock that far off has no bound worth the name.
+            if (lowest..=86_400.0).contains(&value) {
+                Ok(value)
+            } else {
+                Err(format!("{name} {value} s is outside {lowest}..=86400"))
+            }
+        };
+        let stratum = fields[2]
+            .parse()
+            .map_err(|error| format!("stratum {:?}: {error}", fields[2]))?;
+        Ok(Self {
+            reference: format!("{} {}", fields[0], fields[1]).trim().to_owned(),
+            stratum,
+            system_offset_s: seconds(4, "system time", -86_400.0)?,
+            root_delay_s: seconds(10, "root delay", 0.0)?,
+            root_dispersion_s: seconds(11, "root dispersion", 0.0)?,
+            leap_status: fields[13].to_owned(),
+        })
+    }
+
+    /// True while it follows a source.
+    pub fn is_synchronised(&self) -> bool {
+        self.leap_status != "Not synchronised" && (1..16).contains(&self.stratum)
+    }
+
+    /// Largest error of the system clock against the reference, nanoseconds: root dispersion, half
+    /// the root delay, and what chronyd has yet to slew (chrony FAQ, "clock error bound").
+    #[allow(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "each part is at most a day and none below zero"
+    )]
+    pub fn bound_ns(&self) -> u64 {
+        let bound_s = self.root_dispersion_s + self.root_delay_s / 2.0 + self.system_offset_s.abs();
+        (bound_s * 1e9).ceil() as u64
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use hil_models::random::RandomStream;
+
+    const RECORDED: &str = "C0A80A01,192.168.10.1,2,1763775612.482936101,-0.000000213,0.000000094,\
+                            0.000000371,-12.482,0.001,0.018,0.000183211,0.000024716,16.1,Normal\n";
+    const UNSYNCHRONISED: &str = "00000000,,0,0.000000000,0.000000000,0.000000000,0.000000000,0.000,0.000,0.000,\
+         1.000000000,1.000000000,0.0,Not synchronised\n";
+
+    #[test]
+    fn a_recorded_answer_gives_the_bound_of_the_manual() {
+        let tracking = ChronyTracking::parse(RECORDED).unwrap();
+        assert_eq!(tracking.reference, "C0A80A01 192.168.10.1");
+        assert_eq!(tracking.stratum, 2);
+        assert!(tracking.is_synchronised());
+        // 24.716 + 183.211 / 2 + 0.213 microseconds.
+        assert!((116_534..=116_536).contains(&tracking.bound_ns()));
+    }
+
+    #[test]
+    fn an_idle_daemon_is_not_synchronised() {
+        let tracking = ChronyTracking::parse(UNSYNCHRONISED).unwrap();
+        assert!(!tracking.is_synchronised());
+        assert_eq!(tracking.reference, "00000000");
+    }
+
+    #[test]
+    fn faults_are_named() {
+        let short = ChronyTracking::parse("506 Cannot talk to daemon\n").unwrap_err();
+        assert!(short.starts_with("1 fields, 14 expected"), "{short}");
+        let infinite = RECORDED.replace("0.000183211", "inf");
+        let error = ChronyTracking::parse(&infinite).unwrap_err();
+        assert_eq!(error, "root delay inf s is outside 0..=86400");
+    }
+
+    #[test]
+    fn mutated_answers_give_a_bound_or_an_error() {
+        let mut random = RandomStream::new(3, "chrony");
+        let mut read_count = 0_u32;
+        for _ in 0..100_000 {
+            let mut bytes = RECORDED.as_bytes().to_vec();
+            for _ in 0..=random.next_u64() % 4 {
+                let at = usize::try_from(random.next_u64()).unwrap() % bytes.len();
+                match random.next_u64() % 3 {
+                    0 => bytes[at] = random.next_u64().to_le_bytes()[0],
+                    1 => bytes.truncate(at.max(1)),
+                    _ => bytes.insert(at, b"0123456789.,-einf"[at % 17]),
+                }
+            }
+            if let Ok(tracking) = ChronyTracking::parse(&String::from_utf8_lossy(&bytes)) {
+                read_count += 1;
+                assert!(tracking.bound_ns() <= 3 * 86_400_000_000_000);
+            }
+        }
+        assert!(read_count > 1_000, "{read_count}");
+    }
+}

@@ -1,0 +1,145 @@
+//! Network cards with a clock of their own: how they are set up, whether a stamp they advertise
+//! comes back when something is sent, and where their clock stands. Other interfaces have no
+//! finding here; what they claim is said beside.
+
+use nix::net::if_::InterfaceFlags;
+
+use super::network::interfaces;
+use super::{Finding, StampCapabilityQuery};
+use crate::card_clock::probing::{CardProbe, Delivery};
+
+/// Offsets above this are no matter of accuracy but of another time scale or an unset clock.
+const FOREIGN_OFFSET_NS: u64 = 1_000_000;
+
+pub(super) fn examine(
+    wanted: &[String],
+    query: &dyn StampCapabilityQuery,
+    probe: &dyn Fn(&str, u32) -> CardProbe,
+) -> Vec<Finding> {
+    // What keeps the interfaces from being listed is a finding of the network already.
+    let present = interfaces().unwrap_or_default();
+    let names = present
+        .iter()
+        .filter(|(name, _)| wanted.is_empty() || wanted.contains(name));
+    names
+        .filter_map(|(name, flags)| {
+            let claims = query.stamp_capabilities(name).ok()?;
+            let index = claims.hardware_clock_index?;
+            let is_up = flags.contains(InterfaceFlags::IFF_UP | InterfaceFlags::IFF_RUNNING);
+            Some(judge(name, index, is_up, &probe(name, index)))
+        })
+        .collect()
+}
+
+fn judge(name: &str, index: u32, is_up: bool, probe: &CardProbe) -> Finding {
+    let (id, title) = (format!("card.{name}"), format!("Card of {name}"));
+    let setting = match &probe.setting {
+        Ok(setting) => setting.clone(),
+        Err(reason) => format!("setting unknown ({reason})"),
+    };
+    let clock = match &probe.clock {
+        Ok(pair) => format!(
+            "/dev/ptp{index} is {} ns against the system clock, within {} ns",
+            pair.card_offset_ns, pair.bound_ns
+        ),
+        Err(reason) => format!("clock not readable ({reason})"),
+    };
+    let delivery = match &probe.tx_hardware {
+        Ok(Delivery::Delivered) => "delivers hardware transmit stamps".to_owned(),
+        Ok(Delivery::AdvertisedOnly) => {
+            "hardware transmit stamps advertised but never delivered".to_owned()
+        }
+        Ok(Delivery::NotOffered) => "offers no hardware transmit stamps".to_owned(),
+        Err(reason) => format!("not probed ({reason})"),
+    };
+    let value = format!("{setting}; {delivery}; {clock}");
+    if !is_up {
+        return Finding::note(&id, &title, format!("{value}; link down"))
+            .because("nothing leaves an interface without a link, so no stamp can come")
+            .fixed_by("connect it and run the doctor again");
+    }
+    match &probe.tx_hardware {
+        Ok(Delivery::Delivered) => explain_clock(Finding::good(&id, &title, value), probe),
+        Ok(Delivery::AdvertisedOnly) => Finding::note(&id, &title, value)
+            .because(
+                "the driver advertises what its card does not do: a run that asks for hardware \
+                 stamps gets software stamps and says so",
+            )
+            .fixed_by("leave timestamps = \"software\", or use another card"),
+        Ok(Delivery::NotOffered) => Finding::note(&id, &title, value)
+            .because("the card has a clock and does not stamp what it sends")
+            .fixed_by("leave timestamps = \"software\""),
+        Err(_) => Finding::note(&id, &title, value)
+            .because("whether the card delivers the stamps it advertises is not known")
+            .fixed_by("run the doctor with CAP_NET_ADMIN and an address on the interface"),
+    }
+}
+
+fn explain_clock(finding: Finding, probe: &CardProbe) -> Finding {
+    match &probe.clock {
+        Ok(pair) if pair.card_offset_ns.unsigned_abs() > FOREIGN_OFFSET_NS => finding.because(
+            "the card's clock is on another time scale (PTP's TAI is 37 s ahead) or was never \
+             set; a run converts its stamps by paired reads, so that costs nothing",
+        ),
+        _ => finding,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::doctor::{StampCapabilities, State};
+    use hil_gateways::transport::card_clock::CardPair;
+
+    fn probe(tx_hardware: Result<Delivery, String>) -> CardProbe {
+        CardProbe {
+            clock: Ok(CardPair {
+                realtime_ns: 0,
+                card_offset_ns: 37_000_000_120,
+                bound_ns: 900,
+            }),
+            setting: Ok("transmit off, receive filter none".to_owned()),
+            tx_hardware,
+        }
+    }
+
+    #[test]
+    fn a_card_that_delivers_is_good_and_its_clock_is_told_with_its_bound() {
+        let finding = judge("eth0", 2, true, &probe(Ok(Delivery::Delivered)));
+        assert_eq!(finding.state, State::Good);
+        assert!(finding.value.contains("transmit off"), "{}", finding.value);
+        let clock = "/dev/ptp2 is 37000000120 ns against the system clock, within 900 ns";
+        assert!(finding.value.contains(clock), "{}", finding.value);
+        assert!(finding.why.contains("TAI"), "{}", finding.why);
+    }
+
+    #[test]
+    fn a_card_that_only_advertises_is_called_that() {
+        let finding = judge("eth0", 0, true, &probe(Ok(Delivery::AdvertisedOnly)));
+        assert_eq!(finding.state, State::Note);
+        let words = "advertised but never delivered";
+        assert!(finding.value.contains(words), "{}", finding.value);
+    }
+
+    #[test]
+    fn what_could_not_be_found_out_is_a_note_with_the_reason() {
+        let refused = Err("switching the card's stamps on needs CAP_NET_ADMIN".to_owned());
+        let finding = judge("eth0", 0, true, &probe(refused));
+        assert_eq!(finding.state, State::Note);
+        assert!(finding.value.contains("CAP_NET_ADMIN"), "{}", finding.value);
+        let finding = judge("eth0", 0, false, &probe(Ok(Delivery::AdvertisedOnly)));
+        assert!(finding.value.ends_with("link down"), "{}", finding.value);
+    }
+
+    #[test]
+    fn an_interface_without_a_clock_is_not_probed() {
+        let query = |_: &str| {
+            Ok(StampCapabilities {
+                so_timestamping: 0x1a,
+                hardware_clock_index: None,
+            })
+        };
+        let findings = examine(&[], &query, &|name, _| panic!("{name} was probed"));
+        assert!(findings.is_empty());
+    }
+}

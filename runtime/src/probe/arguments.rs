@@ -1,0 +1,162 @@
+//! The command line of the probe: definitions only.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use clap::{Args, Subcommand};
+use hil_gateways::capture::flow::FlowFilter;
+
+const EXAMPLES: &str = "\
+Examples:
+  hil-runtime probe --interface eth0 --output here.pcapng
+      our own datagrams on eth0, until Ctrl-C
+  hil-runtime probe -i lan1 -i lan2 -o bridge.pcapng --duration 60s --flow udp:dport=5004,id=2+2
+      RTP through a bridge with two ports, known again by its sequence number
+  ip netns exec robot hil-runtime probe -i eth0 -o robot.pcapng
+      the same in another network namespace
+  hil-runtime probe analyse here.pcapng there.pcapng
+      delay, jitter, loss and reordering between two points, or between two ports of an ET2000
+  hil-runtime probe compare runs/shuttle-split-20261122-101500-control-pc here.pcapng there.pcapng
+      the gateways' own account of the wire beside the probe's
+
+Flows: hil (our datagrams), egm:port=6510, udp:CONDITIONS; conditions with commas between:
+  port=N sport=N dport=N src=ADDRESS dst=ADDRESS, and for udp id=OFFSET+BYTES[le] (a number in
+  the payload; without it the whole payload is hashed)
+
+Exit codes: 0 done; 1 packets were dropped, an interface failed, a file has a fault, or the figures
+differ; 2 wrong arguments, nothing to read, or a capture without anything of the run; 69 no such interface; 78 the right to capture is missing (root or
+CAP_NET_RAW); 130 interrupted before --duration was over, the file is complete";
+
+/// Look at the wire without taking part: capture, analyse, compare with a run.
+#[derive(Debug, Args)]
+#[command(
+    after_help = EXAMPLES,
+    args_conflicts_with_subcommands = true,
+    arg_required_else_help = true
+)]
+pub struct ProbeArgs {
+    /// What to do, if not to capture.
+    #[command(subcommand)]
+    pub(crate) work: Option<ProbeWork>,
+    /// Capture.
+    #[command(flatten)]
+    pub(crate) live: LiveArgs,
+}
+
+/// Arguments of a live capture.
+#[derive(Debug, Args)]
+pub(crate) struct LiveArgs {
+    /// Interface to tap, of this network namespace; may be repeated.
+    #[arg(long, short, value_name = "NAME")]
+    pub(crate) interface: Vec<String>,
+    /// The pcapng file to write.
+    #[arg(long, short, value_name = "FILE")]
+    pub(crate) output: Option<PathBuf>,
+    /// Replace the output file if it exists.
+    #[arg(long)]
+    pub(crate) force: bool,
+    /// What to follow [default: hil]; may be repeated.
+    #[arg(long, value_name = "FLOW")]
+    pub(crate) flow: Vec<FlowFilter>,
+    /// End after this time, e.g. 60s; otherwise with Ctrl-C.
+    #[arg(long, value_name = "TIME", value_parser = parse_duration)]
+    pub(crate) duration: Option<Duration>,
+    /// Bytes kept of a packet; otherwise as many as the flows need to be known again.
+    #[arg(long, value_name = "BYTES", value_parser = clap::value_parser!(u32).range(64..=65_536))]
+    pub(crate) snap_length: Option<u32>,
+    /// Memory for packets between two looks, MiB per interface.
+    #[arg(long, value_name = "MIB", default_value_t = 8,
+          value_parser = clap::value_parser!(u16).range(1..=256))]
+    pub(crate) ring: u16,
+    /// Print no progress.
+    #[arg(long, short)]
+    pub(crate) quiet: bool,
+}
+
+/// Everything but a live capture.
+#[derive(Debug, Subcommand)]
+pub(crate) enum ProbeWork {
+    /// Delay, jitter, loss, reordering and gaps of the flows in one or two captures.
+    Analyse {
+        /// pcap or pcapng, also of an ET2000.
+        file: PathBuf,
+        /// The capture of a second point.
+        second: Option<PathBuf>,
+        /// How to read them.
+        #[command(flatten)]
+        reading: ReadingArgs,
+    },
+    /// The gateways' account of a finished run beside two captures of its wire.
+    Compare {
+        /// The run's folder, of either host.
+        run: PathBuf,
+        /// A capture at one host, or of both.
+        file: PathBuf,
+        /// The capture at the other.
+        second: Option<PathBuf>,
+        /// Farthest the medians may lie apart, microseconds.
+        #[arg(long, value_name = "US", default_value_t = 5.0)]
+        limit: f64,
+        /// How to read them.
+        #[command(flatten)]
+        reading: ReadingArgs,
+    },
+}
+
+/// How captures are read and results given.
+#[derive(Debug, Args)]
+pub(crate) struct ReadingArgs {
+    /// What to follow [default: hil]; may be repeated.
+    #[arg(long, value_name = "FLOW")]
+    pub(crate) flow: Vec<FlowFilter>,
+    /// Farthest that two stamps of one datagram may lie apart, e.g. 5s.
+    #[arg(long, value_name = "TIME", default_value = "5s", value_parser = parse_duration)]
+    pub(crate) window: Duration,
+    /// Print JSON.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+/// `60`, `60s`, `500ms`, `2min` or `1h`, with or without a space.
+fn parse_duration(text: &str) -> Result<Duration, String> {
+    let at = text
+        .find(|c: char| !(c.is_ascii_digit() || c == '.'))
+        .unwrap_or(text.len());
+    let (digits, unit) = text.split_at(at);
+    let seconds = match unit.trim() {
+        "s" | "" => 1.0,
+        "ms" => 1e-3,
+        "min" => 60.0,
+        "h" => 3600.0,
+        other => return Err(format!("`{other}` is no unit; use ms, s, min or h")),
+    };
+    let number: f64 = digits
+        .parse()
+        .map_err(|_unsaid| format!("`{text}` is no time; e.g. 60s"))?;
+    let whole = number * seconds;
+    if !(1e-3..=1e7).contains(&whole) {
+        return Err(format!("{text} is outside 1ms..=10000000s"));
+    }
+    Ok(Duration::from_secs_f64(whole))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn times_are_read_with_their_units_and_bounds() {
+        for (text, milliseconds) in [
+            ("60", 60_000),
+            ("1.5s", 1500),
+            ("500 ms", 500),
+            ("2min", 120_000),
+        ] {
+            let expected = Duration::from_millis(milliseconds);
+            assert_eq!(parse_duration(text), Ok(expected), "{text}");
+        }
+        for text in ["", "s", "-1s", "3 weeks", "0s", "1e9", "1.2.3s"] {
+            assert!(parse_duration(text).is_err(), "{text}");
+        }
+    }
+}

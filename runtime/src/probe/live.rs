@@ -1,0 +1,382 @@
+//! The live capture: rings looked into every few milliseconds, a pcapng file, a line of progress.
+//! It analyses nothing. Nothing waits for a packet, so that no sender pays for waking the probe.
+
+use std::fs::File;
+use std::io::{self, Seek, Write};
+use std::path::{Path, PathBuf};
+use std::thread;
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use hil_gateways::capture::flow::FlowFilter;
+use hil_gateways::capture::writer::{self, PacketToWrite};
+use hil_gateways::capture::{CaptureInterface, Direction, link_type};
+use hil_gateways::transport::packet_ring::{
+    PacketRing, RingCounters, RingError, RingPacket, RingSettings,
+};
+
+use crate::console::Console;
+use crate::signals::Signals;
+
+/// Time between two looks into the rings.
+const LOOK_PERIOD: Duration = Duration::from_millis(20);
+/// Time between two lines of progress.
+const PROGRESS_PERIOD: Duration = Duration::from_secs(1);
+/// Bytes gathered before they are written.
+const WRITE_BYTES: usize = 1 << 18;
+
+/// What to capture.
+#[derive(Debug)]
+pub(super) struct Request {
+    pub(super) interfaces: Vec<String>,
+    pub(super) output: PathBuf,
+    /// Whether the output may replace a file.
+    pub(super) replaces: bool,
+    pub(super) flows: Vec<FlowFilter>,
+    pub(super) duration: Option<Duration>,
+    pub(super) snap_bytes: u32,
+    pub(super) ring_bytes: usize,
+}
+
+/// Why a capture failed. What was written until then is a file of whole blocks.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum LiveError {
+    #[error(transparent)]
+    Ring(#[from] RingError),
+    #[error("capture file {path}: {source}")]
+    File { path: PathBuf, source: io::Error },
+    #[error("{path}: exists; say --force")]
+    Exists { path: PathBuf },
+    #[error("the kernel does not tell what it dropped on {interface}: {source}")]
+    Counters {
+        interface: String,
+        source: io::Error,
+    },
+}
+
+/// What was captured on one interface.
+#[derive(Debug, Clone, Default)]
+pub(super) struct InterfaceResult {
+    pub(super) name: String,
+    pub(super) inbound_count: u64,
+    pub(super) outbound_count: u64,
+    /// Stamped by the tap itself, because the kernel had not yet.
+    pub(super) late_stamp_count: u64,
+    pub(super) counters: RingCounters,
+    /// The interface was taken down or has gone.
+    pub(super) has_failed: bool,
+}
+
+/// How a capture ended.
+#[derive(Debug)]
+pub(super) struct LiveResult {
+    pub(super) interfaces: Vec<InterfaceResult>,
+    pub(super) length: Duration,
+    pub(super) file_bytes: u64,
+    /// The signal that ended it.
+    pub(super) ended_by: Option<&'static str>,
+}
+
+struct Tap {
+    ring: PacketRing,
+    /// When the interface had gone, nanoseconds since 1970.
+    gone_ns: Option<u64>,
+    result: InterfaceResult,
+}
+
+/// Captures until the time is over or a signal comes.
+pub(super) fn capture(
+    request: &Request,
+    signals: &Signals,
+    console: &mut Console,
+) -> Result<LiveResult, LiveError> {
+    let settings = RingSettings {
+        snap_bytes: request.snap_bytes,
+        ring_bytes: request.ring_bytes,
+    };
+    let mut taps = Vec::with_capacity(request.interfaces.len());
+    for name in &request.interfaces {
+        taps.push(Tap {
+            ring: PacketRing::open(name, &request.flows, &settings)?,
+            gone_ns: None,
+            result: InterfaceResult {
+                name: name.clone(),
+                ..InterfaceResult::default()
+            },
+        });
+    }
+    let start_ns = realtime_ns();
+    let mut file = Output::create(&request.output, request.replaces)?;
+    describe(&mut file.buffer, request, &taps);
+    file.write_out()?;
+    let began = Instant::now();
+    let room = taps.iter().map(|tap| tap.ring.frame_count()).min();
+    console.say(&format!(
+        "probing {} for {}; room for {} packets each; Ctrl-C ends",
+        request.interfaces.join(" and "),
+        flow_list(&request.flows),
+        room.unwrap_or(0),
+    ));
+    let mut progress_due = began + PROGRESS_PERIOD;
+    let (ended_by, end_ns) = loop {
+        let ended_by = signals.received();
+        let is_over = ended_by.is_some() || request.duration.is_some_and(|d| began.elapsed() >= d);
+        let look_ns = realtime_ns();
+        for (index, tap) in taps.iter_mut().enumerate() {
+            drain(tap, index, &mut file)?;
+            watch(tap, look_ns, console);
+        }
+        if is_over || taps.iter().all(|tap| tap.gone_ns.is_some()) {
+            break (ended_by, look_ns);
+        }
+        if Instant::now() >= progress_due {
+            progress_due += PROGRESS_PERIOD;
+            file.write_out()?;
+            show(&mut taps, began.elapsed(), file.written_bytes, console)?;
+        }
+        thread::sleep(LOOK_PERIOD);
+    };
+    for (index, tap) in (0_u32..).zip(&mut taps) {
+        count(tap)?;
+        let RingCounters {
+            matched_count,
+            dropped_count,
+        } = tap.result.counters;
+        let span = (start_ns, tap.gone_ns.unwrap_or(end_ns).max(start_ns));
+        writer::statistics(&mut file.buffer, index, span, matched_count, dropped_count);
+    }
+    file.finish()?;
+    Ok(LiveResult {
+        interfaces: taps.into_iter().map(|tap| tap.result).collect(),
+        length: began.elapsed(),
+        file_bytes: file.written_bytes,
+        ended_by,
+    })
+}
+
+fn describe(buffer: &mut Vec<u8>, request: &Request, taps: &[Tap]) {
+    let application = concat!("hil-runtime probe ", env!("CARGO_PKG_VERSION"));
+    let system = nix::sys::utsname::uname().ok();
+    let release = system.map(|names| format!("Linux {}", names.release().to_string_lossy()));
+    writer::begin(buffer, application, release.as_deref().unwrap_or("Linux"));
+    for tap in taps {
+        let interface = CaptureInterface {
+            name: Some(tap.result.name.clone()),
+            link_type: tap.ring.link_type(),
+            snap_bytes: request.snap_bytes,
+            ..CaptureInterface::default()
+        };
+        writer::interface(buffer, &interface, &flow_list(&request.flows));
+    }
+}
+
+pub(super) fn flow_list(flows: &[FlowFilter]) -> String {
+    let names: Vec<String> = flows.iter().map(ToString::to_string).collect();
+    names.join(" or ")
+}
+
+/// Everything that is in the ring now.
+fn drain(tap: &mut Tap, index: usize, file: &mut Output) -> Result<(), LiveError> {
+    let is_ethernet = tap.ring.link_type() == link_type::ETHERNET;
+    let interface_index = u32::try_from(index).unwrap_or(u32::MAX);
+    let Tap { ring, result, .. } = tap;
+    // A ring that fills as fast as it is emptied must not keep the others waiting.
+    for _ in 0..ring.frame_count() {
+        let buffer = &mut file.buffer;
+        let is_there = ring.next_packet(|packet| {
+            match packet.direction {
+                Direction::Outbound => result.outbound_count += 1,
+                _ => result.inbound_count += 1,
+            }
+            result.late_stamp_count += u64::from(!packet.is_stamped_in_stack);
+            append(buffer, interface_index, packet, is_ethernet);
+        });
+        if !is_there {
+            break;
+        }
+        if file.buffer.len() >= WRITE_BYTES {
+            file.write_out()?;
+        }
+    }
+    Ok(())
+}
+
+/// Says what has happened to the interface of a tap. One that is down may come up again; one that has
+/// gone does not come back under its number.
+fn watch(tap: &mut Tap, now_ns: u64, console: &mut Console) {
+    let Err(error) = tap.ring.check() else {
+        return;
+    };
+    tap.result.has_failed = true;
+    let what = if nix::net::if_::if_nametoindex(tap.result.name.as_str()).is_ok() {
+        "nothing is captured until it is up again"
+    } else {
+        tap.gone_ns.get_or_insert(now_ns);
+        "it has gone, and its part of the capture ends here"
+    };
+    console.warn(&format!("{}: {error}: {what}", tap.result.name));
+}
+
+/// Puts a packet into the file as it was on the wire, with the VLAN tag the kernel took out.
+fn append(buffer: &mut Vec<u8>, interface_index: u32, packet: &RingPacket<'_>, is_ethernet: bool) {
+    let mut whole = PacketToWrite {
+        interface_index,
+        stamp_ns: packet.stamp_ns,
+        original_bytes: packet.original_bytes,
+        direction: packet.direction,
+        data: [packet.data, &[]],
+    };
+    let Some((tag_type, tag)) = packet
+        .vlan
+        .filter(|_| is_ethernet && packet.data.len() >= 12)
+    else {
+        writer::packet(buffer, &whole);
+        return;
+    };
+    let (addresses, rest) = packet.data.split_at(12);
+    let mut head = addresses.to_vec();
+    head.extend_from_slice(&tag_type.to_be_bytes());
+    head.extend_from_slice(&tag.to_be_bytes());
+    whole.data = [&head, rest];
+    whole.original_bytes += 4;
+    writer::packet(buffer, &whole);
+}
+
+fn count(tap: &mut Tap) -> Result<(), LiveError> {
+    tap.result.counters = tap.ring.counters().map_err(|source| LiveError::Counters {
+        interface: tap.result.name.clone(),
+        source,
+    })?;
+    Ok(())
+}
+
+fn show(
+    taps: &mut [Tap],
+    elapsed: Duration,
+    written_bytes: u64,
+    console: &mut Console,
+) -> Result<(), LiveError> {
+    let mut parts = Vec::with_capacity(taps.len());
+    for tap in taps {
+        count(tap)?;
+        let result = &tap.result;
+        parts.push(format!(
+            "{} {} in {} out {} dropped",
+            result.name, result.inbound_count, result.outbound_count, result.counters.dropped_count
+        ));
+    }
+    console.progress(&format!(
+        "{:.0} s | {} | {:.1} MB",
+        elapsed.as_secs_f64(),
+        parts.join(" | "),
+        written_bytes as f64 * 1e-6
+    ));
+    Ok(())
+}
+
+/// Nanoseconds since 1970, the clock of the kernel's stamps.
+fn realtime_ns() -> u64 {
+    let since = SystemTime::now().duration_since(UNIX_EPOCH);
+    since.map_or(0, |time| u64::try_from(time.as_nanos()).unwrap_or(u64::MAX))
+}
+
+struct Output {
+    path: PathBuf,
+    file: File,
+    buffer: Vec<u8>,
+    written_bytes: u64,
+}
+
+impl Output {
+    fn create(path: &Path, replaces: bool) -> Result<Self, LiveError> {
+        let mut options = File::options();
+        options.write(true);
+        if replaces {
+            options.create(true).truncate(true);
+        } else {
+            options.create_new(true);
+        }
+        let path = path.to_owned();
+        match options.open(&path) {
+            Ok(file) => Ok(Self {
+                path,
+                file,
+                buffer: Vec::with_capacity(2 * WRITE_BYTES),
+                written_bytes: 0,
+            }),
+            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {
+                Err(LiveError::Exists { path })
+            }
+            Err(source) => Err(LiveError::File { path, source }),
+        }
+    }
+
+    /// Whole blocks only: where the disk fills up within one, that one is taken back.
+    fn write_out(&mut self) -> Result<(), LiveError> {
+        let outcome = self.file.write_all(&self.buffer);
+        if let Err(source) = outcome {
+            // Where writing failed cutting may fail too; the first error is the one to fix.
+            let _cut = self.cut_to_whole_blocks().is_ok();
+            return Err(self.failed(source));
+        }
+        self.written_bytes += self.buffer.len() as u64;
+        self.buffer.clear();
+        Ok(())
+    }
+
+    fn cut_to_whole_blocks(&mut self) -> io::Result<()> {
+        let there_bytes = self
+            .file
+            .stream_position()?
+            .saturating_sub(self.written_bytes);
+        let whole_bytes = whole_blocks(&self.buffer, there_bytes);
+        self.file.set_len(self.written_bytes + whole_bytes)
+    }
+
+    fn finish(&mut self) -> Result<(), LiveError> {
+        self.write_out()?;
+        self.file.sync_all().map_err(|source| self.failed(source))
+    }
+
+    fn failed(&self, source: io::Error) -> LiveError {
+        LiveError::File {
+            path: self.path.clone(),
+            source,
+        }
+    }
+}
+
+/// Bytes of the blocks in `buffer` that end within its first `there_bytes`.
+fn whole_blocks(buffer: &[u8], there_bytes: u64) -> u64 {
+    let mut whole = 0_usize;
+    while let Some(length) = buffer.get(whole + 4..whole + 8) {
+        let length = length.try_into().map_or(0, u32::from_le_bytes) as usize;
+        if length == 0 || (whole + length) as u64 > there_bytes {
+            break;
+        }
+        whole += length;
+    }
+    whole as u64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_file_that_could_not_grow_is_cut_behind_its_last_whole_block() {
+        let mut buffer = Vec::new();
+        writer::begin(&mut buffer, "test", "none");
+        let head = buffer.len() as u64;
+        writer::statistics(&mut buffer, 0, (0, 1), 2, 3);
+        let all = buffer.len() as u64;
+        for (there, whole) in [
+            (0, 0),
+            (head - 1, 0),
+            (head, head),
+            (all - 1, head),
+            (all, all),
+        ] {
+            assert_eq!(whole_blocks(&buffer, there), whole, "{there} of {all}");
+        }
+    }
+}

@@ -1,0 +1,232 @@
+//! The passive probe: looks at the wire in a process of its own and holds its figures against the
+//! gateways'. It takes no part in any run. Packets are understood in [`hil_gateways::capture`].
+
+mod analyse;
+pub mod arguments;
+mod compare;
+mod files;
+mod live;
+
+use core::fmt::Write as _;
+use std::path::Path;
+use std::time::Duration;
+
+use hil_gateways::capture::flow::{FLOW_COUNT_MAX, FlowFilter};
+use hil_gateways::transport::packet_ring::RingError;
+
+use self::analyse::{Reading, Report};
+use self::arguments::{LiveArgs, ProbeArgs, ProbeWork, ReadingArgs};
+use self::live::{LiveError, LiveResult, Request};
+use crate::console::Console;
+use crate::signals::{EXIT_INTERRUPTED, Signals};
+
+/// Exit codes; the command's help lists them.
+mod exit {
+    pub(super) const DONE: u8 = 0;
+    pub(super) const GAPS: u8 = 1;
+    pub(super) const USAGE: u8 = 2;
+    pub(super) const NO_INTERFACE: u8 = 69;
+    pub(super) const INTERNAL: u8 = 70;
+    pub(super) const HOST_UNFIT: u8 = 78;
+}
+
+/// Does what the command line says and gives the exit code.
+pub(crate) fn run(args: &ProbeArgs, console: &mut Console) -> u8 {
+    match &args.work {
+        None => capture(&args.live),
+        Some(ProbeWork::Analyse {
+            file,
+            second,
+            reading,
+        }) => analyse(&paths(file, second.as_deref()), reading, console),
+        Some(ProbeWork::Compare {
+            run,
+            file,
+            second,
+            limit,
+            reading,
+        }) => {
+            let paths = paths(file, second.as_deref());
+            let Some(captures) = read(&paths, reading, console) else {
+                return exit::USAGE;
+            };
+            for complaint in captures.complaints() {
+                console.warn(&complaint);
+            }
+            match compare::compare(run, &captures, window_ns(reading)) {
+                Ok(comparison) => {
+                    console.result(&if reading.json {
+                        json(&comparison)
+                    } else {
+                        comparison.to_text(*limit)
+                    });
+                    if comparison.agrees_within(*limit) && !captures.has_gaps() {
+                        exit::DONE
+                    } else {
+                        exit::GAPS
+                    }
+                }
+                Err(error) => {
+                    console.error(&error.to_string());
+                    exit::USAGE
+                }
+            }
+        }
+    }
+}
+
+fn paths<'a>(file: &'a Path, second: Option<&'a Path>) -> Vec<&'a Path> {
+    core::iter::once(file).chain(second).collect()
+}
+
+fn window_ns(reading: &ReadingArgs) -> i64 {
+    i64::try_from(reading.window.as_nanos()).unwrap_or(i64::MAX)
+}
+
+fn json(value: &impl serde::Serialize) -> String {
+    let text = serde_json::to_string_pretty(value);
+    format!("{}\n", text.expect("figures are numbers and words"))
+}
+
+/// The flows asked for, or our own.
+fn flows(asked: &[FlowFilter]) -> Vec<FlowFilter> {
+    if asked.is_empty() {
+        vec![FlowFilter::hil()]
+    } else {
+        asked.to_vec()
+    }
+}
+
+fn read(paths: &[&Path], reading: &ReadingArgs, console: &mut Console) -> Option<Reading> {
+    match Reading::of(paths, &flows(&reading.flow)) {
+        Ok(captures) => Some(captures),
+        Err(error) => {
+            console.error(&error.to_string());
+            None
+        }
+    }
+}
+
+fn analyse(paths: &[&Path], reading: &ReadingArgs, console: &mut Console) -> u8 {
+    let Some(captures) = read(paths, reading, console) else {
+        return exit::USAGE;
+    };
+    let report = Report::of(&captures, window_ns(reading));
+    let complaints = captures.complaints();
+    for complaint in &complaints {
+        console.warn(complaint);
+    }
+    if report.is_empty() && !complaints.is_empty() {
+        return exit::USAGE;
+    }
+    console.result(&if reading.json {
+        json(&report)
+    } else {
+        report.to_text()
+    });
+    if captures.has_gaps() {
+        exit::GAPS
+    } else {
+        exit::DONE
+    }
+}
+
+fn capture(args: &LiveArgs) -> u8 {
+    let mut console = Console::new(args.quiet);
+    let Some(output) = &args.output else {
+        console.error("no --output FILE given for the capture; try --help");
+        return exit::USAGE;
+    };
+    if args.interface.is_empty() {
+        console.error("no --interface given; `ip link` lists those of this host");
+        return exit::USAGE;
+    }
+    if args.flow.len() > FLOW_COUNT_MAX {
+        console.error(&format!(
+            "{} flows are more than the {FLOW_COUNT_MAX} one probe follows",
+            args.flow.len()
+        ));
+        return exit::USAGE;
+    }
+    let flows = flows(&args.flow);
+    let needed = flows.iter().map(FlowFilter::snap_bytes).max().unwrap_or(0);
+    let request = Request {
+        interfaces: args.interface.clone(),
+        output: output.clone(),
+        replaces: args.force,
+        duration: args.duration,
+        snap_bytes: args
+            .snap_length
+            .unwrap_or(u32::try_from(needed).unwrap_or(2048)),
+        ring_bytes: usize::from(args.ring) << 20,
+        flows,
+    };
+    let signals = match Signals::install() {
+        Ok(signals) => signals,
+        Err(error) => {
+            console.error(&format!("cannot handle signals: {error}"));
+            return exit::INTERNAL;
+        }
+    };
+    match live::capture(&request, &signals, &mut console) {
+        Ok(result) => conclude(&request, &result, &mut console),
+        Err(error) => {
+            console.error(&error.to_string());
+            match error {
+                LiveError::Ring(RingError::Interface { .. }) => exit::NO_INTERFACE,
+                LiveError::Ring(RingError::Size { .. } | RingError::LinkLayer { .. })
+                | LiveError::File { .. }
+                | LiveError::Exists { .. } => exit::USAGE,
+                LiveError::Ring(RingError::Rights { .. }) => exit::HOST_UNFIT,
+                LiveError::Ring(RingError::Refused { .. }) | LiveError::Counters { .. } => {
+                    exit::INTERNAL
+                }
+            }
+        }
+    }
+}
+
+fn conclude(request: &Request, result: &LiveResult, console: &mut Console) -> u8 {
+    let mut text = String::new();
+    let mut dropped_count = 0;
+    for one in &result.interfaces {
+        dropped_count += one.counters.dropped_count;
+        let _infallible = write!(
+            text,
+            "{}: {} in, {} out, {} dropped by the kernel",
+            one.name, one.inbound_count, one.outbound_count, one.counters.dropped_count
+        );
+        if one.late_stamp_count > 0 {
+            let late = one.late_stamp_count;
+            let _infallible = write!(text, ", {late} stamped by the tap instead of in the stack");
+        }
+        if one.has_failed {
+            text.push_str(", interrupted");
+        }
+        text.push('\n');
+    }
+    let _infallible = writeln!(
+        text,
+        "{}: {} bytes in {:.1} s{}",
+        request.output.display(),
+        result.file_bytes,
+        result.length.as_secs_f64(),
+        result
+            .ended_by
+            .map(|by| format!(", ended by {by}"))
+            .unwrap_or_default()
+    );
+    console.result(&text);
+    let is_early = |planned: Duration| result.length < planned;
+    if result.interfaces.iter().any(|one| one.has_failed) {
+        console.warn("an interface failed while it was watched: the file has a gap from there on");
+        exit::GAPS
+    } else if dropped_count > 0 {
+        console.warn("packets were dropped: the file has gaps; a larger --ring may help");
+        exit::GAPS
+    } else if result.ended_by.is_some() && request.duration.is_some_and(is_early) {
+        u8::try_from(EXIT_INTERRUPTED).unwrap_or(exit::INTERNAL)
+    } else {
+        exit::DONE
+    }
+}

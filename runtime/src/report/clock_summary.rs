@@ -1,0 +1,76 @@
+//! How the clocks of a run's hosts relate, as a summary keeps it. What it follows from is decided
+//! in the analysis.
+
+use std::collections::BTreeMap;
+
+use hil_models::clock::ClockFigures;
+use serde::{Deserialize, Serialize};
+
+use crate::clock_discipline::HostDiscipline;
+
+/// The clocks of all hosts.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct ClockSection {
+    /// True when all hosts read one clock, so that stamps compare as they are.
+    pub has_one_clock: bool,
+    /// Who steers each host's system clock, by host; nothing of a host that told nothing.
+    pub hosts: BTreeMap<String, HostDiscipline>,
+    /// Every pair of hosts with a link between them, once.
+    pub pairs: Vec<HostPairClock>,
+}
+
+/// What the one-way figures between two hosts rest on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ClockRung {
+    /// Both read one clock: exact.
+    OneClock,
+    /// Both system clocks follow one reference, each within a bound of its own.
+    Disciplined,
+    /// The four-stamp exchanges of the gateways.
+    Exchanges,
+    /// Nothing: no figure crosses from one host to the other.
+    None,
+}
+
+impl ClockRung {
+    /// The words a report prints.
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::OneClock => "one clock",
+            Self::Disciplined => "system clocks disciplined to one reference",
+            Self::Exchanges => "exchanges beside the data",
+            Self::None => "not aligned",
+        }
+    }
+}
+
+/// Two hosts' clocks.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct HostPairClock {
+    /// Instants of this host ...
+    pub from: String,
+    /// ... on the clock of this one: `to = from + offset`.
+    pub to: String,
+    /// What was used.
+    pub rung: ClockRung,
+    /// Why no rung above it was used, or what it rests on, in words.
+    pub basis: String,
+    /// What the gateways' exchanges say, whatever was used.
+    pub exchanges: Option<ClockFigures>,
+    /// What the disciplined system clocks say, when they say something.
+    #[serde(default)]
+    pub disciplined: Option<DisciplinedOffset>,
+    /// Set when the rungs contradict each other: one-way delays of this run are invalid, and why.
+    #[serde(default)]
+    pub contradiction: Option<String>,
+}
+
+/// The offset of two monotonic clocks by way of their disciplined system clocks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct DisciplinedOffset {
+    /// Nanoseconds to add.
+    pub offset_ns: i64,
+    /// Largest error: that of both hosts together.
+    pub bound_ns: u64,
+}

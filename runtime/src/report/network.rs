@@ -1,0 +1,375 @@
+//! The network of a run as a summary keeps it: figures of each channel, what happened, both on the
+//! time of the run beside what the robot did. Figures are computed elsewhere.
+
+use hil_models::measure::correlation::PairCorrelation;
+use hil_models::measure::network::{NetworkEventKind, NetworkFigures};
+use serde::{Deserialize, Serialize};
+
+use super::terminal::{JOINT, duration_s, grouped, seconds};
+
+/// How long before an event of the score the network is looked at, seconds. The longest effect
+/// that is known of: a session that an outage ended takes that long to come back.
+pub const FOREGOING_S: f64 = 5.0;
+
+/// Everything a run has to say about its network.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct NetworkReport {
+    /// Channels that crossed a network or the model of one, each one direction.
+    pub channels: Vec<ChannelNetwork>,
+    /// What happened on them, in order of time.
+    pub events: Vec<TimedEvent>,
+    /// Events that found no room.
+    pub events_dropped_count: u64,
+    /// How long before an event of the score is looked at, seconds.
+    pub foregoing_s: f64,
+    /// Share of all moments of the run that have a network event in that time before them: what
+    /// chance alone would put before an event of the score.
+    pub foregoing_chance_ratio: f64,
+    /// True when hosts read different clocks: times count from each host's own start of the run,
+    /// and the hosts start within a message of their supervisors of each other.
+    pub clocks_differ: bool,
+    /// Network and robot on one axis.
+    pub timeline: Timeline,
+    /// Whether the robot's errors follow the network's troubles.
+    pub correlation: Correlation,
+}
+
+/// One channel, which is one direction.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ChannelNetwork {
+    /// Its name.
+    pub channel: String,
+    /// Host of the producer.
+    pub from_host: String,
+    /// Host of the consumer.
+    pub to_host: String,
+    /// Its figures.
+    pub figures: NetworkFigures,
+}
+
+/// Something that happened on a channel.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct TimedEvent {
+    /// The channel; of a process that was down, the first of its channels.
+    pub channel: String,
+    /// When it began, seconds after the start of the run.
+    pub from_s: f64,
+    /// When it was over; `None` when it was not before the end of the run.
+    pub until_s: Option<f64>,
+    /// What it was, with its numbers.
+    #[serde(flatten)]
+    pub kind: NetworkEventKind,
+}
+
+impl TimedEvent {
+    /// How long before `at_s` it was over, seconds; 0 when it was under way, `None` when it is not
+    /// within [`FOREGOING_S`] before.
+    pub(crate) fn over_for_s(&self, at_s: f64) -> Option<f64> {
+        if self.from_s > at_s {
+            return None;
+        }
+        let over_s = self
+            .until_s
+            .map_or(0.0, |until_s| (at_s - until_s).max(0.0));
+        (over_s <= FOREGOING_S).then_some(over_s)
+    }
+
+    /// In words, without its time.
+    pub(crate) fn words(&self) -> String {
+        let length = match self.until_s {
+            Some(until_s) => format!(" for {}", duration_s(until_s - self.from_s)),
+            None => " to the end".to_owned(),
+        };
+        let channel = &self.channel;
+        match &self.kind {
+            NetworkEventKind::Outage { lost_count } => {
+                let lost = counted(*lost_count, "message");
+                format!("outage{length} on {channel}, {lost} lost")
+            }
+            NetworkEventKind::LossBurst {
+                lost_count,
+                of_count,
+            } => {
+                let (lost, of) = (grouped(*lost_count), counted(*of_count, "message"));
+                format!("burst of losses{length} on {channel}, {lost} of {of} lost")
+            }
+            NetworkEventKind::Delay {
+                late_count,
+                delay_max_ns,
+                limit_ns,
+            } => {
+                let [max, limit] = [delay_max_ns, limit_ns].map(|ns| duration_s(*ns as f64 * 1e-9));
+                let late = counted(*late_count, "message");
+                format!("late on {channel}, {late} by up to {max} (limit {limit})")
+            }
+            NetworkEventKind::Reordering {
+                reordered_count,
+                extent_max,
+            } => {
+                let count = counted(*reordered_count, "message");
+                let places = counted(*extent_max, "place");
+                format!("reordering on {channel}, {count} by up to {places}")
+            }
+            NetworkEventKind::ProcessDown { process, cause, .. } => {
+                format!("{process} was down{length} ({cause})")
+            }
+            NetworkEventKind::ClockStep { step_ns } => {
+                let step = duration_s(*step_ns as f64 * 1e-9);
+                format!("a real-time clock beside {channel} was set by {step}")
+            }
+        }
+    }
+}
+
+fn counted(count: u64, what: &str) -> String {
+    let plural = if count == 1 { "" } else { "s" };
+    format!("{}{JOINT}{what}{plural}", grouped(count))
+}
+
+/// What the network went through before one event of the score.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ForegoingNetwork {
+    /// How long before the event was looked at, seconds.
+    pub foregoing_s: f64,
+    /// Network events of that time on any channel, nearest first.
+    pub events: Vec<ForegoingEvent>,
+    /// Further ones.
+    pub more_count: u64,
+    /// Messages lost by the network in that time on all channels, those of the events included.
+    pub lost_count: u64,
+}
+
+/// A network event that came before an event of the score.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ForegoingEvent {
+    /// It.
+    #[serde(flatten)]
+    pub event: TimedEvent,
+    /// How long before the event it was over, seconds; 0 when it was under way.
+    pub over_for_s: f64,
+    /// All of it in words.
+    pub words: String,
+}
+
+impl ForegoingEvent {
+    /// `event`, which was over for `over_for_s` at `at_s`.
+    pub(crate) fn of(event: &TimedEvent, at_s: f64, over_for_s: f64) -> Self {
+        let when = if event.until_s.is_none_or(|until_s| until_s >= at_s) {
+            format!("under way since {}", duration_s(at_s - event.from_s))
+        } else {
+            format!("{} before", duration_s(over_for_s))
+        };
+        let (words, from) = (event.words(), seconds(event.from_s));
+        Self {
+            event: event.clone(),
+            over_for_s,
+            words: format!("{when}: {words}, from {from}"),
+        }
+    }
+}
+
+impl ForegoingNetwork {
+    /// What is said when nothing happened, which is a finding too.
+    pub(crate) fn nothing_words(&self) -> String {
+        let window = duration_s(self.foregoing_s);
+        let lost = match self.lost_count {
+            0 => "no message lost".to_owned(),
+            count => format!("only single losses, {}", counted(count, "message")),
+        };
+        format!("nothing of note on any channel in the {window} before ({lost})")
+    }
+}
+
+/// Network and robot over time, in equal steps from the start of the run.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Timeline {
+    /// Length of a step, seconds.
+    pub step_s: f64,
+    /// Rows; all are equally long.
+    pub rows: Vec<TimelineRow>,
+}
+
+/// One quantity over time.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct TimelineRow {
+    /// The channel, or `robot`.
+    pub of: String,
+    /// What: `lost`, `delay`, `silence`, `events`, or the words of a robot's error.
+    pub what: String,
+    /// `1` for a share or a number, else the unit.
+    pub unit: String,
+    /// The largest value of each step; `None` where there was none.
+    pub values: Vec<Option<f64>>,
+}
+
+/// Whether the robot's errors follow the network's troubles; correlation is not cause.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "state", rename_all = "snake_case")]
+pub enum Correlation {
+    /// All pairs, tested together.
+    Tested(CorrelationTests),
+    /// No test.
+    Unavailable {
+        /// Why.
+        reason: String,
+    },
+}
+
+/// Tests of all pairs of a network's and a robot's series.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct CorrelationTests {
+    /// Width of a bin: lags are multiples of it, seconds.
+    pub bin_s: f64,
+    /// Lags searched: the robot first by so much, seconds.
+    pub lead_max_s: f64,
+    /// The robot later by so much, seconds.
+    pub lag_max_s: f64,
+    /// Shuffles of the robot's series that p-values rest on.
+    pub shuffle_count: u64,
+    /// Seed of the shuffles.
+    pub seed: u64,
+    /// The pairs.
+    pub pairs: Vec<TestedPair>,
+    /// Series that are the same all the time, so that nothing can follow them.
+    pub constant: Vec<String>,
+}
+
+/// One pair.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct TestedPair {
+    /// The channel.
+    pub channel: String,
+    /// `loss`, `delay` or `silence`.
+    pub network: String,
+    /// What of the robot.
+    pub robot: String,
+    /// Lag of the highest coefficient, seconds; above zero when the robot comes later.
+    pub lag_s: f64,
+    /// Coefficient and p-values.
+    #[serde(flatten)]
+    pub correlation: PairCorrelation,
+}
+
+/// Above this a correlation is no more than chance may give.
+pub(crate) const P_MAX: f64 = 0.05;
+
+impl CorrelationTests {
+    /// Those that chance among all pairs does not explain, the strongest first.
+    pub(crate) fn significant(&self) -> Vec<&TestedPair> {
+        let pairs = self.pairs.iter();
+        let mut found: Vec<_> = pairs
+            .filter(|pair| pair.correlation.p_family <= P_MAX)
+            .collect();
+        found.sort_by(|a, b| {
+            b.correlation
+                .coefficient
+                .total_cmp(&a.correlation.coefficient)
+        });
+        found
+    }
+}
+
+impl TestedPair {
+    /// The pair in words, of `count` pairs and `shuffle_count` turns.
+    pub(crate) fn words(&self, count: usize, shuffle_count: u64) -> String {
+        let (robot, network, channel) = (&self.robot, &self.network, &self.channel);
+        let by = duration_s(self.lag_s.abs());
+        let how = match self.correlation.lag_bins {
+            1.. => format!("follows the {network} on {channel} by {by}"),
+            0 => format!("goes with the {network} on {channel} in the same bin"),
+            _ => format!("precedes the {network} on {channel} by {by}"),
+        };
+        let PairCorrelation {
+            coefficient,
+            p_value,
+            p_family,
+            ..
+        } = self.correlation;
+        let shuffles = grouped(shuffle_count);
+        format!(
+            "{robot} {how}: r{JOINT}={JOINT}{coefficient:.2}, p{JOINT}={JOINT}{p_value:.3} of \
+             {shuffles} block shuffles, {p_family:.3} in view of all {count} pairs"
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn outage(from_s: f64, until_s: Option<f64>) -> TimedEvent {
+        TimedEvent {
+            channel: "shuttle/command".to_owned(),
+            from_s,
+            until_s,
+            kind: NetworkEventKind::Outage { lost_count: 80 },
+        }
+    }
+
+    #[test]
+    fn an_event_counts_while_under_way_and_five_seconds_after() {
+        let over = |at_s| outage(3.0, Some(3.8)).over_for_s(at_s);
+        assert_eq!(over(2.9), None);
+        assert_eq!(over(3.5), Some(0.0));
+        assert!((over(4.8).unwrap() - 1.0).abs() < 1e-9);
+        assert_eq!(over(8.9), None);
+        assert_eq!(outage(3.0, None).over_for_s(60.0), Some(0.0));
+    }
+
+    #[test]
+    fn each_foregoing_event_says_when_it_was() {
+        let words = |from_s, until_s, at_s| {
+            let event = outage(from_s, until_s);
+            let over_for_s = event.over_for_s(at_s).unwrap();
+            ForegoingEvent::of(&event, at_s, over_for_s)
+                .words
+                .replace(JOINT, " ")
+        };
+        assert_eq!(
+            words(3.0, Some(3.8), 4.3),
+            "500 ms before: outage for 800 ms on shuttle/command, 80 messages lost, from 3.000 s"
+        );
+        assert_eq!(
+            words(3.0, None, 4.0),
+            "under way since 1.00 s: outage to the end on shuttle/command, 80 messages lost, from \
+             3.000 s"
+        );
+    }
+
+    #[test]
+    fn a_timed_event_keeps_its_numbers_in_json() {
+        let event = outage(3.0, Some(3.8));
+        let text = serde_json::to_string(&event).unwrap();
+        assert!(
+            text.contains("\"kind\":\"outage\",\"lost_count\":80"),
+            "{text}"
+        );
+        assert_eq!(serde_json::from_str::<TimedEvent>(&text).unwrap(), event);
+    }
+
+    #[test]
+    fn a_pair_says_who_follows_whom_and_never_why() {
+        let pair = |lag_bins: i64| TestedPair {
+            channel: "shuttle/command".to_owned(),
+            network: "silence".to_owned(),
+            robot: "joint error".to_owned(),
+            lag_s: lag_bins as f64 * 0.1,
+            correlation: PairCorrelation {
+                coefficient: 0.62,
+                lag_bins,
+                p_value: 0.002,
+                p_family: 0.004,
+            },
+        };
+        let words = |lag_bins| pair(lag_bins).words(12, 499).replace(JOINT, " ");
+        assert_eq!(
+            words(11),
+            "joint error follows the silence on shuttle/command by 1.10 s: r = 0.62, p = 0.002 of \
+             499 block shuffles, 0.004 in view of all 12 pairs"
+        );
+        assert!(
+            words(-4).starts_with("joint error precedes the silence on shuttle/command by 400 ms")
+        );
+        assert!(words(0).contains("goes with the silence"));
+    }
+}

@@ -1,0 +1,166 @@
+//! Network and robot on one time axis: a strip of blocks for each row, time from left to right. It
+//! knows no figures.
+
+use super::canvas::{Canvas, INDENT, Tone, left, right};
+use super::units::{duration_s, figure, percent, seconds};
+use crate::report::network::{Timeline, TimelineRow};
+
+/// Columns of the row's name, of what it shows, and of its scale behind it.
+const WHAT_WIDTH: usize = 9;
+const SCALE_WIDTH: usize = 12;
+
+/// Eighths of a block, lowest first.
+const LEVELS: [char; 8] = ['▁', '▂', '▃', '▄', '▅', '▆', '▇', '█'];
+
+pub(super) fn timeline(canvas: &mut Canvas, all: &Timeline) {
+    let Some(step_count) = all.rows.first().map(|row| row.values.len()) else {
+        return;
+    };
+    let whole_s = all.step_s * step_count as f64;
+    let name_width = if canvas.width() < 100 { 18 } else { 20 };
+    let room = canvas.width() - INDENT - name_width - WHAT_WIDTH - SCALE_WIDTH - 2;
+    let column_s = whole_s / room as f64;
+    let aside = format!(
+        "{} a column, each row to its own largest value, · none",
+        duration_s(column_s)
+    );
+    canvas.heading("Timeline", &aside);
+    let mut last = "";
+    for row in &all.rows {
+        let is_robot = row.of == "robot";
+        let name = if row.of == last { "" } else { &row.of };
+        last = &row.of;
+        let label = if is_robot {
+            // A robot's rows have names of their own.
+            format!("{} ", left(&row.what, name_width + WHAT_WIDTH - 1))
+        } else {
+            format!(
+                "{} {}",
+                left(name, name_width - 1),
+                left(&row.what, WHAT_WIDTH)
+            )
+        };
+        let tone = if is_robot { Tone::Bad } else { Tone::Bar };
+        let line = format!(
+            "{:INDENT$}{}{}  {}",
+            "",
+            canvas.paint(Tone::Faint, &label),
+            canvas.paint(tone, &pad(&strip(&row.values, room), room)),
+            canvas.paint(Tone::Faint, &right(&scale(row), SCALE_WIDTH)),
+        );
+        canvas.line(&line);
+    }
+    let axis_margin = INDENT + name_width + WHAT_WIDTH;
+    let [begin, middle, end] = [0.0, 0.5, 1.0].map(|share| seconds(share * whole_s));
+    let half = room / 2;
+    let axis = format!(
+        "{:axis_margin$}{}{}{}",
+        "",
+        left(&begin, half.saturating_sub(4)),
+        left(&middle, half.saturating_sub(6)),
+        right(&end, room.saturating_sub(2 * half) + 10)
+    );
+    let axis = canvas.paint(Tone::Faint, &axis);
+    canvas.line(&axis);
+}
+
+fn pad(text: &str, width: usize) -> String {
+    let missing = width.saturating_sub(text.chars().count());
+    format!("{text}{:missing$}", "")
+}
+
+/// `width` columns, each as high as the largest value of its time.
+fn strip(values: &[Option<f64>], width: usize) -> String {
+    let largest = values.iter().flatten().copied().fold(0.0, f64::max);
+    let column = |index: usize| {
+        let from = index * values.len() / width;
+        let until = ((index + 1) * values.len() / width).max(from + 1);
+        let within = values
+            .get(from..until.min(values.len()))
+            .unwrap_or_default();
+        match within.iter().flatten().copied().reduce(f64::max) {
+            None => '·',
+            Some(value) if value > 0.0 => LEVELS[level(value / largest)],
+            Some(_) => ' ',
+        }
+    };
+    (0..width).map(column).collect()
+}
+
+#[allow(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "the value is clamped to 0..=7"
+)]
+fn level(share: f64) -> usize {
+    ((share * 8.0).ceil() - 1.0).clamp(0.0, 7.0) as usize
+}
+
+/// The largest value of the row.
+fn scale(row: &TimelineRow) -> String {
+    let Some(largest) = row.values.iter().flatten().copied().reduce(f64::max) else {
+        return "unavailable".to_owned();
+    };
+    match row.unit.as_str() {
+        _ if largest <= 0.0 => "none".to_owned(),
+        "s" => duration_s(largest),
+        "1" if row.of != "robot" => percent(largest),
+        "1" => figure(largest),
+        unit => format!("{} {unit}", figure(largest)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::report::terminal::Style;
+
+    #[test]
+    fn a_strip_keeps_the_highest_value_of_each_column() {
+        let values = [Some(0.0), Some(1.0), None, None, Some(8.0), Some(2.0)];
+        assert_eq!(strip(&values, 3), "▁·█");
+        assert_eq!(strip(&values, 6), " ▁··█▂");
+        assert_eq!(strip(&values[..2], 4), "  ██");
+        assert_eq!(strip(&[Some(0.0); 4], 4), "    ");
+    }
+
+    #[test]
+    fn network_and_robot_share_one_axis() {
+        let row = |of: &str, what: &str, unit: &str, at: usize, value: f64| TimelineRow {
+            of: of.to_owned(),
+            what: what.to_owned(),
+            unit: unit.to_owned(),
+            values: (0..120)
+                .map(|step| Some(if step == at { value } else { 0.0 }))
+                .collect(),
+        };
+        let all = Timeline {
+            step_s: 0.1,
+            rows: vec![
+                row("shuttle/command", "lost", "1", 30, 1.0),
+                row("shuttle/command", "silence", "s", 35, 0.812),
+                row("robot", "error of the cart's speed", "m/s", 40, 1.1),
+            ],
+        };
+        for width in [80, 100] {
+            let mut canvas = Canvas::new(width, Style::Plain);
+            timeline(&mut canvas, &all);
+            let page = canvas.finish();
+            let rows: Vec<&str> = page.lines().collect();
+            assert!(
+                rows.iter().all(|row| row.chars().count() <= width),
+                "{page}"
+            );
+            let place = |row: &str| row.chars().position(|c| c == '█').unwrap();
+            assert!(
+                place(rows[2]) < place(rows[3]) && place(rows[3]) < place(rows[4]),
+                "{page}"
+            );
+            assert!(rows[4].contains("error of the cart's speed"), "{page}");
+            assert!(
+                rows[3].ends_with("812 ms") && rows[5].contains("6.000 s"),
+                "{page}"
+            );
+        }
+    }
+}
