@@ -88,12 +88,15 @@ pub(super) fn of_ingress(ingress: &Ingress) -> Vec<(String, u64)> {
     let bridge = &ingress.bridge;
     let steps = ("clock_step_count", ingress.clock.step_count());
     let foreign = ("refused: foreign source", ingress.foreign_count);
+    let stray = ("refused: message on a clock path", ingress.stray_count);
+    let stray = ingress.output.is_none().then_some(stray);
     named("", bridge.counts().iter())
         .chain(named("messages: ", bridge.sequence_counts().iter()))
         .chain(named("pieces: ", bridge.reassembly_counts().iter()))
         .chain(named("replies: ", bridge.reply_counts().iter()))
         .chain(named("socket: ", ingress.receiver.counters().iter()))
         .chain(named("", [steps, foreign]))
+        .chain(named("", stray))
         .chain(refusals(bridge.refusals()))
         .collect()
 }
