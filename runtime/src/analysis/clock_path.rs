@@ -171,3 +171,76 @@ pub(super) fn warning(pair: &HostPairClock) -> Option<String> {
          and {to} are related by the data path and by what came before and after"
     ))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use hil_models::measure::record::RoundTripRecord;
+
+    const SECOND_NS: i64 = 1_000_000_000;
+
+    /// Exchanges over a second, one each `period_ns`, on a path that takes `there_ns` and `back_ns`;
+    /// the clock converted to is ahead by `offset_ns`.
+    fn map(period_ns: i64, (there_ns, back_ns): (i64, i64), offset_ns: i64) -> ClockMap {
+        let exchange = |index: i64| {
+            let sent_ns = index * period_ns;
+            let arrived_ns = sent_ns + there_ns + offset_ns;
+            let record = RoundTripRecord {
+                sequence: index.unsigned_abs(),
+                t1_ns: sent_ns,
+                t2_ns: arrived_ns,
+                t3_ns: arrived_ns,
+                t4_ns: arrived_ns + back_ns - offset_ns,
+                session: 1,
+                sources: [1; 4],
+            };
+            Exchange::of(&record, Requester::Remote)
+        };
+        let exchanges: Vec<Exchange> = (0..=SECOND_NS / period_ns).filter_map(exchange).collect();
+        ClockMap::new(&exchanges, ClockSettings::default())
+    }
+
+    fn instants() -> impl Iterator<Item = i64> {
+        (0..=10).map(|tenth| tenth * SECOND_NS / 10)
+    }
+
+    #[test]
+    fn a_wide_lopsided_path_and_a_narrow_one_agree_on_the_same_clocks() {
+        let path = map(10_000_000, (8_000, 12_000), 7 * SECOND_NS);
+        for ways in [(9_000_000, 1_000), (1_000, 9_000_000), (5_000, 5_000)] {
+            let data = map(100_000_000, ways, 7 * SECOND_NS);
+            assert_eq!(contradiction((&path, &data), instants()), None, "{ways:?}");
+        }
+        let nothing = ClockMap::new(&[], ClockSettings::default());
+        assert_eq!(contradiction((&path, &nothing), instants()), None);
+    }
+
+    #[test]
+    fn two_paths_to_different_clocks_exclude_each_other_whichever_is_ahead() {
+        let path = map(10_000_000, (8_000, 12_000), 7 * SECOND_NS);
+        for apart_ns in [-400_000, 400_000] {
+            let data = map(100_000_000, (100_000, 100_000), 7 * SECOND_NS + apart_ns);
+            let why = contradiction((&path, &data), instants()).unwrap();
+            assert!(
+                why.contains("over the clock path prove an offset of"),
+                "{why}"
+            );
+            let why = contradiction((&data, &path), instants());
+            assert!(why.is_some());
+        }
+        // A difference that the wide path leaves room for proves nothing.
+        let data = map(100_000_000, (300_000, 300_000), 7 * SECOND_NS + 200_000);
+        assert_eq!(contradiction((&path, &data), instants()), None);
+    }
+
+    #[test]
+    fn the_longest_silence_counts_from_the_start_to_the_end_of_the_run() {
+        let span = (Instant::from_ns(1_000), Instant::from_ns(2_000));
+        let gap = |asked: &[i64]| longest_gap_ns(asked.to_vec(), span);
+        assert_eq!(gap(&[]), None);
+        assert_eq!(gap(&[1_100, 1_400, 1_900]), Some(500));
+        assert_eq!(gap(&[1_900, 1_400]), Some(500));
+        assert_eq!(gap(&[900, 1_700]), Some(700));
+        assert_eq!(gap(&[900, 2_500]), Some(1_000), "none within the run");
+    }
+}
