@@ -9,10 +9,11 @@ use hil_models::clock::{ClockFigures, StampKind};
 use hil_runtime::report::clock_summary::{ClockPathSummary, ClockRung, HostPairClock};
 use hil_runtime::report::summary::{Outcome, RunSummary};
 use hil_tests::account::assert_every_message_is_accounted_for;
+use hil_tests::binary::hil_runtime_binary;
 use hil_tests::child::ChildGuard;
 use hil_tests::lab::{Lab, SECOND_ADDRESSES, SECOND_INTERFACE};
 use hil_tests::run_folder::RunFolder;
-use hil_tests::trial::{RunFiles, Trial, wait_until};
+use hil_tests::trial::{RunFiles, Trial, shipped_topology, wait_until};
 
 const HOSTS: [&str; 2] = ["control-pc", "robot-pc"];
 /// The processes at the ends of the clock path, by host.
@@ -278,4 +279,41 @@ fn a_killed_end_comes_back_and_a_cable_pulled_in_the_run_leaves_a_gap_that_is_to
             assert_eq!(events.count(), 1, "{:?}", summary.events);
         }
     }
+}
+
+#[test]
+fn a_check_and_the_doctor_tell_of_a_clock_path() {
+    let folder = RunFolder::new("clock-words");
+    let base = shipped_topology("shuttle-split.toml");
+    let text = format!(
+        "extends = \"{}\"\n[hosts.control-pc]\nclock_address = \"127.0.0.1\"\n[hosts.robot-pc]\n\
+         clock_address = \"10.78.0.2\"\nclock_interface = \"eth1\"\nclock_port = 7500\n",
+        base.display()
+    );
+    let path = folder.write("with-clocks.toml", &text);
+    let path = path.to_str().unwrap();
+    let run = |arguments: &[&str]| {
+        let mut command = Command::new(hil_runtime_binary());
+        command.args(arguments).env_remove("HIL_HOST");
+        let mut child = ChildGuard::spawn(&mut command).unwrap();
+        let finished = child.wait_within(LIMIT).unwrap();
+        finished.assert_success();
+        finished.stdout
+    };
+    let checked = run(&["--topology", path, "--check"]);
+    for words in [
+        "clock_interface = \"eth1\"",
+        "# clock path 127.0.0.1 <-> 10.78.0.2 (eth1), UDP ports 7390 and 7500",
+    ] {
+        assert!(checked.contains(words), "{words:?} is missing:\n{checked}");
+    }
+    let examined = |host| run(&["doctor", "--json", "--topology", path, "--host", host]);
+    let here = examined("control-pc");
+    assert!(
+        here.contains("127.0.0.1 on lo, UDP from port 7390"),
+        "{here}"
+    );
+    let missing = examined("robot-pc");
+    assert!(missing.contains("no interface has 10.78.0.2"), "{missing}");
+    assert!(!run(&["doctor", "--json"]).contains("clock_path"));
 }

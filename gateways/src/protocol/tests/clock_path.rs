@@ -49,8 +49,8 @@ fn arrival(received_ns: i64) -> ArrivalStamps {
 fn its_greeting_has_these_bytes() {
     let (mut egress, _) = pair();
     let hello = egress.poll_transmit(Instant::from_ns(0x0d)).unwrap();
-    let hash = type_hash("hil.ClockPath.v1", 0, 1).to_le_bytes();
-    let hash: String = hash.iter().map(|byte| format!("{byte:02x}")).collect();
+    let hash = type_hash("hil.ClockPath.v1", 0, 1);
+    let hash = format!("{:016x}", hash.swap_bytes());
     let ones = "01".repeat(16);
     let expected = format!(
         "48494c47 01 04 0000 01020304 ffff 4800 0000000000000000
