@@ -14,20 +14,31 @@ const SILENCE_NS: i64 = 1_000_000_000;
 pub(super) fn egress_state(egress: &Egress) -> String {
     match egress.bridge.peer_state() {
         PeerState::Greeting => "never answered".to_owned(),
+        // No message tells whether it mattered: how long it lasted does.
+        PeerState::Down if egress.input.is_none() => match silence_ns(egress) {
+            Some(silence_ns) => {
+                format!("unreachable for the last {:.3} s", silence_ns as f64 * 1e-9)
+            }
+            None => "unreachable".to_owned(),
+        },
         // Gateways of two hosts stop one after the other: the later one may still have asked the
         // earlier one for the time, with no message concerned.
         PeerState::Down if !has_lost_messages(egress) => "left after the last message".to_owned(),
         PeerState::Down => "unreachable".to_owned(),
         PeerState::Refused(status) => format!("refused the channel: {}", status.label()),
         PeerState::Established => {
-            let heard = egress.bridge.last_heard();
-            let silence_ns = heard.map(|at| MonotonicClock::now().ns_since(at));
-            match silence_ns.filter(|silence_ns| *silence_ns > SILENCE_NS) {
+            match silence_ns(egress).filter(|silence_ns| *silence_ns > SILENCE_NS) {
                 Some(silence_ns) => format!("silent for {:.1} s", silence_ns as f64 * 1e-9),
                 None => "established".to_owned(),
             }
         }
     }
+}
+
+/// How long ago the peer was heard last; `None` when it never was.
+fn silence_ns(egress: &Egress) -> Option<i64> {
+    let heard = egress.bridge.last_heard();
+    heard.map(|at| MonotonicClock::now().ns_since(at))
 }
 
 /// True when a message could not go because the peer was unreachable.

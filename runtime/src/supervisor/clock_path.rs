@@ -94,3 +94,100 @@ fn direction(path: &ClockPath<'_>, host: &Host, side: Side) -> DirectionLaunch {
         is_clock_path: true,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+    use crate::registry::Registry;
+    use crate::topology;
+    use hil_models::shuttle::Shuttle;
+
+    fn topology(overrides: &[&str]) -> Topology {
+        let mut registry = Registry::default();
+        registry.add::<Shuttle>();
+        let path =
+            Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/topologies/shuttle-split.toml");
+        let overrides: Vec<String> = overrides.iter().map(|&text| text.to_owned()).collect();
+        topology::load(&path, &overrides, registry.known()).unwrap()
+    }
+
+    fn ends(topology: &Topology, host: &str) -> Vec<(String, DirectionLaunch, Duration)> {
+        let host = topology.host(host).unwrap();
+        let plans = on(topology, host).map(|plan| match plan.kind {
+            ProcessKind::ClockPath {
+                mut directions,
+                ready_within,
+            } => (plan.name, directions.remove(0), ready_within),
+            other => panic!("{other:?}"),
+        });
+        plans.collect()
+    }
+
+    #[test]
+    fn the_two_ends_meet_and_no_emulated_link_is_in_their_way() {
+        let topology = topology(&[
+            "links.hop.via=\"emulated\"",
+            "links.hop.delay=\"5 ms\"",
+            "hosts.control-pc.clock_address=\"10.78.0.1\"",
+            "hosts.control-pc.clock_interface=\"eth1\"",
+            "hosts.robot-pc.clock_address=\"10.78.0.2\"",
+            "run.start_timeout=\"3 s\"",
+        ]);
+        let [(name, asking, patience)] = &ends(&topology, "control-pc")[..] else {
+            panic!("one end");
+        };
+        let [(other_name, answering, _)] = &ends(&topology, "robot-pc")[..] else {
+            panic!("one end");
+        };
+        assert_eq!(name, "clock-robot-pc-control-pc");
+        assert_eq!(other_name, "clock-control-pc-robot-pc");
+        assert_eq!((asking.side, answering.side), (Side::Egress, Side::Ingress));
+        assert_eq!(
+            (asking.local, asking.peer),
+            (answering.peer, answering.local)
+        );
+        assert_eq!(asking.local.to_string(), "10.78.0.1:7390");
+        assert_eq!(asking.socket.interface.as_deref(), Some("eth1"));
+        assert_eq!(answering.socket.interface, None);
+        assert_eq!(asking.channel, "clock/control-pc-robot-pc");
+        assert_eq!(*patience, Duration::from_millis(1_500));
+        for end in [asking, answering] {
+            assert!(end.is_clock_path && end.emulation.is_none());
+            assert_eq!(end.channel_id, u16::MAX);
+            assert_eq!(end.socket.timestamps, Timestamps::Software);
+            assert_eq!(end.wait, WaitMode::Block);
+        }
+    }
+
+    #[test]
+    fn it_is_started_first_and_neither_component_nor_carrier() {
+        let topology = topology(&[
+            "hosts.control-pc.clock_address=\"10.78.0.1\"",
+            "hosts.robot-pc.clock_address=\"10.78.0.2\"",
+        ]);
+        let host = topology.host("robot-pc").unwrap();
+        let plan = super::super::plan::plan(&topology, &[host]);
+        let roles: Vec<String> = plan.processes.iter().map(ProcessPlan::role).collect();
+        assert_eq!(roles, ["clock path", "gateway", "robot"]);
+        let turns = plan.processes.iter().map(|process| {
+            [
+                process.is_clock_path(),
+                process.is_carrier(),
+                process.is_component(),
+            ]
+        });
+        let expected = [
+            [true, false, false],
+            [false, true, false],
+            [false, false, true],
+        ];
+        assert_eq!(turns.collect::<Vec<_>>(), expected);
+    }
+
+    #[test]
+    fn without_clock_addresses_there_is_none() {
+        assert!(ends(&topology(&[]), "control-pc").is_empty());
+    }
+}
