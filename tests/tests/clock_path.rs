@@ -165,12 +165,12 @@ fn a_slow_data_link_leaves_the_bound_as_narrow_as_the_clock_path() {
         assert!(figures.exchange_count > 300, "{figures:?}");
         let count = |kind| figures.stamp_counts.get(&kind).copied().unwrap_or(0);
         let kernel_count = count(StampKind::KernelSoftware);
-        // Now and then a response's departure is told too late to ride on the next.
+        // With one place missing it would be three quarters.
         assert!(
-            kernel_count * 100 >= figures.exchange_count * 4 * 95,
+            kernel_count * 100 >= figures.exchange_count * 4 * 85,
             "{figures:?}"
         );
-        assert_eq!(warnings(summary, "clock path"), [] as [&String; 0]);
+        assert_eq!(warnings(summary, "gave no exchange"), [] as [&String; 0]);
         assert!(pair.basis.starts_with("system clocks give no bound"));
     }
     let report = report.read("report.txt");
@@ -247,7 +247,7 @@ fn a_killed_end_comes_back_and_a_cable_pulled_in_the_run_leaves_a_gap_that_is_to
     };
     let record = RunFolder::new("clock-killed");
     lab.lay_second_cable();
-    let split = Split::start(lab, &record, "8 s");
+    let split = Split::start(lab, &record, "12 s");
     split.wait_for_messages(10, "the begin of the run");
     for (index, end) in ENDS.iter().enumerate() {
         split.files[index].kill_process(end, 0, LIMIT);
@@ -262,6 +262,7 @@ fn a_killed_end_comes_back_and_a_cable_pulled_in_the_run_leaves_a_gap_that_is_to
         exchanged() > before + 48 * 20
     });
     link(&split.lab, 0, "down");
+    let files = split.files[0].root().join("records");
     for summary in &split.finish() {
         let pair = pair(summary);
         let path = path(pair);
@@ -279,6 +280,15 @@ fn a_killed_end_comes_back_and_a_cable_pulled_in_the_run_leaves_a_gap_that_is_to
             assert_eq!(events.count(), 1, "{:?}", summary.events);
         }
     }
+    // Two starts of the asking end, and nothing of messages that there are none of.
+    let names = std::fs::read_dir(files).unwrap().map(|entry| {
+        let name = entry.unwrap().file_name();
+        name.to_string_lossy().into_owned()
+    });
+    let mut names: Vec<String> = names.filter(|name| name.starts_with("clock.")).collect();
+    names.sort();
+    let file = "clock.control-pc-robot-pc.round-trip.clock-robot-pc-control-pc";
+    assert_eq!(names, [0, 1].map(|start| format!("{file}.{start}.rec")));
 }
 
 #[test]
