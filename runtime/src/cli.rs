@@ -218,9 +218,15 @@ pub enum Command {
     },
     /// Say what this host can measure and what to change.
     #[command(
-        after_help = "Example:\n  hil-runtime doctor --strict   # exit code 78 when something must be fixed"
+        after_help = "Examples:\n  hil-runtime doctor --strict   # exit code 78 when something must be fixed\n  hil-runtime doctor --topology deploy/topologies/split.toml   # its clock path as well"
     )]
     Doctor {
+        /// A topology whose clock path is examined as well, as far as it ends on this host.
+        #[arg(long)]
+        topology: Option<PathBuf>,
+        /// Name of this host in the topology, if it is not found by itself.
+        #[arg(long, requires = "topology")]
+        host: Option<String>,
         /// Exit with 78 when a problem was found.
         #[arg(long)]
         strict: bool,

@@ -5,7 +5,7 @@ mod case_work;
 use std::env;
 use std::fs;
 use std::io::IsTerminal;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::Parser;
@@ -89,8 +89,17 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
             trace::work::End::Failed => exit::FAILED,
             trace::work::End::Refused => exit::USAGE,
         },
-        Command::Doctor { strict, json } => {
-            let worst = examine(json, console);
+        Command::Doctor {
+            topology,
+            host,
+            strict,
+            json,
+        } => {
+            let request = match doctor_request((topology, host), registry, console) {
+                Ok(request) => request,
+                Err(code) => return code,
+            };
+            let worst = examine(&request, json, console);
             if strict && worst == doctor::State::Problem {
                 exit::HOST_UNFIT
             } else {
@@ -214,10 +223,17 @@ fn show_check(path: &Path, topology: &Topology, console: &mut Console) -> u8 {
         ));
         return exit::USAGE;
     }
+    // As comments, so that what follows the first line remains a topology.
+    let clock_paths = topology.clock_paths().map(|clock| {
+        let (asking, answering) = (clock.asking.port(), clock.answering.port());
+        let words = clock.describe();
+        format!("\n# {words}, UDP ports {asking} and {answering}")
+    });
     console.result(&format!(
-        "{}: the file is valid; it comes to\n\n{}",
+        "{}: the file is valid; it comes to\n\n{}{}",
         path.display(),
-        topology.to_toml()
+        topology.to_toml(),
+        clock_paths.collect::<Vec<_>>().concat()
     ));
     exit::RAN
 }
@@ -315,8 +331,30 @@ fn show_report(run: &Path, json: bool, console: &mut Console) -> u8 {
     }
 }
 
-fn examine(json: bool, console: &mut Console) -> doctor::State {
-    let report = doctor::examine(&DoctorRequest::default(), &stamp_capabilities);
+/// What a topology has the doctor look at beside the host itself.
+fn doctor_request(
+    (topology, host): (Option<PathBuf>, Option<String>),
+    registry: &Registry,
+    console: &mut Console,
+) -> Result<DoctorRequest, u8> {
+    let mut request = DoctorRequest::default();
+    let Some(path) = topology else {
+        return Ok(request);
+    };
+    let topology = load(&path, &[], registry, console).ok_or(exit::USAGE)?;
+    let here = hosts_here(&topology, host.as_deref()).map_err(|text| {
+        console.error(&text);
+        exit::USAGE
+    })?;
+    let mut ends = here
+        .iter()
+        .filter_map(|name| topology.host(name)?.clock.clone());
+    request.clock_end = ends.next();
+    Ok(request)
+}
+
+fn examine(request: &DoctorRequest, json: bool, console: &mut Console) -> doctor::State {
+    let report = doctor::examine(request, &stamp_capabilities);
     let text = if json {
         report.to_json()
     } else {

@@ -370,6 +370,7 @@ fn launch(plan: &Plan, way: usize, side: Side) -> DirectionLaunch {
         wait: plan.wait,
         realtime: RealtimeRequest::default(),
         emulation: None,
+        is_clock_path: false,
     }
 }
 

@@ -7,6 +7,7 @@ use hil_models::clock::{ClockMap, ClockSettings, Exchange, Requester};
 use hil_models::measure::account::ChannelPath;
 use hil_models::time::{Alignment, Instant, RemoteInstant};
 
+use super::clock_path;
 use super::records::RunRecords;
 use crate::clock_discipline::{self, HostDiscipline};
 use crate::report::clock_summary::{ClockRung, ClockSection, DisciplinedOffset, HostPairClock};
@@ -122,7 +123,8 @@ impl HostClocks {
         (from, to): (String, String),
     ) {
         let map = |from: &str, to: &str| {
-            let exchanges = exchanges(topology, records, (from, to));
+            let mut exchanges = exchanges(topology, records, (from, to));
+            exchanges.extend(clock_path::exchanges(topology, records, (from, to)));
             ClockMap::new(&exchanges, ClockSettings::default())
         };
         let (there, back) = (map(&from, &to), map(&to, &from));
@@ -135,8 +137,10 @@ impl HostClocks {
             exchanges: (there.figures().exchange_count > 0).then(|| there.figures().clone()),
             disciplined: disciplined.as_ref().ok().copied(),
             contradiction: None,
+            clock_path: None,
         };
         choose(&mut pair, (result.has_one_clock, &there), disciplined);
+        clock_path::compare(&mut pair, (topology, result), records);
         let (forwards, backwards) = match (pair.rung, pair.disciplined) {
             (ClockRung::Exchanges, _) => (
                 Relation::Mapped(Box::new(there)),
@@ -243,7 +247,11 @@ fn disciplined(
 
 /// The exchanges of all channels between two hosts, for instants of the first on the clock of the
 /// second.
-fn exchanges(topology: &Topology, records: &RunRecords, (from, to): (&str, &str)) -> Vec<Exchange> {
+pub(super) fn exchanges(
+    topology: &Topology,
+    records: &RunRecords,
+    (from, to): (&str, &str),
+) -> Vec<Exchange> {
     let mut found = Vec::new();
     for channel in topology.channels() {
         let Some((sender, receiver)) = hosts_of(topology, channel) else {

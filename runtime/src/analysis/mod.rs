@@ -2,6 +2,7 @@
 //! account of each channel, and lets the case score what the robot did.
 
 mod cards;
+mod clock_path;
 mod clocks;
 mod events;
 mod faces;
@@ -192,6 +193,9 @@ fn add_warnings(summary: &mut RunSummary, result: &RunResult, records: &RunRecor
         }
     }
     summary.warnings.extend(records.clocks().warnings());
+    let pairs = &records.clocks().section().pairs;
+    let paths = pairs.iter().filter_map(clock_path::warning);
+    summary.warnings.extend(paths);
 }
 
 /// Width of `report.txt`.

@@ -324,6 +324,7 @@ mod tests {
             address: None,
             interface: interface.map(str::to_owned),
             control_port: 7399,
+            clock: None,
         }
     }
 

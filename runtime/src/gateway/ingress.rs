@@ -28,7 +28,8 @@ pub(crate) struct Ingress {
     /// The receiver holds datagrams back, so it must be told the time.
     pub(crate) is_emulated: bool,
     pub(crate) bridge: IngressBridge,
-    pub(crate) output: RawOutput,
+    /// Where messages go; `None` on a clock path, which carries none.
+    pub(crate) output: Option<RawOutput>,
     pub(crate) wait: WaitStrategy,
     pub(crate) peer: SocketAddr,
     pub(crate) notes: Notes,
@@ -36,6 +37,8 @@ pub(crate) struct Ingress {
     pub(crate) stop: Arc<AtomicBool>,
     /// Datagrams from an address that is not the peer's, dropped unread.
     pub(crate) foreign_count: u64,
+    /// Messages that came over a clock path, dropped.
+    pub(crate) stray_count: u64,
     pub(crate) clock: KernelClock,
     /// The clock response whose departure the kernel is to stamp.
     pub(crate) response: Option<Response>,
@@ -151,12 +154,17 @@ impl Ingress {
             output,
             notes,
             received: count,
+            stray_count,
             buffer,
             ..
         } = self;
         let bytes = &buffer[..received.length_bytes];
         let mut failed = None;
         let mut deliver = |delivery: Delivery<'_>| {
+            let Some(output) = output else {
+                *stray_count += 1;
+                return;
+            };
             count.fetch_add(1, Ordering::Relaxed);
             if let Err(error) = publish(output, notes, &arrival, &delivery) {
                 failed = Some(error);

@@ -53,6 +53,9 @@ pub struct GatewayLaunch {
     pub records: PathBuf,
     /// One thread each.
     pub directions: Vec<DirectionLaunch>,
+    /// How long it waits for the peer's answer before it is ready without; `None` waits on.
+    #[serde(default)]
+    pub ready_within: Option<Duration>,
 }
 
 /// One channel direction through a gateway.
@@ -85,6 +88,9 @@ pub struct DirectionLaunch {
     pub realtime: RealtimeRequest,
     /// A link model in front of this direction's receiver.
     pub emulation: Option<EmulationLaunch>,
+    /// It exchanges clocks only: no channel of shared memory is behind it.
+    #[serde(default)]
+    pub is_clock_path: bool,
 }
 
 /// Which way a gateway thread carries its channel.

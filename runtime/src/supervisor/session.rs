@@ -17,7 +17,7 @@ use super::frame::{Frame, PeerHello, PeerMessage};
 use super::meet::{Meeting, meet};
 use super::outcome::{Heard, Outcome, RunError, RunOptions, RunResult};
 use super::peer::{Peer, PeerEvent};
-use super::plan::plan;
+use super::plan::{ProcessPlan, plan};
 use super::progress_line;
 use crate::card_clock::CardWatch;
 use crate::channel::clock_id;
@@ -376,19 +376,20 @@ impl Session<'_> {
             .progress(&format!("{elapsed_s:6.1} / {total_s:.0} s  {channels}"));
     }
 
-    /// Ends components everywhere first, then gateways, so that what is under way arrives.
+    /// Ends components everywhere first, then gateways, so that what is under way arrives, and last
+    /// the clock paths, so that an exchange follows the last message.
     fn stop(&mut self, outcome: &Outcome) {
         let reason = outcome.text();
         let meaning = outcome.meaning();
         self.say_to_all(&PeerMessage::Stop { reason, meaning });
-        self.crew.stop(STOP_PATIENCE, |plan| !plan.is_carrier());
+        self.crew.stop(STOP_PATIENCE, ProcessPlan::is_component);
         self.say_to_all(&PeerMessage::Quiet);
         if !matches!(outcome, Outcome::PeerLost(_)) {
             self.wait_for_quiet();
         }
         thread::sleep(DRAIN);
-        self.crew
-            .stop(STOP_PATIENCE, super::plan::ProcessPlan::is_carrier);
+        self.crew.stop(STOP_PATIENCE, ProcessPlan::is_carrier);
+        self.crew.stop(STOP_PATIENCE, ProcessPlan::is_clock_path);
     }
 
     fn wait_for_quiet(&mut self) {
