@@ -55,6 +55,7 @@ impl Plan {
             name: "bench.Bytes.v1",
             size_bytes: self.size_bytes,
             alignment_bytes: 8,
+            fields: &[],
         }
     }
 
