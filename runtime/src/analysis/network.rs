@@ -286,6 +286,12 @@ fn trouble(bin: &NetworkBin, index: usize) -> Option<f64> {
     }
 }
 
+/// Largest error of any delay in the bins; `None` without delays.
+fn delay_bound_s(bins: &NetworkBins) -> Option<f64> {
+    let bounds = bins.bins.iter().filter_map(|bin| bin.delay_bound_ns);
+    bounds.max().map(|ns| ns as f64 * 1e-9)
+}
+
 /// True for a channel with less than a message per bin: its silence is nobody's trouble, as nobody
 /// speaks.
 fn speaks_seldom(bins: &NetworkBins) -> bool {
@@ -304,6 +310,7 @@ fn timeline(all: &[(String, NetworkBins)], robot: &RobotBins, width_s: f64) -> T
         what: what.to_owned(),
         unit: unit.to_owned(),
         values: values.chunks(per_step).map(largest).collect(),
+        bound: None,
     };
     let mut rows = Vec::new();
     for (channel, bins) in all {
@@ -312,7 +319,11 @@ fn timeline(all: &[(String, NetworkBins)], robot: &RobotBins, width_s: f64) -> T
                 continue;
             }
             let values = bins.bins.iter().map(|bin| trouble(bin, index));
-            rows.push(row(channel, what, unit, values.collect()));
+            let bound = (*what == "delay").then(|| delay_bound_s(bins)).flatten();
+            rows.push(TimelineRow {
+                bound,
+                ..row(channel, what, unit, values.collect())
+            });
         }
     }
     for (one, bins) in robot {
@@ -466,6 +477,7 @@ fn add_channel(
             other_events,
             span,
             context: NetworkContext {
+                path: context.path,
                 run_ns: Some((span.producer_start_ns, producer_end.as_ns())),
                 payload_bytes,
                 duplicated_count: files

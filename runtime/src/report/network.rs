@@ -97,10 +97,12 @@ impl TimedEvent {
                 late_count,
                 delay_max_ns,
                 limit_ns,
+                bound_ns,
             } => {
                 let [max, limit] = [delay_max_ns, limit_ns].map(|ns| duration_s(*ns as f64 * 1e-9));
                 let late = counted(*late_count, "message");
-                format!("late on {channel}, {late} by up to {max} (limit {limit})")
+                let bound = within(*bound_ns, *delay_max_ns);
+                format!("late on {channel}, {late} by up to {max}{bound} (limit {limit})")
             }
             NetworkEventKind::Reordering {
                 reordered_count,
@@ -119,6 +121,19 @@ impl TimedEvent {
             }
         }
     }
+}
+
+/// How far a one-way figure may be off by the clocks' alignment; nothing on one clock.
+pub(crate) fn within(bound_ns: u64, figure_ns: i64) -> String {
+    if bound_ns == 0 {
+        return String::new();
+    }
+    let wide = if i128::from(bound_ns) > i128::from(figure_ns) {
+        " (wider than the figure)"
+    } else {
+        ""
+    };
+    format!(" ±{}{wide}", duration_s(bound_ns as f64 * 1e-9))
 }
 
 fn counted(count: u64, what: &str) -> String {
@@ -200,6 +215,10 @@ pub struct TimelineRow {
     pub unit: String,
     /// The largest value of each step; `None` where there was none.
     pub values: Vec<Option<f64>>,
+    /// Largest error of any value from the alignment of two hosts' clocks, in the same unit, 0 on one
+    /// clock; `None` for what needs no second clock, and without values.
+    #[serde(default)]
+    pub bound: Option<f64>,
 }
 
 /// Whether the robot's errors follow the network's troubles; correlation is not cause.

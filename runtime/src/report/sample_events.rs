@@ -19,6 +19,7 @@ fn message(sequence: u64, fate: Option<MessageFate>, words: &str) -> ExplainedMe
         published_at_s: fate.map(|_| sequence as f64 * 0.004),
         fate,
         delay_s: None,
+        delay_bound_s: None,
         words: words.to_owned(),
     }
 }

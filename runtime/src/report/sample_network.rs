@@ -2,12 +2,12 @@
 //! are checked in.
 
 use hil_models::case_study::ErrorSeries;
-use hil_models::measure::account::Side;
+use hil_models::measure::account::{ChannelPath, Side};
 use hil_models::measure::network::{
     Crossing, Moment, NetworkContext, NetworkEvent, NetworkEventKind, Passage, SeriesSpan,
 };
 use hil_models::random::RandomStream;
-use hil_models::time::Instant;
+use hil_models::time::{Alignment, Instant};
 
 use super::network::{Correlation, NetworkReport};
 use super::score_event::ScoreEvents;
@@ -101,6 +101,12 @@ pub(super) fn network(names: [&str; 2], events: &mut ScoreEvents) -> NetworkRepo
                 duration_ns: RUN_NS,
             },
             context: NetworkContext {
+                path: ChannelPath::Gateway {
+                    alignment: (index == 0).then_some(Alignment {
+                        offset_ns: 0,
+                        bound_ns: 40_000,
+                    }),
+                },
                 run_ns: Some((0, RUN_NS)),
                 payload_bytes: Some(96),
                 duplicated_count: Some(2),

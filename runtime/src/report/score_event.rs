@@ -112,6 +112,10 @@ pub struct ExplainedMessage {
     pub fate: Option<MessageFate>,
     /// Published to taken, seconds.
     pub delay_s: Option<f64>,
+    /// Largest error of `delay_s` from the alignment of two hosts' clocks, seconds; 0 on one clock,
+    /// `None` without a delay.
+    #[serde(default)]
+    pub delay_bound_s: Option<f64>,
     /// Its fate in words, with the link and the cause where they are known, or why it is
     /// unavailable.
     pub words: String,

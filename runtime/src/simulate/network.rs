@@ -2,6 +2,7 @@
 //! of a live run. What a model delays counts from publication, as no gateway stands between.
 
 use hil_models::case_study::ErrorSeries;
+use hil_models::measure::account::ChannelPath;
 use hil_models::measure::network::{NetworkContext, SeriesSpan};
 use hil_models::plot::PlotSeries;
 use hil_models::run_log::RunLog;
@@ -39,6 +40,7 @@ pub(super) fn of_simulation(
                 duration_ns: length_ns,
             },
             context: NetworkContext {
+                path: ChannelPath::SharedMemory,
                 run_ns: Some((0, length_ns)),
                 payload_bytes: payload.map(|message| message.payload.len() as u64),
                 duplicated_count: Some(duplicated_count),

@@ -47,7 +47,7 @@ pub use stage::{MessageFate, Side, Stage};
 pub use story::{MessageStory, stories};
 pub use trace::{TRACE_MESSAGES_MAX, TooManyMessages, TraceChannel, link_trace};
 
-use crate::clock::ClockMap;
+use crate::clock::{ClockMap, ClockSettings};
 use crate::measure::histogram::LatencyHistogram;
 use crate::measure::record::{
     EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, TakenRecord,
@@ -132,6 +132,18 @@ impl ChannelPath<'_> {
         }
     }
 
+    /// As [`Self::localise`], and further outside the exchanges too; see
+    /// [`ClockMap::localise_beyond`].
+    pub fn localise_beyond(self, remote: RemoteInstant) -> Option<(Instant, u64)> {
+        match self {
+            Self::Mapped { map } => {
+                let localised = map.localise_beyond(remote)?;
+                Some((localised.instant, localised.bound_ns()))
+            }
+            Self::SharedMemory | Self::Gateway { .. } => self.localise(remote),
+        }
+    }
+
     /// An instant of the consumer's host on the clock of the producer's, with the largest error.
     pub fn to_remote(self, local: Instant) -> Option<(RemoteInstant, u64)> {
         let shifted = |alignment: Alignment| {
@@ -142,6 +154,20 @@ impl ChannelPath<'_> {
             Self::SharedMemory => Some(shifted(Alignment::SAME_CLOCK)),
             Self::Gateway { alignment } => alignment.map(shifted),
             Self::Mapped { map } => map.to_remote(local),
+        }
+    }
+
+    /// How far the two hosts' clocks may have moved against each other between two instants of the
+    /// producer's, by the drift allowance of [`ClockSettings`], which needs no alignment; 0 on one
+    /// clock, `None` across a noticed step.
+    pub fn drift_ns(self, from: RemoteInstant, until: RemoteInstant) -> Option<u64> {
+        match self {
+            _ if self.has_one_clock() => Some(0),
+            Self::Mapped { map } => map.drift_ns(from, until),
+            Self::SharedMemory | Self::Gateway { .. } => {
+                let span_ns = until.as_ns().saturating_sub(from.as_ns());
+                Some(ClockSettings::default().drift_ns(span_ns).unsigned_abs())
+            }
         }
     }
 

@@ -45,6 +45,9 @@ pub enum NetworkEventKind {
         delay_max_ns: i64,
         /// What they exceeded.
         limit_ns: i64,
+        /// Largest error of the delays among them, and of those that the limit is made of, from the
+        /// alignment of the clocks; 0 on one clock.
+        bound_ns: u64,
     },
     /// Messages came after later ones.
     Reordering {
@@ -161,6 +164,8 @@ fn late(passages: &[Passage]) -> Vec<NetworkEvent> {
     let Some(limit_ns) = delay_limit_ns(passages) else {
         return Vec::new();
     };
+    let with_delay = passages.iter().filter(|one| one.delay_ns.is_some());
+    let bound_ns = with_delay.map(|one| one.delay_bound_ns).max().unwrap_or(0);
     let mut found: Vec<NetworkEvent> = Vec::new();
     let mut since_last = u64::MAX;
     for one in passages {
@@ -195,6 +200,7 @@ fn late(passages: &[Passage]) -> Vec<NetworkEvent> {
                 late_count: 1,
                 delay_max_ns: delay_ns,
                 limit_ns,
+                bound_ns,
             },
             from: producer(offered_ns),
             until_ns: Some(received_ns),

@@ -10,6 +10,8 @@
 //! beside the network's losses and never among them.
 
 mod bins;
+#[cfg(test)]
+mod bound_tests;
 mod delay;
 mod events;
 mod loss;
@@ -30,7 +32,7 @@ pub use events::{
 pub use loss::{BURST_GAP_MIN, BurstFigures, LongestLoss, LossFigures};
 pub use order::OrderFigures;
 
-use crate::measure::account::Side;
+use crate::measure::account::{ChannelPath, Side};
 use crate::measure::histogram::{Distribution, LatencyHistogram};
 use crate::random::RandomStream;
 
@@ -109,6 +111,8 @@ impl<T> Figure<T> {
 /// What the passages alone do not say.
 #[derive(Debug, Clone, Copy)]
 pub struct NetworkContext<'a> {
+    /// How the clocks of the two hosts relate.
+    pub path: ChannelPath<'a>,
     /// Start and end of the run on the producer's clock, nanoseconds, where known.
     pub run_ns: Option<(i64, i64)>,
     /// Payload of one message.
@@ -145,7 +149,8 @@ pub struct NetworkFigures {
     pub arrived_bytes_per_s: Option<f64>,
     /// Handed to the kernel to received by the other gateway.
     pub delay: Figure<DelayFigures>,
-    /// Difference of the delays of successive messages; needs no alignment of clocks.
+    /// Difference of the delays of successive messages; needs no alignment of clocks, only a bound
+    /// of their rates.
     pub successive: Figure<SuccessiveVariation>,
     /// Losses of the network.
     pub loss: Figure<LossFigures>,
@@ -186,8 +191,8 @@ impl NetworkFigures {
                 .payload_bytes
                 .zip(per_s(arrived_count.saturating_sub(1)))
                 .map(|(bytes, per_s)| bytes as f64 * per_s),
-            delay: delay::delays(passages, &mut random),
-            successive: delay::successive(passages),
+            delay: delay::delays(passages, context.path, &mut random),
+            successive: delay::successive(passages, context.path),
             loss: loss::losses(passages, context.run_ns),
             order: order::order(passages),
             round_trip: round_trip.distribution("no clock exchange took place"),

@@ -8,7 +8,7 @@ const PERIOD_NS: i64 = 10_000_000;
 const DELAY_NS: i64 = 2_000_000;
 
 /// Message `sequence` of a channel that sends every 10 ms.
-fn arrived(sequence: u64, delay_ns: i64) -> Passage {
+pub(super) fn arrived(sequence: u64, delay_ns: i64) -> Passage {
     let offered_ns = i64::try_from(sequence).unwrap() * PERIOD_NS;
     Passage {
         epoch_rank: 0,
@@ -31,7 +31,7 @@ fn lost(sequence: u64) -> Passage {
     }
 }
 
-fn passages(count: u64, is_lost: impl Fn(u64) -> bool) -> Vec<Passage> {
+pub(super) fn passages(count: u64, is_lost: impl Fn(u64) -> bool) -> Vec<Passage> {
     let one = |sequence| {
         if is_lost(sequence) {
             lost(sequence)
@@ -43,7 +43,12 @@ fn passages(count: u64, is_lost: impl Fn(u64) -> bool) -> Vec<Passage> {
 }
 
 fn figures(passages: &[Passage]) -> NetworkFigures {
+    figures_on(ChannelPath::SharedMemory, passages)
+}
+
+pub(super) fn figures_on(path: ChannelPath<'_>, passages: &[Passage]) -> NetworkFigures {
     let context = NetworkContext {
+        path,
         run_ns: Some((0, i64::try_from(passages.len()).unwrap() * PERIOD_NS)),
         payload_bytes: Some(64),
         duplicated_count: Some(0),
@@ -285,6 +290,7 @@ fn a_late_message_is_an_event_and_its_neighbours_belong_to_it() {
     for (sequence, delay_ms) in [(1_000_usize, 40), (1_004, 60), (2_000, 30)] {
         all[sequence] = arrived(sequence as u64, delay_ms * 1_000_000);
     }
+    all[7].delay_bound_ns = 15_000;
     let late: Vec<_> = network_events(&all)
         .into_iter()
         .filter_map(|one| match one.kind {
@@ -292,7 +298,8 @@ fn a_late_message_is_an_event_and_its_neighbours_belong_to_it() {
                 late_count,
                 delay_max_ns,
                 limit_ns,
-            } => Some((one.from.ns, late_count, delay_max_ns, limit_ns)),
+                bound_ns,
+            } => Some((one.from.ns, late_count, delay_max_ns, limit_ns, bound_ns)),
             _ => None,
         })
         .collect();
@@ -301,8 +308,8 @@ fn a_late_message_is_an_event_and_its_neighbours_belong_to_it() {
     assert_eq!(
         late,
         [
-            (1_000 * PERIOD_NS, 2, 60_000_000, limit_ns),
-            (2_000 * PERIOD_NS, 1, 30_000_000, limit_ns)
+            (1_000 * PERIOD_NS, 2, 60_000_000, limit_ns, 15_000),
+            (2_000 * PERIOD_NS, 1, 30_000_000, limit_ns, 15_000)
         ]
     );
 }
@@ -351,7 +358,8 @@ fn a_clock_that_was_set_is_an_event_and_one_that_is_slewed_is_not() {
 #[test]
 fn bins_hold_what_happened_in_their_time() {
     // 10 s at 100 Hz, nothing from 3.00 s to 3.55 s.
-    let all = passages(1_000, |one| (300..355).contains(&one));
+    let mut all = passages(1_000, |one| (300..355).contains(&one));
+    all[105].delay_bound_ns = 25_000;
     let span = SeriesSpan {
         producer_start_ns: 0,
         consumer_start_ns: 0,
@@ -370,6 +378,8 @@ fn bins_hold_what_happened_in_their_time() {
     );
     assert_eq!(binned.bins[10].delay_p50_ns, Some(DELAY_NS));
     assert_eq!(binned.bins[31].delay_max_ns, None);
+    let bounds = [9, 10, 31].map(|index| binned.bins[index].delay_bound_ns);
+    assert_eq!(bounds, [Some(0), Some(25_000), None]);
     // The last reception was at 2.992 s, the next one at 3.552 s.
     let silence: Vec<i64> = binned.bins[29..36]
         .iter()
@@ -379,12 +389,15 @@ fn bins_hold_what_happened_in_their_time() {
     let series = binned.to_series("shuttle/command", Vec::new());
     assert_eq!(series.name, "network-shuttle-command");
     let row = series.rows().nth(30).unwrap();
-    assert!((row[0] - 3.0).abs() < 1e-9 && (row[6] - 0.108).abs() < 1e-9);
+    assert!((row[0] - 3.0).abs() < 1e-9 && (row[7] - 0.108).abs() < 1e-9);
     assert_eq!(
         (row[1].to_bits(), row[2].to_bits()),
         (10.0_f64.to_bits(), 10.0_f64.to_bits())
     );
-    assert!(row[4].is_nan());
+    assert!(row[4].is_nan() && row[6].is_nan());
+    assert_eq!(series.columns[6].name, "delay_s_bound");
+    let row = series.rows().nth(10).unwrap();
+    assert!((row[6] - 25e-6).abs() < 1e-12);
 }
 
 #[test]
