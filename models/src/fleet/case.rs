@@ -61,6 +61,7 @@ impl CaseStudy for Fleet {
     /// A coordinator started anew would believe all robots in their first bays, and robots
     /// started anew would be there while the coordinator believes them under way.
     const MAY_RESTART: bool = false;
+    const SCORE_CLOCK: Option<&'static str> = Some(FLEET_TRUTH);
     type Parameters = FleetParameters;
 
     fn new(parameters: Self::Parameters, seed: u64) -> Result<Self, ParameterError> {

@@ -216,9 +216,14 @@ fn ages(log: &RunLog) -> Vec<Metric> {
         count,
         ..
     } = ages;
-    let method = format!("sampled by the robot to authority sent, of {count} authorities");
     let figures = labels.into_iter().zip([p50_ns, p99_ns, max_ns]);
-    let figures = figures.map(|(label, ns)| metric(label, ns as f64 * 1e-9, "s", &method));
+    let figures = figures.map(|(label, ns)| {
+        let seconds = ns as f64 * 1e-9;
+        let clock = log.clock_words(Some(seconds));
+        let method =
+            format!("sampled by the robot to authority sent, of {count} authorities{clock}");
+        metric(label, seconds, "s", &method)
+    });
     figures.collect()
 }
 

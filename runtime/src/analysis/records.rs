@@ -122,9 +122,9 @@ impl RunRecords {
         (egress.unwrap_or_default(), ingress.unwrap_or_default())
     }
 
-    /// See [`RunLog::set_clocks_differ`].
-    pub(super) fn set_clocks_differ(&mut self) {
-        self.log.set_clocks_differ();
+    /// Every message of the run, to bring them to one clock.
+    pub(super) const fn log_mut(&mut self) -> &mut RunLog {
+        &mut self.log
     }
 
     /// Relates the hosts' clocks; until then none are aligned.

@@ -31,12 +31,15 @@ pub(crate) struct JointError {
     desired_mean: Joints,
     desired_square: f64,
     has_one_clock: bool,
+    /// What there is to say of the clocks that commands and feedback were stamped by.
+    clock: String,
 }
 
 impl JointError {
     pub(crate) fn read(case: &Teleoperation, log: &RunLog, period_s: f64) -> Self {
         let mut error = Self {
             has_one_clock: log.has_one_clock(),
+            clock: log.clock_words(None),
             ..Self::default()
         };
         if !error.has_one_clock {
@@ -93,15 +96,17 @@ impl JointError {
         };
         let (total, square) = (&self.total, self.desired_square);
         let ratio = (square > 0.0).then(|| (total.square / square).sqrt());
+        let clock = &self.clock;
+        let newest = format!("newest command sent by then minus measured{clock}");
         let mut metrics = vec![
             total.rms(
                 ("joint_error_rad_rms", "joint error, RMS", "rad"),
-                "newest command sent by then minus measured",
+                &newest,
                 missing,
             ),
             total.greatest(
                 ("joint_error_rad_max", "joint error, largest", "rad"),
-                "newest command sent by then minus measured",
+                &newest,
                 missing,
             ),
             figure(
@@ -112,7 +117,7 @@ impl JointError {
                 ),
                 ratio,
                 format!(
-                    "RMS error over RMS of the command about its mean; {} messages of feedback",
+                    "RMS error over RMS of the command about its mean; {} messages of feedback{clock}",
                     total.count
                 ),
                 if total.count > 0.0 {
@@ -129,6 +134,8 @@ impl JointError {
     /// Both parts; without them, for the reason `missing`.
     fn split(&self, missing: &str) -> [Metric; 4] {
         let (controller, network) = (&self.controller, &self.network);
+        let [of_controller, of_network] =
+            [CONTROLLER_PART, NETWORK_PART].map(|part| [part, &self.clock].concat());
         [
             controller.rms(
                 (
@@ -136,7 +143,7 @@ impl JointError {
                     "joint error of the servo alone, without the network, RMS",
                     "rad",
                 ),
-                CONTROLLER_PART,
+                &of_controller,
                 missing,
             ),
             controller.greatest(
@@ -145,7 +152,7 @@ impl JointError {
                     "joint error of the servo alone, without the network, largest",
                     "rad",
                 ),
-                CONTROLLER_PART,
+                &of_controller,
                 missing,
             ),
             network.rms(
@@ -154,7 +161,7 @@ impl JointError {
                     "joint error the network adds, RMS",
                     "rad",
                 ),
-                NETWORK_PART,
+                &of_network,
                 missing,
             ),
             network.greatest(
@@ -163,7 +170,7 @@ impl JointError {
                     "joint error the network adds, largest",
                     "rad",
                 ),
-                NETWORK_PART,
+                &of_network,
                 missing,
             ),
         ]
