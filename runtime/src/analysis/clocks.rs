@@ -116,6 +116,21 @@ impl HostClocks {
         pairs.all(|(from, to)| self.path(from, to).is_aligned())
     }
 
+    /// The largest error with which instants of two aligned hosts compare, over the time of the
+    /// exchanges; 0 on one clock, and without any alignment.
+    pub(super) fn largest_bound_ns(&self) -> u64 {
+        let bounds = self
+            .section
+            .pairs
+            .iter()
+            .filter_map(|pair| match pair.rung {
+                ClockRung::OneClock | ClockRung::None => None,
+                ClockRung::Disciplined => pair.disciplined.map(|offset| offset.bound_ns),
+                ClockRung::Exchanges => Some(pair.exchanges.as_ref()?.bound?.largest_ns),
+            });
+        bounds.max().unwrap_or(0)
+    }
+
     fn relate(
         &mut self,
         (topology, result): (&Topology, &RunResult),

@@ -10,6 +10,7 @@ pub(crate) mod network;
 pub(crate) mod outages;
 mod radio;
 pub(crate) mod records;
+mod robot_series;
 mod score_clock;
 
 use std::fs;

@@ -234,8 +234,9 @@ impl RunRecords {
         run: (&Topology, &RunResult),
         channel: &Channel,
     ) -> (Option<TransmitStampFigures>, Option<RadioFigures>) {
-        self.consult(run, channel, |records, _| {
-            (records.egress.map(transmit_stamps), radio_figures(records))
+        self.consult(run, channel, |records, context| {
+            let stamps = records.egress.map(transmit_stamps);
+            (stamps, radio_figures(records, context))
         })
     }
 

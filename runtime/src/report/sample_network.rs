@@ -11,7 +11,7 @@ use hil_models::time::{Alignment, Instant};
 
 use super::network::{Correlation, NetworkReport};
 use super::score_event::ScoreEvents;
-use crate::analysis::network::{ChannelPassages, NetworkBuilder, RobotSeries};
+use crate::analysis::network::{AxisClocks, ChannelPassages, NetworkBuilder, RobotSeries};
 
 const MS: i64 = 1_000_000;
 const RUN_NS: i64 = 20_000 * MS;
@@ -115,10 +115,11 @@ pub(super) fn network(names: [&str; 2], events: &mut ScoreEvents) -> NetworkRepo
             },
         });
     }
-    let clocks_differ = events.clocks_differ;
-    let (report, series) = builder
-        .finish(events, vec![error()], (42, clocks_differ))
-        .unwrap();
+    let axis = AxisClocks {
+        differ: events.clocks_differ,
+        bound_s: 0.0,
+    };
+    let (report, series) = builder.finish(events, vec![error()], (42, axis)).unwrap();
     assert_eq!(series.len(), 2);
     report
 }

@@ -9,7 +9,7 @@ use hil_models::run_log::RunLog;
 use hil_models::time::{Instant, duration_ns};
 
 use super::watched::Watch;
-use crate::analysis::network::{ChannelPassages, NetworkBuilder, RobotSeries};
+use crate::analysis::network::{AxisClocks, ChannelPassages, NetworkBuilder, RobotSeries};
 use crate::report::network::NetworkReport;
 use crate::report::score_event::ScoreEvents;
 use crate::topology::Topology;
@@ -51,5 +51,5 @@ pub(super) fn of_simulation(
     }
     let errors = errors.into_iter();
     let errors = errors.map(|one| RobotSeries::of(one, Instant::ZERO));
-    builder.finish(events, errors.collect(), (seed, false))
+    builder.finish(events, errors.collect(), (seed, AxisClocks::default()))
 }

@@ -21,6 +21,7 @@ mod gaps;
 mod join;
 mod outage;
 mod passage;
+mod radio;
 #[cfg(test)]
 mod random_fates;
 mod segments;
@@ -43,6 +44,7 @@ pub use outage::{
     OutageFinder, Standing, foregoing, outages,
 };
 pub use passage::passages;
+pub(crate) use radio::{HandedFate, handed_fates};
 pub use stage::{MessageFate, Side, Stage};
 pub use story::{MessageStory, stories};
 pub use trace::{TRACE_MESSAGES_MAX, TooManyMessages, TraceChannel, link_trace};
@@ -334,6 +336,23 @@ pub fn account(records: &ChannelRecords<'_>, context: &AccountContext<'_>) -> Ch
         loss_bursts: bursts.finish(),
         gaps,
         interruptions: judge.interruptions(&gap_of_interruption),
+    }
+}
+
+/// Hands every message of a channel to `take`, in the order of the producer's starts and numbers: what
+/// is recorded of it, what became of it, and the interruption that cost it, by its place in the context.
+/// A judge remembers the message before, so it sees all of them, whatever the caller wants.
+fn each_judged(
+    records: &ChannelRecords<'_>,
+    context: &AccountContext<'_>,
+    mut take: impl FnMut(&join::Joined<'_>, MessageFate, Option<usize>),
+) {
+    let records = records.on(context.path);
+    let join = join::Join::new(&records);
+    let mut judge = fate::Judge::new(&records, context, &join);
+    for joined in join {
+        let fate = judge.judge(&joined);
+        take(&joined, fate, judge.last_interruption());
     }
 }
 

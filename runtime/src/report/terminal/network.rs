@@ -316,32 +316,37 @@ fn order_words(figures: &NetworkFigures) -> String {
     );
     match &figures.order {
         Figure::Unavailable { reason } => format!("unavailable: {reason}; {copies}"),
-        Figure::Measured(order) if order.reordered_count == 0 => {
-            format!("none of {} reordered; {copies}", grouped(order.count))
+        Figure::Measured(order) => {
+            let Some((p50, max)) = order.extent_p50.zip(order.extent_max) else {
+                return format!("none of {} reordered; {copies}", grouped(order.count));
+            };
+            format!(
+                "{} of {} reordered ({}), by {} places at the median, by up to {}; {copies}",
+                grouped(order.reordered_count),
+                grouped(order.count),
+                percent(order.ratio),
+                grouped(p50),
+                grouped(max),
+            )
         }
-        Figure::Measured(order) => format!(
-            "{} of {} reordered ({}), by {} places at the median, by up to {}; {copies}",
-            grouped(order.reordered_count),
-            grouped(order.count),
-            percent(order.ratio),
-            grouped(order.extent_p50),
-            grouped(order.extent_max),
-        ),
     }
 }
 
 fn rate_words(figures: &NetworkFigures) -> String {
-    let (Some(offered), Some(arrived)) = (figures.offered_per_s, figures.arrived_per_s) else {
-        return "unavailable: fewer than two messages".to_owned();
+    let rate = |per_s: Option<f64>, what: &str| {
+        per_s.map_or_else(
+            || format!("{what} unavailable: fewer than two"),
+            |per_s| format!("{} messages/s {what}", figure(per_s)),
+        )
     };
     let bytes = figures.arrived_bytes_per_s.map_or_else(
         || "payload unavailable".to_owned(),
         |bytes| format!("{} B/s of payload", figure(bytes)),
     );
     format!(
-        "{} messages/s handed over, {} received, {bytes}",
-        figure(offered),
-        figure(arrived)
+        "{}, {}, {bytes}",
+        rate(figures.offered_per_s, "handed over"),
+        rate(figures.arrived_per_s, "received")
     )
 }
 
@@ -369,7 +374,11 @@ pub(super) fn what_preceded_what(
 }
 
 fn foregoing_words(report: &NetworkReport, events: &ScoreEvents) -> String {
-    let window = duration_s(report.foregoing_s);
+    let bound_s = Some(report.clock_bound_s).filter(|bound_s| *bound_s > 0.0);
+    let slack = bound_s.map_or_else(String::new, |bound_s| {
+        format!(" (±{} by the clocks)", duration_s(bound_s))
+    });
+    let window = duration_s(report.foregoing_s) + &slack;
     let chance = percent(report.foregoing_chance_ratio);
     let noted = report.events.len() as u64 + report.events_dropped_count;
     let known: Vec<_> = events
