@@ -126,23 +126,25 @@ fn outages_before(
         let is_consumers = channel.to.as_deref().is_some_and(is_here);
         let on_producers_clock = host_of(&channel.from).and_then(|producers| {
             let remote = RemoteInstant::from_ns(event.at.as_ns());
-            let (at, _) = clocks.path(here, producers).localise(remote)?;
-            Some((at, Side::Producer))
+            let (at, bound_ns) = clocks.path(here, producers).localise(remote)?;
+            Some((at, Side::Producer, bound_ns))
         });
         let lost_published_ns = ways
             .get(spec.name)
             .map_or_else(Vec::new, |way| way.lost_published_ns(event));
         // A time compares only with times of its own clock.
         let sides = [
-            is_consumers.then_some((event.at, Side::Consumer)),
+            is_consumers.then_some((event.at, Side::Consumer, 0)),
             on_producers_clock,
         ];
         let mut sides = sides.into_iter().flatten().map(Some).chain([None]);
-        sides.find_map(|at| {
-            story.before(&Happening {
-                at,
+        sides.find_map(|side| {
+            let mut found = story.before(&Happening {
+                at: side.map(|(at, side, _)| (at, side)),
                 lost_published_ns: &lost_published_ns,
-            })
+            })?;
+            found.put_clock_bound(side.map_or(0, |(.., bound_ns)| bound_ns));
+            Some(found)
         })
     };
     let concerned = event.concerned_channels(specs);

@@ -96,17 +96,15 @@ impl JointError {
         };
         let (total, square) = (&self.total, self.desired_square);
         let ratio = (square > 0.0).then(|| (total.square / square).sqrt());
-        let clock = &self.clock;
-        let newest = format!("newest command sent by then minus measured{clock}");
         let mut metrics = vec![
             total.rms(
                 ("joint_error_rad_rms", "joint error, RMS", "rad"),
-                &newest,
+                "newest command sent by then minus measured",
                 missing,
             ),
             total.greatest(
                 ("joint_error_rad_max", "joint error, largest", "rad"),
-                &newest,
+                "newest command sent by then minus measured",
                 missing,
             ),
             figure(
@@ -117,7 +115,7 @@ impl JointError {
                 ),
                 ratio,
                 format!(
-                    "RMS error over RMS of the command about its mean; {} messages of feedback{clock}",
+                    "RMS error over RMS of the command about its mean; {} messages of feedback",
                     total.count
                 ),
                 if total.count > 0.0 {
@@ -128,14 +126,15 @@ impl JointError {
             ),
         ];
         metrics.extend(self.split(self.unsplit.unwrap_or(missing)));
+        for metric in metrics.iter_mut().filter(|metric| metric.value.is_some()) {
+            metric.method.push_str(&self.clock);
+        }
         metrics
     }
 
     /// Both parts; without them, for the reason `missing`.
     fn split(&self, missing: &str) -> [Metric; 4] {
         let (controller, network) = (&self.controller, &self.network);
-        let [of_controller, of_network] =
-            [CONTROLLER_PART, NETWORK_PART].map(|part| [part, &self.clock].concat());
         [
             controller.rms(
                 (
@@ -143,7 +142,7 @@ impl JointError {
                     "joint error of the servo alone, without the network, RMS",
                     "rad",
                 ),
-                &of_controller,
+                CONTROLLER_PART,
                 missing,
             ),
             controller.greatest(
@@ -152,7 +151,7 @@ impl JointError {
                     "joint error of the servo alone, without the network, largest",
                     "rad",
                 ),
-                &of_controller,
+                CONTROLLER_PART,
                 missing,
             ),
             network.rms(
@@ -161,7 +160,7 @@ impl JointError {
                     "joint error the network adds, RMS",
                     "rad",
                 ),
-                &of_network,
+                NETWORK_PART,
                 missing,
             ),
             network.greatest(
@@ -170,7 +169,7 @@ impl JointError {
                     "joint error the network adds, largest",
                     "rad",
                 ),
-                &of_network,
+                NETWORK_PART,
                 missing,
             ),
         ]

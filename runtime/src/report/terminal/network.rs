@@ -333,10 +333,10 @@ fn order_words(figures: &NetworkFigures) -> String {
 }
 
 fn rate_words(figures: &NetworkFigures) -> String {
-    let rate = |per_s: Option<f64>, what: &str| {
+    let rate = |per_s: Option<f64>, unit: &str, what: &str| {
         per_s.map_or_else(
-            || format!("{what} unavailable: fewer than two"),
-            |per_s| format!("{} messages/s {what}", figure(per_s)),
+            || format!("{what} unavailable: fewer than two messages"),
+            |per_s| format!("{}{unit} {what}", figure(per_s)),
         )
     };
     let bytes = figures.arrived_bytes_per_s.map_or_else(
@@ -345,8 +345,8 @@ fn rate_words(figures: &NetworkFigures) -> String {
     );
     format!(
         "{}, {}, {bytes}",
-        rate(figures.offered_per_s, "handed over"),
-        rate(figures.arrived_per_s, "received")
+        rate(figures.offered_per_s, " messages/s", "handed over"),
+        rate(figures.arrived_per_s, "", "received")
     )
 }
 
