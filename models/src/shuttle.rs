@@ -89,6 +89,7 @@ impl CaseStudy for Shuttle {
         ChannelSpec::of::<ShuttleCommand>("shuttle/command", "controller", "robot"),
         ChannelSpec::of::<ShuttleStatus>("shuttle/status", "robot", "controller"),
     ];
+    const SCORE_CLOCK: Option<&'static str> = Some("shuttle/status");
     type Parameters = ShuttleParameters;
 
     fn new(parameters: Self::Parameters, _seed: u64) -> Result<Self, ParameterError> {

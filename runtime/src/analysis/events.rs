@@ -10,6 +10,7 @@ use hil_models::time::{Instant, RemoteInstant};
 use super::clocks::HostClocks;
 use super::outages::OutageStory;
 use super::records::RunRecords;
+use crate::report::network::within;
 use crate::report::score_event::{EventOutage, ExplainedEvent, ExplainedMessage, ScoreEvents};
 use crate::report::summary::{ChannelSummary, LinkKind};
 use crate::report::terminal::duration_s;
@@ -68,11 +69,16 @@ pub(super) fn start_of(
     start_on(result, &topology.process(&channel.from)?.host, clocks)
 }
 
-/// Start of the run on the clock of `host`; see [`start_of`].
+/// Start of the run on the clock of `host`; see [`start_of`]. Where the clocks are not aligned each host
+/// counts from its own, and the report says so; where they are, a start that does not convert is unknown.
 pub(super) fn start_on(result: &RunResult, host: &str, clocks: &HostClocks) -> Option<Instant> {
     let own = result.spans.get(host).map(|span| span.0)?;
     let starts = result.spans.iter().map(|(host, span)| (host, span.0));
-    clocks.earliest_on(host, starts).or(Some(own))
+    if clocks.are_aligned(result.spans.keys()) {
+        clocks.earliest_on(host, starts)
+    } else {
+        Some(own)
+    }
 }
 
 fn explain(
@@ -120,23 +126,25 @@ fn outages_before(
         let is_consumers = channel.to.as_deref().is_some_and(is_here);
         let on_producers_clock = host_of(&channel.from).and_then(|producers| {
             let remote = RemoteInstant::from_ns(event.at.as_ns());
-            let (at, _) = clocks.path(here, producers).localise(remote)?;
-            Some((at, Side::Producer))
+            let (at, bound_ns) = clocks.path(here, producers).localise(remote)?;
+            Some((at, Side::Producer, bound_ns))
         });
         let lost_published_ns = ways
             .get(spec.name)
             .map_or_else(Vec::new, |way| way.lost_published_ns(event));
         // A time compares only with times of its own clock.
         let sides = [
-            is_consumers.then_some((event.at, Side::Consumer)),
+            is_consumers.then_some((event.at, Side::Consumer, 0)),
             on_producers_clock,
         ];
         let mut sides = sides.into_iter().flatten().map(Some).chain([None]);
-        sides.find_map(|at| {
-            story.before(&Happening {
-                at,
+        sides.find_map(|side| {
+            let mut found = story.before(&Happening {
+                at: side.map(|(at, side, _)| (at, side)),
                 lost_published_ns: &lost_published_ns,
-            })
+            })?;
+            found.put_clock_bound(side.map_or(0, |(.., bound_ns)| bound_ns));
+            Some(found)
         })
     };
     let concerned = event.concerned_channels(specs);
@@ -153,6 +161,7 @@ fn unavailable(message: &MessageRef, why: &str) -> ExplainedMessage {
         published_at_s: None,
         fate: None,
         delay_s: None,
+        delay_bound_s: None,
         words: format!("unavailable: {why}"),
     }
 }
@@ -180,6 +189,7 @@ impl Way<'_> {
                 .map(|(published, start)| published.seconds_since(start)),
             fate: Some(story.fate),
             delay_s: story.delay_ns.map(|ns| ns as f64 * 1e-9),
+            delay_bound_s: story.delay_bound_ns.map(|ns| ns as f64 * 1e-9),
             words: self.words(story),
             ..unavailable(message, "")
         }
@@ -201,12 +211,8 @@ impl Way<'_> {
             MessageFate::Taken => {
                 let how = match story.delay_ns {
                     Some(ns) => {
-                        let bound = match story.delay_bound_ns {
-                            Some(bound_ns) if bound_ns > 0 => {
-                                [" ±", &duration_s(bound_ns as f64 * 1e-9)].concat()
-                            }
-                            _ => String::new(),
-                        };
+                        let bound_ns = story.delay_bound_ns.unwrap_or(0);
+                        let bound = within(bound_ns, ns);
                         format!("delivered after {}{bound}", duration_s(ns as f64 * 1e-9))
                     }
                     None => "delivered; delay unavailable: clocks not aligned".to_owned(),

@@ -11,6 +11,8 @@ pub(crate) mod network;
 pub(crate) mod outages;
 mod radio;
 pub(crate) mod records;
+mod robot_series;
+mod score_clock;
 
 use std::fs;
 use std::io;
@@ -58,11 +60,10 @@ pub(crate) fn conclude(
     (topology_file, command_line): (&Path, &[String]),
 ) -> Result<RunSummary, AnalysisError> {
     let mut records = RunRecords::read(&result.folder.records())?;
-    if !result.has_one_clock {
-        records.set_clocks_differ();
-    }
     let clocks = HostClocks::of(topology, result, &records);
     records.set_clocks(clocks);
+    let case = registry.make_case(topology)?;
+    let unscored = score_clock::apply(&mut records, (topology, result), case.as_ref());
     let mut summary = RunSummary::new(run_facts(topology, result, topology_file, command_line));
     summary.host_facts = result
         .facts
@@ -89,7 +90,6 @@ pub(crate) fn conclude(
     summary.faces = faces::face_summaries(topology, result, &records);
     summary.hardware_stamps = cards::hardware_stamps(topology, result, &records);
     let outages = add_outages(&mut summary, (topology, result), &records);
-    let case = registry.make_case(topology)?;
     let (specs, score) = match &case {
         Some((entry, case)) => (entry.channels, case.score(records.log())),
         None => (&[][..], Score::default()),
@@ -113,6 +113,7 @@ pub(crate) fn conclude(
     summary.network = network;
     radio::add(&mut summary, (topology, result), &records);
     add_warnings(&mut summary, result, &records);
+    summary.warnings.extend(unscored);
     let case = case.as_ref().map(|(_, case)| case.as_ref());
     let network_series = network_series.unwrap_or_default();
     write_series(&mut summary, result, (case, network_series), records);

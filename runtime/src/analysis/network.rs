@@ -4,7 +4,7 @@
 
 use std::collections::BTreeSet;
 
-use hil_models::case_study::{ErrorSeries, Severity};
+use hil_models::case_study::ErrorSeries;
 use hil_models::measure::account::{Side, passages};
 use hil_models::measure::correlation::{self, LagWindow};
 use hil_models::measure::network::{
@@ -14,10 +14,11 @@ use hil_models::measure::network::{
 use hil_models::measure::record::IngressRecord;
 use hil_models::plot::PlotSeries;
 use hil_models::random::RandomStream;
-use hil_models::time::Instant;
 
 use super::events::{start_of, start_on};
 use super::records::RunRecords;
+pub(crate) use super::robot_series::RobotSeries;
+use super::robot_series::{index_of, without_holes};
 use crate::report::network::{
     ChannelNetwork, Correlation, CorrelationTests, FOREGOING_S, ForegoingEvent, ForegoingNetwork,
     NetworkReport, TestedPair, TimedEvent, Timeline, TimelineRow,
@@ -48,84 +49,13 @@ pub(crate) struct ChannelPassages<'a> {
     pub(crate) context: NetworkContext<'a>,
 }
 
-/// What the robot did, on the run's axis.
-#[derive(Debug)]
-pub(crate) struct RobotSeries {
-    label: String,
-    unit: &'static str,
-    /// Seconds after the start of the run, and magnitude; in order of time.
-    samples: Vec<(f64, f64)>,
-}
-
-impl RobotSeries {
-    /// A case's error; `start` is that of the run on the clock of its samples.
-    pub(crate) fn of(errors: ErrorSeries, start: Instant) -> Self {
-        let samples = errors.samples.into_iter();
-        Self {
-            label: errors.label.to_owned(),
-            unit: errors.unit,
-            samples: samples
-                .map(|(at, value)| (at.seconds_since(start), value))
-                .collect(),
-        }
-    }
-
-    /// The events of a score that matter: one for each.
-    fn of_events(all: &ScoreEvents) -> Self {
-        let is_grave = |severity| severity > Severity::Notice;
-        let has_grave = all.events.iter().any(|event| is_grave(event.severity));
-        let chosen = all
-            .events
-            .iter()
-            .filter(|event| !has_grave || is_grave(event.severity));
-        let mut samples: Vec<_> = chosen
-            .filter_map(|event| Some((event.at_s?, 1.0)))
-            .collect();
-        samples.sort_by(|a, b| a.0.total_cmp(&b.0));
-        let label = if has_grave {
-            "incidents and hazards"
-        } else {
-            "events of the score"
-        };
-        Self {
-            label: label.to_owned(),
-            unit: "1",
-            samples,
-        }
-    }
-
-    /// Per bin: how many, or the largest, which holds until there is another.
-    fn binned(&self, width_s: f64, count: usize, is_count: bool) -> Vec<f64> {
-        let mut bins = vec![None; count];
-        for (at_s, value) in &self.samples {
-            let Some(bin) = index_of(at_s / width_s).and_then(|index| bins.get_mut(index)) else {
-                continue;
-            };
-            let known: f64 = bin.unwrap_or(0.0);
-            *bin = Some(if is_count {
-                known + value
-            } else {
-                known.max(*value)
-            });
-        }
-        let mut held = 0.0;
-        let held_or = |bin: Option<f64>| {
-            held = bin.unwrap_or(if is_count { 0.0 } else { held });
-            held
-        };
-        bins.into_iter().map(held_or).collect()
-    }
-}
-
-#[allow(
-    clippy::cast_possible_truncation,
-    clippy::cast_sign_loss,
-    reason = "the value is checked to lie in 0..2^32"
-)]
-fn index_of(bin: f64) -> Option<usize> {
-    (0.0..4_294_967_296.0)
-        .contains(&bin)
-        .then_some(bin as usize)
+/// How the hosts' clocks stand to each other on the run's axis.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct AxisClocks {
+    /// True when they are not aligned.
+    pub(crate) differ: bool,
+    /// How far instants of two aligned hosts may lie off each other, seconds.
+    pub(crate) bound_s: f64,
 }
 
 /// A network under way of being put together, channel by channel, so that the passages of only
@@ -186,13 +116,13 @@ impl NetworkBuilder {
         mut self,
         score: &mut ScoreEvents,
         errors: Vec<RobotSeries>,
-        (seed, clocks_differ): (u64, bool),
+        (seed, axis): (u64, AxisClocks),
     ) -> Option<(NetworkReport, Vec<PlotSeries>)> {
         let (_, first) = self.bins.first()?;
         let (width_s, count) = (first.width_ns as f64 * 1e-9, first.bins.len());
         self.events.sort_by(|a, b| a.from_s.total_cmp(&b.from_s));
         for event in &mut score.events {
-            event.network = event.at_s.map(|at_s| self.before(at_s));
+            event.network = event.at_s.map(|at_s| self.before(at_s, axis.bound_s));
         }
         let mut robot = vec![(RobotSeries::of_events(score), true)];
         robot.extend(errors.into_iter().map(|one| (one, false)));
@@ -207,8 +137,9 @@ impl NetworkBuilder {
         let dropped = self.events.len().saturating_sub(EVENTS_MAX);
         let report = NetworkReport {
             foregoing_s: FOREGOING_S,
-            foregoing_chance_ratio: covered_s(&self.events, run_s) / run_s,
-            clocks_differ,
+            foregoing_chance_ratio: covered_s(&self.events, (run_s, axis.bound_s)) / run_s,
+            clocks_differ: axis.differ,
+            clock_bound_s: axis.bound_s,
             timeline: timeline(&self.bins, &robot, width_s),
             correlation: correlate(&self.bins, &robot, (width_s, seed)),
             events: self.events.into_iter().take(EVENTS_MAX).collect(),
@@ -228,18 +159,19 @@ impl NetworkBuilder {
     }
 
     /// What the network went through before `at_s`, nearest first.
-    fn before(&self, at_s: f64) -> ForegoingNetwork {
+    fn before(&self, at_s: f64, clock_bound_s: f64) -> ForegoingNetwork {
         let mut found: Vec<(f64, &TimedEvent)> = self
             .events
             .iter()
-            .filter_map(|event| Some((event.over_for_s(at_s)?, event)))
+            .filter_map(|event| Some((event.over_for_s(at_s, clock_bound_s)?, event)))
             .collect();
         // Of those under way the one that began first weighs most.
         found.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.from_s.total_cmp(&b.1.from_s)));
         let lost = |bins: &NetworkBins| {
             let width_s = bins.width_ns as f64 * 1e-9;
-            let first = index_of((at_s - FOREGOING_S).max(0.0) / width_s).unwrap_or(0);
-            let last = index_of(at_s / width_s).map_or(0, |last| last + 1);
+            let from_s = at_s - FOREGOING_S - clock_bound_s;
+            let first = index_of(from_s.max(0.0) / width_s).unwrap_or(0);
+            let last = index_of((at_s + clock_bound_s) / width_s).map_or(0, |last| last + 1);
             let within = bins.bins.iter().take(last).skip(first);
             within.map(|bin| bin.lost_count).sum::<u64>()
         };
@@ -257,11 +189,12 @@ impl NetworkBuilder {
 }
 
 /// How much of the run has an event in the time looked at before it.
-fn covered_s(events: &[TimedEvent], run_s: f64) -> f64 {
+fn covered_s(events: &[TimedEvent], (run_s, clock_bound_s): (f64, f64)) -> f64 {
     let (mut covered_s, mut until_s) = (0.0, 0.0_f64);
     for event in events {
-        let from_s = event.from_s.clamp(until_s, run_s);
-        let end_s = event.until_s.map_or(run_s, |end_s| end_s + FOREGOING_S);
+        let from_s = (event.from_s - clock_bound_s).clamp(until_s, run_s);
+        let after_s = FOREGOING_S + clock_bound_s;
+        let end_s = event.until_s.map_or(run_s, |end_s| end_s + after_s);
         let end_s = end_s.clamp(from_s, run_s);
         covered_s += end_s - from_s;
         until_s = until_s.max(end_s);
@@ -286,6 +219,12 @@ fn trouble(bin: &NetworkBin, index: usize) -> Option<f64> {
     }
 }
 
+/// Largest error of any delay in the bins; `None` without delays.
+fn delay_bound_s(bins: &NetworkBins) -> Option<f64> {
+    let bounds = bins.bins.iter().filter_map(|bin| bin.delay_bound_ns);
+    bounds.max().map(|ns| ns as f64 * 1e-9)
+}
+
 /// True for a channel with less than a message per bin: its silence is nobody's trouble, as nobody
 /// speaks.
 fn speaks_seldom(bins: &NetworkBins) -> bool {
@@ -304,6 +243,7 @@ fn timeline(all: &[(String, NetworkBins)], robot: &RobotBins, width_s: f64) -> T
         what: what.to_owned(),
         unit: unit.to_owned(),
         values: values.chunks(per_step).map(largest).collect(),
+        bound: None,
     };
     let mut rows = Vec::new();
     for (channel, bins) in all {
@@ -312,12 +252,16 @@ fn timeline(all: &[(String, NetworkBins)], robot: &RobotBins, width_s: f64) -> T
                 continue;
             }
             let values = bins.bins.iter().map(|bin| trouble(bin, index));
-            rows.push(row(channel, what, unit, values.collect()));
+            let bound = (*what == "delay").then(|| delay_bound_s(bins)).flatten();
+            rows.push(TimelineRow {
+                bound,
+                ..row(channel, what, unit, values.collect())
+            });
         }
     }
     for (one, bins) in robot {
         let values = bins.iter().map(|value| Some(*value)).collect();
-        rows.push(row("robot", &one.label, one.unit, values));
+        rows.push(row("robot", one.label(), one.unit(), values));
     }
     Timeline {
         step_s: per_step as f64 * width_s,
@@ -337,13 +281,8 @@ fn correlate(
             if *what == "silence" && speaks_seldom(bins) {
                 continue;
             }
-            let mut held = 0.0;
-            let values = bins.bins.iter().map(|bin| {
-                // What is unknown where nothing arrived goes on as it was.
-                held = trouble(bin, index).unwrap_or(held);
-                held
-            });
-            causes.push(values.collect());
+            let values = bins.bins.iter().map(|bin| trouble(bin, index));
+            causes.push(without_holes(values.collect()));
             names.push((channel, *network));
         }
     }
@@ -368,7 +307,7 @@ fn correlate(
             pairs.extend(pair.map(|correlation| TestedPair {
                 channel: (*channel).clone(),
                 network: (*network).to_owned(),
-                robot: one.label.clone(),
+                robot: one.label().to_owned(),
                 lag_s: correlation.lag_bins as f64 * width_s,
                 correlation,
             }));
@@ -386,7 +325,7 @@ fn correlate(
     let constant_effects = robot
         .iter()
         .filter(|(_, values)| is_constant(values))
-        .map(|(one, _)| one.label.clone());
+        .map(|(one, _)| one.label().to_owned());
     Correlation::Tested(CorrelationTests {
         bin_s: width_s,
         lead_max_s: tested.window.lead_max as f64 * width_s,
@@ -421,8 +360,11 @@ pub(super) fn of_run(
         Some(RobotSeries::of(one, start))
     });
     let seed = topology.run().seed;
-    let clocks_differ = !records.clocks().are_aligned(result.spans.keys());
-    builder.finish(score, errors.collect(), (seed, clocks_differ))
+    let axis = AxisClocks {
+        differ: !records.clocks().are_aligned(result.spans.keys()),
+        bound_s: records.clocks().largest_bound_ns() as f64 * 1e-9,
+    };
+    builder.finish(score, errors.collect(), (seed, axis))
 }
 
 fn add_channel(
@@ -466,6 +408,7 @@ fn add_channel(
             other_events,
             span,
             context: NetworkContext {
+                path: context.path,
                 run_ns: Some((span.producer_start_ns, producer_end.as_ns())),
                 payload_bytes,
                 duplicated_count: files

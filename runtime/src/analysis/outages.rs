@@ -69,6 +69,7 @@ impl OutageStory {
             length_s: outage.length_ns(self.end).map(|ns| ns as f64 * 1e-9),
             lost_count: outage.lost_count,
             standing: found.standing,
+            clock_bound_s: 0.0,
             other_count: found.other_count,
             words: String::new(),
         };

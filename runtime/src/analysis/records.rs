@@ -122,9 +122,9 @@ impl RunRecords {
         (egress.unwrap_or_default(), ingress.unwrap_or_default())
     }
 
-    /// See [`RunLog::set_clocks_differ`].
-    pub(super) fn set_clocks_differ(&mut self) {
-        self.log.set_clocks_differ();
+    /// Every message of the run, to bring them to one clock.
+    pub(super) const fn log_mut(&mut self) -> &mut RunLog {
+        &mut self.log
     }
 
     /// Relates the hosts' clocks; until then none are aligned.
@@ -234,8 +234,9 @@ impl RunRecords {
         run: (&Topology, &RunResult),
         channel: &Channel,
     ) -> (Option<TransmitStampFigures>, Option<RadioFigures>) {
-        self.consult(run, channel, |records, _| {
-            (records.egress.map(transmit_stamps), radio_figures(records))
+        self.consult(run, channel, |records, context| {
+            let stamps = records.egress.map(transmit_stamps);
+            (stamps, radio_figures(records, context))
         })
     }
 

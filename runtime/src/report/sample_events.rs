@@ -19,6 +19,7 @@ fn message(sequence: u64, fate: Option<MessageFate>, words: &str) -> ExplainedMe
         published_at_s: fate.map(|_| sequence as f64 * 0.004),
         fate,
         delay_s: None,
+        delay_bound_s: None,
         words: words.to_owned(),
     }
 }
@@ -57,6 +58,7 @@ pub(super) fn few_events() -> ScoreEvents {
         length_s: Some(0.8),
         lost_count: 20,
         standing: Standing::OverFor(521_000_000),
+        clock_bound_s: 0.0,
         other_count: 3,
         words: "outage of 800 ms on fleet/authority, 3.600 s to 4.400 s, 20 messages lost, over \
                 for 521 ms (3 others about then)"

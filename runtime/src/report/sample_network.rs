@@ -2,16 +2,16 @@
 //! are checked in.
 
 use hil_models::case_study::ErrorSeries;
-use hil_models::measure::account::Side;
+use hil_models::measure::account::{ChannelPath, Side};
 use hil_models::measure::network::{
     Crossing, Moment, NetworkContext, NetworkEvent, NetworkEventKind, Passage, SeriesSpan,
 };
 use hil_models::random::RandomStream;
-use hil_models::time::Instant;
+use hil_models::time::{Alignment, Instant};
 
 use super::network::{Correlation, NetworkReport};
 use super::score_event::ScoreEvents;
-use crate::analysis::network::{ChannelPassages, NetworkBuilder, RobotSeries};
+use crate::analysis::network::{AxisClocks, ChannelPassages, NetworkBuilder, RobotSeries};
 
 const MS: i64 = 1_000_000;
 const RUN_NS: i64 = 20_000 * MS;
@@ -101,6 +101,12 @@ pub(super) fn network(names: [&str; 2], events: &mut ScoreEvents) -> NetworkRepo
                 duration_ns: RUN_NS,
             },
             context: NetworkContext {
+                path: ChannelPath::Gateway {
+                    alignment: (index == 0).then_some(Alignment {
+                        offset_ns: 0,
+                        bound_ns: 40_000,
+                    }),
+                },
                 run_ns: Some((0, RUN_NS)),
                 payload_bytes: Some(96),
                 duplicated_count: Some(2),
@@ -109,10 +115,11 @@ pub(super) fn network(names: [&str; 2], events: &mut ScoreEvents) -> NetworkRepo
             },
         });
     }
-    let clocks_differ = events.clocks_differ;
-    let (report, series) = builder
-        .finish(events, vec![error()], (42, clocks_differ))
-        .unwrap();
+    let axis = AxisClocks {
+        differ: events.clocks_differ,
+        bound_s: 0.0,
+    };
+    let (report, series) = builder.finish(events, vec![error()], (42, axis)).unwrap();
     assert_eq!(series.len(), 2);
     report
 }

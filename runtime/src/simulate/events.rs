@@ -100,6 +100,7 @@ fn explain(message: &MessageRef, stories: &[OutageStory], log: &RunLog) -> Expla
         published_at_s: published_ns.map(|ns| ns as f64 * 1e-9),
         fate: is_lost.unwrap_or(false).then_some(MessageFate::LostOnWire),
         delay_s: None,
+        delay_bound_s: None,
         words: words.to_owned(),
     }
 }

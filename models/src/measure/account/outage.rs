@@ -6,11 +6,10 @@ use core::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use super::fate::Judge;
-use super::join::{Join, Joined, stamp};
+use super::join::{Joined, stamp};
 use super::stage::{MessageFate, Side};
 use super::story::published_ns;
-use super::{AccountContext, ChannelRecords};
+use super::{AccountContext, ChannelRecords, each_judged};
 use crate::time::{Instant, duration_ns};
 
 /// How long after its end an outage may still show in what a robot does: a session that it ended
@@ -162,14 +161,10 @@ impl OutageFinder {
 /// Every outage of a channel, in the order of its messages. Time and memory grow with the number
 /// of records.
 pub fn outages(records: &ChannelRecords<'_>, context: &AccountContext<'_>) -> Vec<Outage> {
-    let records = records.on(context.path);
-    let join = Join::new(&records);
-    let mut judge = Judge::new(&records, context, &join);
     let mut finder = OutageFinder::default();
-    for joined in join {
-        let fate = judge.judge(&joined);
-        finder.see(&joined, fate, judge.last_interruption());
-    }
+    each_judged(records, context, |joined, fate, interruption| {
+        finder.see(joined, fate, interruption);
+    });
     finder.finish()
 }
 

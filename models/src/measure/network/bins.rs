@@ -51,6 +51,8 @@ pub struct NetworkBin {
     pub delay_p50_ns: Option<i64>,
     /// Largest delay.
     pub delay_max_ns: Option<i64>,
+    /// Largest error of any of these delays from the alignment of the clocks; 0 on one clock.
+    pub delay_bound_ns: Option<u64>,
     /// The longest time since the last reception that was reached in this stretch; `None` before
     /// the first reception.
     pub silence_max_ns: Option<i64>,
@@ -93,6 +95,8 @@ impl NetworkBins {
                 Crossing::Unknown => {}
             }
             delays_ns[index].extend(one.delay_ns);
+            let bound_ns = one.delay_ns.map(|_| one.delay_bound_ns);
+            bin.delay_bound_ns = bin.delay_bound_ns.max(bound_ns);
         }
         for (bin, delays_ns) in bins.iter_mut().zip(&mut delays_ns) {
             delays_ns.sort_unstable();
@@ -132,6 +136,11 @@ impl NetworkBins {
                 ),
                 column("delay_s_max", "largest delay", "s"),
                 column(
+                    "delay_s_bound",
+                    "largest error of these delays by the clocks' alignment, 0 on one clock",
+                    "s",
+                ),
+                column(
                     "silence_s_max",
                     "longest time since the last reception that was reached in the bin",
                     "s",
@@ -146,6 +155,7 @@ impl NetworkBins {
                         bin.host_lost_count as f64,
                         seconds(bin.delay_p50_ns),
                         seconds(bin.delay_max_ns),
+                        bin.delay_bound_ns.map_or(f64::NAN, |ns| ns as f64 * 1e-9),
                         seconds(bin.silence_max_ns),
                     ]
                 })

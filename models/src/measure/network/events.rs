@@ -19,6 +19,9 @@ pub const EVENT_OUTAGE_MIN_NS: i64 = 100_000_000;
 const STEP_MIN_NS: u64 = 1_000_000;
 const SLEW_MAX_RATIO: f64 = 500e-6;
 
+/// A gateway reads the two clocks as a pair this often, and notes what it read last.
+const READING_PERIOD_NS: i64 = 100_000_000;
+
 /// What happened.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case")]
@@ -45,6 +48,9 @@ pub enum NetworkEventKind {
         delay_max_ns: i64,
         /// What they exceeded.
         limit_ns: i64,
+        /// Largest error of the delays among them, and of those that the limit is made of, from the
+        /// alignment of the clocks; 0 on one clock.
+        bound_ns: u64,
     },
     /// Messages came after later ones.
     Reordering {
@@ -161,6 +167,8 @@ fn late(passages: &[Passage]) -> Vec<NetworkEvent> {
     let Some(limit_ns) = delay_limit_ns(passages) else {
         return Vec::new();
     };
+    let with_delay = passages.iter().filter(|one| one.delay_ns.is_some());
+    let bound_ns = with_delay.map(|one| one.delay_bound_ns).max().unwrap_or(0);
     let mut found: Vec<NetworkEvent> = Vec::new();
     let mut since_last = u64::MAX;
     for one in passages {
@@ -195,6 +203,7 @@ fn late(passages: &[Passage]) -> Vec<NetworkEvent> {
                 late_count: 1,
                 delay_max_ns: delay_ns,
                 limit_ns,
+                bound_ns,
             },
             from: producer(offered_ns),
             until_ns: Some(received_ns),
@@ -278,13 +287,16 @@ fn steps(readings: &mut Vec<(i64, i64)>, side: Side) -> Vec<NetworkEvent> {
         let [before, after] = [pair[0], pair[1]];
         let step_ns = after.1.saturating_sub(before.1);
         let passed_ns = after.0.saturating_sub(before.0) as f64;
-        // Readings are refreshed every 100 ms: a step shows up to that much later.
-        let slewed_ns = SLEW_MAX_RATIO * (passed_ns + 1e8);
+        // A step shows up to a period after it happened.
+        let slewed_ns = SLEW_MAX_RATIO * (passed_ns + READING_PERIOD_NS as f64);
         let is_step = step_ns.unsigned_abs() > STEP_MIN_NS
             && step_ns.unsigned_abs() as f64 > slewed_ns + STEP_MIN_NS as f64;
         is_step.then_some(NetworkEvent {
             kind: NetworkEventKind::ClockStep { step_ns },
-            from: Moment { side, ns: before.0 },
+            from: Moment {
+                side,
+                ns: before.0.saturating_sub(READING_PERIOD_NS),
+            },
             until_ns: Some(after.0),
         })
     };
