@@ -3,6 +3,7 @@
 
 mod face;
 mod faulty;
+mod fitted;
 mod fleet;
 mod hosts;
 mod layers;
