@@ -38,8 +38,9 @@ const SHARPNESS_RATIO: f64 = 0.02;
 const SHARPNESS_FACTOR: f64 = 4.0;
 /// The same while the grid is known by its middle phase only.
 const EARLY_OF_MIDDLE_RATIO: f64 = 0.25;
-/// How far back a message that left in a later period is looked for a tick without one.
-const LATE_TICKS_MAX: usize = 8;
+/// How far back a message that left in a later period is looked for a tick without one: as many as a
+/// producer that was held up may find waiting and publish at once.
+const LATE_TICKS_MAX: usize = 256;
 /// Most ticks from the first record to the last: at 1 kHz seven weeks, and whole numbers to spare in
 /// every sum.
 const TICKS_MAX: i64 = 1 << 32;

@@ -183,9 +183,15 @@ fn of_two_in_one_period_the_earlier_takes_the_last_tick_without_a_record() {
     assert_eq!(sorted(vec![0, 4, 4, 4, 5]), [0, 2, 3, 4, 5]);
     // The first was late itself.
     assert_eq!(sorted(vec![0, 0, 1]), [-1, 0, 1]);
+    // Eleven that a producer found waiting when it was let go.
+    let mut burst = vec![0, 1];
+    burst.extend([13; 11]);
+    burst.extend([14, 15]);
+    let in_turn: Vec<i64> = [0, 1].into_iter().chain(3..16).collect();
+    assert_eq!(sorted(burst), in_turn);
     // None is near: they share it, and nothing else moves.
-    let mut long: Vec<i64> = (0..20).collect();
-    long.push(19);
+    let mut long: Vec<i64> = (0..400).collect();
+    long.push(399);
     assert_eq!(sorted(long.clone()), long);
 }
 
