@@ -30,6 +30,10 @@ const TELEOPERATION_CHANNELS: [(&str, u64); 4] = [
 ];
 /// A few messages per run, as many as the arms ask for.
 const RARE_CHANNELS: [&str; 2] = ["motion/request", "motion/response"];
+/// What the servo makes of the commands over a perfect channel: by definition no link has a share in
+/// it. It depends on where in its cycle the robot was when the human began, which live is chance and
+/// in virtual time is not, and over a minute its interval is narrow enough to tell.
+const NOT_OF_THE_LINK: &str = "joint_error_controller_rad_rms";
 /// A link with bursts and outages.
 const BURSTS: &str = r#"delay = "5 ms"
 outages = { mean = "300 ms", per_hour = 600 }
@@ -195,6 +199,9 @@ fn check_scores(summary: &RunSummary, virtual_time: &Value) -> (usize, f64) {
         let (Some(of_live), Some(of_virtual)) = (*interval, other_interval) else {
             continue;
         };
+        if name == NOT_OF_THE_LINK {
+            continue;
+        }
         compared_count += 1;
         let is_inside = |x: f64, (low, high): (f64, f64)| (low..=high).contains(&x);
         let agree = is_inside(live, of_virtual) || is_inside(virtually, of_live);
@@ -274,7 +281,8 @@ fn a_live_teleoperation_run_and_its_replay_agree() {
     }
     let by_tick = replayed(&trial, &files, "tick", duration);
     let (compared_count, _) = check_scores(&files.summary(), &by_tick);
-    assert!(compared_count > 0);
+    // Of a quarter of a minute only the lost loops have an interval.
+    assert!(compared_count >= if duration < 60 { 1 } else { 5 });
 }
 
 /// A trace of 300 messages, a third of them lost.
