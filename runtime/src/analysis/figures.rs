@@ -170,6 +170,11 @@ pub(super) fn channel_summary(
 ) -> ChannelSummary {
     let crossing = topology.crossing(channel);
     let directions = directions(result, &channel.name);
+    let reports = result.processes.iter().flat_map(|one| &one.report);
+    let trace_replay = reports
+        .flat_map(|report| &report.directions)
+        .filter(|direction| direction.channel == channel.name)
+        .find_map(|direction| direction.replay);
     let refusals = directions
         .iter()
         .flat_map(|direction| &direction.counters)
@@ -202,6 +207,7 @@ pub(super) fn channel_summary(
             .then(|| records.account(topology, result, channel)),
         outages: None,
         emulation: EmulationFigures::of(records.arrivals(&channel.name), overflow_count),
+        trace_replay,
         recorded: channel
             .is_recorded_only()
             .then(|| records.recorded(&channel.name))

@@ -314,7 +314,10 @@ impl RunRecords {
         // A link that delays on purpose keeps messages under way for that much longer.
         let delay = crossing
             .and_then(|crossing| EmulationLaunch::of(&crossing, topology.run().seed))
-            .map(|emulation| emulation.flight_time(FLIGHT_QUANTILE));
+            .map(|emulation| {
+                let delay = emulation.flight_time(FLIGHT_QUANTILE);
+                delay.expect("a run begins when its traces were read, and what was read is noted")
+            });
         let round_trips = files.round_trips.values();
         let round_trips_ns: Vec<i64> = round_trips.map(RoundTripRecord::rtt_ns).collect();
         let context = AccountContext {

@@ -9,6 +9,7 @@ use std::time::Duration;
 use hil_gateways::protocol::{EgressBridge, EgressSettings, IngressBridge, IngressSettings};
 use hil_gateways::transport::tcp::ConnectionTally;
 use hil_gateways::transport::{DatagramReceiver, DatagramSender};
+use hil_models::link::trace::ReplayTally;
 use hil_models::measure::record::{EgressRecord, FollowUpRecord, IngressRecord, RoundTripRecord};
 
 use super::egress::{Attention, Egress};
@@ -51,6 +52,7 @@ pub struct Opened {
 pub struct Direction {
     way: Way,
     facts: Vec<(String, String)>,
+    replay: Option<ReplayTally>,
 }
 
 #[derive(Debug)]
@@ -144,7 +146,12 @@ impl Opened {
         launch: &DirectionLaunch,
         surroundings: &Surroundings,
     ) -> Result<Direction, GatewayError> {
-        let OpenSocket { ends, facts, .. } = self.socket;
+        let OpenSocket {
+            ends,
+            facts,
+            replay,
+            ..
+        } = self.socket;
         let way = match ends {
             Ends::Sender(sender, datagram_bytes_max) => Way::Egress(Box::new(egress(
                 (sender, datagram_bytes_max),
@@ -159,7 +166,7 @@ impl Opened {
                 (launch, surroundings),
             )?)),
         };
-        Ok(Direction { way, facts })
+        Ok(Direction { way, facts, replay })
     }
 }
 
@@ -306,6 +313,7 @@ impl Direction {
             peer_state,
             counters,
             facts,
+            replay: self.replay.as_ref().map(ReplayTally::counts),
         }
     }
 }

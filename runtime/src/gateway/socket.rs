@@ -15,6 +15,7 @@ use hil_gateways::transport::tcp::{
 use hil_gateways::transport::timestamping::TimestampMode;
 use hil_gateways::transport::udp::{GrantedOptions, PathMtu, UdpReceiver, UdpSender, UdpSettings};
 use hil_gateways::transport::{DatagramReceiver, DatagramSender};
+use hil_models::link::trace::ReplayTally;
 use hil_models::link::{Fate, LinkModel, LossCauses};
 use hil_models::time::Instant;
 
@@ -40,6 +41,8 @@ pub(super) struct OpenSocket {
     pub(super) facts: Vec<(String, String)>,
     /// How often its connections come and go, where this end tells of it.
     pub(super) tally: Option<Arc<ConnectionTally>>,
+    /// What its link model met of the trace that it replays, where it replays one.
+    pub(super) replay: Option<ReplayTally>,
 }
 
 /// Which end of the hop it is.
@@ -69,7 +72,7 @@ impl OpenSocket {
         (launch, plan): (&DirectionLaunch, StampPlan),
         start: &RunStart,
     ) -> Result<Self, GatewayError> {
-        let (ends, mut facts) = match launch.side {
+        let (ends, mut facts, replay) = match launch.side {
             Side::Egress => {
                 let sender = UdpSender::open(settings)?;
                 let mut facts = socket_facts(settings, sender.granted());
@@ -81,12 +84,13 @@ impl OpenSocket {
                 let text = format!("{} bytes, {configured} configured", mtu.packet_bytes);
                 facts.push(("path MTU".to_owned(), text));
                 let longest = datagram_bytes_max(launch, mtu);
-                (Ends::Sender(Box::new(sender), longest), facts)
+                (Ends::Sender(Box::new(sender), longest), facts, None)
             }
             Side::Ingress => {
                 let receiver = UdpReceiver::open(settings)?;
                 let facts = socket_facts(settings, receiver.granted());
-                (Ends::Receiver(emulate(receiver, launch, start)?), facts)
+                let (receiver, replay) = emulate(receiver, launch, start)?;
+                (Ends::Receiver(receiver), facts, replay)
             }
         };
         if let Some(emulation) = &launch.emulation {
@@ -103,6 +107,7 @@ impl OpenSocket {
             ends,
             facts,
             tally: None,
+            replay,
         })
     }
 
@@ -138,7 +143,12 @@ impl OpenSocket {
             USER_TIMEOUT.as_secs()
         );
         facts.push(("TCP".to_owned(), options));
-        Ok(Self { ends, facts, tally })
+        Ok(Self {
+            ends,
+            facts,
+            tally,
+            replay: None,
+        })
     }
 }
 
@@ -211,7 +221,7 @@ fn room(
     emulation: &EmulationLaunch,
     launch: &DirectionLaunch,
 ) -> Result<EmulationRoom, EmulationError> {
-    Ok(emulation.room(launch.size_bytes)?)
+    emulation.room(launch.size_bytes)
 }
 
 /// The longest datagram of the channel: as long as a message needs, with room for the greetings and
@@ -221,15 +231,18 @@ fn held_bytes_max(launch: &DirectionLaunch) -> usize {
     message.max(512).min(launch.socket.path_mtu_bytes)
 }
 
+/// A receiver, and what its link model met of the trace that it replays.
+type Emulated = (Box<dyn DatagramReceiver>, Option<ReplayTally>);
+
 /// Puts the receiver behind the launch's link model, if it has one. Greetings and clock exchanges
 /// pass freely: the model stands for what happens to the robot's messages.
 fn emulate(
     receiver: UdpReceiver,
     launch: &DirectionLaunch,
     start: &RunStart,
-) -> Result<Box<dyn DatagramReceiver>, GatewayError> {
+) -> Result<Emulated, GatewayError> {
     let Some(emulation) = &launch.emulation else {
-        return Ok(Box::new(receiver));
+        return Ok((Box::new(receiver), None));
     };
     let link = SinceStart {
         link: emulation.model(&launch.channel)?,
@@ -243,12 +256,9 @@ fn emulate(
     };
     let is_exempt =
         |bytes: &[u8]| wire::decode(bytes).is_ok_and(|datagram| datagram.header.kind != Kind::Data);
-    Ok(Box::new(EmulatedReceiver::new(
-        receiver,
-        Box::new(link),
-        is_exempt,
-        settings,
-    )))
+    let replay = link.replay_tally();
+    let receiver = EmulatedReceiver::new(receiver, Box::new(link), is_exempt, settings);
+    Ok((Box::new(receiver), replay))
 }
 
 /// Which message of its channel a datagram carries, or a part of.
@@ -287,6 +297,10 @@ impl<L: LinkModel> SinceStart<L> {
 impl<L: LinkModel> LinkModel for SinceStart<L> {
     fn loss_causes(&self) -> Option<LossCauses> {
         self.link.loss_causes()
+    }
+
+    fn replay_tally(&self) -> Option<ReplayTally> {
+        self.link.replay_tally()
     }
 
     fn offer(&mut self, now: Instant, length_bytes: usize) -> Fate {

@@ -9,6 +9,7 @@ pub mod face;
 mod face_warnings;
 pub mod network;
 pub mod radio;
+pub(crate) mod replay;
 pub mod score_event;
 pub mod summary;
 pub mod terminal;

@@ -117,6 +117,7 @@ pub(super) fn recorded_channel() -> ChannelSummary {
         account: None,
         outages: None,
         emulation: None,
+        trace_replay: None,
         recorded: Some(RecordedFigures {
             message_count: 12_345,
             missing_count: 0,

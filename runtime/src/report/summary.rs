@@ -9,6 +9,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use hil_models::case_study::{Metric, Score};
+use hil_models::link::trace::ReplayCounts;
 use hil_models::measure::account::{ChannelAccount, OutageFigures};
 use serde::{Deserialize, Serialize};
 
@@ -334,6 +335,10 @@ pub struct ChannelSummary {
     /// came through it.
     #[serde(default)]
     pub emulation: Option<EmulationFigures>,
+    /// What its emulated link met of the trace that it replays; `None` where it replays none, or
+    /// its gateway left no word.
+    #[serde(default)]
+    pub trace_replay: Option<ReplayCounts>,
     /// What was recorded of a channel that is only recorded; `None` when nothing was.
     #[serde(default)]
     pub recorded: Option<RecordedFigures>,

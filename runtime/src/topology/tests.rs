@@ -4,6 +4,7 @@
 mod clock_path;
 mod face;
 mod faulty;
+mod fitted;
 mod fleet;
 mod hosts;
 mod layers;

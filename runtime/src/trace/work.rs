@@ -233,7 +233,7 @@ fn converted(trace: &Trace, form: TraceForm) -> Result<(Vec<u8>, String), String
         TraceForm::Csv => Ok((csv::encode(trace).into_bytes(), String::new())),
         TraceForm::Mahimahi => {
             let text = opportunities::encode(trace);
-            let text = text.ok_or("no message has a known arrival, so there is no opportunity")?;
+            let text = text.map_err(|error| error.to_string())?;
             let remark = format!("; {}; {}", opportunities::ENCODE_LOSS, bound_words(trace));
             Ok((text.into_bytes(), remark))
         }

@@ -120,13 +120,19 @@ impl TraceFit {
     pub fn of(trace: &Trace, seed: u64) -> Self {
         let figures = TraceFigures::of(trace, seed);
         let losses = known_losses(trace);
-        let delays_s: Vec<f64> = trace
-            .delays_ns()
-            .iter()
-            .map(|ns| *ns as f64 * 1e-9)
-            .collect();
+        let measured = trace.delays_ns();
+        let delays_s = measured.iter().map(|ns| (*ns).max(0) as f64 * 1e-9);
+        let delays_s: Vec<f64> = delays_s.collect();
         let tested = delay::thinned(&delays_s);
         let mut remarks = Vec::new();
+        let negative_count = measured.iter().filter(|ns| **ns < 0).count();
+        if negative_count > 0 {
+            remarks.push(format!(
+                "{negative_count} of {} delays are below zero, as two clocks within their bound allow; \
+                 the delay laws take them as zero, and so does a replay.",
+                measured.len()
+            ));
+        }
         if let Some(memory) = &figures.delay_memory {
             let first = memory.coefficients.first().copied().unwrap_or(0.0);
             if first.abs() > memory.independent_within {
@@ -196,8 +202,9 @@ impl TraceFit {
         };
         format!(
             "{bound}[links.{link}]\nvia = \"emulated\"\n{}{}",
-            best(&self.delay),
-            best(&self.loss)
+            // A ratio of losses is a key of the link and no table: it goes before them.
+            best(&self.loss),
+            best(&self.delay)
         )
     }
 }

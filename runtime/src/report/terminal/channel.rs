@@ -48,6 +48,9 @@ pub(super) fn channel(canvas: &mut Canvas, channel: &ChannelSummary) {
     if let Some(figures) = &channel.emulation {
         super::emulation::emulation(canvas, figures);
     }
+    if let Some(counts) = &channel.trace_replay {
+        super::emulation::replay(canvas, counts);
+    }
     if let Some(figures) = &channel.outages {
         super::outages::outages(canvas, figures);
     }
