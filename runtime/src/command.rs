@@ -14,6 +14,7 @@ use hil_models::case_study::ParameterError;
 use hil_models::teleoperation::swing::swing_bvh;
 
 use crate::analysis;
+use crate::card_clock::guard;
 use crate::cases;
 use crate::cli::{Cli, Command, RunArgs};
 use crate::console::Console;
@@ -60,6 +61,7 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
             supervisor,
             program,
         } => code_of(own_program::become_program(supervisor, &program), console),
+        Command::CardGuard(args) => code_of(guard::run(&args), console),
         Command::Face { launch } => code_of(face::process::run(&launch), console),
         Command::Gateway { launch } => code_of(gateway::process::run(&launch), console),
         Command::Simulate {
@@ -89,14 +91,7 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
             trace::work::End::Failed => exit::FAILED,
             trace::work::End::Refused => exit::USAGE,
         },
-        Command::Doctor { strict, json } => {
-            let worst = examine(json, console);
-            if strict && worst == doctor::State::Problem {
-                exit::HOST_UNFIT
-            } else {
-                exit::RAN
-            }
-        }
+        Command::Doctor { strict, json } => examine((strict, json), console),
         Command::Probe(args) => probe::run(&args, console),
         Command::Cases => {
             console.result(&cases::list(registry));
@@ -123,6 +118,14 @@ fn code_of<E: core::fmt::Display>(outcome: Result<(), E>, console: &mut Console)
             exit::FAILED
         }
     }
+}
+
+/// Takes over the signals that end programs, or says why it cannot.
+fn signals(console: &mut Console) -> Result<Signals, u8> {
+    Signals::install().map_err(|error| {
+        console.error(&format!("cannot handle signals: {error}"));
+        exit::INTERNAL
+    })
 }
 
 fn load(
@@ -162,12 +165,9 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
             return exit::USAGE;
         }
     };
-    let signals = match Signals::install() {
+    let signals = match signals(console) {
         Ok(signals) => signals,
-        Err(error) => {
-            console.error(&format!("cannot handle signals: {error}"));
-            return exit::INTERNAL;
-        }
+        Err(code) => return code,
     };
     let options = RunOptions {
         hosts,
@@ -315,15 +315,27 @@ fn show_report(run: &Path, json: bool, console: &mut Console) -> u8 {
     }
 }
 
-fn examine(json: bool, console: &mut Console) -> doctor::State {
+fn examine((is_strict, json): (bool, bool), console: &mut Console) -> u8 {
+    let signals = match signals(console) {
+        Ok(signals) => signals,
+        Err(code) => return code,
+    };
+    let watch = signals.end_program_unless_over(
+        "the doctor describes a host whole or not at all; a card it was trying is put back",
+    );
     let report = doctor::examine(&DoctorRequest::default(), &stamp_capabilities);
+    drop(watch);
     let text = if json {
         report.to_json()
     } else {
         report.to_text(true)
     };
     console.result(&text);
-    report.worst_state()
+    if is_strict && report.worst_state() == doctor::State::Problem {
+        exit::HOST_UNFIT
+    } else {
+        exit::RAN
+    }
 }
 
 /// What an interface claims, in the bits of the kernel's answer.
