@@ -9,8 +9,9 @@ use std::time::{Duration, Instant};
 
 use super::{ChronyTracking, NtpVariables, PtpStatus};
 
-/// How long a tool may take; a daemon on this host answers within milliseconds.
-const PATIENCE: Duration = Duration::from_millis(500);
+/// How long a tool may take; a daemon on this host answers within milliseconds, but `ntpq` of ntpsec
+/// alone takes a third of a second to start on a busy machine.
+const PATIENCE: Duration = Duration::from_secs(1);
 const LOOK_PERIOD: Duration = Duration::from_millis(5);
 /// Longer than any answer.
 const ANSWER_BYTES_MAX: u64 = 1 << 16;
