@@ -1,7 +1,7 @@
 #!/bin/bash
 # Inside one emulated PC of hardware-stamps.sh, as /share/run.sh: runs the shuttle with the other PC
-# and then ends programs roughly while they have set the card up. What it leaves in /share is judged
-# by hardware_stamps_check.py. From /share/settings: host, address, nic, seconds, boot_limit.
+# then ends programs roughly while they have set the card up, and at last looks at a PTP clock's
+# datagrams with a probe. What it leaves in /share is judged by hardware_stamps_check.py. From /share/settings: host, address, nic, seconds, boot_limit.
 set -u
 share=/share
 # shellcheck disable=SC1091
@@ -71,6 +71,25 @@ interrupted_doctor() {
     examine doctor-interrupted-after
 }
 
+# probed_ptp: two PTP clocks that steer nothing, one on each PC, and a probe that asks for the card's
+# stamps of what arrives. Somebody else has set the card up then, and it must stay so.
+probed_ptp() {
+    local clock role=()
+    [[ $host == control-pc ]] || role=(--slaveOnly 1)
+    ptp4l -m -l 4 -i eth0 --free_running 1 --logSyncInterval -3 --logMinDelayReqInterval -3 \
+        "${role[@]}" >"$share/ptp.txt" 2>&1 &
+    clock=$!
+    sleep 15
+    examine doctor-ptp-before
+    "$hil" probe -i eth0 -o "$share/card.pcapng" --force --stamps card --flow udp:port=319 \
+        --duration 10s --quiet >"$share/probe.txt" 2>&1
+    left probe $?
+    "$hil" probe analyse "$share/card.pcapng" --flow udp:port=319 --json >"$share/probe.json"
+    examine doctor-ptp-after
+    kill "$clock"
+    wait "$clock"
+}
+
 modprobe "$nic"
 until_so 10 test -e /sys/class/net/eth0
 ip address add "$address/24" dev eth0 && ip link set eth0 up || exit 3
@@ -87,4 +106,5 @@ cp -r /tmp/record "$share/"
 interrupted_doctor
 rough_end killed control-pc KILL
 rough_end twice robot-pc INT INT
+probed_ptp
 exit "$code"

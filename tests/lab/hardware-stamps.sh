@@ -12,8 +12,8 @@
 # It checks that the cards were armed and put back, that the sending card's stamps came, each
 # matched to its message with the software stamp beside it, that missing receive stamps are
 # labelled, that each card's clock is known within a bound, what the doctor says of the card, and that
-# the card is as it was found after a run was killed outright or interrupted twice, and after a
-# doctor was interrupted.
+# the card is as it was found after a run was killed outright or interrupted twice, after a doctor
+# was interrupted, and after a probe beside a PTP clock.
 # Needs root and the packages that images.sh names; the first time builds the images. Takes two or
 # three minutes after that and never more than eight. Exit code 0 when all holds, 1 when something does
 # not, 2 when the lab could not be set up.

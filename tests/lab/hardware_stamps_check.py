@@ -5,6 +5,7 @@ Usage: hardware_stamps_check.py igb|e1000e FOLDER
 """
 import glob
 import json
+import re
 import sys
 
 NIC, FOLDER = sys.argv[1], sys.argv[2]
@@ -87,6 +88,33 @@ def rough_ends(host):
     unchanged(host, what, f"doctor-{name}-after.json")
 
 
+def probed_ptp(host):
+    """A probe that asked for card stamps of PTP's datagrams, beside a PTP clock."""
+    before = setting(finding(host, "doctor-ptp-before.json"))
+    after = setting(finding(host, "doctor-ptp-after.json"))
+    check("PTPv2 event" in before, f"{host}: a PTP clock has set its card up: {before}")
+    check(after == before, f"{host}: a probe that asked for card stamps leaves it so: {after}")
+    told = re.search(r"(\d+) of (\d+) arrivals have the card's stamp", words_of(host, "probe.txt"))
+    check(told is not None, f"{host}: the probe says how many arrivals the card stamped")
+    if told is None:
+        return
+    stamped, arrived = (int(text) for text in told.groups())
+    analysis = json.loads(words_of(host, "probe.json"))
+    points = analysis["points"]
+
+    def counted(is_card):
+        chosen = [one for one in points if one["point"].endswith("by the card's clock") == is_card]
+        return sum(one["figures"]["datagram_count"] for one in chosen if "(in)" in one["point"])
+
+    # Without the transmit stamps that the e1000e owes it, ptp4l falls silent.
+    least = 20 if NIC == "igb" else 0
+    # The two rings are opened one after the other.
+    check(arrived >= least and abs(counted(False) - arrived) <= 1,
+          f"{host}: {arrived} arrivals, {counted(False)} in the kernel's part of the capture")
+    check(counted(True) == stamped,
+          f"{host}: the card stamped {stamped} of them, {counted(True)} are in its part")
+
+
 def not_stamped(host):
     """Stamps that the card's driver itself says it did not give during the run."""
     counts = []
@@ -158,6 +186,7 @@ def channel(one, summary):
 for host in HOSTS:
     doctor(host)
     rough_ends(host)
+    probed_ptp(host)
     paths = glob.glob(f"{FOLDER}/{host}/record/*/summary.json")
     check(len(paths) == 1, f"{host}: one run folder")
     if len(paths) != 1:
