@@ -3,7 +3,7 @@
 //! the cards back as they were. The stamps themselves come through the gateways' sockets.
 //!
 //! The supervisor does this and not a gateway, because a card belongs to its host: two links may
-//! use one card. A supervisor that is killed outright cannot put it back; then its [`guard`] does.
+//! use one card. A supervisor that is killed outright cannot put it back; then its guard does.
 
 pub mod figures;
 pub(crate) mod guard;
