@@ -147,6 +147,23 @@ pub struct CalibrateArgs {
     pub batch: BatchArgs,
 }
 
+/// How a network card was found, in the kernel's numbers (`struct hwtstamp_config`).
+#[derive(Debug, Args)]
+pub struct CardGuardArgs {
+    /// Its interface.
+    #[arg(long)]
+    pub interface: String,
+    /// `flags`.
+    #[arg(long, allow_negative_numbers = true)]
+    pub flags: i32,
+    /// `tx_type`.
+    #[arg(long, allow_negative_numbers = true)]
+    pub transmit_type: i32,
+    /// `rx_filter`.
+    #[arg(long, allow_negative_numbers = true)]
+    pub receive_filter: i32,
+}
+
 /// Everything but a run.
 #[derive(Debug, Subcommand)]
 pub enum Command {
@@ -272,6 +289,9 @@ pub enum Command {
         #[arg(last = true, required = true)]
         program: Vec<String>,
     },
+    /// Wait for the end of the program that set a network card up; not for use by hand.
+    #[command(hide = true)]
+    CardGuard(CardGuardArgs),
     /// Speak with a foreign EGM program; started by a run, not by hand.
     #[command(hide = true)]
     Face {

@@ -14,6 +14,7 @@ use hil_models::case_study::ParameterError;
 use hil_models::teleoperation::swing::swing_bvh;
 
 use crate::analysis;
+use crate::card_clock::guard;
 use crate::cases;
 use crate::cli::{Cli, Command, RunArgs};
 use crate::console::Console;
@@ -60,6 +61,7 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
             supervisor,
             program,
         } => code_of(own_program::become_program(supervisor, &program), console),
+        Command::CardGuard(args) => code_of(guard::run(&args), console),
         Command::Face { launch } => code_of(face::process::run(&launch), console),
         Command::Gateway { launch } => code_of(gateway::process::run(&launch), console),
         Command::Simulate {
@@ -94,18 +96,10 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
             host,
             strict,
             json,
-        } => {
-            let request = match doctor_request((topology, host), registry, console) {
-                Ok(request) => request,
-                Err(code) => return code,
-            };
-            let worst = examine(&request, json, console);
-            if strict && worst == doctor::State::Problem {
-                exit::HOST_UNFIT
-            } else {
-                exit::RAN
-            }
-        }
+        } => match doctor_request((topology, host), registry, console) {
+            Ok(request) => examine(&request, (strict, json), console),
+            Err(code) => code,
+        },
         Command::Probe(args) => probe::run(&args, console),
         Command::Cases => {
             console.result(&cases::list(registry));
@@ -132,6 +126,14 @@ fn code_of<E: core::fmt::Display>(outcome: Result<(), E>, console: &mut Console)
             exit::FAILED
         }
     }
+}
+
+/// Takes over the signals that end programs, or says why it cannot.
+fn signals(console: &mut Console) -> Result<Signals, u8> {
+    Signals::install().map_err(|error| {
+        console.error(&format!("cannot handle signals: {error}"));
+        exit::INTERNAL
+    })
 }
 
 fn load(
@@ -171,12 +173,9 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
             return exit::USAGE;
         }
     };
-    let signals = match Signals::install() {
+    let signals = match signals(console) {
         Ok(signals) => signals,
-        Err(error) => {
-            console.error(&format!("cannot handle signals: {error}"));
-            return exit::INTERNAL;
-        }
+        Err(code) => return code,
     };
     let options = RunOptions {
         hosts,
@@ -353,15 +352,27 @@ fn doctor_request(
     Ok(request)
 }
 
-fn examine(request: &DoctorRequest, json: bool, console: &mut Console) -> doctor::State {
+fn examine(request: &DoctorRequest, (is_strict, json): (bool, bool), console: &mut Console) -> u8 {
+    let signals = match signals(console) {
+        Ok(signals) => signals,
+        Err(code) => return code,
+    };
+    let watch = signals.end_program_unless_over(
+        "the doctor describes a host whole or not at all; a card it was trying is put back",
+    );
     let report = doctor::examine(request, &stamp_capabilities);
+    drop(watch);
     let text = if json {
         report.to_json()
     } else {
         report.to_text(true)
     };
     console.result(&text);
-    report.worst_state()
+    if is_strict && report.worst_state() == doctor::State::Problem {
+        exit::HOST_UNFIT
+    } else {
+        exit::RAN
+    }
 }
 
 /// What an interface claims, in the bits of the kernel's answer.

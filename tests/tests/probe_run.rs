@@ -263,6 +263,11 @@ fn what_cannot_be_tapped_or_read_is_refused_with_its_own_exit_code() {
             69,
             "no interface `hil-none0`",
         ),
+        (
+            vec!["-i", "lo", "-o", output, "--stamps", "card"],
+            78,
+            "the card of lo gives no stamps",
+        ),
         (vec!["-i", "lo"], 2, "--output"),
         (vec!["-o", output], 2, "--interface"),
         (

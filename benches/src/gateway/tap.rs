@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use hil_gateways::capture::flow::FlowFilter;
 use hil_gateways::capture::writer::{self, PacketToWrite};
-use hil_gateways::transport::packet_ring::{PacketRing, RingCounters, RingSettings};
+use hil_gateways::transport::packet_ring::{PacketRing, RingCounters, RingSettings, RingStamps};
 use hil_tests::lab::INTERFACE;
 
 use super::hosts::SetupError;
@@ -77,6 +77,7 @@ impl Drainer {
         let settings = RingSettings {
             snap_bytes: u32::try_from(flows[0].snap_bytes())?,
             ring_bytes: 8 << 20,
+            stamps: RingStamps::Kernel,
         };
         let open = |host| network.on(host, || PacketRing::open(INTERFACE, &flows, &settings));
         let pair = [open(0)?, open(1)?];

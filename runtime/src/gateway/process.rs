@@ -78,7 +78,7 @@ fn prepare_and_live(path: &Path) -> Result<(), GatewayError> {
     let (sender, ready) = channel();
     let mut threads = Vec::new();
     for (direction, one) in opened {
-        warn_of_spinning(direction);
+        warn_of_spinning(&direction.channel, direction.wait, direction.realtime.cpu);
         threads.push(spawn(
             direction.clone(),
             one,
@@ -153,7 +153,8 @@ fn watch(
     }
 }
 
-type Counter = (String, &'static str, Arc<AtomicU64>);
+/// Channel, what happened to its messages, and how many.
+pub(crate) type Counter = (String, &'static str, Arc<AtomicU64>);
 
 fn counter(launch: &DirectionLaunch, opened: &Opened) -> Counter {
     let what = match launch.side {
@@ -163,7 +164,7 @@ fn counter(launch: &DirectionLaunch, opened: &Opened) -> Counter {
     (launch.channel.clone(), what, opened.count())
 }
 
-fn report_progress(counters: &[Counter]) {
+pub(crate) fn report_progress(counters: &[Counter]) {
     let progress = counters
         .iter()
         .map(|(channel, what, count)| ChannelProgress {
@@ -253,22 +254,19 @@ fn finish(
     outcome
 }
 
-fn warn_of_spinning(launch: &DirectionLaunch) {
-    if launch.wait != WaitMode::Spin {
+/// Says what a spinning thread, of the channel or arm `name`, will lose or take on its CPU.
+pub(crate) fn warn_of_spinning(name: &str, wait: WaitMode, cpu: Option<usize>) {
+    if wait != WaitMode::Spin {
         return;
     }
-    let channel = &launch.channel;
-    match launch.realtime.cpu.map(realtime::spin_advice) {
+    match cpu.map(realtime::spin_advice) {
         Some(SpinAdvice::Fine) => {}
         Some(SpinAdvice::Warn(why)) => {
-            say(&FromProcess::Warning(format!(
-                "{channel}: wait = spin: {why}"
-            )));
+            say(&FromProcess::Warning(format!("{name}: wait = spin: {why}")));
         }
         None => {
-            say(&FromProcess::Warning(format!(
-                "{channel}: wait = spin without a cpu of its own"
-            )));
+            let text = format!("{name}: wait = spin without a cpu of its own");
+            say(&FromProcess::Warning(text));
         }
     }
 }

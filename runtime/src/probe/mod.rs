@@ -3,6 +3,7 @@
 
 mod analyse;
 pub mod arguments;
+mod card_tap;
 mod compare;
 mod files;
 mod live;
@@ -12,10 +13,10 @@ use std::path::Path;
 use std::time::Duration;
 
 use hil_gateways::capture::flow::{FLOW_COUNT_MAX, FlowFilter};
-use hil_gateways::transport::packet_ring::RingError;
+use hil_gateways::transport::packet_ring::{RingError, RingStamps};
 
 use self::analyse::{Reading, Report};
-use self::arguments::{LiveArgs, ProbeArgs, ProbeWork, ReadingArgs};
+use self::arguments::{LiveArgs, ProbeArgs, ProbeWork, ReadingArgs, Stamps};
 use self::live::{LiveError, LiveResult, Request};
 use crate::console::Console;
 use crate::signals::{EXIT_INTERRUPTED, Signals};
@@ -159,6 +160,10 @@ fn capture(args: &LiveArgs) -> u8 {
             .snap_length
             .unwrap_or(u32::try_from(needed).unwrap_or(2048)),
         ring_bytes: usize::from(args.ring) << 20,
+        stamps: match args.stamps {
+            Stamps::Kernel => RingStamps::Kernel,
+            Stamps::Card => RingStamps::Card,
+        },
         flows,
     };
     let signals = match Signals::install() {
@@ -177,7 +182,9 @@ fn capture(args: &LiveArgs) -> u8 {
                 LiveError::Ring(RingError::Size { .. } | RingError::LinkLayer { .. })
                 | LiveError::File { .. }
                 | LiveError::Exists { .. } => exit::USAGE,
-                LiveError::Ring(RingError::Rights { .. }) => exit::HOST_UNFIT,
+                LiveError::Ring(RingError::Rights { .. }) | LiveError::Card { .. } => {
+                    exit::HOST_UNFIT
+                }
                 LiveError::Ring(RingError::Refused { .. }) | LiveError::Counters { .. } => {
                     exit::INTERNAL
                 }
@@ -204,6 +211,20 @@ fn conclude(request: &Request, result: &LiveResult, console: &mut Console) -> u8
             text.push_str(", interrupted");
         }
         text.push('\n');
+        if let Some(card) = &one.card {
+            dropped_count += card.counters.dropped_count;
+            let _infallible = writeln!(
+                text,
+                "{}: {} of {} arrivals have the card's stamp, the others the kernel's alone; {} \
+                 dropped by the kernel; {}; the card {}",
+                one.name,
+                card.stamped_count,
+                card.stamped_count + card.unstamped_count,
+                card.counters.dropped_count,
+                card.granted,
+                card.restoring
+            );
+        }
     }
     let _infallible = writeln!(
         text,
