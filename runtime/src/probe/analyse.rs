@@ -14,6 +14,7 @@ use hil_models::measure::statistics::IntervalNs;
 use serde::Serialize;
 
 use super::files::{CaptureFile, FileError, read};
+use super::point_clocks::PointClocks;
 
 /// Captures read, and every point in them.
 #[derive(Debug)]
@@ -157,6 +158,9 @@ struct PointReport {
 struct JoinReport {
     first: String,
     second: String,
+    clocks: PointClocks,
+    /// How far the clocks may lead the delays astray; `None` where it is unknown.
+    delay_bound_ns: Option<u64>,
     #[serde(flatten)]
     stream: StreamReport,
     figures: JoinFigures,
@@ -174,7 +178,7 @@ pub(super) struct Report {
 
 impl Report {
     /// Draws up the figures.
-    pub(super) fn of(reading: &Reading, window_ns: i64) -> Self {
+    pub(super) fn of(reading: &Reading, window_ns: i64, is_one_clock: bool) -> Self {
         let stream_report = |stream: &Stream| StreamReport {
             flow: reading.observer.flows()[stream.flow_index].to_string(),
             source: stream.source.to_string(),
@@ -209,6 +213,8 @@ impl Report {
             }));
         }
         let joins = reading.joined(window_ns).into_iter();
+        let clocks =
+            |one: &Joined| PointClocks::of(&one.first_point, &one.second_point, is_one_clock);
         Self {
             schema_version: 1,
             files: reading.files.iter().map(file_report).collect(),
@@ -218,6 +224,8 @@ impl Report {
                 .map(|(stream, joined)| JoinReport {
                     first: reading.name(&joined.first_point),
                     second: reading.name(&joined.second_point),
+                    clocks: clocks(&joined),
+                    delay_bound_ns: clocks(&joined).bound_ns(),
                     stream: stream_report(&stream),
                     figures: joined.figures,
                 })
@@ -293,6 +301,8 @@ impl Report {
             line(&mut text, &stream_line(&joined.stream));
             let ends = format!("  from {} to {}", joined.first, joined.second);
             line(&mut text, &ends);
+            let clocks = format!("  clock       {}", joined.clocks.words());
+            line(&mut text, &clocks);
             join_text(&mut text, &joined.figures);
         }
         text

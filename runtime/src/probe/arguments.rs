@@ -97,6 +97,10 @@ pub(crate) enum ProbeWork {
         file: PathBuf,
         /// The capture of a second point.
         second: Option<PathBuf>,
+        /// Both captures were stamped by one clock, e.g. on one machine: only then is the time
+        /// between them a one-way delay.
+        #[arg(long)]
+        one_clock: bool,
         /// How to read them.
         #[command(flatten)]
         reading: ReadingArgs,

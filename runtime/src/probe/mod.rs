@@ -7,6 +7,7 @@ mod card_tap;
 mod compare;
 mod files;
 mod live;
+mod point_clocks;
 
 use core::fmt::Write as _;
 use std::path::Path;
@@ -38,8 +39,12 @@ pub(crate) fn run(args: &ProbeArgs, console: &mut Console) -> u8 {
         Some(ProbeWork::Analyse {
             file,
             second,
+            one_clock,
             reading,
-        }) => analyse(&paths(file, second.as_deref()), reading, console),
+        }) => {
+            let paths = paths(file, second.as_deref());
+            analyse(&paths, reading, *one_clock, console)
+        }
         Some(ProbeWork::Compare {
             run,
             file,
@@ -108,11 +113,16 @@ fn read(paths: &[&Path], reading: &ReadingArgs, console: &mut Console) -> Option
     }
 }
 
-fn analyse(paths: &[&Path], reading: &ReadingArgs, console: &mut Console) -> u8 {
+fn analyse(
+    paths: &[&Path],
+    reading: &ReadingArgs,
+    is_one_clock: bool,
+    console: &mut Console,
+) -> u8 {
     let Some(captures) = read(paths, reading, console) else {
         return exit::USAGE;
     };
-    let report = Report::of(&captures, window_ns(reading));
+    let report = Report::of(&captures, window_ns(reading), is_one_clock);
     let complaints = captures.complaints();
     for complaint in &complaints {
         console.warn(complaint);
