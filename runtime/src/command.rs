@@ -18,7 +18,7 @@ use crate::card_clock::guard;
 use crate::cases;
 use crate::cli::{Cli, Command, RunArgs};
 use crate::console::Console;
-use crate::doctor::{self, DoctorRequest, StampCapabilities};
+use crate::doctor::{self, ClockQuestion, DoctorRequest, StampCapabilities};
 use crate::face;
 use crate::gateway;
 use crate::probe;
@@ -345,10 +345,13 @@ fn doctor_request(
         console.error(&text);
         exit::USAGE
     })?;
+    // Several hosts are here only when none has an address, and none of these has a clock path.
     let mut ends = here
         .iter()
         .filter_map(|name| topology.host(name)?.clock.clone());
-    request.clock_end = ends.next();
+    request.clock_end = ends
+        .next()
+        .map_or(ClockQuestion::NoneNamed, ClockQuestion::End);
     Ok(request)
 }
 

@@ -279,6 +279,11 @@ fn what_cannot_be_tapped_or_read_is_refused_with_its_own_exit_code() {
         (vec!["-i", "lo"], 2, "--output"),
         (vec!["-o", output], 2, "--interface"),
         (
+            vec!["-i", "lo", "-i", "lo", "-o", output],
+            2,
+            "--interface lo is given twice",
+        ),
+        (
             vec!["-i", "lo", "-o", output, "--flow", "udp"],
             2,
             "would follow every datagram",

@@ -155,12 +155,17 @@ fn contradiction(
 /// What a reader must know of a clock path that did not give what it is for.
 pub(super) fn warning(pair: &HostPairClock) -> Option<String> {
     let path = pair.clock_path.as_ref()?;
+    let instead = match pair.rung {
+        // Nothing hangs on it then.
+        ClockRung::OneClock => return None,
+        ClockRung::Disciplined => "follows from their system clocks",
+        ClockRung::Exchanges | ClockRung::None => "comes over the data path",
+    };
     let what = path.describe();
     let (from, to) = (&pair.from, &pair.to);
     if !path.has_exchanges() {
         return Some(format!(
-            "{what} gave no exchange ({}): what relates the clocks of {from} and {to} comes over \
-             the data path",
+            "{what} gave no exchange ({}): what relates the clocks of {from} and {to} {instead}",
             path.state
         ));
     }

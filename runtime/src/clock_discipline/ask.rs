@@ -67,7 +67,7 @@ pub(super) fn ptp() -> Result<PtpStatus, String> {
 }
 
 pub(super) fn ntp() -> Result<NtpVariables, String> {
-    NtpVariables::parse(&answer("ntpq", &["-n", "-c", "rv"])?)
+    NtpVariables::parse(&answer("ntpq", &["-n", "-c", "rv", "127.0.0.1"])?)
 }
 
 /// What `program` prints, if it ends in time and without a fault.

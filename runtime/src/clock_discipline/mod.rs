@@ -14,12 +14,14 @@ pub use ntp::NtpVariables;
 pub use ptp::PtpStatus;
 
 use self::ask::Daemons;
+use self::ntp::is_local_reference;
 use crate::realtime::clock_discipline;
 
 /// What `phc2sys` may leave between a card's clock and the system clock: it publishes no figure, and
 /// stays below this once settled. Cross-checked by the gateways' exchanges like the rest.
 const PHC2SYS_ERROR_NS: u64 = 5_000;
 
+const LOCAL_CLOCK: &str = "; its own undisciplined clock, which is nobody else's reference";
 const NOBODY: &str = "none of chronyd, ptp4l, ntpd and systemd-timesyncd runs here";
 
 /// What is known of how a host's system clock is steered.
@@ -102,7 +104,9 @@ impl HostDiscipline {
             self.basis = format!("ntpd: {}; not synchronised", variables.reference);
             return;
         };
-        if self.is_kernel_synchronised {
+        if variables.is_local() {
+            self.basis.push_str(LOCAL_CLOCK);
+        } else if self.is_kernel_synchronised {
             self.reference = Some(format!("ntp {}", variables.reference));
             self.bound_ns = Some(bound_ns);
         } else {
@@ -122,6 +126,8 @@ impl HostDiscipline {
         );
         if !tracking.is_synchronised() {
             self.basis.push_str("; not synchronised");
+        } else if is_local_reference(&tracking.reference) {
+            self.basis.push_str(LOCAL_CLOCK);
         } else if !self.is_kernel_synchronised {
             self.basis
                 .push_str("; the kernel says that nobody keeps the clock");
@@ -282,6 +288,15 @@ mod tests {
         // 3 + 2 / 2 + 0.1 milliseconds, and 15 ppm of 100 s.
         let bound_ns = host.bound_ns.unwrap();
         assert!((5_600_000..=5_600_001).contains(&bound_ns), "{bound_ns}");
+        for local in ["LOCL", "127.127.1.0", "LOCAL(0)"] {
+            let own = NtpVariables {
+                reference: local.to_owned(),
+                ..variables.clone()
+            };
+            let mut host = nobody();
+            host.believe_ntp(&own);
+            assert_eq!((host.bound_ns, &host.reference), (None, &None), "{local}");
+        }
         let alarmed = NtpVariables {
             leap: 3,
             ..variables.clone()

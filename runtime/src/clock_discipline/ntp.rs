@@ -81,6 +81,11 @@ impl NtpVariables {
         self.leap != 3 && (1..16).contains(&self.stratum)
     }
 
+    /// True while its source is the local clock itself, which is the reference of nobody else.
+    pub fn is_local(&self) -> bool {
+        is_local_reference(&self.reference)
+    }
+
     /// Largest error of the system clock against the reference, nanoseconds; `None` when not
     /// synchronised. Root distance (RFC 5905, appendix A.5.5.2), the offset it has yet to correct,
     /// and what the clock may have strayed since the last update.
@@ -96,6 +101,18 @@ impl NtpVariables {
         self.is_synchronised()
             .then(|| (bound_s * 1e9).ceil() as u64)
     }
+}
+
+/// Drivers of an undisciplined local clock: ntpd's (127.127.1.u, `LOCL`, ntpsec's `LOCAL(u)`) and
+/// chronyd's (`7F7F0101`, 127.127.1.1). Two hosts that each follow their own have no clock in
+/// common, whatever their references are called.
+pub(super) fn is_local_reference(reference: &str) -> bool {
+    reference.split_whitespace().any(|word| {
+        word.starts_with("127.")
+            || word == "LOCL"
+            || word.starts_with("LOCAL")
+            || word.starts_with("7F7F")
+    })
 }
 
 fn within(name: &str, value_s: f64, lowest_s: f64) -> Result<f64, String> {

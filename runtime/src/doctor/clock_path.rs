@@ -3,8 +3,7 @@
 
 use std::net::IpAddr;
 
-use super::{Finding, StampCapabilityQuery};
-use crate::topology::ClockEnd;
+use super::{ClockQuestion, Finding, StampCapabilityQuery};
 
 const ID: &str = "clock_path";
 const TITLE: &str = "Clock path";
@@ -12,15 +11,25 @@ const TITLE: &str = "Clock path";
 const GOES_ON: &str = "the run would go on with the clock exchanges of the data path, whose bound is as wide as that \
                        path is slow";
 
+const NONE_NAMED: &str = "clocks are exchanged over the data path alone, and the bound of one-way figures is as \
+                          wide as that path is slow";
+
 /// Which interface has an address, in words when the host does not tell.
 pub(super) type InterfaceOf<'a> = &'a dyn Fn(IpAddr) -> Result<Option<String>, String>;
 
 pub(super) fn examine(
-    end: Option<&ClockEnd>,
+    question: &ClockQuestion,
     interface_of: InterfaceOf<'_>,
     stamps: &dyn StampCapabilityQuery,
 ) -> Option<Finding> {
-    let end = end?;
+    let end = match question {
+        ClockQuestion::NotAsked => return None,
+        ClockQuestion::NoneNamed => {
+            let value = "the topology names no clock_address of this host".to_owned();
+            return Some(Finding::note(ID, TITLE, value).because(NONE_NAMED));
+        }
+        ClockQuestion::End(end) => end,
+    };
     let address = end.address;
     let interface = match interface_of(address) {
         Ok(Some(interface)) => interface,
@@ -66,6 +75,7 @@ pub(super) fn examine(
 mod tests {
     use super::*;
     use crate::doctor::{StampCapabilities, State};
+    use crate::topology::ClockEnd;
 
     fn end(interface: Option<&str>) -> ClockEnd {
         ClockEnd {
@@ -87,7 +97,7 @@ mod tests {
                 .map(|name| name.map(str::to_owned))
                 .map_err(str::to_owned)
         };
-        examine(Some(&end(interface)), &of, &query).unwrap()
+        examine(&ClockQuestion::End(end(interface)), &of, &query).unwrap()
     }
 
     #[test]
@@ -113,6 +123,9 @@ mod tests {
         assert_eq!(elsewhere.fix, "clock_interface = \"eth1\"");
         assert_eq!(examined(None, Err("no"), 0x1a).state, State::Note);
         let query = |name: &str| panic!("{name} was asked");
-        assert_eq!(examine(None, &|_| Ok(None), &query), None);
+        let examine = |question| examine(&question, &|_| Ok(None), &query);
+        assert_eq!(examine(ClockQuestion::NotAsked), None);
+        let unnamed = examine(ClockQuestion::NoneNamed).unwrap();
+        assert_eq!(unnamed.state, State::Note, "looked at, and not there");
     }
 }

@@ -112,7 +112,11 @@ impl Patience<'_> {
         let peers: Vec<String> = peers.map(|one| one.peer.to_string()).collect();
         let within_s = self.launch.ready_within.unwrap_or_default().as_secs_f64();
         let peers = peers.join(", ");
-        format!("no answer from {peers} within {within_s:.1} s: the run begins without it")
+        let then = match self.launch.instance {
+            0 => "the run begins without it",
+            _ => "it goes on asking",
+        };
+        format!("no answer from {peers} within {within_s:.1} s: {then}")
     }
 }
 

@@ -152,6 +152,16 @@ fn capture(args: &LiveArgs) -> u8 {
         console.error("no --interface given; `ip link` lists those of this host");
         return exit::USAGE;
     }
+    let again = (1..args.interface.len())
+        .map(|index| &args.interface[index])
+        .zip(1..)
+        .find(|(name, index)| args.interface[..*index].contains(name));
+    if let Some((name, _)) = again {
+        console.error(&format!(
+            "--interface {name} is given twice; one tap sees all there is"
+        ));
+        return exit::USAGE;
+    }
     if args.flow.len() > FLOW_COUNT_MAX {
         console.error(&format!(
             "{} flows are more than the {FLOW_COUNT_MAX} one probe follows",

@@ -6,7 +6,7 @@ use std::time::Duration;
 use super::plan::{ProcessKind, ProcessPlan};
 use crate::process::launch::{DirectionLaunch, Side, SocketLaunch, Transport};
 use crate::realtime::RealtimeRequest;
-use crate::topology::{ClockPath, Host, OnExit, Timestamps, Topology};
+use crate::topology::{ClockPath, Host, OnExit, Timestamps, Topology, end_name};
 use crate::wait::WaitMode;
 
 /// Name of the message type that a clock path announces and never sends.
@@ -27,7 +27,7 @@ pub(crate) fn process_name(path: &ClockPath<'_>, host: &str) -> String {
     } else {
         &path.from.name
     };
-    format!("clock-{other}-{host}")
+    end_name(host, other)
 }
 
 /// The ends of clock paths on `host`.

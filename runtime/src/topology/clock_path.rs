@@ -71,6 +71,15 @@ fn name_of(from: &str, to: &str) -> String {
     format!("clock/{from}-{to}")
 }
 
+/// Name of the process on `host` at the end of a clock path to `other`.
+pub(crate) fn end_name(host: &str, other: &str) -> String {
+    format!("clock-{other}-{host}")
+}
+
+fn ends_of(one: &str, other: &str) -> [String; 2] {
+    [end_name(one, other), end_name(other, one)]
+}
+
 impl Topology {
     /// The clock paths: one for every two hosts with a clock address that a link with gateways joins.
     pub fn clock_paths(&self) -> impl Iterator<Item = ClockPath<'_>> {
@@ -109,6 +118,19 @@ impl Topology {
             (one.min(other).as_str(), one.max(other).as_str())
         });
         pairs.collect()
+    }
+
+    /// Two other hosts whose clock path has a name or a process in common with that of these.
+    fn namesake(&self, (from, to): (&Host, &Host)) -> Option<(&str, &str)> {
+        let own = (name_of(&from.name, &to.name), ends_of(&from.name, &to.name));
+        let pairs = self.clock_pairs().into_iter();
+        let mut others = pairs
+            .map(|(one, two)| (one.name.as_str(), two.name.as_str()))
+            .filter(|pair| *pair != (from.name.as_str(), to.name.as_str()));
+        others.find(|(one, two)| {
+            let ends = ends_of(one, two);
+            name_of(one, two) == own.0 || ends.iter().any(|end| own.1.contains(end))
+        })
     }
 
     fn clock_pairs(&self) -> Vec<(&Host, &Host)> {
@@ -306,6 +328,14 @@ fn check_name(
         )
     } else if topology.channel(&name).is_some() {
         format!("makes a clock path called `{name}`, and a channel has that name")
+    } else if let Some((one, two)) = topology.namesake((host, other)) {
+        // `a-b` with `c`, and `a` with `b-c`: their exchanges could not be told apart.
+        format!("makes a clock path called `{name}`, as hosts `{one}` and `{two}` do: rename one")
+    } else if let Some(process) = ends_of(&host.name, &other.name)
+        .into_iter()
+        .find(|end| topology.process(end).is_some())
+    {
+        format!("makes a process called `{process}`, and another has that name")
     } else {
         return;
     };

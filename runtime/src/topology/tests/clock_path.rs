@@ -229,3 +229,27 @@ fn a_path_has_a_name_of_its_own_that_fits_a_record_file() {
         "{errors}"
     );
 }
+
+#[test]
+fn what_would_share_a_name_with_a_clock_path_is_refused() {
+    let text = format!(
+        "{}[processes.clock-robot-pc-control-pc]\nrun = ['x']\nhost = \"control-pc\"\n",
+        good()
+    );
+    let fault = fault_of(&text, "hosts.control-pc.clock_address");
+    assert!(fault.contains("another has that name"), "{fault}");
+
+    // `control-pc` with `robot-pc`, and `control` with `pc-robot-pc`.
+    let hosts = "[hosts.control]\naddress = \"10.77.0.3\"\nclock_address = \"10.78.0.3\"\n\
+                 [hosts.pc-robot-pc]\naddress = \"10.77.0.4\"\nclock_address = \"10.78.0.4\"\n\
+                 [processes.human]";
+    let programs = "[processes.camera]\nrun = ['camera']\nhost = \"control\"\n\
+                    [processes.viewer]\nrun = ['viewer']\nhost = \"pc-robot-pc\"\n\
+                    [channels.\"a/1\"]\nmessage = { name = 'x.v1', size_bytes = 8 }\n\
+                    from = 'camera'\nto = 'viewer'\nlink = 'wire'\n\
+                    [links.wire]\nvia = 'tcp'\nport = 8000\n";
+    let text = format!("{}{programs}", good().replace("[processes.human]", hosts));
+    let errors = parse("clock.toml", &text, &[], &known()).expect_err("one name for two paths");
+    let text = errors.to_string();
+    assert!(text.contains("rename one"), "{text}");
+}
