@@ -153,6 +153,30 @@ impl Lab {
         ["port0", "port1"]
     }
 
+    /// Has the bridge of [`Lab::put_bridge_between`] send every frame to a third port as well, and
+    /// returns the interface on host 0 at the far end of it: a mirror port of the switch.
+    ///
+    /// # Panics
+    /// When it cannot be built, or there is no bridge.
+    pub fn add_mirror_port(&self) -> &'static str {
+        let first = self.hosts[0].namespace.as_str();
+        let built = [
+            "link set bridge0 type bridge ageing_time 0",
+            "link add port2 type veth peer name mirror0",
+            "link set port2 master bridge0 up",
+            "link set mirror0 up",
+        ]
+        .iter()
+        .try_for_each(|words| {
+            let words: Vec<&str> = ["-n", first].into_iter().chain(words.split(' ')).collect();
+            namespace::ip(&words)
+        });
+        if let Err(reason) = built {
+            panic!("no mirror port: {reason}");
+        }
+        "mirror0"
+    }
+
     /// Host 0 (the controller's, by convention) or host 1 (the robot's).
     ///
     /// # Panics
