@@ -14,6 +14,7 @@ pub mod rate;
 pub mod reordering;
 pub mod spec;
 pub mod trace;
+mod trace_offers;
 mod trace_ticks;
 pub mod wifi;
 

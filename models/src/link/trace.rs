@@ -7,7 +7,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use core::time::Duration;
 use serde::{Deserialize, Serialize};
 
-use crate::link::trace_ticks::{OfferGrid, Ticks};
+use crate::link::trace_offers::OfferGrid;
+use crate::link::trace_ticks::Ticks;
 use crate::link::{Fate, LinkModel};
 use crate::time::Instant;
 use crate::trace::{Trace, TraceFate, TraceRecord, UNAVAILABLE_NS};
