@@ -1,7 +1,9 @@
-//! Which tick of its producer a message offered to a replay belongs to. Its producer's clock is not the
+//! Which message of its channel is offered to a replay, over all starts of its producer and however many
+//! pieces it comes in; and which tick of its producer it belongs to. The producer's clock is not the
 //! trace's, so its grid is followed like that of a trace: by the same rules over the first messages, and
 //! message by message from then on.
 
+use crate::link::MessageNumber;
 use crate::link::trace_ticks::{EARLY_RATIO, sort_out, whole};
 
 /// Messages that the grid is sought in anew with each of them: the first of a run is the coldest, and
@@ -38,6 +40,19 @@ impl OfferGrid {
             newest: tick,
             young: Some(Young::new(at_ns, tick)),
         }
+    }
+
+    /// The same of a producer that was started anew, which begins another grid: its first message has
+    /// the tick of its instant on the old one, after that of the last.
+    pub(super) fn restarted(mut self, at_ns: i64) -> Self {
+        let last = self.newest;
+        let tick = self.tick(at_ns).max(last.saturating_add(1));
+        Self::new(at_ns, tick, self.period_ns)
+    }
+
+    /// The tick of the last message.
+    pub(super) const fn newest(&self) -> u64 {
+        self.newest
     }
 
     /// The tick of the next message, never before that of the last.
@@ -124,6 +139,73 @@ fn ticks_on(places: &[f64], phase: f64) -> ([i64; YOUNG_COUNT], f64) {
     let late = |(place, tick): (&f64, &i64)| (place - phase - *tick as f64).max(0.0);
     let lateness = places.iter().zip(&ticks).map(late).sum();
     (ticks, lateness)
+}
+
+/// Messages offered lately whose pieces and copies are known again.
+const RECENT_COUNT: usize = 64;
+
+/// Numbers messages over all starts of their producer, and remembers what the last ones met.
+#[derive(Debug)]
+pub(super) struct Offered<T> {
+    /// The current start and the one before, each with the number of its first message.
+    starts: [Option<(u32, u64)>; 2],
+    /// One past the highest number.
+    next: u64,
+    /// The last message of each number modulo their count.
+    recent: [Option<(u64, T)>; RECENT_COUNT],
+}
+
+impl<T: Copy> Offered<T> {
+    pub(super) const fn new() -> Self {
+        Self {
+            starts: [None; 2],
+            next: 0,
+            recent: [None; RECENT_COUNT],
+        }
+    }
+
+    /// The message after the last.
+    pub(super) fn following(&self) -> MessageNumber {
+        let (start, first) = self.starts[0].unwrap_or((0, 0));
+        MessageNumber {
+            start,
+            sequence: self.next.saturating_sub(first),
+        }
+    }
+
+    /// The number of `message` over all starts, from 0; true with it when a start began that is not the
+    /// first. A start's first message has the number after the highest one offered before.
+    pub(super) fn number(&mut self, message: MessageNumber) -> (u64, bool) {
+        let is_of = |known: &&(u32, u64)| known.0 == message.start;
+        // A straggler of the start before is no new start.
+        let known = self.starts.iter().flatten().find(is_of);
+        let (first, is_restarted) = match (known, self.starts[0]) {
+            (Some(&(_, first)), _) => (first, false),
+            (None, None) => (0, false),
+            (None, Some(_)) => (self.next, true),
+        };
+        if known.is_none() {
+            self.starts = [Some((message.start, first)), self.starts[0]];
+        }
+        let number = first.saturating_add(message.sequence);
+        self.next = self.next.max(number.saturating_add(1));
+        (number, is_restarted)
+    }
+
+    /// What the message of this `number` met when a piece or copy of it was offered before.
+    pub(super) fn met(&self, number: u64) -> Option<T> {
+        let (known, met) = self.recent[place(number)]?;
+        (known == number).then_some(met)
+    }
+
+    /// Remembers it.
+    pub(super) fn keep(&mut self, number: u64, met: T) {
+        self.recent[place(number)] = Some((number, met));
+    }
+}
+
+fn place(number: u64) -> usize {
+    usize::try_from(number % RECENT_COUNT as u64).expect("below the count")
 }
 
 #[cfg(test)]
@@ -226,5 +308,38 @@ mod tests {
         assert_eq!(given(&[2.3, 2.3, 2.31, 3.0, 4.0]), [0, 1, 2, 3, 4]);
         let far = [0.0, 1.0, 2.0, 1_000.0, 1_001.0, 5_000.4, 5_001.0];
         assert_eq!(given(&far), [0, 1, 2, 1_000, 1_001, 5_000, 5_001]);
+    }
+
+    #[test]
+    fn messages_are_numbered_over_all_starts() {
+        let mut offered = Offered::<()>::new();
+        let mut number = |start, sequence| offered.number(MessageNumber { start, sequence });
+        assert_eq!(number(9, 3), (3, false));
+        assert_eq!(number(9, 5), (5, false));
+        // The new start's first message was lost before the link.
+        assert_eq!(number(2, 1), (7, true));
+        assert_eq!(number(9, 4), (4, false), "a straggler");
+        assert_eq!(number(2, 2), (8, false));
+        assert_eq!(number(3, 0), (9, true));
+        let following = offered.following();
+        assert_eq!((following.start, following.sequence), (3, 1));
+    }
+
+    #[test]
+    fn a_producer_started_anew_begins_another_grid() {
+        let at = |place: f64| ns(place * 1e6);
+        let mut grid = OfferGrid::new(0, 0, 1e6);
+        for tick in 1..100_u32 {
+            assert_eq!(grid.tick(at(f64::from(tick))), u64::from(tick));
+        }
+        // Half a period off the old one, where each error would round either way.
+        let mut grid = grid.restarted(at(250.49));
+        for tick in 251..2_000_u32 {
+            let late = if tick % 2 == 0 { 0.0 } else { 0.3 };
+            let found = grid.tick(at(f64::from(tick) + 0.49 + late));
+            assert_eq!(found, u64::from(tick), "the first had 250");
+        }
+        let mut soon = OfferGrid::new(0, 7, 1e6).restarted(at(0.2));
+        assert_eq!(soon.tick(at(1.2)), 9, "a tick of its own");
     }
 }
