@@ -7,8 +7,9 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use core::time::Duration;
 use serde::{Deserialize, Serialize};
 
-use crate::link::trace_ticks::{OfferGrid, Ticks};
-use crate::link::{Fate, LinkModel};
+use crate::link::trace_offers::{OfferGrid, Offered};
+use crate::link::trace_ticks::Ticks;
+use crate::link::{Fate, LinkModel, MessageNumber};
 use crate::time::Instant;
 use crate::trace::{Trace, TraceFate, TraceRecord, UNAVAILABLE_NS};
 
@@ -16,7 +17,8 @@ use crate::trace::{Trace, TraceFate, TraceRecord, UNAVAILABLE_NS};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum TraceMatch {
-    /// The n-th message of the channel meets the n-th record: equal departures have equal counts.
+    /// The n-th message of the channel meets the n-th record: equal departures have equal counts. Counted
+    /// over all starts of its producer: a start's first comes after the last one offered before.
     #[default]
     Index,
     /// The record published last at that time of the run: counted from the run's start where the
@@ -82,7 +84,7 @@ pub struct ReplayCounts {
     pub matching: TraceMatch,
     /// Records of the trace.
     pub record_count: u64,
-    /// Messages offered.
+    /// Messages offered, however many pieces or copies each came in.
     pub offered_count: u64,
     /// Of these, within the trace.
     pub met_count: u64,
@@ -150,6 +152,17 @@ impl ReplayTally {
     }
 }
 
+/// What a message met. Each piece of it meets the same: a message that was lost comes in none, and one
+/// that was delivered in all, each as much later as the record says.
+#[derive(Debug, Clone, Copy)]
+enum Met {
+    Record(TraceRecord),
+    /// The trace has no record at its tick.
+    Unpublished,
+    /// It came after the end.
+    End,
+}
+
 /// The link.
 #[derive(Debug)]
 pub struct TraceLink {
@@ -159,7 +172,7 @@ pub struct TraceLink {
     /// zero.
     origin_ns: i64,
     span_ns: i64,
-    next_number: u64,
+    offered: Offered<Met>,
     /// Where records are matched by ticks.
     ticks: Option<Ticks>,
     /// The grid of the messages offered, and the tick of the last.
@@ -199,7 +212,7 @@ impl TraceLink {
             replay,
             origin_ns,
             span_ns: end_ns.saturating_sub(origin_ns).max(1),
-            next_number: 0,
+            offered: Offered::new(),
             ticks,
             offers: None,
             cells: Arc::default(),
@@ -224,33 +237,43 @@ impl TraceLink {
         longest.max(self.replay.delay_otherwise.unwrap_or_default())
     }
 
-    /// As [`LinkModel::offer`], for the message `number` of its channel, counted from 0 over all
-    /// starts of its producer.
-    pub fn offer_number(&mut self, now: Instant, number: u64) -> Fate {
-        self.next_number = number.saturating_add(1);
-        let place = match self.replay.matching {
-            TraceMatch::Index => self.by_index(number),
-            TraceMatch::Time => self.by_time(now),
-            TraceMatch::Tick => match self.by_tick(now, number) {
-                Ok(place) => place,
-                Err(fate) => return fate,
-            },
+    /// As [`LinkModel::offer`], for this message of its channel. A piece or copy of one of the last 64
+    /// meets what that met, and is not counted again.
+    pub fn offer_message(&mut self, now: Instant, message: MessageNumber) -> Fate {
+        let (number, is_restarted) = self.offered.number(message);
+        if let Some(met) = self.offered.met(number) {
+            return self.fate(met, now);
+        }
+        let met = match self.replay.matching {
+            TraceMatch::Index => self.counted(self.by_index(number)),
+            TraceMatch::Time => self.counted(self.by_time(now)),
+            TraceMatch::Tick => self.by_tick(now, number, is_restarted),
         };
+        self.offered.keep(number, met);
+        if let Met::Record(record) = met
+            && record.fate == TraceFate::Delivered
+        {
+            let delays = [record.delay(), record.second_delay()];
+            for _ in delays.into_iter().flatten().filter(|delay| *delay < 0) {
+                add(&self.cells.negative_delay);
+            }
+        }
+        self.fate(met, now)
+    }
+
+    /// Counts what a message meets with a record of its own, or none after the end.
+    fn counted(&self, place: Option<(TraceRecord, bool)>) -> Met {
         let Some((record, is_beyond)) = place else {
             add(&self.cells.beyond_end);
-            return match self.replay.end {
-                TraceEnd::Lost => Fate::Lost,
-                TraceEnd::Perfect | TraceEnd::Wrap => Fate::Delivered(now),
-            };
+            return Met::End;
         };
-        let fate = self.fate(&record, now);
         add(match record.fate {
             _ if is_beyond => &self.cells.beyond_end,
             TraceFate::Delivered => &self.cells.delivered,
             TraceFate::Unknown => &self.cells.unknown,
             _ => &self.cells.lost,
         });
-        fate
+        Met::Record(record)
     }
 
     /// The record, and whether it stands for one after the end; `None` after the end.
@@ -282,62 +305,57 @@ impl TraceLink {
         Some((records[place], is_beyond))
     }
 
-    /// As the others, or the fate of a message that meets no record of its own.
-    fn by_tick(&mut self, now: Instant, number: u64) -> Result<Option<(TraceRecord, bool)>, Fate> {
+    /// As the others, with its count: a message may have no record of its own.
+    fn by_tick(&mut self, now: Instant, number: u64, is_restarted: bool) -> Met {
         let ticks = self.ticks.as_ref().expect("matching by ticks has them");
+        let at_ns = now.as_ns();
         let (offered, is_repeated) = match &mut self.offers {
             None => {
-                self.offers = Some((OfferGrid::new(now.as_ns(), number, ticks.period_ns), number));
+                self.offers = Some((OfferGrid::new(at_ns, number, ticks.period_ns), number));
                 (number, false)
             }
             Some((grid, last)) => {
-                let tick = grid.tick(now.as_ns());
+                if is_restarted {
+                    *grid = grid.restarted(at_ns);
+                } else {
+                    grid.tick(at_ns);
+                }
+                let tick = grid.newest();
                 (tick, core::mem::replace(last, tick) == tick)
             }
         };
         let is_beyond = offered >= ticks.count();
         if is_beyond && self.replay.end != TraceEnd::Wrap {
-            return Ok(None);
+            return self.counted(None);
         }
-        let place = ticks.record_of(offered % ticks.count());
-        let Some(place) = place else {
+        let Some(place) = ticks.record_of(offered % ticks.count()) else {
             add(&self.cells.unpublished);
-            return Err(Fate::Lost);
+            return Met::Unpublished;
         };
         let record = self.trace.records[place];
         if is_repeated && !is_beyond {
             add(&self.cells.repeated);
-            return Err(self.fate(&record, now));
+            return Met::Record(record);
         }
-        Ok(Some((record, is_beyond)))
+        self.counted(Some((record, is_beyond)))
     }
 
-    fn fate(&self, record: &TraceRecord, now: Instant) -> Fate {
-        if record.fate != TraceFate::Delivered {
-            return Fate::Lost;
-        }
-        let otherwise = self.replay.delay_otherwise.unwrap_or_default();
-        let first = match record.delay() {
-            Some(delay_ns) => now + self.duration(delay_ns),
-            None => now + otherwise,
+    fn fate(&self, met: Met, now: Instant) -> Fate {
+        let record = match met {
+            Met::Record(record) if record.fate == TraceFate::Delivered => record,
+            Met::End if self.replay.end != TraceEnd::Lost => return Fate::Delivered(now),
+            Met::Record(_) | Met::Unpublished | Met::End => return Fate::Lost,
         };
-        match record.second_delay() {
+        let after = |delay_ns: i64| now + Duration::from_nanos(delay_ns.max(0).unsigned_abs());
+        let otherwise = now + self.replay.delay_otherwise.unwrap_or_default();
+        let first = record.delay().map_or(otherwise, after);
+        match record.second_delay().map(after) {
             None => Fate::Delivered(first),
-            Some(delay_ns) => {
-                let second = now + self.duration(delay_ns);
-                Fate::Duplicated {
-                    first: first.min(second),
-                    second: first.max(second),
-                }
-            }
+            Some(second) => Fate::Duplicated {
+                first: first.min(second),
+                second: first.max(second),
+            },
         }
-    }
-
-    fn duration(&self, delay_ns: i64) -> Duration {
-        if delay_ns < 0 {
-            add(&self.cells.negative_delay);
-        }
-        Duration::from_nanos(delay_ns.max(0).unsigned_abs())
     }
 }
 
@@ -361,11 +379,16 @@ fn add(cell: &AtomicU64) {
 
 impl LinkModel for TraceLink {
     fn offer(&mut self, now: Instant, _length_bytes: usize) -> Fate {
-        self.offer_number(now, self.next_number)
+        self.offer_message(now, self.offered.following())
     }
 
-    fn offer_numbered(&mut self, now: Instant, _length_bytes: usize, number: u64) -> Fate {
-        self.offer_number(now, number)
+    fn offer_numbered(
+        &mut self,
+        now: Instant,
+        _length_bytes: usize,
+        message: MessageNumber,
+    ) -> Fate {
+        self.offer_message(now, message)
     }
 
     fn replay_tally(&self) -> Option<ReplayTally> {

@@ -29,6 +29,10 @@ fn at(ms: i64) -> Instant {
     Instant::from_ns(ms * MS)
 }
 
+fn number(start: u32, sequence: u64) -> MessageNumber {
+    MessageNumber { start, sequence }
+}
+
 fn met(ms: i64) -> Vec<Fate> {
     vec![
         Fate::Delivered(at(ms + 2)),
@@ -56,7 +60,7 @@ fn the_nth_message_meets_the_nth_record_whenever_it_comes() {
     assert_eq!(counts.record_count, 4);
     assert_eq!(link.delay_max(), Duration::from_millis(5));
     // Told by number, it does not matter which were never offered.
-    assert_eq!(link.offer_number(at(9), 2), met(9)[2]);
+    assert_eq!(link.offer_message(at(9), number(0, 10)), met(9)[2]);
     assert_eq!(link.offer(at(9), 1), Fate::Lost);
 }
 
@@ -181,7 +185,7 @@ fn unknown_delays_need_a_word_and_negative_ones_are_counted() {
         ..TraceReplay::default()
     };
     let mut link = TraceLink::new(unknown, replay).unwrap();
-    let fate = link.offer_number(at(0), 2);
+    let fate = link.offer_message(at(0), number(0, 2));
     assert_eq!(fate.arrival(), Some(at(3)));
     let mut early = trace();
     early.records[0].delay_ns = -5;
@@ -194,4 +198,65 @@ fn unknown_delays_need_a_word_and_negative_ones_are_counted() {
     };
     let refused = TraceLink::new(Arc::new(empty), TraceReplay::default());
     assert_eq!(refused.unwrap_err(), ReplayError::Empty);
+}
+
+#[test]
+fn pieces_and_copies_of_a_message_meet_one_record_and_count_once() {
+    for matching in [TraceMatch::Index, TraceMatch::Time, TraceMatch::Tick] {
+        let mut ticking = trace();
+        let of = |tick: i64| TraceRecord::published(tick * 10 * MS, 0, 1);
+        let known = |tick: i64| of(tick).delivered(if tick % 8 == 0 { -1 } else { tick }, 0);
+        let records = (0..100).map(|tick| if tick % 3 == 1 { of(tick) } else { known(tick) });
+        ticking.records = records.collect();
+        let replay = TraceReplay {
+            matching,
+            ..TraceReplay::default()
+        };
+        let mut link = TraceLink::new(Arc::new(ticking.clone()), replay).unwrap();
+        for (tick, record) in (0..100).zip(&ticking.records) {
+            // Three pieces; a copy of one when the next two messages are through already.
+            for (ms, sequence) in [(0, tick), (1, tick), (4, tick), (5, tick - 2)] {
+                let now = at(tick * 10 + ms);
+                let Ok(sequence) = u64::try_from(sequence) else {
+                    continue;
+                };
+                let record = if ms == 5 {
+                    ticking.records[usize::try_from(sequence).unwrap()]
+                } else {
+                    *record
+                };
+                let delay = |ns: i64| Duration::from_nanos(ns.max(0).unsigned_abs());
+                let expected = record
+                    .delay()
+                    .map_or(Fate::Lost, |ns| Fate::Delivered(now + delay(ns)));
+                assert_eq!(
+                    link.offer_message(now, number(0, sequence)),
+                    expected,
+                    "{matching:?} {tick}"
+                );
+            }
+        }
+        let counts = link.tally().counts();
+        assert_eq!((counts.offered_count, counts.met_count), (100, 100));
+        assert_eq!((counts.delivered_count, counts.unknown_count), (67, 33));
+        assert_eq!(
+            counts.negative_delay_count, 9,
+            "of 13 eighths 4 are unknown"
+        );
+    }
+}
+
+#[test]
+fn by_index_a_producer_started_anew_goes_on_where_it_was() {
+    let mut link = link(TraceMatch::Index, TraceEnd::Lost);
+    let mut offer = |start, sequence| link.offer_message(at(0), number(start, sequence));
+    assert_eq!(offer(5, 0), met(0)[0]);
+    assert_eq!(offer(5, 1), met(0)[1]);
+    assert_eq!(offer(6, 0), met(0)[2]);
+    assert_eq!(offer(6, 0), met(0)[2], "a copy");
+    assert_eq!(offer(5, 1), met(0)[1], "a straggler");
+    assert_eq!(offer(6, 1), met(0)[3]);
+    assert_eq!(offer(6, 2), Fate::Lost);
+    let counts = link.tally().counts();
+    assert_eq!((counts.met_count, counts.beyond_end_count), (4, 1));
 }

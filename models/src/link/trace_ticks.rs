@@ -1,6 +1,6 @@
-//! Which tick of its producer each record of a trace belongs to, from the instants alone; which ticks
-//! have no record because the process that should have published was held up; and which tick a message
-//! offered to a replay belongs to.
+//! Which tick of its producer each record of a trace belongs to, from the instants alone; and which
+//! ticks have no record because the process that should have published was held up. The messages offered to
+//! a replay have theirs from [`super::trace_offers`].
 //!
 //! A producer's timer stands on an absolute grid (`time::PeriodicTimer`): its messages leave late, never
 //! early, and a late one moves none after it. So the grid is the lower edge of the instants. It is found
@@ -29,7 +29,7 @@ const CORRECTION_MAX: f64 = 0.05;
 /// Blocks that the grid is drawn through; older ones are forgotten bit by bit.
 const MEMORY_BLOCKS: f64 = 64.0;
 /// Most of a period by which an instant may lie before the grid; the rest is lateness.
-const EARLY_RATIO: f64 = 0.125;
+pub(super) const EARLY_RATIO: f64 = 0.125;
 /// And least, where the grid is sharp.
 const EARLY_MIN_RATIO: f64 = 0.01;
 /// Of all latenesses, the one that says how sharp it is: fewer messages are late by almost a period.
@@ -44,10 +44,6 @@ const LATE_TICKS_MAX: usize = 256;
 /// Most ticks from the first record to the last: at 1 kHz seven weeks, and whole numbers to spare in
 /// every sum.
 const TICKS_MAX: i64 = 1 << 32;
-/// Share of an offer's distance from the grid that moves the grid, and that changes its period: a
-/// quarter of the square of the first, so that it settles without swinging.
-const PHASE_GAIN: f64 = 1.0 / 128.0;
-const PERIOD_GAIN: f64 = PHASE_GAIN * PHASE_GAIN / 4.0;
 
 /// A producer's ticks.
 #[derive(Debug, Clone)]
@@ -97,7 +93,7 @@ fn quantile(mut values: Vec<f64>, ratio: f64) -> f64 {
     clippy::cast_possible_truncation,
     reason = "ticks are far below 2^63, and the cast saturates"
 )]
-fn whole(x: f64) -> i64 {
+pub(super) fn whole(x: f64) -> i64 {
     x as i64
 }
 
@@ -274,7 +270,7 @@ fn ticks_of(instants: &[f64], middle_ns: f64) -> Option<Vec<i64>> {
 
 /// Of two messages in one period the earlier is a late one: it takes the last tick before that has
 /// none, if there is one not far off; what is between moves with it.
-fn sort_out(ticks: &mut [i64]) {
+pub(super) fn sort_out(ticks: &mut [i64]) {
     for index in 1..ticks.len() {
         if ticks[index] > ticks[index - 1] {
             continue;
@@ -340,39 +336,6 @@ impl Ticks {
     pub(super) fn record_of(&self, tick: u64) -> Option<usize> {
         let place = self.ticks.partition_point(|before| *before < tick);
         (self.ticks.get(place) == Some(&tick)).then_some(place)
-    }
-}
-
-/// The grid of the messages that a replay is offered. Their producer's clock is not the trace's, so
-/// their grid is followed as well: counting periods from the first would be a tick off after 5000
-/// at 100 parts per million.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct OfferGrid {
-    /// Where the newest tick's message is expected.
-    expected_ns: f64,
-    period_ns: f64,
-    tick: u64,
-}
-
-impl OfferGrid {
-    /// The first message, which belongs to `tick`, of a producer with about the period `period_ns`.
-    pub(super) const fn new(at_ns: i64, tick: u64, period_ns: f64) -> Self {
-        Self {
-            expected_ns: at_ns as f64,
-            period_ns,
-            tick,
-        }
-    }
-
-    /// The tick of the next message, never before that of the last.
-    pub(super) fn tick(&mut self, at_ns: i64) -> u64 {
-        let distance = (at_ns as f64 - self.expected_ns) / self.period_ns;
-        let steps = distance.round().max(0.0);
-        let error = (distance - steps).max(-0.5);
-        self.expected_ns += (steps + PHASE_GAIN * error) * self.period_ns;
-        self.period_ns *= 1.0 + PERIOD_GAIN * error;
-        self.tick += u64::try_from(whole(steps)).unwrap_or(0);
-        self.tick
     }
 }
 

@@ -196,23 +196,6 @@ fn of_two_in_one_period_the_earlier_takes_the_last_tick_without_a_record() {
 }
 
 #[test]
-fn offers_of_another_clock_are_followed() {
-    for ppm in [-100.0, 0.0, 100.0] {
-        let mut random = RandomStream::new(5, "offers");
-        let mut grid = OfferGrid::new(77, 0, 1e6);
-        let period_ns = 1e6 * (1.0 + ppm * 1e-6);
-        for tick in 1..1_000_000_u64 {
-            let late = if random.chance(0.1) { 0.4 } else { 0.02 } * random.uniform();
-            if random.chance(0.05) || tick % 100_000 > 99_000 {
-                continue;
-            }
-            let at_ns = 77 + whole_ns((tick as f64 + late) * period_ns);
-            assert_eq!(grid.tick(at_ns), tick, "{ppm} ppm");
-        }
-    }
-}
-
-#[test]
 fn what_has_no_period_has_no_ticks() {
     let mut random = RandomStream::new(1, "no period");
     let mut at_ns = 0;

@@ -16,7 +16,7 @@ use hil_gateways::transport::timestamping::TimestampMode;
 use hil_gateways::transport::udp::{GrantedOptions, PathMtu, UdpReceiver, UdpSender, UdpSettings};
 use hil_gateways::transport::{DatagramReceiver, DatagramSender};
 use hil_models::link::trace::ReplayTally;
-use hil_models::link::{Fate, LinkModel, LossCauses};
+use hil_models::link::{Fate, LinkModel, LossCauses, MessageNumber};
 use hil_models::time::Instant;
 
 use super::GatewayError;
@@ -262,9 +262,12 @@ fn emulate(
 }
 
 /// Which message of its channel a datagram carries, or a part of.
-fn message_number(bytes: &[u8]) -> Option<u64> {
+fn message_number(bytes: &[u8]) -> Option<MessageNumber> {
     let header = wire::decode(bytes).ok()?.header;
-    (header.kind == Kind::Data).then_some(header.sequence)
+    (header.kind == Kind::Data).then_some(MessageNumber {
+        start: header.epoch,
+        sequence: header.sequence,
+    })
 }
 
 /// A link on a clock that reads zero when the run starts, as it does in virtual time; before the
@@ -307,9 +310,14 @@ impl<L: LinkModel> LinkModel for SinceStart<L> {
         self.ask(now, |link, at| link.offer(at, length_bytes))
     }
 
-    fn offer_numbered(&mut self, now: Instant, length_bytes: usize, number: u64) -> Fate {
+    fn offer_numbered(
+        &mut self,
+        now: Instant,
+        length_bytes: usize,
+        message: MessageNumber,
+    ) -> Fate {
         self.ask(now, |link, at| {
-            link.offer_numbered(at, length_bytes, number)
+            link.offer_numbered(at, length_bytes, message)
         })
     }
 }
@@ -328,82 +336,5 @@ fn datagram_bytes_max(launch: &DirectionLaunch, path: PathMtu) -> usize {
 }
 
 #[cfg(test)]
-mod tests {
-    use hil_models::link::outages::{Outage, OutageSchedule, Outages};
-    use hil_models::link::spec::{LinkSpec, Way};
-    use hil_models::random::RandomStream;
-
-    use super::*;
-
-    fn emulation(per_hour: f64) -> EmulationLaunch {
-        let outages = Outages {
-            mean_s: 0.5,
-            per_hour,
-            buffered: false,
-        };
-        EmulationLaunch {
-            spec: LinkSpec {
-                outages,
-                ..LinkSpec::fixed(Duration::from_millis(5), 0.0)
-            },
-            link: "hop".to_owned(),
-            way: Way::Forward,
-            seed: 3,
-            trace: None,
-        }
-    }
-
-    fn live(channel: &str, start: &RunStart) -> SinceStart<impl LinkModel + use<>> {
-        SinceStart {
-            link: emulation(600.0).model(channel).unwrap(),
-            start: start.clone(),
-        }
-    }
-
-    #[test]
-    fn outages_count_from_the_start_of_the_run_on_every_channel_alike() {
-        let start = RunStart::default();
-        let began = Instant::from_ns(77_000_000_000_123);
-        let (mut there, mut back) = (live("a/b", &start), live("b/a", &start));
-        // Nothing fails before the start, however long it takes.
-        for step in 0..1_000 {
-            let now = Instant::from_ns(step * 1_000_000_000);
-            assert_eq!(
-                there.offer(now, 1),
-                Fate::Delivered(now + Duration::from_millis(5))
-            );
-        }
-        start.set(began);
-        let mut restarted = None;
-        let mut virtual_time = emulation(600.0).model("a/b").unwrap();
-        let mut lost_count = 0;
-        for step in 0..100_000 {
-            let elapsed = Duration::from_millis(4 * step);
-            let now = began + elapsed;
-            let is_lost = there.offer(now, 1) == Fate::Lost;
-            lost_count += u32::from(is_lost);
-            assert_eq!(back.offer(now, 1) == Fate::Lost, is_lost);
-            let simulated = virtual_time.offer(Instant::ZERO + elapsed, 1);
-            assert_eq!(simulated == Fate::Lost, is_lost);
-            if step >= 50_000 {
-                // A gateway that was started again in the middle of the run.
-                let restarted = restarted.get_or_insert_with(|| live("a/b", &start));
-                assert_eq!(restarted.offer(now, 1) == Fate::Lost, is_lost);
-            }
-        }
-        assert!(lost_count > 1_000, "{lost_count}");
-    }
-
-    #[test]
-    fn two_links_of_one_run_fail_apart() {
-        let first = |link: &str| -> Outage {
-            let emulation = emulation(600.0);
-            let name = format!("links.{link}.outages");
-            let stream = RandomStream::new(emulation.seed, &name);
-            let mut schedule =
-                OutageSchedule::new(emulation.spec.outages, stream, Instant::ZERO).unwrap();
-            schedule.next().unwrap()
-        };
-        assert_ne!(first("hop"), first("wire"));
-    }
-}
+#[path = "socket_tests.rs"]
+mod tests;
