@@ -96,7 +96,7 @@ fn check_channels(summary: &RunSummary) {
 /// What is made of delays says how far it may be off, and so does the score of both hosts' messages.
 fn check_bounds(summary: &RunSummary) {
     let network = summary.network.as_ref().unwrap();
-    assert!(!network.clocks_differ && network.clock_bound_s > 0.0);
+    assert!(!network.clocks_differ && network.clock_bound_s > Some(0.0));
     for one in &network.channels {
         let (name, figures) = (&one.channel, &one.figures);
         // A channel that answers requests may have had one.

@@ -87,7 +87,8 @@ impl ClockMap {
     /// As [`Self::localise`], and further outside the exchanges too: what the nearest of them says,
     /// widened by the drift allowance for all the time between, in which no clock may step. For the
     /// axis of a report, on which a start that lies before all exchanges must be put somewhere; no delay is
-    /// converted so. `None` in a noticed step and without exchanges.
+    /// converted so. `None` in a noticed step and without exchanges. See [`Self::localise_early`] for a
+    /// score.
     pub fn localise_beyond(&self, remote: RemoteInstant) -> Option<Localised> {
         if let Some(localised) = self.localise(remote) {
             return Some(localised);
@@ -106,6 +107,19 @@ impl ClockMap {
             earliest: at(lowest_ns),
             latest: at(highest_ns),
         })
+    }
+
+    /// As [`Self::localise_beyond`] before the first exchange, as [`Self::localise`] from then on. For the
+    /// messages of a score, which are published before gateways meet; true beside those that only this
+    /// converts, which take it that no clock stepped before the first exchange.
+    pub fn localise_early(&self, remote: RemoteInstant) -> Option<(Localised, bool)> {
+        if let Some(localised) = self.localise(remote) {
+            return Some((localised, false));
+        }
+        let at_ns = remote.as_ns();
+        let first_ns = self.pieces.first()?.band.nearest_ns(at_ns)?;
+        let is_early = at_ns < first_ns;
+        is_early.then_some((self.localise_beyond(remote)?, true))
     }
 
     /// `local` on the other host's clock, with the largest error in nanoseconds.

@@ -261,9 +261,15 @@ fn an_instant_far_before_the_exchanges_converts_within_the_drift_allowance() {
             "{beyond_s} s: {found:?}"
         );
         assert_eq!(map.localise(at).is_some(), beyond_s <= 1);
+        assert_eq!(map.localise_early(at), Some((found, beyond_s > 1)));
     }
     let nothing = ClockMap::new(&[], ClockSettings::default());
     assert_eq!(nothing.localise_beyond(RemoteInstant::from_ns(0)), None);
+    assert_eq!(nothing.localise_early(RemoteInstant::from_ns(0)), None);
+    // After the last exchange a score gets no more than a delay.
+    let late = RemoteInstant::from_ns(first_ns + 3_600_000_000_000);
+    assert!(map.localise_beyond(late).is_some());
+    assert_eq!(map.localise_early(late), None);
 }
 
 #[test]

@@ -93,7 +93,7 @@ impl HostClocks {
 
     /// The earliest of several hosts' instants, on the clock of `host`; `None` unless all of them
     /// convert. Gateways may begin to exchange clocks long after the run began, so instants before
-    /// the exchanges convert, too.
+    /// the exchanges convert, too. Its error shifts all times since the start alike.
     pub(super) fn earliest_on<'a>(
         &self,
         host: &str,
@@ -117,19 +117,15 @@ impl HostClocks {
         pairs.all(|(from, to)| self.path(from, to).is_aligned())
     }
 
-    /// The largest error with which instants of two aligned hosts compare, over the time of the
-    /// exchanges; 0 on one clock, and without any alignment.
-    pub(super) fn largest_bound_ns(&self) -> u64 {
-        let bounds = self
-            .section
-            .pairs
-            .iter()
-            .filter_map(|pair| match pair.rung {
-                ClockRung::OneClock | ClockRung::None => None,
-                ClockRung::Disciplined => pair.disciplined.map(|offset| offset.bound_ns),
-                ClockRung::Exchanges => Some(pair.exchanges.as_ref()?.bound?.largest_ns),
-            });
-        bounds.max().unwrap_or(0)
+    /// Hosts that exchanges relate, each map from the first of two to the second.
+    #[cfg(test)]
+    pub(super) fn mapped(maps: Vec<((String, String), ClockMap)>) -> Self {
+        let relations = maps.into_iter();
+        let relations = relations.map(|(hosts, map)| (hosts, Relation::Mapped(Box::new(map))));
+        Self {
+            relations: relations.collect(),
+            ..Self::default()
+        }
     }
 
     fn relate(
@@ -395,16 +391,14 @@ mod tests {
     #[test]
     fn a_run_that_began_long_before_the_exchanges_has_one_beginning() {
         let ahead_ns = 100_000_000_000;
-        let mut clocks = HostClocks::default();
+        let mut maps = Vec::new();
         let [here, there] = ["control-pc", "robot-pc"].map(str::to_owned);
         for (from, to, ahead_ns) in [(&there, &here, ahead_ns), (&here, &there, -ahead_ns)] {
             let from_s = if ahead_ns > 0 { 5 } else { 105 };
             let map = ClockMap::new(&exchanges(from_s, |_| ahead_ns), ClockSettings::default());
-            let relation = Relation::Mapped(Box::new(map));
-            clocks
-                .relations
-                .insert((from.clone(), to.clone()), relation);
+            maps.push(((from.clone(), to.clone()), map));
         }
+        let clocks = HostClocks::mapped(maps);
         // Three seconds before the first exchange, the other host 2 ms later.
         let start = Instant::from_ns(2_000_000_000);
         let later = Instant::from_ns(start.as_ns() + ahead_ns + 2_000_000);

@@ -6,6 +6,7 @@ use std::path::Path;
 
 use hil_models::time::Instant;
 
+use super::axis::RunAxis;
 use super::records::RunRecords;
 use crate::realtime::GrantOutcome;
 use crate::report::emulation::EmulationFigures;
@@ -147,16 +148,13 @@ pub(super) fn process_summary(process: &ProcessStory) -> ProcessSummary {
     }
 }
 
-pub(super) fn run_event(result: &RunResult, event: &Event) -> RunEvent {
+pub(super) fn run_event(axis: &RunAxis<'_>, event: &Event) -> RunEvent {
     let gap = event.interruption.map(|gap| match gap.until {
         Some(until) => format!("away for {:.0} ms", until.seconds_since(gap.from) * 1e3),
         None => "never came back".to_owned(),
     });
     RunEvent {
-        at_s: result
-            .spans
-            .get(&event.host)
-            .map_or(0.0, |(start, _)| event.at.seconds_since(*start)),
+        at_s: axis.shown_s(&event.host, event.at),
         what: format!("{}: {}", event.process, event.what),
         cause: gap.unwrap_or_default(),
     }

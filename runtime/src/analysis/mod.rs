@@ -1,6 +1,7 @@
 //! From the records of a finished run to its summary: reads the record files, draws up the
 //! account of each channel, and lets the case score what the robot did.
 
+mod axis;
 mod cards;
 mod clock_path;
 mod clocks;
@@ -22,6 +23,7 @@ use hil_models::case_study::Score;
 use hil_models::measure::account::MessageFate;
 use hil_models::plot::PlotSeries;
 
+use axis::RunAxis;
 use clocks::HostClocks;
 use figures::{channel_summary, process_summary, realtime_facts, run_event, run_facts};
 use outages::OutageStory;
@@ -64,6 +66,8 @@ pub(crate) fn conclude(
     records.set_clocks(clocks);
     let case = registry.make_case(topology)?;
     let unscored = score_clock::apply(&mut records, (topology, result), case.as_ref());
+    let score_host = score_clock::host(topology, case.as_ref());
+    let axis = RunAxis::of(records.clocks(), &result.spans, score_host);
     let mut summary = RunSummary::new(run_facts(topology, result, topology_file, command_line));
     summary.host_facts = result
         .facts
@@ -79,7 +83,7 @@ pub(crate) fn conclude(
     summary.events = result
         .events
         .iter()
-        .map(|event| run_event(result, event))
+        .map(|event| run_event(&axis, event))
         .collect();
     summary.channels = topology
         .channels()
@@ -89,7 +93,7 @@ pub(crate) fn conclude(
     capture::write(&mut summary, (topology, result), &records);
     summary.faces = faces::face_summaries(topology, result, &records);
     summary.hardware_stamps = cards::hardware_stamps(topology, result, &records);
-    let outages = add_outages(&mut summary, (topology, result), &records);
+    let outages = add_outages(&mut summary, (topology, result), (&records, &axis));
     let (specs, score) = match &case {
         Some((entry, case)) => (entry.channels, case.score(records.log())),
         None => (&[][..], Score::default()),
@@ -98,20 +102,20 @@ pub(crate) fn conclude(
     summary.score_events = events::explained(
         &score,
         (topology, result),
-        &records,
+        (&records, &axis),
         &summary.channels,
         (specs, &outages),
     );
     let errors = case.as_ref().map(|(_, case)| case.errors(records.log()));
     let network = network::of_run(
         (topology, result),
-        &records,
+        (&records, &axis),
         errors.unwrap_or_default(),
         (&mut summary.score_events, &mut summary.warnings),
     );
     let (network, network_series) = network.unzip();
     summary.network = network;
-    radio::add(&mut summary, (topology, result), &records);
+    radio::add(&mut summary, (topology, result), (&records, &axis));
     add_warnings(&mut summary, result, &records);
     summary.warnings.extend(unscored);
     let case = case.as_ref().map(|(_, case)| case.as_ref());
@@ -131,14 +135,14 @@ pub(crate) fn conclude(
 fn add_outages(
     summary: &mut RunSummary,
     run: (&Topology, &RunResult),
-    records: &RunRecords,
+    (records, axis): (&RunRecords, &RunAxis<'_>),
 ) -> Vec<OutageStory> {
     let mut stories = Vec::new();
     for (summary, channel) in summary.channels.iter_mut().zip(run.0.channels()) {
         let unknown = MessageFate::UnknownPeerRecordsUnavailable;
         let fates = summary.account.as_ref().map(|account| &account.fates);
         let is_partial = fates.is_some_and(|fates| fates.of(unknown) > 0);
-        if let Some(story) = OutageStory::of(run, channel, records, is_partial) {
+        if let Some(story) = OutageStory::of(run, channel, (records, axis), is_partial) {
             summary.outages = story.figures();
             stories.push(story);
         }

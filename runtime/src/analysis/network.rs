@@ -8,14 +8,15 @@ use hil_models::case_study::ErrorSeries;
 use hil_models::measure::account::{Side, passages};
 use hil_models::measure::correlation::{self, LagWindow};
 use hil_models::measure::network::{
-    NetworkBin, NetworkBins, NetworkContext, NetworkEvent, NetworkEventKind, NetworkFigures,
-    Passage, SeriesSpan, bin_width_ns, clock_steps, interruptions, network_events,
+    Moment, NetworkBin, NetworkBins, NetworkContext, NetworkEvent, NetworkEventKind,
+    NetworkFigures, Passage, Place, bin_width_ns, clock_steps, interruptions, network_events,
 };
 use hil_models::measure::record::IngressRecord;
 use hil_models::plot::PlotSeries;
 use hil_models::random::RandomStream;
 
-use super::events::{start_of, start_on};
+use super::axis::RunAxis;
+use super::events::start_on;
 use super::records::RunRecords;
 pub(crate) use super::robot_series::RobotSeries;
 use super::robot_series::{index_of, without_holes};
@@ -45,17 +46,23 @@ pub(crate) struct ChannelPassages<'a> {
     pub(crate) passages: &'a [Passage],
     /// What the passages alone do not show.
     pub(crate) other_events: Vec<NetworkEvent>,
-    pub(crate) span: SeriesSpan,
+    pub(crate) duration_ns: i64,
+    /// Puts moments of its hosts on the run's axis.
+    pub(crate) place: &'a Place<'a>,
     pub(crate) context: NetworkContext<'a>,
 }
 
 /// How the hosts' clocks stand to each other on the run's axis.
-#[derive(Debug, Clone, Copy, Default)]
+#[derive(Debug, Clone, Copy)]
 pub(crate) struct AxisClocks {
-    /// True when they are not aligned.
-    pub(crate) differ: bool,
-    /// How far instants of two aligned hosts may lie off each other, seconds.
-    pub(crate) bound_s: f64,
+    /// How far instants of two hosts, or of a host and the score, may lie off each other, seconds; `None`
+    /// when the clocks are not aligned.
+    pub(crate) bound_s: Option<f64>,
+}
+
+impl AxisClocks {
+    /// All hosts read one clock.
+    pub(crate) const ONE: Self = Self { bound_s: Some(0.0) };
 }
 
 /// A network under way of being put together, channel by channel, so that the passages of only
@@ -67,6 +74,9 @@ pub(crate) struct NetworkBuilder {
     bins: Vec<(String, NetworkBins)>,
     /// Processes whose time without them is told already.
     told: BTreeSet<(String, i64)>,
+    /// Events and messages without a place on the run's axis.
+    unplaced_event_count: u64,
+    unplaced_message_count: u64,
 }
 
 impl NetworkBuilder {
@@ -80,34 +90,50 @@ impl NetworkBuilder {
         let mut events = network_events(one.passages);
         events.extend(one.other_events);
         for event in events {
-            self.add_event(one.channel, event, one.span);
+            self.add_event(one.channel, event, (one.duration_ns, one.place));
         }
-        let width_ns = bin_width_ns(one.span.duration_ns);
-        let bins = NetworkBins::of(one.passages, one.span, width_ns);
+        let width_ns = bin_width_ns(one.duration_ns);
+        let bins = NetworkBins::of(one.passages, (one.duration_ns, width_ns), one.place);
+        self.unplaced_message_count += bins.unplaced_count;
         self.bins.push((one.channel.to_owned(), bins));
     }
 
-    fn add_event(&mut self, channel: &str, event: NetworkEvent, span: SeriesSpan) {
+    fn add_event(
+        &mut self,
+        channel: &str,
+        event: NetworkEvent,
+        (duration_ns, place): (i64, &Place<'_>),
+    ) {
         if let NetworkEventKind::ProcessDown { process, .. } = &event.kind
             && !self.told.insert((process.clone(), event.from.ns))
         {
             return;
         }
-        let start_ns = match event.from.side {
-            Side::Producer => span.producer_start_ns,
-            Side::Consumer => span.consumer_start_ns,
+        let side = event.from.side;
+        let since_s = |ns: i64| Some(place(Moment { side, ns })? as f64 * 1e-9);
+        let until_s = event.until_ns.map(since_s);
+        let (Some(from_s), None | Some(Some(_))) = (since_s(event.from.ns), until_s) else {
+            self.unplaced_event_count += 1;
+            return;
         };
-        let since_s = |ns: i64| ns.saturating_sub(start_ns) as f64 * 1e-9;
-        let end_s = span.duration_ns as f64 * 1e-9;
+        let end_s = duration_ns as f64 * 1e-9;
         self.events.push(TimedEvent {
             channel: channel.to_owned(),
-            from_s: since_s(event.from.ns),
-            until_s: event
-                .until_ns
-                .map(since_s)
-                .filter(|until_s| *until_s < end_s),
+            from_s,
+            until_s: until_s.flatten().filter(|until_s| *until_s < end_s),
             kind: event.kind,
         });
+    }
+
+    /// What a reader must know of what has no place on the axis.
+    fn unplaced(&self) -> Option<String> {
+        let (events, messages) = (self.unplaced_event_count, self.unplaced_message_count);
+        (events + messages > 0).then(|| {
+            format!(
+                "network: {events} events and {messages} messages are in no series and before no event \
+                 of the score: beside a step of a clock their times do not convert"
+            )
+        })
     }
 
     /// The report, and the series of every channel; `None` when no channel crossed a network. Puts
@@ -120,9 +146,11 @@ impl NetworkBuilder {
     ) -> Option<(NetworkReport, Vec<PlotSeries>)> {
         let (_, first) = self.bins.first()?;
         let (width_s, count) = (first.width_ns as f64 * 1e-9, first.bins.len());
+        // Without an alignment nothing is known to widen by; the report says so.
+        let bound_s = axis.bound_s.unwrap_or(0.0);
         self.events.sort_by(|a, b| a.from_s.total_cmp(&b.from_s));
         for event in &mut score.events {
-            event.network = event.at_s.map(|at_s| self.before(at_s, axis.bound_s));
+            event.network = event.at_s.map(|at_s| self.before(at_s, bound_s));
         }
         let mut robot = vec![(RobotSeries::of_events(score), true)];
         robot.extend(errors.into_iter().map(|one| (one, false)));
@@ -137,8 +165,8 @@ impl NetworkBuilder {
         let dropped = self.events.len().saturating_sub(EVENTS_MAX);
         let report = NetworkReport {
             foregoing_s: FOREGOING_S,
-            foregoing_chance_ratio: covered_s(&self.events, (run_s, axis.bound_s)) / run_s,
-            clocks_differ: axis.differ,
+            foregoing_chance_ratio: covered_s(&self.events, (run_s, bound_s)) / run_s,
+            clocks_differ: axis.bound_s.is_none(),
             clock_bound_s: axis.bound_s,
             timeline: timeline(&self.bins, &robot, width_s),
             correlation: correlate(&self.bins, &robot, (width_s, seed)),
@@ -340,37 +368,41 @@ fn correlate(
 /// Everything the records of a live run say of its network; see [`NetworkBuilder::finish`].
 pub(super) fn of_run(
     run: (&Topology, &RunResult),
-    records: &RunRecords,
+    (records, axis): (&RunRecords, &RunAxis<'_>),
     errors: Vec<ErrorSeries>,
     (score, warnings): (&mut ScoreEvents, &mut Vec<String>),
 ) -> Option<(NetworkReport, Vec<PlotSeries>)> {
-    let (topology, result) = run;
+    let (topology, _) = run;
     let mut builder = NetworkBuilder::default();
     for channel in topology.channels() {
         if topology.crossing(channel).is_some() && records.has(&channel.name) {
-            let added = add_channel(&mut builder, run, records, channel);
+            let added = add_channel(&mut builder, run, (records, axis), channel);
             warnings.extend(added.err().map(|missing| {
                 let name = &channel.name;
                 format!("{name}: left out of the network's figures: {missing}")
             }));
         }
     }
+    warnings.extend(builder.unplaced());
     let errors = errors.into_iter().filter_map(|one| {
-        let start = start_of(run, topology.channel(one.clock_of)?, records.clocks())?;
-        Some(RobotSeries::of(one, start))
+        let host = &topology
+            .process(&topology.channel(one.clock_of)?.from)?
+            .host;
+        Some(RobotSeries::of(one, |at| axis.place_s(host, at)))
     });
-    let seed = topology.run().seed;
-    let axis = AxisClocks {
-        differ: !records.clocks().are_aligned(result.spans.keys()),
-        bound_s: records.clocks().largest_bound_ns() as f64 * 1e-9,
+    let errors = errors.collect();
+    // The stamps that events and errors were made of may have been brought to the score's clock.
+    axis.note_score(records.log().stamp_bound_ns());
+    let clocks = AxisClocks {
+        bound_s: axis.bound_ns().map(|ns| ns as f64 * 1e-9),
     };
-    builder.finish(score, errors.collect(), (seed, axis))
+    builder.finish(score, errors, (topology.run().seed, clocks))
 }
 
 fn add_channel(
     builder: &mut NetworkBuilder,
     run: (&Topology, &RunResult),
-    records: &RunRecords,
+    (records, axis): (&RunRecords, &RunAxis<'_>),
     channel: &Channel,
 ) -> Result<(), String> {
     let (topology, result) = run;
@@ -379,23 +411,25 @@ fn add_channel(
         let host = topology.process(process).map(|process| &process.host);
         host.map_or("", |host| host.as_str())
     });
-    let within = |host: &str| {
-        let span = start_on(result, host, records.clocks()).zip(result.spans.get(host));
-        let missing = || format!("when the run began and ended on host {host} is unavailable");
-        span.map(|(start, (_, end))| (start, *end))
-            .ok_or_else(missing)
+    let end_on = |host: &str| {
+        let (_, end) = result.spans.get(host)?;
+        Some((*end, axis.at(host, end.as_ns())?.0))
     };
-    let (producer_start, producer_end) = within(hosts[0])?;
-    let (consumer_start, consumer_end) = within(hosts[1])?;
-    let span = SeriesSpan {
-        producer_start_ns: producer_start.as_ns(),
-        consumer_start_ns: consumer_start.as_ns(),
-        duration_ns: producer_end
-            .ns_since(producer_start)
-            .max(consumer_end.ns_since(consumer_start)),
-    };
+    let missing =
+        |host: &str| format!("when the run began and ended on host {host} is unavailable");
+    let [producer_end, consumer_end] = hosts.map(|host| end_on(host).ok_or_else(|| missing(host)));
+    let ((producer_end, one_ns), (_, other_ns)) = (producer_end?, consumer_end?);
+    let producer_start =
+        start_on(result, hosts[0], records.clocks()).ok_or_else(|| missing(hosts[0]))?;
     let payload_bytes = records.log().raw(&channel.name).first();
     let payload_bytes = payload_bytes.map(|message| message.payload.len() as u64);
+    let place = |at: Moment| {
+        let host = match at.side {
+            Side::Producer => hosts[0],
+            Side::Consumer => hosts[1],
+        };
+        axis.place_ns(host, at.ns)
+    };
     records.consult(run, channel, |files, context| {
         let ways = passages(files, context);
         let is_copy = |record: &&IngressRecord| record.flags & IngressRecord::DUPLICATE != 0;
@@ -406,10 +440,11 @@ fn add_channel(
             hosts,
             passages: &ways,
             other_events,
-            span,
+            duration_ns: one_ns.max(other_ns),
+            place: &place,
             context: NetworkContext {
                 path: context.path,
-                run_ns: Some((span.producer_start_ns, producer_end.as_ns())),
+                run_ns: Some((producer_start.as_ns(), producer_end.as_ns())),
                 payload_bytes,
                 duplicated_count: files
                     .ingress

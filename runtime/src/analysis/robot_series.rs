@@ -16,14 +16,15 @@ pub(crate) struct RobotSeries {
 }
 
 impl RobotSeries {
-    /// A case's error; `start` is that of the run on the clock of its samples.
-    pub(crate) fn of(errors: ErrorSeries, start: Instant) -> Self {
+    /// A case's error; `place_s` puts instants of its samples' clock on the run's axis. Samples without a
+    /// place there are left out.
+    pub(crate) fn of(errors: ErrorSeries, place_s: impl Fn(Instant) -> Option<f64>) -> Self {
         let samples = errors.samples.into_iter();
         Self {
             label: errors.label.to_owned(),
             unit: errors.unit,
             samples: samples
-                .map(|(at, value)| (at.seconds_since(start), value))
+                .filter_map(|(at, value)| Some((place_s(at)?, value)))
                 .collect(),
         }
     }
@@ -128,7 +129,8 @@ mod tests {
             clock_of: "shuttle/status",
             samples: vec![at(1, 0.25), at(3, 0.75), at(3, 0.5)],
         };
-        let bins = RobotSeries::of(errors, Instant::ZERO).binned(1.0, 5, false);
+        let bins = RobotSeries::of(errors, |at| Some(at.seconds_since(Instant::ZERO)))
+            .binned(1.0, 5, false);
         let expected = vec![0.25, 0.25, 0.25, 0.75, 0.75];
         assert_eq!(bins.map_bits(), expected.map_bits());
     }

@@ -28,10 +28,10 @@ pub struct NetworkReport {
     /// True when hosts read different clocks: times count from each host's own start of the run,
     /// and the hosts start within a message of their supervisors of each other.
     pub clocks_differ: bool,
-    /// How far instants of two hosts may lie off each other on this axis where their clocks are aligned,
-    /// seconds; 0 on one clock, and unknown where `clocks_differ`.
+    /// How far instants of two hosts, or of a host and the score, may lie off each other on this axis
+    /// where the clocks are aligned, seconds; 0 on one clock, and `None` where `clocks_differ`.
     #[serde(default)]
-    pub clock_bound_s: f64,
+    pub clock_bound_s: Option<f64>,
     /// Network and robot on one axis.
     pub timeline: Timeline,
     /// Whether the robot's errors follow the network's troubles.

@@ -142,7 +142,7 @@ fn full() -> RunSummary {
             killed,
         ],
         events: vec![RunEvent {
-            at_s: 8.0,
+            at_s: Some(8.0),
             what: "robot gateway ended and was restarted after 0.757 s".to_owned(),
             cause: "killed by signal 9".to_owned(),
         }],

@@ -277,8 +277,8 @@ pub struct ProcessSummary {
 /// Something that happened during the run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RunEvent {
-    /// When, seconds after the start.
-    pub at_s: f64,
+    /// When, seconds after the start; `None` when the run's start on its host is unknown.
+    pub at_s: Option<f64>,
     /// What, in words.
     pub what: String,
     /// Why, in words; empty when unknown.

@@ -146,6 +146,21 @@ impl ChannelPath<'_> {
         }
     }
 
+    /// As [`Self::localise`], and further before the first exchange too, with true beside those that only
+    /// this converts; see [`ClockMap::localise_early`].
+    pub fn localise_early(self, remote: RemoteInstant) -> Option<(Instant, u64, bool)> {
+        match self {
+            Self::Mapped { map } => {
+                let (localised, is_early) = map.localise_early(remote)?;
+                Some((localised.instant, localised.bound_ns(), is_early))
+            }
+            Self::SharedMemory | Self::Gateway { .. } => {
+                let (at, bound_ns) = self.localise(remote)?;
+                Some((at, bound_ns, false))
+            }
+        }
+    }
+
     /// An instant of the consumer's host on the clock of the producer's, with the largest error.
     pub fn to_remote(self, local: Instant) -> Option<(RemoteInstant, u64)> {
         let shifted = |alignment: Alignment| {

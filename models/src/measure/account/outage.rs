@@ -201,8 +201,8 @@ pub struct OutageClass {
 /// The longest outage of a channel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LongestOutage {
-    /// Publication of its first lost message, nanoseconds after the start of the run, or on the
-    /// producer's clock when that start is unknown.
+    /// Publication of its first lost message, nanoseconds after the start of the run in a report; on the
+    /// producer's clock where they are drawn up, and when that start is unknown.
     pub start_ns: i64,
     /// Length, nanoseconds.
     pub length_ns: i64,
@@ -215,8 +215,8 @@ pub struct LongestOutage {
 }
 
 impl OutageFigures {
-    /// The figures of `outages`; `start` and `end` of the run are on the producer's clock.
-    pub fn of(outages: &[Outage], start: Option<Instant>, end: Option<Instant>) -> Self {
+    /// The figures of `outages`; `end` of the run is on the producer's clock.
+    pub fn of(outages: &[Outage], end: Option<Instant>) -> Self {
         let mut figures = Self {
             outage_count: outages.len() as u64,
             lost_count: 0,
@@ -241,7 +241,7 @@ impl OutageFigures {
             let is_longest = figures.longest.is_none_or(|one| one.length_ns < length_ns);
             if is_longest {
                 figures.longest = Some(LongestOutage {
-                    start_ns: from_ns.saturating_sub(start.map_or(0, Instant::as_ns)),
+                    start_ns: from_ns,
                     length_ns,
                     lost_count: outage.lost_count,
                     first_sequence: outage.first_sequence,

@@ -19,8 +19,9 @@ pub const EVENT_OUTAGE_MIN_NS: i64 = 100_000_000;
 const STEP_MIN_NS: u64 = 1_000_000;
 const SLEW_MAX_RATIO: f64 = 500e-6;
 
-/// A gateway reads the two clocks as a pair this often, and notes what it read last.
-const READING_PERIOD_NS: i64 = 100_000_000;
+/// How old a gateway's reading of the two clocks as a pair may be when it notes it with a message: the
+/// period of the readings and the longest sleep between two looks at it. What the scheduler adds is not in it.
+pub const CLOCK_READING_AGE_NS_MAX: i64 = 150_000_000;
 
 /// What happened.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -287,15 +288,15 @@ fn steps(readings: &mut Vec<(i64, i64)>, side: Side) -> Vec<NetworkEvent> {
         let [before, after] = [pair[0], pair[1]];
         let step_ns = after.1.saturating_sub(before.1);
         let passed_ns = after.0.saturating_sub(before.0) as f64;
-        // A step shows up to a period after it happened.
-        let slewed_ns = SLEW_MAX_RATIO * (passed_ns + READING_PERIOD_NS as f64);
+        // A step shows up to a reading's age after it happened.
+        let slewed_ns = SLEW_MAX_RATIO * (passed_ns + CLOCK_READING_AGE_NS_MAX as f64);
         let is_step = step_ns.unsigned_abs() > STEP_MIN_NS
             && step_ns.unsigned_abs() as f64 > slewed_ns + STEP_MIN_NS as f64;
         is_step.then_some(NetworkEvent {
             kind: NetworkEventKind::ClockStep { step_ns },
             from: Moment {
                 side,
-                ns: before.0.saturating_sub(READING_PERIOD_NS),
+                ns: before.0.saturating_sub(CLOCK_READING_AGE_NS_MAX),
             },
             until_ns: Some(after.0),
         })

@@ -21,13 +21,14 @@ mod tests;
 
 use serde::{Deserialize, Serialize};
 
-pub use bins::{NetworkBin, NetworkBins, SeriesSpan, bin_width_ns};
+pub use bins::{NetworkBin, NetworkBins, Place, bin_width_ns};
 pub(crate) use delay::has_tail;
 pub use delay::{
     DelayFigures, DelayQuantile, DelayVariation, InterarrivalJitter, SuccessiveVariation,
 };
 pub use events::{
-    EVENT_OUTAGE_MIN_NS, NetworkEvent, NetworkEventKind, clock_steps, interruptions, network_events,
+    CLOCK_READING_AGE_NS_MAX, EVENT_OUTAGE_MIN_NS, NetworkEvent, NetworkEventKind, clock_steps,
+    interruptions, network_events,
 };
 pub use loss::{BURST_GAP_MIN, BurstFigures, LongestLoss, LossFigures};
 pub use order::OrderFigures;

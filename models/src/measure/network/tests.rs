@@ -373,7 +373,7 @@ fn a_clock_that_was_set_is_an_event_and_one_that_is_slewed_is_not() {
     };
     assert_eq!(
         (steps[0].kind.clone(), steps[0].from.ns),
-        (expected, 119 * PERIOD_NS - 100_000_000)
+        (expected, 119 * PERIOD_NS - CLOCK_READING_AGE_NS_MAX)
     );
 }
 
@@ -382,12 +382,9 @@ fn bins_hold_what_happened_in_their_time() {
     // 10 s at 100 Hz, nothing from 3.00 s to 3.55 s.
     let mut all = passages(1_000, |one| (300..355).contains(&one));
     all[105].delay_bound_ns = 25_000;
-    let span = SeriesSpan {
-        producer_start_ns: 0,
-        consumer_start_ns: 0,
-        duration_ns: 1_000 * PERIOD_NS,
-    };
-    let binned = NetworkBins::of(&all, span, bin_width_ns(span.duration_ns));
+    let duration_ns = 1_000 * PERIOD_NS;
+    let shape = (duration_ns, bin_width_ns(duration_ns));
+    let binned = NetworkBins::of(&all, shape, &|at: Moment| Some(at.ns));
     assert_eq!((binned.width_ns, binned.bins.len()), (100_000_000, 100));
     let lost: Vec<u64> = binned.bins[29..37]
         .iter()
@@ -420,6 +417,29 @@ fn bins_hold_what_happened_in_their_time() {
     assert_eq!(series.columns[6].name, "delay_s_bound");
     let row = series.rows().nth(10).unwrap();
     assert!((row[6] - 25e-6).abs() < 1e-12);
+}
+
+#[test]
+fn bins_are_on_the_axis_that_moments_are_put_on() {
+    // 10 s at 100 Hz. The consumer's clock is two minutes ahead; nothing converts in the ninth second.
+    const AHEAD_NS: i64 = 120_000_000_000;
+    let mut all = passages(1_000, |one| (300..355).contains(&one));
+    for one in &mut all {
+        one.received_ns = one.received_ns.map(|ns| ns + AHEAD_NS);
+    }
+    let place = |at: Moment| match at.side {
+        Side::Producer => (at.ns < 900 * PERIOD_NS).then_some(at.ns),
+        Side::Consumer => Some(at.ns - AHEAD_NS),
+    };
+    let binned = NetworkBins::of(&all, (1_000 * PERIOD_NS, 100_000_000), &place);
+    assert_eq!(binned.unplaced_count, 100);
+    let sent_count: u64 = binned.bins.iter().map(|bin| bin.sent_count).sum();
+    assert_eq!(sent_count, 900);
+    let silences: Vec<i64> = binned.bins[29..36]
+        .iter()
+        .map(|bin| bin.silence_max_ns.unwrap() / 1_000_000)
+        .collect();
+    assert_eq!(silences, [10, 108, 208, 308, 408, 508, 560]);
 }
 
 #[test]

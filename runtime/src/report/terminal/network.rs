@@ -374,7 +374,7 @@ pub(super) fn what_preceded_what(
 }
 
 fn foregoing_words(report: &NetworkReport, events: &ScoreEvents) -> String {
-    let bound_s = Some(report.clock_bound_s).filter(|bound_s| *bound_s > 0.0);
+    let bound_s = report.clock_bound_s.filter(|bound_s| *bound_s > 0.0);
     let slack = bound_s.map_or_else(String::new, |bound_s| {
         format!(" (±{} by the clocks)", duration_s(bound_s))
     });

@@ -267,9 +267,17 @@ fn two_clocks_withdraw_error_and_lag_but_not_the_loops() {
     }
     // An alignment that is off by 15 us brings them back, and they say so.
     let bound_ns = 15_000;
-    let aligned = log.bring_to_one_clock(|channel, ns| match channel {
-        EGM_RIGHT_COMMAND => Some((ns + 77_000_000_000 - 15_000, bound_ns)),
-        _ => Some((ns, 0)),
+    let source_of = |channel: &str| Some(channel.to_owned());
+    let stamp = |at_ns, bound_ns| {
+        Some(crate::run_log::BroughtStamp {
+            at_ns,
+            bound_ns,
+            is_early: false,
+        })
+    };
+    let aligned = log.bring_to_one_clock(source_of, |channel, ns| match channel {
+        EGM_RIGHT_COMMAND => stamp(ns + 77_000_000_000 - 15_000, bound_ns),
+        _ => stamp(ns, 0),
     });
     assert_eq!(aligned, Ok(()));
     let aligned = case.score(&log);
