@@ -190,7 +190,9 @@ fn check_ticks(files: &RunFiles, name: &str, trace: &Trace) -> (usize, usize) {
         .map(|one| (u64::try_from(one.published_ns / PERIOD_NS).unwrap(), one))
         .collect();
     // No two records have one delay.
-    let tick_met: BTreeMap<i64, u64> = record_of.keys().map(|tick| (delay_of(*tick), *tick))
+    let tick_met: BTreeMap<i64, u64> = record_of
+        .keys()
+        .map(|tick| (delay_of(*tick), *tick))
         .collect();
     assert_eq!(tick_met.len(), record_of.len());
     let arrivals = records::<IngressRecord>(files, name, "ingress");
