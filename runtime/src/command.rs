@@ -2,6 +2,7 @@
 
 mod case_work;
 
+use std::collections::BTreeMap;
 use std::env;
 use std::fs;
 use std::io::IsTerminal;
@@ -11,6 +12,7 @@ use std::process::ExitCode;
 use clap::Parser;
 use hil_gateways::transport::timestamping::TimestampCapabilities;
 use hil_models::case_study::ParameterError;
+use hil_models::layout::Field;
 use hil_models::teleoperation::swing::swing_bvh;
 
 use crate::analysis;
@@ -181,6 +183,7 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
         hosts,
         domain_root: args.domain_root.clone(),
         command_line: env::args().collect(),
+        layouts: layouts(&topology, registry),
     };
     match supervisor::run(&topology, &options, &signals, console) {
         Ok(result) => {
@@ -210,6 +213,15 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
             exit_code_of_error(&error)
         }
     }
+}
+
+/// The fields of the messages of the topology's case, by channel.
+fn layouts(topology: &Topology, registry: &Registry) -> BTreeMap<String, &'static [Field]> {
+    let entry = topology.case().and_then(|case| registry.find(&case.name));
+    let channels = entry.into_iter().flat_map(|entry| entry.channels);
+    channels
+        .map(|channel| (channel.name.to_owned(), channel.message.fields))
+        .collect()
 }
 
 /// What the file comes to, or why no run of it can be what it says.

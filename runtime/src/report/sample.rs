@@ -2,6 +2,8 @@
 //! them after a deliberate change: `HIL_BLESS=1 cargo test -p hil-runtime report`, then read the
 //! difference.
 
+use std::collections::BTreeMap;
+
 use hil_models::measure::account::{
     AccountContext, ChannelAccount, ChannelPath, ChannelRecords, Coverage, account,
 };
@@ -27,6 +29,7 @@ fn run_facts() -> RunFacts {
         seed: 42,
         host: "operator".to_owned(),
         started: "2026-03-14 09:26:53 +01:00".to_owned(),
+        starts_ns: BTreeMap::new(),
         duration_s: 20.0,
         outcome: Outcome::Completed,
         exit_reason: "ran its 20 s".to_owned(),
