@@ -1,9 +1,10 @@
 //! From the monotonic clock on which a host stamped to the times of a recording. It aligns no two
 //! hosts: each goes by its own real-time clock, or by its monotonic one where no relation is known.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use hil_models::measure::record::{EgressRecord, IngressRecord, UNAVAILABLE};
+use hil_runtime::manifest::Manifest;
 use hil_runtime::record::RecordKind;
 
 use crate::run::Run;
@@ -76,15 +77,9 @@ impl Clocks {
         names.sort();
         names.dedup();
         let section = run.summary.as_ref().and_then(|one| one.clocks.as_ref());
-        let is_single = described.iter().all(|one| {
-            let others = one.to_host.iter().chain(&one.from_host);
-            others
-                .clone()
-                .all(|host| Some(host) == described[0].from_host.as_ref())
-        });
         clocks.has_one_clock = section
             .map(|section| section.has_one_clock)
-            .or((is_single && !described.is_empty()).then_some(true));
+            .or(is_one_machine(manifest).then_some(true));
         for name in names {
             let clock = clocks.host_clock(run, &name, &noted);
             clocks.hosts.insert(name, clock);
@@ -154,6 +149,20 @@ impl Clocks {
             .map(|(name, clock)| (name.as_str(), clock));
         hosts.filter(move |(name, _)| is_used(name))
     }
+}
+
+/// True when every host with a channel ran on the machine that wrote the manifest, or there is only
+/// one: what a killed run still tells.
+fn is_one_machine(manifest: Option<&Manifest>) -> bool {
+    let Some(manifest) = manifest else {
+        return false;
+    };
+    let channels = manifest.channels.iter();
+    let hosts: BTreeSet<&String> = channels
+        .flat_map(|one| one.from_host.iter().chain(&one.to_host))
+        .collect();
+    let is_here = |host: &&String| manifest.hosts_here.contains(*host);
+    hosts.len() == 1 || (!hosts.is_empty() && hosts.iter().all(is_here))
 }
 
 /// The offsets that the gateways of one host noted.

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 use std::process::ExitCode;
+use std::time::{Duration, Instant};
 
 use clap::Parser;
 use hil_runtime::console::Console;
@@ -21,6 +22,9 @@ mod exit {
     pub(super) const USAGE: u8 = 2;
     pub(super) const INTERNAL: u8 = 70;
 }
+
+/// How long work goes on before it says how far it is.
+const SILENCE: Duration = Duration::from_secs(1);
 
 /// Does what the command line says.
 pub(crate) fn run() -> ExitCode {
@@ -67,13 +71,32 @@ fn unless_refused(
     }
 }
 
+/// Work that is done in a moment needs no word on how far it is.
+struct Patience {
+    since: Instant,
+}
+
+impl Patience {
+    fn new() -> Self {
+        let since = Instant::now();
+        Self { since }
+    }
+
+    fn progress(&self, console: &mut Console, words: &str) {
+        if self.since.elapsed() >= SILENCE {
+            console.progress(words);
+        }
+    }
+}
+
 fn interrupted() -> u8 {
     u8::try_from(EXIT_INTERRUPTED).unwrap_or(exit::FAILED)
 }
 
 fn convert_run((run, output): (&Path, &Path), signals: &Signals, console: &mut Console) -> u8 {
+    let patience = Patience::new();
     let converted = convert(run, output, &mut |words| {
-        console.progress(words);
+        patience.progress(console, words);
         signals.received()
     });
     match converted {
@@ -106,8 +129,9 @@ fn convert_run((run, output): (&Path, &Path), signals: &Signals, console: &mut C
 }
 
 fn recover_file((broken, output): (&Path, &Path), signals: &Signals, console: &mut Console) -> u8 {
+    let patience = Patience::new();
     let recovered = recover(broken, output, &mut |offset| {
-        console.progress(&format!("{} MiB read", offset >> 20));
+        patience.progress(console, &format!("{} MiB read", offset >> 20));
         signals.received()
     });
     let recovered = match recovered {
@@ -145,8 +169,9 @@ fn recover_file((broken, output): (&Path, &Path), signals: &Signals, console: &m
 }
 
 fn show(file: &Path, json: bool, signals: &Signals, console: &mut Console) -> u8 {
+    let patience = Patience::new();
     let found = info(file, &mut |offset| {
-        console.progress(&format!("{} MiB read", offset >> 20));
+        patience.progress(console, &format!("{} MiB read", offset >> 20));
         signals.received()
     });
     match found {

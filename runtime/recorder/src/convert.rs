@@ -85,11 +85,13 @@ pub(crate) fn convert(
 ) -> Result<Converted, ConvertError> {
     let mut stopped = None;
     let mut run = Run::read(from, &mut |path| {
-        stopped = stopped.or(look(&format!("reading {path}")));
+        stopped = look(&format!("reading {path}"));
+        stopped.is_none()
     })?;
     if let Some(signal) = stopped {
         return Err(ConvertError::Interrupted(signal));
     }
+    run.count_missing();
     let clocks = Clocks::of(&run);
     let mut conversion = Conversion::begin(to, &run, &clocks)?;
     let items = conversion.plan(&run, &clocks);

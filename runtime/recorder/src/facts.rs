@@ -151,6 +151,9 @@ fn recording_words(run: &Run, names: &Names) -> Words {
         .collect();
     let version = env!("CARGO_PKG_VERSION").to_owned();
     words.insert("recorder_version".to_owned(), version);
+    for (channel, count) in &gaps.missing {
+        words.insert(format!("missing {channel}"), count.to_string());
+    }
     for (gap, number) in gaps.words.iter().zip(1..) {
         words.insert(format!("gap_{number:04}"), gap.clone());
     }

@@ -67,17 +67,41 @@ pub(crate) fn recover(
     to: &Path,
     look: &mut dyn FnMut(u64) -> Option<&'static str>,
 ) -> Result<Recovered, RecoverError> {
-    let mut copy = Copy {
-        recording: Recording::create(to)?,
-        schemas: BTreeMap::new(),
-        channels: BTreeSet::new(),
-        recovered: Recovered::default(),
-        stopped: None,
-        record_count: 0,
-    };
+    let (recording, mut recovered) = attempt(from, Copy::new(to)?, look)?;
+    if recovered.homeless_count == 0 {
+        recovered.message_count = recording.finish()?;
+        return Ok(recovered);
+    }
+    drop(recording);
+    // What describes some topic was lost where it first stood; it may be there further on.
+    let mut copy = Copy::new(to)?;
+    let mut described = Vec::new();
+    scan(from, &mut |_, record| {
+        if matches!(record, Record::Schema { .. } | Record::Channel(_)) {
+            described.push(record.into_owned());
+        }
+        true
+    })?;
+    for record in described {
+        match copy.take(record) {
+            Ok(()) | Err(CopyError::Conflict(_)) => {}
+            Err(CopyError::Write(error)) => return Err(error.into()),
+        }
+    }
+    let (recording, mut recovered) = attempt(from, copy, look)?;
+    recovered.message_count = recording.finish()?;
+    Ok(recovered)
+}
+
+/// One pass over the file, with the topics that `copy` knows already; the new file is not yet complete.
+fn attempt(
+    from: &Path,
+    mut copy: Copy,
+    look: &mut dyn FnMut(u64) -> Option<&'static str>,
+) -> Result<(Recording, Recovered), RecoverError> {
     let mut conflicts = Vec::new();
     let end = scan(from, &mut |offset, record| {
-        match copy.take(offset, record) {
+        match copy.take(record) {
             Ok(()) => {}
             Err(CopyError::Conflict(why)) => conflicts.push((offset, why)),
             Err(CopyError::Write(error)) => copy.stopped = Some(error.into()),
@@ -103,8 +127,7 @@ pub(crate) fn recover(
     }
     let mut recording = copy.recording;
     recording.describe("hil.recovery", words(from, &recovered))?;
-    recovered.message_count = recording.finish()?;
-    Ok(recovered)
+    Ok((recording, recovered))
 }
 
 /// What the new file says of where it comes from.
@@ -167,7 +190,18 @@ struct Copy {
 }
 
 impl Copy {
-    fn take(&mut self, _offset: u64, record: Record<'_>) -> Result<(), CopyError> {
+    fn new(to: &Path) -> Result<Self, WriteError> {
+        Ok(Self {
+            recording: Recording::create(to)?,
+            schemas: BTreeMap::new(),
+            channels: BTreeSet::new(),
+            recovered: Recovered::default(),
+            stopped: None,
+            record_count: 0,
+        })
+    }
+
+    fn take(&mut self, record: Record<'_>) -> Result<(), CopyError> {
         match record {
             Record::Schema { header, data } => {
                 let schema = Schema {

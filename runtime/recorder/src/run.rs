@@ -1,6 +1,7 @@
 //! A run folder as far as it can be read: what is missing or cut short is said and counted, and the
 //! rest is used. It makes no topic of anything.
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -73,6 +74,9 @@ pub(crate) struct Gaps {
     pub(crate) misfit_count: u64,
     /// Messages and records that have no time on the recording's clock, and were left out.
     pub(crate) timeless_count: u64,
+    /// Numbers below the highest of each start of a producer without a recorded message, by
+    /// channel: its recorder was full, or its process was killed.
+    pub(crate) missing: BTreeMap<String, u64>,
     /// All of it in words, one line each.
     pub(crate) words: Vec<String>,
 }
@@ -88,11 +92,14 @@ impl Gaps {
 }
 
 impl Run {
-    /// Reads the folder at `path`; `progress` hears the name of each file.
+    /// Reads the folder at `path`; `goes_on` hears the name of each file, and ends it with false.
     ///
     /// # Errors
     /// When it is no run's folder.
-    pub(crate) fn read(path: &Path, progress: &mut dyn FnMut(&str)) -> Result<Self, RunError> {
+    pub(crate) fn read(
+        path: &Path,
+        goes_on: &mut dyn FnMut(&str) -> bool,
+    ) -> Result<Self, RunError> {
         let folder = RunFolder::existing(path);
         if !folder.records().is_dir() && folder.virtual_report().is_file() {
             let path = path.to_owned();
@@ -109,7 +116,9 @@ impl Run {
             folder,
         };
         for path in paths {
-            progress(&path.display().to_string());
+            if !goes_on(&path.display().to_string()) {
+                break;
+            }
             run.read_records(&path);
         }
         if run.folder.traces().is_dir() {
@@ -180,6 +189,32 @@ impl Run {
         manifest.channels.iter().find(|one| one.name == channel)
     }
 
+    /// Counts the messages that their producers numbered and nobody recorded.
+    pub(crate) fn count_missing(&mut self) {
+        let mut seen: BTreeMap<(&str, u32), (u64, u64)> = BTreeMap::new();
+        for file in &self.files {
+            for index in 0..file.record_count() {
+                let Some((envelope, _)) = file.message(index) else {
+                    break;
+                };
+                let key = (file.header.channel.as_str(), envelope.epoch);
+                let (given, count) = seen.entry(key).or_default();
+                *given = (*given).max(envelope.sequence.saturating_add(1));
+                *count += 1;
+            }
+        }
+        for ((channel, _), (given, count)) in seen {
+            let missing_count = given.saturating_sub(count);
+            if missing_count > 0 {
+                *self.gaps.missing.entry(channel.to_owned()).or_default() += missing_count;
+            }
+        }
+        for (channel, count) in &self.gaps.missing {
+            let words = format!("{channel}: {count} messages were numbered and not recorded");
+            self.gaps.words.push(words);
+        }
+    }
+
     /// Names of all channels with records, in order.
     pub(crate) fn channels(&self) -> Vec<String> {
         let names = self.files.iter().map(|file| file.header.channel.clone());
@@ -213,10 +248,15 @@ fn read_json(path: &Path, what: &str, gaps: &mut Gaps) -> Option<Manifest> {
     .ok()
 }
 
-/// A run that was killed has none, and that is no gap in what was recorded of it.
+/// A run that was killed has none, which is said and is no gap in what was recorded of it.
 fn read_summary(folder: &RunFolder, gaps: &mut Gaps) -> Option<RunSummary> {
     let path = folder.summary();
-    let text = fs::read_to_string(&path).ok()?;
+    let Ok(text) = fs::read_to_string(&path) else {
+        let why =
+            "the run was killed, or still goes on; without its events and the links' verdicts";
+        gaps.words.push(format!("no {}: {why}", path.display()));
+        return None;
+    };
     RunSummary::from_json(&text)
         .inspect_err(|error| {
             gaps.unreadable_file_count += 1;

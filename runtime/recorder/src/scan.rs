@@ -68,7 +68,7 @@ pub(crate) struct ScanEnd {
 }
 
 /// Scans the file at `path`; `visit` is given every record of the data section that is whole, those
-/// of chunks in their place, with the offset of the file at which it (or its chunk) begins, and
+/// of chunks in their place, and the descriptions of topics that the summary repeats, with the offset of the file at which it (or its chunk) begins, and
 /// ends the scan with false.
 ///
 /// # Errors
@@ -181,6 +181,10 @@ impl Scanner {
             Ok(Record::DataEnd(_)) => self.is_summary = true,
             Ok(Record::Statistics(statistics)) => {
                 self.end.counted = Some(statistics.message_count);
+            }
+            // The summary repeats them: of use when the chunk that had them is damaged.
+            Ok(record @ (Record::Schema { .. } | Record::Channel(_))) => {
+                return visit(start, record);
             }
             Ok(_) if self.is_summary => {}
             Ok(record) => return visit(start, record),

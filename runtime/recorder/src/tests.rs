@@ -142,7 +142,9 @@ fn a_folder_with_nothing_but_records_is_kept_as_bytes() {
     let gaps = &info.metadata["hil.recording"];
     assert_eq!(gaps["unreadable_file_count"], "1");
     assert_eq!(gaps["renamed /a/b_2"], "/a/b was taken");
-    let basis = &info.metadata["hil.clocks"]["(unknown host)/basis"];
+    let clocks = &info.metadata["hil.clocks"];
+    assert_eq!(clocks["has_one_clock"], "unknown");
+    let basis = &clocks["(unknown host)/basis"];
     assert!(basis.starts_with("monotonic"), "{basis}");
     assert_eq!(info.topics[1].first_ns, Some(1_000_000_000));
 }
@@ -175,6 +177,7 @@ fn layouts_that_do_not_fit_cost_types_and_no_messages() {
     let info = shown(&folder.at("run.mcap"));
     assert_eq!(schemas(&info)["/good"], ("my.Message.v1", 4));
     assert_eq!(schemas(&info)["/short"].0, "google.protobuf.BytesValue");
+    assert_eq!(info.metadata["hil.clocks"]["has_one_clock"], "true");
     // By the read of both clocks that the manifest has.
     assert_eq!(info.topics[0].first_ns, Some(1_700_000_001_000_000_000));
 }
@@ -183,7 +186,7 @@ fn layouts_that_do_not_fit_cost_types_and_no_messages() {
 fn what_is_cut_short_is_counted() {
     let folder = Folder::new();
     folder.manifest(&[described("a", KindDescription::U64, 8)]);
-    let path = folder.record("a", 0..4);
+    let path = folder.record("a", [0, 2, 3, 4].into_iter());
     let bytes = fs::read(&path).unwrap();
     fs::write(&path, &bytes[..bytes.len() - 1]).unwrap();
     fs::write(folder.at("run/records/b.taken.x.0.rec"), "").unwrap();
@@ -193,6 +196,7 @@ fn what_is_cut_short_is_counted() {
     let gaps = &shown(&folder.at("run.mcap")).metadata["hil.recording"];
     assert_eq!(gaps["truncated_bytes"], "127");
     assert_eq!(gaps["unreadable_file_count"], "2");
+    assert_eq!(gaps["missing a"], "1");
     assert!(gaps["gap_0002"].contains("half a record"), "{gaps:?}");
 }
 
@@ -298,6 +302,29 @@ fn damage_in_the_middle_costs_its_chunk_only() {
     assert!(
         words["loss_0001"].starts_with(&format!("byte {start}, ")),
         "{words:?}"
+    );
+}
+
+#[test]
+fn topics_are_found_in_the_summary_when_their_chunk_is_damaged() {
+    let folder = Folder::new();
+    let (mut bytes, chunks) = whole(&folder);
+    let (start, end) = chunks[0];
+    bytes[usize::midpoint(start, end)] ^= 0x55;
+    let recovered = folder.recover(&bytes).unwrap();
+    assert_eq!(recovered.message_count, MESSAGE_COUNT);
+    assert_eq!(
+        (recovered.homeless_count, recovered.end.losses.len()),
+        (0, 1)
+    );
+    let info = shown(&folder.at("whole.mcap"));
+    assert_eq!(schemas(&info)["/a"], ("my.Message.v1", MESSAGE_COUNT));
+    // Without the summary nobody knows what the messages are.
+    let cut = chunks.last().unwrap().1;
+    let recovered = folder.recover(&bytes[..cut]).unwrap();
+    assert_eq!(
+        (recovered.message_count, recovered.homeless_count),
+        (0, MESSAGE_COUNT)
     );
 }
 
