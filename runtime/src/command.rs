@@ -1,6 +1,7 @@
 //! What each command of the command line does, and the exit code it ends with.
 
 mod case_work;
+mod report_work;
 
 use std::collections::BTreeMap;
 use std::env;
@@ -27,9 +28,7 @@ use crate::probe;
 use crate::process::emulation_room::check_emulation;
 use crate::process::{component, own_program};
 use crate::registry::Registry;
-use crate::report::summary::RunSummary;
 use crate::report::terminal::{self, Style};
-use crate::run_folder::RunFolder;
 use crate::signals::{EXIT_INTERRUPTED, Signals};
 use crate::supervisor::{self, Outcome, PeerError, RunError, RunOptions, RunResult};
 use crate::topology::{self, HOST_VARIABLE, HostChoice, MachineIdentity, Topology, which_host};
@@ -87,7 +86,7 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
         }
         Command::Calibrate(args) => case_work::calibrate(args, registry),
         Command::Replay { run, json } => case_work::replay(&run, json, registry, console),
-        Command::Report { run, json } => show_report(&run, json, console),
+        Command::Report(args) => report_work::report(&args, console),
         Command::Trace { command } => match trace::work::work(command, columns(), console) {
             trace::work::End::Done => exit::RAN,
             trace::work::End::Failed => exit::FAILED,
@@ -305,40 +304,6 @@ fn hosts_here(topology: &Topology, requested: Option<&str>) -> Result<Vec<String
             .map(|host| host.name.clone())
             .collect()),
         Err(error) => Err(error.to_string()),
-    }
-}
-
-fn show_report(run: &Path, json: bool, console: &mut Console) -> u8 {
-    let folder = RunFolder::existing(run);
-    let text = match fs::read_to_string(folder.summary()) {
-        Ok(text) => text,
-        Err(error) => {
-            let path = folder.summary();
-            let text = if folder.manifest().is_file() {
-                "this run never began or was killed outright, so it left no summary".to_owned()
-            } else if folder.virtual_report().is_file() {
-                "this is a folder of `simulate` or `tables`, not of a run; read its report.txt, or                  report.json for every figure"
-                    .to_owned()
-            } else {
-                format!("not a run's folder: {error}")
-            };
-            console.error(&format!("{}: {text}", path.display()));
-            return exit::USAGE;
-        }
-    };
-    if json {
-        console.result(&text);
-        return exit::RAN;
-    }
-    match RunSummary::from_json(&text) {
-        Ok(summary) => {
-            console.result(&terminal::render(&summary, columns(), Style::Coloured));
-            exit::RAN
-        }
-        Err(error) => {
-            console.error(&format!("{}: {error}", folder.summary().display()));
-            exit::USAGE
-        }
     }
 }
 

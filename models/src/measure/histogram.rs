@@ -193,7 +193,7 @@ fn upper_edge_ns(magnitude: u64) -> i64 {
     }
     let wanted = signed(magnitude);
     let near = ((magnitude as f64).log10() * f64::from(BINS_PER_DECADE)).floor() as i32;
-    (near.saturating_sub(1).max(0)..)
+    (near.saturating_sub(1).max(0)..=near.saturating_add(2))
         .map(edge_ns)
         .find(|edge| *edge >= wanted)
         .unwrap_or(i64::MAX)

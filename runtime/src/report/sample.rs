@@ -123,7 +123,7 @@ fn channels() -> Vec<ChannelSummary> {
 }
 
 /// A whole report.
-fn full() -> RunSummary {
+pub(super) fn full() -> RunSummary {
     let mut killed = process("robot gateway", "gateway", None);
     killed.restart_count = 1;
     killed.cpu_time_s = None;
@@ -172,7 +172,7 @@ fn full() -> RunSummary {
 }
 
 /// Names longer than any column, hostile characters, an overrun host, processes without figures.
-fn awkward() -> RunSummary {
+pub(super) fn awkward() -> RunSummary {
     let long = "an-exceedingly-long-name-that-someone-will-surely-choose-one-day".repeat(2);
     let mut summary = full();
     summary.run.name.clone_from(&long);
@@ -201,7 +201,7 @@ fn awkward() -> RunSummary {
 }
 
 /// Nothing ran, nothing is known.
-fn empty() -> RunSummary {
+pub(super) fn empty() -> RunSummary {
     let mut run = run_facts();
     run.outcome = Outcome::Stopped;
     run.exit_reason = "stopped by a person while waiting for host robot".to_owned();
