@@ -31,13 +31,11 @@ pub(super) fn report(args: &ReportArgs, console: &mut Console) -> u8 {
         || args.template.is_some()
         || args.figure.is_some();
     if !is_file {
-        return match args.runs.as_slice() {
-            [run] => show(run, args.json, console),
-            _ => {
-                console.error("several runs need --output or --format, e.g. -o report.html");
-                exit::USAGE
-            }
-        };
+        if let [run] = args.runs.as_slice() {
+            return show(run, args.json, console);
+        }
+        console.error("several runs need --output or --format, e.g. -o report.html");
+        return exit::USAGE;
     }
     match to_files(args, console) {
         Ok(()) => exit::RAN,

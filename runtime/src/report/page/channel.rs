@@ -16,6 +16,8 @@ use crate::report::terminal::{JOINT, duration, grouped, percent};
 /// What there is of one channel.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Sources<'a> {
+    /// True for a channel that goes over a network or the model of one.
+    pub(super) crosses: bool,
     pub(super) account: Option<&'a ChannelAccount>,
     pub(super) network: Option<&'a NetworkFigures>,
     pub(super) outages: Option<&'a OutageFigures>,
@@ -34,10 +36,7 @@ const VIRTUAL: &str =
 /// Figures and tables of a channel.
 pub(super) fn fill(channel: &mut Channel, sources: &Sources<'_>) {
     channel.figures.extend(counts(sources));
-    let is_unknown = sources.account.is_none() && sources.virtual_counts.is_none();
-    let is_behind_gateway = sources.account.is_some_and(|one| one.late_count.is_some());
-    let crosses = sources.network.is_some() || is_unknown || is_behind_gateway;
-    if crosses {
+    if sources.crosses {
         channel.figures.push(loss_ratio(sources.network));
         channel.figures.extend(order(sources));
     } else {
@@ -45,7 +44,7 @@ pub(super) fn fill(channel: &mut Channel, sources: &Sources<'_>) {
         channel.notes.push(words.to_owned());
     }
     channel.figures.extend(end_to_end(sources));
-    if crosses {
+    if sources.crosses {
         channel.figures.extend(network(sources));
     }
     if let Some(outages) = sources.outages {
@@ -164,10 +163,10 @@ fn order(sources: &Sources<'_>) -> Vec<Figure> {
 
 fn quantile_figures(
     (prefix, words): (&str, &str),
-    values: [(&str, &str, i64, Option<IntervalNs>); 6],
+    values: &[(&str, &str, i64, Option<IntervalNs>)],
     method: &str,
 ) -> Vec<Figure> {
-    let figure = |(name, label, ns, interval): (&str, &str, i64, Option<IntervalNs>)| {
+    let figure = |&(name, label, ns, interval): &(&str, &str, i64, Option<IntervalNs>)| {
         let interval = interval.map(|one| (ns_s(one.low_ns), ns_s(one.high_ns)));
         let method = if interval.is_some() { method } else { "" };
         Figure::new(
@@ -179,7 +178,7 @@ fn quantile_figures(
         .within(interval)
         .by(method)
     };
-    values.map(figure).to_vec()
+    values.iter().map(figure).collect()
 }
 
 fn unavailable_quantiles((prefix, words): (&str, &str), reason: &str) -> Vec<Figure> {
@@ -240,7 +239,7 @@ fn of_summary(
         ("p999", "p99.9", summary.p999_ns, None),
         ("max", "largest", summary.max_ns, None),
     ];
-    quantile_figures(names, values, BOOTSTRAP)
+    quantile_figures(names, &values, BOOTSTRAP)
 }
 
 fn network(sources: &Sources<'_>) -> Vec<Figure> {
@@ -260,7 +259,7 @@ fn network(sources: &Sources<'_>) -> Vec<Figure> {
                 of("p999", "p99.9", delay.p999),
                 ("max", "largest", delay.max_ns, None),
             ];
-            let mut figures = quantile_figures(names, values, BOOTSTRAP);
+            let mut figures = quantile_figures(names, &values, BOOTSTRAP);
             let variation = delay.variation.p99_ns;
             figures.push(
                 Figure::new(
@@ -396,10 +395,9 @@ fn segment_table(account: &ChannelAccount) -> Table {
     table
         .rows
         .push(segment_row("published → taken", &whole.distribution, bound));
-    table.note =
-        "Quantiles are from histograms with three digits, of messages that have both ends. \
+    "Quantiles are from histograms with three digits, of messages that have both ends. \
                   \"Off by at most\" is what the alignment of two hosts' clocks may add or take."
-            .to_owned();
+        .clone_into(&mut table.note);
     table
 }
 

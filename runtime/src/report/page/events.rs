@@ -111,11 +111,8 @@ pub(super) fn network_events(report: &NetworkReport) -> EventList {
          stand before an event of the score by chance."
     );
     if total > shown {
-        note.push_str(&format!(
-            " The first {} of {}.",
-            grouped(shown),
-            grouped(total)
-        ));
+        let (shown, total) = (grouped(shown), grouped(total));
+        note.push_str(&[" The first ", &shown, " of ", &total, "."].concat());
     }
     EventList {
         events: listed.collect(),

@@ -55,6 +55,7 @@ pub(crate) struct VirtualReport {
 
 /// Messages of a channel in virtual time.
 #[derive(Debug, Clone, Copy, Deserialize)]
+#[allow(clippy::struct_field_names, reason = "as `report.json` names them")]
 pub(crate) struct VirtualCounts {
     pub(crate) published_count: u64,
     pub(crate) taken_count: u64,

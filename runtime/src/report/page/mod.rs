@@ -18,6 +18,7 @@ mod svg;
 mod template;
 #[cfg(test)]
 mod tests;
+mod timeline;
 mod virtual_run;
 mod words;
 pub(crate) mod write;

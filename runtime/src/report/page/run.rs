@@ -7,12 +7,13 @@ use super::drawings;
 use super::events::{correlation, network_events, score_events};
 use super::material::{Found, Material};
 use super::paper;
+use super::timeline;
 use super::virtual_run::{unfinished, virtual_time};
 use super::words::{UNAVAILABLE, count};
 use crate::report::assessment::Assessment;
 use crate::report::clock_summary::ClockSection;
 use crate::report::score_event::ScoreEvents;
-use crate::report::summary::{ChannelSummary, Fact, RunSummary, ScoreMetric};
+use crate::report::summary::{ChannelSummary, Fact, LinkKind, RunSummary, ScoreMetric};
 use crate::report::terminal::{self, duration, grouped, seconds};
 
 /// How figures came about, for every run.
@@ -43,7 +44,7 @@ pub(super) fn of(material: &Material, index: usize, steps: usize) -> Run {
         Found::Unfinished(_) => (None, &ScoreEvents::default()),
     };
     if let Some(report) = network {
-        run.drawings.push(drawings::over_run(
+        run.drawings.push(timeline::over_run(
             &key,
             report,
             events,
@@ -58,7 +59,7 @@ pub(super) fn of(material: &Material, index: usize, steps: usize) -> Run {
         );
     }
     run.score_events = score_events(events);
-    let (drawing, left_out) = drawings::of_case(&key, &material.series, steps);
+    let (drawing, left_out) = timeline::of_case(&key, &material.series, steps);
     if drawing.is_none() && run.kind != "unfinished" {
         run.missing
             .push("The robot over time: the case left no series, or they are empty.".to_owned());
@@ -225,26 +226,34 @@ fn live_channel(key: &str, one: &ChannelSummary, summary: &RunSummary) -> Channe
         channel.notes.push(recorded);
         return channel;
     }
+    let is_local = matches!(one.link, LinkKind::SharedMemory | LinkKind::RecordOnly);
     let sources = Sources {
+        crosses: network.is_some() || !is_local,
         account: one.account.as_ref(),
         network: network.map(|network| &network.figures),
         outages: one.outages.as_ref(),
         ..Sources::default()
     };
     channel::fill(&mut channel, &sources);
+    channel.notes.extend(notes(one));
+    channel.drawings = drawings::of_channel((key, &one.name), &sources);
+    channel
+}
+
+/// What has no figure: whether the account closes, the link model, the gateways.
+fn notes(one: &ChannelSummary) -> Vec<String> {
+    let mut notes = Vec::new();
     if let Some(account) = &one.account {
-        channel
-            .notes
-            .extend(terminal::closing_text(&account.closing));
+        notes.extend(terminal::closing_text(&account.closing));
         if account.published_count == 0 {
-            channel.notes.push("no message was published".to_owned());
+            notes.push("no message was published".to_owned());
         }
     }
     if let Some(figures) = &one.emulation {
         let [asked, done] = [figures.requested, figures.achieved].map(|one| duration(one.p50_ns));
         let late = duration(figures.scheduling_error.p99_ns);
         let limit = duration(figures.error_max_ns);
-        channel.notes.push(format!(
+        notes.push(format!(
             "emulated link: delay asked for {asked}, given {done} (medians); released late by {late} at \
              p99, limit {limit}"
         ));
@@ -255,9 +264,7 @@ fn live_channel(key: &str, one: &ChannelSummary, summary: &RunSummary) -> Channe
         .map(|one| format!("{} {}", one.name, grouped(one.count)));
     let refusals: Vec<_> = refusals.collect();
     if !refusals.is_empty() {
-        channel
-            .notes
-            .push(format!("datagrams refused: {}", refusals.join(", ")));
+        notes.push(format!("datagrams refused: {}", refusals.join(", ")));
     }
     for direction in &one.directions {
         let facts = direction.facts.iter();
@@ -265,12 +272,9 @@ fn live_channel(key: &str, one: &ChannelSummary, summary: &RunSummary) -> Channe
         let words: Vec<String> = core::iter::once(format!("peer {}", direction.peer_state))
             .chain(facts)
             .collect();
-        channel
-            .notes
-            .push(format!("{}: {}", direction.direction, words.join(", ")));
+        notes.push(format!("{}: {}", direction.direction, words.join(", ")));
     }
-    channel.drawings = drawings::of_channel((key, &one.name), &sources);
-    channel
+    notes
 }
 
 /// The figures of a score.
@@ -284,8 +288,9 @@ pub(super) fn score(metrics: &[ScoreMetric]) -> Vec<Figure> {
 }
 
 fn processes(summary: &RunSummary) -> Option<Table> {
-    let first = summary.processes.first()?;
-    let _at_least_one = first;
+    if summary.processes.is_empty() {
+        return None;
+    }
     let columns = [
         "process",
         "host",

@@ -103,6 +103,15 @@ fn rendered(
             AutoEscape::None
         }
     });
+    // The engine's own escaping also replaces every slash; ours leaves paths readable.
+    environment.set_formatter(|out, state, value| {
+        let is_text = value.as_str().is_some_and(|_| !value.is_safe());
+        if is_text && state.auto_escape() == AutoEscape::Html {
+            let text = escaped(value.as_str().unwrap_or_default());
+            return out.write_str(&text).map_err(minijinja::Error::from);
+        }
+        minijinja::escape_formatter(out, state, value)
+    });
     environment.add_filter("md", |text: String| markdown_escaped(&text));
     environment.add_filter("tex", |text: String| tex_escaped(&text));
     environment.add_filter("xml", |text: String| {

@@ -82,6 +82,7 @@ fn virtual_channel(
         ..Channel::default()
     };
     let sources = Sources {
+        crosses: network.is_some() || link.is_some(),
         network: network.map(|one| &one.figures),
         outages: report.outages.get(name),
         virtual_counts: Some((
