@@ -121,6 +121,8 @@ pub(crate) struct Table {
 #[derive(Debug, Clone, Default, Serialize)]
 pub(crate) struct EventList {
     pub(crate) events: Vec<Event>,
+    /// Incidents and hazards among all events, also those left out.
+    pub(crate) grave_count: u64,
     /// What was left out, and where it is; empty when nothing was.
     pub(crate) note: String,
 }

@@ -15,6 +15,11 @@ const EVENTS_MAX: usize = 200;
 
 pub(super) fn score_events(events: &ScoreEvents) -> EventList {
     let total = events.events.len();
+    let grave = events
+        .events
+        .iter()
+        .filter(|event| event.severity != Severity::Notice);
+    let grave_count = grave.count() as u64;
     let mut chosen: Vec<&ExplainedEvent> = events.events.iter().collect();
     // The gravest stay, in order of time.
     if total > EVENTS_MAX {
@@ -53,6 +58,7 @@ pub(super) fn score_events(events: &ScoreEvents) -> EventList {
         );
     }
     EventList {
+        grave_count,
         events: chosen
             .into_iter()
             .map(|event| score_event(event, events.clocks_differ))
@@ -115,6 +121,7 @@ pub(super) fn network_events(report: &NetworkReport) -> EventList {
         note.push_str(&[" The first ", &shown, " of ", &total, "."].concat());
     }
     EventList {
+        grave_count: 0,
         events: listed.collect(),
         note,
     }

@@ -30,7 +30,7 @@ use clap::ValueEnum;
 
 use self::data::{Drawing, Page, Run, SCHEMA_VERSION, Table};
 use self::material::Material;
-use super::terminal::JOINT;
+use super::terminal::{JOINT, grouped};
 
 pub(crate) use self::template::TemplateError;
 
@@ -130,14 +130,9 @@ fn overview(runs: &[Run]) -> Table {
                 },
             ));
         }
-        let grave = run
-            .score_events
-            .events
-            .iter()
-            .filter(|event| event.severity != "notice");
         let count = match run.kind {
             "unfinished" => words::UNAVAILABLE.to_owned(),
-            _ => grave.count().to_string(),
+            _ => grouped(run.score_events.grave_count),
         };
         row.push(count);
         table.rows.push(row);

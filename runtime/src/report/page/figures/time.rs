@@ -133,7 +133,14 @@ impl Colours {
         line_class(place.unwrap_or(index))
     }
 
+    /// A line that its panel's title names needs no legend.
     fn entries(&self, panel: &PlotPanel) -> Vec<(String, String)> {
+        if let [one] = panel.series.as_slice()
+            && one.channel.is_empty()
+            && panel.title.contains(&one.name)
+        {
+            return Vec::new();
+        }
         let entry = |(index, one): (usize, &Thinned)| (self.class(one, index), one.name.clone());
         panel.series.iter().enumerate().map(entry).collect()
     }
