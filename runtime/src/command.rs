@@ -1,7 +1,9 @@
 //! What each command of the command line does, and the exit code it ends with.
 
 mod case_work;
+mod report_work;
 
+use std::collections::BTreeMap;
 use std::env;
 use std::fs;
 use std::io::IsTerminal;
@@ -11,6 +13,7 @@ use std::process::ExitCode;
 use clap::Parser;
 use hil_gateways::transport::timestamping::TimestampCapabilities;
 use hil_models::case_study::ParameterError;
+use hil_models::layout::Field;
 use hil_models::teleoperation::swing::swing_bvh;
 
 use crate::analysis;
@@ -25,9 +28,7 @@ use crate::probe;
 use crate::process::emulation_room::check_emulation;
 use crate::process::{component, own_program};
 use crate::registry::Registry;
-use crate::report::summary::RunSummary;
 use crate::report::terminal::{self, Style};
-use crate::run_folder::RunFolder;
 use crate::signals::{EXIT_INTERRUPTED, Signals};
 use crate::supervisor::{self, Outcome, PeerError, RunError, RunOptions, RunResult};
 use crate::topology::{self, HOST_VARIABLE, HostChoice, MachineIdentity, Topology, which_host};
@@ -85,7 +86,7 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
         }
         Command::Calibrate(args) => case_work::calibrate(args, registry),
         Command::Replay { run, json } => case_work::replay(&run, json, registry, console),
-        Command::Report { run, json } => show_report(&run, json, console),
+        Command::Report(args) => report_work::report(&args, console),
         Command::Trace { command } => match trace::work::work(command, columns(), console) {
             trace::work::End::Done => exit::RAN,
             trace::work::End::Failed => exit::FAILED,
@@ -181,6 +182,7 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
         hosts,
         domain_root: args.domain_root.clone(),
         command_line: env::args().collect(),
+        layouts: layouts(&topology, registry),
     };
     match supervisor::run(&topology, &options, &signals, console) {
         Ok(result) => {
@@ -210,6 +212,15 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
             exit_code_of_error(&error)
         }
     }
+}
+
+/// The fields of the messages of the topology's case, by channel.
+fn layouts(topology: &Topology, registry: &Registry) -> BTreeMap<String, &'static [Field]> {
+    let entry = topology.case().and_then(|case| registry.find(&case.name));
+    let channels = entry.into_iter().flat_map(|entry| entry.channels);
+    channels
+        .map(|channel| (channel.name.to_owned(), channel.message.fields))
+        .collect()
 }
 
 /// What the file comes to, or why no run of it can be what it says.
@@ -293,40 +304,6 @@ fn hosts_here(topology: &Topology, requested: Option<&str>) -> Result<Vec<String
             .map(|host| host.name.clone())
             .collect()),
         Err(error) => Err(error.to_string()),
-    }
-}
-
-fn show_report(run: &Path, json: bool, console: &mut Console) -> u8 {
-    let folder = RunFolder::existing(run);
-    let text = match fs::read_to_string(folder.summary()) {
-        Ok(text) => text,
-        Err(error) => {
-            let path = folder.summary();
-            let text = if folder.manifest().is_file() {
-                "this run never began or was killed outright, so it left no summary".to_owned()
-            } else if folder.virtual_report().is_file() {
-                "this is a folder of `simulate` or `tables`, not of a run; read its report.txt, or                  report.json for every figure"
-                    .to_owned()
-            } else {
-                format!("not a run's folder: {error}")
-            };
-            console.error(&format!("{}: {text}", path.display()));
-            return exit::USAGE;
-        }
-    };
-    if json {
-        console.result(&text);
-        return exit::RAN;
-    }
-    match RunSummary::from_json(&text) {
-        Ok(summary) => {
-            console.result(&terminal::render(&summary, columns(), Style::Coloured));
-            exit::RAN
-        }
-        Err(error) => {
-            console.error(&format!("{}: {error}", folder.summary().display()));
-            exit::USAGE
-        }
     }
 }
 

@@ -61,6 +61,11 @@ pub(super) fn run_facts(
         seed: topology.run().seed,
         host: result.own_hosts.join(", "),
         started: result.started.clone(),
+        starts_ns: result
+            .spans
+            .iter()
+            .map(|(host, (start, _))| (host.clone(), start.as_ns()))
+            .collect(),
         duration_s: own_span(result).map_or(0.0, |(start, end)| end.seconds_since(start)),
         outcome,
         exit_reason: result.outcome.reason(),

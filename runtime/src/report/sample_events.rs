@@ -1,6 +1,8 @@
 //! What happened to the robot of a run that never was, and the channel that only its record
 //! heard, for the reports that are checked in.
 
+use std::collections::BTreeMap;
+
 use hil_models::case_study::Severity;
 use hil_models::measure::account::{MessageFate, Standing};
 
@@ -136,6 +138,7 @@ pub(super) fn summary(channel: ChannelSummary) -> RunSummary {
         seed: 1,
         host: "control-pc".to_owned(),
         started: String::new(),
+        starts_ns: BTreeMap::new(),
         duration_s: 1.0,
         outcome: Outcome::Completed,
         exit_reason: "as planned".to_owned(),

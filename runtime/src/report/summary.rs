@@ -5,6 +5,7 @@
 //! `assessment`. Within a schema version fields are only added; a reader ignores what it does
 //! not know. Units are part of the names.
 
+use std::collections::BTreeMap;
 use std::io;
 use std::path::{Path, PathBuf};
 
@@ -184,6 +185,10 @@ pub struct RunFacts {
     pub host: String,
     /// Wall-clock time of the start, with its zone.
     pub started: String,
+    /// The start on each host's own monotonic clock, nanoseconds; nothing of a host that told
+    /// nothing.
+    #[serde(default)]
+    pub starts_ns: BTreeMap<String, i64>,
     /// Length of the run, seconds.
     pub duration_s: f64,
     /// How it ended.

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use std::io;
 use std::path::PathBuf;
 
+use hil_models::layout::Field;
 use hil_models::time::Instant;
 
 use super::crew::CrewError;
@@ -28,6 +29,8 @@ pub struct RunOptions {
     pub domain_root: Option<PathBuf>,
     /// The command line, for the manifest.
     pub command_line: Vec<String>,
+    /// The fields of the channels whose messages are known, by channel, for the manifest.
+    pub layouts: BTreeMap<String, &'static [Field]>,
 }
 
 /// Why a run did not come about.

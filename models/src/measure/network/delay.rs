@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{Crossing, Figure, Passage};
 use crate::measure::account::ChannelPath;
+use crate::measure::histogram::{DurationBin, LatencyHistogram};
 use crate::measure::special::ceil_count;
 use crate::measure::statistics::{CONFIDENCE, IntervalNs, block_bootstrap_quantile};
 use crate::random::RandomStream;
@@ -171,6 +172,18 @@ pub(super) fn delays(
             is_bound_wider: exceeds(bound_ns, above_min(p50.value_ns)),
         },
     })
+}
+
+/// The delays of the messages that arrived, as a histogram.
+pub(super) fn delay_bins(passages: &[Passage]) -> Vec<DurationBin> {
+    let mut histogram = LatencyHistogram::default();
+    let arrived = passages
+        .iter()
+        .filter(|one| one.crossing == Crossing::Arrived);
+    for delay_ns in arrived.filter_map(|one| one.delay_ns) {
+        histogram.record(delay_ns);
+    }
+    histogram.bins()
 }
 
 /// True when a figure says less than its bound.

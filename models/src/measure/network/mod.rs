@@ -34,7 +34,7 @@ pub use loss::{BURST_GAP_MIN, BurstFigures, LongestLoss, LossFigures};
 pub use order::OrderFigures;
 
 use crate::measure::account::{ChannelPath, Side};
-use crate::measure::histogram::{Distribution, LatencyHistogram};
+use crate::measure::histogram::{Distribution, DurationBin, LatencyHistogram};
 use crate::random::RandomStream;
 
 /// What the network did to one message.
@@ -151,6 +151,9 @@ pub struct NetworkFigures {
     pub arrived_bytes_per_s: Option<f64>,
     /// Handed to the kernel to received by the other gateway.
     pub delay: Figure<DelayFigures>,
+    /// The same delays as a histogram; empty where none was measured.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub delay_bins: Vec<DurationBin>,
     /// Difference of the delays of successive messages; needs no alignment of clocks, only a bound
     /// of their rates.
     pub successive: Figure<SuccessiveVariation>,
@@ -197,6 +200,7 @@ impl NetworkFigures {
                 .payload_bytes
                 .zip(arrived_per_s)
                 .map(|(bytes, per_s)| bytes as f64 * per_s),
+            delay_bins: delay::delay_bins(passages),
             delay: delay::delays(passages, context.path, &mut random),
             successive: delay::successive(passages, context.path),
             loss: loss::losses(passages, context.run_ns),

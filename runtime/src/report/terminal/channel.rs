@@ -294,6 +294,16 @@ fn closing(canvas: &mut Canvas, closing: &Closing) {
     }
 }
 
+/// Whether the account closes, in words; nothing when no message was checked.
+pub(crate) fn closing_text(closing: &Closing) -> Option<String> {
+    match closing {
+        Closing::Checked(figures) => {
+            closing_words(figures).map(|(_, text)| format!("account {text}"))
+        }
+        Closing::Unavailable { reason } => Some(format!("closing unavailable: {reason}")),
+    }
+}
+
 fn closing_words(figures: &ClosingFigures) -> Option<(Tone, String)> {
     let (ratio, interval) = figures.closed_ratio()?;
     let mut text = format!(
