@@ -15,9 +15,10 @@ use std::time::Duration;
 
 use hil_benches::face::{Exchange, Pair};
 use hil_benches::gateway::hosts::SetupError;
+use hil_benches::gateway::notices::{announce, ended};
 use hil_benches::gateway::parties::{MachineTime, PRIORITY, claim, stolen_text};
 use hil_benches::gateway::verdict::Verdict;
-use hil_benches::{Case, Comparison, HostFacts, compare, json_line, table};
+use hil_benches::{Case, Comparison, compare, json_line, table};
 use hil_runtime::clock::MonotonicClock;
 use hil_runtime::report::face::FaceSegment;
 use serde_json::json;
@@ -151,18 +152,13 @@ fn measure_all() -> Result<(), SetupError> {
     // Receive stamps are switched on by a kernel worker, which needs a moment.
     thread::sleep(Duration::from_millis(300));
     let refusals = claim(0);
-    let facts = HostFacts::read(&format!(
-        "robot and its face on cpu 0, controller and its face on cpu 1, waiting in the kernel, \
+    announce(
+        BENCH,
+        &format!(
+            "robot and its face on cpu 0, controller and its face on cpu 1, waiting in the kernel, \
          SCHED_FIFO {PRIORITY} asked for"
-    ));
-    let network = pair.network_note().to_owned();
-    println!(
-        "{}",
-        json!({"bench": BENCH, "host": facts.to_json(), "network": network})
-    );
-    println!(
-        "network: {network}; load {} at the start; policy {}; governor {}",
-        facts.load_average, facts.scheduling_policy, facts.governor
+        ),
+        pair.network_note(),
     );
     let measured = RefCell::new(Measured {
         pair,
@@ -200,8 +196,5 @@ fn measure_all() -> Result<(), SetupError> {
 }
 
 fn main() -> ExitCode {
-    if let Err(error) = measure_all() {
-        println!("{BENCH}: not measurable here: {error}");
-    }
-    ExitCode::SUCCESS
+    ended(BENCH, measure_all())
 }

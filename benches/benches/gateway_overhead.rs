@@ -15,11 +15,12 @@ use hil_benches::gateway::applications::{Crew, PARTY_COUNT};
 use hil_benches::gateway::cases::{CasePlan, Kind, PERIOD, case_plans, only};
 use hil_benches::gateway::ends::{NearEnd, Setup};
 use hil_benches::gateway::hosts::{Hosts, Plan, SetupError};
+use hil_benches::gateway::notices::{announce, with_a_processor_each};
 use hil_benches::gateway::parties::{MachineTime, PRIORITY, Party, Usage, stolen_text};
 use hil_benches::gateway::segments::{SEGMENTS, WAKE_UPS, segments};
 use hil_benches::gateway::turns::{STOP, Turns, pace, ping};
 use hil_benches::gateway::verdict::Verdict;
-use hil_benches::{Case, Comparison, HostFacts, compare, json_line, table};
+use hil_benches::{Case, Comparison, compare, json_line, table};
 use hil_runtime::wait::WaitMode;
 use serde_json::json;
 
@@ -376,17 +377,10 @@ fn measure_all(cpu_count: usize) -> Result<(), SetupError> {
         cases = only(&cases, &text);
     }
     let mut setup = Setup::open(&cases, cpu_count)?;
-    let facts = HostFacts::read(&format!(
-        "near host on cpu 0, far host on cpu 1, SCHED_FIFO {PRIORITY} asked for"
-    ));
-    let network = setup.hosts.network.note().to_owned();
-    println!(
-        "{}",
-        json!({"bench": BENCH, "host": facts.to_json(), "network": network})
-    );
-    println!(
-        "network: {network}; load {} at the start; policy {}; governor {}",
-        facts.load_average, facts.scheduling_policy, facts.governor
+    announce(
+        BENCH,
+        &format!("near host on cpu 0, far host on cpu 1, SCHED_FIFO {PRIORITY} asked for"),
+        setup.hosts.network.note(),
     );
     println!("without stamps means: these sockets ask for none; the host's receive stamps are on");
     let before = MachineTime::read();
@@ -396,13 +390,5 @@ fn measure_all(cpu_count: usize) -> Result<(), SetupError> {
 }
 
 fn main() -> ExitCode {
-    let cpu_count = std::thread::available_parallelism().map_or(1, Into::into);
-    if cpu_count < 2 {
-        println!("{BENCH}: not measurable here: {cpu_count} processor, 2 hosts that want one each");
-        return ExitCode::SUCCESS;
-    }
-    if let Err(error) = measure_all(cpu_count) {
-        println!("{BENCH}: not measurable here: {error}");
-    }
-    ExitCode::SUCCESS
+    with_a_processor_each(BENCH, measure_all)
 }

@@ -14,10 +14,11 @@ use std::time::{Duration, Instant as Stopwatch};
 
 use hil_benches::gateway::hosts::{Hosts, Plan, Ports, SetupError, greet};
 use hil_benches::gateway::network::Network;
+use hil_benches::gateway::notices::{announce, ended};
 use hil_benches::gateway::parties::{MachineTime, PRIORITY, claim, stolen_text};
 use hil_benches::gateway::stages::{BATCH, STAGES, Stage, Workbench};
 use hil_benches::gateway::verdict::Verdict;
-use hil_benches::{Case, Comparison, HostFacts, Row, compare, json_line, table};
+use hil_benches::{Case, Comparison, Row, compare, json_line, table};
 use hil_models::endpoint::InputPort;
 use hil_models::time::Instant;
 use hil_runtime::clock::MonotonicClock;
@@ -260,17 +261,10 @@ fn measure_all() -> Result<(), SetupError> {
     // Receive stamps are switched on by a kernel worker, which needs a moment.
     thread::sleep(Duration::from_millis(300));
     let refusals = claim(0);
-    let facts = HostFacts::read(&format!(
-        "one thread on cpu 0, SCHED_FIFO {PRIORITY} asked for"
-    ));
-    let network = hosts.network.note().to_owned();
-    println!(
-        "{}",
-        json!({"bench": BENCH, "host": facts.to_json(), "network": network})
-    );
-    println!(
-        "network: {network}; load {} at the start; policy {}; governor {}",
-        facts.load_average, facts.scheduling_policy, facts.governor
+    announce(
+        BENCH,
+        &format!("one thread on cpu 0, SCHED_FIFO {PRIORITY} asked for"),
+        hosts.network.note(),
     );
     println!("nanoseconds per message; stages are means of {BATCH} messages, steps are single;");
     println!("sending includes the way to the receiving socket, as both are on one processor");
@@ -298,8 +292,5 @@ fn measure_all() -> Result<(), SetupError> {
 }
 
 fn main() -> ExitCode {
-    if let Err(error) = measure_all() {
-        println!("{BENCH}: not measurable here: {error}");
-    }
-    ExitCode::SUCCESS
+    ended(BENCH, measure_all())
 }

@@ -14,12 +14,12 @@ use std::time::Duration;
 use hil_benches::gateway::cases::{CasePlan, Kind, PERIOD, case_plans};
 use hil_benches::gateway::ends::{NearEnd, Setup};
 use hil_benches::gateway::hosts::SetupError;
+use hil_benches::gateway::notices::{announce, with_a_processor_each};
 use hil_benches::gateway::parties::{MachineTime, PRIORITY, Party, stolen_text};
 use hil_benches::gateway::tap::Drainer;
 use hil_benches::gateway::turns::{STOP, Turns, pace, ping};
 use hil_benches::gateway::verdict::Verdict;
-use hil_benches::{Case, Comparison, HostFacts, compare, json_line, table};
-use serde_json::json;
+use hil_benches::{Case, Comparison, compare, json_line, table};
 
 const BENCH: &str = "probe_overhead";
 /// Tapped against alone, median and 99th percentile.
@@ -198,17 +198,12 @@ fn measure_all(cpu_count: usize) -> Result<(), SetupError> {
     let cases = plans(cpu_count);
     let drainer = Drainer::start();
     let mut setup = Setup::open(&cases, cpu_count)?;
-    let facts = HostFacts::read(&format!(
-        "near host on cpu 0, far host on cpu 1, SCHED_FIFO {PRIORITY} asked for, probe free"
-    ));
-    let network = setup.hosts.network.note().to_owned();
-    println!(
-        "{}",
-        json!({"bench": BENCH, "host": facts.to_json(), "network": network})
-    );
-    println!(
-        "network: {network}; load {} at the start; policy {}; governor {}",
-        facts.load_average, facts.scheduling_policy, facts.governor
+    announce(
+        BENCH,
+        &format!(
+            "near host on cpu 0, far host on cpu 1, SCHED_FIFO {PRIORITY} asked for, probe free"
+        ),
+        setup.hosts.network.note(),
     );
     let before = MachineTime::read();
     let tapped = Tapped::default();
@@ -239,13 +234,5 @@ fn measure_all(cpu_count: usize) -> Result<(), SetupError> {
 }
 
 fn main() -> ExitCode {
-    let cpu_count = std::thread::available_parallelism().map_or(1, Into::into);
-    if cpu_count < 2 {
-        println!("{BENCH}: not measurable here: {cpu_count} processor, 2 hosts that want one each");
-        return ExitCode::SUCCESS;
-    }
-    if let Err(error) = measure_all(cpu_count) {
-        println!("{BENCH}: not measurable here: {error}");
-    }
-    ExitCode::SUCCESS
+    with_a_processor_each(BENCH, measure_all)
 }

@@ -15,6 +15,6 @@ mod report;
 mod rounds;
 
 pub use host::{HostFacts, pin_to_cpu};
-pub use quantiles::{PairedRatio, Quantiles};
+pub use quantiles::{MedianInterval, PairedRatio, Quantiles};
 pub use report::{json_line, table};
 pub use rounds::{Case, Comparison, FLOOR_JUMP_RATIO_MAX, Row, compare};

@@ -82,6 +82,44 @@ impl PairedRatio {
     }
 }
 
+/// The median of independent figures with its 95 % interval by order statistics: whatever their
+/// distribution, the true median lies outside with at most that probability.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MedianInterval {
+    /// Median of the figures.
+    pub median: f64,
+    /// Lower end.
+    pub low: f64,
+    /// Upper end.
+    pub high: f64,
+}
+
+impl MedianInterval {
+    /// Largest probability on either side of the interval.
+    const TAIL: f64 = 0.025;
+
+    /// `None` with fewer than six figures: not even the smallest and the largest make an interval
+    /// of 95 %.
+    pub fn of(mut figures: Vec<f64>) -> Option<Self> {
+        figures.sort_unstable_by(f64::total_cmp);
+        let count = figures.len();
+        // Terms of a binomial distribution of one half; the first `left_out` lie below the interval.
+        let mut term = 0.5_f64.powi(i32::try_from(count).ok()?);
+        let (mut sum, mut left_out) = (0.0, 0_usize);
+        while left_out < count && sum + term <= Self::TAIL {
+            sum += term;
+            term *= (count - left_out) as f64 / (left_out + 1) as f64;
+            left_out += 1;
+        }
+        let first = left_out.checked_sub(1)?;
+        Some(Self {
+            median: f64::midpoint(figures[(count - 1) / 2], figures[count / 2]),
+            low: figures[first],
+            high: figures[count - 1 - first],
+        })
+    }
+}
+
 /// The middle of a few figures; `None` without any.
 pub(crate) fn median(mut values: Vec<u64>) -> Option<u64> {
     values.sort_unstable();
@@ -108,6 +146,19 @@ mod tests {
         assert_eq!((quantiles.p50_ns, quantiles.p99_9_ns), (7, 7));
         assert_eq!(Quantiles::of(&mut []), None);
         assert_eq!(median(Vec::new()), None);
+    }
+
+    #[test]
+    fn the_interval_of_a_median_is_that_of_the_tables() {
+        // Ranks 2 and 9 of 10, 6 and 15 of 20, 10 and 21 of 30: Conover, Practical Nonparametric
+        // Statistics, table A3.
+        for (count, low, high) in [(10, 2.0, 9.0), (20, 6.0, 15.0), (30, 10.0, 21.0)] {
+            let interval = MedianInterval::of((1..=count).rev().map(f64::from).collect()).unwrap();
+            let found = (interval.low, interval.median, interval.high);
+            assert_eq!(found, (low, f64::midpoint(low, high), high), "{count}");
+        }
+        assert_eq!(MedianInterval::of(vec![1.0; 5]), None);
+        assert!(MedianInterval::of(vec![1.0; 6]).is_some());
     }
 
     #[test]

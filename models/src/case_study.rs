@@ -33,6 +33,12 @@ pub trait CaseStudy: Sized + Debug + 'static {
     /// False when a role keeps what the others rely on, so that one started anew in the midst of
     /// a run would be wrong about the world: a topology may not ask for its restart then.
     const MAY_RESTART: bool = true;
+    /// The channel on whose producer's clock the score is kept: events and errors have their times on
+    /// it, and so have stamps that messages carry as payload. Where hosts have clocks of their own and
+    /// these are aligned, the log has the stamps of all channels on this clock, with the bound
+    /// [`RunLog::clock_bound_ns`]; without it they stay as they were read, and
+    /// [`RunLog::has_one_clock`] is false.
+    const SCORE_CLOCK: Option<&'static str> = None;
     /// The series that [`CaseStudy::series`] can give, by name.
     const SERIES: &'static [&'static str] = &[];
     /// The figures that [`CaseStudy::calibration`] knows, by name.

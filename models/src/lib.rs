@@ -11,7 +11,8 @@
 //! 6. [`egm`], [`yumi`] and [`teleoperation`]: the dual-arm robot of the seed paper, its guided
 //!    motion and the person who guides it; [`fleet`]: its seven vehicles.
 //! 7. [`trace`]: what a link did to every message of a run, as data.
-//! 8. [`study`]: batches of virtual-time runs that end in tables.
+//! 8. [`mod@layout`]: the fields of a message, for programs that do not know its type.
+//! 9. [`study`]: batches of virtual-time runs that end in tables.
 #![forbid(unsafe_code)]
 
 pub mod arrival;
@@ -21,6 +22,7 @@ pub mod component;
 pub mod egm;
 pub mod endpoint;
 pub mod fleet;
+pub mod layout;
 pub mod link;
 pub mod measure;
 pub mod message;

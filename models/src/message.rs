@@ -5,6 +5,8 @@ use core::fmt::Debug;
 
 use bytemuck::{Pod, Zeroable};
 
+use crate::layout::Field;
+
 /// A fixed-size message without padding, so that its shared-memory layout is its wire layout.
 ///
 /// ```
@@ -20,6 +22,9 @@ use bytemuck::{Pod, Zeroable};
 pub trait Message: Pod + Debug + Send + 'static {
     /// Name and version, e.g. `hil.EgmCommand.v1`. A changed layout needs a new version.
     const NAME: &'static str;
+    /// Its fields, by [`layout!`](crate::layout!); empty where nobody stated them, and who records
+    /// such messages keeps their bytes.
+    const FIELDS: &'static [Field] = &[];
 }
 
 /// A message's identity at run time: what two hosts compare before they trust bytes.
@@ -31,6 +36,8 @@ pub struct MessageType {
     pub size_bytes: usize,
     /// Alignment in shared memory.
     pub alignment_bytes: usize,
+    /// [`Message::FIELDS`].
+    pub fields: &'static [Field],
 }
 
 impl MessageType {
@@ -40,6 +47,7 @@ impl MessageType {
             name: M::NAME,
             size_bytes: size_of::<M>(),
             alignment_bytes: align_of::<M>(),
+            fields: M::FIELDS,
         }
     }
 

@@ -11,6 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::case_study::{CaseStudy, ChannelSpec, ErrorSeries, Metric, ParameterError, Score};
 use crate::component::{Component, Outbox, Role, into_role};
+use crate::layout::Field;
 use crate::measure::series::Estimate;
 use crate::measure::special::ceil_count;
 use crate::message::Message;
@@ -27,8 +28,14 @@ pub struct ShuttleCommand {
     pub target_m: f64,
 }
 
+crate::layout!(ShuttleCommand {
+    speed_mps,
+    target_m
+});
+
 impl Message for ShuttleCommand {
     const NAME: &'static str = "hil.ShuttleCommand.v1";
+    const FIELDS: &'static [Field] = Self::LAYOUT;
 }
 
 /// Robot to controller: where the cart is.
@@ -39,8 +46,11 @@ pub struct ShuttleStatus {
     pub position_m: f64,
 }
 
+crate::layout!(ShuttleStatus { position_m });
+
 impl Message for ShuttleStatus {
     const NAME: &'static str = "hil.ShuttleStatus.v1";
+    const FIELDS: &'static [Field] = Self::LAYOUT;
 }
 
 /// `[case.parameters]` of the shuttle.
@@ -79,6 +89,7 @@ impl CaseStudy for Shuttle {
         ChannelSpec::of::<ShuttleCommand>("shuttle/command", "controller", "robot"),
         ChannelSpec::of::<ShuttleStatus>("shuttle/status", "robot", "controller"),
     ];
+    const SCORE_CLOCK: Option<&'static str> = Some("shuttle/status");
     type Parameters = ShuttleParameters;
 
     fn new(parameters: Self::Parameters, _seed: u64) -> Result<Self, ParameterError> {

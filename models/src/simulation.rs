@@ -40,7 +40,7 @@ impl<L: LinkModel> Carrier for L {
         payload: &[u8],
         deliver: &mut dyn FnMut(Instant, Envelope, &[u8]),
     ) {
-        let fate = self.offer_numbered(now, payload.len(), envelope.sequence);
+        let fate = self.offer_numbered(now, payload.len(), envelope.into());
         for at in [fate.arrival(), fate.second_arrival()]
             .into_iter()
             .flatten()

@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use clap::{ArgGroup, Args, Parser, Subcommand};
 
 use crate::probe::arguments::ProbeArgs;
+use crate::report::page::Format;
 use crate::trace::cli::TraceCommand;
 
 const EXAMPLES: &str = "\
@@ -53,6 +54,24 @@ Example:
 Reads the manifest and the records of the run, and nothing else. Exit code 0 when every
 message is the same to the last bit, 1 when one differs or records are missing, 2 when the
 folder cannot be replayed at all.";
+
+const REPORT_EXAMPLES: &str = "\
+Examples:
+  hil-runtime report runs/teleop-local-20261121-101500
+      print it again, as the run did at its end
+  hil-runtime report runs/teleop-local-20261121-101500 -o report.html
+      one page with figures that opens offline and can be printed
+  hil-runtime report runs/a runs/b simulated -o report.html
+      several runs: a table with one row each, then each run
+  hil-runtime report runs/a --format csv
+      one row per channel and figure, to standard output
+  hil-runtime report runs/a --format svg -o figures
+      every figure as a file of its own; --figure timeline for one
+  hil-runtime report runs/a --template lab.html -o report.html
+      the data of --format json through a template of your own
+
+A folder that `simulate --output` wrote is a run as well. A file that is there already is
+overwritten only if it is a report, or with --force. docs/reports.md has the rest.";
 
 /// Runs a robot's controller and its model as separate processes, over shared memory or a real
 /// network, and accounts for every microsecond in between.
@@ -147,6 +166,49 @@ pub struct CalibrateArgs {
     pub batch: BatchArgs,
 }
 
+/// Arguments of a report.
+#[derive(Debug, Args)]
+pub struct ReportArgs {
+    /// The folders of the runs.
+    #[arg(required = true, value_name = "RUN")]
+    pub runs: Vec<PathBuf>,
+    /// Print summary.json instead of the table.
+    #[arg(long, conflicts_with_all = ["output", "format", "template", "figure"])]
+    pub json: bool,
+    /// Write the report to this file (or figures to this folder) instead of printing it.
+    #[arg(long, short, value_name = "FILE")]
+    pub output: Option<PathBuf>,
+    /// What to write; otherwise what the ending of --output says.
+    #[arg(long, value_enum)]
+    pub format: Option<Format>,
+    /// Write one figure only, by its name.
+    #[arg(long, value_name = "NAME")]
+    pub figure: Option<String>,
+    /// Put the data of --format json through this template (minijinja, which reads Jinja2).
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["format", "figure"])]
+    pub template: Option<PathBuf>,
+    /// Overwrite --output whatever it is.
+    #[arg(long)]
+    pub force: bool,
+}
+
+/// How a network card was found, in the kernel's numbers (`struct hwtstamp_config`).
+#[derive(Debug, Args)]
+pub struct CardGuardArgs {
+    /// Its interface.
+    #[arg(long)]
+    pub interface: String,
+    /// `flags`.
+    #[arg(long, allow_negative_numbers = true)]
+    pub flags: i32,
+    /// `tx_type`.
+    #[arg(long, allow_negative_numbers = true)]
+    pub transmit_type: i32,
+    /// `rx_filter`.
+    #[arg(long, allow_negative_numbers = true)]
+    pub receive_filter: i32,
+}
+
 /// Everything but a run.
 #[derive(Debug, Subcommand)]
 pub enum Command {
@@ -189,15 +251,9 @@ pub enum Command {
     /// Find the link parameters under which a figure comes out as given, in virtual time.
     #[command(after_help = CALIBRATE_EXAMPLES)]
     Calibrate(CalibrateArgs),
-    /// Print the report of a finished run again.
-    #[command(after_help = "Example:\n  hil-runtime report runs/teleop-local-20261121-101500")]
-    Report {
-        /// The run's folder.
-        run: PathBuf,
-        /// Print summary.json instead of the table.
-        #[arg(long)]
-        json: bool,
-    },
+    /// Print the report of a finished run again, or write it as a page, tables or figures.
+    #[command(after_help = REPORT_EXAMPLES)]
+    Report(ReportArgs),
     /// Run the robot of a finished run again in virtual time and compare every message.
     #[command(after_help = REPLAY_EXAMPLES)]
     Replay {
@@ -218,9 +274,15 @@ pub enum Command {
     },
     /// Say what this host can measure and what to change.
     #[command(
-        after_help = "Example:\n  hil-runtime doctor --strict   # exit code 78 when something must be fixed"
+        after_help = "Examples:\n  hil-runtime doctor --strict   # exit code 78 when something must be fixed\n  hil-runtime doctor --topology deploy/topologies/split.toml   # its clock path as well"
     )]
     Doctor {
+        /// A topology whose clock path is examined as well, as far as it ends on this host.
+        #[arg(long)]
+        topology: Option<PathBuf>,
+        /// Name of this host in the topology, if it is not found by itself.
+        #[arg(long, requires = "topology")]
+        host: Option<String>,
         /// Exit with 78 when a problem was found.
         #[arg(long)]
         strict: bool,
@@ -266,6 +328,9 @@ pub enum Command {
         #[arg(last = true, required = true)]
         program: Vec<String>,
     },
+    /// Wait for the end of the program that set a network card up; not for use by hand.
+    #[command(hide = true)]
+    CardGuard(CardGuardArgs),
     /// Speak with a foreign EGM program; started by a run, not by hand.
     #[command(hide = true)]
     Face {

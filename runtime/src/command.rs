@@ -1,32 +1,34 @@
 //! What each command of the command line does, and the exit code it ends with.
 
 mod case_work;
+mod report_work;
 
+use std::collections::BTreeMap;
 use std::env;
 use std::fs;
 use std::io::IsTerminal;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::Parser;
 use hil_gateways::transport::timestamping::TimestampCapabilities;
 use hil_models::case_study::ParameterError;
+use hil_models::layout::Field;
 use hil_models::teleoperation::swing::swing_bvh;
 
 use crate::analysis;
+use crate::card_clock::guard;
 use crate::cases;
 use crate::cli::{Cli, Command, RunArgs};
 use crate::console::Console;
-use crate::doctor::{self, DoctorRequest, StampCapabilities};
+use crate::doctor::{self, ClockQuestion, DoctorRequest, StampCapabilities};
 use crate::face;
 use crate::gateway;
 use crate::probe;
 use crate::process::emulation_room::check_emulation;
 use crate::process::{component, own_program};
 use crate::registry::Registry;
-use crate::report::summary::RunSummary;
 use crate::report::terminal::{self, Style};
-use crate::run_folder::RunFolder;
 use crate::signals::{EXIT_INTERRUPTED, Signals};
 use crate::supervisor::{self, Outcome, PeerError, RunError, RunOptions, RunResult};
 use crate::topology::{self, HOST_VARIABLE, HostChoice, MachineIdentity, Topology, which_host};
@@ -60,6 +62,7 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
             supervisor,
             program,
         } => code_of(own_program::become_program(supervisor, &program), console),
+        Command::CardGuard(args) => code_of(guard::run(&args), console),
         Command::Face { launch } => code_of(face::process::run(&launch), console),
         Command::Gateway { launch } => code_of(gateway::process::run(&launch), console),
         Command::Simulate {
@@ -83,20 +86,21 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
         }
         Command::Calibrate(args) => case_work::calibrate(args, registry),
         Command::Replay { run, json } => case_work::replay(&run, json, registry, console),
-        Command::Report { run, json } => show_report(&run, json, console),
+        Command::Report(args) => report_work::report(&args, console),
         Command::Trace { command } => match trace::work::work(command, columns(), console) {
             trace::work::End::Done => exit::RAN,
             trace::work::End::Failed => exit::FAILED,
             trace::work::End::Refused => exit::USAGE,
         },
-        Command::Doctor { strict, json } => {
-            let worst = examine(json, console);
-            if strict && worst == doctor::State::Problem {
-                exit::HOST_UNFIT
-            } else {
-                exit::RAN
-            }
-        }
+        Command::Doctor {
+            topology,
+            host,
+            strict,
+            json,
+        } => match doctor_request((topology, host), registry, console) {
+            Ok(request) => examine(&request, (strict, json), console),
+            Err(code) => code,
+        },
         Command::Probe(args) => probe::run(&args, console),
         Command::Cases => {
             console.result(&cases::list(registry));
@@ -123,6 +127,14 @@ fn code_of<E: core::fmt::Display>(outcome: Result<(), E>, console: &mut Console)
             exit::FAILED
         }
     }
+}
+
+/// Takes over the signals that end programs, or says why it cannot.
+fn signals(console: &mut Console) -> Result<Signals, u8> {
+    Signals::install().map_err(|error| {
+        console.error(&format!("cannot handle signals: {error}"));
+        exit::INTERNAL
+    })
 }
 
 fn load(
@@ -162,17 +174,15 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
             return exit::USAGE;
         }
     };
-    let signals = match Signals::install() {
+    let signals = match signals(console) {
         Ok(signals) => signals,
-        Err(error) => {
-            console.error(&format!("cannot handle signals: {error}"));
-            return exit::INTERNAL;
-        }
+        Err(code) => return code,
     };
     let options = RunOptions {
         hosts,
         domain_root: args.domain_root.clone(),
         command_line: env::args().collect(),
+        layouts: layouts(&topology, registry),
     };
     match supervisor::run(&topology, &options, &signals, console) {
         Ok(result) => {
@@ -204,6 +214,15 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
     }
 }
 
+/// The fields of the messages of the topology's case, by channel.
+fn layouts(topology: &Topology, registry: &Registry) -> BTreeMap<String, &'static [Field]> {
+    let entry = topology.case().and_then(|case| registry.find(&case.name));
+    let channels = entry.into_iter().flat_map(|entry| entry.channels);
+    channels
+        .map(|channel| (channel.name.to_owned(), channel.message.fields))
+        .collect()
+}
+
 /// What the file comes to, or why no run of it can be what it says.
 fn show_check(path: &Path, topology: &Topology, console: &mut Console) -> u8 {
     if let Err(error) = check_emulation(topology) {
@@ -214,10 +233,17 @@ fn show_check(path: &Path, topology: &Topology, console: &mut Console) -> u8 {
         ));
         return exit::USAGE;
     }
+    // As comments, so that what follows the first line remains a topology.
+    let clock_paths = topology.clock_paths().map(|clock| {
+        let (asking, answering) = (clock.asking.port(), clock.answering.port());
+        let words = clock.describe();
+        format!("\n# {words}, UDP ports {asking} and {answering}")
+    });
     console.result(&format!(
-        "{}: the file is valid; it comes to\n\n{}",
+        "{}: the file is valid; it comes to\n\n{}{}",
         path.display(),
-        topology.to_toml()
+        topology.to_toml(),
+        clock_paths.collect::<Vec<_>>().concat()
     ));
     exit::RAN
 }
@@ -281,49 +307,52 @@ fn hosts_here(topology: &Topology, requested: Option<&str>) -> Result<Vec<String
     }
 }
 
-fn show_report(run: &Path, json: bool, console: &mut Console) -> u8 {
-    let folder = RunFolder::existing(run);
-    let text = match fs::read_to_string(folder.summary()) {
-        Ok(text) => text,
-        Err(error) => {
-            let path = folder.summary();
-            let text = if folder.manifest().is_file() {
-                "this run never began or was killed outright, so it left no summary".to_owned()
-            } else if folder.virtual_report().is_file() {
-                "this is a folder of `simulate` or `tables`, not of a run; read its report.txt, or                  report.json for every figure"
-                    .to_owned()
-            } else {
-                format!("not a run's folder: {error}")
-            };
-            console.error(&format!("{}: {text}", path.display()));
-            return exit::USAGE;
-        }
+/// What a topology has the doctor look at beside the host itself.
+fn doctor_request(
+    (topology, host): (Option<PathBuf>, Option<String>),
+    registry: &Registry,
+    console: &mut Console,
+) -> Result<DoctorRequest, u8> {
+    let mut request = DoctorRequest::default();
+    let Some(path) = topology else {
+        return Ok(request);
     };
-    if json {
-        console.result(&text);
-        return exit::RAN;
-    }
-    match RunSummary::from_json(&text) {
-        Ok(summary) => {
-            console.result(&terminal::render(&summary, columns(), Style::Coloured));
-            exit::RAN
-        }
-        Err(error) => {
-            console.error(&format!("{}: {error}", folder.summary().display()));
-            exit::USAGE
-        }
-    }
+    let topology = load(&path, &[], registry, console).ok_or(exit::USAGE)?;
+    let here = hosts_here(&topology, host.as_deref()).map_err(|text| {
+        console.error(&text);
+        exit::USAGE
+    })?;
+    // Several hosts are here only when none has an address, and none of these has a clock path.
+    let mut ends = here
+        .iter()
+        .filter_map(|name| topology.host(name)?.clock.clone());
+    request.clock_end = ends
+        .next()
+        .map_or(ClockQuestion::NoneNamed, ClockQuestion::End);
+    Ok(request)
 }
 
-fn examine(json: bool, console: &mut Console) -> doctor::State {
-    let report = doctor::examine(&DoctorRequest::default(), &stamp_capabilities);
+fn examine(request: &DoctorRequest, (is_strict, json): (bool, bool), console: &mut Console) -> u8 {
+    let signals = match signals(console) {
+        Ok(signals) => signals,
+        Err(code) => return code,
+    };
+    let watch = signals.end_program_unless_over(
+        "the doctor describes a host whole or not at all; a card it was trying is put back",
+    );
+    let report = doctor::examine(request, &stamp_capabilities);
+    drop(watch);
     let text = if json {
         report.to_json()
     } else {
         report.to_text(true)
     };
     console.result(&text);
-    report.worst_state()
+    if is_strict && report.worst_state() == doctor::State::Problem {
+        exit::HOST_UNFIT
+    } else {
+        exit::RAN
+    }
 }
 
 /// What an interface claims, in the bits of the kernel's answer.

@@ -32,6 +32,7 @@ pub mod doctor;
 pub mod face;
 pub mod gateway;
 pub mod host_facts;
+pub mod manifest;
 pub mod probe;
 pub mod process;
 pub mod radio;

@@ -127,6 +127,8 @@ pub struct CaseEntry {
     pub roles: &'static [&'static str],
     /// Its channels.
     pub channels: &'static [ChannelSpec],
+    /// See [`CaseStudy::SCORE_CLOCK`].
+    pub score_clock: Option<&'static str>,
     /// The series it can give, by name.
     pub series: &'static [&'static str],
     /// The figures it can be calibrated for, by name.
@@ -176,6 +178,7 @@ impl Registry {
             summary: C::SUMMARY,
             roles: C::ROLES,
             channels: C::CHANNELS,
+            score_clock: C::SCORE_CLOCK,
             series: C::SERIES,
             calibrated_figures: C::CALIBRATED_FIGURES,
             make: make::<C>,

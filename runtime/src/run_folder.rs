@@ -10,7 +10,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 ///
 /// | path | content |
 /// |---|---|
-/// | `manifest.json` | resolved topology, versions, host facts, seed, command line |
+/// | `manifest.json` | resolved topology, layouts of messages, versions, host facts, seed |
 /// | `summary.json` | every figure of the report |
 /// | `report.txt` | the report as printed |
 /// | `events.log` | what happened to the robot, one line each |

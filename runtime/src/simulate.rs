@@ -14,7 +14,7 @@ use std::path::{Path, PathBuf};
 
 use hil_models::case_study::Score;
 use hil_models::link::LinkModel;
-use hil_models::link::trace::{ReplayCounts, ReplayTally, TraceMatch};
+use hil_models::link::trace::{ReplayCounts, ReplayTally};
 use hil_models::measure::account::OutageFigures;
 use hil_models::plot::PlotSeries;
 use hil_models::simulation::{Carrier, Simulation, SimulationResult};
@@ -24,6 +24,7 @@ use crate::process::launch::EmulationLaunch;
 use crate::registry::{Case, Registry};
 use crate::report::event_log;
 use crate::report::network::NetworkReport;
+use crate::report::replay::replay_words;
 use crate::report::score_event::ScoreEvents;
 use crate::report::summary::ScoreMetric;
 use crate::report::terminal::{self, Style};
@@ -254,7 +255,8 @@ impl Simulated {
             text.push_str(&figures.page(name));
         }
         for (name, tally) in &self.replays {
-            text.push_str(&replay_line(name, &tally.counts()));
+            let words = replay_words(&tally.counts());
+            let _infallible = writeln!(text, "  {name:<18} {words}");
         }
         for (name, figures) in self.outage_figures() {
             text.push_str(&terminal::render_outages(name, &figures, columns, style));
@@ -310,39 +312,6 @@ impl Simulated {
         let stories = self.outages.iter();
         stories.filter_map(|story| Some((story.channel.as_str(), story.figures()?)))
     }
-}
-
-/// What a channel met of its trace.
-fn replay_line(name: &str, counts: &ReplayCounts) -> String {
-    let mut text = format!(
-        "  {name:<18} met {} of {} records of its trace: {} delivered, {} lost",
-        counts.met_count, counts.record_count, counts.delivered_count, counts.lost_count
-    );
-    let how = match counts.matching {
-        TraceMatch::Index => "message by message",
-        TraceMatch::Time => "by time",
-        TraceMatch::Tick => "tick by tick",
-    };
-    let _infallible = write!(text, ", {how}");
-    for (count, what) in [
-        (counts.unknown_count, "of unknown fate, taken as lost"),
-        (
-            counts.unpublished_count,
-            "at ticks without a record, taken as lost",
-        ),
-        (counts.repeated_count, "at a tick for the second time"),
-        (counts.beyond_end_count, "after its end"),
-        (
-            counts.negative_delay_count,
-            "with a delay below zero, taken as zero",
-        ),
-    ] {
-        if count > 0 {
-            let _infallible = write!(text, ", {count} {what}");
-        }
-    }
-    text.push('\n');
-    text
 }
 
 /// Width of `report.txt`.

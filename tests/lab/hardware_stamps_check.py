@@ -5,6 +5,7 @@ Usage: hardware_stamps_check.py igb|e1000e FOLDER
 """
 import glob
 import json
+import re
 import sys
 
 NIC, FOLDER = sys.argv[1], sys.argv[2]
@@ -13,6 +14,13 @@ SENDERS = {"shuttle/command": HOSTS[0], "shuttle/status": HOSTS[1]}
 # The card has one stamp register: what is sent before its driver read it gets none. How often
 # that is depends on the load of the emulating host; the driver counts it, and so it is checked.
 TX_SHARE_MIN = 0.5
+# What a guard says when it had to act.
+PUT_BACK = "ended without putting it back"
+# Of each PC: the run that was ended there, its exit code, and how.
+ROUGH_ENDS = {
+    HOSTS[0]: ("killed", 137, "a run killed outright"),
+    HOSTS[1]: ("twice", 131, "a run interrupted twice"),
+}
 failures = 0
 
 
@@ -34,15 +42,77 @@ def finding(host, file_name):
     return findings.get("card.eth0", "")
 
 
+def setting(found):
+    return found.split(";")[0]
+
+
 def doctor(host):
-    found, after = finding(host, "doctor.json"), finding(host, "doctor-after.json")
+    found = finding(host, "doctor.json")
     check(found != "", f"{host}: doctor examined the card")
     print(f"        doctor: {found}")
     words = "delivers" if NIC == "igb" else "advertised but never delivered"
     check(words in found, f"{host}: doctor says the card {words}")
-    setting = after.split(";")[0]
-    check(setting == found.split(";")[0] != "",
-          f"{host}: after the run doctor finds the card as before it: {setting}")
+    after = finding(host, "doctor-after.json")
+    check(words in after, f"{host}: and says so after the run")
+    if words not in after:
+        print(f"        doctor: {after}")
+    unchanged(host, "the run", "doctor-after.json")
+
+
+def unchanged(host, what, file_name):
+    before, after = setting(finding(host, "doctor.json")), setting(finding(host, file_name))
+    check(after == before != "", f"{host}: after {what} the card is as it was found: {after}")
+
+
+def words_of(host, file_name):
+    with open(f"{FOLDER}/{host}/{file_name}", encoding="utf-8", errors="replace") as file:
+        return file.read()
+
+
+def rough_ends(host):
+    """Programs that were ended while they had the card set up, and what became of it."""
+    pairs = (line.split("=") for line in words_of(host, "codes.txt").splitlines())
+    # The last attempt of several counts.
+    codes = {name: int(code) for name, code in pairs}
+    code = codes["interrupted_doctor"]
+    check(code == 130, f"{host}: an interrupted doctor ends with {code}")
+    caught = PUT_BACK in words_of(host, "interrupted-doctor.txt")
+    check(caught, f"{host}: attempt {codes['interrupted_doctor_attempts']} was interrupted while "
+          "the card was set up, and its guard put it back")
+    unchanged(host, "an interrupted doctor", "doctor-interrupted-after.json")
+    name, expected, what = ROUGH_ENDS[host]
+    check(codes[name] == expected, f"{host}: {what} ends with {codes[name]}")
+    during = setting(finding(host, f"doctor-{name}-during.json"))
+    check("transmit on" in during, f"{host}: before that the card was set up: {during}")
+    check(PUT_BACK in words_of(host, f"{name}-run.txt"), f"{host}: the guard says so")
+    unchanged(host, what, f"doctor-{name}-after.json")
+
+
+def probed_ptp(host):
+    """A probe that asked for card stamps of PTP's datagrams, beside a PTP clock."""
+    before = setting(finding(host, "doctor-ptp-before.json"))
+    after = setting(finding(host, "doctor-ptp-after.json"))
+    check("PTPv2 event" in before, f"{host}: a PTP clock has set its card up: {before}")
+    check(after == before, f"{host}: a probe that asked for card stamps leaves it so: {after}")
+    told = re.search(r"(\d+) of (\d+) arrivals have the card's stamp", words_of(host, "probe.txt"))
+    check(told is not None, f"{host}: the probe says how many arrivals the card stamped")
+    if told is None:
+        return
+    stamped, arrived = (int(text) for text in told.groups())
+    analysis = json.loads(words_of(host, "probe.json"))
+    points = analysis["points"]
+
+    def counted(is_card):
+        chosen = [one for one in points if one["point"].endswith("by the card's clock") == is_card]
+        return sum(one["figures"]["datagram_count"] for one in chosen if "(in)" in one["point"])
+
+    # Without the transmit stamps that the e1000e owes it, ptp4l falls silent.
+    least = 20 if NIC == "igb" else 0
+    # The two rings are opened one after the other.
+    check(arrived >= least and abs(counted(False) - arrived) <= 1,
+          f"{host}: {arrived} arrivals, {counted(False)} in the kernel's part of the capture")
+    check(counted(True) == stamped,
+          f"{host}: the card stamped {stamped} of them, {counted(True)} are in its part")
 
 
 def not_stamped(host):
@@ -115,6 +185,8 @@ def channel(one, summary):
 
 for host in HOSTS:
     doctor(host)
+    rough_ends(host)
+    probed_ptp(host)
     paths = glob.glob(f"{FOLDER}/{host}/record/*/summary.json")
     check(len(paths) == 1, f"{host}: one run folder")
     if len(paths) != 1:

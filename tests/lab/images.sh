@@ -15,9 +15,9 @@ set -u -o pipefail
 # shellcheck source=tests/lab/lib.sh
 source "$(dirname "$0")/lib.sh"
 
-# In the order a session needs them: links, Wi-Fi, watching.
+# In the order a session needs them: links, Wi-Fi, clocks, watching.
 GUEST_PACKAGES=iproute2,kmod,iputils-ping,ethtool,procps,busybox-static
-GUEST_PACKAGES+=,hostapd,wpasupplicant,iw,wireless-regdb,tcpdump
+GUEST_PACKAGES+=,hostapd,wpasupplicant,iw,wireless-regdb,linuxptp,tcpdump
 # Folders of kernel modules, under lib/modules/VERSION/kernel.
 GUEST_MODULES=(net crypto lib arch fs/9p fs/netfs fs/fscache fs/ext4 fs/jbd2 fs/mbcache.ko
     drivers/virtio drivers/block/virtio_blk.ko drivers/char/hw_random drivers/ptp drivers/pps

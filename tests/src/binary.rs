@@ -1,4 +1,4 @@
-//! The `hil-runtime` binary the tests start, built in the profile of the tests themselves.
+//! The `hil-runtime` and `hil-recorder` binaries the tests start, built in the profile of the tests themselves.
 
 use std::env;
 use std::ffi::OsString;
@@ -10,6 +10,8 @@ use serde_json::Value;
 
 /// Names a binary to test in place of the one cargo builds.
 pub const BINARY_VARIABLE: &str = "HIL_RUNTIME_BINARY";
+/// The same of the recorder.
+pub const RECORDER_VARIABLE: &str = "HIL_RECORDER_BINARY";
 
 /// The `hil-runtime` binary: the one named by `HIL_RUNTIME_BINARY`, else freshly built by cargo.
 ///
@@ -19,19 +21,28 @@ pub const BINARY_VARIABLE: &str = "HIL_RUNTIME_BINARY";
 /// When the named file does not exist, or the build fails; with cargo's words.
 pub fn hil_runtime_binary() -> &'static Path {
     static BINARY: OnceLock<PathBuf> = OnceLock::new();
-    BINARY.get_or_init(|| {
-        locate(env::var_os(BINARY_VARIABLE)).unwrap_or_else(|reason| panic!("{reason}"))
-    })
+    BINARY.get_or_init(|| located("hil-runtime", BINARY_VARIABLE))
 }
 
-fn locate(named: Option<OsString>) -> Result<PathBuf, String> {
+/// The `hil-recorder` binary: the one named by `HIL_RECORDER_BINARY`, else freshly built by cargo.
+///
+/// # Panics
+/// As [`hil_runtime_binary`].
+pub fn hil_recorder_binary() -> &'static Path {
+    static BINARY: OnceLock<PathBuf> = OnceLock::new();
+    BINARY.get_or_init(|| located("hil-recorder", RECORDER_VARIABLE))
+}
+
+fn located(package: &str, variable: &str) -> PathBuf {
+    let found = locate(package, variable, env::var_os(variable));
+    found.unwrap_or_else(|reason| panic!("{reason}"))
+}
+
+fn locate(package: &str, variable: &str, named: Option<OsString>) -> Result<PathBuf, String> {
     match named {
         Some(path) if Path::new(&path).is_file() => Ok(PathBuf::from(path)),
-        Some(path) => Err(format!(
-            "{BINARY_VARIABLE} names {}, no file",
-            path.display()
-        )),
-        None => build(),
+        Some(path) => Err(format!("{variable} names {}, no file", path.display())),
+        None => build(package),
     }
 }
 
@@ -43,11 +54,11 @@ pub fn workspace_folder() -> PathBuf {
         .map_or_else(|| package.to_owned(), Path::to_owned)
 }
 
-fn build() -> Result<PathBuf, String> {
+fn build(package: &str) -> Result<PathBuf, String> {
     let cargo = env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
     let output = Command::new(cargo)
         .current_dir(workspace_folder())
-        .args(["build", "--package", "hil-runtime", "--bin", "hil-runtime"])
+        .args(["build", "--package", package, "--bin", package])
         .args([
             "--profile",
             &profile(),
@@ -58,10 +69,10 @@ fn build() -> Result<PathBuf, String> {
         .map_err(|error| format!("cargo cannot be started: {error}"))?;
     if !output.status.success() {
         let words = String::from_utf8_lossy(&output.stderr);
-        return Err(format!("building hil-runtime failed:\n{words}"));
+        return Err(format!("building {package} failed:\n{words}"));
     }
-    executable_in(&String::from_utf8_lossy(&output.stdout))
-        .ok_or_else(|| "cargo reported no executable for hil-runtime".to_owned())
+    executable_in(package, &String::from_utf8_lossy(&output.stdout))
+        .ok_or_else(|| format!("cargo reported no executable for {package}"))
 }
 
 /// The profile this test was built in: its folder is `<target>/<profile>/deps`.
@@ -74,13 +85,13 @@ fn profile() -> String {
     }
 }
 
-/// The path in cargo's message about the finished `hil-runtime` binary.
-fn executable_in(messages: &str) -> Option<PathBuf> {
+/// The path in cargo's message about the finished binary of `package`.
+fn executable_in(package: &str, messages: &str) -> Option<PathBuf> {
     messages
         .lines()
         .filter_map(|line| serde_json::from_str::<Value>(line).ok())
         .find_map(|message| {
-            let is_ours = message["target"]["name"] == "hil-runtime";
+            let is_ours = message["target"]["name"] == package;
             let executable = message["executable"].as_str()?;
             is_ours.then(|| PathBuf::from(executable))
         })
@@ -100,8 +111,9 @@ mod tests {
     #[test]
     fn a_named_binary_must_exist() {
         let named = env::current_exe().unwrap();
-        assert_eq!(locate(Some(named.clone().into())), Ok(named));
-        let error = locate(Some("/no/such/file".into())).unwrap_err();
+        let locate = |named: OsString| locate("hil-runtime", BINARY_VARIABLE, Some(named));
+        assert_eq!(locate(named.clone().into()), Ok(named));
+        let error = locate("/no/such/file".into()).unwrap_err();
         assert_eq!(error, "HIL_RUNTIME_BINARY names /no/such/file, no file");
     }
 
@@ -112,9 +124,9 @@ not json
 {"reason":"compiler-artifact","target":{"name":"hil-runtime"},"executable":"/t/hil-runtime"}
 {"reason":"build-finished","success":true}"#;
         assert_eq!(
-            executable_in(messages),
+            executable_in("hil-runtime", messages),
             Some(PathBuf::from("/t/hil-runtime"))
         );
-        assert_eq!(executable_in(""), None);
+        assert_eq!(executable_in("hil-runtime", ""), None);
     }
 }

@@ -29,6 +29,11 @@ pub use self::privilege::require_privileges;
 pub const INTERFACE: &str = "eth0";
 /// The addresses of host 0 and host 1.
 pub const ADDRESSES: [Ipv4Addr; 2] = [Ipv4Addr::new(10, 77, 0, 1), Ipv4Addr::new(10, 77, 0, 2)];
+/// The interface of a second cable, see [`Lab::lay_second_cable`].
+pub const SECOND_INTERFACE: &str = "eth1";
+/// The addresses of host 0 and host 1 on a second cable.
+pub const SECOND_ADDRESSES: [Ipv4Addr; 2] =
+    [Ipv4Addr::new(10, 78, 0, 1), Ipv4Addr::new(10, 78, 0, 2)];
 
 /// No set-up command takes a tenth of this on an overloaded machine.
 const SETUP_LIMIT: Duration = Duration::from_secs(20);
@@ -69,7 +74,8 @@ impl Lab {
         ];
         namespace::join(&names, INTERFACE)?;
         for host in &hosts {
-            host.bring_up()?;
+            namespace::ip(&["-n", &host.namespace, "link", "set", "lo", "up"])?;
+            host.bring_up(INTERFACE, host.address)?;
         }
         Ok(Self { hosts })
     }
@@ -94,6 +100,81 @@ impl Lab {
             return None;
         }
         Some(Self::with_clock_ahead(ahead_s).unwrap_or_else(|reason| panic!("no lab: {reason}")))
+    }
+
+    /// Lays a second cable between the hosts.
+    ///
+    /// # Panics
+    /// When it cannot be laid.
+    pub fn lay_second_cable(&self) {
+        let names = [0, 1].map(|index| self.hosts[index].namespace.clone());
+        let laid = namespace::join(&names, SECOND_INTERFACE).and_then(|()| {
+            let ends = self.hosts.iter().zip(SECOND_ADDRESSES);
+            ends.into_iter()
+                .try_for_each(|(host, address)| host.bring_up(SECOND_INTERFACE, address))
+        });
+        if let Err(reason) = laid {
+            panic!("no second cable: {reason}");
+        }
+    }
+
+    /// Cuts the first cable and puts a bridge on host 0 in between, whose queues towards either
+    /// host can be throttled at the interfaces it returns.
+    ///
+    /// What waits there waits on the wire as far as the hosts' kernels can tell: their own queues lie
+    /// before the stamp of a departure, and throttling those would show in no stamp.
+    ///
+    /// # Panics
+    /// When it cannot be built.
+    pub fn put_bridge_between(&self) -> [&'static str; 2] {
+        let [first, second] = [0, 1].map(|index| self.hosts[index].namespace.as_str());
+        let in_first = |words: &str| -> Result<(), String> {
+            let words: Vec<&str> = ["-n", first].into_iter().chain(words.split(' ')).collect();
+            namespace::ip(&words)
+        };
+        let built = || -> Result<(), String> {
+            in_first(&format!("link delete {INTERFACE}"))?;
+            in_first("link add bridge0 type bridge")?;
+            in_first(&format!("link add {INTERFACE} type veth peer name port0"))?;
+            in_first(&format!(
+                "link add port1 type veth peer name {INTERFACE} netns {second}"
+            ))?;
+            for port in ["port0", "port1"] {
+                in_first(&format!("link set {port} master bridge0 up"))?;
+            }
+            in_first("link set bridge0 up")?;
+            self.hosts
+                .iter()
+                .try_for_each(|host| host.bring_up(INTERFACE, host.address))
+        };
+        if let Err(reason) = built() {
+            panic!("no bridge: {reason}");
+        }
+        ["port0", "port1"]
+    }
+
+    /// Has the bridge of [`Lab::put_bridge_between`] send every frame to a third port as well, and
+    /// returns the interface on host 0 at the far end of it: a mirror port of the switch.
+    ///
+    /// # Panics
+    /// When it cannot be built, or there is no bridge.
+    pub fn add_mirror_port(&self) -> &'static str {
+        let first = self.hosts[0].namespace.as_str();
+        let built = [
+            "link set bridge0 type bridge ageing_time 0",
+            "link add port2 type veth peer name mirror0",
+            "link set port2 master bridge0 up",
+            "link set mirror0 up",
+        ]
+        .iter()
+        .try_for_each(|words| {
+            let words: Vec<&str> = ["-n", first].into_iter().chain(words.split(' ')).collect();
+            namespace::ip(&words)
+        });
+        if let Err(reason) = built {
+            panic!("no mirror port: {reason}");
+        }
+        "mirror0"
     }
 
     /// Host 0 (the controller's, by convention) or host 1 (the robot's).
@@ -273,12 +354,11 @@ impl LabHost {
         }
     }
 
-    fn bring_up(&self) -> Result<(), String> {
+    fn bring_up(&self, interface: &str, address: Ipv4Addr) -> Result<(), String> {
         let name = self.namespace.as_str();
-        let address = format!("{}/24", self.address);
-        namespace::ip(&["-n", name, "link", "set", "lo", "up"])?;
-        namespace::ip(&["-n", name, "address", "add", &address, "dev", INTERFACE])?;
-        namespace::ip(&["-n", name, "link", "set", INTERFACE, "up"])
+        let address = format!("{address}/24");
+        namespace::ip(&["-n", name, "address", "add", &address, "dev", interface])?;
+        namespace::ip(&["-n", name, "link", "set", interface, "up"])
     }
 }
 

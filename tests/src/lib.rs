@@ -8,5 +8,6 @@ pub mod binary;
 pub mod child;
 pub mod lab;
 pub mod run_folder;
+pub mod shuttle;
 pub mod source_tree;
 pub mod trial;

@@ -135,6 +135,20 @@ pub fn wait_until(limit: Duration, what: &str, mut is_so: impl FnMut() -> bool) 
     }
 }
 
+/// Waits until the process has a handler of its own for SIGINT.
+///
+/// # Panics
+/// When it has none within `limit`, or is gone.
+pub fn wait_until_it_heeds_interrupts(child: &ChildGuard, limit: Duration) {
+    let path = format!("/proc/{}/status", child.pid());
+    wait_until(limit, "a handler for SIGINT", || {
+        let status = fs::read_to_string(&path).expect("a child that runs has a status");
+        let caught = status.lines().find_map(|line| line.strip_prefix("SigCgt:"));
+        let caught = caught.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok());
+        caught.is_some_and(|mask| mask & (1 << (Signal::SIGINT as u32 - 1)) != 0)
+    });
+}
+
 /// Processes that were ready to run on this machine over the last minute, with the number of
 /// processors: what a reader must know of a late result.
 pub fn load_average() -> String {

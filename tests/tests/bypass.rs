@@ -155,6 +155,7 @@ fn direction(side: Side, [local, peer]: [SocketAddr; 2]) -> DirectionLaunch {
         wait: WaitMode::Block,
         realtime: RealtimeRequest::default(),
         emulation: None,
+        is_clock_path: false,
     }
 }
 
@@ -175,6 +176,7 @@ fn launch(folder: &RunFolder, name: &str, domain: &Domain, direction: DirectionL
         domain: domain.address().to_string(),
         records,
         directions: vec![direction],
+        ready_within: None,
     };
     let path = folder.join(format!("{name}.json"));
     write(&path, &launch).unwrap();

@@ -93,6 +93,45 @@ fn check_channels(summary: &RunSummary) {
     }
 }
 
+/// What is made of delays says how far it may be off, and so does the score of both hosts' messages.
+fn check_bounds(summary: &RunSummary) {
+    let network = summary.network.as_ref().unwrap();
+    assert!(!network.clocks_differ && network.clock_bound_s > Some(0.0));
+    for one in &network.channels {
+        let (name, figures) = (&one.channel, &one.figures);
+        // A channel that answers requests may have had one.
+        let measured = figures.delay.measured().zip(figures.successive.measured());
+        let Some((delay, successive)) = measured else {
+            continue;
+        };
+        let (bound_ns, variation) = (delay.alignment_bound_ns, delay.variation);
+        println!(
+            "{name}: delay p50 {} ns ±{bound_ns}, variation p50 {} ns ±{}, successive p50 {} ns ±{}, \
+             jitter mean {:.0} ns ±{:.0}",
+            delay.p50.value_ns,
+            variation.p50_ns,
+            variation.bound_ns,
+            successive.p50_ns,
+            successive.bound_ns,
+            successive.jitter.mean_ns,
+            successive.jitter.bound_ns,
+        );
+        assert!(bound_ns > 0 && variation.bound_ns > 0 && successive.bound_ns > 0);
+        assert!(variation.bound_ns <= 2 * bound_ns, "{variation:?}");
+        let rows = network.timeline.rows.iter();
+        let mut rows = rows.filter(|row| row.of == *name && row.what == "delay");
+        assert!(rows.next().unwrap().bound.unwrap() > 0.0, "{name}");
+    }
+    let metric = summary
+        .score
+        .iter()
+        .find(|one| one.name == "joint_error_rad_rms");
+    let metric = metric.unwrap();
+    println!("{}: {:?}, {}", metric.label, metric.value, metric.method);
+    assert!(metric.value.is_some(), "{metric:?}");
+    assert!(metric.method.contains("aligned within"), "{metric:?}");
+}
+
 #[test]
 fn an_offset_of_a_day_is_found_within_its_bound_and_carries_the_account() {
     let record = RunFolder::new("clocks");
@@ -113,6 +152,7 @@ fn an_offset_of_a_day_is_found_within_its_bound_and_carries_the_account() {
         };
         check_alignment(pair);
         check_channels(summary);
+        check_bounds(summary);
         assert_every_message_is_accounted_for(summary);
         let unaligned = summary
             .warnings

@@ -4,7 +4,6 @@
 
 use std::collections::BTreeSet;
 use std::fs;
-use std::path::Path;
 use std::process::Command;
 use std::time::Duration;
 
@@ -13,40 +12,23 @@ use hil_models::measure::account::MessageFate;
 use hil_models::measure::record::{IngressRecord, PublishedRecord};
 use hil_models::random::RandomStream;
 use hil_models::time::Instant;
-use hil_runtime::record::RecordFile;
 use hil_runtime::report::summary::LinkKind;
 use hil_tests::account::{account, assert_every_message_is_accounted_for, channel, describe};
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::run_folder::RunFolder;
+use hil_tests::shuttle::{CHANNELS, PERIOD_NS, SEED, emulated_shuttle, records};
 use hil_tests::trial::{RunFiles, Trial};
 
 const LIMIT: Duration = Duration::from_mins(1);
-const CHANNELS: [&str; 2] = ["shuttle/command", "shuttle/status"];
-const PERIOD_NS: i64 = 10_000_000;
 /// What one message may be off by: its period, and the time a process needs to begin.
 const SLACK_NS: i64 = PERIOD_NS + 15_000_000;
-const SEED: u64 = 4;
 const OUTAGES: Outages = Outages {
     mean_s: 0.3,
     per_hour: 2_400.0,
     buffered: false,
 };
-const TOPOLOGY: &str = r#"
-version = 1
-name = "outages"
-run = { duration = "12 s", seed = 4 }
-case = { name = "shuttle", parameters = { rate_hz = 100.0 } }
-hosts = { control-pc = {}, robot-pc = {} }
-processes.controller = { role = "controller", host = "control-pc" }
-processes.robot = { role = "robot", host = "robot-pc" }
-channels."shuttle/command".link = "hop"
-channels."shuttle/status".link = "hop"
-[links.hop]
-via = "emulated"
-between = ["control-pc", "robot-pc"]
-delay = "5 ms"
-outages = { mean = "300 ms", per_hour = 2400, buffered = false }
-"#;
+const LINK: &str = r#"delay = "5 ms"
+outages = { mean = "300 ms", per_hour = 2400, buffered = false }"#;
 
 /// The outages of the run, counted from its start.
 fn outages(end: Instant) -> Vec<Outage> {
@@ -55,28 +37,10 @@ fn outages(end: Instant) -> Vec<Outage> {
     schedule.take_while(|outage| outage.begin < end).collect()
 }
 
-/// Every record of `channel` and `kind`.
-fn records<T: bytemuck::Pod>(root: &Path, channel: &str, kind: &str) -> Vec<T> {
-    let start = format!("{}.{kind}.", channel.replace('/', "."));
-    let mut found = Vec::new();
-    for entry in fs::read_dir(root.join("records")).unwrap() {
-        let path = entry.unwrap().path();
-        if path
-            .file_name()
-            .unwrap()
-            .to_string_lossy()
-            .starts_with(&start)
-        {
-            found.extend(RecordFile::read(&path).unwrap().records::<T>());
-        }
-    }
-    found
-}
-
 /// When each message was published, counted from the first, and whether it came through.
 fn lived(files: &RunFiles, channel: &str) -> Vec<(i64, bool)> {
-    let published: Vec<PublishedRecord> = records(files.root(), channel, "published");
-    let received: Vec<IngressRecord> = records(files.root(), channel, "ingress");
+    let published: Vec<PublishedRecord> = records(files, channel, "published");
+    let received: Vec<IngressRecord> = records(files, channel, "ingress");
     let came: BTreeSet<u64> = received.iter().map(|one| one.sequence).collect();
     let first_ns = published.iter().map(|one| one.published_ns).min().unwrap();
     let at = |one: &PublishedRecord| one.published_ns - first_ns;
@@ -95,7 +59,7 @@ fn is_within(outages: &[Outage], at_ns: i64, by_ns: i64) -> bool {
 #[test]
 fn a_live_run_loses_the_spans_that_virtual_time_loses() {
     let record = RunFolder::new("outages");
-    let topology = record.write("outages.toml", TOPOLOGY);
+    let topology = record.write("outages.toml", &emulated_shuttle("outages", LINK));
     let trial = Trial::of(&topology, &record.join("runs"));
     let mut child = trial.start_here();
     child.wait_within(LIMIT).unwrap().assert_success();

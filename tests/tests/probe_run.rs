@@ -80,6 +80,7 @@ fn probe_and_gateways_agree_on_every_datagram_and_on_the_time_on_the_wire() {
     ];
     let (comparison, code) = json(&arguments);
     println!("{comparison:#}");
+    assert_eq!(comparison["clocks"], "one", "two namespaces of one machine");
     let channels = comparison["channels"].as_array().unwrap();
     assert_eq!(
         channels.len(),
@@ -208,6 +209,9 @@ fn check_analysis(captures: &[std::path::PathBuf; 2]) {
         "two channels, each with messages, greetings, exchanges: {joins:#?}"
     );
     for joined in joins {
+        // Two files of which nothing is said may be of two machines.
+        assert_eq!(joined["clocks"], "unknown");
+        assert_eq!(joined["delay_bound_ns"], Value::Null);
         let figures = &joined["figures"];
         assert_eq!(figures["order"], "packet_direction");
         for count in [
@@ -220,6 +224,10 @@ fn check_analysis(captures: &[std::path::PathBuf; 2]) {
         }
         assert_eq!(figures["first_count"], figures["second_count"]);
     }
+    let one_clock = Path::new("--one-clock");
+    let (report, _) = json(&[Path::new("analyse"), &captures[0], &captures[1], one_clock]);
+    assert_eq!(report["joins"][0]["clocks"], "declared_one");
+    assert_eq!(report["joins"][0]["delay_bound_ns"], 0);
 }
 
 /// A capture cut off in the middle keeps what was there and is told apart by exit code and offset.
@@ -263,8 +271,18 @@ fn what_cannot_be_tapped_or_read_is_refused_with_its_own_exit_code() {
             69,
             "no interface `hil-none0`",
         ),
+        (
+            vec!["-i", "lo", "-o", output, "--stamps", "card"],
+            78,
+            "the card of lo gives no stamps",
+        ),
         (vec!["-i", "lo"], 2, "--output"),
         (vec!["-o", output], 2, "--interface"),
+        (
+            vec!["-i", "lo", "-i", "lo", "-o", output],
+            2,
+            "--interface lo is given twice",
+        ),
         (
             vec!["-i", "lo", "-o", output, "--flow", "udp"],
             2,

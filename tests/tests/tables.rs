@@ -9,7 +9,7 @@ use std::time::Duration;
 use hil_tests::binary::{hil_runtime_binary, workspace_folder};
 use hil_tests::child::{ChildGuard, Finished};
 use hil_tests::run_folder::RunFolder;
-use hil_tests::trial::wait_until;
+use hil_tests::trial::wait_until_it_heeds_interrupts;
 use nix::sys::signal::Signal;
 use serde_json::Value;
 
@@ -137,17 +137,6 @@ fn an_interrupted_study_prints_what_is_complete() {
     assert!(finished.stderr.contains("ended by Ctrl-C"), "{finished:?}");
 }
 
-/// Waits until the process has a handler of its own for SIGINT.
-fn wait_until_it_heeds_interrupts(child: &ChildGuard) {
-    let status = format!("/proc/{}/status", child.pid());
-    wait_until(LIMIT, "a handler for SIGINT", || {
-        let status = fs::read_to_string(&status).unwrap();
-        let caught = status.lines().find_map(|line| line.strip_prefix("SigCgt:"));
-        let caught = u64::from_str_radix(caught.unwrap().trim(), 16).unwrap();
-        caught & (1 << (Signal::SIGINT as u32 - 1)) != 0
-    });
-}
-
 #[test]
 fn an_interruption_is_answered_from_the_first_moment_on() {
     let mut simulate = Command::new(hil_runtime_binary());
@@ -157,7 +146,7 @@ fn an_interruption_is_answered_from_the_first_moment_on() {
         .current_dir(workspace_folder());
     for mut command in [simulate, command(SHIPPED, &["--sections", "100000000"])] {
         let mut child = ChildGuard::spawn(&mut command).unwrap();
-        wait_until_it_heeds_interrupts(&child);
+        wait_until_it_heeds_interrupts(&child, LIMIT);
         child.signal(Signal::SIGINT).unwrap();
         let finished = child.wait_within(LIMIT).unwrap();
         assert_eq!(finished.status.code(), Some(130), "{finished:?}");

@@ -43,7 +43,7 @@ const UNSAFE_FILES: [&str; 7] = [
 ];
 
 /// Packages each crate must not depend on: the arrows of the architecture.
-const FORBIDDEN_DEPENDENCIES: [(&str, &[&str]); 2] = [
+const FORBIDDEN_DEPENDENCIES: [(&str, &[&str]); 3] = [
     (
         "models",
         &[
@@ -56,13 +56,22 @@ const FORBIDDEN_DEPENDENCIES: [(&str, &[&str]); 2] = [
         ],
     ),
     ("gateways", &["hil-runtime", "iceoryx2"]),
+    // Nothing of the recorder may get into the real-time binary.
+    ("runtime", &["hil-recorder", "foxglove", "mcap", "tokio"]),
 ];
 /// Folders within a crate with the modules they must not name, not even in their tests.
 const FORBIDDEN_MODULES: [(&str, &str); 2] = [
     ("models/src/egm", "teleoperation"),
     ("models/src/yumi", "teleoperation"),
 ];
-const MEMBERS: [&str; 5] = ["models", "gateways", "runtime", "tests", "benches"];
+const MEMBERS: [&str; 6] = [
+    "models",
+    "gateways",
+    "runtime",
+    "runtime/recorder",
+    "tests",
+    "benches",
+];
 
 type Rule = fn(&SourceFile) -> Vec<String>;
 

@@ -55,6 +55,7 @@ impl Plan {
             name: "bench.Bytes.v1",
             size_bytes: self.size_bytes,
             alignment_bytes: 8,
+            fields: &[],
         }
     }
 
@@ -370,6 +371,7 @@ fn launch(plan: &Plan, way: usize, side: Side) -> DirectionLaunch {
         wait: plan.wait,
         realtime: RealtimeRequest::default(),
         emulation: None,
+        is_clock_path: false,
     }
 }
 

@@ -9,6 +9,7 @@
 //! - [`stages`]: a hop taken apart in one thread.
 //! - [`tap`]: a probe at both ends, while wanted.
 //! - [`segments`]: where the time of a hop went.
+//! - [`notices`]: what is said before and after.
 //! - [`parties`]: processor time and wake-ups of threads; [`verdict`]: aims met and missed.
 
 pub mod applications;
@@ -16,6 +17,7 @@ pub mod cases;
 pub mod ends;
 pub mod hosts;
 pub mod network;
+pub mod notices;
 pub mod parties;
 pub mod segments;
 pub mod side;

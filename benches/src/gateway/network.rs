@@ -28,6 +28,11 @@ impl Network {
         }
     }
 
+    /// The hosts themselves; `None` on the loopback.
+    pub fn lab(&self) -> Option<&Lab> {
+        self.lab.as_ref()
+    }
+
     /// What the datagrams cross.
     pub fn note(&self) -> &str {
         &self.note

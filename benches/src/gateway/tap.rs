@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use hil_gateways::capture::flow::FlowFilter;
 use hil_gateways::capture::writer::{self, PacketToWrite};
-use hil_gateways::transport::packet_ring::{PacketRing, RingCounters, RingSettings};
+use hil_gateways::transport::packet_ring::{PacketRing, RingCounters, RingSettings, RingStamps};
 use hil_tests::lab::INTERFACE;
 
 use super::hosts::SetupError;
@@ -22,7 +22,7 @@ const LOOK_PERIOD: Duration = Duration::from_millis(20);
 /// it would inherit.
 #[derive(Debug)]
 pub struct Drainer {
-    rings: Sender<[PacketRing; 2]>,
+    rings: Sender<Vec<PacketRing>>,
     counts: Receiver<RingCounters>,
     is_wanted: Arc<AtomicBool>,
     thread: JoinHandle<()>,
@@ -31,22 +31,22 @@ pub struct Drainer {
 impl Drainer {
     /// Starts the thread; it sleeps until there are rings.
     pub fn start() -> Self {
-        let (rings, incoming) = channel::<[PacketRing; 2]>();
+        let (rings, incoming) = channel::<Vec<PacketRing>>();
         let (done, counts) = channel();
         let is_wanted = Arc::new(AtomicBool::new(false));
         let thread = thread::spawn({
             let is_wanted = Arc::clone(&is_wanted);
             move || {
-                for mut pair in incoming {
+                for mut taps in incoming {
                     let mut file = Vec::new();
                     while is_wanted.load(Ordering::Acquire) {
-                        for ring in &mut pair {
+                        for ring in &mut taps {
                             drain(ring, &mut file);
                         }
                         thread::sleep(LOOK_PERIOD);
                     }
                     let mut sum = RingCounters::default();
-                    for one in pair.iter_mut().filter_map(|ring| ring.counters().ok()) {
+                    for one in taps.iter_mut().filter_map(|ring| ring.counters().ok()) {
                         sum.matched_count += one.matched_count;
                         sum.dropped_count += one.dropped_count;
                     }
@@ -73,15 +73,32 @@ impl Drainer {
         network: &Network,
         work: impl FnOnce() -> T,
     ) -> Result<(T, RingCounters), SetupError> {
+        self.while_tapped_at(network, &[(0, INTERFACE), (1, INTERFACE)], work)
+    }
+
+    /// Taps interfaces of hosts while `work` runs; gives what it gave, and what the kernel counted.
+    ///
+    /// # Errors
+    /// When one cannot be tapped.
+    pub fn while_tapped_at<T>(
+        &self,
+        network: &Network,
+        places: &[(usize, &str)],
+        work: impl FnOnce() -> T,
+    ) -> Result<(T, RingCounters), SetupError> {
         let flows = [FlowFilter::hil()];
         let settings = RingSettings {
             snap_bytes: u32::try_from(flows[0].snap_bytes())?,
             ring_bytes: 8 << 20,
+            stamps: RingStamps::Kernel,
         };
-        let open = |host| network.on(host, || PacketRing::open(INTERFACE, &flows, &settings));
-        let pair = [open(0)?, open(1)?];
+        let open = |(host, name): &(usize, &str)| {
+            network.on(*host, || PacketRing::open(name, &flows, &settings))
+        };
+        let taps: Result<Vec<PacketRing>, _> = places.iter().map(open).collect();
+        let taps = taps?;
         self.is_wanted.store(true, Ordering::Release);
-        let sent = self.rings.send(pair);
+        let sent = self.rings.send(taps);
         sent.map_err(|_left| "the draining thread has ended")?;
         let outcome = work();
         self.is_wanted.store(false, Ordering::Release);

@@ -66,11 +66,16 @@ impl Direction {
     }
 }
 
+/// How the description of an interface begins whose packets have the card's stamps.
+pub const CARD_CLOCK: &str = "stamps of the network card's own clock";
+
 /// An interface that packets were captured on.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct CaptureInterface {
     /// Its name, when the file has one.
     pub name: Option<String>,
+    /// What the file says of it; see [`CARD_CLOCK`].
+    pub description: Option<String>,
     /// See [`link_type`].
     pub link_type: u16,
     /// Bytes kept of a packet; 0 without limit.
@@ -89,6 +94,15 @@ pub struct CaptureInterface {
     pub dropped_count: Option<u64>,
 }
 
+impl CaptureInterface {
+    /// Its stamps are of the network card, on a clock of its own: no other interface's compare
+    /// with them.
+    pub fn has_card_clock(&self) -> bool {
+        let description = self.description.as_deref();
+        description.is_some_and(|text| text.starts_with(CARD_CLOCK))
+    }
+}
+
 /// One packet of a capture.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct CapturedPacket<'a> {
@@ -103,6 +117,8 @@ pub struct CapturedPacket<'a> {
     pub stamp_ns: Option<i64>,
     /// Length on the wire; more than `data` when the packet was cut short.
     pub original_bytes: u32,
+    /// Its stamp is of the network card; see [`CaptureInterface::has_card_clock`].
+    pub is_card_stamped: bool,
     /// Which way it went.
     pub direction: Direction,
     /// What was kept of it, from the link layer on.

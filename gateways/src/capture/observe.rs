@@ -243,6 +243,10 @@ impl Observer {
             let (Some(start), Some(end)) = (interface.start_ns, interface.end_ns) else {
                 continue;
             };
+            // Its packets are those of another interface once more, on another clock.
+            if interface.has_card_clock() {
+                continue;
+            }
             let point = |direction| Point {
                 file_index,
                 interface_index,

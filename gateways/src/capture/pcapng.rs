@@ -217,6 +217,9 @@ fn describe(body: &Body<'_>, interfaces: &mut Vec<CaptureInterface>) -> Result<(
     let outcome = body.options(8, |code, value| {
         match (code, value) {
             (2, name) => interface.name = Some(String::from_utf8_lossy(name).into_owned()),
+            (3, text) => {
+                interface.description = Some(String::from_utf8_lossy(text).into_owned());
+            }
             (9, &[resolution]) => interface.unit_ns = unit_ns(resolution)?,
             (14, seconds) => {
                 let seconds = body.order.u64(seconds, 0).map(u64::cast_signed);

@@ -202,12 +202,14 @@ impl CaptureReader {
                 Next::Packet(found) => {
                     self.given_bytes = found.record_bytes;
                     let (from, to) = found.data;
+                    let interface = &self.interfaces[found.interface_index];
                     return Step::Packet(CapturedPacket {
                         offset: found.offset,
                         interface_index: found.interface_index,
-                        link_type: self.interfaces[found.interface_index].link_type,
+                        link_type: interface.link_type,
                         stamp_ns: found.stamp_ns,
                         original_bytes: found.original_bytes,
+                        is_card_stamped: interface.has_card_clock(),
                         direction: found.direction,
                         data: &self.window.bytes()[from..to],
                     });

@@ -30,6 +30,9 @@ pub fn interface(out: &mut Vec<u8>, interface: &CaptureInterface, filter: &str) 
         if let Some(name) = &interface.name {
             option(body, 2, name.as_bytes());
         }
+        if let Some(description) = &interface.description {
+            option(body, 3, description.as_bytes());
+        }
         option(body, 9, &[NANOSECONDS]);
         // 0: the filter is a text.
         let mut text = vec![0];
@@ -76,14 +79,14 @@ pub fn packet(out: &mut Vec<u8>, packet: &PacketToWrite<'_>) {
     });
 }
 
-/// What an interface saw between `from_ns` and `to_ns` (since 1970). `received_count` are the
-/// packets that passed the filter, `dropped_count` those of them that found no room.
+/// What an interface saw during `span_ns` (from and to, nanoseconds since 1970). The counts are of
+/// packets that passed the filter, and of those that found no room.
 pub fn statistics(
     out: &mut Vec<u8>,
     interface_index: u32,
     span_ns: (u64, u64),
-    received_count: u64,
-    dropped_count: u64,
+    (received_count, dropped_count): (u64, u64),
+    comment: Option<&str>,
 ) {
     let halves = |value: u64| {
         let mut bytes = Vec::with_capacity(8);
@@ -93,6 +96,9 @@ pub fn statistics(
     block(out, 5, |body| {
         body.extend_from_slice(&interface_index.to_le_bytes());
         stamp(body, span_ns.1);
+        if let Some(comment) = comment {
+            option(body, 1, comment.as_bytes());
+        }
         option(body, 2, &halves(span_ns.0));
         option(body, 3, &halves(span_ns.1));
         option(body, 4, &received_count.to_le_bytes());

@@ -31,6 +31,10 @@
 //! after its datagram has left, so it rides on a later one. A fragment's length follows from
 //! `total_len` and `fragment_count` alone ([`super::fragment`]), so overlaps cannot be expressed.
 //!
+//! A **clock path** is a channel without messages over addresses of its own: it sends every kind but
+//! DATA, its number is counted down from 65535, its type is `hil.ClockPath.v1` of 0 bytes, aligned to 1,
+//! and its name `clock/` with the names of both hosts. Nothing in a datagram tells it from another channel.
+//!
 //! Authentication is not configured in this version: a set bit 0 is refused, and the room for the
 //! tag is kept free so that switching it on will not change how messages fragment.
 

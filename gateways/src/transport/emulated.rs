@@ -10,7 +10,7 @@ use std::io;
 use std::net::SocketAddr;
 use std::os::fd::BorrowedFd;
 
-use hil_models::link::LinkModel;
+use hil_models::link::{LinkModel, MessageNumber};
 use hil_models::time::Instant;
 
 use super::tcp::StreamFigures;
@@ -28,7 +28,7 @@ pub struct EmulatedSettings {
     /// much. `None` trusts `now`, as virtual time does.
     pub clock: Option<fn() -> Instant>,
     /// Which message of its channel a datagram belongs to; `None` where nobody can tell. Only a
-    /// recorded trace asks.
+    /// recorded trace asks: to it all pieces of a message are one.
     pub number_of: Option<NumberOf>,
 }
 
@@ -45,7 +45,7 @@ impl Default for EmulatedSettings {
 }
 
 /// Reads which message of its channel a datagram belongs to.
-pub type NumberOf = fn(&[u8]) -> Option<u64>;
+pub type NumberOf = fn(&[u8]) -> Option<MessageNumber>;
 
 /// Position in the order of delivery: due first, then arrival, and the buffer that holds it.
 type Position = Reverse<(Instant, u64, usize)>;

@@ -26,6 +26,7 @@ pub mod probe;
 pub mod queue;
 pub mod radio;
 mod reply_stamps;
+pub mod ring_frame;
 pub mod tcp;
 pub mod timestamping;
 pub mod udp;

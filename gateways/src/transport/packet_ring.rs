@@ -1,6 +1,6 @@
 //! The live tap of a probe: an `AF_PACKET` socket that copies packets of followed flows, both ways,
-//! with nanosecond kernel stamps into memory shared with the kernel (`TPACKET_V2`). It sends nothing
-//! and takes no part in any flow; what the packets mean is read by [`crate::capture`].
+//! with nanosecond stamps into memory shared with the kernel (`TPACKET_V2`). It sends nothing and takes
+//! no part in any flow; what the packets mean is read by [`crate::capture`].
 //!
 //! Version 2 of the ring, not 3: version 3 hands over blocks, and where every block times out with
 //! one packet in it, it runs out of them. Nobody is woken for a packet unless somebody waits on the
@@ -22,9 +22,10 @@ use nix::sys::mman::{MapFlags, ProtFlags, mmap, munmap};
 use nix::sys::socket::{getsockopt, setsockopt, sockopt};
 use thiserror::Error;
 
+use super::ring_frame::RingPacket;
 use crate::capture::flow::FlowFilter;
+use crate::capture::link_type;
 use crate::capture::program::compile;
-use crate::capture::{Direction, link_type};
 
 /// Smallest and largest ring, bytes.
 pub const RING_BYTES: core::ops::RangeInclusive<usize> = (1 << 16)..=(1 << 28);
@@ -39,6 +40,8 @@ const PACKET_FAMILY: u16 = 17;
 const _: () = assert!(EVERY_PROTOCOL as c_int == libc::ETH_P_ALL);
 const _: () = assert!(PACKET_FAMILY as c_int == libc::AF_PACKET);
 const _: () = assert!(1 == libc::PACKET_MR_PROMISC);
+/// `linux/if_packet.h`; since Linux 4.20.
+const PACKET_IGNORE_OUTGOING: c_int = 23;
 const NO_ADDRESS: libc::sockaddr_ll = libc::sockaddr_ll {
     sll_family: 0,
     sll_protocol: 0,
@@ -56,6 +59,19 @@ pub struct RingSettings {
     pub snap_bytes: u32,
     /// Memory for packets that were not fetched yet; rounded up to a power of two.
     pub ring_bytes: usize,
+    /// Whose stamps are wanted.
+    pub stamps: RingStamps,
+}
+
+/// Whose stamps a ring asks for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum RingStamps {
+    /// The kernel's, of packets both ways.
+    #[default]
+    Kernel,
+    /// The card's, of arriving packets: a tap sees what leaves before the card does. Packets that
+    /// the card did not stamp come with the kernel's, and say so.
+    Card,
 }
 
 /// Why there is no tap.
@@ -107,24 +123,6 @@ pub enum RingError {
         /// What the kernel said.
         source: io::Error,
     },
-}
-
-/// A packet in the ring.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct RingPacket<'a> {
-    /// Nanoseconds since 1970, this host's clock.
-    pub stamp_ns: u64,
-    /// True when the kernel stamped the packet as it came or left; otherwise only when the tap
-    /// saw it, some hundred nanoseconds later.
-    pub is_stamped_in_stack: bool,
-    /// Which way.
-    pub direction: Direction,
-    /// Length on the wire, without a VLAN tag that was taken out.
-    pub original_bytes: u32,
-    /// A VLAN tag that the kernel took out behind the addresses: type and tag.
-    pub vlan: Option<(u16, u16)>,
-    /// What was kept, from the link layer on.
-    pub data: &'a [u8],
 }
 
 /// What the kernel counted since the tap was opened.
@@ -196,6 +194,9 @@ impl PacketRing {
         // Makes the kernel stamp packets in its stack even when no other socket asks for it.
         setsockopt(&socket, sockopt::ReceiveTimestampns, &true)
             .map_err(|errno| refused("SO_TIMESTAMPNS")(errno.into()))?;
+        if settings.stamps == RingStamps::Card {
+            prefer_card(&socket).map_err(refused("PACKET_TIMESTAMP"))?;
+        }
         attach(&socket, &program).map_err(refused("SO_ATTACH_FILTER"))?;
         let frame_bytes = (FRAME_HEADER_BYTES + settings.snap_bytes as usize).next_power_of_two();
         let block_bytes = BLOCK_BYTES.max(frame_bytes);
@@ -248,44 +249,10 @@ impl PacketRing {
         if status & libc::TP_STATUS_USER == 0 {
             return false;
         }
-        // SAFETY: with the user bit set the frame is ours and begins with a whole header.
-        let header: libc::tpacket2_hdr = unsafe { frame.cast().read() };
-        let address_at = size_of::<libc::tpacket2_hdr>().next_multiple_of(16);
-        // SAFETY: the frame is longer than header and address together.
-        let at = unsafe { frame.add(address_at) };
-        // SAFETY: the kernel writes the link address behind the aligned header.
-        let address: libc::sockaddr_ll = unsafe { at.cast().read_unaligned() };
-        let (from, length) = (usize::from(header.tp_mac), header.tp_snaplen as usize);
-        assert!(
-            from + length <= self.frame_bytes,
-            "packet at {from} of {length} bytes in a frame of {}",
-            self.frame_bytes
-        );
-        // SAFETY: `from` was checked to lie within the frame.
-        let start = unsafe { frame.add(from) };
-        // SAFETY: so were `length` bytes from there; the kernel leaves the frame alone until its
+        // SAFETY: with the user bit set the whole frame is ours: the kernel leaves it alone until its
         // status is set back, which happens after `take` has returned.
-        let data = unsafe { core::slice::from_raw_parts(start.as_ptr(), length) };
-        let has = |bit: u32| status & bit != 0;
-        take(&RingPacket {
-            stamp_ns: u64::from(header.tp_sec) * 1_000_000_000 + u64::from(header.tp_nsec),
-            is_stamped_in_stack: has(libc::TP_STATUS_TS_SOFTWARE),
-            direction: match address.sll_pkttype {
-                libc::PACKET_OUTGOING => Direction::Outbound,
-                _ => Direction::Inbound,
-            },
-            original_bytes: header.tp_len,
-            vlan: has(libc::TP_STATUS_VLAN_VALID).then_some({
-                let is_typed = has(libc::TP_STATUS_VLAN_TPID_VALID);
-                let tag_type = if is_typed {
-                    header.tp_vlan_tpid
-                } else {
-                    0x8100
-                };
-                (tag_type, header.tp_vlan_tci)
-            }),
-            data,
-        });
+        let bytes = unsafe { core::slice::from_raw_parts(frame.as_ptr(), self.frame_bytes) };
+        take(&RingPacket::read(bytes, status));
         status_cell.store(libc::TP_STATUS_KERNEL, Ordering::Release);
         self.next_index = (self.next_index + 1) % self.frame_count;
         true
@@ -426,6 +393,14 @@ fn listen_to_all(socket: &OwnedFd, interface_index: c_uint) -> io::Result<()> {
         libc::PACKET_ADD_MEMBERSHIP,
         &membership,
     )
+}
+
+/// Gives arriving packets the card's stamp where there is one, and leaves out what leaves.
+fn prefer_card(socket: &OwnedFd) -> io::Result<()> {
+    let hardware = libc::SOF_TIMESTAMPING_RAW_HARDWARE;
+    set_option(socket, libc::SOL_PACKET, libc::PACKET_TIMESTAMP, &hardware)?;
+    let ignore: c_int = 1;
+    set_option(socket, libc::SOL_PACKET, PACKET_IGNORE_OUTGOING, &ignore)
 }
 
 fn attach(socket: &OwnedFd, program: &[crate::capture::program::Instruction]) -> io::Result<()> {

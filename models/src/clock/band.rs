@@ -81,6 +81,12 @@ impl Band {
         }
     }
 
+    /// The instant nearest to `at_ns` that some exchange covers; `None` without any.
+    pub(super) fn nearest_ns(&self, at_ns: i64) -> Option<i64> {
+        let (begun_ns, over_ns) = (self.future.first()?.0, self.past.last()?.0);
+        Some(at_ns.clamp(begun_ns, over_ns.max(begun_ns)))
+    }
+
     /// Smallest and largest offset at `at_ns`: the hull of what exchanges that were over by then
     /// and exchanges that had not begun allow. At the ends there is one of the two only. `None` more
     /// than [`BEYOND_NS_MAX`] outside all exchanges, and when one of the two contradicts itself.

@@ -96,6 +96,11 @@ impl Exchange {
         self.kinds
     }
 
+    /// When one of its datagrams arrived at the host whose clock is converted from, on that clock.
+    pub const fn remote_ns(&self) -> i64 {
+        self.there_received_ns
+    }
+
     /// Time under way, both directions together, nanoseconds.
     pub const fn rtt_ns(&self) -> i64 {
         let there = self.there_received_ns.saturating_sub(self.there_sent_ns);

@@ -84,6 +84,44 @@ impl ClockMap {
         })
     }
 
+    /// As [`Self::localise`], and further outside the exchanges too: what the nearest of them says,
+    /// widened by the drift allowance for all the time between, in which no clock may step. For the
+    /// axis of a report, on which a start that lies before all exchanges must be put somewhere; no delay is
+    /// converted so. `None` in a noticed step and without exchanges. See [`Self::localise_early`] for a
+    /// score.
+    pub fn localise_beyond(&self, remote: RemoteInstant) -> Option<Localised> {
+        if let Some(localised) = self.localise(remote) {
+            return Some(localised);
+        }
+        let at_ns = remote.as_ns();
+        let piece = self.piece_at(at_ns)?;
+        let near_ns = piece.band.nearest_ns(at_ns)?;
+        let near = piece.offset_at(near_ns, &self.settings)?;
+        let drift_ns = self.settings.drift_ns(at_ns.saturating_sub(near_ns));
+        let lowest_ns = near.lowest_ns.saturating_sub(drift_ns);
+        let highest_ns = near.highest_ns.saturating_add(drift_ns);
+        let estimate_ns = piece.anchors.offset_at(at_ns)?.clamp(lowest_ns, highest_ns);
+        let at = |offset_ns: i64| Instant::from_ns(at_ns.saturating_add(offset_ns));
+        Some(Localised {
+            instant: at(estimate_ns),
+            earliest: at(lowest_ns),
+            latest: at(highest_ns),
+        })
+    }
+
+    /// As [`Self::localise_beyond`] before the first exchange, as [`Self::localise`] from then on. For the
+    /// messages of a score, which are published before gateways meet; true beside those that only this
+    /// converts, which take it that no clock stepped before the first exchange.
+    pub fn localise_early(&self, remote: RemoteInstant) -> Option<(Localised, bool)> {
+        if let Some(localised) = self.localise(remote) {
+            return Some((localised, false));
+        }
+        let at_ns = remote.as_ns();
+        let first_ns = self.pieces.first()?.band.nearest_ns(at_ns)?;
+        let is_early = at_ns < first_ns;
+        is_early.then_some((self.localise_beyond(remote)?, true))
+    }
+
     /// `local` on the other host's clock, with the largest error in nanoseconds.
     pub fn to_remote(&self, local: Instant) -> Option<(RemoteInstant, u64)> {
         self.pieces.iter().find_map(|piece| {
@@ -103,6 +141,16 @@ impl ClockMap {
             let bound_ns = self.localise(remote).filter(|_| is_inside)?.bound_ns();
             Some((remote, bound_ns))
         })
+    }
+
+    /// How far the offset may have moved between two instants of the other host's clock, by the
+    /// drift allowance; `None` when a noticed step lies between them, or one is in a step.
+    pub fn drift_ns(&self, from: RemoteInstant, until: RemoteInstant) -> Option<u64> {
+        let [from_ns, until_ns] = [from.as_ns(), until.as_ns()];
+        let piece = self.piece_at(from_ns)?;
+        let is_same = (piece.from_ns..=piece.until_ns).contains(&until_ns);
+        let drift_ns = self.settings.drift_ns(until_ns.saturating_sub(from_ns));
+        is_same.then_some(drift_ns.unsigned_abs())
     }
 
     /// What the map says of itself.

@@ -246,9 +246,45 @@ fn alignment_reaches_a_second_beyond_the_exchanges_and_no_further() {
 }
 
 #[test]
-fn a_step_in_mid_run_leaves_the_offset_of_an_instant_that_has_one() {
+fn an_instant_far_before_the_exchanges_converts_within_the_drift_allowance() {
+    let map = ClockMap::new(&asymmetric(Requester::Local), ClockSettings::default());
+    let first_ns = 5_000_100_000;
+    for beyond_s in [0, 1, 3, 60] {
+        let at = RemoteInstant::from_ns(first_ns - beyond_s * 1_000_000_000);
+        let found = map.localise_beyond(at).unwrap();
+        let truth = Instant::from_ns(at.as_ns() - 5_000_000_000);
+        assert!((found.earliest..=found.latest).contains(&truth));
+        let drift_ns = u64::try_from(beyond_s).unwrap() * 200_000;
+        assert!(found.bound_ns() >= drift_ns, "{beyond_s} s: {found:?}");
+        assert!(
+            found.bound_ns() <= drift_ns + 500_000,
+            "{beyond_s} s: {found:?}"
+        );
+        assert_eq!(map.localise(at).is_some(), beyond_s <= 1);
+        assert_eq!(map.localise_early(at), Some((found, beyond_s > 1)));
+    }
+    let nothing = ClockMap::new(&[], ClockSettings::default());
+    assert_eq!(nothing.localise_beyond(RemoteInstant::from_ns(0)), None);
+    assert_eq!(nothing.localise_early(RemoteInstant::from_ns(0)), None);
+    // After the last exchange a score gets no more than a delay.
+    let late = RemoteInstant::from_ns(first_ns + 3_600_000_000_000);
+    assert!(map.localise_beyond(late).is_some());
+    assert_eq!(map.localise_early(late), None);
+}
+
+#[test]
+fn drift_is_bounded_within_a_stretch_and_unknown_across_a_step() {
+    let at = RemoteInstant::from_ns;
+    let map = ClockMap::new(&stepped(), ClockSettings::default());
+    let (early, late) = (at(5_100_000_000), at(9_900_000_000));
+    assert_eq!(map.drift_ns(early, at(6_100_000_000)), Some(200_000));
+    assert_eq!(map.drift_ns(at(6_100_000_000), early), Some(200_000));
+    assert_eq!(map.drift_ns(early, late), None);
+}
+
+/// As [`asymmetric`]; the other clock gains 20 ms in mid-run.
+fn stepped() -> Vec<Exchange> {
     let mut exchanges = asymmetric(Requester::Local);
-    // The other clock gains 20 ms in mid-run.
     for index in 250..500_i64 {
         let sent = index * 10_000_000;
         let arrived = sent + 100_000 + 5_020_000_000;
@@ -256,7 +292,12 @@ fn a_step_in_mid_run_leaves_the_offset_of_an_instant_that_has_one() {
         exchanges[usize::try_from(index).unwrap()] =
             Exchange::of(&record(stamps), Requester::Local).unwrap();
     }
-    let map = ClockMap::new(&exchanges, ClockSettings::default());
+    exchanges
+}
+
+#[test]
+fn a_step_in_mid_run_leaves_the_offset_of_an_instant_that_has_one() {
+    let map = ClockMap::new(&stepped(), ClockSettings::default());
     let figures = map.figures();
     let step = figures.steps[0];
     let middle_ns = 7_505_000_000;

@@ -10,7 +10,7 @@ use crate::fleet::robots::Robots;
 use crate::fleet::scenario::Scene;
 use crate::fleet::score;
 use crate::run_log::RunLog;
-use crate::score::Score;
+use crate::score::{ErrorSeries, Score};
 use crate::study::{Batch, into_batch};
 
 /// Channel from controller to robots: how far each may go.
@@ -61,6 +61,7 @@ impl CaseStudy for Fleet {
     /// A coordinator started anew would believe all robots in their first bays, and robots
     /// started anew would be there while the coordinator believes them under way.
     const MAY_RESTART: bool = false;
+    const SCORE_CLOCK: Option<&'static str> = Some(FLEET_TRUTH);
     type Parameters = FleetParameters;
 
     fn new(parameters: Self::Parameters, seed: u64) -> Result<Self, ParameterError> {
@@ -97,6 +98,10 @@ impl CaseStudy for Fleet {
 
     fn score(&self, log: &RunLog) -> Score {
         score::score(self, log)
+    }
+
+    fn errors(&self, log: &RunLog) -> Vec<ErrorSeries> {
+        score::errors(self, log)
     }
 
     fn study(&self) -> Result<Option<Box<dyn Batch>>, ParameterError> {

@@ -62,14 +62,17 @@ struct Sent {
 struct Orders {
     authorities: BTreeMap<Key, Vec<Sent>>,
     missions: BTreeMap<(u32, u32, u32), Vec<Sent>>,
-    /// Controller and robots read one clock: their times compare.
+    /// Controller and robots read one clock, or theirs are aligned: their times compare.
     has_one_clock: bool,
+    /// How much later than its effect a command may seem to have left.
+    reading: Duration,
 }
 
 impl Orders {
     fn of(log: &RunLog) -> Self {
         let mut orders = Self {
             has_one_clock: log.has_one_clock(),
+            reading: READING + Duration::from_nanos(log.clock_bound_ns()),
             ..Self::default()
         };
         for (sent, authority) in sent::<Authority>(log, FLEET_AUTHORITY) {
@@ -109,7 +112,7 @@ impl Orders {
     /// before the one that was; `None` when it was not held up, or no one can say.
     fn held_up(&self, copies: &[Sent], at: Instant) -> Option<(f64, usize)> {
         let first = copies.first().filter(|_| self.has_one_clock)?;
-        let taken = copies.iter().rfind(|copy| copy.at <= at + READING)?;
+        let taken = copies.iter().rfind(|copy| copy.at <= at + self.reading)?;
         let missed = copies
             .iter()
             .filter(|copy| copy.at + HELD_UP_AFTER <= taken.at);
@@ -121,7 +124,7 @@ impl Orders {
 impl Orders {
     /// The first of `copies` that went out before `event`: what was sent later did not lead to it.
     fn named(&self, event: ScoreEvent, mut copies: Vec<Sent>) -> ScoreEvent {
-        copies.retain(|sent| !self.has_one_clock || sent.at <= event.at + READING);
+        copies.retain(|sent| !self.has_one_clock || sent.at <= event.at + self.reading);
         copies.sort_by_key(|sent| sent.at);
         let copies = copies.iter().take(COPIES_NAMED_MAX);
         copies.fold(event, |event, sent| event.naming(sent.message))

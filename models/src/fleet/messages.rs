@@ -5,6 +5,7 @@
 use bytemuck::{Pod, Zeroable};
 use serde::{Deserialize, Serialize};
 
+use crate::layout::Field;
 use crate::message::Message;
 
 /// What the three messages between controller and robot begin with, 24 bytes.
@@ -22,6 +23,14 @@ pub struct Header {
     /// When the sender gave the message, nanoseconds on its own clock.
     pub sent_ns: i64,
 }
+
+crate::layout!(Header {
+    fleet_id,
+    robot_id,
+    header_id,
+    mission_id,
+    sent_ns
+});
 
 /// What a receiver does with messages that arrive out of order or twice.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -118,8 +127,27 @@ impl State {
     }
 }
 
+crate::layout!(State {
+    header,
+    sampled_ns,
+    x_m,
+    y_m,
+    heading_rad,
+    travelled_m,
+    speed_mps,
+    acceleration_mps2,
+    path_index,
+    authority_index,
+    applied_sequence,
+    stop_index,
+    phase,
+    flags,
+    reserved
+});
+
 impl Message for State {
     const NAME: &'static str = "hil.FleetState.v1";
+    const FIELDS: &'static [Field] = Self::LAYOUT;
 }
 
 /// Controller to robot: how far it may go (the end of VDA 5050's *base*), 48 bytes.
@@ -147,8 +175,18 @@ impl Authority {
     pub const ACKNOWLEDGED: u32 = 1;
 }
 
+crate::layout!(Authority {
+    header,
+    sequence,
+    authority_index,
+    lease_ns,
+    echo_header_id,
+    flags
+});
+
 impl Message for Authority {
     const NAME: &'static str = "hil.FleetAuthority.v1";
+    const FIELDS: &'static [Field] = Self::LAYOUT;
 }
 
 /// Controller to robot: the path to drive (VDA 5050 `order`), repeated until a state shows the
@@ -175,8 +213,18 @@ impl Mission {
     pub const REPLACE: u32 = 1;
 }
 
+crate::layout!(Mission {
+    header,
+    path_id,
+    start_index,
+    end_index,
+    flags,
+    path_hash
+});
+
 impl Message for Mission {
     const NAME: &'static str = "hil.FleetMission.v1";
+    const FIELDS: &'static [Field] = Self::LAYOUT;
 }
 
 /// Robot to recorder, never over the network: its motion from this instant until the next such
@@ -210,8 +258,24 @@ pub struct Truth {
     pub reserved: u32,
 }
 
+crate::layout!(Truth {
+    at_ns,
+    fleet_id,
+    robot_id,
+    mission_id,
+    path_id,
+    travelled_m,
+    speed_mps,
+    acceleration_mps2,
+    authority_index,
+    caused_by_sequence,
+    kind,
+    reserved
+});
+
 impl Message for Truth {
     const NAME: &'static str = "hil.FleetTruth.v1";
+    const FIELDS: &'static [Field] = Self::LAYOUT;
 }
 
 /// Why a truth record was written.

@@ -4,7 +4,7 @@
 
 use std::collections::BTreeMap;
 
-use crate::case_study::{Metric, Score};
+use crate::case_study::{ErrorSeries, Metric, Score};
 use crate::fleet::case::{FLEET_AUTHORITY, FLEET_STATE, FLEET_TRUTH, Fleet};
 use crate::fleet::events::events;
 use crate::fleet::experiment::collision_interval;
@@ -16,10 +16,8 @@ use crate::time::Instant;
 
 /// Scores a run.
 pub(crate) fn score(case: &Fleet, log: &RunLog) -> Score {
-    let mut truths: Vec<Truth> = log.messages(FLEET_TRUTH).map(|(_, truth)| truth).collect();
-    // A robot notes what happened between two of its events afterwards, with its true time.
-    truths.sort_by_key(|truth| truth.at_ns);
-    let Some((first, last)) = truths.first().zip(truths.last()) else {
+    let truths = truths(log);
+    let Some((start, end)) = span(&truths) else {
         return Score {
             metrics: vec![unavailable(
                 COLLISIONS,
@@ -29,9 +27,6 @@ pub(crate) fn score(case: &Fleet, log: &RunLog) -> Score {
             ..Score::default()
         };
     };
-    let start = Instant::from_ns(first.at_ns);
-    // Robots in motion go on for a look after their last record.
-    let end = Instant::from_ns(last.at_ns) + SCAN_PERIOD;
     let mut referee = Referee::new(case.scene(), case.parameters().fleets);
     referee.replay(&mut truths.into_iter(), start, end);
     let run_s = end.seconds_since(start);
@@ -179,6 +174,41 @@ fn commands(tally: &Tally) -> Vec<Metric> {
     .into()
 }
 
+/// Robots that stand still on a mission, over time. Some always wait for others at a section; what a
+/// network holds up or loses makes more of them wait, and longer.
+pub(crate) fn errors(case: &Fleet, log: &RunLog) -> Vec<ErrorSeries> {
+    let truths = truths(log);
+    let Some(span) = span(&truths) else {
+        return Vec::new();
+    };
+    let mut samples = Vec::new();
+    let mut referee = Referee::new(case.scene(), case.parameters().fleets);
+    referee.replay_seeing(&mut truths.into_iter(), span, &mut |now, referee| {
+        samples.push((now, referee.standing_count() as f64));
+    });
+    vec![ErrorSeries {
+        label: "robots standing still on a mission",
+        unit: "1",
+        clock_of: FLEET_TRUTH,
+        samples,
+    }]
+}
+
+/// What the robots recorded, in order of time.
+fn truths(log: &RunLog) -> Vec<Truth> {
+    let mut truths: Vec<Truth> = log.messages(FLEET_TRUTH).map(|(_, truth)| truth).collect();
+    // A robot notes what happened between two of its events afterwards, with its true time.
+    truths.sort_by_key(|truth| truth.at_ns);
+    truths
+}
+
+/// From the first record to a look after the last: robots in motion go on until then.
+fn span(truths: &[Truth]) -> Option<(Instant, Instant)> {
+    let (first, last) = truths.first().zip(truths.last())?;
+    let end = Instant::from_ns(last.at_ns) + SCAN_PERIOD;
+    Some((Instant::from_ns(first.at_ns), end))
+}
+
 /// How old the newest state was on which each authority rests.
 fn ages(log: &RunLog) -> Vec<Metric> {
     let labels = [
@@ -216,9 +246,14 @@ fn ages(log: &RunLog) -> Vec<Metric> {
         count,
         ..
     } = ages;
-    let method = format!("sampled by the robot to authority sent, of {count} authorities");
     let figures = labels.into_iter().zip([p50_ns, p99_ns, max_ns]);
-    let figures = figures.map(|(label, ns)| metric(label, ns as f64 * 1e-9, "s", &method));
+    let figures = figures.map(|(label, ns)| {
+        let seconds = ns as f64 * 1e-9;
+        let clock = log.clock_words(Some(seconds));
+        let method =
+            format!("sampled by the robot to authority sent, of {count} authorities{clock}");
+        metric(label, seconds, "s", &method)
+    });
     figures.collect()
 }
 
@@ -264,7 +299,8 @@ mod tests {
     use crate::case_study::CaseStudy;
     use crate::fleet::FleetParameters;
     use crate::fleet::scenario::Scenario;
-    use crate::simulation::Simulation;
+    use crate::link::{Fate, LinkModel};
+    use crate::simulation::{Carrier, Simulation};
 
     fn crossing() -> Fleet {
         let mut parameters = FleetParameters::default();
@@ -294,6 +330,45 @@ mod tests {
             [],
             "a perfect channel does nothing to a robot"
         );
+    }
+
+    /// Loses everything offered from 30 s to 60 s.
+    #[derive(Debug)]
+    struct Silence;
+
+    impl LinkModel for Silence {
+        fn offer(&mut self, now: Instant, _length_bytes: usize) -> Fate {
+            if (30.0..60.0).contains(&now.seconds_since(Instant::ZERO)) {
+                Fate::Lost
+            } else {
+                Fate::Delivered(now)
+            }
+        }
+    }
+
+    #[test]
+    fn more_robots_stand_still_while_no_command_gets_through() {
+        let case = crossing();
+        let standing_s = |carriers: BTreeMap<String, Box<dyn Carrier>>| -> f64 {
+            let result = Simulation::new(&case, carriers).unwrap();
+            let result = result.run(Duration::from_mins(2)).unwrap();
+            let errors = case.errors(&result.log);
+            assert_eq!(errors.len(), 1);
+            let samples = &errors[0].samples;
+            assert!(samples.is_sorted_by_key(|sample| sample.0));
+            assert!(samples.iter().all(|sample| sample.1 >= 0.0));
+            let within = samples
+                .iter()
+                .filter(|(at, _)| (40.0..60.0).contains(&at.seconds_since(Instant::ZERO)));
+            within
+                .map(|(_, count)| count * SCAN_PERIOD.as_secs_f64())
+                .sum()
+        };
+        let silence: Box<dyn Carrier> = Box::new(Silence);
+        let silent_s = standing_s(BTreeMap::from([(FLEET_AUTHORITY.to_owned(), silence)]));
+        let whole_s = standing_s(BTreeMap::new());
+        assert!(silent_s > whole_s + 10.0, "{silent_s} s, {whole_s} s");
+        assert!(case.errors(&RunLog::default()).is_empty());
     }
 
     #[test]

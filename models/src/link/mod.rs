@@ -14,6 +14,7 @@ pub mod rate;
 pub mod reordering;
 pub mod spec;
 pub mod trace;
+mod trace_offers;
 mod trace_ticks;
 pub mod wifi;
 
@@ -22,6 +23,7 @@ use core::fmt::Debug;
 use serde::{Deserialize, Serialize};
 
 use self::trace::ReplayTally;
+use crate::message::Envelope;
 use crate::time::Instant;
 
 /// What happens to one offered message.
@@ -58,16 +60,40 @@ impl Fate {
     }
 }
 
+/// Which message of its channel is offered. All pieces of a message have its number, and so has what a
+/// network brings twice.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct MessageNumber {
+    /// The producer's start, its epoch on the channel.
+    pub start: u32,
+    /// Counted from 0 at each start.
+    pub sequence: u64,
+}
+
+impl From<&Envelope> for MessageNumber {
+    fn from(envelope: &Envelope) -> Self {
+        Self {
+            start: envelope.epoch,
+            sequence: envelope.sequence,
+        }
+    }
+}
+
 /// A one-directional link.
 pub trait LinkModel: Debug + Send {
     /// Offers a message of `length_bytes` at `now` and decides its fate. Calls come in
     /// non-decreasing `now`.
     fn offer(&mut self, now: Instant, length_bytes: usize) -> Fate;
 
-    /// As [`LinkModel::offer`], told which message of its channel it is, counted from 0: what a
+    /// As [`LinkModel::offer`], told which message of its channel it is or is a part of: what a
     /// recorded trace goes by. To other models it is one message like the next.
-    fn offer_numbered(&mut self, now: Instant, length_bytes: usize, number: u64) -> Fate {
-        let _ = number;
+    fn offer_numbered(
+        &mut self,
+        now: Instant,
+        length_bytes: usize,
+        message: MessageNumber,
+    ) -> Fate {
+        let _ = message;
         self.offer(now, length_bytes)
     }
 
@@ -88,8 +114,13 @@ impl<L: LinkModel + ?Sized> LinkModel for Box<L> {
         (**self).offer(now, length_bytes)
     }
 
-    fn offer_numbered(&mut self, now: Instant, length_bytes: usize, number: u64) -> Fate {
-        (**self).offer_numbered(now, length_bytes, number)
+    fn offer_numbered(
+        &mut self,
+        now: Instant,
+        length_bytes: usize,
+        message: MessageNumber,
+    ) -> Fate {
+        (**self).offer_numbered(now, length_bytes, message)
     }
 
     fn replay_tally(&self) -> Option<ReplayTally> {

@@ -7,24 +7,30 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use core::time::Duration;
 use serde::{Deserialize, Serialize};
 
+use crate::link::trace_offers::{OfferGrid, Offered};
 use crate::link::trace_ticks::Ticks;
-use crate::link::{Fate, LinkModel};
+use crate::link::{Fate, LinkModel, MessageNumber};
 use crate::time::Instant;
-use crate::trace::{Trace, TraceFate, TraceRecord};
+use crate::trace::{Trace, TraceFate, TraceRecord, UNAVAILABLE_NS};
 
 /// Which record a message meets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum TraceMatch {
-    /// The n-th message of the channel meets the n-th record: equal departures have equal counts.
+    /// The n-th message of the channel meets the n-th record: equal departures have equal counts. Counted
+    /// over all starts of its producer: a start's first comes after the last one offered before.
     #[default]
     Index,
-    /// The record published last at that time of the run, before the first record the first.
+    /// The record published last at that time of the run: counted from the run's start where the
+    /// trace says how long its run was, else from its first record. Before the first record the
+    /// first, in a later round the last of the round before.
     Time,
     /// The record of the same tick: as many periods after the first message of its channel as the
-    /// record is after the first of the trace. What nobody published live is lost, so the other end
-    /// hears at each tick what it heard live. A trace without a period, or of a producer that was
-    /// started anew, is matched by index instead, and the counts say so.
+    /// record is after the first of the trace, however many were missed and however long it is. What
+    /// nobody published live is lost, so the other end hears at each tick what it heard live. A
+    /// trace without a period, or of a producer that was started anew, is matched by index instead,
+    /// and the counts say so. The first message offered belongs to the tick of its number: to none
+    /// too early, and to one too late by what was missed before it.
     Tick,
 }
 
@@ -78,7 +84,7 @@ pub struct ReplayCounts {
     pub matching: TraceMatch,
     /// Records of the trace.
     pub record_count: u64,
-    /// Messages offered.
+    /// Messages offered, however many pieces or copies each came in.
     pub offered_count: u64,
     /// Of these, within the trace.
     pub met_count: u64,
@@ -146,19 +152,31 @@ impl ReplayTally {
     }
 }
 
+/// What a message met. Each piece of it meets the same: a message that was lost comes in none, and one
+/// that was delivered in all, each as much later as the record says.
+#[derive(Debug, Clone, Copy)]
+enum Met {
+    Record(TraceRecord),
+    /// The trace has no record at its tick.
+    Unpublished,
+    /// It came after the end.
+    End,
+}
+
 /// The link.
 #[derive(Debug)]
 pub struct TraceLink {
     trace: Arc<Trace>,
     replay: TraceReplay,
-    /// Length of one round through the trace, above zero.
+    /// What time zero of the run is in the trace, and the length of one round through it, above
+    /// zero.
+    origin_ns: i64,
     span_ns: i64,
-    next_number: u64,
+    offered: Offered<Met>,
     /// Where records are matched by ticks.
     ticks: Option<Ticks>,
-    /// The first message offered, and the tick of the last.
-    first_offer: Option<Instant>,
-    last_tick: Option<usize>,
+    /// The grid of the messages offered, and the tick of the last.
+    offers: Option<(OfferGrid, u64)>,
     cells: Arc<Cells>,
 }
 
@@ -180,11 +198,8 @@ impl TraceLink {
             let clock = trace.header.clock.clone();
             return Err(ReplayError::DelayUnknown { index, clock });
         }
-        let after_last_ns = last
-            .published_ns
-            .saturating_add(trace.period_ns().unwrap_or(0));
-        let span_ns = after_last_ns.max(trace.header.duration_ns).max(1);
         let period_ns = trace.period_ns().unwrap_or(0);
+        let (origin_ns, end_ns) = round(&trace, last.published_ns, period_ns);
         let ticks = match replay.matching {
             TraceMatch::Index | TraceMatch::Time => None,
             TraceMatch::Tick => Ticks::of(&trace.records, period_ns),
@@ -195,11 +210,11 @@ impl TraceLink {
         Ok(Self {
             trace,
             replay,
-            span_ns,
-            next_number: 0,
+            origin_ns,
+            span_ns: end_ns.saturating_sub(origin_ns).max(1),
+            offered: Offered::new(),
             ticks,
-            first_offer: None,
-            last_tick: None,
+            offers: None,
             cells: Arc::default(),
         })
     }
@@ -222,33 +237,43 @@ impl TraceLink {
         longest.max(self.replay.delay_otherwise.unwrap_or_default())
     }
 
-    /// As [`LinkModel::offer`], for the message `number` of its channel, counted from 0 over all
-    /// starts of its producer.
-    pub fn offer_number(&mut self, now: Instant, number: u64) -> Fate {
-        self.next_number = number.saturating_add(1);
-        let place = match self.replay.matching {
-            TraceMatch::Index => self.by_index(number),
-            TraceMatch::Time => self.by_time(now),
-            TraceMatch::Tick => match self.by_tick(now) {
-                Ok(place) => place,
-                Err(fate) => return fate,
-            },
+    /// As [`LinkModel::offer`], for this message of its channel. A piece or copy of one of the last 64
+    /// meets what that met, and is not counted again.
+    pub fn offer_message(&mut self, now: Instant, message: MessageNumber) -> Fate {
+        let (number, is_restarted) = self.offered.number(message);
+        if let Some(met) = self.offered.met(number) {
+            return self.fate(met, now);
+        }
+        let met = match self.replay.matching {
+            TraceMatch::Index => self.counted(self.by_index(number)),
+            TraceMatch::Time => self.counted(self.by_time(now)),
+            TraceMatch::Tick => self.by_tick(now, number, is_restarted),
         };
+        self.offered.keep(number, met);
+        if let Met::Record(record) = met
+            && record.fate == TraceFate::Delivered
+        {
+            let delays = [record.delay(), record.second_delay()];
+            for _ in delays.into_iter().flatten().filter(|delay| *delay < 0) {
+                add(&self.cells.negative_delay);
+            }
+        }
+        self.fate(met, now)
+    }
+
+    /// Counts what a message meets with a record of its own, or none after the end.
+    fn counted(&self, place: Option<(TraceRecord, bool)>) -> Met {
         let Some((record, is_beyond)) = place else {
             add(&self.cells.beyond_end);
-            return match self.replay.end {
-                TraceEnd::Lost => Fate::Lost,
-                TraceEnd::Perfect | TraceEnd::Wrap => Fate::Delivered(now),
-            };
+            return Met::End;
         };
-        let fate = self.fate(&record, now);
         add(match record.fate {
             _ if is_beyond => &self.cells.beyond_end,
             TraceFate::Delivered => &self.cells.delivered,
             TraceFate::Unknown => &self.cells.unknown,
             _ => &self.cells.lost,
         });
-        fate
+        Met::Record(record)
     }
 
     /// The record, and whether it stands for one after the end; `None` after the end.
@@ -268,62 +293,83 @@ impl TraceLink {
         if is_beyond && self.replay.end != TraceEnd::Wrap {
             return None;
         }
-        let at_ns = now.as_ns().rem_euclid(self.span_ns);
+        let in_round_ns = now.as_ns().rem_euclid(self.span_ns);
+        let at_ns = self.origin_ns.saturating_add(in_round_ns);
         let records = &self.trace.records;
         let after = records.partition_point(|record| record.published_ns <= at_ns);
-        Some((records[after.saturating_sub(1)], is_beyond))
+        let place = match after.checked_sub(1) {
+            Some(place) => place,
+            None if is_beyond => records.len() - 1,
+            None => 0,
+        };
+        Some((records[place], is_beyond))
     }
 
-    /// As the others, or the fate of a message that meets no record of its own.
-    fn by_tick(&mut self, now: Instant) -> Result<Option<(TraceRecord, bool)>, Fate> {
-        let first = *self.first_offer.get_or_insert(now);
+    /// As the others, with its count: a message may have no record of its own.
+    fn by_tick(&mut self, now: Instant, number: u64, is_restarted: bool) -> Met {
         let ticks = self.ticks.as_ref().expect("matching by ticks has them");
-        let offered = ticks.at(now.ns_since(first));
+        let at_ns = now.as_ns();
+        let (offered, is_repeated) = match &mut self.offers {
+            None => {
+                self.offers = Some((OfferGrid::new(at_ns, number, ticks.period_ns), number));
+                (number, false)
+            }
+            Some((grid, last)) => {
+                if is_restarted {
+                    *grid = grid.restarted(at_ns);
+                } else {
+                    grid.tick(at_ns);
+                }
+                let tick = grid.newest();
+                (tick, core::mem::replace(last, tick) == tick)
+            }
+        };
         let is_beyond = offered >= ticks.count();
         if is_beyond && self.replay.end != TraceEnd::Wrap {
-            return Ok(None);
+            return self.counted(None);
         }
-        let place = ticks.record_of(offered % ticks.count());
-        let is_repeated = self.last_tick.replace(offered) == Some(offered);
-        let Some(place) = place else {
+        let Some(place) = ticks.record_of(offered % ticks.count()) else {
             add(&self.cells.unpublished);
-            return Err(Fate::Lost);
+            return Met::Unpublished;
         };
         let record = self.trace.records[place];
         if is_repeated && !is_beyond {
             add(&self.cells.repeated);
-            return Err(self.fate(&record, now));
+            return Met::Record(record);
         }
-        Ok(Some((record, is_beyond)))
+        self.counted(Some((record, is_beyond)))
     }
 
-    fn fate(&self, record: &TraceRecord, now: Instant) -> Fate {
-        if record.fate != TraceFate::Delivered {
-            return Fate::Lost;
-        }
-        let otherwise = self.replay.delay_otherwise.unwrap_or_default();
-        let first = match record.delay() {
-            Some(delay_ns) => now + self.duration(delay_ns),
-            None => now + otherwise,
+    fn fate(&self, met: Met, now: Instant) -> Fate {
+        let record = match met {
+            Met::Record(record) if record.fate == TraceFate::Delivered => record,
+            Met::End if self.replay.end != TraceEnd::Lost => return Fate::Delivered(now),
+            Met::Record(_) | Met::Unpublished | Met::End => return Fate::Lost,
         };
-        match record.second_delay() {
+        let after = |delay_ns: i64| now + Duration::from_nanos(delay_ns.max(0).unsigned_abs());
+        let otherwise = now + self.replay.delay_otherwise.unwrap_or_default();
+        let first = record.delay().map_or(otherwise, after);
+        match record.second_delay().map(after) {
             None => Fate::Delivered(first),
-            Some(delay_ns) => {
-                let second = now + self.duration(delay_ns);
-                Fate::Duplicated {
-                    first: first.min(second),
-                    second: first.max(second),
-                }
-            }
+            Some(second) => Fate::Duplicated {
+                first: first.min(second),
+                second: first.max(second),
+            },
         }
     }
+}
 
-    fn duration(&self, delay_ns: i64) -> Duration {
-        if delay_ns < 0 {
-            add(&self.cells.negative_delay);
-        }
-        Duration::from_nanos(delay_ns.max(0).unsigned_abs())
+/// Where a round through `trace` by time begins and ends: with its run, where it says how long that
+/// was, so also a text of opportunities, which wraps at its last line; else with its first record and
+/// a period after its last. Instants of another origin than the run's thus do not count as a time
+/// without end before the first record.
+fn round(trace: &Trace, last_ns: i64, period_ns: i64) -> (i64, i64) {
+    let first_ns = trace.records.first().map_or(0, |first| first.published_ns);
+    let duration_ns = trace.header.duration_ns;
+    if duration_ns != UNAVAILABLE_NS && first_ns <= duration_ns {
+        return (0, duration_ns.max(last_ns));
     }
+    (first_ns, last_ns.saturating_add(period_ns))
 }
 
 /// One thread counts, another reads when the first is done.
@@ -333,11 +379,16 @@ fn add(cell: &AtomicU64) {
 
 impl LinkModel for TraceLink {
     fn offer(&mut self, now: Instant, _length_bytes: usize) -> Fate {
-        self.offer_number(now, self.next_number)
+        self.offer_message(now, self.offered.following())
     }
 
-    fn offer_numbered(&mut self, now: Instant, _length_bytes: usize, number: u64) -> Fate {
-        self.offer_number(now, number)
+    fn offer_numbered(
+        &mut self,
+        now: Instant,
+        _length_bytes: usize,
+        message: MessageNumber,
+    ) -> Fate {
+        self.offer_message(now, message)
     }
 
     fn replay_tally(&self) -> Option<ReplayTally> {
@@ -346,150 +397,5 @@ impl LinkModel for TraceLink {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::trace::TraceHeader;
-
-    const MS: i64 = 1_000_000;
-
-    /// Every 10 ms: delivered after 2 ms, lost, delivered twice, unknown.
-    fn trace() -> Trace {
-        let at = |index: i64| TraceRecord::published(index * 10 * MS, index.unsigned_abs(), 16);
-        let mut records = vec![at(0).delivered(2 * MS, 0), at(1), at(2), at(3)];
-        records[1].fate = TraceFate::LostInNetwork;
-        records[2] = records[2].delivered(5 * MS, 0);
-        records[2].second_delay_ns = 3 * MS;
-        let header = TraceHeader::new("a/b");
-        Trace { header, records }
-    }
-
-    fn link(matching: TraceMatch, end: TraceEnd) -> TraceLink {
-        let replay = TraceReplay {
-            matching,
-            end,
-            delay_otherwise: None,
-        };
-        TraceLink::new(Arc::new(trace()), replay).unwrap()
-    }
-
-    fn at(ms: i64) -> Instant {
-        Instant::from_ns(ms * MS)
-    }
-
-    fn met(ms: i64) -> Vec<Fate> {
-        vec![
-            Fate::Delivered(at(ms + 2)),
-            Fate::Lost,
-            Fate::Duplicated {
-                first: at(ms + 3),
-                second: at(ms + 5),
-            },
-            Fate::Lost,
-        ]
-    }
-
-    #[test]
-    fn the_nth_message_meets_the_nth_record_whenever_it_comes() {
-        let mut link = link(TraceMatch::Index, TraceEnd::Wrap);
-        let tally = link.tally();
-        for round in 0..2 {
-            let fates: Vec<_> = (0..4).map(|_| link.offer(at(700), 16)).collect();
-            assert_eq!(fates, met(700), "round {round}");
-        }
-        let counts = tally.counts();
-        assert_eq!((counts.offered_count, counts.met_count), (8, 4));
-        assert_eq!((counts.delivered_count, counts.lost_count), (2, 1));
-        assert_eq!((counts.unknown_count, counts.beyond_end_count), (1, 4));
-        assert_eq!(counts.record_count, 4);
-        assert_eq!(link.delay_max(), Duration::from_millis(5));
-        // Told by number, it does not matter which were never offered.
-        assert_eq!(link.offer_number(at(9), 2), met(9)[2]);
-        assert_eq!(link.offer(at(9), 1), Fate::Lost);
-    }
-
-    #[test]
-    fn by_time_a_message_meets_the_record_published_last() {
-        let mut link = link(TraceMatch::Time, TraceEnd::Wrap);
-        for (ms, index) in [(0, 0), (9, 0), (10, 1), (25, 2), (39, 3), (40, 0), (52, 1)] {
-            assert_eq!(link.offer(at(ms), 1), met(ms)[index], "{ms} ms");
-        }
-        assert_eq!(link.tally().counts().beyond_end_count, 2);
-    }
-
-    #[test]
-    fn by_tick_a_message_meets_the_record_of_its_tick_and_what_nobody_published_is_lost() {
-        let mut ticking = trace();
-        ticking.records = (0..100)
-            .filter(|tick| tick % 10 != 7)
-            .map(|tick| TraceRecord::published(3 * MS + tick * 10 * MS, 0, 1).delivered(tick, 0))
-            .collect();
-        let replay = TraceReplay {
-            matching: TraceMatch::Tick,
-            end: TraceEnd::Perfect,
-            delay_otherwise: None,
-        };
-        let mut link = TraceLink::new(Arc::new(ticking), replay).unwrap();
-        for tick in 0..100 {
-            let now = at(500 + tick * 10);
-            let expected = match tick % 10 {
-                7 => Fate::Lost,
-                _ => Fate::Delivered(Instant::from_ns(now.as_ns() + tick)),
-            };
-            assert_eq!(link.offer(now, 1), expected, "tick {tick}");
-        }
-        assert_eq!(link.offer(at(500 + 991), 1), link.offer(at(500 + 991), 1));
-        assert_eq!(link.offer(at(1_500), 1), Fate::Delivered(at(1_500)));
-        let counts = link.tally().counts();
-        assert_eq!((counts.met_count, counts.unpublished_count), (90, 10));
-        assert_eq!((counts.repeated_count, counts.beyond_end_count), (2, 1));
-        assert_eq!(counts.offered_count, 103);
-        let without_period = TraceLink::new(Arc::new(trace()), replay).unwrap();
-        assert_eq!(without_period.tally().counts().matching, TraceMatch::Index);
-    }
-
-    #[test]
-    fn after_the_end_it_does_what_it_was_told_and_counts_it() {
-        for matching in [TraceMatch::Index, TraceMatch::Time] {
-            for (end, fate) in [
-                (TraceEnd::Perfect, Fate::Delivered(at(40))),
-                (TraceEnd::Lost, Fate::Lost),
-            ] {
-                let mut link = link(matching, end);
-                for ms in [0, 10, 20, 30] {
-                    link.offer(at(ms), 1);
-                }
-                assert_eq!(link.offer(at(40), 1), fate);
-                let counts = link.tally().counts();
-                assert_eq!((counts.met_count, counts.beyond_end_count), (4, 1));
-            }
-        }
-    }
-
-    #[test]
-    fn unknown_delays_need_a_word_and_negative_ones_are_counted() {
-        let mut unknown = trace();
-        unknown.records[2].delay_ns = crate::trace::UNAVAILABLE_NS;
-        unknown.header.clock = "clocks not aligned".to_owned();
-        let unknown = Arc::new(unknown);
-        let error = TraceLink::new(Arc::clone(&unknown), TraceReplay::default()).unwrap_err();
-        assert!(error.to_string().contains("record 2"), "{error}");
-        let replay = TraceReplay {
-            delay_otherwise: Some(Duration::from_millis(4)),
-            ..TraceReplay::default()
-        };
-        let mut link = TraceLink::new(unknown, replay).unwrap();
-        let fate = link.offer_number(at(0), 2);
-        assert_eq!(fate.arrival(), Some(at(3)));
-        let mut early = trace();
-        early.records[0].delay_ns = -5;
-        let mut link = TraceLink::new(Arc::new(early), TraceReplay::default()).unwrap();
-        assert_eq!(link.offer(at(1), 1), Fate::Delivered(at(1)));
-        assert_eq!(link.tally().counts().negative_delay_count, 1);
-        let empty = Trace {
-            records: Vec::new(),
-            ..trace()
-        };
-        let refused = TraceLink::new(Arc::new(empty), TraceReplay::default());
-        assert_eq!(refused.unwrap_err(), ReplayError::Empty);
-    }
-}
+#[path = "trace_tests.rs"]
+mod tests;

@@ -93,7 +93,7 @@ pub enum CorrelationError {
 /// All pairs of a family, tested together.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Family {
-    /// By effect, then by cause; `None` where one of the two is constant.
+    /// By effect, then by cause; `None` where one of the two is constant or not finite throughout.
     pub pairs: Vec<Vec<Option<PairCorrelation>>>,
     /// The lags searched.
     pub window: LagWindow,
@@ -106,8 +106,8 @@ impl Family {
     }
 }
 
-/// Tests every effect against every cause. All series are on the same bins, without holes; a value
-/// that is not finite counts as 0. Equal series and streams give equal results; time grows with the
+/// Tests every effect against every cause. All series are on the same bins, without holes: a series
+/// with a value that is not finite is in no pair, as any number in its place would be made up. Equal series and streams give equal results; time grows with the
 /// square of the number of bins.
 ///
 /// # Errors
@@ -206,16 +206,15 @@ impl Shuffle {
     }
 }
 
-/// Mean 0 and sum of squares 1; `None` for a constant series.
+/// Mean 0 and sum of squares 1; `None` for a constant series and one with a value that is not finite.
 fn standardised(series: &[f64]) -> Option<Vec<f64>> {
-    let finite = |value: &f64| if value.is_finite() { *value } else { 0.0 };
-    let mean = series.iter().map(finite).sum::<f64>() / series.len() as f64;
-    let centred: Vec<f64> = series.iter().map(|value| finite(value) - mean).collect();
+    if !series.iter().all(|value| value.is_finite()) {
+        return None;
+    }
+    let mean = series.iter().sum::<f64>() / series.len() as f64;
+    let centred: Vec<f64> = series.iter().map(|value| value - mean).collect();
     let square: f64 = centred.iter().map(|value| value * value).sum();
-    let largest = series
-        .iter()
-        .map(|value| finite(value).abs())
-        .fold(0.0, f64::max);
+    let largest = series.iter().map(|value| value.abs()).fold(0.0, f64::max);
     // Rounding of the mean leaves a constant series a scatter of its own.
     let is_moving = square.sqrt() > 1e-9 * largest * (series.len() as f64).sqrt();
     is_moving.then(|| {
@@ -343,10 +342,17 @@ mod tests {
     }
 
     /// Of 120 pairs without any connection 6 should reach p <= 0.05; three standard deviations of
-    /// the binomial are 7. Series with long memory are a little above, sparse ones below.
+    /// the binomial are 7, and one more is admitted. Series whose memory is a quarter of the run have
+    /// too few blocks to shuffle and are above it; sparse ones are below. `docs/network-figures.md` quotes
+    /// what comes out.
     #[test]
     fn independent_series_are_called_correlated_in_five_of_a_hundred_cases() {
-        for (name, memory) in [("white", 0.0), ("long memory", 0.9), ("outages", -1.0)] {
+        for (name, memory, most) in [
+            ("white", 0.0, 14),
+            ("long memory", 0.9, 14),
+            ("a quarter of the run", 0.99, 26),
+            ("outages", -1.0, 14),
+        ] {
             let (mut alone, mut in_family) = (0, 0);
             for seed in 0..120 {
                 let mut random = RandomStream::new(seed, name);
@@ -370,9 +376,9 @@ mod tests {
             }
             // Sparse series have few coincidences, so the test is careful with them.
             let least = i32::from(memory >= 0.0);
-            assert!((least..=14).contains(&alone), "{name}: {alone} of 120");
+            assert!((least..=most).contains(&alone), "{name}: {alone} of 120");
             assert!(
-                (least..=14).contains(&in_family),
+                (least..=most).contains(&in_family),
                 "{name}: {in_family} of 120"
             );
         }
@@ -383,7 +389,9 @@ mod tests {
         let mut random = RandomStream::new(7, "constant");
         let moving = series(300, 0.5, &mut random);
         let causes = [vec![0.1; 300], moving.clone()];
-        let effects = [moving, vec![f64::NAN; 300]];
+        let mut broken = series(300, 0.5, &mut random);
+        broken[17] = f64::NAN;
+        let effects = [moving, broken];
         let found = family(&causes, &effects, WINDOW, &mut random).unwrap();
         assert_eq!(found.pairs[0][0], None);
         assert_eq!(found.pairs[1], [None, None]);

@@ -118,11 +118,100 @@ impl LatencyHistogram {
         })
     }
 
+    /// How often which values occurred, in bins whose upper edges grow by a fixed ratio: the
+    /// smallest first, empty bins left out. A value is in the bin of the first edge that is not below
+    /// it, within the 0.1 % of the histogram.
+    pub fn bins(&self) -> Vec<DurationBin> {
+        let mut bins: Vec<DurationBin> = Vec::new();
+        let mut count = |until_ns: i64, count: u64| match bins.last_mut() {
+            Some(last) if last.until_ns == until_ns => last.count += count,
+            _ => bins.push(DurationBin { until_ns, count }),
+        };
+        // Magnitudes of negative values come smallest first, which are the largest values.
+        let negative = self.negative.iter().flat_map(Histogram::iter_recorded);
+        let negative: Vec<_> = negative
+            .map(|step| (step.value_iterated_to(), step.count_at_value()))
+            .collect();
+        for (magnitude, times) in negative.into_iter().rev() {
+            count(-lower_edge_ns(magnitude.saturating_add(1)), times);
+        }
+        for step in self.positive.iter_recorded() {
+            count(
+                upper_edge_ns(step.value_iterated_to()),
+                step.count_at_value(),
+            );
+        }
+        bins
+    }
+
     /// The figures, or `reason` when there is nothing to summarise.
     pub fn distribution(&self, reason: &str) -> Distribution {
         self.summary()
             .map_or_else(|| Distribution::unavailable(reason), Distribution::Measured)
     }
+}
+
+/// Bins of one decade.
+const BINS_PER_DECADE: i32 = 20;
+
+/// One bin of a histogram over durations.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct DurationBin {
+    /// Upper edge, included; the lower one is the next smaller step of 20 to a decade.
+    pub until_ns: i64,
+    /// Values in it.
+    pub count: u64,
+}
+
+impl DurationBin {
+    /// Where the bin begins, not included: the edge before [`DurationBin::until_ns`].
+    pub fn from_ns(&self) -> i64 {
+        match self.until_ns {
+            ..=0 => -upper_edge_ns(self.until_ns.unsigned_abs().saturating_add(1)),
+            1 => 0,
+            until_ns => lower_edge_ns(until_ns.unsigned_abs()),
+        }
+    }
+}
+
+/// The edge of this number, counted from 1 ns.
+#[allow(
+    clippy::cast_possible_truncation,
+    reason = "edges are positive and saturate at the largest 64-bit integer"
+)]
+fn edge_ns(index: i32) -> i64 {
+    10_f64
+        .powf(f64::from(index) / f64::from(BINS_PER_DECADE))
+        .round() as i64
+}
+
+/// The smallest edge not below `magnitude`; 0 for 0.
+#[allow(clippy::cast_possible_truncation, reason = "at most 386")]
+fn upper_edge_ns(magnitude: u64) -> i64 {
+    if magnitude == 0 {
+        return 0;
+    }
+    let wanted = signed(magnitude);
+    let near = ((magnitude as f64).log10() * f64::from(BINS_PER_DECADE)).floor() as i32;
+    (near.saturating_sub(1).max(0)..=near.saturating_add(2))
+        .map(edge_ns)
+        .find(|edge| *edge >= wanted)
+        .unwrap_or(i64::MAX)
+}
+
+/// The largest edge below `magnitude`; 0 for 1 and less.
+#[allow(clippy::cast_possible_truncation, reason = "at most 386")]
+fn lower_edge_ns(magnitude: u64) -> i64 {
+    let wanted = signed(magnitude);
+    if wanted <= 1 {
+        return 0;
+    }
+    let near = ((magnitude as f64).log10() * f64::from(BINS_PER_DECADE)).ceil() as i32;
+    (0..=near.saturating_add(1))
+        .rev()
+        .map(edge_ns)
+        .find(|edge| *edge < wanted)
+        .unwrap_or(0)
 }
 
 fn signed(magnitude: u64) -> i64 {
@@ -238,6 +327,53 @@ mod tests {
         let none = histogram.distribution("no message arrived");
         assert_eq!(none, Distribution::unavailable("no message arrived"));
         assert_eq!(none.measured(), None);
+    }
+
+    #[test]
+    fn bins_hold_every_value_once_in_ascending_edges() {
+        let mut stream = RandomStream::new(3, "bins");
+        let mut histogram = LatencyHistogram::default();
+        let values: Vec<i64> = (0..2_000)
+            .map(|_| (stream.next_u64() >> (30 + stream.next_u64() % 34)).cast_signed() - 40)
+            .collect();
+        for value in &values {
+            histogram.record(*value);
+        }
+        let bins = histogram.bins();
+        assert!(bins.windows(2).all(|two| two[0].until_ns < two[1].until_ns));
+        assert!(
+            bins.windows(2)
+                .all(|two| two[0].until_ns <= two[1].from_ns())
+        );
+        assert_eq!(bins.iter().map(|bin| bin.count).sum::<u64>(), 2_000);
+        for bin in bins {
+            // What the histogram rounds may fall on the other side of an edge.
+            let slack = |edge: i64| edge.abs() / 900 + 1;
+            let (from, until) = (bin.from_ns(), bin.until_ns);
+            let at_most = values
+                .iter()
+                .filter(|value| **value > from - slack(from) && **value <= until + slack(until));
+            assert!(at_most.count() as u64 >= bin.count, "{bin:?}");
+        }
+        assert!(LatencyHistogram::default().bins().is_empty());
+    }
+
+    #[test]
+    fn the_edges_of_bins_are_powers_of_ten_and_steps_between() {
+        assert_eq!(
+            [0, 1, 2, 999, 1_000, 1_001].map(upper_edge_ns),
+            [0, 1, 2, 1_000, 1_000, 1_122]
+        );
+        assert_eq!(
+            [0, 1, 2, 1_000, 1_001].map(lower_edge_ns),
+            [0, 0, 1, 891, 1_000]
+        );
+        assert_eq!(upper_edge_ns(u64::MAX), i64::MAX);
+        let bin = DurationBin {
+            until_ns: -1_000,
+            count: 1,
+        };
+        assert_eq!(bin.from_ns(), -1_122);
     }
 
     #[test]

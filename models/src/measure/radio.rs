@@ -4,13 +4,12 @@
 //! A frame is acknowledged by the peer *radio* (IEEE 802.11, clause 10.3.2.11). So a message that
 //! was acknowledged and never received was lost above the radio, one that was not acknowledged and
 //! received lost its acknowledgement, and one that was neither was lost in the air: these three are
-//! different faults with different cures.
-
-use std::collections::BTreeSet;
+//! different faults with different cures. What was lost while a process was down, or was still under way at
+//! the end, is none of them.
 
 use serde::{Deserialize, Serialize};
 
-use super::account::ChannelRecords;
+use super::account::{AccountContext, ChannelRecords, HandedFate, handed_fates};
 use super::record::{EgressRecord, UNAVAILABLE};
 use super::statistics::{Interval, wilson};
 
@@ -18,39 +17,63 @@ use super::statistics::{Interval, wilson};
 const CONFIDENCE: f64 = 0.95;
 
 /// What became of the messages a gateway sent, by the radio's report of their last datagram. Every
-/// message handed to the kernel is in exactly one count.
+/// message handed to the kernel is in exactly one row, and there in exactly one class.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RadioFigures {
     /// Messages handed to the kernel.
     pub handed_count: u64,
-    /// Acknowledged, and received by the gateway at the other end.
-    pub acknowledged_arrived_count: u64,
-    /// Acknowledged, and never received: lost above the peer radio.
-    pub acknowledged_lost_count: u64,
-    /// Not acknowledged, and received: the acknowledgement was lost.
-    pub unacknowledged_arrived_count: u64,
-    /// Not acknowledged, and never received: lost in the air, or dropped before.
-    pub unacknowledged_lost_count: u64,
-    /// Without a report of the radio, and received.
-    pub unreported_arrived_count: u64,
-    /// Without a report of the radio, and never received.
-    pub unreported_lost_count: u64,
-    /// Whether a message arrived is not known, as the receiving gateway's records are not at hand:
-    /// the `arrived` and `lost` counts are zero and these two tell what the radio said.
-    pub is_arrival_unknown: bool,
-    /// Acknowledged, of those whose arrival is not known.
-    pub acknowledged_unknown_count: u64,
-    /// Not acknowledged, of those whose arrival is not known.
-    pub unacknowledged_unknown_count: u64,
-    /// Without a report, of those whose arrival is not known.
-    pub unreported_unknown_count: u64,
+    /// Acknowledged by the peer radio. What was lost was lost above it.
+    pub acknowledged: RadioRow,
+    /// Not acknowledged. Of what arrived, the acknowledgement was lost; what was lost, was lost in the
+    /// air, or dropped before.
+    pub unacknowledged: RadioRow,
+    /// Without a report of the radio.
+    pub unreported: RadioRow,
     /// Share of reported messages that were not acknowledged, 0..=1; `None` without reports.
     pub unacknowledged_ratio: Option<Share>,
     /// Share of lost messages whose loss the radio knew of (not acknowledged), 0..=1; `None` when
-    /// none was lost.
+    /// none was lost, and when arrivals are not known.
     pub known_loss_ratio: Option<Share>,
-    /// Share of messages that never arrived, 0..=1; `None` when arrivals are not known.
+    /// Share of messages that were lost, of those that arrived or were lost, 0..=1; `None` when
+    /// arrivals are not known.
     pub lost_ratio: Option<Share>,
+}
+
+/// Messages of which a radio said the same.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RadioRow {
+    /// Messages.
+    pub count: u64,
+    /// What became of them; `None` when the receiving gateway's records are not at hand.
+    pub fates: Option<RadioFates>,
+}
+
+/// What became of some messages, each in one of these.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RadioFates {
+    /// Received by the gateway at the other end.
+    pub arrived_count: u64,
+    /// Never received, while every process on the way worked.
+    pub lost_count: u64,
+    /// Lost while a process on the way was down: no fault of the air or of what lies above it.
+    pub interrupted_count: u64,
+    /// Still under way when the run ended, so that nobody knows.
+    pub in_flight_count: u64,
+}
+
+impl RadioRow {
+    fn add(&mut self, fate: HandedFate) {
+        self.count += 1;
+        let Some(fates) = &mut self.fates else { return };
+        match fate {
+            HandedFate::Arrived => fates.arrived_count += 1,
+            HandedFate::Lost => fates.lost_count += 1,
+            HandedFate::Interrupted => fates.interrupted_count += 1,
+            HandedFate::InFlight => fates.in_flight_count += 1,
+            // Without any receiver's records all of them are unknown, and with them none is.
+            HandedFate::Unknown => self.fates = None,
+        }
+    }
 }
 
 /// A share with its interval (Wilson 1927, 95 %).
@@ -112,19 +135,23 @@ pub fn transmit_stamps(egress: &[EgressRecord]) -> TransmitStampFigures {
 }
 
 /// Sets what the radio reported against what arrived; `None` when no radio reported anything or
-/// the sending gateway's records are not at hand.
-pub fn radio_figures(records: &ChannelRecords<'_>) -> Option<RadioFigures> {
-    let egress = records.egress?;
+/// the sending gateway's records are not at hand. Fates are those of the account, so that what was
+/// under way at the end, or met a gateway that was down, counts as neither lost in the air nor above it.
+pub fn radio_figures(
+    records: &ChannelRecords<'_>,
+    context: &AccountContext<'_>,
+) -> Option<RadioFigures> {
     let reports = EgressRecord::RADIO_ACKNOWLEDGED | EgressRecord::RADIO_UNACKNOWLEDGED;
-    if !egress.iter().any(|record| record.flags & reports != 0) {
+    if !records
+        .egress?
+        .iter()
+        .any(|record| record.flags & reports != 0)
+    {
         return None;
     }
-    let arrived: Option<BTreeSet<(u32, u64)>> = records
-        .ingress
-        .map(|all| all.iter().map(|one| (one.epoch, one.sequence)).collect());
-    // Rows: acknowledged, not acknowledged, not reported. Columns: arrived, lost, unknown.
-    let mut counts = [[0_u64; 3]; 3];
-    for record in handed(egress) {
+    let fates = records.ingress.map(|_| RadioFates::default());
+    let mut rows = [RadioRow { count: 0, fates }; 3];
+    for (record, fate) in handed_fates(records, context) {
         let row = if record.flags & EgressRecord::RADIO_ACKNOWLEDGED != 0 {
             0
         } else if record.flags & EgressRecord::RADIO_UNACKNOWLEDGED != 0 {
@@ -132,34 +159,33 @@ pub fn radio_figures(records: &ChannelRecords<'_>) -> Option<RadioFigures> {
         } else {
             2
         };
-        let column = match &arrived {
-            None => 2,
-            Some(arrived) => usize::from(!arrived.contains(&(record.epoch, record.sequence))),
-        };
-        counts[row][column] += 1;
+        rows[row].add(fate);
     }
-    Some(figures(counts, arrived.is_none()))
+    Some(figures(rows))
 }
 
-fn figures(counts: [[u64; 3]; 3], is_arrival_unknown: bool) -> RadioFigures {
-    let row = |index: usize| counts[index].iter().sum::<u64>();
-    let column = |index: usize| counts.iter().map(|row| row[index]).sum::<u64>();
-    let handed_count = row(0) + row(1) + row(2);
+fn figures(rows: [RadioRow; 3]) -> RadioFigures {
+    let [acknowledged, unacknowledged, unreported] = rows;
+    let sum = |of: fn(&RadioFates) -> u64| -> Option<u64> {
+        rows.iter().map(|row| row.fates.as_ref().map(of)).sum()
+    };
+    let (arrived_count, lost_count) = (sum(|one| one.arrived_count), sum(|one| one.lost_count));
+    let share = |part: Option<u64>, whole: Option<u64>| {
+        let (part, whole) = part.zip(whole)?;
+        Share::of(part, whole)
+    };
+    let judged_count = arrived_count.zip(lost_count).map(|(a, b)| a + b);
     RadioFigures {
-        handed_count,
-        acknowledged_arrived_count: counts[0][0],
-        acknowledged_lost_count: counts[0][1],
-        unacknowledged_arrived_count: counts[1][0],
-        unacknowledged_lost_count: counts[1][1],
-        unreported_arrived_count: counts[2][0],
-        unreported_lost_count: counts[2][1],
-        is_arrival_unknown,
-        acknowledged_unknown_count: counts[0][2],
-        unacknowledged_unknown_count: counts[1][2],
-        unreported_unknown_count: counts[2][2],
-        unacknowledged_ratio: Share::of(row(1), row(0) + row(1)),
-        known_loss_ratio: Share::of(counts[1][1], column(1)),
-        lost_ratio: Share::of(column(1), column(0) + column(1)),
+        handed_count: rows.iter().map(|row| row.count).sum(),
+        acknowledged,
+        unacknowledged,
+        unreported,
+        unacknowledged_ratio: Share::of(
+            unacknowledged.count,
+            acknowledged.count + unacknowledged.count,
+        ),
+        known_loss_ratio: share(unacknowledged.fates.map(|one| one.lost_count), lost_count),
+        lost_ratio: share(lost_count, judged_count),
     }
 }
 
@@ -172,8 +198,10 @@ fn handed(egress: &[EgressRecord]) -> impl Iterator<Item = &EgressRecord> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::account::{ChannelPath, Interruption, PathProcess, RunSpan};
     use super::super::record::IngressRecord;
     use super::*;
+    use crate::time::{Alignment, Instant};
 
     const ACK: u32 = EgressRecord::RADIO_ACKNOWLEDGED;
     const NO_ACK: u32 = EgressRecord::RADIO_UNACKNOWLEDGED;
@@ -214,8 +242,22 @@ mod tests {
         (egress, ingress)
     }
 
+    fn context<'a>() -> AccountContext<'a> {
+        AccountContext::new(ChannelPath::Gateway { alignment: None })
+    }
+
+    fn counts(row: RadioRow) -> [u64; 4] {
+        let fates = row.fates.unwrap();
+        [
+            fates.arrived_count,
+            fates.lost_count,
+            fates.interrupted_count,
+            fates.in_flight_count,
+        ]
+    }
+
     #[test]
-    fn every_handed_message_is_in_one_count() {
+    fn every_handed_message_is_in_one_class() {
         let (mut egress, ingress) = example();
         egress.push(sent(7, EgressRecord::REFUSED_BY_KERNEL));
         let mut unhanded = sent(8, 0);
@@ -226,14 +268,11 @@ mod tests {
             ingress: Some(&ingress),
             ..ChannelRecords::default()
         };
-        let figures = radio_figures(&records).unwrap();
+        let figures = radio_figures(&records, &context()).unwrap();
         assert_eq!(figures.handed_count, 7);
-        assert_eq!(figures.acknowledged_arrived_count, 1);
-        assert_eq!(figures.acknowledged_lost_count, 1);
-        assert_eq!(figures.unacknowledged_arrived_count, 1);
-        assert_eq!(figures.unacknowledged_lost_count, 2);
-        assert_eq!(figures.unreported_arrived_count, 1);
-        assert_eq!(figures.unreported_lost_count, 1);
+        assert_eq!(counts(figures.acknowledged), [1, 1, 0, 0]);
+        assert_eq!(counts(figures.unacknowledged), [1, 2, 0, 0]);
+        assert_eq!(counts(figures.unreported), [1, 1, 0, 0]);
         let known = figures.known_loss_ratio.unwrap();
         assert_eq!((known.success_count, known.trial_count), (2, 4));
         assert!(known.low < 0.5 && known.high > 0.5);
@@ -243,17 +282,63 @@ mod tests {
     }
 
     #[test]
+    fn what_was_under_way_or_met_a_dead_gateway_was_not_lost_in_the_air() {
+        let second = |sequence: u64, flags| {
+            let at_ns = i64::try_from(sequence).unwrap() * 1_000_000_000;
+            let mut record = sent(sequence, flags);
+            (record.published_ns, record.handed_ns) = (at_ns, at_ns + 10);
+            record
+        };
+        // One a second. 3 meets a gateway that is down, 9 is under way when the run ends, 5 is lost.
+        let egress: Vec<_> = (0..10).map(|one| second(one, NO_ACK)).collect();
+        let ingress: Vec<_> = [0, 1, 2, 4, 6, 7, 8].into_iter().map(came).collect();
+        let records = ChannelRecords {
+            egress: Some(&egress),
+            ingress: Some(&ingress),
+            ..ChannelRecords::default()
+        };
+        let at = Instant::from_ns;
+        let down = [Interruption {
+            process: "gateway".to_owned(),
+            place: PathProcess::ReceivingGateway,
+            from: at(2_900_000_000),
+            until: at(3_100_000_000),
+            cause: "killed by signal 9".to_owned(),
+        }];
+        let run = Some(RunSpan {
+            start: at(0),
+            end: at(9_010_000_000),
+        });
+        let context = AccountContext {
+            producer_run: run,
+            consumer_run: run,
+            interruptions: &down,
+            ..AccountContext::new(ChannelPath::Gateway {
+                alignment: Some(Alignment::SAME_CLOCK),
+            })
+        };
+        let figures = radio_figures(&records, &context).unwrap();
+        assert_eq!(counts(figures.unacknowledged), [7, 1, 1, 1]);
+        let lost = figures.lost_ratio.unwrap();
+        assert_eq!((lost.success_count, lost.trial_count), (1, 8));
+        assert_eq!(figures.known_loss_ratio.unwrap().trial_count, 1);
+    }
+
+    #[test]
     fn without_the_receivers_records_no_message_is_called_lost() {
         let (egress, _) = example();
         let records = ChannelRecords {
             egress: Some(&egress),
             ..ChannelRecords::default()
         };
-        let figures = radio_figures(&records).unwrap();
-        assert!(figures.is_arrival_unknown);
-        assert_eq!(figures.acknowledged_unknown_count, 2);
-        assert_eq!(figures.unacknowledged_unknown_count, 3);
-        assert_eq!(figures.unreported_unknown_count, 2);
+        let figures = radio_figures(&records, &context()).unwrap();
+        let rows = [
+            figures.acknowledged,
+            figures.unacknowledged,
+            figures.unreported,
+        ];
+        assert_eq!(rows.map(|row| row.count), [2, 3, 2]);
+        assert!(rows.iter().all(|row| row.fates.is_none()), "{rows:?}");
         assert_eq!((figures.lost_ratio, figures.known_loss_ratio), (None, None));
     }
 
@@ -264,8 +349,9 @@ mod tests {
             egress: Some(&egress),
             ..ChannelRecords::default()
         };
-        assert_eq!(radio_figures(&records), None);
-        assert_eq!(radio_figures(&ChannelRecords::default()), None);
+        assert_eq!(radio_figures(&records, &context()), None);
+        let nothing = ChannelRecords::default();
+        assert_eq!(radio_figures(&nothing, &context()), None);
     }
 
     #[test]

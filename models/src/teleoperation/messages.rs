@@ -3,6 +3,7 @@
 
 use bytemuck::{Pod, Zeroable};
 
+use crate::layout::Field;
 use crate::message::Message;
 use crate::yumi::Pose;
 
@@ -25,8 +26,17 @@ pub struct HumanFrame {
     pub left_hand: Pose,
 }
 
+crate::layout!(HumanFrame {
+    frame_index,
+    source_time_ns,
+    root,
+    right_hand,
+    left_hand
+});
+
 impl Message for HumanFrame {
     const NAME: &'static str = "hil.HumanFrame.v1";
+    const FIELDS: &'static [Field] = Self::LAYOUT;
 }
 
 const _: () = assert!(size_of::<HumanFrame>() == 184);

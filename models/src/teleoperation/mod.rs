@@ -158,6 +158,7 @@ impl CaseStudy for Teleoperation {
         ChannelSpec::recorded::<EgmArrival>(EGM_RECEIVED, "robot"),
         ChannelSpec::recorded::<MotionArrival>(MOTION_RECEIVED, "robot"),
     ];
+    const SCORE_CLOCK: Option<&'static str> = Some(EGM_RIGHT_FEEDBACK);
     const SERIES: &'static [&'static str] = &[
         "fig6-input",
         "fig7-9-tool-y",

@@ -22,6 +22,9 @@ pub const COLUMNS: [&str; 10] = [
     "flags",
 ];
 
+/// Most bytes of a message: 1024 datagrams of the longest kind, what a gateway joins at most.
+pub const SIZE_BYTES_MAX: u32 = 1024 * 65_535;
+
 /// What is wrong with a text, and where. What stands before is whole.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("line {line}, byte {offset}: {what}")]
@@ -267,6 +270,12 @@ impl Columns {
             ));
         }
         let bound: Option<u64> = optional(cell(4), COLUMNS[4])?;
+        let size_bytes = optional(cell(6), COLUMNS[6])?.unwrap_or(0);
+        if size_bytes > SIZE_BYTES_MAX {
+            return Err(format!(
+                "size_bytes is {size_bytes}, allowed are 0..={SIZE_BYTES_MAX}"
+            ));
+        }
         let flags = optional(cell(9), COLUMNS[9])?.unwrap_or(0);
         if flags & !TraceRecord::FLAGS != 0 {
             return Err(format!("flags are {flags}, allowed are 0..=31"));
@@ -277,7 +286,7 @@ impl Columns {
             delay_ns: delay.unwrap_or(UNAVAILABLE_NS),
             bound_ns: bound.filter(|_| delay.is_some()).unwrap_or(UNBOUNDED_NS),
             second_delay_ns: optional(cell(5), COLUMNS[5])?.unwrap_or(UNAVAILABLE_NS),
-            size_bytes: optional(cell(6), COLUMNS[6])?.unwrap_or(0),
+            size_bytes,
             sequence: optional(cell(7), COLUMNS[7])?.unwrap_or(index),
             start: optional(cell(8), COLUMNS[8])?.unwrap_or(0),
             fate,
@@ -353,6 +362,13 @@ mod tests {
             assert!(fault.what.contains(why), "{fault}");
             assert_eq!(decoded.trace.records.len(), 1);
         }
+        let sized = decode("published_ns,delay_ns,size_bytes\n0,1,40\n1,1,67107841\n").unwrap();
+        let fault = sized.fault.unwrap();
+        assert_eq!((fault.line, sized.trace.records.len()), (3, 1));
+        assert_eq!(
+            fault.what,
+            "size_bytes is 67107841, allowed are 0..=67107840"
+        );
         let text = encode(&sample());
         let cut = &text[..text.len() - "10,10,delivered,-3,9,12,40,2,0,1\n".len()];
         let fault = decode(cut).unwrap().fault.unwrap();

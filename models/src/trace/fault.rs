@@ -15,6 +15,20 @@ pub enum EncodeError {
         /// Bytes there are for it.
         limit: usize,
     },
+    /// A name has a zero in it, where it would end.
+    #[error("the name of the {what} has a NUL in it, where its file would end it")]
+    NameWithNul {
+        /// Which name.
+        what: &'static str,
+    },
+    /// The fields of a record say together what nobody can read.
+    #[error("record {index}: {what}")]
+    Record {
+        /// Its place, from 0.
+        index: u32,
+        /// What is wrong.
+        what: FaultKind,
+    },
     /// A record was published before its predecessor.
     #[error("record {index} was published before the one before it")]
     OutOfOrder {

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use super::{Trace, TraceCounts, TraceFate, TraceRecord, UNAVAILABLE_NS, UNBOUNDED_NS};
+use super::{Trace, TraceCounts, TraceFate, TraceRecord, UNAVAILABLE_NS};
 use crate::measure::histogram::{Distribution, LatencyHistogram};
 use crate::measure::network::has_tail;
 use crate::measure::statistics::{
@@ -79,11 +79,15 @@ pub struct TraceFigures {
     pub loss_memory: Option<Memory>,
     /// Of successive delivered messages' delays; `None` when they do not vary.
     pub delay_memory: Option<Memory>,
-    /// All delays.
+    /// All delays of messages that were delivered.
     pub delay: Distribution,
+    /// Delays of messages that arrived and were not published, mostly because they came too late;
+    /// in no other figure of delays.
+    pub late_delay: Distribution,
     /// With intervals.
     pub quantiles: Vec<QuantileFigure>,
-    /// Largest error of any delay; `None` without delays.
+    /// Largest error of any delay from the clocks, 0 on one clock; `None` without delays, and when
+    /// that of one of them is not known.
     pub bound_max_ns: Option<u64>,
     /// Longest time without a delivery.
     pub longest_outage: Option<TraceOutage>,
@@ -103,10 +107,14 @@ impl TraceFigures {
         let counts = trace.counts();
         let known_count = counts.message_count - counts.unknown_count;
         let delays_ns = trace.delays_ns();
-        let mut histogram = LatencyHistogram::default();
-        for delay_ns in &delays_ns {
-            histogram.record(*delay_ns);
-        }
+        let histogram = |delays_ns: &[i64]| {
+            let mut histogram = LatencyHistogram::default();
+            for delay_ns in delays_ns {
+                histogram.record(*delay_ns);
+            }
+            histogram
+        };
+        let late = histogram(&trace.late_delays_ns());
         let reason = if counts.delivered_count == 0 {
             "no message was delivered"
         } else if trace.header.clock.is_empty() {
@@ -127,9 +135,10 @@ impl TraceFigures {
             delivery_runs: runs(false),
             loss_memory: memory(&as_numbers),
             delay_memory: memory(&delays),
-            delay: histogram.distribution(reason),
+            delay: histogram(&delays_ns).distribution(reason),
+            late_delay: late.distribution("no message is known to have come too late"),
             quantiles: quantiles(&delays_ns, seed),
-            bound_max_ns: bound_max_ns(&trace.records),
+            bound_max_ns: trace.delay_bound_ns(),
             longest_outage: longest_outage(&trace.records),
             period_ns: trace.period_ns(),
             rate_hz,
@@ -212,12 +221,6 @@ fn quantiles(delays_ns: &[i64], seed: u64) -> Vec<QuantileFigure> {
         }
     };
     QUANTILES.into_iter().map(of).collect()
-}
-
-fn bound_max_ns(records: &[TraceRecord]) -> Option<u64> {
-    let with_delay = records.iter().filter(|record| record.delay().is_some());
-    let bounds = with_delay.map(|record| record.bound_ns);
-    bounds.filter(|bound| *bound != UNBOUNDED_NS).max()
 }
 
 fn longest_outage(records: &[TraceRecord]) -> Option<TraceOutage> {
@@ -318,6 +321,32 @@ mod tests {
         assert!((figures.rate_bytes_per_s.unwrap() - 2_500.0).abs() < 1e-6);
         assert_eq!(figures.bound_max_ns, Some(7));
         assert_eq!(figures.delay.measured().unwrap().count, 6);
+    }
+
+    #[test]
+    fn a_bound_that_one_delay_does_not_have_is_known_of_none() {
+        let mut traced = trace("1122");
+        traced.records[2].bound_ns = 90;
+        assert_eq!(TraceFigures::of(&traced, 1).bound_max_ns, Some(90));
+        traced.records[0].bound_ns = crate::trace::UNBOUNDED_NS;
+        assert_eq!(TraceFigures::of(&traced, 1).bound_max_ns, None);
+        assert_eq!(TraceFigures::of(&trace("xx"), 1).bound_max_ns, None);
+    }
+
+    #[test]
+    fn what_came_too_late_has_its_delay_in_a_figure_of_its_own() {
+        let mut traced = trace("11911");
+        traced.records[2].fate = TraceFate::LostAfterLink;
+        let figures = TraceFigures::of(&traced, 1);
+        assert_eq!(figures.delay.measured().unwrap().max_ns, MS);
+        let late = figures.late_delay.measured().unwrap();
+        assert_eq!((late.count, late.max_ns), (1, 9 * MS));
+        assert!(
+            TraceFigures::of(&trace("1x"), 1)
+                .late_delay
+                .measured()
+                .is_none()
+        );
     }
 
     #[test]

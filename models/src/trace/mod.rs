@@ -323,6 +323,23 @@ impl Trace {
         counts
     }
 
+    /// Largest error of any delay from the clocks, 0 on one clock; `None` without delays, and when
+    /// that of one of them is not known.
+    pub fn delay_bound_ns(&self) -> Option<u64> {
+        let delays = self.records.iter();
+        let delays = delays.filter(|record| record.delay().is_some());
+        let largest_ns = delays.map(|record| record.bound_ns).max()?;
+        (largest_ns != UNBOUNDED_NS).then_some(largest_ns)
+    }
+
+    /// The delays of messages that arrived and were not published, in their order: they came too
+    /// late, or something refused them.
+    pub fn late_delays_ns(&self) -> Vec<i64> {
+        let unused = self.records.iter();
+        let unused = unused.filter(|record| record.fate == TraceFate::LostAfterLink);
+        unused.filter_map(TraceRecord::delay).collect()
+    }
+
     /// The delays of delivered messages, in their order; those without one are left out.
     pub fn delays_ns(&self) -> Vec<i64> {
         let delivered = self.records.iter();

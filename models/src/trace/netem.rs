@@ -20,6 +20,8 @@ pub struct NetemTable {
     pub mean_ns: f64,
     /// Standard deviation, for its second argument.
     pub deviation_ns: f64,
+    /// Largest error of both from the clocks, 0 on one clock; `None` when it is not known.
+    pub bound_ns: Option<u64>,
 }
 
 /// The table of the trace's delays; `None` below two delays, or when they do not vary.
@@ -42,6 +44,17 @@ pub fn table(trace: &Trace) -> Option<NetemTable> {
         mean_ns / 1e3,
         deviation_ns / 1e3
     );
+    let bound_ns = trace.delay_bound_ns();
+    // A remark to `tc`, as the line above. Moving each delay by at most the bound moves neither mean
+    // nor deviation by more.
+    let _infallible = match bound_ns {
+        Some(0) => writeln!(text, "# both delays measured on one clock"),
+        Some(ns) => writeln!(text, "# both within {:.3}us by the clocks", ns as f64 / 1e3),
+        None => writeln!(
+            text,
+            "# how far the clocks may have led both astray is unknown"
+        ),
+    };
     for index in 0..TABLE_COUNT {
         // The middle of each of 4096 equal shares.
         let rank = (2 * index + 1) * delays_ns.len() / (2 * TABLE_COUNT);
@@ -55,6 +68,7 @@ pub fn table(trace: &Trace) -> Option<NetemTable> {
         text,
         mean_ns,
         deviation_ns,
+        bound_ns,
     })
 }
 
@@ -77,7 +91,8 @@ mod tests {
         };
         let table = table(&trace).unwrap();
         assert!((table.mean_ns - 6e6).abs() < 3e4, "{}", table.mean_ns);
-        let numbers = table.text.lines().skip(1).flat_map(str::split_whitespace);
+        let lines = table.text.lines().filter(|line| !line.starts_with('#'));
+        let numbers = lines.flat_map(str::split_whitespace);
         let numbers: Vec<f64> = numbers.map(|number| number.parse().unwrap()).collect();
         assert_eq!(numbers.len(), TABLE_COUNT);
         assert!(numbers.is_sorted());
@@ -85,6 +100,30 @@ mod tests {
         let square = numbers.iter().map(|x| x * x).sum::<f64>() / 4096.0;
         assert!(mean.abs() < 30.0, "{mean}");
         assert!((square.sqrt() / SCALE - 1.0).abs() < 0.01, "{square}");
+    }
+
+    #[test]
+    fn a_table_says_how_far_its_mean_may_be_off() {
+        let told = |bounds: [u64; 2]| {
+            let mut delay_ns = 1_000_000;
+            let records = bounds.map(|bound_ns| {
+                delay_ns += 500_000;
+                TraceRecord::published(0, 0, 1).delivered(delay_ns, bound_ns)
+            });
+            let trace = Trace {
+                header: TraceHeader::new("a/b"),
+                records: records.to_vec(),
+            };
+            let table = table(&trace).unwrap();
+            let line = table.text.lines().nth(1).unwrap().to_owned();
+            (table.bound_ns, line)
+        };
+        let (bound_ns, line) = told([40_000, 90_000]);
+        assert_eq!(bound_ns, Some(90_000));
+        assert_eq!(line, "# both within 90.000us by the clocks");
+        assert_eq!(told([0, 0]).1, "# both delays measured on one clock");
+        let (bound_ns, line) = told([0, crate::trace::UNBOUNDED_NS]);
+        assert!(bound_ns.is_none() && line.ends_with("is unknown"), "{line}");
     }
 
     #[test]

@@ -11,6 +11,9 @@ use super::{Trace, TraceFate, TraceHeader, TraceRecord};
 /// Bytes of one opportunity.
 pub const OPPORTUNITY_BYTES: u64 = 1500;
 
+/// Most opportunities of a text: what 2^24 messages of one packet make, the most of a run's trace.
+pub const OPPORTUNITY_COUNT_MAX: u64 = 1 << 24;
+
 const MS_NS: i64 = 1_000_000;
 
 /// What this form does not keep of a trace.
@@ -22,21 +25,58 @@ pub const ENCODE_LOSS: &str = "kept: the millisecond of each arrival, one opport
 pub const DECODE_LOSS: &str = "one message of 1500 bytes is published and delivered at once at each \
      opportunity: the trace has the rate of the link, and neither delay nor loss";
 
+/// Why a trace has no opportunities.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum OpportunityError {
+    /// No message has a known arrival.
+    #[error("no message has a known arrival, so there is no opportunity")]
+    None,
+    /// The messages are too long, or too many.
+    #[error(
+        "record {index} of {size_bytes} bytes makes it {count} opportunities of \
+         {OPPORTUNITY_BYTES} bytes, at most {OPPORTUNITY_COUNT_MAX}"
+    )]
+    TooMany {
+        /// The first record beyond the bound, from 0.
+        index: usize,
+        /// Its size.
+        size_bytes: u32,
+        /// Opportunities up to it.
+        count: u64,
+    },
+}
+
 /// The opportunities of `trace`: the arrivals of its delivered messages, from the first departure
-/// on. `None` when none has a known arrival.
-pub fn encode(trace: &Trace) -> Option<String> {
-    let origin_ns = trace.records.first()?.departure_ns;
-    let delivered = trace.records.iter();
-    let delivered = delivered.filter(|record| record.fate == TraceFate::Delivered);
-    let mut arrivals: Vec<(i64, u64)> = delivered
-        .filter_map(|record| {
-            let arrival_ns = record.departure_ns.saturating_add(record.delay()?);
-            let packets = u64::from(record.size_bytes).div_ceil(OPPORTUNITY_BYTES);
-            Some((arrival_ns.saturating_sub(origin_ns).max(0), packets.max(1)))
-        })
-        .collect();
+/// on.
+///
+/// # Errors
+/// [`OpportunityError`].
+pub fn encode(trace: &Trace) -> Result<String, OpportunityError> {
+    let origin_ns = trace.records.first().map_or(0, |first| first.departure_ns);
+    let mut arrivals: Vec<(i64, u64)> = Vec::new();
+    let mut count = 0;
+    for (index, record) in trace.records.iter().enumerate() {
+        let delay = record
+            .delay()
+            .filter(|_| record.fate == TraceFate::Delivered);
+        let Some(delay_ns) = delay else {
+            continue;
+        };
+        let size_bytes = record.size_bytes;
+        let packets = u64::from(size_bytes).div_ceil(OPPORTUNITY_BYTES).max(1);
+        count += packets;
+        if count > OPPORTUNITY_COUNT_MAX {
+            return Err(OpportunityError::TooMany {
+                index,
+                size_bytes,
+                count,
+            });
+        }
+        let arrival_ns = record.departure_ns.saturating_add(delay_ns);
+        arrivals.push((arrival_ns.saturating_sub(origin_ns).max(0), packets));
+    }
     if arrivals.is_empty() {
-        return None;
+        return Err(OpportunityError::None);
     }
     arrivals.sort_unstable();
     let mut text = String::new();
@@ -45,7 +85,7 @@ pub fn encode(trace: &Trace) -> Option<String> {
             let _infallible = writeln!(text, "{}", at_ns / MS_NS);
         }
     }
-    Some(text)
+    Ok(text)
 }
 
 /// The trace of a text; see [`DECODE_LOSS`].
@@ -126,7 +166,17 @@ mod tests {
             records: vec![lost],
             ..trace
         };
-        assert_eq!(encode(&none), None);
+        assert_eq!(encode(&none), Err(OpportunityError::None));
+        let mut huge = Trace {
+            records: vec![at(0, 1).delivered(0, 0); 8],
+            ..none
+        };
+        for record in &mut huge.records {
+            record.size_bytes = u32::MAX;
+        }
+        let error = encode(&huge).unwrap_err().to_string();
+        let start = "record 5 of 4294967295 bytes makes it 17179872 opportunities";
+        assert!(error.starts_with(start), "{error}");
     }
 
     #[test]

@@ -41,7 +41,7 @@ pub struct Decoded {
 /// The bytes of `trace`.
 ///
 /// # Errors
-/// [`EncodeError`].
+/// [`EncodeError`], for whatever [`decode`] would refuse or read otherwise.
 pub fn encode(trace: &Trace) -> Result<Vec<u8>, EncodeError> {
     if let Some(index) = trace.first_out_of_order() {
         return Err(EncodeError::OutOfOrder { index });
@@ -53,6 +53,7 @@ pub fn encode(trace: &Trace) -> Result<Vec<u8>, EncodeError> {
     let mut bytes = Vec::with_capacity(HEADER_BYTES + count * RECORD_BYTES);
     bytes.extend_from_slice(&encode_header(&trace.header, count as u64)?);
     for (record, index) in trace.records.iter().zip(0_u32..) {
+        check_record(record).map_err(|(_, what)| EncodeError::Record { index, what })?;
         bytes.extend_from_slice(&encode_record(record, index));
     }
     Ok(bytes)
@@ -88,6 +89,10 @@ fn encode_header(header: &TraceHeader, count: u64) -> Result<[u8; HEADER_BYTES],
                 length,
                 limit,
             });
+        }
+        // Zeros end a name when it is read.
+        if name.bytes().any(|byte| byte == 0) {
+            return Err(EncodeError::NameWithNul { what });
         }
         put(&mut bytes, at, name.as_bytes());
     }

@@ -234,3 +234,77 @@ fn mutated_traces_keep_their_whole_records_and_never_panic() {
     }
     assert!(fault_count > 100_000, "{fault_count}");
 }
+
+#[test]
+fn what_would_not_be_read_is_not_written() {
+    let refused = |change: &dyn Fn(&mut Trace)| {
+        let mut trace = sample();
+        change(&mut trace);
+        encode(&trace).unwrap_err().to_string()
+    };
+    for (change, says) in [
+        (
+            &(|trace: &mut Trace| trace.header.link = "h\0p".to_owned()) as &dyn Fn(&mut Trace),
+            "the name of the link has a NUL",
+        ),
+        (
+            &|trace| trace.header.run = "x".repeat(97),
+            "the name of the run has 97 bytes, at most 96",
+        ),
+        (
+            &|trace| trace.records[2].flags = 64,
+            "record 2: flags is 64, allowed are 0..=31",
+        ),
+        (
+            &|trace| trace.records[1].delay_ns = 5,
+            "record 1: delay_ns is 5, allowed are none for a message that never arrived",
+        ),
+        (
+            &|trace| trace.records[1].bound_ns = 5,
+            "record 1: bound_ns is 5, allowed are none without a delay",
+        ),
+        (
+            &|trace| trace.records[0].published_ns = UNAVAILABLE_NS,
+            "record 0: published_ns",
+        ),
+        (
+            &|trace| trace.records[1].published_ns = -1,
+            "record 1 was published before",
+        ),
+    ] {
+        let text = refused(change);
+        assert!(text.starts_with(says), "{text}");
+    }
+}
+
+#[test]
+fn whatever_is_written_is_read_as_it_was() {
+    let seed = 12;
+    let mut random = RandomStream::new(seed, "records");
+    let mut written_count = 0;
+    for case in 0..20_000 {
+        let mut trace = sample();
+        let number = random.next_u64();
+        let record = &mut trace.records[usize::try_from(number % 4).unwrap()];
+        match number >> 8 & 7 {
+            0 => record.flags = number.to_le_bytes()[7],
+            1 => record.delay_ns = random.next_u64().cast_signed(),
+            2 => record.bound_ns = random.next_u64() % 3,
+            3 => record.fate = TraceFate::ALL[usize::from(number.to_le_bytes()[7] % 5)],
+            4 => record.published_ns = (random.next_u64() % 50_000_000).cast_signed(),
+            5 => record.second_delay_ns = UNAVAILABLE_NS,
+            6 => trace.header.clock = "µ\0x".chars().take(case % 4).collect(),
+            _ => record.start = number.to_le_bytes()[7].into(),
+        }
+        if let Ok(bytes) = encode(&trace) {
+            let read = decode(&bytes).unwrap();
+            assert_eq!(
+                (read.trace, read.fault),
+                (trace, None),
+                "seed {seed}, case {case}"
+            );
+            written_count += 1;
+        }
+    }
+    assert!((5_000..19_000).contains(&written_count), "{written_count}");
+}

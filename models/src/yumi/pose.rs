@@ -17,6 +17,11 @@ pub struct Pose {
     pub quaternion_wxyz: [f64; 4],
 }
 
+crate::layout!(Pose {
+    position_m,
+    quaternion_wxyz
+});
+
 impl Pose {
     /// Largest magnitude of any number of a pose: far beyond any robot or person, far below
     /// where arithmetic overflows.

@@ -3,10 +3,11 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use hil_models::clock::{ClockMap, ClockSettings, Exchange, Requester};
+use hil_models::clock::{ClockFigures, ClockMap, ClockSettings, Exchange, Requester};
 use hil_models::measure::account::ChannelPath;
 use hil_models::time::{Alignment, Instant, RemoteInstant};
 
+use super::clock_path;
 use super::records::RunRecords;
 use crate::clock_discipline::{self, HostDiscipline};
 use crate::report::clock_summary::{ClockRung, ClockSection, DisciplinedOffset, HostPairClock};
@@ -91,7 +92,8 @@ impl HostClocks {
     }
 
     /// The earliest of several hosts' instants, on the clock of `host`; `None` unless all of them
-    /// convert.
+    /// convert. Gateways may begin to exchange clocks long after the run began, so instants before
+    /// the exchanges convert, too. Its error shifts all times since the start alike.
     pub(super) fn earliest_on<'a>(
         &self,
         host: &str,
@@ -100,7 +102,7 @@ impl HostClocks {
         let mut earliest: Option<Instant> = None;
         for (from, instant) in instants {
             let remote = RemoteInstant::from_ns(instant.as_ns());
-            let (here, _) = self.path(from, host).localise(remote)?;
+            let (here, _) = self.path(from, host).localise_beyond(remote)?;
             earliest = Some(earliest.map_or(here, |known| known.min(here)));
         }
         earliest
@@ -115,6 +117,17 @@ impl HostClocks {
         pairs.all(|(from, to)| self.path(from, to).is_aligned())
     }
 
+    /// Hosts that exchanges relate, each map from the first of two to the second.
+    #[cfg(test)]
+    pub(super) fn mapped(maps: Vec<((String, String), ClockMap)>) -> Self {
+        let relations = maps.into_iter();
+        let relations = relations.map(|(hosts, map)| (hosts, Relation::Mapped(Box::new(map))));
+        Self {
+            relations: relations.collect(),
+            ..Self::default()
+        }
+    }
+
     fn relate(
         &mut self,
         (topology, result): (&Topology, &RunResult),
@@ -122,7 +135,8 @@ impl HostClocks {
         (from, to): (String, String),
     ) {
         let map = |from: &str, to: &str| {
-            let exchanges = exchanges(topology, records, (from, to));
+            let mut exchanges = exchanges(topology, records, (from, to));
+            exchanges.extend(clock_path::exchanges(topology, records, (from, to)));
             ClockMap::new(&exchanges, ClockSettings::default())
         };
         let (there, back) = (map(&from, &to), map(&to, &from));
@@ -135,8 +149,10 @@ impl HostClocks {
             exchanges: (there.figures().exchange_count > 0).then(|| there.figures().clone()),
             disciplined: disciplined.as_ref().ok().copied(),
             contradiction: None,
+            clock_path: None,
         };
         choose(&mut pair, (result.has_one_clock, &there), disciplined);
+        clock_path::compare(&mut pair, (topology, result), records);
         let (forwards, backwards) = match (pair.rung, pair.disciplined) {
             (ClockRung::Exchanges, _) => (
                 Relation::Mapped(Box::new(there)),
@@ -171,12 +187,12 @@ fn choose(
         "same boot, same time namespace: stamps compare as they are".clone_into(&mut pair.basis);
         return;
     }
-    let middle = map.figures().offset;
+    let figures = map.figures();
     match disciplined {
         Ok(offset) => {
-            pair.contradiction = middle.and_then(|exchanged| contradiction(offset, exchanged));
+            pair.contradiction = contradiction(offset, figures);
             // A daemon's word is used where it says more than causality does.
-            let exchanged_ns = map.figures().bound.map(|bound| bound.median_ns);
+            let exchanged_ns = figures.bound.map(|bound| bound.median_ns);
             if pair.contradiction.is_some() {
                 pair.rung = ClockRung::None;
                 "the rungs contradict each other".clone_into(&mut pair.basis);
@@ -191,7 +207,7 @@ fn choose(
                 );
             }
         }
-        Err(why) if middle.is_some() => {
+        Err(why) if figures.offset.is_some() => {
             pair.rung = ClockRung::Exchanges;
             pair.basis = format!("system clocks give no bound: {why}");
         }
@@ -201,21 +217,28 @@ fn choose(
     }
 }
 
-/// Why two offsets cannot both be right.
-fn contradiction(
-    offset: DisciplinedOffset,
-    exchanged: hil_models::clock::OffsetFigures,
-) -> Option<String> {
-    let lowest_ns = offset.offset_ns.saturating_sub_unsigned(offset.bound_ns);
-    let highest_ns = offset.offset_ns.saturating_add_unsigned(offset.bound_ns);
-    let is_apart = highest_ns < exchanged.lowest_ns || lowest_ns > exchanged.highest_ns;
-    is_apart.then(|| {
-        format!(
-            "the system clocks claim an offset of {lowest_ns} to {highest_ns} ns, and the \
-             exchanges prove one of {} to {} ns",
-            exchanged.lowest_ns, exchanged.highest_ns
-        )
-    })
+/// Why the system clocks and the exchanges cannot both be right: what the former claim holds for the
+/// whole run, so it must be possible in each stretch between steps.
+fn contradiction(claimed: DisciplinedOffset, exchanges: &ClockFigures) -> Option<String> {
+    let lowest_ns = claimed.offset_ns.saturating_sub_unsigned(claimed.bound_ns);
+    let highest_ns = claimed.offset_ns.saturating_add_unsigned(claimed.bound_ns);
+    let stretches = &exchanges.stretch_offsets;
+    let mut apart = stretches
+        .iter()
+        .filter(|one| highest_ns < one.lowest_ns || lowest_ns > one.highest_ns);
+    let first = apart.next()?;
+    let place = match stretches.len() {
+        1 => String::new(),
+        count => format!(
+            " in {} of the {count} stretches between steps of a clock",
+            1 + apart.count()
+        ),
+    };
+    Some(format!(
+        "the system clocks claim an offset of {lowest_ns} to {highest_ns} ns, and the exchanges prove \
+         one of {} to {} ns{place}",
+        first.lowest_ns, first.highest_ns
+    ))
 }
 
 /// Both hosts' system clocks follow one reference, so their real-time clocks are equal within both
@@ -243,7 +266,11 @@ fn disciplined(
 
 /// The exchanges of all channels between two hosts, for instants of the first on the clock of the
 /// second.
-fn exchanges(topology: &Topology, records: &RunRecords, (from, to): (&str, &str)) -> Vec<Exchange> {
+pub(super) fn exchanges(
+    topology: &Topology,
+    records: &RunRecords,
+    (from, to): (&str, &str),
+) -> Vec<Exchange> {
     let mut found = Vec::new();
     for channel in topology.channels() {
         let Some((sender, receiver)) = hosts_of(topology, channel) else {
@@ -272,4 +299,117 @@ pub(super) fn hosts_of(
     let from = &topology.process(&channel.from)?.host;
     let to = &topology.process(channel.to.as_deref()?)?.host;
     (from != to).then(|| (from.clone(), to.clone()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use hil_models::measure::record::RoundTripRecord;
+
+    /// Exchanges every 10 ms for 4 s from `from_s` on of `here`; the other clock is `ahead_ns`
+    /// ahead by then, and the way takes 100 us in either direction.
+    fn exchanges(from_s: i64, ahead_ns: impl Fn(i64) -> i64) -> Vec<Exchange> {
+        let exchange = |index: i64| {
+            let sent_ns = from_s * 1_000_000_000 + index * 10_000_000;
+            let arrived_ns = sent_ns + 100_000 + ahead_ns(index);
+            let record = RoundTripRecord {
+                sequence: 1,
+                t1_ns: sent_ns,
+                t2_ns: arrived_ns,
+                t3_ns: arrived_ns + 5_000,
+                t4_ns: sent_ns + 205_000,
+                session: 1,
+                sources: [0; 4],
+            };
+            Exchange::of(&record, Requester::Local).unwrap()
+        };
+        (0..400).map(exchange).collect()
+    }
+
+    fn chosen(map: &ClockMap, claimed: DisciplinedOffset) -> HostPairClock {
+        let mut pair = HostPairClock {
+            from: "control-pc".to_owned(),
+            to: "robot-pc".to_owned(),
+            rung: ClockRung::None,
+            basis: String::new(),
+            exchanges: None,
+            disciplined: None,
+            contradiction: None,
+            clock_path: None,
+        };
+        choose(&mut pair, (false, map), Ok(claimed));
+        pair
+    }
+
+    #[test]
+    fn a_claim_that_any_stretch_between_steps_disproves_is_contradicted() {
+        // The other clock gains 20 ms in mid-run, which the claim knows nothing of.
+        let step = |index: i64| if index < 200 { 0 } else { 20_000_000 };
+        let map = ClockMap::new(&exchanges(0, step), ClockSettings::default());
+        assert_eq!(map.figures().stretch_offsets.len(), 2);
+        for offset_ns in [0, -20_000_000] {
+            let bound_ns = 50_000;
+            let pair = chosen(
+                &map,
+                DisciplinedOffset {
+                    offset_ns,
+                    bound_ns,
+                },
+            );
+            assert_eq!(pair.rung, ClockRung::None, "{pair:?}");
+            let why = pair.contradiction.unwrap();
+            assert!(why.contains("in 1 of the 2 stretches"), "{why}");
+        }
+        // One that is wide enough for both holds, and says less than the exchanges.
+        let wide = DisciplinedOffset {
+            offset_ns: -10_000_000,
+            bound_ns: 11_000_000,
+        };
+        let pair = chosen(&map, wide);
+        assert_eq!(
+            (pair.rung, pair.contradiction),
+            (ClockRung::Exchanges, None)
+        );
+    }
+
+    #[test]
+    fn a_claim_is_taken_where_it_is_narrower_than_the_exchanges() {
+        let map = ClockMap::new(&exchanges(0, |_| 0), ClockSettings::default());
+        let claimed = |offset_ns| DisciplinedOffset {
+            offset_ns,
+            bound_ns: 2_000,
+        };
+        let pair = chosen(&map, claimed(0));
+        assert_eq!(
+            (pair.rung, pair.contradiction),
+            (ClockRung::Disciplined, None)
+        );
+        let why = chosen(&map, claimed(500_000)).contradiction.unwrap();
+        assert!(!why.contains("stretches"), "{why}");
+    }
+
+    #[test]
+    fn a_run_that_began_long_before_the_exchanges_has_one_beginning() {
+        let ahead_ns = 100_000_000_000;
+        let mut maps = Vec::new();
+        let [here, there] = ["control-pc", "robot-pc"].map(str::to_owned);
+        for (from, to, ahead_ns) in [(&there, &here, ahead_ns), (&here, &there, -ahead_ns)] {
+            let from_s = if ahead_ns > 0 { 5 } else { 105 };
+            let map = ClockMap::new(&exchanges(from_s, |_| ahead_ns), ClockSettings::default());
+            maps.push(((from.clone(), to.clone()), map));
+        }
+        let clocks = HostClocks::mapped(maps);
+        // Three seconds before the first exchange, the other host 2 ms later.
+        let start = Instant::from_ns(2_000_000_000);
+        let later = Instant::from_ns(start.as_ns() + ahead_ns + 2_000_000);
+        let remote = RemoteInstant::from_ns(start.as_ns());
+        assert_eq!(clocks.path(&here, &there).localise(remote), None);
+        let spans = [(&here, start), (&there, later)];
+        for (host, expected_ns) in [(&here, 2_000_000_000), (&there, 102_000_000_000)] {
+            let found = clocks.earliest_on(host, spans.into_iter()).unwrap();
+            assert!(found.as_ns().abs_diff(expected_ns) < 1_000, "{found:?}");
+        }
+        let alone = clocks.earliest_on("third", spans.into_iter());
+        assert_eq!(alone, None, "no clock of it is known");
+    }
 }

@@ -7,9 +7,11 @@ use hil_models::case_study::{ChannelSpec, MessageRef, Score, ScoreEvent};
 use hil_models::measure::account::{Happening, MessageFate, MessageStory, Side};
 use hil_models::time::{Instant, RemoteInstant};
 
+use super::axis::RunAxis;
 use super::clocks::HostClocks;
 use super::outages::OutageStory;
 use super::records::RunRecords;
+use crate::report::network::within;
 use crate::report::score_event::{EventOutage, ExplainedEvent, ExplainedMessage, ScoreEvents};
 use crate::report::summary::{ChannelSummary, LinkKind};
 use crate::report::terminal::duration_s;
@@ -20,7 +22,7 @@ use crate::topology::{Channel, Topology};
 pub(super) fn explained(
     score: &Score,
     run: (&Topology, &RunResult),
-    records: &RunRecords,
+    (records, axis): (&RunRecords, &RunAxis<'_>),
     channels: &[ChannelSummary],
     (specs, outages): (&[ChannelSpec], &[OutageStory]),
 ) -> ScoreEvents {
@@ -29,11 +31,12 @@ pub(super) fn explained(
         let of_channel = wanted.entry(message.channel).or_default();
         of_channel.insert((message.epoch, message.sequence));
     }
-    let (topology, result) = run;
+    let (topology, _) = run;
     let ways = wanted.iter().filter_map(|(name, wanted)| {
         let channel = topology.channel(name)?;
         let way = Way {
-            start: start_of(run, channel, records.clocks()),
+            axis,
+            host: topology.process(&channel.from).map(|one| one.host.as_str()),
             stories: if channel.is_recorded_only() {
                 BTreeMap::new()
             } else {
@@ -50,39 +53,34 @@ pub(super) fn explained(
         events: events
             .map(|event| ExplainedEvent {
                 outages: outages_before(event, (run, records.clocks()), (specs, outages), &ways),
-                ..explain(event, run, (records.clocks(), &ways))
+                ..explain(event, topology, (axis, &ways))
             })
             .collect(),
         dropped_count: score.events_dropped_count,
-        clocks_differ: !records.clocks().are_aligned(result.spans.keys()),
+        clocks_differ: axis.is_split(),
     }
 }
 
-/// Start of the run on the clock of the channel's producer. Hosts begin milliseconds apart; where
-/// their clocks are aligned, one beginning holds for all, lest an effect come before its cause.
-pub(super) fn start_of(
-    (topology, result): (&Topology, &RunResult),
-    channel: &Channel,
-    clocks: &HostClocks,
-) -> Option<Instant> {
-    start_on(result, &topology.process(&channel.from)?.host, clocks)
-}
-
-/// Start of the run on the clock of `host`; see [`start_of`].
+/// Start of the run on the clock of `host`. Hosts begin milliseconds apart; where their clocks are
+/// aligned, one beginning holds for all, lest an effect come before its cause, and a start that does not
+/// convert is unknown. Where they are not, each host counts from its own, and the report says so.
 pub(super) fn start_on(result: &RunResult, host: &str, clocks: &HostClocks) -> Option<Instant> {
     let own = result.spans.get(host).map(|span| span.0)?;
     let starts = result.spans.iter().map(|(host, span)| (host, span.0));
-    clocks.earliest_on(host, starts).or(Some(own))
+    if clocks.are_aligned(result.spans.keys()) {
+        clocks.earliest_on(host, starts)
+    } else {
+        Some(own)
+    }
 }
 
 fn explain(
     event: &ScoreEvent,
-    run: (&Topology, &RunResult),
-    (clocks, ways): (&HostClocks, &BTreeMap<&str, Way<'_>>),
+    topology: &Topology,
+    (axis, ways): (&RunAxis<'_>, &BTreeMap<&str, Way<'_>>),
 ) -> ExplainedEvent {
-    let clock_of = run.0.channel(event.clock_of);
-    let process = clock_of.and_then(|channel| run.0.process(&channel.from));
-    let start = clock_of.and_then(|channel| start_of(run, channel, clocks));
+    let clock_of = topology.channel(event.clock_of);
+    let process = clock_of.and_then(|channel| topology.process(&channel.from));
     let messages = event.messages.iter().map(|message| {
         ways.get(message.channel).map_or_else(
             || unavailable(message, "the run has no such channel"),
@@ -90,7 +88,7 @@ fn explain(
         )
     });
     ExplainedEvent {
-        at_s: start.map(|start| event.at.seconds_since(start)),
+        at_s: process.and_then(|process| axis.place_s(&process.host, event.at)),
         clock: process.map_or_else(|| "unknown".to_owned(), |process| process.host.clone()),
         severity: event.severity,
         what: event.what.clone(),
@@ -120,23 +118,25 @@ fn outages_before(
         let is_consumers = channel.to.as_deref().is_some_and(is_here);
         let on_producers_clock = host_of(&channel.from).and_then(|producers| {
             let remote = RemoteInstant::from_ns(event.at.as_ns());
-            let (at, _) = clocks.path(here, producers).localise(remote)?;
-            Some((at, Side::Producer))
+            let (at, bound_ns) = clocks.path(here, producers).localise(remote)?;
+            Some((at, Side::Producer, bound_ns))
         });
         let lost_published_ns = ways
             .get(spec.name)
             .map_or_else(Vec::new, |way| way.lost_published_ns(event));
         // A time compares only with times of its own clock.
         let sides = [
-            is_consumers.then_some((event.at, Side::Consumer)),
+            is_consumers.then_some((event.at, Side::Consumer, 0)),
             on_producers_clock,
         ];
         let mut sides = sides.into_iter().flatten().map(Some).chain([None]);
-        sides.find_map(|at| {
-            story.before(&Happening {
-                at,
+        sides.find_map(|side| {
+            let mut found = story.before(&Happening {
+                at: side.map(|(at, side, _)| (at, side)),
                 lost_published_ns: &lost_published_ns,
-            })
+            })?;
+            found.put_clock_bound(side.map_or(0, |(.., bound_ns)| bound_ns));
+            Some(found)
         })
     };
     let concerned = event.concerned_channels(specs);
@@ -153,6 +153,7 @@ fn unavailable(message: &MessageRef, why: &str) -> ExplainedMessage {
         published_at_s: None,
         fate: None,
         delay_s: None,
+        delay_bound_s: None,
         words: format!("unavailable: {why}"),
     }
 }
@@ -162,7 +163,9 @@ struct Way<'a> {
     channel: &'a Channel,
     summary: &'a ChannelSummary,
     stories: BTreeMap<(u32, u64), MessageStory>,
-    start: Option<Instant>,
+    axis: &'a RunAxis<'a>,
+    /// Of its producer.
+    host: Option<&'a str>,
 }
 
 impl Way<'_> {
@@ -176,10 +179,11 @@ impl Way<'_> {
         let published = story.published_ns.map(Instant::from_ns);
         ExplainedMessage {
             published_at_s: published
-                .zip(self.start)
-                .map(|(published, start)| published.seconds_since(start)),
+                .zip(self.host)
+                .and_then(|(published, host)| self.axis.place_s(host, published)),
             fate: Some(story.fate),
             delay_s: story.delay_ns.map(|ns| ns as f64 * 1e-9),
+            delay_bound_s: story.delay_bound_ns.map(|ns| ns as f64 * 1e-9),
             words: self.words(story),
             ..unavailable(message, "")
         }
@@ -201,12 +205,8 @@ impl Way<'_> {
             MessageFate::Taken => {
                 let how = match story.delay_ns {
                     Some(ns) => {
-                        let bound = match story.delay_bound_ns {
-                            Some(bound_ns) if bound_ns > 0 => {
-                                [" ±", &duration_s(bound_ns as f64 * 1e-9)].concat()
-                            }
-                            _ => String::new(),
-                        };
+                        let bound_ns = story.delay_bound_ns.unwrap_or(0);
+                        let bound = within(bound_ns, ns);
                         format!("delivered after {}{bound}", duration_s(ns as f64 * 1e-9))
                     }
                     None => "delivered; delay unavailable: clocks not aligned".to_owned(),

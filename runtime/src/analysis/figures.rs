@@ -6,6 +6,7 @@ use std::path::Path;
 
 use hil_models::time::Instant;
 
+use super::axis::RunAxis;
 use super::records::RunRecords;
 use crate::realtime::GrantOutcome;
 use crate::report::emulation::EmulationFigures;
@@ -60,6 +61,11 @@ pub(super) fn run_facts(
         seed: topology.run().seed,
         host: result.own_hosts.join(", "),
         started: result.started.clone(),
+        starts_ns: result
+            .spans
+            .iter()
+            .map(|(host, (start, _))| (host.clone(), start.as_ns()))
+            .collect(),
         duration_s: own_span(result).map_or(0.0, |(start, end)| end.seconds_since(start)),
         outcome,
         exit_reason: result.outcome.reason(),
@@ -147,16 +153,13 @@ pub(super) fn process_summary(process: &ProcessStory) -> ProcessSummary {
     }
 }
 
-pub(super) fn run_event(result: &RunResult, event: &Event) -> RunEvent {
+pub(super) fn run_event(axis: &RunAxis<'_>, event: &Event) -> RunEvent {
     let gap = event.interruption.map(|gap| match gap.until {
         Some(until) => format!("away for {:.0} ms", until.seconds_since(gap.from) * 1e3),
         None => "never came back".to_owned(),
     });
     RunEvent {
-        at_s: result
-            .spans
-            .get(&event.host)
-            .map_or(0.0, |(start, _)| event.at.seconds_since(*start)),
+        at_s: axis.shown_s(&event.host, event.at),
         what: format!("{}: {}", event.process, event.what),
         cause: gap.unwrap_or_default(),
     }
@@ -170,6 +173,11 @@ pub(super) fn channel_summary(
 ) -> ChannelSummary {
     let crossing = topology.crossing(channel);
     let directions = directions(result, &channel.name);
+    let reports = result.processes.iter().flat_map(|one| &one.report);
+    let trace_replay = reports
+        .flat_map(|report| &report.directions)
+        .filter(|direction| direction.channel == channel.name)
+        .find_map(|direction| direction.replay);
     let refusals = directions
         .iter()
         .flat_map(|direction| &direction.counters)
@@ -202,6 +210,7 @@ pub(super) fn channel_summary(
             .then(|| records.account(topology, result, channel)),
         outages: None,
         emulation: EmulationFigures::of(records.arrivals(&channel.name), overflow_count),
+        trace_replay,
         recorded: channel
             .is_recorded_only()
             .then(|| records.recorded(&channel.name))

@@ -1,7 +1,9 @@
 //! From the records of a finished run to its summary: reads the record files, draws up the
 //! account of each channel, and lets the case score what the robot did.
 
+mod axis;
 mod cards;
+mod clock_path;
 mod clocks;
 mod events;
 mod faces;
@@ -10,6 +12,8 @@ pub(crate) mod network;
 pub(crate) mod outages;
 mod radio;
 pub(crate) mod records;
+mod robot_series;
+mod score_clock;
 
 use std::fs;
 use std::io;
@@ -19,6 +23,7 @@ use hil_models::case_study::Score;
 use hil_models::measure::account::MessageFate;
 use hil_models::plot::PlotSeries;
 
+use axis::RunAxis;
 use clocks::HostClocks;
 use figures::{channel_summary, process_summary, realtime_facts, run_event, run_facts};
 use outages::OutageStory;
@@ -57,11 +62,12 @@ pub(crate) fn conclude(
     (topology_file, command_line): (&Path, &[String]),
 ) -> Result<RunSummary, AnalysisError> {
     let mut records = RunRecords::read(&result.folder.records())?;
-    if !result.has_one_clock {
-        records.set_clocks_differ();
-    }
     let clocks = HostClocks::of(topology, result, &records);
     records.set_clocks(clocks);
+    let case = registry.make_case(topology)?;
+    let unscored = score_clock::apply(&mut records, (topology, result), case.as_ref());
+    let score_host = score_clock::host(topology, case.as_ref());
+    let axis = RunAxis::of(records.clocks(), &result.spans, score_host);
     let mut summary = RunSummary::new(run_facts(topology, result, topology_file, command_line));
     summary.host_facts = result
         .facts
@@ -77,7 +83,7 @@ pub(crate) fn conclude(
     summary.events = result
         .events
         .iter()
-        .map(|event| run_event(result, event))
+        .map(|event| run_event(&axis, event))
         .collect();
     summary.channels = topology
         .channels()
@@ -87,8 +93,7 @@ pub(crate) fn conclude(
     capture::write(&mut summary, (topology, result), &records);
     summary.faces = faces::face_summaries(topology, result, &records);
     summary.hardware_stamps = cards::hardware_stamps(topology, result, &records);
-    let outages = add_outages(&mut summary, (topology, result), &records);
-    let case = registry.make_case(topology)?;
+    let outages = add_outages(&mut summary, (topology, result), (&records, &axis));
     let (specs, score) = match &case {
         Some((entry, case)) => (entry.channels, case.score(records.log())),
         None => (&[][..], Score::default()),
@@ -97,21 +102,22 @@ pub(crate) fn conclude(
     summary.score_events = events::explained(
         &score,
         (topology, result),
-        &records,
+        (&records, &axis),
         &summary.channels,
         (specs, &outages),
     );
     let errors = case.as_ref().map(|(_, case)| case.errors(records.log()));
     let network = network::of_run(
         (topology, result),
-        &records,
+        (&records, &axis),
         errors.unwrap_or_default(),
         (&mut summary.score_events, &mut summary.warnings),
     );
     let (network, network_series) = network.unzip();
     summary.network = network;
-    radio::add(&mut summary, (topology, result), &records);
+    radio::add(&mut summary, (topology, result), (&records, &axis));
     add_warnings(&mut summary, result, &records);
+    summary.warnings.extend(unscored);
     let case = case.as_ref().map(|(_, case)| case.as_ref());
     let network_series = network_series.unwrap_or_default();
     write_series(&mut summary, result, (case, network_series), records);
@@ -129,14 +135,14 @@ pub(crate) fn conclude(
 fn add_outages(
     summary: &mut RunSummary,
     run: (&Topology, &RunResult),
-    records: &RunRecords,
+    (records, axis): (&RunRecords, &RunAxis<'_>),
 ) -> Vec<OutageStory> {
     let mut stories = Vec::new();
     for (summary, channel) in summary.channels.iter_mut().zip(run.0.channels()) {
         let unknown = MessageFate::UnknownPeerRecordsUnavailable;
         let fates = summary.account.as_ref().map(|account| &account.fates);
         let is_partial = fates.is_some_and(|fates| fates.of(unknown) > 0);
-        if let Some(story) = OutageStory::of(run, channel, records, is_partial) {
+        if let Some(story) = OutageStory::of(run, channel, (records, axis), is_partial) {
             summary.outages = story.figures();
             stories.push(story);
         }
@@ -192,6 +198,9 @@ fn add_warnings(summary: &mut RunSummary, result: &RunResult, records: &RunRecor
         }
     }
     summary.warnings.extend(records.clocks().warnings());
+    let pairs = &records.clocks().section().pairs;
+    let paths = pairs.iter().filter_map(clock_path::warning);
+    summary.warnings.extend(paths);
 }
 
 /// Width of `report.txt`.

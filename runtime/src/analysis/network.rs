@@ -4,20 +4,22 @@
 
 use std::collections::BTreeSet;
 
-use hil_models::case_study::{ErrorSeries, Severity};
+use hil_models::case_study::ErrorSeries;
 use hil_models::measure::account::{Side, passages};
 use hil_models::measure::correlation::{self, LagWindow};
 use hil_models::measure::network::{
-    NetworkBin, NetworkBins, NetworkContext, NetworkEvent, NetworkEventKind, NetworkFigures,
-    Passage, SeriesSpan, bin_width_ns, clock_steps, interruptions, network_events,
+    Moment, NetworkBin, NetworkBins, NetworkContext, NetworkEvent, NetworkEventKind,
+    NetworkFigures, Passage, Place, bin_width_ns, clock_steps, interruptions, network_events,
 };
 use hil_models::measure::record::IngressRecord;
 use hil_models::plot::PlotSeries;
 use hil_models::random::RandomStream;
-use hil_models::time::Instant;
 
-use super::events::{start_of, start_on};
+use super::axis::RunAxis;
+use super::events::start_on;
 use super::records::RunRecords;
+pub(crate) use super::robot_series::RobotSeries;
+use super::robot_series::{index_of, without_holes};
 use crate::report::network::{
     ChannelNetwork, Correlation, CorrelationTests, FOREGOING_S, ForegoingEvent, ForegoingNetwork,
     NetworkReport, TestedPair, TimedEvent, Timeline, TimelineRow,
@@ -44,88 +46,23 @@ pub(crate) struct ChannelPassages<'a> {
     pub(crate) passages: &'a [Passage],
     /// What the passages alone do not show.
     pub(crate) other_events: Vec<NetworkEvent>,
-    pub(crate) span: SeriesSpan,
+    pub(crate) duration_ns: i64,
+    /// Puts moments of its hosts on the run's axis.
+    pub(crate) place: &'a Place<'a>,
     pub(crate) context: NetworkContext<'a>,
 }
 
-/// What the robot did, on the run's axis.
-#[derive(Debug)]
-pub(crate) struct RobotSeries {
-    label: String,
-    unit: &'static str,
-    /// Seconds after the start of the run, and magnitude; in order of time.
-    samples: Vec<(f64, f64)>,
+/// How the hosts' clocks stand to each other on the run's axis.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct AxisClocks {
+    /// How far instants of two hosts, or of a host and the score, may lie off each other, seconds; `None`
+    /// when the clocks are not aligned.
+    pub(crate) bound_s: Option<f64>,
 }
 
-impl RobotSeries {
-    /// A case's error; `start` is that of the run on the clock of its samples.
-    pub(crate) fn of(errors: ErrorSeries, start: Instant) -> Self {
-        let samples = errors.samples.into_iter();
-        Self {
-            label: errors.label.to_owned(),
-            unit: errors.unit,
-            samples: samples
-                .map(|(at, value)| (at.seconds_since(start), value))
-                .collect(),
-        }
-    }
-
-    /// The events of a score that matter: one for each.
-    fn of_events(all: &ScoreEvents) -> Self {
-        let is_grave = |severity| severity > Severity::Notice;
-        let has_grave = all.events.iter().any(|event| is_grave(event.severity));
-        let chosen = all
-            .events
-            .iter()
-            .filter(|event| !has_grave || is_grave(event.severity));
-        let mut samples: Vec<_> = chosen
-            .filter_map(|event| Some((event.at_s?, 1.0)))
-            .collect();
-        samples.sort_by(|a, b| a.0.total_cmp(&b.0));
-        let label = if has_grave {
-            "incidents and hazards"
-        } else {
-            "events of the score"
-        };
-        Self {
-            label: label.to_owned(),
-            unit: "1",
-            samples,
-        }
-    }
-
-    /// Per bin: how many, or the largest, which holds until there is another.
-    fn binned(&self, width_s: f64, count: usize, is_count: bool) -> Vec<f64> {
-        let mut bins = vec![None; count];
-        for (at_s, value) in &self.samples {
-            let Some(bin) = index_of(at_s / width_s).and_then(|index| bins.get_mut(index)) else {
-                continue;
-            };
-            let known: f64 = bin.unwrap_or(0.0);
-            *bin = Some(if is_count {
-                known + value
-            } else {
-                known.max(*value)
-            });
-        }
-        let mut held = 0.0;
-        let held_or = |bin: Option<f64>| {
-            held = bin.unwrap_or(if is_count { 0.0 } else { held });
-            held
-        };
-        bins.into_iter().map(held_or).collect()
-    }
-}
-
-#[allow(
-    clippy::cast_possible_truncation,
-    clippy::cast_sign_loss,
-    reason = "the value is checked to lie in 0..2^32"
-)]
-fn index_of(bin: f64) -> Option<usize> {
-    (0.0..4_294_967_296.0)
-        .contains(&bin)
-        .then_some(bin as usize)
+impl AxisClocks {
+    /// All hosts read one clock.
+    pub(crate) const ONE: Self = Self { bound_s: Some(0.0) };
 }
 
 /// A network under way of being put together, channel by channel, so that the passages of only
@@ -137,6 +74,9 @@ pub(crate) struct NetworkBuilder {
     bins: Vec<(String, NetworkBins)>,
     /// Processes whose time without them is told already.
     told: BTreeSet<(String, i64)>,
+    /// Events and messages without a place on the run's axis.
+    unplaced_event_count: u64,
+    unplaced_message_count: u64,
 }
 
 impl NetworkBuilder {
@@ -150,34 +90,50 @@ impl NetworkBuilder {
         let mut events = network_events(one.passages);
         events.extend(one.other_events);
         for event in events {
-            self.add_event(one.channel, event, one.span);
+            self.add_event(one.channel, event, (one.duration_ns, one.place));
         }
-        let width_ns = bin_width_ns(one.span.duration_ns);
-        let bins = NetworkBins::of(one.passages, one.span, width_ns);
+        let width_ns = bin_width_ns(one.duration_ns);
+        let bins = NetworkBins::of(one.passages, (one.duration_ns, width_ns), one.place);
+        self.unplaced_message_count += bins.unplaced_count;
         self.bins.push((one.channel.to_owned(), bins));
     }
 
-    fn add_event(&mut self, channel: &str, event: NetworkEvent, span: SeriesSpan) {
+    fn add_event(
+        &mut self,
+        channel: &str,
+        event: NetworkEvent,
+        (duration_ns, place): (i64, &Place<'_>),
+    ) {
         if let NetworkEventKind::ProcessDown { process, .. } = &event.kind
             && !self.told.insert((process.clone(), event.from.ns))
         {
             return;
         }
-        let start_ns = match event.from.side {
-            Side::Producer => span.producer_start_ns,
-            Side::Consumer => span.consumer_start_ns,
+        let side = event.from.side;
+        let since_s = |ns: i64| Some(place(Moment { side, ns })? as f64 * 1e-9);
+        let until_s = event.until_ns.map(since_s);
+        let (Some(from_s), None | Some(Some(_))) = (since_s(event.from.ns), until_s) else {
+            self.unplaced_event_count += 1;
+            return;
         };
-        let since_s = |ns: i64| ns.saturating_sub(start_ns) as f64 * 1e-9;
-        let end_s = span.duration_ns as f64 * 1e-9;
+        let end_s = duration_ns as f64 * 1e-9;
         self.events.push(TimedEvent {
             channel: channel.to_owned(),
-            from_s: since_s(event.from.ns),
-            until_s: event
-                .until_ns
-                .map(since_s)
-                .filter(|until_s| *until_s < end_s),
+            from_s,
+            until_s: until_s.flatten().filter(|until_s| *until_s < end_s),
             kind: event.kind,
         });
+    }
+
+    /// What a reader must know of what has no place on the axis.
+    fn unplaced(&self) -> Option<String> {
+        let (events, messages) = (self.unplaced_event_count, self.unplaced_message_count);
+        (events + messages > 0).then(|| {
+            format!(
+                "network: {events} events and {messages} messages are in no series and before no event \
+                 of the score: beside a step of a clock their times do not convert"
+            )
+        })
     }
 
     /// The report, and the series of every channel; `None` when no channel crossed a network. Puts
@@ -186,13 +142,15 @@ impl NetworkBuilder {
         mut self,
         score: &mut ScoreEvents,
         errors: Vec<RobotSeries>,
-        (seed, clocks_differ): (u64, bool),
+        (seed, axis): (u64, AxisClocks),
     ) -> Option<(NetworkReport, Vec<PlotSeries>)> {
         let (_, first) = self.bins.first()?;
         let (width_s, count) = (first.width_ns as f64 * 1e-9, first.bins.len());
+        // Without an alignment nothing is known to widen by; the report says so.
+        let bound_s = axis.bound_s.unwrap_or(0.0);
         self.events.sort_by(|a, b| a.from_s.total_cmp(&b.from_s));
         for event in &mut score.events {
-            event.network = event.at_s.map(|at_s| self.before(at_s));
+            event.network = event.at_s.map(|at_s| self.before(at_s, bound_s));
         }
         let mut robot = vec![(RobotSeries::of_events(score), true)];
         robot.extend(errors.into_iter().map(|one| (one, false)));
@@ -207,8 +165,9 @@ impl NetworkBuilder {
         let dropped = self.events.len().saturating_sub(EVENTS_MAX);
         let report = NetworkReport {
             foregoing_s: FOREGOING_S,
-            foregoing_chance_ratio: covered_s(&self.events, run_s) / run_s,
-            clocks_differ,
+            foregoing_chance_ratio: covered_s(&self.events, (run_s, bound_s)) / run_s,
+            clocks_differ: axis.bound_s.is_none(),
+            clock_bound_s: axis.bound_s,
             timeline: timeline(&self.bins, &robot, width_s),
             correlation: correlate(&self.bins, &robot, (width_s, seed)),
             events: self.events.into_iter().take(EVENTS_MAX).collect(),
@@ -228,18 +187,19 @@ impl NetworkBuilder {
     }
 
     /// What the network went through before `at_s`, nearest first.
-    fn before(&self, at_s: f64) -> ForegoingNetwork {
+    fn before(&self, at_s: f64, clock_bound_s: f64) -> ForegoingNetwork {
         let mut found: Vec<(f64, &TimedEvent)> = self
             .events
             .iter()
-            .filter_map(|event| Some((event.over_for_s(at_s)?, event)))
+            .filter_map(|event| Some((event.over_for_s(at_s, clock_bound_s)?, event)))
             .collect();
         // Of those under way the one that began first weighs most.
         found.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.from_s.total_cmp(&b.1.from_s)));
         let lost = |bins: &NetworkBins| {
             let width_s = bins.width_ns as f64 * 1e-9;
-            let first = index_of((at_s - FOREGOING_S).max(0.0) / width_s).unwrap_or(0);
-            let last = index_of(at_s / width_s).map_or(0, |last| last + 1);
+            let from_s = at_s - FOREGOING_S - clock_bound_s;
+            let first = index_of(from_s.max(0.0) / width_s).unwrap_or(0);
+            let last = index_of((at_s + clock_bound_s) / width_s).map_or(0, |last| last + 1);
             let within = bins.bins.iter().take(last).skip(first);
             within.map(|bin| bin.lost_count).sum::<u64>()
         };
@@ -257,11 +217,12 @@ impl NetworkBuilder {
 }
 
 /// How much of the run has an event in the time looked at before it.
-fn covered_s(events: &[TimedEvent], run_s: f64) -> f64 {
+fn covered_s(events: &[TimedEvent], (run_s, clock_bound_s): (f64, f64)) -> f64 {
     let (mut covered_s, mut until_s) = (0.0, 0.0_f64);
     for event in events {
-        let from_s = event.from_s.clamp(until_s, run_s);
-        let end_s = event.until_s.map_or(run_s, |end_s| end_s + FOREGOING_S);
+        let from_s = (event.from_s - clock_bound_s).clamp(until_s, run_s);
+        let after_s = FOREGOING_S + clock_bound_s;
+        let end_s = event.until_s.map_or(run_s, |end_s| end_s + after_s);
         let end_s = end_s.clamp(from_s, run_s);
         covered_s += end_s - from_s;
         until_s = until_s.max(end_s);
@@ -286,6 +247,12 @@ fn trouble(bin: &NetworkBin, index: usize) -> Option<f64> {
     }
 }
 
+/// Largest error of any delay in the bins; `None` without delays.
+fn delay_bound_s(bins: &NetworkBins) -> Option<f64> {
+    let bounds = bins.bins.iter().filter_map(|bin| bin.delay_bound_ns);
+    bounds.max().map(|ns| ns as f64 * 1e-9)
+}
+
 /// True for a channel with less than a message per bin: its silence is nobody's trouble, as nobody
 /// speaks.
 fn speaks_seldom(bins: &NetworkBins) -> bool {
@@ -304,6 +271,7 @@ fn timeline(all: &[(String, NetworkBins)], robot: &RobotBins, width_s: f64) -> T
         what: what.to_owned(),
         unit: unit.to_owned(),
         values: values.chunks(per_step).map(largest).collect(),
+        bound: None,
     };
     let mut rows = Vec::new();
     for (channel, bins) in all {
@@ -312,12 +280,16 @@ fn timeline(all: &[(String, NetworkBins)], robot: &RobotBins, width_s: f64) -> T
                 continue;
             }
             let values = bins.bins.iter().map(|bin| trouble(bin, index));
-            rows.push(row(channel, what, unit, values.collect()));
+            let bound = (*what == "delay").then(|| delay_bound_s(bins)).flatten();
+            rows.push(TimelineRow {
+                bound,
+                ..row(channel, what, unit, values.collect())
+            });
         }
     }
     for (one, bins) in robot {
         let values = bins.iter().map(|value| Some(*value)).collect();
-        rows.push(row("robot", &one.label, one.unit, values));
+        rows.push(row("robot", one.label(), one.unit(), values));
     }
     Timeline {
         step_s: per_step as f64 * width_s,
@@ -337,13 +309,8 @@ fn correlate(
             if *what == "silence" && speaks_seldom(bins) {
                 continue;
             }
-            let mut held = 0.0;
-            let values = bins.bins.iter().map(|bin| {
-                // What is unknown where nothing arrived goes on as it was.
-                held = trouble(bin, index).unwrap_or(held);
-                held
-            });
-            causes.push(values.collect());
+            let values = bins.bins.iter().map(|bin| trouble(bin, index));
+            causes.push(without_holes(values.collect()));
             names.push((channel, *network));
         }
     }
@@ -368,7 +335,7 @@ fn correlate(
             pairs.extend(pair.map(|correlation| TestedPair {
                 channel: (*channel).clone(),
                 network: (*network).to_owned(),
-                robot: one.label.clone(),
+                robot: one.label().to_owned(),
                 lag_s: correlation.lag_bins as f64 * width_s,
                 correlation,
             }));
@@ -386,7 +353,7 @@ fn correlate(
     let constant_effects = robot
         .iter()
         .filter(|(_, values)| is_constant(values))
-        .map(|(one, _)| one.label.clone());
+        .map(|(one, _)| one.label().to_owned());
     Correlation::Tested(CorrelationTests {
         bin_s: width_s,
         lead_max_s: tested.window.lead_max as f64 * width_s,
@@ -401,34 +368,41 @@ fn correlate(
 /// Everything the records of a live run say of its network; see [`NetworkBuilder::finish`].
 pub(super) fn of_run(
     run: (&Topology, &RunResult),
-    records: &RunRecords,
+    (records, axis): (&RunRecords, &RunAxis<'_>),
     errors: Vec<ErrorSeries>,
     (score, warnings): (&mut ScoreEvents, &mut Vec<String>),
 ) -> Option<(NetworkReport, Vec<PlotSeries>)> {
-    let (topology, result) = run;
+    let (topology, _) = run;
     let mut builder = NetworkBuilder::default();
     for channel in topology.channels() {
         if topology.crossing(channel).is_some() && records.has(&channel.name) {
-            let added = add_channel(&mut builder, run, records, channel);
+            let added = add_channel(&mut builder, run, (records, axis), channel);
             warnings.extend(added.err().map(|missing| {
                 let name = &channel.name;
                 format!("{name}: left out of the network's figures: {missing}")
             }));
         }
     }
+    warnings.extend(builder.unplaced());
     let errors = errors.into_iter().filter_map(|one| {
-        let start = start_of(run, topology.channel(one.clock_of)?, records.clocks())?;
-        Some(RobotSeries::of(one, start))
+        let host = &topology
+            .process(&topology.channel(one.clock_of)?.from)?
+            .host;
+        Some(RobotSeries::of(one, |at| axis.place_s(host, at)))
     });
-    let seed = topology.run().seed;
-    let clocks_differ = !records.clocks().are_aligned(result.spans.keys());
-    builder.finish(score, errors.collect(), (seed, clocks_differ))
+    let errors = errors.collect();
+    // The stamps that events and errors were made of may have been brought to the score's clock.
+    axis.note_score(records.log().stamp_bound_ns());
+    let clocks = AxisClocks {
+        bound_s: axis.bound_ns().map(|ns| ns as f64 * 1e-9),
+    };
+    builder.finish(score, errors, (topology.run().seed, clocks))
 }
 
 fn add_channel(
     builder: &mut NetworkBuilder,
     run: (&Topology, &RunResult),
-    records: &RunRecords,
+    (records, axis): (&RunRecords, &RunAxis<'_>),
     channel: &Channel,
 ) -> Result<(), String> {
     let (topology, result) = run;
@@ -437,23 +411,25 @@ fn add_channel(
         let host = topology.process(process).map(|process| &process.host);
         host.map_or("", |host| host.as_str())
     });
-    let within = |host: &str| {
-        let span = start_on(result, host, records.clocks()).zip(result.spans.get(host));
-        let missing = || format!("when the run began and ended on host {host} is unavailable");
-        span.map(|(start, (_, end))| (start, *end))
-            .ok_or_else(missing)
+    let end_on = |host: &str| {
+        let (_, end) = result.spans.get(host)?;
+        Some((*end, axis.at(host, end.as_ns())?.0))
     };
-    let (producer_start, producer_end) = within(hosts[0])?;
-    let (consumer_start, consumer_end) = within(hosts[1])?;
-    let span = SeriesSpan {
-        producer_start_ns: producer_start.as_ns(),
-        consumer_start_ns: consumer_start.as_ns(),
-        duration_ns: producer_end
-            .ns_since(producer_start)
-            .max(consumer_end.ns_since(consumer_start)),
-    };
+    let missing =
+        |host: &str| format!("when the run began and ended on host {host} is unavailable");
+    let [producer_end, consumer_end] = hosts.map(|host| end_on(host).ok_or_else(|| missing(host)));
+    let ((producer_end, one_ns), (_, other_ns)) = (producer_end?, consumer_end?);
+    let producer_start =
+        start_on(result, hosts[0], records.clocks()).ok_or_else(|| missing(hosts[0]))?;
     let payload_bytes = records.log().raw(&channel.name).first();
     let payload_bytes = payload_bytes.map(|message| message.payload.len() as u64);
+    let place = |at: Moment| {
+        let host = match at.side {
+            Side::Producer => hosts[0],
+            Side::Consumer => hosts[1],
+        };
+        axis.place_ns(host, at.ns)
+    };
     records.consult(run, channel, |files, context| {
         let ways = passages(files, context);
         let is_copy = |record: &&IngressRecord| record.flags & IngressRecord::DUPLICATE != 0;
@@ -464,9 +440,11 @@ fn add_channel(
             hosts,
             passages: &ways,
             other_events,
-            span,
+            duration_ns: one_ns.max(other_ns),
+            place: &place,
             context: NetworkContext {
-                run_ns: Some((span.producer_start_ns, producer_end.as_ns())),
+                path: context.path,
+                run_ns: Some((producer_start.as_ns(), producer_end.as_ns())),
                 payload_bytes,
                 duplicated_count: files
                     .ingress

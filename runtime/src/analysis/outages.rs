@@ -4,7 +4,9 @@
 use hil_models::measure::account::{Happening, Outage, OutageFigures, Side, Standing, foregoing};
 use hil_models::time::Instant;
 
-use super::events::start_of;
+use std::collections::BTreeMap;
+
+use super::axis::RunAxis;
 use super::records::RunRecords;
 use crate::report::score_event::EventOutage;
 use crate::report::terminal::{duration_s, grouped, seconds};
@@ -18,9 +20,10 @@ pub(crate) struct OutageStory {
     pub(crate) channel: String,
     /// In the order of its messages.
     pub(crate) outages: Vec<Outage>,
-    /// Start of the run on the producer's clock.
-    pub(crate) start: Option<Instant>,
-    /// Its end there.
+    /// Instants of the producer's clock at which outages begin and end, nanoseconds, and when they were
+    /// after the start of the run.
+    pub(crate) placed_ns: BTreeMap<i64, i64>,
+    /// End of the run on the producer's clock.
     pub(crate) end: Option<Instant>,
     /// Processes that were down, by [`Outage::interruption_index`].
     pub(crate) interrupted: Vec<String>,
@@ -33,7 +36,7 @@ impl OutageStory {
     pub(super) fn of(
         run: (&Topology, &RunResult),
         channel: &Channel,
-        records: &RunRecords,
+        (records, axis): (&RunRecords, &RunAxis<'_>),
         is_partial: bool,
     ) -> Option<Self> {
         if channel.is_recorded_only() || !records.has(&channel.name) {
@@ -41,10 +44,11 @@ impl OutageStory {
         }
         let (topology, result) = run;
         let host = &topology.process(&channel.from)?.host;
+        let outages = records.outages(run, channel);
         Some(Self {
             channel: channel.name.clone(),
-            outages: records.outages(run, channel),
-            start: start_of(run, channel, records.clocks()),
+            placed_ns: placed(&outages, |ns| axis.place_ns(host, ns)),
+            outages,
             end: result.spans.get(host).map(|span| span.1),
             interrupted: records.interrupted(run, channel),
             is_partial,
@@ -54,14 +58,21 @@ impl OutageStory {
     /// In figures; `None` when none was found and some may be missing.
     pub(crate) fn figures(&self) -> Option<OutageFigures> {
         let is_unknown = self.is_partial && self.outages.is_empty();
-        (!is_unknown).then(|| OutageFigures::of(&self.outages, self.start, self.end))
+        (!is_unknown).then(|| {
+            let mut figures = OutageFigures::of(&self.outages, self.end);
+            if let Some(longest) = &mut figures.longest {
+                let placed_ns = self.placed_ns.get(&longest.start_ns);
+                longest.start_ns = placed_ns.copied().unwrap_or(longest.start_ns);
+            }
+            figures
+        })
     }
 
     /// What has most to do with something that happened.
     pub(crate) fn before(&self, happening: &Happening<'_>) -> Option<EventOutage> {
         let found = foregoing(&self.outages, happening)?;
         let outage = found.outage;
-        let since_start_s = |ns: i64| Some(Instant::from_ns(ns).seconds_since(self.start?));
+        let since_start_s = |ns: i64| Some(*self.placed_ns.get(&ns)? as f64 * 1e-9);
         let mut event_outage = EventOutage {
             channel: self.channel.clone(),
             from_s: outage.from_ns.and_then(since_start_s),
@@ -69,6 +80,7 @@ impl OutageStory {
             length_s: outage.length_ns(self.end).map(|ns| ns as f64 * 1e-9),
             lost_count: outage.lost_count,
             standing: found.standing,
+            clock_bound_s: 0.0,
             other_count: found.other_count,
             words: String::new(),
         };
@@ -86,6 +98,13 @@ impl OutageStory {
         event_outage.words = words(&event_outage, interrupted, later_ns);
         Some(event_outage)
     }
+}
+
+/// Puts the ends of outages on the run's axis, as far as `place` can.
+pub(crate) fn placed(outages: &[Outage], place: impl Fn(i64) -> Option<i64>) -> BTreeMap<i64, i64> {
+    let ends = outages.iter().flat_map(|one| [one.from_ns, one.until_ns]);
+    let placed = ends.flatten().filter_map(|ns| Some((ns, place(ns)?)));
+    placed.collect()
 }
 
 /// An outage that began after the event did so `later_ns` later.
@@ -141,8 +160,8 @@ mod tests {
     fn story(outages: Vec<Outage>) -> OutageStory {
         OutageStory {
             channel: "egm/right/command".to_owned(),
+            placed_ns: placed(&outages, |ns| Some(ns - 1_000 * MS)),
             outages,
-            start: Some(Instant::from_ns(1_000 * MS)),
             end: Some(Instant::from_ns(61_000 * MS)),
             interrupted: vec!["gateway".to_owned()],
             is_partial: false,
@@ -235,6 +254,9 @@ mod tests {
         story.is_partial = true;
         assert_eq!(story.figures(), None);
         story.outages.push(outage(2_000, Some(2_100), 12));
-        assert_eq!(story.figures().unwrap().outage_count, 1);
+        story.placed_ns = placed(&story.outages, |ns| Some(ns - 1_000 * MS));
+        let figures = story.figures().unwrap();
+        assert_eq!(figures.outage_count, 1);
+        assert_eq!(figures.longest.unwrap().start_ns, 1_000 * MS);
     }
 }

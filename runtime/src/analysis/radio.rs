@@ -9,6 +9,7 @@ use std::path::Path;
 use hil_models::measure::record::UNAVAILABLE;
 use hil_models::time::Instant;
 
+use super::axis::RunAxis;
 use super::records::RunRecords;
 use crate::radio::nl80211::command;
 use crate::radio::record::{NO_CODE, NO_RATE, NO_SIGNAL, RadioRecord, RateRecord, SAMPLE};
@@ -21,7 +22,7 @@ use crate::topology::Topology;
 pub(super) fn add(
     summary: &mut RunSummary,
     (topology, result): (&Topology, &RunResult),
-    records: &RunRecords,
+    (records, axis): (&RunRecords, &RunAxis<'_>),
 ) {
     let mut report = RadioReport::default();
     for channel in topology.channels() {
@@ -40,14 +41,17 @@ pub(super) fn add(
         let (process, interface) = name.rsplit_once('/').unwrap_or((name, ""));
         let host = result.processes.iter().find(|one| one.name == process);
         let host = host.map_or_else(String::new, |one| one.host.clone());
-        let start = result.spans.get(&host).map(|span| span.0);
+        let place_s = |at_ns| axis.shown_s(&host, Instant::from_ns(at_ns));
+        let is_in_run = result.spans.contains_key(&host);
         let mut hop = summarise(samples);
-        (hop.process, hop.interface, hop.host) = (process.to_owned(), interface.to_owned(), host);
-        match start {
-            Some(start) => add_events(&mut summary.events, &hop, samples, start),
-            None => summary.warnings.extend(left_out(&hop)),
+        (hop.process, hop.interface) = (process.to_owned(), interface.to_owned());
+        hop.host.clone_from(&host);
+        if is_in_run {
+            add_events(&mut summary.events, &hop, samples, place_s);
+        } else {
+            summary.warnings.extend(left_out(&hop));
         }
-        match write_series(&result.folder.series(), &hop, samples, start) {
+        match write_series(&result.folder.series(), &hop, samples, place_s) {
             Ok(file) => {
                 let what = "samples of the radio; columns in its first line".to_owned();
                 summary.run.files.push(Fact::new(file.clone(), what));
@@ -59,7 +63,9 @@ pub(super) fn add(
         }
         report.hops.push(hop);
     }
-    summary.events.sort_by(|a, b| a.at_s.total_cmp(&b.at_s));
+    // Those of unknown time come last.
+    let key = |event: &RunEvent| event.at_s.unwrap_or(f64::INFINITY);
+    summary.events.sort_by(|a, b| key(a).total_cmp(&key(b)));
     add_mark_warnings(summary);
     summary.radio = report;
 }
@@ -178,7 +184,7 @@ fn add_events(
     events: &mut Vec<RunEvent>,
     hop: &RadioHopSummary,
     samples: &[RadioRecord],
-    start: Instant,
+    place_s: impl Fn(i64) -> Option<f64>,
 ) {
     for record in samples {
         let Some(what) = words_of(record) else {
@@ -191,15 +197,11 @@ fn add_events(
         };
         let code = (record.code != NO_CODE).then(|| format!("802.11 code {}", record.code));
         events.push(RunEvent {
-            at_s: seconds_since(record.at_ns, start),
+            at_s: place_s(record.at_ns),
             what: format!("{}: {} {what}{whom}", hop.process, hop.interface),
             cause: code.unwrap_or_default(),
         });
     }
-}
-
-fn seconds_since(at_ns: i64, start: Instant) -> f64 {
-    Instant::from_ns(at_ns).seconds_since(start)
 }
 
 /// Writes the samples as a table; gives its name below the run's folder.
@@ -207,7 +209,7 @@ fn write_series(
     folder: &Path,
     hop: &RadioHopSummary,
     samples: &[RadioRecord],
-    start: Option<Instant>,
+    place_s: impl Fn(i64) -> Option<f64>,
 ) -> std::io::Result<String> {
     let mut text = String::from(
         "at_s,mac,signal_dbm,signal_average_dbm,tx_mbps,tx_modulation,rx_mbps,rx_modulation,\
@@ -228,7 +230,7 @@ fn write_series(
         format!("{mbps},{modulation}")
     };
     for one in samples.iter().filter(|one| one.event == SAMPLE) {
-        let at_s = start.map(|start| format!("{:.6}", seconds_since(one.at_ns, start)));
+        let at_s = place_s(one.at_ns).map(|at_s| format!("{at_s:.6}"));
         let at_s = at_s.unwrap_or_default();
         writeln!(
             text,
@@ -300,10 +302,10 @@ mod tests {
         assert_eq!((hop.event_count, hop.stations.len()), (1, 0));
         (hop.process, hop.interface) = ("gateway".to_owned(), "wlan0".to_owned());
         let mut events = Vec::new();
-        add_events(&mut events, &hop, &samples, Instant::ZERO);
+        add_events(&mut events, &hop, &samples, |ns| Some(ns as f64 * 1e-9));
         assert_eq!(events[0].what, "gateway: wlan0 disconnected");
         assert_eq!(events[0].cause, "802.11 code 3");
-        assert!((events[0].at_s - 1.5).abs() < 1e-9);
+        assert!((events[0].at_s.unwrap() - 1.5).abs() < 1e-9);
     }
 
     #[test]

@@ -122,9 +122,9 @@ impl RunRecords {
         (egress.unwrap_or_default(), ingress.unwrap_or_default())
     }
 
-    /// See [`RunLog::set_clocks_differ`].
-    pub(super) fn set_clocks_differ(&mut self) {
-        self.log.set_clocks_differ();
+    /// Every message of the run, to bring them to one clock.
+    pub(super) const fn log_mut(&mut self) -> &mut RunLog {
+        &mut self.log
     }
 
     /// Relates the hosts' clocks; until then none are aligned.
@@ -234,8 +234,9 @@ impl RunRecords {
         run: (&Topology, &RunResult),
         channel: &Channel,
     ) -> (Option<TransmitStampFigures>, Option<RadioFigures>) {
-        self.consult(run, channel, |records, _| {
-            (records.egress.map(transmit_stamps), radio_figures(records))
+        self.consult(run, channel, |records, context| {
+            let stamps = records.egress.map(transmit_stamps);
+            (stamps, radio_figures(records, context))
         })
     }
 
@@ -313,7 +314,10 @@ impl RunRecords {
         // A link that delays on purpose keeps messages under way for that much longer.
         let delay = crossing
             .and_then(|crossing| EmulationLaunch::of(&crossing, topology.run().seed))
-            .map(|emulation| emulation.flight_time(FLIGHT_QUANTILE));
+            .map(|emulation| {
+                let delay = emulation.flight_time(FLIGHT_QUANTILE);
+                delay.expect("a run begins when its traces were read, and what was read is noted")
+            });
         let round_trips = files.round_trips.values();
         let round_trips_ns: Vec<i64> = round_trips.map(RoundTripRecord::rtt_ns).collect();
         let context = AccountContext {

@@ -3,10 +3,10 @@
 //! the cards back as they were. The stamps themselves come through the gateways' sockets.
 //!
 //! The supervisor does this and not a gateway, because a card belongs to its host: two links may
-//! use one card, and a gateway that is killed could not put it back. A supervisor that is killed
-//! outright cannot either; the report of the next run names the setting it found.
+//! use one card. A supervisor that is killed outright cannot put it back; then its guard does.
 
 pub mod figures;
+pub(crate) mod guard;
 pub(crate) mod probing;
 
 use std::path::Path;
@@ -15,7 +15,6 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use hil_gateways::transport::card_arming::{ArmedCard, InterfaceCard};
 use hil_gateways::transport::card_clock::CardClock;
 use hil_gateways::transport::clock_pair::ClockPair;
 use hil_gateways::transport::interface::interface_with_address;
@@ -23,6 +22,7 @@ use hil_gateways::transport::timestamping::TimestampCapabilities;
 use hil_models::measure::card_clock::CardClockRecord;
 use serde::{Deserialize, Serialize};
 
+use self::guard::GuardedCard;
 use crate::record::{RecordKind, RecordSink, Recorder};
 use crate::topology::{Host, Program, Timestamps, Topology, Via};
 
@@ -74,7 +74,7 @@ pub(crate) fn card_name(host: &str, interface: &str) -> String {
 #[derive(Debug)]
 struct WatchedCard {
     story: CardStory,
-    armed: Option<ArmedCard>,
+    armed: Option<GuardedCard>,
 }
 
 /// The cards of this supervisor's hosts, armed and watched until [`CardWatch::finish`].
@@ -109,7 +109,8 @@ impl CardWatch {
             problems: Vec::new(),
         };
         for host in hosts.iter().filter(|host| wants_cards(topology, host)) {
-            watch.cards.push(open_card(host));
+            let card = open_card(host, &watch.cards);
+            watch.cards.push(card);
         }
         if let Err(problem) = watch.begin_sampling(records) {
             watch.problems.push(problem);
@@ -241,7 +242,7 @@ pub(crate) fn interface_of(host: &Host) -> Result<String, String> {
     }
 }
 
-fn open_card(host: &Host) -> WatchedCard {
+fn open_card(host: &Host, others: &[WatchedCard]) -> WatchedCard {
     let mut story = CardStory {
         host: host.name.clone(),
         interface: String::new(),
@@ -270,15 +271,19 @@ fn open_card(host: &Host) -> WatchedCard {
         }
         Err(error) => story.claims = format!("unavailable: {error}"),
     }
-    let armed = match ArmedCard::arm(InterfaceCard { interface }) {
-        Ok(armed) => {
+    let is_guarded = others
+        .iter()
+        .any(|other| other.armed.is_some() && other.story.interface == interface);
+    let armed = match GuardedCard::arm(&interface, is_guarded) {
+        Ok(guarded) => {
+            let armed = guarded.armed();
             story.arming = armed.describe();
             story.is_armed = true;
             story.stamps_all_arrivals = armed.stamps_all_arrivals();
-            Some(armed)
+            Some(guarded)
         }
-        Err(error) => {
-            story.arming = format!("unavailable: {error}");
+        Err(reason) => {
+            story.arming = format!("unavailable: {reason}");
             None
         }
     };
@@ -324,12 +329,13 @@ mod tests {
             address: None,
             interface: interface.map(str::to_owned),
             control_port: 7399,
+            clock: None,
         }
     }
 
     #[test]
     fn an_interface_without_a_card_is_said_to_have_none() {
-        let card = open_card(&host(Some("lo")));
+        let card = open_card(&host(Some("lo")), &[]);
         assert!(card.armed.is_none() && !card.story.is_armed);
         assert_eq!(card.story.phc_index, None);
         assert!(
@@ -353,7 +359,7 @@ mod tests {
     #[test]
     fn a_host_that_names_no_interface_uses_that_of_its_address() {
         assert_eq!(interface_of(&host(None)).as_deref(), Ok("lo"));
-        let card = open_card(&host(Some("no-such-card")));
+        let card = open_card(&host(Some("no-such-card")), &[]);
         assert!(
             card.story.claims.starts_with("unavailable: "),
             "{:?}",

@@ -4,10 +4,12 @@
 use std::net::{Ipv4Addr, SocketAddr};
 use std::time::Duration;
 
-use hil_gateways::transport::card_arming::{ArmedCard, InterfaceCard, describe_setting};
+use hil_gateways::transport::card_arming::describe_setting;
 use hil_gateways::transport::card_clock::{CardClock, CardPair};
 use hil_gateways::transport::probe::{Availability, DISCARD_PORT, ProbeSettings, arm_and_probe};
 use hil_gateways::transport::timestamping::{HardwareStamping, TimestampMode};
+
+use super::guard::GuardedCard;
 
 /// Reads of the clock of which the narrowest counts.
 const READ_ATTEMPTS: u32 = 10;
@@ -55,11 +57,8 @@ pub(crate) fn probe_card(interface: &str, phc_index: u32) -> CardProbe {
 }
 
 fn probe_transmit(interface: &str) -> Result<Delivery, String> {
-    let card = InterfaceCard {
-        interface: interface.to_owned(),
-    };
     // Puts the card back when it goes.
-    let _armed = ArmedCard::arm(card).map_err(|error| error.to_string())?;
+    let _armed = GuardedCard::arm(interface, false)?;
     let settings = ProbeSettings {
         timestamps: TimestampMode::Hardware,
         transmit_target: Some(SocketAddr::from((LINK_HOSTS, DISCARD_PORT))),

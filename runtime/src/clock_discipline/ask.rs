@@ -7,36 +7,53 @@ use std::process::{Command, Stdio};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use super::{ChronyTracking, PtpStatus};
+use super::{ChronyTracking, NtpVariables, PtpStatus};
 
-/// How long a tool may take; a daemon on this host answers within milliseconds.
-const PATIENCE: Duration = Duration::from_millis(500);
+/// How long a tool may take; a daemon on this host answers within milliseconds, but `ntpq` of ntpsec
+/// alone takes a third of a second to start on a busy machine.
+const PATIENCE: Duration = Duration::from_secs(1);
 const LOOK_PERIOD: Duration = Duration::from_millis(5);
 /// Longer than any answer.
 const ANSWER_BYTES_MAX: u64 = 1 << 16;
 
 /// Which of the field's daemons run on this host.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[allow(
+    clippy::struct_excessive_bools,
+    reason = "a set of daemons, any of which may run beside any other"
+)]
 pub(super) struct Daemons {
     pub(super) chronyd: bool,
     pub(super) ptp4l: bool,
     pub(super) phc2sys: bool,
+    pub(super) ntpd: bool,
+    pub(super) timesyncd: bool,
 }
 
-/// By the names of the processes this one can see.
-pub(super) fn running_daemons() -> Daemons {
-    let mut found = Daemons::default();
-    let entries = fs::read_dir("/proc").into_iter().flatten().flatten();
-    for entry in entries {
-        let name = fs::read_to_string(entry.path().join("comm")).unwrap_or_default();
-        match name.trim() {
-            "chronyd" => found.chronyd = true,
-            "ptp4l" => found.ptp4l = true,
-            "phc2sys" => found.phc2sys = true,
-            _ => {}
+impl Daemons {
+    /// By the names of processes, as the kernel cuts them: at fifteen bytes.
+    fn named(names: impl Iterator<Item = String>) -> Self {
+        let mut found = Self::default();
+        for name in names {
+            match name.trim() {
+                "chronyd" => found.chronyd = true,
+                "ptp4l" => found.ptp4l = true,
+                "phc2sys" => found.phc2sys = true,
+                "ntpd" => found.ntpd = true,
+                "systemd-timesyn" => found.timesyncd = true,
+                _ => {}
+            }
         }
+        found
     }
-    found
+}
+
+/// Among the processes this one can see.
+pub(super) fn running_daemons() -> Daemons {
+    let entries = fs::read_dir("/proc").into_iter().flatten().flatten();
+    Daemons::named(
+        entries.map(|entry| fs::read_to_string(entry.path().join("comm")).unwrap_or_default()),
+    )
 }
 
 pub(super) fn chrony() -> Result<ChronyTracking, String> {
@@ -47,6 +64,10 @@ pub(super) fn ptp() -> Result<PtpStatus, String> {
     let questions = ["GET TIME_STATUS_NP", "GET CURRENT_DATA_SET"];
     let [status, current] = questions;
     PtpStatus::parse(&answer("pmc", &["-u", "-b", "0", status, current])?)
+}
+
+pub(super) fn ntp() -> Result<NtpVariables, String> {
+    NtpVariables::parse(&answer("ntpq", &["-n", "-c", "rv", "127.0.0.1"])?)
 }
 
 /// What `program` prints, if it ends in time and without a fault.
@@ -92,6 +113,18 @@ fn answer(program: &str, arguments: &[&str]) -> Result<String, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn daemons_are_known_by_the_names_that_the_kernel_cuts() {
+        let names = ["systemd-timesyn\n", "bash\n", "phc2sys\n", "ntpdate\n"];
+        let found = Daemons::named(names.into_iter().map(str::to_owned));
+        let expected = Daemons {
+            phc2sys: true,
+            timesyncd: true,
+            ..Daemons::default()
+        };
+        assert_eq!(found, expected);
+    }
 
     #[test]
     fn a_tool_that_is_not_there_fails_or_hangs_is_an_error_and_one_that_answers_is_read() {

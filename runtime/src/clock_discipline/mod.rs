@@ -4,18 +4,25 @@
 
 mod ask;
 mod chrony;
+mod ntp;
 mod ptp;
 
 use serde::{Deserialize, Serialize};
 
 pub use chrony::ChronyTracking;
+pub use ntp::NtpVariables;
 pub use ptp::PtpStatus;
 
+use self::ask::Daemons;
+use self::ntp::is_local_reference;
 use crate::realtime::clock_discipline;
 
 /// What `phc2sys` may leave between a card's clock and the system clock: it publishes no figure, and
 /// stays below this once settled. Cross-checked by the gateways' exchanges like the rest.
 const PHC2SYS_ERROR_NS: u64 = 5_000;
+
+const LOCAL_CLOCK: &str = "; its own undisciplined clock, which is nobody else's reference";
+const NOBODY: &str = "none of chronyd, ptp4l, ntpd and systemd-timesyncd runs here";
 
 /// What is known of how a host's system clock is steered.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -54,21 +61,58 @@ impl HostDiscipline {
             bound_ns: None,
             basis: String::new(),
         };
-        let running = ask::running_daemons();
+        found.believe(ask::running_daemons());
+        Ok(found)
+    }
+
+    fn believe(&mut self, running: Daemons) {
         if running.chronyd {
             match ask::chrony() {
-                Ok(tracking) => found.believe_chrony(&tracking),
-                Err(why) => found.basis = format!("chronyd runs but says nothing: {why}"),
+                Ok(tracking) => self.believe_chrony(&tracking),
+                Err(why) => self.basis = format!("chronyd runs but says nothing: {why}"),
             }
         } else if running.ptp4l {
             match ask::ptp() {
-                Ok(status) => found.believe_ptp(&status, running.phc2sys),
-                Err(why) => found.basis = format!("ptp4l runs but says nothing: {why}"),
+                Ok(status) => self.believe_ptp(&status, running.phc2sys),
+                Err(why) => self.basis = format!("ptp4l runs but says nothing: {why}"),
             }
+        } else if running.ntpd {
+            match ask::ntp() {
+                Ok(variables) => self.believe_ntp(&variables),
+                Err(why) => self.basis = format!("ntpd runs but says nothing: {why}"),
+            }
+        } else if running.timesyncd {
+            "systemd-timesyncd keeps the clock and publishes no bound of its error"
+                .clone_into(&mut self.basis);
         } else {
-            "neither chronyd nor ptp4l runs here".clone_into(&mut found.basis);
+            NOBODY.clone_into(&mut self.basis);
         }
-        Ok(found)
+    }
+
+    fn believe_ntp(&mut self, variables: &NtpVariables) {
+        self.basis = format!(
+            "ntpd: {} (stratum {}), offset {:+.9} s, root delay {:.9} s, root dispersion {:.9} s \
+             {:.0} s ago",
+            variables.reference,
+            variables.stratum,
+            variables.offset_s,
+            variables.root_delay_s,
+            variables.root_dispersion_s,
+            variables.age_s
+        );
+        let Some(bound_ns) = variables.bound_ns() else {
+            self.basis = format!("ntpd: {}; not synchronised", variables.reference);
+            return;
+        };
+        if variables.is_local() {
+            self.basis.push_str(LOCAL_CLOCK);
+        } else if self.is_kernel_synchronised {
+            self.reference = Some(format!("ntp {}", variables.reference));
+            self.bound_ns = Some(bound_ns);
+        } else {
+            self.basis
+                .push_str("; the kernel says that nobody keeps the clock");
+        }
     }
 
     fn believe_chrony(&mut self, tracking: &ChronyTracking) {
@@ -82,6 +126,8 @@ impl HostDiscipline {
         );
         if !tracking.is_synchronised() {
             self.basis.push_str("; not synchronised");
+        } else if is_local_reference(&tracking.reference) {
+            self.basis.push_str(LOCAL_CLOCK);
         } else if !self.is_kernel_synchronised {
             self.basis
                 .push_str("; the kernel says that nobody keeps the clock");
@@ -171,7 +217,7 @@ mod tests {
             frequency_ppb: 0,
             reference: None,
             bound_ns: None,
-            basis: "neither chronyd nor ptp4l runs here".to_owned(),
+            basis: NOBODY.to_owned(),
         }
     }
 
@@ -191,7 +237,7 @@ mod tests {
         let why = common_bound_ns(("x", &near), ("y", &other)).unwrap_err();
         assert_eq!(why, "x follows ptp a, y follows ptp b");
         let why = common_bound_ns(("x", &near), ("y", &nobody())).unwrap_err();
-        assert_eq!(why, "on y, neither chronyd nor ptp4l runs here");
+        assert_eq!(why, format!("on y, {NOBODY}"));
     }
 
     #[test]
@@ -223,6 +269,67 @@ mod tests {
         let mut host = nobody();
         host.believe_ptp(&status, true);
         assert_eq!(host.bound_ns, Some(9_620 + PHC2SYS_ERROR_NS));
+    }
+
+    #[test]
+    fn ntpd_has_a_bound_only_while_it_and_the_kernel_say_synchronised() {
+        let variables = NtpVariables {
+            reference: "192.0.2.7".to_owned(),
+            leap: 0,
+            stratum: 2,
+            offset_s: -0.000_1,
+            root_delay_s: 0.002,
+            root_dispersion_s: 0.003,
+            age_s: 100.0,
+        };
+        let mut host = nobody();
+        host.believe_ntp(&variables);
+        assert_eq!(host.reference.as_deref(), Some("ntp 192.0.2.7"));
+        // 3 + 2 / 2 + 0.1 milliseconds, and 15 ppm of 100 s.
+        let bound_ns = host.bound_ns.unwrap();
+        assert!((5_600_000..=5_600_001).contains(&bound_ns), "{bound_ns}");
+        for local in ["LOCL", "127.127.1.0", "LOCAL(0)"] {
+            let own = NtpVariables {
+                reference: local.to_owned(),
+                ..variables.clone()
+            };
+            let mut host = nobody();
+            host.believe_ntp(&own);
+            assert_eq!((host.bound_ns, &host.reference), (None, &None), "{local}");
+        }
+        let alarmed = NtpVariables {
+            leap: 3,
+            ..variables.clone()
+        };
+        let mut host = nobody();
+        host.believe_ntp(&alarmed);
+        assert_eq!((host.bound_ns, host.reference), (None, None));
+        let mut host = nobody();
+        host.is_kernel_synchronised = false;
+        host.believe_ntp(&variables);
+        assert_eq!((host.bound_ns, host.reference), (None, None));
+        assert!(
+            host.basis.ends_with("nobody keeps the clock"),
+            "{}",
+            host.basis
+        );
+    }
+
+    #[test]
+    fn a_daemon_without_figures_is_named_all_the_same() {
+        let mut host = nobody();
+        host.believe(Daemons {
+            timesyncd: true,
+            ..Daemons::default()
+        });
+        assert!(
+            host.basis.starts_with("systemd-timesyncd keeps"),
+            "{}",
+            host.basis
+        );
+        assert_eq!((&host.reference, host.bound_ns), (&None, None));
+        host.believe(Daemons::default());
+        assert_eq!(host.basis, NOBODY);
     }
 
     #[test]

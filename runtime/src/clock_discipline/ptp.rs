@@ -88,29 +88,51 @@ mod tests {
     use super::*;
     use hil_models::random::RandomStream;
 
+    /// Printed by `pmc -u -b 0` of linuxptp 3.1.1 (Debian 12) beside a `ptp4l` with software stamps and
+    /// `free_running 1` that hears another over a veth.
     const RECORDED: &str = "sending: GET TIME_STATUS_NP
-\t90e2ba.fffe.20c7f8-0 seq 0 RESPONSE MANAGEMENT TIME_STATUS_NP
-\t\tmaster_offset              310
-\t\tingress_time               1361545089345029441
-\t\tcumulativeScaledRateOffset +1.000000000
+sending: GET CURRENT_DATA_SET
+\t361e6c.fffe.0d61b0-0 seq 0 RESPONSE MANAGEMENT TIME_STATUS_NP\x20
+\t\tmaster_offset              -519
+\t\tingress_time               1795338462591352301
+\t\tcumulativeScaledRateOffset +0.000000000
 \t\tscaledLastGmPhaseChange    0
 \t\tgmTimeBaseIndicator        0
 \t\tlastGmPhaseChange          0x0000'0000000000000000.0000
 \t\tgmPresent                  true
-\t\tgmIdentity                 00a069.fffe.0b552d
-sending: GET CURRENT_DATA_SET
-\t90e2ba.fffe.20c7f8-0 seq 1 RESPONSE MANAGEMENT CURRENT_DATA_SET
+\t\tgmIdentity                 622b0d.fffe.8ca8c0
+\t361e6c.fffe.0d61b0-0 seq 1 RESPONSE MANAGEMENT CURRENT_DATA_SET\x20
 \t\tstepsRemoved     1
-\t\toffsetFromMaster -142.0
-\t\tmeanPathDelay    9310.0
+\t\toffsetFromMaster -519.0
+\t\tmeanPathDelay    1291.0
+";
+    /// The same of the clock that it hears.
+    const GRANDMASTER: &str = "sending: GET TIME_STATUS_NP
+sending: GET CURRENT_DATA_SET
+\t622b0d.fffe.8ca8c0-0 seq 0 RESPONSE MANAGEMENT TIME_STATUS_NP\x20
+\t\tmaster_offset              0
+\t\tingress_time               0
+\t\tcumulativeScaledRateOffset +0.000000000
+\t\tscaledLastGmPhaseChange    0
+\t\tgmTimeBaseIndicator        0
+\t\tlastGmPhaseChange          0x0000'0000000000000000.0000
+\t\tgmPresent                  false
+\t\tgmIdentity                 622b0d.fffe.8ca8c0
+\t622b0d.fffe.8ca8c0-0 seq 1 RESPONSE MANAGEMENT CURRENT_DATA_SET\x20
+\t\tstepsRemoved     0
+\t\toffsetFromMaster 0.0
+\t\tmeanPathDelay    0.0
 ";
 
     #[test]
     fn a_recorded_answer_gives_grandmaster_and_bound() {
         let status = PtpStatus::parse(RECORDED).unwrap();
-        assert_eq!(status.grandmaster, "00a069.fffe.0b552d");
+        assert_eq!(status.grandmaster, "622b0d.fffe.8ca8c0");
         assert!(status.is_present);
-        assert_eq!(status.bound_ns(), 310 + 9_310);
+        assert_eq!(status.bound_ns(), 519 + 1_291);
+        let own = PtpStatus::parse(GRANDMASTER).unwrap();
+        assert_eq!(own.grandmaster, status.grandmaster);
+        assert!(!own.is_present);
     }
 
     #[test]

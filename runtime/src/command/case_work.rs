@@ -14,7 +14,7 @@ use crate::simulate;
 use crate::study::{self, StudyEnd, StudyOptions, Wanted};
 use crate::topology::{self, Topology, TopologyErrors};
 
-use super::{columns, exit, interrupted, load};
+use super::{columns, exit, interrupted, load, signals};
 
 /// `simulate`, with its page or JSON and the folder for its files.
 pub(super) fn simulate(
@@ -73,13 +73,6 @@ pub(super) fn simulate(
             exit::FAILED
         }
     }
-}
-
-fn signals(console: &mut Console) -> Result<Signals, u8> {
-    Signals::install().map_err(|error| {
-        console.error(&format!("cannot handle signals: {error}"));
-        exit::INTERNAL
-    })
 }
 
 /// `tables`.

@@ -7,7 +7,6 @@ use super::{Finding, State};
 use crate::clock::MonotonicClock;
 use crate::clock_discipline::HostDiscipline;
 use crate::host_facts::{Fact, HostFiles};
-use crate::realtime::{ClockDiscipline, clock_discipline};
 
 /// A vDSO read stays below this on any PC of the last ten years.
 const READ_COST_NS_GOOD: f64 = 100.0;
@@ -15,11 +14,12 @@ const READ_COST_NS_GOOD: f64 = 100.0;
 const READ_COST_NS_BAD: f64 = 1000.0;
 
 pub(crate) fn examine(files: &HostFiles) -> Vec<Finding> {
+    let (synchronisation, reference) = steering(HostDiscipline::gather());
     vec![
         clocksource(files),
         read_cost(cheapest_read_ns()),
-        synchronisation(),
-        reference(),
+        synchronisation,
+        reference,
     ]
 }
 
@@ -78,28 +78,23 @@ fn read_cost(cost_ns: f64) -> Finding {
     .quiet_when_good()
 }
 
-fn synchronisation() -> Finding {
-    match clock_discipline() {
-        Ok(discipline) => judge_discipline(&discipline),
-        Err(errno) => Finding::unknown(
-            "clock_synchronisation",
-            "Time of day against a reference",
-            &format!("adjtimex: {errno}"),
-        ),
+const SYNCHRONISATION: (&str, &str) = ("clock_synchronisation", "Time of day against a reference");
+const REFERENCE: (&str, &str) = ("clock_reference", "Reference of the time of day");
+
+/// What the kernel says of the time of day, and what the daemon that keeps it does.
+fn steering(found: Result<HostDiscipline, String>) -> (Finding, Finding) {
+    match found {
+        Ok(found) => (judge_discipline(&found), judge_reference(&found)),
+        Err(why) => {
+            let unknown = |(id, title)| Finding::unknown(id, title, &why);
+            (unknown(SYNCHRONISATION), unknown(REFERENCE))
+        }
     }
 }
 
 /// What one-way figures to another host could rest on besides clock exchanges.
-fn reference() -> Finding {
-    let (id, title) = ("clock_reference", "Reference of the time of day");
-    match HostDiscipline::gather() {
-        Ok(found) => judge_reference(&found),
-        Err(why) => Finding::unknown(id, title, &why),
-    }
-}
-
 fn judge_reference(found: &HostDiscipline) -> Finding {
-    let (id, title) = ("clock_reference", "Reference of the time of day");
+    let (id, title) = REFERENCE;
     if let Some((reference, bound_ns)) = found.reference.as_ref().zip(found.bound_ns) {
         let value = format!("{reference}, within ±{} us", bound_ns.div_ceil(1_000));
         return Finding::good(id, title, value).because(found.basis.clone());
@@ -115,20 +110,20 @@ fn judge_reference(found: &HostDiscipline) -> Finding {
         )
 }
 
-fn judge_discipline(discipline: &ClockDiscipline) -> Finding {
-    let (id, title) = ("clock_synchronisation", "Time of day against a reference");
+fn judge_discipline(found: &HostDiscipline) -> Finding {
+    let (id, title) = SYNCHRONISATION;
     let value = format!(
         "{}, claimed error {} us, estimate {} us, rate {:+} ppb",
-        if discipline.is_synchronised {
+        if found.is_kernel_synchronised {
             "synchronised"
         } else {
             "not synchronised"
         },
-        discipline.max_error_us,
-        discipline.estimated_error_us,
-        discipline.frequency_ppb
+        found.kernel_max_error_us,
+        found.kernel_estimated_error_us,
+        found.frequency_ppb
     );
-    if discipline.is_synchronised {
+    if found.is_kernel_synchronised {
         // ptp4l and phc2sys leave maxerror alone or write a constant into it.
         let why = "the claimed error is the daemon's word: chronyd and ntpd keep it, ptp4l and \
                    phc2sys do not, so it is no bound under PTP";
@@ -170,17 +165,30 @@ mod tests {
         assert!(cheapest_read_ns() > 0.0);
     }
 
-    #[test]
-    fn only_a_reference_with_a_bound_is_good() {
-        let mut found = HostDiscipline {
+    fn kept() -> HostDiscipline {
+        HostDiscipline {
             is_kernel_synchronised: true,
-            kernel_max_error_us: 0,
-            kernel_estimated_error_us: 0,
-            frequency_ppb: 0,
+            kernel_max_error_us: 16,
+            kernel_estimated_error_us: 3,
+            frequency_ppb: -1200,
             reference: None,
             bound_ns: None,
-            basis: "neither chronyd nor ptp4l runs here".to_owned(),
-        };
+            basis: "systemd-timesyncd keeps the clock".to_owned(),
+        }
+    }
+
+    #[test]
+    fn what_the_kernel_does_not_say_is_unknown_in_both_findings() {
+        let (synchronisation, reference) = steering(Err("adjtimex: EPERM".to_owned()));
+        for finding in [synchronisation, reference] {
+            assert_ne!(finding.state, State::Good);
+            assert!(finding.value.contains("EPERM"), "{}", finding.value);
+        }
+    }
+
+    #[test]
+    fn only_a_reference_with_a_bound_is_good() {
+        let mut found = kept();
         let finding = judge_reference(&found);
         assert_eq!(finding.state, State::Note);
         assert_eq!(finding.value, found.basis);
@@ -193,12 +201,7 @@ mod tests {
 
     #[test]
     fn a_claimed_error_is_never_called_a_bound() {
-        let discipline = ClockDiscipline {
-            is_synchronised: true,
-            max_error_us: 16,
-            estimated_error_us: 3,
-            frequency_ppb: -1200,
-        };
+        let discipline = kept();
         let finding = judge_discipline(&discipline);
         assert_eq!(finding.state, State::Good);
         assert_eq!(
@@ -206,8 +209,8 @@ mod tests {
             "synchronised, claimed error 16 us, estimate 3 us, rate -1200 ppb"
         );
         assert!(finding.why.contains("no bound under PTP"));
-        let loose = ClockDiscipline {
-            is_synchronised: false,
+        let loose = HostDiscipline {
+            is_kernel_synchronised: false,
             ..discipline
         };
         assert_eq!(judge_discipline(&loose).state, State::Note);

@@ -6,6 +6,7 @@
 //! network; each is a function from the kernel's files to findings.
 
 mod card;
+mod clock_path;
 mod clocks;
 mod finding;
 mod network;
@@ -19,6 +20,7 @@ mod wakeup;
 use std::path::PathBuf;
 use std::time::Duration;
 
+use hil_gateways::transport::interface::interface_with_address;
 use serde::{Deserialize, Serialize};
 
 pub use self::finding::{Finding, State};
@@ -26,6 +28,18 @@ pub use self::network::{StampCapabilities, StampCapabilityQuery};
 pub use self::wakeup::WakeupMeasurement;
 use crate::card_clock::probing::probe_card;
 use crate::host_facts::{HostFacts, HostFiles};
+use crate::topology::ClockEnd;
+
+/// Which end of a clock path to look at.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum ClockQuestion {
+    /// No topology was given.
+    NotAsked,
+    /// The topology has this host, and no clock address of it.
+    NoneNamed,
+    /// This one.
+    End(ClockEnd),
+}
 
 /// What to examine.
 #[derive(Debug, Clone)]
@@ -34,6 +48,8 @@ pub struct DoctorRequest {
     pub pinned_cpus: Vec<usize>,
     /// Network interfaces a topology uses; empty for all of this host.
     pub interfaces: Vec<String>,
+    /// Where a topology has this host exchange clocks.
+    pub clock_end: ClockQuestion,
     /// How long the wake-up latency is measured.
     pub wakeup_duration: Duration,
     /// Folders for sockets and service files, in the order the runtime tries them.
@@ -47,6 +63,7 @@ impl Default for DoctorRequest {
         Self {
             pinned_cpus: Vec::new(),
             interfaces: Vec::new(),
+            clock_end: ClockQuestion::NotAsked,
             wakeup_duration: Duration::from_secs(1),
             runtime_folders: vec![PathBuf::from("/run/hil"), std::env::temp_dir()],
             files: HostFiles::of_this_host(),
@@ -102,6 +119,10 @@ pub fn examine(request: &DoctorRequest, stamps: &dyn StampCapabilityQuery) -> Do
     findings.extend(network::examine(files, &request.interfaces, stamps));
     findings.extend(card::examine(&request.interfaces, stamps, &probe_card));
     findings.extend(radio::examine(&request.interfaces));
+    let end = &request.clock_end;
+    let interface_of =
+        |address| interface_with_address(address).map_err(|error| format!("getifaddrs: {error}"));
+    findings.extend(clock_path::examine(end, &interface_of, stamps));
     findings.extend(clocks::examine(files));
     findings.extend(processors::examine(files, &request.pinned_cpus));
     findings.extend(privileges::examine(files));

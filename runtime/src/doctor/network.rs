@@ -33,6 +33,14 @@ impl StampCapabilities {
     fn has(self, bits: u32) -> bool {
         self.so_timestamping & bits == bits
     }
+
+    pub(super) fn has_software_both_ways(self) -> bool {
+        self.has(RX_SOFTWARE | TX_SOFTWARE)
+    }
+
+    pub(super) fn describe(self) -> String {
+        describe(self)
+    }
 }
 
 /// Answers which timestamps an interface claims.

@@ -5,7 +5,6 @@
 use std::net::SocketAddr;
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Sender, channel};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
@@ -20,15 +19,16 @@ use crate::channel::Domain;
 use crate::clock::MonotonicClock;
 use crate::gateway::GatewayError;
 use crate::gateway::arming::arm_and_describe;
-use crate::gateway::process::{PROBE_BOUND, wait_until_open};
+use crate::gateway::process::{
+    Counter, PROBE_BOUND, report_progress, wait_until_open, warn_of_spinning,
+};
 use crate::gateway::socket::timestamp_mode;
 use crate::process::launch::read;
-use crate::process::pipe::{ChannelProgress, FaceReport, FromProcess, Orders, ProcessReport, say};
+use crate::process::pipe::{FaceReport, FromProcess, Orders, ProcessReport, say};
 use crate::process::usage::add_usage;
-use crate::realtime::{self, RealtimeGrant, SpinAdvice};
+use crate::realtime::{self, RealtimeGrant};
 use crate::record::Recorder;
 use crate::topology::{FaceKind, Timestamps};
-use crate::wait::WaitMode;
 
 const PROGRESS_PERIOD: Duration = Duration::from_millis(250);
 /// How often orders and threads are looked at.
@@ -67,7 +67,7 @@ fn prepare_and_live(path: &Path) -> Result<(), FaceError> {
     let (sender, ready) = channel();
     let mut threads = Vec::new();
     for (arm, one) in opened {
-        warn_of_spinning(launch.wait, &arm);
+        warn_of_spinning(&arm.arm, launch.wait, arm.realtime.cpu);
         let around = (Arc::clone(&launch), Arc::clone(&domain), Arc::clone(&gate));
         threads.push(spawn(arm, one, around, sender.clone())?);
     }
@@ -107,20 +107,11 @@ fn watch(orders: &Orders, threads: &[JoinHandle<Lived>], counters: &[Counter]) {
         let now = MonotonicClock::now();
         if now.saturating_duration_since(told) >= PROGRESS_PERIOD {
             told = now;
-            let progress = counters
-                .iter()
-                .map(|(channel, what, count)| ChannelProgress {
-                    channel: channel.clone(),
-                    what: (*what).to_owned(),
-                    count: count.load(Ordering::Relaxed),
-                });
-            say(&FromProcess::Progress(progress.collect()));
+            report_progress(counters);
         }
         thread::sleep(WATCH_PERIOD);
     }
 }
-
-type Counter = (String, &'static str, Arc<AtomicU64>);
 
 fn counters(arm: &ArmLaunch, opened: &OpenedArm) -> [Counter; 2] {
     let [taken, given] = &opened.counts;
@@ -202,21 +193,4 @@ fn finish(
     add_usage(&mut report);
     say(&FromProcess::Finished(Box::new(report)));
     outcome
-}
-
-fn warn_of_spinning(wait: WaitMode, arm: &ArmLaunch) {
-    if wait != WaitMode::Spin {
-        return;
-    }
-    let name = &arm.arm;
-    match arm.realtime.cpu.map(realtime::spin_advice) {
-        Some(SpinAdvice::Fine) => {}
-        Some(SpinAdvice::Warn(why)) => {
-            say(&FromProcess::Warning(format!("{name}: wait = spin: {why}")));
-        }
-        None => {
-            let text = format!("{name}: wait = spin without a cpu of its own");
-            say(&FromProcess::Warning(text));
-        }
-    }
 }

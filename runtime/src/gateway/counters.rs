@@ -14,20 +14,31 @@ const SILENCE_NS: i64 = 1_000_000_000;
 pub(super) fn egress_state(egress: &Egress) -> String {
     match egress.bridge.peer_state() {
         PeerState::Greeting => "never answered".to_owned(),
+        // No message tells whether it mattered: how long it lasted does.
+        PeerState::Down if egress.input.is_none() => match silence_ns(egress) {
+            Some(silence_ns) => {
+                format!("unreachable for the last {:.3} s", silence_ns as f64 * 1e-9)
+            }
+            None => "unreachable".to_owned(),
+        },
         // Gateways of two hosts stop one after the other: the later one may still have asked the
         // earlier one for the time, with no message concerned.
         PeerState::Down if !has_lost_messages(egress) => "left after the last message".to_owned(),
         PeerState::Down => "unreachable".to_owned(),
         PeerState::Refused(status) => format!("refused the channel: {}", status.label()),
         PeerState::Established => {
-            let heard = egress.bridge.last_heard();
-            let silence_ns = heard.map(|at| MonotonicClock::now().ns_since(at));
-            match silence_ns.filter(|silence_ns| *silence_ns > SILENCE_NS) {
+            match silence_ns(egress).filter(|silence_ns| *silence_ns > SILENCE_NS) {
                 Some(silence_ns) => format!("silent for {:.1} s", silence_ns as f64 * 1e-9),
                 None => "established".to_owned(),
             }
         }
     }
+}
+
+/// How long ago the peer was heard last; `None` when it never was.
+fn silence_ns(egress: &Egress) -> Option<i64> {
+    let heard = egress.bridge.last_heard();
+    heard.map(|at| MonotonicClock::now().ns_since(at))
 }
 
 /// True when a message could not go because the peer was unreachable.
@@ -88,12 +99,15 @@ pub(super) fn of_ingress(ingress: &Ingress) -> Vec<(String, u64)> {
     let bridge = &ingress.bridge;
     let steps = ("clock_step_count", ingress.clock.step_count());
     let foreign = ("refused: foreign source", ingress.foreign_count);
+    let stray = ("refused: message on a clock path", ingress.stray_count);
+    let stray = ingress.output.is_none().then_some(stray);
     named("", bridge.counts().iter())
         .chain(named("messages: ", bridge.sequence_counts().iter()))
         .chain(named("pieces: ", bridge.reassembly_counts().iter()))
         .chain(named("replies: ", bridge.reply_counts().iter()))
         .chain(named("socket: ", ingress.receiver.counters().iter()))
         .chain(named("", [steps, foreign]))
+        .chain(named("", stray))
         .chain(refusals(bridge.refusals()))
         .collect()
 }

@@ -9,6 +9,7 @@ use std::time::Duration;
 use hil_gateways::protocol::{EgressBridge, EgressSettings, IngressBridge, IngressSettings};
 use hil_gateways::transport::tcp::ConnectionTally;
 use hil_gateways::transport::{DatagramReceiver, DatagramSender};
+use hil_models::link::trace::ReplayTally;
 use hil_models::measure::record::{EgressRecord, FollowUpRecord, IngressRecord, RoundTripRecord};
 
 use super::egress::{Attention, Egress};
@@ -31,6 +32,9 @@ const RING_RECORDS: usize = 16_384;
 /// Time between clock exchanges: frequent enough for a round-trip distribution, rare enough to
 /// be a fraction of any control channel's traffic.
 const SYNC_PERIOD: Duration = Duration::from_millis(100);
+/// The same on a clock path, which has nothing else to do: clocks stray by 2 us at most in between,
+/// which is less than the fastest exchange leaves open.
+const CLOCK_PATH_PERIOD: Duration = Duration::from_millis(10);
 type Sinks = (RecordSink, RecordSink);
 
 /// A direction whose socket and files are open and whose port is not.
@@ -48,6 +52,7 @@ pub struct Opened {
 pub struct Direction {
     way: Way,
     facts: Vec<(String, String)>,
+    replay: Option<ReplayTally>,
 }
 
 #[derive(Debug)]
@@ -97,7 +102,13 @@ pub fn open_with<'a>(
 
 fn open_sinks(launch: &DirectionLaunch, recorder: &mut Recorder) -> Result<Sinks, GatewayError> {
     let channel = &launch.channel;
-    let mut sink = |kind, size| recorder.sink(kind, channel, size, RING_RECORDS);
+    let mut sink = |kind, size| {
+        // Files of messages would say that a channel carried none.
+        if launch.is_clock_path && kind != RecordKind::RoundTrip {
+            return Ok(recorder.closed_sink());
+        }
+        recorder.sink(kind, channel, size, RING_RECORDS)
+    };
     Ok(match launch.side {
         Side::Egress => (
             sink(RecordKind::Egress, size_of::<EgressRecord>())?,
@@ -135,7 +146,12 @@ impl Opened {
         launch: &DirectionLaunch,
         surroundings: &Surroundings,
     ) -> Result<Direction, GatewayError> {
-        let OpenSocket { ends, facts, .. } = self.socket;
+        let OpenSocket {
+            ends,
+            facts,
+            replay,
+            ..
+        } = self.socket;
         let way = match ends {
             Ends::Sender(sender, datagram_bytes_max) => Way::Egress(Box::new(egress(
                 (sender, datagram_bytes_max),
@@ -150,7 +166,7 @@ impl Opened {
                 (launch, surroundings),
             )?)),
         };
-        Ok(Direction { way, facts })
+        Ok(Direction { way, facts, replay })
     }
 }
 
@@ -166,13 +182,20 @@ fn egress(
         domain: around.fingerprint,
         clock_id: around.clock_id,
         datagram_max_bytes,
-        sync_period: SYNC_PERIOD,
+        sync_period: if launch.is_clock_path {
+            CLOCK_PATH_PERIOD
+        } else {
+            SYNC_PERIOD
+        },
     })?;
-    let waiter = (launch.wait != WaitMode::Spin)
+    let input = (!launch.is_clock_path)
+        .then(|| RawInput::open(&around.domain, &launch.channel, launch.depth))
+        .transpose()?;
+    let waiter = (launch.wait != WaitMode::Spin && input.is_some())
         .then(|| Waiter::open(&around.domain, &[launch.channel.as_str()]))
         .transpose()?;
     Ok(Egress {
-        input: RawInput::open(&around.domain, &launch.channel, launch.depth)?,
+        input,
         waiter,
         bridge,
         line: Line::new(sender, sinks, around.session, plan)?,
@@ -198,11 +221,14 @@ fn ingress(
         around.clock_id,
     );
     let (messages, follow_ups) = sinks;
+    let output = (!launch.is_clock_path)
+        .then(|| RawOutput::open(&around.domain, &launch.channel, true))
+        .transpose()?;
     Ok(Ingress {
         receiver,
         is_emulated: launch.emulation.is_some(),
         bridge: IngressBridge::new(settings)?,
-        output: RawOutput::open(&around.domain, &launch.channel, true)?,
+        output,
         wait: WaitStrategy::new(launch.wait),
         peer: launch.peer,
         notes: Notes {
@@ -212,6 +238,7 @@ fn ingress(
         received: count,
         stop: Arc::clone(&around.stop),
         foreign_count: 0,
+        stray_count: 0,
         clock: KernelClock::read()?,
         response: None,
         buffer: vec![0; usize::from(u16::MAX)].into_boxed_slice(),
@@ -286,6 +313,7 @@ impl Direction {
             peer_state,
             counters,
             facts,
+            replay: self.replay.as_ref().map(ReplayTally::counts),
         }
     }
 }

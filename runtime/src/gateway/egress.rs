@@ -22,7 +22,8 @@ const REPLY_BYTES_MAX: usize = 1024;
 /// Everything the thread works with.
 #[derive(Debug)]
 pub(crate) struct Egress {
-    pub(crate) input: RawInput,
+    /// Where messages come from; `None` on a clock path, which carries none.
+    pub(crate) input: Option<RawInput>,
     pub(crate) waiter: Option<Waiter>,
     pub(crate) bridge: EgressBridge,
     pub(crate) line: Line,
@@ -88,8 +89,8 @@ impl Egress {
             self.hear()?;
             self.line.expire(now);
             self.line.clock.refresh(now);
-            let is_established = self.bridge.peer_state() == PeerState::Established;
-            self.is_established.store(is_established, Ordering::Release);
+            self.is_established
+                .store(self.is_ready(), Ordering::Release);
         }
         if self.bridge.next_wakeup().is_some_and(|due| due <= now) {
             self.line.transmit(&mut self.bridge);
@@ -103,6 +104,13 @@ impl Egress {
         Ok(moved || was_announced)
     }
 
+    /// True while the peer takes messages. On a clock path the run may begin after an exchange
+    /// whose four stamps are known: that of the response's departure rides on the next.
+    fn is_ready(&self) -> bool {
+        let is_established = self.bridge.peer_state() == PeerState::Established;
+        is_established && (self.input.is_some() || self.bridge.counts().round_trip_count > 1)
+    }
+
     /// Sends the oldest waiting message; false when none waited.
     fn forward(&mut self) -> Result<bool, GatewayError> {
         let Self {
@@ -113,6 +121,9 @@ impl Egress {
             sent,
             ..
         } = self;
+        let Some(input) = input else {
+            return Ok(false);
+        };
         let mut take = |envelope: &Envelope, payload: &[u8]| {
             let taken = MonotonicClock::now();
             wait.on_arrival(taken);

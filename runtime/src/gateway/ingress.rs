@@ -28,7 +28,8 @@ pub(crate) struct Ingress {
     /// The receiver holds datagrams back, so it must be told the time.
     pub(crate) is_emulated: bool,
     pub(crate) bridge: IngressBridge,
-    pub(crate) output: RawOutput,
+    /// Where messages go; `None` on a clock path, which carries none.
+    pub(crate) output: Option<RawOutput>,
     pub(crate) wait: WaitStrategy,
     pub(crate) peer: SocketAddr,
     pub(crate) notes: Notes,
@@ -36,6 +37,8 @@ pub(crate) struct Ingress {
     pub(crate) stop: Arc<AtomicBool>,
     /// Datagrams from an address that is not the peer's, dropped unread.
     pub(crate) foreign_count: u64,
+    /// Messages that came over a clock path, dropped.
+    pub(crate) stray_count: u64,
     pub(crate) clock: KernelClock,
     /// The clock response whose departure the kernel is to stamp.
     pub(crate) response: Option<Response>,
@@ -105,10 +108,12 @@ impl Ingress {
     /// for a second one at once would cost a system call that a message just delivered, or the
     /// thread's other work, would have to wait for.
     pub(crate) fn step(&mut self) -> Result<bool, GatewayError> {
-        if self.take()? {
+        if let Some(at) = self.take()? {
             if self.bridge.has_reply() {
                 self.answer();
             }
+            // Under load too, but after the message: a reading of the clocks must not age.
+            self.clock.refresh(at);
             return Ok(true);
         }
         let now = MonotonicClock::now();
@@ -119,8 +124,8 @@ impl Ingress {
         Ok(false)
     }
 
-    /// Takes one datagram; false when none waits.
-    fn take(&mut self) -> Result<bool, GatewayError> {
+    /// Takes one datagram and gives when; `None` when none waits.
+    fn take(&mut self) -> Result<Option<Instant>, GatewayError> {
         // Only a link model asks what time it is.
         let now = if self.is_emulated {
             MonotonicClock::now()
@@ -132,13 +137,13 @@ impl Ingress {
             .receive(now, &mut self.buffer)
             .map_err(GatewayError::Socket)?
         else {
-            return Ok(false);
+            return Ok(None);
         };
         let at = MonotonicClock::now();
         self.wait.on_arrival(at);
         if received.source != self.peer {
             self.foreign_count += 1;
-            return Ok(true);
+            return Ok(Some(at));
         }
         let arrival = Arrival {
             received,
@@ -151,12 +156,17 @@ impl Ingress {
             output,
             notes,
             received: count,
+            stray_count,
             buffer,
             ..
         } = self;
         let bytes = &buffer[..received.length_bytes];
         let mut failed = None;
         let mut deliver = |delivery: Delivery<'_>| {
+            let Some(output) = output else {
+                *stray_count += 1;
+                return;
+            };
             count.fetch_add(1, Ordering::Relaxed);
             if let Err(error) = publish(output, notes, &arrival, &delivery) {
                 failed = Some(error);
@@ -166,7 +176,7 @@ impl Ingress {
         if let Ok(disposition) = bridge.on_datagram(at, stamps, bytes, &mut deliver) {
             note_undelivered(notes, &arrival, disposition);
         }
-        failed.map_or(Ok(true), |error| Err(error.into()))
+        failed.map_or(Ok(Some(at)), |error| Err(error.into()))
     }
 
     /// Sends the replies that are due; a reply that cannot leave is counted by the transport.

@@ -68,3 +68,30 @@ impl KernelClock {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::wait::WAIT_MAX;
+    use hil_models::measure::network::CLOCK_READING_AGE_NS_MAX;
+    use hil_models::time::duration_ns;
+
+    #[test]
+    fn a_step_is_looked_for_as_far_back_as_a_reading_may_be_old() {
+        // A reading that is not yet due may be slept on, and a datagram is taken before the next.
+        assert_eq!(
+            duration_ns(PAIR_PERIOD + WAIT_MAX),
+            CLOCK_READING_AGE_NS_MAX
+        );
+    }
+
+    #[test]
+    fn a_reading_is_renewed_once_it_is_old_and_not_before() {
+        let mut clock = KernelClock::read().unwrap();
+        let taken = clock.pair.taken;
+        clock.refresh(taken + PAIR_PERIOD / 2);
+        assert_eq!(clock.pair.taken, taken);
+        clock.refresh(taken + PAIR_PERIOD);
+        assert!(clock.pair.taken > taken);
+    }
+}

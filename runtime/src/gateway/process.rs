@@ -13,6 +13,8 @@ use std::time::Duration;
 use super::connection::Connection;
 use super::direction::{self, Opened};
 use super::{GatewayError, Surroundings, arming};
+use hil_models::time::Instant;
+
 use crate::channel::Domain;
 use crate::clock::MonotonicClock;
 use crate::process::launch::{DirectionLaunch, GatewayLaunch, Side, read};
@@ -76,7 +78,7 @@ fn prepare_and_live(path: &Path) -> Result<(), GatewayError> {
     let (sender, ready) = channel();
     let mut threads = Vec::new();
     for (direction, one) in opened {
-        warn_of_spinning(direction);
+        warn_of_spinning(&direction.channel, direction.wait, direction.realtime.cpu);
         threads.push(spawn(
             direction.clone(),
             one,
@@ -86,11 +88,36 @@ fn prepare_and_live(path: &Path) -> Result<(), GatewayError> {
     }
     drop(sender);
     if wait_until_open(&ready, threads.len()) {
-        watch(&orders, &threads, (&counters, &established), &mut watched);
+        let patience = launch.ready_within.map(|within| Patience {
+            until: MonotonicClock::now() + within,
+            launch: &launch,
+        });
+        let hops = (counters.as_slice(), established.as_slice());
+        watch(&orders, &threads, hops, (&mut watched, patience));
     }
     surroundings.stop.store(true, Ordering::Release);
     armed.facts.extend(sampler.map(Sampler::finish));
     finish(threads, recorder, &armed.facts)
+}
+
+/// A gateway that is ready without its peer after a while.
+struct Patience<'a> {
+    until: Instant,
+    launch: &'a GatewayLaunch,
+}
+
+impl Patience<'_> {
+    fn warning(&self) -> String {
+        let peers = self.launch.directions.iter();
+        let peers: Vec<String> = peers.map(|one| one.peer.to_string()).collect();
+        let within_s = self.launch.ready_within.unwrap_or_default().as_secs_f64();
+        let peers = peers.join(", ");
+        let then = match self.launch.instance {
+            0 => "the run begins without it",
+            _ => "it goes on asking",
+        };
+        format!("no answer from {peers} within {within_s:.1} s: {then}")
+    }
 }
 
 /// Says when every direction is ready and how many messages passed, until told to stop or a
@@ -99,17 +126,24 @@ fn watch(
     orders: &Orders,
     threads: &[JoinHandle<Lived>],
     (counters, established): (&[Counter], &[Arc<AtomicBool>]),
-    connections: &mut [Connection],
+    (connections, patience): (&mut [Connection], Option<Patience<'_>>),
 ) {
     let mut is_ready = false;
     let mut told = MonotonicClock::now();
     while !orders.is_stopping() && !threads.iter().any(JoinHandle::is_finished) {
-        // Messages published before the peer has greeted back would be refused.
-        if !is_ready && established.iter().all(|one| one.load(Ordering::Acquire)) {
-            is_ready = true;
-            say(&FromProcess::Ready);
-        }
         let now = MonotonicClock::now();
+        // Messages published before the peer has greeted back would be refused.
+        if !is_ready {
+            let is_established = established.iter().all(|one| one.load(Ordering::Acquire));
+            let given_up = patience.as_ref().filter(|patience| now >= patience.until);
+            if let Some(patience) = given_up.filter(|_| !is_established) {
+                say(&FromProcess::Warning(patience.warning()));
+            }
+            is_ready = is_established || given_up.is_some();
+            if is_ready {
+                say(&FromProcess::Ready);
+            }
+        }
         if now.saturating_duration_since(told) >= PROGRESS_PERIOD {
             told = now;
             report_progress(counters);
@@ -123,7 +157,8 @@ fn watch(
     }
 }
 
-type Counter = (String, &'static str, Arc<AtomicU64>);
+/// Channel, what happened to its messages, and how many.
+pub(crate) type Counter = (String, &'static str, Arc<AtomicU64>);
 
 fn counter(launch: &DirectionLaunch, opened: &Opened) -> Counter {
     let what = match launch.side {
@@ -133,7 +168,7 @@ fn counter(launch: &DirectionLaunch, opened: &Opened) -> Counter {
     (launch.channel.clone(), what, opened.count())
 }
 
-fn report_progress(counters: &[Counter]) {
+pub(crate) fn report_progress(counters: &[Counter]) {
     let progress = counters
         .iter()
         .map(|(channel, what, count)| ChannelProgress {
@@ -223,22 +258,19 @@ fn finish(
     outcome
 }
 
-fn warn_of_spinning(launch: &DirectionLaunch) {
-    if launch.wait != WaitMode::Spin {
+/// Says what a spinning thread, of the channel or arm `name`, will lose or take on its CPU.
+pub(crate) fn warn_of_spinning(name: &str, wait: WaitMode, cpu: Option<usize>) {
+    if wait != WaitMode::Spin {
         return;
     }
-    let channel = &launch.channel;
-    match launch.realtime.cpu.map(realtime::spin_advice) {
+    match cpu.map(realtime::spin_advice) {
         Some(SpinAdvice::Fine) => {}
         Some(SpinAdvice::Warn(why)) => {
-            say(&FromProcess::Warning(format!(
-                "{channel}: wait = spin: {why}"
-            )));
+            say(&FromProcess::Warning(format!("{name}: wait = spin: {why}")));
         }
         None => {
-            say(&FromProcess::Warning(format!(
-                "{channel}: wait = spin without a cpu of its own"
-            )));
+            let text = format!("{name}: wait = spin without a cpu of its own");
+            say(&FromProcess::Warning(text));
         }
     }
 }

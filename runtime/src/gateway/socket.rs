@@ -15,7 +15,8 @@ use hil_gateways::transport::tcp::{
 use hil_gateways::transport::timestamping::TimestampMode;
 use hil_gateways::transport::udp::{GrantedOptions, PathMtu, UdpReceiver, UdpSender, UdpSettings};
 use hil_gateways::transport::{DatagramReceiver, DatagramSender};
-use hil_models::link::{Fate, LinkModel, LossCauses};
+use hil_models::link::trace::ReplayTally;
+use hil_models::link::{Fate, LinkModel, LossCauses, MessageNumber};
 use hil_models::time::Instant;
 
 use super::GatewayError;
@@ -40,6 +41,8 @@ pub(super) struct OpenSocket {
     pub(super) facts: Vec<(String, String)>,
     /// How often its connections come and go, where this end tells of it.
     pub(super) tally: Option<Arc<ConnectionTally>>,
+    /// What its link model met of the trace that it replays, where it replays one.
+    pub(super) replay: Option<ReplayTally>,
 }
 
 /// Which end of the hop it is.
@@ -69,7 +72,7 @@ impl OpenSocket {
         (launch, plan): (&DirectionLaunch, StampPlan),
         start: &RunStart,
     ) -> Result<Self, GatewayError> {
-        let (ends, mut facts) = match launch.side {
+        let (ends, mut facts, replay) = match launch.side {
             Side::Egress => {
                 let sender = UdpSender::open(settings)?;
                 let mut facts = socket_facts(settings, sender.granted());
@@ -81,12 +84,13 @@ impl OpenSocket {
                 let text = format!("{} bytes, {configured} configured", mtu.packet_bytes);
                 facts.push(("path MTU".to_owned(), text));
                 let longest = datagram_bytes_max(launch, mtu);
-                (Ends::Sender(Box::new(sender), longest), facts)
+                (Ends::Sender(Box::new(sender), longest), facts, None)
             }
             Side::Ingress => {
                 let receiver = UdpReceiver::open(settings)?;
                 let facts = socket_facts(settings, receiver.granted());
-                (Ends::Receiver(emulate(receiver, launch, start)?), facts)
+                let (receiver, replay) = emulate(receiver, launch, start)?;
+                (Ends::Receiver(receiver), facts, replay)
             }
         };
         if let Some(emulation) = &launch.emulation {
@@ -103,6 +107,7 @@ impl OpenSocket {
             ends,
             facts,
             tally: None,
+            replay,
         })
     }
 
@@ -138,7 +143,12 @@ impl OpenSocket {
             USER_TIMEOUT.as_secs()
         );
         facts.push(("TCP".to_owned(), options));
-        Ok(Self { ends, facts, tally })
+        Ok(Self {
+            ends,
+            facts,
+            tally,
+            replay: None,
+        })
     }
 }
 
@@ -211,7 +221,7 @@ fn room(
     emulation: &EmulationLaunch,
     launch: &DirectionLaunch,
 ) -> Result<EmulationRoom, EmulationError> {
-    Ok(emulation.room(launch.size_bytes)?)
+    emulation.room(launch.size_bytes)
 }
 
 /// The longest datagram of the channel: as long as a message needs, with room for the greetings and
@@ -221,15 +231,18 @@ fn held_bytes_max(launch: &DirectionLaunch) -> usize {
     message.max(512).min(launch.socket.path_mtu_bytes)
 }
 
+/// A receiver, and what its link model met of the trace that it replays.
+type Emulated = (Box<dyn DatagramReceiver>, Option<ReplayTally>);
+
 /// Puts the receiver behind the launch's link model, if it has one. Greetings and clock exchanges
 /// pass freely: the model stands for what happens to the robot's messages.
 fn emulate(
     receiver: UdpReceiver,
     launch: &DirectionLaunch,
     start: &RunStart,
-) -> Result<Box<dyn DatagramReceiver>, GatewayError> {
+) -> Result<Emulated, GatewayError> {
     let Some(emulation) = &launch.emulation else {
-        return Ok(Box::new(receiver));
+        return Ok((Box::new(receiver), None));
     };
     let link = SinceStart {
         link: emulation.model(&launch.channel)?,
@@ -243,18 +256,18 @@ fn emulate(
     };
     let is_exempt =
         |bytes: &[u8]| wire::decode(bytes).is_ok_and(|datagram| datagram.header.kind != Kind::Data);
-    Ok(Box::new(EmulatedReceiver::new(
-        receiver,
-        Box::new(link),
-        is_exempt,
-        settings,
-    )))
+    let replay = link.replay_tally();
+    let receiver = EmulatedReceiver::new(receiver, Box::new(link), is_exempt, settings);
+    Ok((Box::new(receiver), replay))
 }
 
 /// Which message of its channel a datagram carries, or a part of.
-fn message_number(bytes: &[u8]) -> Option<u64> {
+fn message_number(bytes: &[u8]) -> Option<MessageNumber> {
     let header = wire::decode(bytes).ok()?.header;
-    (header.kind == Kind::Data).then_some(header.sequence)
+    (header.kind == Kind::Data).then_some(MessageNumber {
+        start: header.epoch,
+        sequence: header.sequence,
+    })
 }
 
 /// A link on a clock that reads zero when the run starts, as it does in virtual time; before the
@@ -289,13 +302,22 @@ impl<L: LinkModel> LinkModel for SinceStart<L> {
         self.link.loss_causes()
     }
 
+    fn replay_tally(&self) -> Option<ReplayTally> {
+        self.link.replay_tally()
+    }
+
     fn offer(&mut self, now: Instant, length_bytes: usize) -> Fate {
         self.ask(now, |link, at| link.offer(at, length_bytes))
     }
 
-    fn offer_numbered(&mut self, now: Instant, length_bytes: usize, number: u64) -> Fate {
+    fn offer_numbered(
+        &mut self,
+        now: Instant,
+        length_bytes: usize,
+        message: MessageNumber,
+    ) -> Fate {
         self.ask(now, |link, at| {
-            link.offer_numbered(at, length_bytes, number)
+            link.offer_numbered(at, length_bytes, message)
         })
     }
 }
@@ -314,82 +336,5 @@ fn datagram_bytes_max(launch: &DirectionLaunch, path: PathMtu) -> usize {
 }
 
 #[cfg(test)]
-mod tests {
-    use hil_models::link::outages::{Outage, OutageSchedule, Outages};
-    use hil_models::link::spec::{LinkSpec, Way};
-    use hil_models::random::RandomStream;
-
-    use super::*;
-
-    fn emulation(per_hour: f64) -> EmulationLaunch {
-        let outages = Outages {
-            mean_s: 0.5,
-            per_hour,
-            buffered: false,
-        };
-        EmulationLaunch {
-            spec: LinkSpec {
-                outages,
-                ..LinkSpec::fixed(Duration::from_millis(5), 0.0)
-            },
-            link: "hop".to_owned(),
-            way: Way::Forward,
-            seed: 3,
-            trace: None,
-        }
-    }
-
-    fn live(channel: &str, start: &RunStart) -> SinceStart<impl LinkModel + use<>> {
-        SinceStart {
-            link: emulation(600.0).model(channel).unwrap(),
-            start: start.clone(),
-        }
-    }
-
-    #[test]
-    fn outages_count_from_the_start_of_the_run_on_every_channel_alike() {
-        let start = RunStart::default();
-        let began = Instant::from_ns(77_000_000_000_123);
-        let (mut there, mut back) = (live("a/b", &start), live("b/a", &start));
-        // Nothing fails before the start, however long it takes.
-        for step in 0..1_000 {
-            let now = Instant::from_ns(step * 1_000_000_000);
-            assert_eq!(
-                there.offer(now, 1),
-                Fate::Delivered(now + Duration::from_millis(5))
-            );
-        }
-        start.set(began);
-        let mut restarted = None;
-        let mut virtual_time = emulation(600.0).model("a/b").unwrap();
-        let mut lost_count = 0;
-        for step in 0..100_000 {
-            let elapsed = Duration::from_millis(4 * step);
-            let now = began + elapsed;
-            let is_lost = there.offer(now, 1) == Fate::Lost;
-            lost_count += u32::from(is_lost);
-            assert_eq!(back.offer(now, 1) == Fate::Lost, is_lost);
-            let simulated = virtual_time.offer(Instant::ZERO + elapsed, 1);
-            assert_eq!(simulated == Fate::Lost, is_lost);
-            if step >= 50_000 {
-                // A gateway that was started again in the middle of the run.
-                let restarted = restarted.get_or_insert_with(|| live("a/b", &start));
-                assert_eq!(restarted.offer(now, 1) == Fate::Lost, is_lost);
-            }
-        }
-        assert!(lost_count > 1_000, "{lost_count}");
-    }
-
-    #[test]
-    fn two_links_of_one_run_fail_apart() {
-        let first = |link: &str| -> Outage {
-            let emulation = emulation(600.0);
-            let name = format!("links.{link}.outages");
-            let stream = RandomStream::new(emulation.seed, &name);
-            let mut schedule =
-                OutageSchedule::new(emulation.spec.outages, stream, Instant::ZERO).unwrap();
-            schedule.next().unwrap()
-        };
-        assert_ne!(first("hop"), first("wire"));
-    }
-}
+#[path = "socket_tests.rs"]
+mod tests;

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use hil_gateways::capture::flow::FlowFilter;
 use hil_gateways::capture::join::{JoinFigures, Joined, OrderSource};
-use hil_gateways::capture::observe::{Observer, PacketCounts, Point, Stream};
+use hil_gateways::capture::observe::{Observation, Observer, PacketCounts, Point, Stream};
 use hil_gateways::capture::pairing::join_all;
 use hil_gateways::capture::point::{PointFigures, single_point_figures};
 use hil_models::measure::histogram::Distribution;
@@ -14,23 +14,31 @@ use hil_models::measure::statistics::IntervalNs;
 use serde::Serialize;
 
 use super::files::{CaptureFile, FileError, read};
+use super::point_clocks::PointClocks;
 
 /// Captures read, and every point in them.
 #[derive(Debug)]
 pub(super) struct Reading {
     pub(super) files: Vec<CaptureFile>,
     pub(super) observer: Observer,
+    /// What cards stamped of the same, each on a clock of its own.
+    of_cards: Observer,
 }
 
 impl Reading {
     /// Reads up to two files.
     pub(super) fn of(paths: &[&Path], flows: &[FlowFilter]) -> Result<Self, FileError> {
         let mut observer = Observer::new(flows);
+        let mut of_cards = Observer::new(flows);
         let mut files = Vec::with_capacity(paths.len());
         for (index, path) in paths.iter().enumerate() {
-            files.push(read(path, index, &mut observer)?);
+            files.push(read(path, index, (&mut observer, &mut of_cards))?);
         }
-        Ok(Self { files, observer })
+        Ok(Self {
+            files,
+            observer,
+            of_cards,
+        })
     }
 
     /// A point in words: file, interface, port, direction.
@@ -55,6 +63,31 @@ impl Reading {
             let _infallible = write!(text, " ({})", point.direction.label());
         }
         text
+    }
+
+    /// Every stream that a card stamped, with how many of its datagrams have the kernel's stamp.
+    fn card_streams(&self) -> impl Iterator<Item = (&Point, &Stream, &Vec<Observation>, u64)> {
+        let seen = self.of_cards.seen().iter();
+        let streams = seen.flat_map(|(point, seen)| {
+            let streams = seen.streams.iter();
+            streams.map(move |(stream, list)| (point, stream, list))
+        });
+        streams.map(|(point, stream, list)| {
+            let name = |one: &Point| {
+                let interfaces = &self.files[one.file_index].interfaces;
+                interfaces.get(one.interface_index)?.name.as_deref()
+            };
+            let is_same_place = |one: &Point| {
+                (one.file_index, one.direction) == (point.file_index, point.direction)
+                    && name(one) == name(point)
+            };
+            let of_kernel = self.observer.seen().iter();
+            let all: usize = of_kernel
+                .filter(|(one, _)| is_same_place(one))
+                .filter_map(|(_, seen)| seen.streams.get(stream).map(Vec::len))
+                .sum();
+            (point, stream, list, all as u64)
+        })
     }
 
     /// Every stream at two points, joined.
@@ -112,6 +145,10 @@ struct StreamReport {
 #[derive(Debug, Serialize)]
 struct PointReport {
     point: String,
+    /// By a network card's clock: datagrams of this stream that have the kernel's stamp, of which
+    /// the figures hold those that have the card's as well.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    kernel_stamped_count: Option<u64>,
     #[serde(flatten)]
     stream: StreamReport,
     figures: PointFigures,
@@ -121,6 +158,9 @@ struct PointReport {
 struct JoinReport {
     first: String,
     second: String,
+    clocks: PointClocks,
+    /// How far the clocks may lead the delays astray; `None` where it is unknown.
+    delay_bound_ns: Option<u64>,
     #[serde(flatten)]
     stream: StreamReport,
     figures: JoinFigures,
@@ -138,7 +178,7 @@ pub(super) struct Report {
 
 impl Report {
     /// Draws up the figures.
-    pub(super) fn of(reading: &Reading, window_ns: i64) -> Self {
+    pub(super) fn of(reading: &Reading, window_ns: i64, is_one_clock: bool) -> Self {
         let stream_report = |stream: &Stream| StreamReport {
             flow: reading.observer.flows()[stream.flow_index].to_string(),
             source: stream.source.to_string(),
@@ -152,13 +192,29 @@ impl Report {
                 points.extend(
                     single_point_figures(observations).map(|figures| PointReport {
                         point: reading.name(point),
+                        kernel_stamped_count: None,
                         stream: stream_report(stream),
                         figures,
                     }),
                 );
             }
         }
+        for (point, stream, observations, all) in reading.card_streams() {
+            let figures = single_point_figures(observations);
+            points.extend(figures.map(|figures| PointReport {
+                point: format!("{}, by the card's clock", reading.name(point)),
+                kernel_stamped_count: Some(all),
+                stream: stream_report(stream),
+                // A number that the card did not stamp was not skipped.
+                figures: PointFigures {
+                    numbers: figures.numbers.filter(|_| figures.datagram_count == all),
+                    ..figures
+                },
+            }));
+        }
         let joins = reading.joined(window_ns).into_iter();
+        let clocks =
+            |one: &Joined| PointClocks::of(&one.first_point, &one.second_point, is_one_clock);
         Self {
             schema_version: 1,
             files: reading.files.iter().map(file_report).collect(),
@@ -168,6 +224,8 @@ impl Report {
                 .map(|(stream, joined)| JoinReport {
                     first: reading.name(&joined.first_point),
                     second: reading.name(&joined.second_point),
+                    clocks: clocks(&joined),
+                    delay_bound_ns: clocks(&joined).bound_ns(),
                     stream: stream_report(&stream),
                     figures: joined.figures,
                 })
@@ -233,6 +291,9 @@ impl Report {
                 &mut text,
                 &format!("{}  at {}", stream_line(&point.stream), point.point),
             );
+            if let Some(all) = point.kernel_stamped_count {
+                line(&mut text, &format!("  {all} arrived, of which"));
+            }
             point_text(&mut text, &point.figures);
         }
         for joined in &self.joins {
@@ -240,6 +301,8 @@ impl Report {
             line(&mut text, &stream_line(&joined.stream));
             let ends = format!("  from {} to {}", joined.first, joined.second);
             line(&mut text, &ends);
+            let clocks = format!("  clock       {}", joined.clocks.words());
+            line(&mut text, &clocks);
             join_text(&mut text, &joined.figures);
         }
         text
@@ -253,7 +316,11 @@ fn file_report(file: &CaptureFile) -> FileReport {
         format: file.format,
         packet_count: file.packet_count,
         interfaces: names
-            .map(|(index, one)| one.name.clone().unwrap_or_else(|| index.to_string()))
+            .map(|(index, one)| {
+                let name = one.name.clone().unwrap_or_else(|| index.to_string());
+                let of_card = if one.has_card_clock() { " (card)" } else { "" };
+                name + of_card
+            })
             .collect(),
         dropped_count: file.dropped_count(),
         fault_count: file.fault_count,

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use clap::{Args, Subcommand};
+use clap::{Args, Subcommand, ValueEnum};
 use hil_gateways::capture::flow::FlowFilter;
 
 const EXAMPLES: &str = "\
@@ -12,6 +12,8 @@ Examples:
       our own datagrams on eth0, until Ctrl-C
   hil-runtime probe -i lan1 -i lan2 -o bridge.pcapng --duration 60s --flow udp:dport=5004,id=2+2
       RTP through a bridge with two ports, known again by its sequence number
+  hil-runtime probe -i eth0 -o card.pcapng --stamps card
+      with the network card's own stamps of what arrives beside the kernel's
   ip netns exec robot hil-runtime probe -i eth0 -o robot.pcapng
       the same in another network namespace
   hil-runtime probe analyse here.pcapng there.pcapng
@@ -25,7 +27,7 @@ Flows: hil (our datagrams), egm:port=6510, udp:CONDITIONS; conditions with comma
 
 Exit codes: 0 done; 1 packets were dropped, an interface failed, a file has a fault, or the figures
 differ; 2 wrong arguments, nothing to read, or a capture without anything of the run; 69 no such interface; 78 the right to capture is missing (root or
-CAP_NET_RAW); 130 interrupted before --duration was over, the file is complete";
+CAP_NET_RAW) or the card gives no stamps; 130 interrupted before --duration was over, the file is complete";
 
 /// Look at the wire without taking part: capture, analyse, compare with a run.
 #[derive(Debug, Args)]
@@ -68,9 +70,22 @@ pub(crate) struct LiveArgs {
     #[arg(long, value_name = "MIB", default_value_t = 8,
           value_parser = clap::value_parser!(u16).range(1..=256))]
     pub(crate) ring: u16,
+    /// Whose stamps; `card` adds those of the network card, on its own clock, for what arrives. It
+    /// sets the card up (`CAP_NET_ADMIN`) and puts it back.
+    #[arg(long, value_enum, default_value = "kernel")]
+    pub(crate) stamps: Stamps,
     /// Print no progress.
     #[arg(long, short)]
     pub(crate) quiet: bool,
+}
+
+/// Whose stamps a capture has.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Stamps {
+    /// The kernel's.
+    Kernel,
+    /// The card's as well.
+    Card,
 }
 
 /// Everything but a live capture.
@@ -82,6 +97,10 @@ pub(crate) enum ProbeWork {
         file: PathBuf,
         /// The capture of a second point.
         second: Option<PathBuf>,
+        /// Both captures were stamped by one clock, e.g. on one machine: only then is the time
+        /// between them a one-way delay.
+        #[arg(long)]
+        one_clock: bool,
         /// How to read them.
         #[command(flatten)]
         reading: ReadingArgs,

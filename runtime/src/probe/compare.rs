@@ -18,6 +18,7 @@ use hil_models::measure::record::{EgressRecord, IngressRecord, UNAVAILABLE};
 use serde::Serialize;
 
 use super::analyse::{Reading, quantiles};
+use super::point_clocks::WireClocks;
 use crate::record::{RecordFile, RecordFileError, RecordKind};
 use crate::report::summary::{RunSummary, SummaryError};
 use crate::run_folder::RunFolder;
@@ -96,6 +97,7 @@ impl ChannelComparison {
 pub(super) struct Comparison {
     schema_version: u32,
     run: String,
+    clocks: WireClocks,
     channels: Vec<ChannelComparison>,
 }
 
@@ -106,7 +108,8 @@ impl Comparison {
     }
 
     pub(super) fn to_text(&self, limit_us: f64) -> String {
-        let mut text = format!("{}: gateways and probe\n", self.run);
+        let clocks = self.clocks.words();
+        let mut text = format!("{}: gateways and probe; {clocks}\n", self.run);
         for one in &self.channels {
             let _infallible = write!(text, "\n{}\n", one.channel);
             for (what, counts) in [
@@ -196,6 +199,7 @@ pub(super) fn compare(
     Ok(Comparison {
         schema_version: 1,
         run: folder.name(),
+        clocks: WireClocks::of(summary.as_ref()),
         channels: channels.collect(),
     })
 }

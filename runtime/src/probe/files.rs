@@ -41,11 +41,12 @@ pub(super) struct FileError {
     source: io::Error,
 }
 
-/// Reads a whole file into the observer; faults of the format are part of the result.
+/// Reads a whole file; faults of the format are part of the result. Packets go to `observer`, and
+/// once more to `of_cards` where the file has them with a card's stamp as well.
 pub(super) fn read(
     path: &Path,
     file_index: usize,
-    observer: &mut Observer,
+    (observer, of_cards): (&mut Observer, &mut Observer),
 ) -> Result<CaptureFile, FileError> {
     let failed = |source| FileError {
         path: path.to_owned(),
@@ -64,6 +65,7 @@ pub(super) fn read(
     };
     loop {
         match reader.next_step() {
+            Step::Packet(packet) if packet.is_card_stamped => of_cards.take(file_index, &packet),
             Step::Packet(packet) => {
                 file.packet_count += 1;
                 observer.take(file_index, &packet);

@@ -9,11 +9,13 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use hil_gateways::capture::flow::FlowFilter;
 use hil_gateways::capture::writer::{self, PacketToWrite};
-use hil_gateways::capture::{CaptureInterface, Direction, link_type};
+use hil_gateways::capture::{CaptureInterface, Direction, link_type as link};
 use hil_gateways::transport::packet_ring::{
-    PacketRing, RingCounters, RingError, RingPacket, RingSettings,
+    PacketRing, RingCounters, RingError, RingSettings, RingStamps,
 };
+use hil_gateways::transport::ring_frame::{RingPacket, StampSource};
 
+use super::card_tap::{CardResult, CardTap};
 use crate::console::Console;
 use crate::signals::Signals;
 
@@ -35,6 +37,8 @@ pub(super) struct Request {
     pub(super) duration: Option<Duration>,
     pub(super) snap_bytes: u32,
     pub(super) ring_bytes: usize,
+    /// Whose stamps the file is to have, besides the kernel's.
+    pub(super) stamps: RingStamps,
 }
 
 /// Why a capture failed. What was written until then is a file of whole blocks.
@@ -42,6 +46,8 @@ pub(super) struct Request {
 pub(super) enum LiveError {
     #[error(transparent)]
     Ring(#[from] RingError),
+    #[error("the card of {interface} gives no stamps: {reason}")]
+    Card { interface: String, reason: String },
     #[error("capture file {path}: {source}")]
     File { path: PathBuf, source: io::Error },
     #[error("{path}: exists; say --force")]
@@ -64,6 +70,8 @@ pub(super) struct InterfaceResult {
     pub(super) counters: RingCounters,
     /// The interface was taken down or has gone.
     pub(super) has_failed: bool,
+    /// Of its card, if that was asked for stamps.
+    pub(super) card: Option<CardResult>,
 }
 
 /// How a capture ended.
@@ -78,6 +86,7 @@ pub(super) struct LiveResult {
 
 struct Tap {
     ring: PacketRing,
+    card: Option<CardTap>,
     /// When the interface had gone, nanoseconds since 1970.
     gone_ns: Option<u64>,
     result: InterfaceResult,
@@ -89,21 +98,7 @@ pub(super) fn capture(
     signals: &Signals,
     console: &mut Console,
 ) -> Result<LiveResult, LiveError> {
-    let settings = RingSettings {
-        snap_bytes: request.snap_bytes,
-        ring_bytes: request.ring_bytes,
-    };
-    let mut taps = Vec::with_capacity(request.interfaces.len());
-    for name in &request.interfaces {
-        taps.push(Tap {
-            ring: PacketRing::open(name, &request.flows, &settings)?,
-            gone_ns: None,
-            result: InterfaceResult {
-                name: name.clone(),
-                ..InterfaceResult::default()
-            },
-        });
-    }
+    let mut taps = open_taps(request, console)?;
     let start_ns = realtime_ns();
     let mut file = Output::create(&request.output, request.replaces)?;
     describe(&mut file.buffer, request, &taps);
@@ -116,13 +111,14 @@ pub(super) fn capture(
         flow_list(&request.flows),
         room.unwrap_or(0),
     ));
+    let tap_count = u32::try_from(taps.len()).unwrap_or(u32::MAX);
     let mut progress_due = began + PROGRESS_PERIOD;
     let (ended_by, end_ns) = loop {
         let ended_by = signals.received();
         let is_over = ended_by.is_some() || request.duration.is_some_and(|d| began.elapsed() >= d);
         let look_ns = realtime_ns();
-        for (index, tap) in taps.iter_mut().enumerate() {
-            drain(tap, index, &mut file)?;
+        for (index, tap) in (0_u32..).zip(&mut taps) {
+            drain(tap, (index, tap_count), &mut file)?;
             watch(tap, look_ns, console);
         }
         if is_over || taps.iter().all(|tap| tap.gone_ns.is_some()) {
@@ -142,7 +138,12 @@ pub(super) fn capture(
             dropped_count,
         } = tap.result.counters;
         let span = (start_ns, tap.gone_ns.unwrap_or(end_ns).max(start_ns));
-        writer::statistics(&mut file.buffer, index, span, matched_count, dropped_count);
+        let counts = (matched_count, dropped_count);
+        writer::statistics(&mut file.buffer, index, span, counts, None);
+        if let Some(card) = tap.card.take() {
+            let index = tap_count + index;
+            tap.result.card = Some(card.finish(index, span, &mut file.buffer)?);
+        }
     }
     file.finish()?;
     Ok(LiveResult {
@@ -153,6 +154,43 @@ pub(super) fn capture(
     })
 }
 
+fn open_taps(request: &Request, console: &mut Console) -> Result<Vec<Tap>, LiveError> {
+    let settings = RingSettings {
+        snap_bytes: request.snap_bytes,
+        ring_bytes: request.ring_bytes,
+        stamps: RingStamps::Kernel,
+    };
+    let mut taps: Vec<Tap> = Vec::with_capacity(request.interfaces.len());
+    for name in &request.interfaces {
+        let ring = PacketRing::open(name, &request.flows, &settings)?;
+        let card = match request.stamps {
+            RingStamps::Kernel => None,
+            RingStamps::Card => {
+                let is_guarded = taps.iter().any(|tap| tap.result.name == *name);
+                let card = CardTap::open(name, is_guarded, &request.flows, &settings)?;
+                let granted = format!("{name}: the card grants {}", card.granted());
+                if card.stamps_all_arrivals() {
+                    console.say(&granted);
+                } else {
+                    console.warn(&granted);
+                }
+                Some(card)
+            }
+        };
+        taps.push(Tap {
+            ring,
+            card,
+            gone_ns: None,
+            result: InterfaceResult {
+                name: name.clone(),
+                ..InterfaceResult::default()
+            },
+        });
+    }
+    Ok(taps)
+}
+
+/// Interfaces first, then their cards in the same order.
 fn describe(buffer: &mut Vec<u8>, request: &Request, taps: &[Tap]) {
     let application = concat!("hil-runtime probe ", env!("CARGO_PKG_VERSION"));
     let system = nix::sys::utsname::uname().ok();
@@ -167,6 +205,9 @@ fn describe(buffer: &mut Vec<u8>, request: &Request, taps: &[Tap]) {
         };
         writer::interface(buffer, &interface, &flow_list(&request.flows));
     }
+    for card in taps.iter().filter_map(|tap| tap.card.as_ref()) {
+        card.describe(buffer, request.snap_bytes, &request.flows);
+    }
 }
 
 pub(super) fn flow_list(flows: &[FlowFilter]) -> String {
@@ -175,9 +216,15 @@ pub(super) fn flow_list(flows: &[FlowFilter]) -> String {
 }
 
 /// Everything that is in the ring now.
-fn drain(tap: &mut Tap, index: usize, file: &mut Output) -> Result<(), LiveError> {
-    let is_ethernet = tap.ring.link_type() == link_type::ETHERNET;
-    let interface_index = u32::try_from(index).unwrap_or(u32::MAX);
+fn drain(
+    tap: &mut Tap,
+    (index, tap_count): (u32, u32),
+    file: &mut Output,
+) -> Result<(), LiveError> {
+    if let Some(card) = &mut tap.card {
+        card.drain(tap_count + index, file)?;
+    }
+    let link_type = tap.ring.link_type();
     let Tap { ring, result, .. } = tap;
     // A ring that fills as fast as it is emptied must not keep the others waiting.
     for _ in 0..ring.frame_count() {
@@ -187,15 +234,13 @@ fn drain(tap: &mut Tap, index: usize, file: &mut Output) -> Result<(), LiveError
                 Direction::Outbound => result.outbound_count += 1,
                 _ => result.inbound_count += 1,
             }
-            result.late_stamp_count += u64::from(!packet.is_stamped_in_stack);
-            append(buffer, interface_index, packet, is_ethernet);
+            result.late_stamp_count += u64::from(packet.source == StampSource::Tap);
+            append(buffer, index, packet, link_type);
         });
         if !is_there {
             break;
         }
-        if file.buffer.len() >= WRITE_BYTES {
-            file.write_out()?;
-        }
+        file.write_if_full()?;
     }
     Ok(())
 }
@@ -217,7 +262,13 @@ fn watch(tap: &mut Tap, now_ns: u64, console: &mut Console) {
 }
 
 /// Puts a packet into the file as it was on the wire, with the VLAN tag the kernel took out.
-fn append(buffer: &mut Vec<u8>, interface_index: u32, packet: &RingPacket<'_>, is_ethernet: bool) {
+pub(super) fn append(
+    buffer: &mut Vec<u8>,
+    interface_index: u32,
+    packet: &RingPacket<'_>,
+    link_type: u16,
+) {
+    let is_ethernet = link_type == link::ETHERNET;
     let mut whole = PacketToWrite {
         interface_index,
         stamp_ns: packet.stamp_ns,
@@ -242,11 +293,15 @@ fn append(buffer: &mut Vec<u8>, interface_index: u32, packet: &RingPacket<'_>, i
 }
 
 fn count(tap: &mut Tap) -> Result<(), LiveError> {
-    tap.result.counters = tap.ring.counters().map_err(|source| LiveError::Counters {
-        interface: tap.result.name.clone(),
-        source,
-    })?;
+    tap.result.counters = counters_of(&mut tap.ring, &tap.result.name)?;
     Ok(())
+}
+
+pub(super) fn counters_of(ring: &mut PacketRing, name: &str) -> Result<RingCounters, LiveError> {
+    ring.counters().map_err(|source| LiveError::Counters {
+        interface: name.to_owned(),
+        source,
+    })
 }
 
 fn show(
@@ -279,7 +334,7 @@ fn realtime_ns() -> u64 {
     since.map_or(0, |time| u64::try_from(time.as_nanos()).unwrap_or(u64::MAX))
 }
 
-struct Output {
+pub(super) struct Output {
     path: PathBuf,
     file: File,
     buffer: Vec<u8>,
@@ -308,6 +363,18 @@ impl Output {
             }
             Err(source) => Err(LiveError::File { path, source }),
         }
+    }
+
+    /// What is to be written next.
+    pub(super) fn buffer(&mut self) -> &mut Vec<u8> {
+        &mut self.buffer
+    }
+
+    pub(super) fn write_if_full(&mut self) -> Result<(), LiveError> {
+        if self.buffer.len() < WRITE_BYTES {
+            return Ok(());
+        }
+        self.write_out()
     }
 
     /// Whole blocks only: where the disk fills up within one, that one is taken back.
@@ -367,7 +434,7 @@ mod tests {
         let mut buffer = Vec::new();
         writer::begin(&mut buffer, "test", "none");
         let head = buffer.len() as u64;
-        writer::statistics(&mut buffer, 0, (0, 1), 2, 3);
+        writer::statistics(&mut buffer, 0, (0, 1), (2, 3), None);
         let all = buffer.len() as u64;
         for (there, whole) in [
             (0, 0),

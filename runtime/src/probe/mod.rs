@@ -3,19 +3,21 @@
 
 mod analyse;
 pub mod arguments;
+mod card_tap;
 mod compare;
 mod files;
 mod live;
+mod point_clocks;
 
 use core::fmt::Write as _;
 use std::path::Path;
 use std::time::Duration;
 
 use hil_gateways::capture::flow::{FLOW_COUNT_MAX, FlowFilter};
-use hil_gateways::transport::packet_ring::RingError;
+use hil_gateways::transport::packet_ring::{RingError, RingStamps};
 
 use self::analyse::{Reading, Report};
-use self::arguments::{LiveArgs, ProbeArgs, ProbeWork, ReadingArgs};
+use self::arguments::{LiveArgs, ProbeArgs, ProbeWork, ReadingArgs, Stamps};
 use self::live::{LiveError, LiveResult, Request};
 use crate::console::Console;
 use crate::signals::{EXIT_INTERRUPTED, Signals};
@@ -37,8 +39,12 @@ pub(crate) fn run(args: &ProbeArgs, console: &mut Console) -> u8 {
         Some(ProbeWork::Analyse {
             file,
             second,
+            one_clock,
             reading,
-        }) => analyse(&paths(file, second.as_deref()), reading, console),
+        }) => {
+            let paths = paths(file, second.as_deref());
+            analyse(&paths, reading, *one_clock, console)
+        }
         Some(ProbeWork::Compare {
             run,
             file,
@@ -107,11 +113,16 @@ fn read(paths: &[&Path], reading: &ReadingArgs, console: &mut Console) -> Option
     }
 }
 
-fn analyse(paths: &[&Path], reading: &ReadingArgs, console: &mut Console) -> u8 {
+fn analyse(
+    paths: &[&Path],
+    reading: &ReadingArgs,
+    is_one_clock: bool,
+    console: &mut Console,
+) -> u8 {
     let Some(captures) = read(paths, reading, console) else {
         return exit::USAGE;
     };
-    let report = Report::of(&captures, window_ns(reading));
+    let report = Report::of(&captures, window_ns(reading), is_one_clock);
     let complaints = captures.complaints();
     for complaint in &complaints {
         console.warn(complaint);
@@ -141,6 +152,16 @@ fn capture(args: &LiveArgs) -> u8 {
         console.error("no --interface given; `ip link` lists those of this host");
         return exit::USAGE;
     }
+    let again = (1..args.interface.len())
+        .map(|index| &args.interface[index])
+        .zip(1..)
+        .find(|(name, index)| args.interface[..*index].contains(name));
+    if let Some((name, _)) = again {
+        console.error(&format!(
+            "--interface {name} is given twice; one tap sees all there is"
+        ));
+        return exit::USAGE;
+    }
     if args.flow.len() > FLOW_COUNT_MAX {
         console.error(&format!(
             "{} flows are more than the {FLOW_COUNT_MAX} one probe follows",
@@ -159,6 +180,10 @@ fn capture(args: &LiveArgs) -> u8 {
             .snap_length
             .unwrap_or(u32::try_from(needed).unwrap_or(2048)),
         ring_bytes: usize::from(args.ring) << 20,
+        stamps: match args.stamps {
+            Stamps::Kernel => RingStamps::Kernel,
+            Stamps::Card => RingStamps::Card,
+        },
         flows,
     };
     let signals = match Signals::install() {
@@ -177,7 +202,9 @@ fn capture(args: &LiveArgs) -> u8 {
                 LiveError::Ring(RingError::Size { .. } | RingError::LinkLayer { .. })
                 | LiveError::File { .. }
                 | LiveError::Exists { .. } => exit::USAGE,
-                LiveError::Ring(RingError::Rights { .. }) => exit::HOST_UNFIT,
+                LiveError::Ring(RingError::Rights { .. }) | LiveError::Card { .. } => {
+                    exit::HOST_UNFIT
+                }
                 LiveError::Ring(RingError::Refused { .. }) | LiveError::Counters { .. } => {
                     exit::INTERNAL
                 }
@@ -204,6 +231,20 @@ fn conclude(request: &Request, result: &LiveResult, console: &mut Console) -> u8
             text.push_str(", interrupted");
         }
         text.push('\n');
+        if let Some(card) = &one.card {
+            dropped_count += card.counters.dropped_count;
+            let _infallible = writeln!(
+                text,
+                "{}: {} of {} arrivals have the card's stamp, the others the kernel's alone; {} \
+                 dropped by the kernel; {}; the card {}",
+                one.name,
+                card.stamped_count,
+                card.stamped_count + card.unstamped_count,
+                card.counters.dropped_count,
+                card.granted,
+                card.restoring
+            );
+        }
     }
     let _infallible = writeln!(
         text,

@@ -8,7 +8,7 @@ use hil_gateways::protocol::wire;
 use hil_models::case_study::ParameterError;
 use hil_models::link::spec::LinkSpec;
 
-use super::launch::EmulationLaunch;
+use super::launch::{EmulationError, EmulationLaunch};
 use crate::topology::Topology;
 
 /// Datagrams there is room for whatever the link does: bursts.
@@ -99,8 +99,8 @@ impl EmulationRoom {
 /// Whether gateways can hold what every emulated link of `topology` leaves under way.
 ///
 /// # Errors
-/// The first link for which they cannot.
-pub(crate) fn check_emulation(topology: &Topology) -> Result<(), ParameterError> {
+/// The first link for which they cannot, or a trace that cannot be read.
+pub(crate) fn check_emulation(topology: &Topology) -> Result<(), EmulationError> {
     for crossing in topology.crossings() {
         if let Some(emulation) = EmulationLaunch::of(&crossing, topology.run().seed) {
             emulation.room(crossing.channel.message.size_bytes)?;

@@ -16,7 +16,7 @@ use serde::{Deserialize, Serialize};
 use super::emulation_room::EmulationRoom;
 use crate::realtime::RealtimeRequest;
 use crate::topology::{Crossing, Direction, Timestamps};
-use crate::trace::source::{TraceFileError, TraceLaunch};
+use crate::trace::source::{TraceError, TraceLaunch};
 use crate::wait::WaitMode;
 
 /// How to start one component here.
@@ -53,6 +53,9 @@ pub struct GatewayLaunch {
     pub records: PathBuf,
     /// One thread each.
     pub directions: Vec<DirectionLaunch>,
+    /// How long it waits for the peer's answer before it is ready without; `None` waits on.
+    #[serde(default)]
+    pub ready_within: Option<Duration>,
 }
 
 /// One channel direction through a gateway.
@@ -85,6 +88,9 @@ pub struct DirectionLaunch {
     pub realtime: RealtimeRequest,
     /// A link model in front of this direction's receiver.
     pub emulation: Option<EmulationLaunch>,
+    /// It exchanges clocks only: no channel of shared memory is behind it.
+    #[serde(default)]
+    pub is_clock_path: bool,
 }
 
 /// Which way a gateway thread carries its channel.
@@ -153,7 +159,7 @@ pub enum EmulationError {
     Parameter(#[from] ParameterError),
     /// The trace cannot be replayed.
     #[error(transparent)]
-    Trace(#[from] TraceFileError),
+    Trace(#[from] TraceError),
 }
 
 impl EmulationLaunch {
@@ -167,10 +173,10 @@ impl EmulationLaunch {
                 Direction::Backward => Way::Backward,
             },
             seed,
-            trace: crossing
-                .link
-                .emulation()
-                .and_then(|emulation| emulation.trace.as_ref()?.launch(&crossing.channel.name)),
+            trace: crossing.link.emulation().and_then(|emulation| {
+                let trace = emulation.trace.as_ref()?;
+                trace.launch(&crossing.link.name, &crossing.channel.name)
+            }),
         })
     }
 
@@ -192,22 +198,32 @@ impl EmulationLaunch {
     }
 
     /// How long all but a share of 1 - `quantile` of the messages are under way at most.
-    pub fn flight_time(&self, quantile: f64) -> Duration {
-        let traced = self.trace.as_ref().and_then(TraceLaunch::delay_max);
-        traced.unwrap_or_else(|| self.spec.flight_time(quantile))
+    ///
+    /// # Errors
+    /// When its trace was not read before and cannot be.
+    pub fn flight_time(&self, quantile: f64) -> Result<Duration, EmulationError> {
+        match &self.trace {
+            Some(trace) => Ok(trace.delay_max()?),
+            None => Ok(self.spec.flight_time(quantile)),
+        }
     }
 
     /// Room for what the model holds of a channel of messages of `message_bytes`.
     ///
     /// # Errors
-    /// When a gateway cannot hold that much.
-    pub fn room(&self, message_bytes: usize) -> Result<EmulationRoom, ParameterError> {
-        let traced = self.trace.as_ref().and_then(TraceLaunch::delay_max);
-        let traced = traced.map(|longest| LinkSpec::fixed(longest, 0.0));
+    /// When a gateway cannot hold that much, or its trace was not read before and cannot be.
+    pub fn room(&self, message_bytes: usize) -> Result<EmulationRoom, EmulationError> {
+        let traced = match &self.trace {
+            Some(trace) => Some(LinkSpec::fixed(trace.delay_max()?, 0.0)),
+            None => None,
+        };
         let spec = traced.as_ref().unwrap_or(&self.spec);
         EmulationRoom::of(spec, message_bytes).map_err(|error| {
-            let key = format!("links.{}.{}", self.link, error.key);
-            ParameterError::new(&key, error.problem)
+            let key = match &self.trace {
+                Some(trace) => trace.key.clone(),
+                None => format!("links.{}.{}", self.link, error.key),
+            };
+            ParameterError::new(&key, error.problem).into()
         })
     }
 

@@ -7,6 +7,7 @@ use std::sync::atomic::{AtomicI64, AtomicU8, Ordering};
 use std::thread;
 use std::time::Duration;
 
+use hil_models::link::trace::ReplayCounts;
 use hil_models::time::Instant;
 use serde::{Deserialize, Serialize};
 
@@ -121,6 +122,9 @@ pub struct DirectionReport {
     pub counters: Vec<(String, u64)>,
     /// Facts in words: granted buffers, stamp probe, path MTU.
     pub facts: Vec<(String, String)>,
+    /// What its link model met of the trace that it replays; `None` where it replays none.
+    #[serde(default)]
+    pub replay: Option<ReplayCounts>,
 }
 
 const WAITING: u8 = 0;

@@ -286,6 +286,22 @@ impl RecordFile {
             .filter_map(|bytes| bytemuck::try_pod_read_unaligned(bytes).ok())
     }
 
+    /// How many whole records there are.
+    pub fn record_count(&self) -> usize {
+        self.raw().len()
+    }
+
+    /// The message with `index` in the order of the file; `None` beyond the last, and when the
+    /// file holds records of another kind.
+    pub fn message(&self, index: usize) -> Option<(Envelope, &[u8])> {
+        if self.header.kind != RecordKind::Message {
+            return None;
+        }
+        let bytes = self.raw().nth(index)?;
+        let (envelope, payload) = bytes.split_at(size_of::<Envelope>());
+        Some((bytemuck::pod_read_unaligned(envelope), payload))
+    }
+
     /// The messages, appended to a run log under the channel's name; nothing when the file holds
     /// records of another kind.
     pub fn append_messages(&self, log: &mut RunLog) {
@@ -302,7 +318,7 @@ impl RecordFile {
         }
     }
 
-    fn raw(&self) -> impl Iterator<Item = &[u8]> {
+    fn raw(&self) -> impl ExactSizeIterator<Item = &[u8]> {
         self.bytes[HEADER_BYTES..].chunks_exact(self.header.record_bytes as usize)
     }
 }

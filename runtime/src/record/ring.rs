@@ -96,6 +96,16 @@ impl Recorder {
         }
     }
 
+    /// A sink without a file, for records that a thread of its kind may make and this one does not:
+    /// every one would count as dropped.
+    pub fn closed_sink(&self) -> RecordSink {
+        let (ring, _nobody) = rtrb::RingBuffer::new(0);
+        RecordSink {
+            ring,
+            dropped: Arc::clone(&self.dropped),
+        }
+    }
+
     /// Opens the file for `kind` records of `channel` and a ring of `capacity_records`, or of
     /// as many as 8 MiB hold. Call
     /// before [`Recorder::start`].
@@ -213,6 +223,20 @@ mod tests {
             epoch: 0,
             reserved: 0,
         }
+    }
+
+    #[test]
+    fn a_closed_sink_leaves_no_file_and_counts_what_it_is_given() {
+        let folder = env::temp_dir().join(format!("hil-closed-{}", process::id()));
+        fs::create_dir_all(&folder).unwrap();
+        let mut recorder = Recorder::new(&folder, "clock", 0);
+        let mut sink = recorder.closed_sink();
+        recorder.start().unwrap();
+        sink.push(&record(0));
+        sink.push(&record(1));
+        assert_eq!(recorder.finish().dropped_count, 2);
+        assert_eq!(fs::read_dir(&folder).unwrap().count(), 0);
+        fs::remove_dir_all(&folder).unwrap();
     }
 
     #[test]

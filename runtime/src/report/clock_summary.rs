@@ -7,6 +7,7 @@ use hil_models::clock::ClockFigures;
 use serde::{Deserialize, Serialize};
 
 use crate::clock_discipline::HostDiscipline;
+use crate::topology::describe_end;
 
 /// The clocks of all hosts.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -64,6 +65,65 @@ pub struct HostPairClock {
     /// Set when the rungs contradict each other: one-way delays of this run are invalid, and why.
     #[serde(default)]
     pub contradiction: Option<String>,
+    /// The clock path between them, where the topology has one.
+    #[serde(default)]
+    pub clock_path: Option<ClockPathSummary>,
+}
+
+impl HostPairClock {
+    /// What was used, in the words of a report.
+    pub fn rung_words(&self) -> &'static str {
+        let path = self.clock_path.as_ref();
+        if self.rung == ClockRung::Exchanges && path.is_some_and(ClockPathSummary::has_exchanges) {
+            return "exchanges over the clock path, and beside the data";
+        }
+        self.rung.label()
+    }
+}
+
+/// What came over a clock path, beside what the data path gave.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ClockPathSummary {
+    /// Its name in records, `clock/<host>-<host>`.
+    pub name: String,
+    /// The end that asks, and the one that answers.
+    pub ends: [ClockPathEnd; 2],
+    /// How the end that asks stood to the other at the end of the run, in words.
+    pub state: String,
+    /// What its exchanges say by themselves; `None` when there were none.
+    pub exchanges: Option<ClockFigures>,
+    /// What the exchanges of the data path say by themselves; `None` when there were none.
+    pub data_path: Option<ClockFigures>,
+    /// The longest time of the run without an exchange over it, nanoseconds on the clock of the host
+    /// that asks; `None` when there was none at all, or that host did not say when the run was.
+    pub longest_gap_ns: Option<u64>,
+}
+
+/// One end of a clock path.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ClockPathEnd {
+    /// The host.
+    pub host: String,
+    /// Its address on the path.
+    pub address: String,
+    /// Interface it is bound to, when the topology names one.
+    pub interface: Option<String>,
+}
+
+impl ClockPathSummary {
+    /// True when anything came over it.
+    pub const fn has_exchanges(&self) -> bool {
+        self.exchanges.is_some()
+    }
+
+    /// `clock path 10.78.0.1 (eth1) <-> 10.78.0.2 (eth1)`.
+    pub fn describe(&self) -> String {
+        let [from, to] = self
+            .ends
+            .each_ref()
+            .map(|end| describe_end(&end.address, end.interface.as_deref()));
+        format!("clock path {from} <-> {to}")
+    }
 }
 
 /// The offset of two monotonic clocks by way of their disciplined system clocks.

@@ -98,6 +98,7 @@ mod tests {
             length_s: None,
             lost_count: 230,
             standing: Standing::UnderWay,
+            clock_bound_s: 0.0,
             other_count: 0,
             words: format!("outage of 1.84{JOINT}s on egm/right/command"),
         });

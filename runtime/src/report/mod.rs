@@ -8,13 +8,15 @@ pub(crate) mod event_log;
 pub mod face;
 mod face_warnings;
 pub mod network;
+pub(crate) mod page;
 pub mod radio;
+pub(crate) mod replay;
 pub mod score_event;
 pub mod summary;
 pub mod terminal;
 
 #[cfg(test)]
-mod sample;
+pub(crate) mod sample;
 #[cfg(test)]
 mod sample_events;
 #[cfg(test)]

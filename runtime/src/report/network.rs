@@ -28,6 +28,10 @@ pub struct NetworkReport {
     /// True when hosts read different clocks: times count from each host's own start of the run,
     /// and the hosts start within a message of their supervisors of each other.
     pub clocks_differ: bool,
+    /// How far instants of two hosts, or of a host and the score, may lie off each other on this axis
+    /// where the clocks are aligned, seconds; 0 on one clock, and `None` where `clocks_differ`.
+    #[serde(default)]
+    pub clock_bound_s: Option<f64>,
     /// Network and robot on one axis.
     pub timeline: Timeline,
     /// Whether the robot's errors follow the network's troubles.
@@ -62,16 +66,16 @@ pub struct TimedEvent {
 }
 
 impl TimedEvent {
-    /// How long before `at_s` it was over, seconds; 0 when it was under way, `None` when it is not
-    /// within [`FOREGOING_S`] before.
-    pub(crate) fn over_for_s(&self, at_s: f64) -> Option<f64> {
-        if self.from_s > at_s {
+    /// How long before `at_s` it was over, seconds; 0 when it was under way, `None` when it cannot have
+    /// been within [`FOREGOING_S`] before, as two hosts' times are known to `clock_bound_s` of each other.
+    pub(crate) fn over_for_s(&self, at_s: f64, clock_bound_s: f64) -> Option<f64> {
+        if self.from_s > at_s + clock_bound_s {
             return None;
         }
         let over_s = self
             .until_s
             .map_or(0.0, |until_s| (at_s - until_s).max(0.0));
-        (over_s <= FOREGOING_S).then_some(over_s)
+        (over_s <= FOREGOING_S + clock_bound_s).then_some(over_s)
     }
 
     /// In words, without its time.
@@ -97,10 +101,12 @@ impl TimedEvent {
                 late_count,
                 delay_max_ns,
                 limit_ns,
+                bound_ns,
             } => {
                 let [max, limit] = [delay_max_ns, limit_ns].map(|ns| duration_s(*ns as f64 * 1e-9));
                 let late = counted(*late_count, "message");
-                format!("late on {channel}, {late} by up to {max} (limit {limit})")
+                let bound = within(*bound_ns, *delay_max_ns);
+                format!("late on {channel}, {late} by up to {max}{bound} (limit {limit})")
             }
             NetworkEventKind::Reordering {
                 reordered_count,
@@ -119,6 +125,19 @@ impl TimedEvent {
             }
         }
     }
+}
+
+/// How far a one-way figure may be off by the clocks' alignment; nothing on one clock.
+pub(crate) fn within(bound_ns: u64, figure_ns: i64) -> String {
+    if bound_ns == 0 {
+        return String::new();
+    }
+    let wide = if i128::from(bound_ns) > i128::from(figure_ns) {
+        " (wider than the figure)"
+    } else {
+        ""
+    };
+    format!(" ±{}{wide}", duration_s(bound_ns as f64 * 1e-9))
 }
 
 fn counted(count: u64, what: &str) -> String {
@@ -155,7 +174,9 @@ impl ForegoingEvent {
     /// `event`, which was over for `over_for_s` at `at_s`.
     pub(crate) fn of(event: &TimedEvent, at_s: f64, over_for_s: f64) -> Self {
         let when = if event.until_s.is_none_or(|until_s| until_s >= at_s) {
-            format!("under way since {}", duration_s(at_s - event.from_s))
+            // Within the clocks' bound it may seem to have begun after.
+            let since_s = (at_s - event.from_s).max(0.0);
+            format!("under way since {}", duration_s(since_s))
         } else {
             format!("{} before", duration_s(over_for_s))
         };
@@ -200,6 +221,10 @@ pub struct TimelineRow {
     pub unit: String,
     /// The largest value of each step; `None` where there was none.
     pub values: Vec<Option<f64>>,
+    /// Largest error of any value from the alignment of two hosts' clocks, in the same unit, 0 on one
+    /// clock; `None` for what needs no second clock, and without values.
+    #[serde(default)]
+    pub bound: Option<f64>,
 }
 
 /// Whether the robot's errors follow the network's troubles; correlation is not cause.
@@ -308,19 +333,25 @@ mod tests {
 
     #[test]
     fn an_event_counts_while_under_way_and_five_seconds_after() {
-        let over = |at_s| outage(3.0, Some(3.8)).over_for_s(at_s);
+        let over = |at_s| outage(3.0, Some(3.8)).over_for_s(at_s, 0.0);
         assert_eq!(over(2.9), None);
         assert_eq!(over(3.5), Some(0.0));
         assert!((over(4.8).unwrap() - 1.0).abs() < 1e-9);
         assert_eq!(over(8.9), None);
-        assert_eq!(outage(3.0, None).over_for_s(60.0), Some(0.0));
+        assert_eq!(outage(3.0, None).over_for_s(60.0, 0.0), Some(0.0));
+        // Clocks known to 200 ms leave room for what seems too late or too long ago.
+        let over = |at_s| outage(3.0, Some(3.8)).over_for_s(at_s, 0.2);
+        assert_eq!(over(2.9), Some(0.0));
+        assert_eq!(over(2.7), None);
+        assert!((over(8.9).unwrap() - 5.1).abs() < 1e-9);
+        assert_eq!(over(9.1), None);
     }
 
     #[test]
     fn each_foregoing_event_says_when_it_was() {
         let words = |from_s, until_s, at_s| {
             let event = outage(from_s, until_s);
-            let over_for_s = event.over_for_s(at_s).unwrap();
+            let over_for_s = event.over_for_s(at_s, 0.0).unwrap();
             ForegoingEvent::of(&event, at_s, over_for_s)
                 .words
                 .replace(JOINT, " ")

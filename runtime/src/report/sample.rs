@@ -2,6 +2,8 @@
 //! them after a deliberate change: `HIL_BLESS=1 cargo test -p hil-runtime report`, then read the
 //! difference.
 
+use std::collections::BTreeMap;
+
 use hil_models::measure::account::{
     AccountContext, ChannelAccount, ChannelPath, ChannelRecords, Coverage, account,
 };
@@ -27,6 +29,7 @@ fn run_facts() -> RunFacts {
         seed: 42,
         host: "operator".to_owned(),
         started: "2026-03-14 09:26:53 +01:00".to_owned(),
+        starts_ns: BTreeMap::new(),
         duration_s: 20.0,
         outcome: Outcome::Completed,
         exit_reason: "ran its 20 s".to_owned(),
@@ -83,6 +86,7 @@ fn channel(
         account: Some(account),
         outages: None,
         emulation: None,
+        trace_replay: None,
         recorded: None,
         refusals: Vec::new(),
         directions: Vec::new(),
@@ -119,7 +123,7 @@ fn channels() -> Vec<ChannelSummary> {
 }
 
 /// A whole report.
-fn full() -> RunSummary {
+pub(super) fn full() -> RunSummary {
     let mut killed = process("robot gateway", "gateway", None);
     killed.restart_count = 1;
     killed.cpu_time_s = None;
@@ -141,7 +145,7 @@ fn full() -> RunSummary {
             killed,
         ],
         events: vec![RunEvent {
-            at_s: 8.0,
+            at_s: Some(8.0),
             what: "robot gateway ended and was restarted after 0.757 s".to_owned(),
             cause: "killed by signal 9".to_owned(),
         }],
@@ -168,7 +172,7 @@ fn full() -> RunSummary {
 }
 
 /// Names longer than any column, hostile characters, an overrun host, processes without figures.
-fn awkward() -> RunSummary {
+pub(super) fn awkward() -> RunSummary {
     let long = "an-exceedingly-long-name-that-someone-will-surely-choose-one-day".repeat(2);
     let mut summary = full();
     summary.run.name.clone_from(&long);
@@ -197,7 +201,7 @@ fn awkward() -> RunSummary {
 }
 
 /// Nothing ran, nothing is known.
-fn empty() -> RunSummary {
+pub(super) fn empty() -> RunSummary {
     let mut run = run_facts();
     run.outcome = Outcome::Stopped;
     run.exit_reason = "stopped by a person while waiting for host robot".to_owned();
@@ -217,6 +221,7 @@ fn empty() -> RunSummary {
             account,
             outages: None,
             emulation: None,
+            trace_replay: None,
             recorded: None,
             refusals: Vec::new(),
             directions: Vec::new(),

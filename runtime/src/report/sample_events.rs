@@ -1,6 +1,8 @@
 //! What happened to the robot of a run that never was, and the channel that only its record
 //! heard, for the reports that are checked in.
 
+use std::collections::BTreeMap;
+
 use hil_models::case_study::Severity;
 use hil_models::measure::account::{MessageFate, Standing};
 
@@ -19,6 +21,7 @@ fn message(sequence: u64, fate: Option<MessageFate>, words: &str) -> ExplainedMe
         published_at_s: fate.map(|_| sequence as f64 * 0.004),
         fate,
         delay_s: None,
+        delay_bound_s: None,
         words: words.to_owned(),
     }
 }
@@ -57,6 +60,7 @@ pub(super) fn few_events() -> ScoreEvents {
         length_s: Some(0.8),
         lost_count: 20,
         standing: Standing::OverFor(521_000_000),
+        clock_bound_s: 0.0,
         other_count: 3,
         words: "outage of 800 ms on fleet/authority, 3.600 s to 4.400 s, 20 messages lost, over \
                 for 521 ms (3 others about then)"
@@ -115,6 +119,7 @@ pub(super) fn recorded_channel() -> ChannelSummary {
         account: None,
         outages: None,
         emulation: None,
+        trace_replay: None,
         recorded: Some(RecordedFigures {
             message_count: 12_345,
             missing_count: 0,
@@ -133,6 +138,7 @@ pub(super) fn summary(channel: ChannelSummary) -> RunSummary {
         seed: 1,
         host: "control-pc".to_owned(),
         started: String::new(),
+        starts_ns: BTreeMap::new(),
         duration_s: 1.0,
         outcome: Outcome::Completed,
         exit_reason: "as planned".to_owned(),

@@ -2,16 +2,16 @@
 //! are checked in.
 
 use hil_models::case_study::ErrorSeries;
-use hil_models::measure::account::Side;
+use hil_models::measure::account::{ChannelPath, Side};
 use hil_models::measure::network::{
-    Crossing, Moment, NetworkContext, NetworkEvent, NetworkEventKind, Passage, SeriesSpan,
+    Crossing, Moment, NetworkContext, NetworkEvent, NetworkEventKind, Passage,
 };
 use hil_models::random::RandomStream;
-use hil_models::time::Instant;
+use hil_models::time::{Alignment, Instant};
 
 use super::network::{Correlation, NetworkReport};
 use super::score_event::ScoreEvents;
-use crate::analysis::network::{ChannelPassages, NetworkBuilder, RobotSeries};
+use crate::analysis::network::{AxisClocks, ChannelPassages, NetworkBuilder, RobotSeries};
 
 const MS: i64 = 1_000_000;
 const RUN_NS: i64 = 20_000 * MS;
@@ -70,7 +70,7 @@ fn error() -> RobotSeries {
         clock_of: "arm/status",
         samples: samples.collect(),
     };
-    RobotSeries::of(errors, Instant::ZERO)
+    RobotSeries::of(errors, |at| Some(at.seconds_since(Instant::ZERO)))
 }
 
 /// The network of `names`, the second of which is between clocks that are not aligned; puts beside
@@ -95,12 +95,15 @@ pub(super) fn network(names: [&str; 2], events: &mut ScoreEvents) -> NetworkRepo
             hosts: ["control-pc", "robot-pc"],
             passages: &passages(index as u64, index == 0),
             other_events: vec![down],
-            span: SeriesSpan {
-                producer_start_ns: 0,
-                consumer_start_ns: 0,
-                duration_ns: RUN_NS,
-            },
+            duration_ns: RUN_NS,
+            place: &|at: Moment| Some(at.ns),
             context: NetworkContext {
+                path: ChannelPath::Gateway {
+                    alignment: (index == 0).then_some(Alignment {
+                        offset_ns: 0,
+                        bound_ns: 40_000,
+                    }),
+                },
                 run_ns: Some((0, RUN_NS)),
                 payload_bytes: Some(96),
                 duplicated_count: Some(2),
@@ -109,10 +112,10 @@ pub(super) fn network(names: [&str; 2], events: &mut ScoreEvents) -> NetworkRepo
             },
         });
     }
-    let clocks_differ = events.clocks_differ;
-    let (report, series) = builder
-        .finish(events, vec![error()], (42, clocks_differ))
-        .unwrap();
+    let axis = AxisClocks {
+        bound_s: (!events.clocks_differ).then_some(0.0),
+    };
+    let (report, series) = builder.finish(events, vec![error()], (42, axis)).unwrap();
     assert_eq!(series.len(), 2);
     report
 }

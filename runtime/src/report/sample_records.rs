@@ -111,7 +111,7 @@ impl Files {
     pub(super) fn outages(&self) -> OutageFigures {
         let found = self.consult(Some(Alignment::SAME_CLOCK), outages);
         let end = Instant::from_ns(5_000 * PERIOD_NS);
-        OutageFigures::of(&found, Some(Instant::ZERO), Some(end))
+        OutageFigures::of(&found, Some(end))
     }
 
     fn consult<T>(

@@ -7,6 +7,7 @@ use hil_models::measure::network::NetworkEventKind;
 use serde::{Deserialize, Serialize};
 
 use super::network::{ForegoingEvent, ForegoingNetwork};
+use super::terminal::duration_s;
 
 /// The events of a run's score.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -76,6 +77,10 @@ pub struct EventOutage {
     /// How it stands to the event in time, as far as the process that tells of it could see;
     /// nanoseconds.
     pub standing: Standing,
+    /// Largest error of `standing` from the alignment of two hosts' clocks, seconds; 0 where both times
+    /// were read from one.
+    #[serde(default)]
+    pub clock_bound_s: f64,
     /// Other outages of the channel about then.
     pub other_count: u64,
     /// All of it in words.
@@ -83,6 +88,17 @@ pub struct EventOutage {
 }
 
 impl EventOutage {
+    /// Notes how far the two hosts' clocks may have led its standing astray.
+    pub(crate) fn put_clock_bound(&mut self, bound_ns: u64) {
+        let is_measured = matches!(self.standing, Standing::OverFor(_) | Standing::BegunLater);
+        self.clock_bound_s = bound_ns as f64 * 1e-9;
+        if is_measured && bound_ns > 0 {
+            let bound = duration_s(self.clock_bound_s);
+            self.words
+                .push_str(&[" (±", &bound, " by the clocks)"].concat());
+        }
+    }
+
     /// Puts those first whose channel's name has most words in common with `what` happened: an
     /// event of the right arm is about the right arm's channels before it is about the other's.
     pub(crate) fn put_own_channels_first(outages: &mut [Self], what: &str) {
@@ -112,6 +128,10 @@ pub struct ExplainedMessage {
     pub fate: Option<MessageFate>,
     /// Published to taken, seconds.
     pub delay_s: Option<f64>,
+    /// Largest error of `delay_s` from the alignment of two hosts' clocks, seconds; 0 on one clock,
+    /// `None` without a delay.
+    #[serde(default)]
+    pub delay_bound_s: Option<f64>,
     /// Its fate in words, with the link and the cause where they are known, or why it is
     /// unavailable.
     pub words: String,
@@ -122,6 +142,29 @@ mod tests {
     use super::*;
 
     #[test]
+    fn an_outage_on_another_clock_says_how_far_its_standing_may_be_off() {
+        let told = |standing, bound_ns| {
+            let mut outage = EventOutage {
+                channel: "a/b".to_owned(),
+                from_s: None,
+                until_s: None,
+                length_s: None,
+                lost_count: 1,
+                standing,
+                clock_bound_s: 0.0,
+                other_count: 0,
+                words: "over for 5 ms".to_owned(),
+            };
+            outage.put_clock_bound(bound_ns);
+            outage.words.replace('\u{a0}', " ")
+        };
+        let over = Standing::OverFor(5_000_000);
+        assert_eq!(told(over, 15_700), "over for 5 ms (±15.7 µs by the clocks)");
+        assert_eq!(told(over, 0), "over for 5 ms");
+        assert_eq!(told(Standing::UnderWay, 15_700), "over for 5 ms");
+    }
+
+    #[test]
     fn an_events_own_arm_comes_first() {
         let outage = |channel: &str| EventOutage {
             channel: channel.to_owned(),
@@ -130,6 +173,7 @@ mod tests {
             length_s: None,
             lost_count: 1,
             standing: Standing::Unknown,
+            clock_bound_s: 0.0,
             other_count: 0,
             words: String::new(),
         };

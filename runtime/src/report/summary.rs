@@ -5,10 +5,12 @@
 //! `assessment`. Within a schema version fields are only added; a reader ignores what it does
 //! not know. Units are part of the names.
 
+use std::collections::BTreeMap;
 use std::io;
 use std::path::{Path, PathBuf};
 
 use hil_models::case_study::{Metric, Score};
+use hil_models::link::trace::ReplayCounts;
 use hil_models::measure::account::{ChannelAccount, OutageFigures};
 use serde::{Deserialize, Serialize};
 
@@ -183,6 +185,10 @@ pub struct RunFacts {
     pub host: String,
     /// Wall-clock time of the start, with its zone.
     pub started: String,
+    /// The start on each host's own monotonic clock, nanoseconds; nothing of a host that told
+    /// nothing.
+    #[serde(default)]
+    pub starts_ns: BTreeMap<String, i64>,
     /// Length of the run, seconds.
     pub duration_s: f64,
     /// How it ended.
@@ -276,8 +282,8 @@ pub struct ProcessSummary {
 /// Something that happened during the run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RunEvent {
-    /// When, seconds after the start.
-    pub at_s: f64,
+    /// When, seconds after the start; `None` when the run's start on its host is unknown.
+    pub at_s: Option<f64>,
     /// What, in words.
     pub what: String,
     /// Why, in words; empty when unknown.
@@ -334,6 +340,10 @@ pub struct ChannelSummary {
     /// came through it.
     #[serde(default)]
     pub emulation: Option<EmulationFigures>,
+    /// What its emulated link met of the trace that it replays; `None` where it replays none, or
+    /// its gateway left no word.
+    #[serde(default)]
+    pub trace_replay: Option<ReplayCounts>,
     /// What was recorded of a channel that is only recorded; `None` when nothing was.
     #[serde(default)]
     pub recorded: Option<RecordedFigures>,

@@ -8,15 +8,16 @@ use hil_models::measure::account::{Happening, MessageFate, Outage, Side};
 use hil_models::run_log::{LoggedMessage, RunLog};
 use hil_models::time::Instant;
 
-use crate::analysis::outages::OutageStory;
+use crate::analysis::outages::{OutageStory, placed};
 use crate::report::score_event::{EventOutage, ExplainedEvent, ExplainedMessage, ScoreEvents};
 
 /// The outages of `channel` in a run of `duration`, which begins at instant zero.
 pub(super) fn story(channel: String, outages: Vec<Outage>, duration: Duration) -> OutageStory {
     OutageStory {
         channel,
+        // Virtual time begins with the run.
+        placed_ns: placed(&outages, Some),
         outages,
-        start: Some(Instant::ZERO),
         end: Some(Instant::ZERO + duration),
         interrupted: Vec::new(),
         is_partial: false,
@@ -100,6 +101,7 @@ fn explain(message: &MessageRef, stories: &[OutageStory], log: &RunLog) -> Expla
         published_at_s: published_ns.map(|ns| ns as f64 * 1e-9),
         fate: is_lost.unwrap_or(false).then_some(MessageFate::LostOnWire),
         delay_s: None,
+        delay_bound_s: None,
         words: words.to_owned(),
     }
 }

@@ -2,13 +2,14 @@
 //! of a live run. What a model delays counts from publication, as no gateway stands between.
 
 use hil_models::case_study::ErrorSeries;
-use hil_models::measure::network::{NetworkContext, SeriesSpan};
+use hil_models::measure::account::ChannelPath;
+use hil_models::measure::network::{Moment, NetworkContext};
 use hil_models::plot::PlotSeries;
 use hil_models::run_log::RunLog;
 use hil_models::time::{Instant, duration_ns};
 
 use super::watched::Watch;
-use crate::analysis::network::{ChannelPassages, NetworkBuilder, RobotSeries};
+use crate::analysis::network::{AxisClocks, ChannelPassages, NetworkBuilder, RobotSeries};
 use crate::report::network::NetworkReport;
 use crate::report::score_event::ScoreEvents;
 use crate::topology::Topology;
@@ -32,13 +33,11 @@ pub(super) fn of_simulation(
             hosts: [&crossing.from_host.name, &crossing.to_host.name],
             passages: &passages,
             other_events: Vec::new(),
+            duration_ns: length_ns,
             // Virtual time begins with the run, for all hosts alike.
-            span: SeriesSpan {
-                producer_start_ns: 0,
-                consumer_start_ns: 0,
-                duration_ns: length_ns,
-            },
+            place: &|at: Moment| Some(at.ns),
             context: NetworkContext {
+                path: ChannelPath::SharedMemory,
                 run_ns: Some((0, length_ns)),
                 payload_bytes: payload.map(|message| message.payload.len() as u64),
                 duplicated_count: Some(duplicated_count),
@@ -48,6 +47,6 @@ pub(super) fn of_simulation(
         });
     }
     let errors = errors.into_iter();
-    let errors = errors.map(|one| RobotSeries::of(one, Instant::ZERO));
-    builder.finish(events, errors.collect(), (seed, false))
+    let errors = errors.map(|one| RobotSeries::of(one, |at| Some(at.seconds_since(Instant::ZERO))));
+    builder.finish(events, errors.collect(), (seed, AxisClocks::ONE))
 }

@@ -70,9 +70,7 @@ impl Carrier for Watched {
     ) {
         // The length that a gateway's model would be offered: a datagram, not a message.
         let length_bytes = payload.len() + wire::HEADER_BYTES;
-        let fate = self
-            .link
-            .offer_numbered(now, length_bytes, envelope.sequence);
+        let fate = self.link.offer_numbered(now, length_bytes, envelope.into());
         let arrivals = [fate.arrival(), fate.second_arrival()];
         for at in arrivals.into_iter().flatten() {
             deliver(at, *envelope, payload);

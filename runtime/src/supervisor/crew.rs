@@ -255,11 +255,17 @@ impl Crew {
             self.note(now, index, text, Some(interruption));
             return match self.spawn(index) {
                 Ok(()) => Verdict::GoesOn,
+                Err(error) if self.members[index].plan.is_clock_path() => {
+                    self.go_on_without(now, index, &error.to_string())
+                }
                 Err(error) => {
                     self.note(now, index, error.to_string(), None);
                     Verdict::Failed(error.to_string())
                 }
             };
+        }
+        if self.members[index].plan.is_clock_path() {
+            return self.go_on_without(now, index, &what);
         }
         // What it had in its queues, or came for it until the end, is lost with it.
         let interruption = Some(interruption).filter(|_| !is_orderly);
@@ -275,6 +281,15 @@ impl Crew {
         } else {
             Verdict::Failed(text)
         }
+    }
+
+    /// A clock path that is gone for good: nothing waits for it, and no message depends on it.
+    fn go_on_without(&mut self, now: Instant, index: usize, what: &str) -> Verdict {
+        self.members[index].is_ready = true;
+        let text =
+            format!("{what}; policy: the run goes on, with the clock exchanges of the data path");
+        self.note(now, index, text, None);
+        Verdict::GoesOn
     }
 
     fn listen(&mut self) {
@@ -429,13 +444,18 @@ fn write_launch(
             write(path, &launch)?;
             Ok("component")
         }
-        ProcessKind::Gateway(directions) => {
+        ProcessKind::Gateway(directions) | ProcessKind::ClockPath { directions, .. } => {
+            let ready_within = match &plan.kind {
+                ProcessKind::ClockPath { ready_within, .. } => Some(*ready_within),
+                _ => None,
+            };
             let launch = GatewayLaunch {
                 process,
                 instance,
                 domain,
                 records: folder.records(),
                 directions: directions.clone(),
+                ready_within,
             };
             write(path, &launch)?;
             Ok("gateway")

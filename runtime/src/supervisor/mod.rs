@@ -2,6 +2,7 @@
 //! everything in order and leaves a complete report, whatever happened. It carries no message.
 
 pub(crate) mod child;
+pub(crate) mod clock_path;
 pub(crate) mod crew;
 pub(crate) mod domains;
 pub mod event;

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::io;
 use std::path::PathBuf;
 
-use hil_models::case_study::ParameterError;
+use hil_models::layout::Field;
 use hil_models::time::Instant;
 
 use super::crew::CrewError;
@@ -17,6 +17,7 @@ use crate::card_clock::CardStory;
 use crate::channel::DomainError;
 use crate::clock_discipline::HostDiscipline;
 use crate::host_facts::HostFacts;
+use crate::process::launch::EmulationError;
 use crate::run_folder::RunFolder;
 
 /// What the command line asks of a run beyond the topology.
@@ -28,6 +29,8 @@ pub struct RunOptions {
     pub domain_root: Option<PathBuf>,
     /// The command line, for the manifest.
     pub command_line: Vec<String>,
+    /// The fields of the channels whose messages are known, by channel, for the manifest.
+    pub layouts: BTreeMap<String, &'static [Field]>,
 }
 
 /// Why a run did not come about.
@@ -55,7 +58,7 @@ pub enum RunError {
     Start(String),
     /// An emulated link asks for more than a gateway can hold.
     #[error("the emulated link cannot be kept: {0}")]
-    Emulation(ParameterError),
+    Emulation(EmulationError),
 }
 
 impl From<CrewError> for RunError {

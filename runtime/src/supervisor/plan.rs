@@ -10,6 +10,7 @@ use hil_models::egm::messages::Side as ArmSide;
 use hil_models::egm::parameters::{ControllerSettings, EgmParameters};
 use nix::unistd::{AccessFlags, Uid, access};
 
+use super::clock_path;
 use crate::face::launch::{ArmLaunch, FaceSettings};
 use crate::process::launch::{DirectionLaunch, EmulationLaunch, Side, SocketLaunch, Transport};
 use crate::realtime::{RealtimeRequest, SchedulingPolicy};
@@ -24,7 +25,8 @@ use crate::wait::WaitMode;
 pub(crate) struct Plan {
     /// One per host that runs here.
     pub(crate) hosts: Vec<HostPlan>,
-    /// Gateways and faces first: they must be ready before components publish.
+    /// Clock paths first, whose exchanges are to lie on both sides of every message; then gateways
+    /// and faces, which must be ready before components publish.
     pub(crate) processes: Vec<ProcessPlan>,
 }
 
@@ -54,6 +56,13 @@ pub(crate) enum ProcessKind {
     Component(ProcessCard),
     /// The gateway of one link, in this binary.
     Gateway(Vec<DirectionLaunch>),
+    /// One end of a clock path: a gateway that carries no messages.
+    ClockPath {
+        /// One.
+        directions: Vec<DirectionLaunch>,
+        /// How long the run may wait for the other end.
+        ready_within: Duration,
+    },
     /// What speaks with a foreign program, in this binary.
     Face(FaceSettings),
     /// The user's own program.
@@ -65,6 +74,16 @@ pub(crate) enum ProcessKind {
 }
 
 impl ProcessPlan {
+    /// True for what makes messages, or hears them.
+    pub(crate) fn is_component(&self) -> bool {
+        !self.is_carrier() && !self.is_clock_path()
+    }
+
+    /// True for what exchanges clocks and nothing else.
+    pub(crate) fn is_clock_path(&self) -> bool {
+        matches!(self.kind, ProcessKind::ClockPath { .. })
+    }
+
     /// True for what carries messages instead of making them: a gateway, or a face.
     pub(crate) fn is_carrier(&self) -> bool {
         matches!(self.kind, ProcessKind::Gateway(_) | ProcessKind::Face(_))
@@ -75,6 +94,7 @@ impl ProcessPlan {
         match &self.kind {
             ProcessKind::Component(card) => card.role.clone().unwrap_or_default(),
             ProcessKind::Gateway(_) => "gateway".to_owned(),
+            ProcessKind::ClockPath { .. } => "clock path".to_owned(),
             ProcessKind::Face(face) => format!("{} by {FACE_ROLE}", face.role),
             ProcessKind::Foreign { .. } => "own program".to_owned(),
         }
@@ -101,14 +121,16 @@ pub(crate) fn plan(topology: &Topology, hosts: &[&Host]) -> Plan {
             channels: channels.cloned().collect(),
         }
     });
+    let clock_paths = hosts.iter().flat_map(|host| clock_path::on(topology, host));
     let gateways = hosts.iter().flat_map(|host| gateways_on(topology, host));
     let processes = topology
         .processes()
         .iter()
         .filter(|process| is_here(&process.host))
         .map(|process| component(topology, process));
-    let mut processes: Vec<ProcessPlan> = gateways.chain(processes).collect();
-    processes.sort_by_key(|process| !process.is_carrier());
+    let carriers = clock_paths.chain(gateways);
+    let mut processes: Vec<ProcessPlan> = carriers.chain(processes).collect();
+    processes.sort_by_key(|process| (!process.is_clock_path(), process.is_component()));
     Plan {
         hosts: host_plans.collect(),
         processes,
@@ -298,6 +320,7 @@ fn direction(crossing: &Crossing<'_>, side: Side, index: usize, seed: u64) -> Di
         wait: wait_mode(hop.gateway.execution.wait),
         realtime: realtime(&hop.gateway.execution, index),
         emulation: EmulationLaunch::of(crossing, seed).filter(|_| side == Side::Ingress),
+        is_clock_path: false,
     }
 }
 

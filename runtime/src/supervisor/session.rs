@@ -1,13 +1,11 @@
 //! One run from beginning to end. Each step is short; what a step does is in its own file.
 
 use std::collections::BTreeMap;
-use std::fs;
 use std::path::PathBuf;
 use std::thread;
 use std::time::{Duration, Instant as WallInstant, SystemTime};
 
 use hil_models::time::Instant;
-use serde_json::json;
 
 use super::crew::{self, Crew, Verdict};
 use super::domains::Domains;
@@ -17,7 +15,7 @@ use super::frame::{Frame, PeerHello, PeerMessage};
 use super::meet::{Meeting, meet};
 use super::outcome::{Heard, Outcome, RunError, RunOptions, RunResult};
 use super::peer::{Peer, PeerEvent};
-use super::plan::plan;
+use super::plan::{ProcessPlan, plan};
 use super::progress_line;
 use crate::card_clock::CardWatch;
 use crate::channel::clock_id;
@@ -25,6 +23,7 @@ use crate::clock::MonotonicClock;
 use crate::clock_discipline::HostDiscipline;
 use crate::console::Console;
 use crate::host_facts::HostFacts;
+use crate::manifest;
 use crate::process::emulation_room::check_emulation;
 use crate::run_folder::{RunFolder, utc_text};
 use crate::signals::Signals;
@@ -65,7 +64,10 @@ pub fn run(
     let folder = make_folder(topology, &hosts)?;
     let facts = HostFacts::gather();
     let discipline = HostDiscipline::gather().ok();
-    write_manifest(topology, options, &folder, &facts)?;
+    manifest::write(topology, options, &folder, &facts).map_err(|source| RunError::Folder {
+        folder: folder.root().to_owned(),
+        source,
+    })?;
     let run = folder.root().to_string_lossy();
     let domains = Domains::create(&plan.hosts, options.domain_root.as_ref(), &run)?;
     console.say(&format!("run folder {}", folder.root().display()));
@@ -113,30 +115,6 @@ fn make_folder(topology: &Topology, hosts: &[&Host]) -> Result<RunFolder, RunErr
     let suffix = (hosts.len() < topology.hosts().len()).then(|| hosts[0].name.as_str());
     RunFolder::create(&parent, topology.name(), suffix).map_err(|source| RunError::Folder {
         folder: parent,
-        source,
-    })
-}
-
-fn write_manifest(
-    topology: &Topology,
-    options: &RunOptions,
-    folder: &RunFolder,
-    facts: &HostFacts,
-) -> Result<(), RunError> {
-    let manifest = json!({
-        "schema_version": 1,
-        "program": { "name": env!("CARGO_PKG_NAME"), "version": env!("CARGO_PKG_VERSION") },
-        "command_line": options.command_line,
-        "created": utc_text(SystemTime::now()),
-        "hosts_here": options.hosts,
-        "topology_hash": format!("{:016x}", topology.hash()),
-        "topology": topology.resolved(),
-        "seed": topology.run().seed,
-        "host_facts": facts,
-    });
-    let text = serde_json::to_string_pretty(&manifest).unwrap_or_default();
-    fs::write(folder.manifest(), text).map_err(|source| RunError::Folder {
-        folder: folder.root().to_owned(),
         source,
     })
 }
@@ -376,19 +354,20 @@ impl Session<'_> {
             .progress(&format!("{elapsed_s:6.1} / {total_s:.0} s  {channels}"));
     }
 
-    /// Ends components everywhere first, then gateways, so that what is under way arrives.
+    /// Ends components everywhere first, then gateways, so that what is under way arrives, and last
+    /// the clock paths, so that an exchange follows the last message.
     fn stop(&mut self, outcome: &Outcome) {
         let reason = outcome.text();
         let meaning = outcome.meaning();
         self.say_to_all(&PeerMessage::Stop { reason, meaning });
-        self.crew.stop(STOP_PATIENCE, |plan| !plan.is_carrier());
+        self.crew.stop(STOP_PATIENCE, ProcessPlan::is_component);
         self.say_to_all(&PeerMessage::Quiet);
         if !matches!(outcome, Outcome::PeerLost(_)) {
             self.wait_for_quiet();
         }
         thread::sleep(DRAIN);
-        self.crew
-            .stop(STOP_PATIENCE, super::plan::ProcessPlan::is_carrier);
+        self.crew.stop(STOP_PATIENCE, ProcessPlan::is_carrier);
+        self.crew.stop(STOP_PATIENCE, ProcessPlan::is_clock_path);
     }
 
     fn wait_for_quiet(&mut self) {

@@ -3,6 +3,7 @@
 
 use super::check_channels;
 use super::check_face::{check_face, check_faces, is_dispensable};
+use super::clock_path::{self, ClockEntry};
 use super::errors::{Fault, Faults, Place};
 use super::face::EgmFace;
 use super::file::{CaseEntry, File, HostEntry, ProcessEntry};
@@ -33,7 +34,7 @@ pub(super) fn check(file: File<'_>, known: &KnownCases, needs: Needs, faults: &F
         (Some(entry), Some(known)) => check_case(entry, known, file.run.seed, faults),
         _ => None,
     };
-    let hosts = check_hosts(file.hosts, faults);
+    let (hosts, clock_entries) = check_hosts(file.hosts, faults);
     let roles = Roles {
         known: known_case,
         has_case: case_entry.is_some(),
@@ -70,6 +71,7 @@ pub(super) fn check(file: File<'_>, known: &KnownCases, needs: Needs, faults: &F
         };
         check_channels::check(&mut topology, known_case, tables, file.links, faults);
     }
+    clock_path::check(&topology, &clock_entries, faults);
     topology
 }
 
@@ -168,15 +170,18 @@ fn split_index(step: &str) -> (&str, Option<usize>) {
     found.map_or((step, None), |(key, index)| (key, Some(index)))
 }
 
-fn check_hosts(entries: Vec<HostEntry>, faults: &Faults) -> Vec<Host> {
+/// The hosts, and where the clock address of each stands.
+fn check_hosts(entries: Vec<HostEntry>, faults: &Faults) -> (Vec<Host>, Vec<Option<ClockEntry>>) {
     if entries.is_empty() {
-        return vec![Host {
+        let host = Host {
             name: IMPLICIT_HOST.to_owned(),
             address: None,
             interface: None,
             control_port: u16::try_from(limits::HOST_CONTROL_PORT.default)
                 .expect("a default port is within 1..=65535"),
-        }];
+            clock: None,
+        };
+        return (vec![host], vec![None]);
     }
     let with_address = entries.iter().find(|entry| entry.host.address.is_some());
     let with_address = with_address.map(|entry| entry.host.name.clone());
@@ -198,7 +203,8 @@ fn check_hosts(entries: Vec<HostEntry>, faults: &Faults) -> Vec<Host> {
             faults.add(key, Some(entry.place), Fault::Inconsistent(fault));
         }
     }
-    entries.into_iter().map(|entry| entry.host).collect()
+    let hosts = entries.into_iter().map(|entry| (entry.host, entry.clock));
+    hosts.unzip()
 }
 
 /// What a process may say as its role.

@@ -5,8 +5,8 @@
 //! and lose the place of a key inside tagged tables.
 
 use std::collections::BTreeMap;
-use std::net::IpAddr;
 
+use super::clock_path::{self, ClockEntry};
 use super::errors::{Fault, Faults, Place};
 use super::face::FaceEntry;
 use super::file_links::LinkEntry;
@@ -42,6 +42,8 @@ pub(super) struct HostEntry {
     pub path: String,
     /// Of its address or, without one, of its key.
     pub place: Place,
+    /// Where its clock address stands.
+    pub clock: Option<ClockEntry>,
 }
 
 #[derive(Debug)]
@@ -181,24 +183,10 @@ fn read_host(name: String, mut reader: Reader<'_>) -> HostEntry {
     let place = address_text
         .as_ref()
         .map_or(reader.place, |text| text.place);
-    let address = address_text.and_then(|text| {
-        let parsed: Option<IpAddr> = text.value.parse().ok();
-        if parsed.is_none_or(|address| address.is_unspecified() || address.is_multicast()) {
-            let text = text.value;
-            let fault = Fault::Inconsistent(format!("\"{text}\" is no address of one host"));
-            reader.refuse("address", fault);
-            return None;
-        }
-        parsed
-    });
-    let interface = reader.text("interface").map(|interface| interface.value);
-    if interface
-        .as_deref()
-        .is_some_and(|name| !is_interface_name(name))
-    {
-        let fault = "is no interface name: 1 to 15 letters without blank or slash";
-        reader.refuse("interface", Fault::Inconsistent(fault.to_owned()));
-    }
+    let address =
+        address_text.and_then(|text| clock_path::read_address(&reader, "address", &text.value));
+    let interface = clock_path::read_interface(&mut reader, "interface");
+    let (clock, clock_entry) = clock_path::read(&mut reader);
     let control_port = reader.integer("control_port", &limits::HOST_CONTROL_PORT);
     if !reader.has("address") {
         let why = "needs `address`: without it one supervisor runs this host and its peers";
@@ -213,15 +201,12 @@ fn read_host(name: String, mut reader: Reader<'_>) -> HostEntry {
             address,
             interface,
             control_port,
+            clock,
         },
         path,
         place,
+        clock: clock_entry,
     }
-}
-
-/// `IFNAMSIZ` is 16 with the terminating zero.
-fn is_interface_name(name: &str) -> bool {
-    (1..=15).contains(&name.len()) && !name.contains([' ', '/', ':']) && name.is_ascii()
 }
 
 fn default_port(limit: &limits::Limit<i64>) -> u16 {

@@ -7,7 +7,7 @@ use super::errors::Fault;
 use super::limits;
 use super::reader::Reader;
 use super::resolved::{duration, put};
-use crate::trace::source::{BaseFolder, TraceSource};
+use crate::trace::source::{BaseFolder, NotedDelays, TraceSource};
 
 const MATCHES: &[(&str, TraceMatch)] = &[
     ("index", TraceMatch::Index),
@@ -33,6 +33,7 @@ pub(super) fn read_trace(reader: &mut Reader<'_>) -> Option<TraceSource> {
             files: std::collections::BTreeMap::new(),
             replay: TraceReplay::default(),
             base: BaseFolder::default(),
+            noted: NotedDelays::default(),
         });
     }
     let mut table = reader.table("trace")?;
@@ -54,6 +55,7 @@ pub(super) fn read_trace(reader: &mut Reader<'_>) -> Option<TraceSource> {
         files,
         replay,
         base: BaseFolder::default(),
+        noted: NotedDelays::default(),
     })
 }
 

@@ -28,6 +28,10 @@ pub(super) fn read_wifi(reader: &mut Reader<'_>) -> Option<WifiSpec> {
         &["outages"],
         "beside `wifi` says outages twice; the radio has its own, in [links.<name>.wifi.outages]",
     );
+    reader.refuse_present(
+        &["trace"],
+        "beside `wifi` stands in its place, so no message would meet the radio; say one of them",
+    );
     if !reader.is_table("wifi") {
         return Some(reader.word("wifi", PRESETS)?.spec());
     }

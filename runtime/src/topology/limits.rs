@@ -35,6 +35,8 @@ pub(super) const RUN_START_TIMEOUT: Limit<Duration> = limit(ms(30_000), ms(1_000
 pub(super) const RUN_PEER_TIMEOUT: Limit<Duration> = limit(ms(30_000), ms(1_000), ms(3_600_000));
 
 pub(super) const HOST_CONTROL_PORT: Limit<i64> = limit(7_399, 1_024, 65_535);
+/// Below the ports of links, with room for ten clock paths of one host.
+pub(super) const HOST_CLOCK_PORT: Limit<i64> = limit(7_390, 1_024, 65_535);
 
 /// Cores are counted from 0; without the key any core will do, so the default is unused.
 pub(super) const CPU: Limit<i64> = limit(0, 0, 1_023);
@@ -156,6 +158,7 @@ mod tests {
             VERSION,
             RUN_SEED,
             HOST_CONTROL_PORT,
+            HOST_CLOCK_PORT,
             CPU,
             FIFO_PRIORITY,
             RESTART_LIMIT,

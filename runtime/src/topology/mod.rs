@@ -14,6 +14,7 @@ mod card;
 mod check;
 mod check_channels;
 mod check_face;
+mod clock_path;
 mod errors;
 mod face;
 mod file;
@@ -38,6 +39,8 @@ use std::path::Path;
 
 pub use card::{CardChannel, ProcessCard};
 pub(crate) use check_face::{command_channel, feedback_channel};
+pub use clock_path::{ClockEnd, ClockPath};
+pub(crate) use clock_path::{describe_end, end_name};
 pub use errors::{Fault, Location, TopologyError, TopologyErrors};
 pub use face::{EgmFace, FaceKind, FaceSend};
 pub use host::{HOST_VARIABLE, HostChoice, HostError, MachineIdentity, which_host};

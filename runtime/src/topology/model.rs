@@ -11,6 +11,7 @@ use hil_models::message::type_hash;
 
 use super::model_links::{Hop, Link};
 
+use super::clock_path::ClockEnd;
 use super::face::EgmFace;
 
 /// A topology file after every check. Only [`load`](super::load) and [`parse`](super::parse)
@@ -61,6 +62,8 @@ pub struct Host {
     pub interface: Option<String>,
     /// TCP port of its supervisor; meaningful only with an address.
     pub control_port: u16,
+    /// Where it exchanges clocks beside the link under test, if it does.
+    pub clock: Option<ClockEnd>,
 }
 
 impl Host {

@@ -112,6 +112,13 @@ fn resolved_host(host: &Host) -> Table {
     if let Some(interface) = &host.interface {
         put(&mut table, "interface", interface.as_str());
     }
+    if let Some(clock) = &host.clock {
+        put(&mut table, "clock_address", clock.address.to_string());
+        put(&mut table, "clock_port", integer(clock.port));
+        if let Some(interface) = &clock.interface {
+            put(&mut table, "clock_interface", interface.as_str());
+        }
+    }
     table
 }
 

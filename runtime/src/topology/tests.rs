@@ -1,8 +1,10 @@
 //! Good topologies: what they become, how they are written back, and what a process is told.
 //! Faulty ones are in `tests/faulty.rs`.
 
+mod clock_path;
 mod face;
 mod faulty;
+mod fitted;
 mod fleet;
 mod hosts;
 mod layers;
@@ -144,8 +146,14 @@ rate_hz = 125
 mirrored = true
 servo = { gain_per_s = 5.5, cycle_us = 4032 }
 [hosts]
-control-pc = { address = "10.77.0.1", interface = "eth0", control_port = 7001 }
-robot-pc = { address = "10.77.0.2" }
+robot-pc = { address = "10.77.0.2", clock_address = "10.78.0.2" }
+[hosts.control-pc]
+address = "10.77.0.1"
+interface = "eth0"
+control_port = 7001
+clock_address = "10.78.0.1"
+clock_interface = "eth1"
+clock_port = 7500
 [processes.human]
 host = "control-pc"
 role = "human"

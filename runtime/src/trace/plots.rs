@@ -1,8 +1,8 @@
 //! The series of a trace, ready for any plotting program.
 
 use hil_models::plot::{PlotColumn, PlotSeries};
-use hil_models::trace::Trace;
 use hil_models::trace::figures::{RunCount, TraceFigures};
+use hil_models::trace::{Trace, UNBOUNDED_NS};
 
 const fn column(name: &'static str, label: &'static str, unit: &'static str) -> PlotColumn {
     PlotColumn { name, label, unit }
@@ -43,6 +43,11 @@ fn cdf(trace: &Trace) -> PlotSeries {
             (rank + 1) as f64 / delays.len() as f64,
         ]
     };
+    let bound_ms = bound_ms(trace.delay_bound_ns());
+    let point = |step: usize| {
+        let [delay_ms, share] = point(step);
+        [delay_ms, share, bound_ms]
+    };
     let values = (0..=steps).filter(|_| steps > 0).flat_map(point).collect();
     let columns = vec![
         column("delay_ms", "delay", "ms"),
@@ -51,8 +56,17 @@ fn cdf(trace: &Trace) -> PlotSeries {
             "share of the delivered messages up to it",
             "1",
         ),
+        column(
+            "bound_ms",
+            "largest error of any delay by the clocks, empty where unknown",
+            "ms",
+        ),
     ];
     made("cdf", "distribution of the delay", columns, values)
+}
+
+fn bound_ms(bound_ns: Option<u64>) -> f64 {
+    bound_ns.map_or(f64::NAN, |ns| ns as f64 * 1e-6)
 }
 
 fn runs(name: &str, title: &str, runs: &[RunCount]) -> PlotSeries {
@@ -99,12 +113,19 @@ fn over_time(trace: &Trace) -> PlotSeries {
         .flat_map(|record| {
             let delay = record.delay().map_or(f64::NAN, |ns| ns as f64 * 1e-6);
             let is_lost = f64::from(record.fate.is_loss());
-            [record.published_ns as f64 * 1e-9, delay, is_lost]
+            let bound_ns = record.delay().map(|_| record.bound_ns);
+            let bound = bound_ms(bound_ns.filter(|ns| *ns != UNBOUNDED_NS));
+            [record.published_ns as f64 * 1e-9, delay, bound, is_lost]
         })
         .collect();
     let columns = vec![
         column("published_s", "publication, since the run's start", "s"),
         column("delay_ms", "delay, empty where there is none", "ms"),
+        column(
+            "bound_ms",
+            "its largest error by the clocks, empty where unknown",
+            "ms",
+        ),
         column("lost", "1 when it was lost", "1"),
     ];
     made("time", "every message", columns, values)

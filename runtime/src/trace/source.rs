@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use hil_models::link::trace::{ReplayError, TraceEnd, TraceLink, TraceMatch, TraceReplay};
@@ -27,6 +27,8 @@ pub struct TraceSource {
     pub replay: TraceReplay,
     /// What the paths start from.
     pub base: BaseFolder,
+    /// What was read of them, so that nobody reads a file twice for it.
+    pub noted: NotedDelays,
 }
 
 /// The folder of the topology file. Where a file lies is no part of what it says, so any two are
@@ -42,14 +44,56 @@ impl PartialEq for BaseFolder {
 
 impl Eq for BaseFolder {}
 
+/// The longest delay of each trace that was read. It is kept beside what names the files and is no
+/// part of it, so any two are equal.
+#[derive(Debug, Clone, Default)]
+pub struct NotedDelays(Arc<Mutex<BTreeMap<PathBuf, Duration>>>);
+
+impl NotedDelays {
+    fn get(&self, file: &Path) -> Option<Duration> {
+        let noted = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        noted.get(file).copied()
+    }
+
+    fn note(&self, file: &Path, delay_max: Duration) {
+        let mut noted = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        noted.insert(file.to_owned(), delay_max);
+    }
+}
+
+impl PartialEq for NotedDelays {
+    fn eq(&self, _other: &Self) -> bool {
+        true
+    }
+}
+
+impl Eq for NotedDelays {}
+
 /// One channel's trace and how to replay it: what a gateway is told.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TraceLaunch {
+    /// The key that names it in the topology.
+    pub key: String,
     /// The file.
     pub file: PathBuf,
     /// How to replay it.
     pub replay: TraceReplay,
+    /// Its longest delay, where whoever made this has read it.
+    pub delay_max: Option<Duration>,
+    /// Where that is noted once it was read.
+    #[serde(skip)]
+    pub noted: NotedDelays,
+}
+
+/// A trace that a topology names cannot be used.
+#[derive(Debug, thiserror::Error)]
+#[error("{key}: {source}")]
+pub struct TraceError {
+    /// The key that names it.
+    pub key: String,
+    /// What is wrong with it.
+    pub source: TraceFileError,
 }
 
 /// Why a trace file cannot be used.
@@ -103,18 +147,23 @@ pub enum TraceFileError {
 }
 
 impl TraceSource {
-    /// The trace of `channel`; `None` for one that is not named where no folder is.
-    pub fn launch(&self, channel: &str) -> Option<TraceLaunch> {
-        let named = self.files.get(channel).map(PathBuf::from);
-        let in_folder = || {
-            let folder = self.folder.as_ref()?;
-            Some(Path::new(folder).join(file_name(channel)))
+    /// The trace of `channel` on `link`; `None` for one that is not named where no folder is.
+    pub fn launch(&self, link: &str, channel: &str) -> Option<TraceLaunch> {
+        let (key, named) = if let Some(file) = self.files.get(channel) {
+            (format!("files.\"{channel}\""), PathBuf::from(file))
+        } else {
+            let folder = Path::new(self.folder.as_ref()?);
+            ("folder".to_owned(), folder.join(file_name(channel)))
         };
-        let file = self.base.0.join(named.or_else(in_folder)?);
+        let file = self.base.0.join(named);
+        // A gateway may run in another folder.
+        let file = std::path::absolute(&file).unwrap_or(file);
         Some(TraceLaunch {
-            // A gateway may run in another folder.
-            file: std::path::absolute(&file).unwrap_or(file),
+            key: format!("links.{link}.trace.{key}"),
+            delay_max: self.noted.get(&file),
+            file,
             replay: self.replay,
+            noted: self.noted.clone(),
         })
     }
 }
@@ -123,13 +172,14 @@ impl TraceSource {
 ///
 /// # Errors
 /// The first that cannot be used.
-pub fn check(topology: &Topology) -> Result<(), TraceFileError> {
+pub fn check(topology: &Topology) -> Result<(), TraceError> {
     for crossing in topology.crossings() {
         let source = crossing
             .link
             .emulation()
             .and_then(|emulation| emulation.trace.as_ref());
-        if let Some(launch) = source.and_then(|source| source.launch(&crossing.channel.name)) {
+        let (link, channel) = (&crossing.link.name, &crossing.channel.name);
+        if let Some(launch) = source.and_then(|source| source.launch(link, channel)) {
             launch.model()?;
         }
     }
@@ -137,9 +187,15 @@ pub fn check(topology: &Topology) -> Result<(), TraceFileError> {
 }
 
 impl TraceLaunch {
-    /// The longest delay of the trace; `None` when it cannot be read.
-    pub fn delay_max(&self) -> Option<Duration> {
-        self.model().ok().map(|link| link.delay_max())
+    /// The longest delay that it adds; the file is read unless it was before.
+    ///
+    /// # Errors
+    /// As [`TraceLaunch::model`].
+    pub fn delay_max(&self) -> Result<Duration, TraceError> {
+        match self.delay_max.or_else(|| self.noted.get(&self.file)) {
+            Some(known) => Ok(known),
+            None => Ok(self.model()?.delay_max()),
+        }
     }
 
     /// What it does, in words.
@@ -163,13 +219,22 @@ impl TraceLaunch {
     /// The link.
     ///
     /// # Errors
-    /// When the file is no whole trace, or cannot be replayed.
-    pub fn model(&self) -> Result<TraceLink, TraceFileError> {
-        let trace = read_whole(&self.file)?;
-        TraceLink::new(Arc::new(trace), self.replay).map_err(|source| TraceFileError::Replay {
-            path: self.file.clone(),
+    /// When the file is no whole trace, or cannot be replayed; with the key that names it.
+    pub fn model(&self) -> Result<TraceLink, TraceError> {
+        let failed = |source| TraceError {
+            key: self.key.clone(),
             source,
-        })
+        };
+        let trace = read_whole(&self.file).map_err(failed)?;
+        let link = TraceLink::new(Arc::new(trace), self.replay);
+        let link = link.map_err(|source| {
+            failed(TraceFileError::Replay {
+                path: self.file.clone(),
+                source,
+            })
+        })?;
+        self.noted.note(&self.file, link.delay_max());
+        Ok(link)
     }
 }
 
@@ -231,22 +296,62 @@ pub fn looks_like_text(bytes: &[u8]) -> bool {
 mod tests {
     use super::*;
 
-    #[test]
-    fn a_file_of_its_own_goes_before_the_folder() {
-        let source = TraceSource {
-            folder: Some("runs/x/traces".to_owned()),
-            files: BTreeMap::from([("a/b".to_owned(), "/tmp/one.trace".to_owned())]),
+    fn source(folder: Option<&str>, channel: &str, file: &str) -> TraceSource {
+        TraceSource {
+            folder: folder.map(str::to_owned),
+            files: BTreeMap::from([(channel.to_owned(), file.to_owned())]),
             replay: TraceReplay::default(),
             base: BaseFolder(PathBuf::from("/lab")),
-        };
-        let of = |channel| source.launch(channel).unwrap().file;
-        assert_eq!(of("a/b"), Path::new("/tmp/one.trace"));
-        assert_eq!(of("b/a"), Path::new("/lab/runs/x/traces/b.a.trace"));
+            noted: NotedDelays::default(),
+        }
+    }
+
+    #[test]
+    fn a_file_of_its_own_goes_before_the_folder() {
+        let source = source(Some("runs/x/traces"), "a/b", "/tmp/one.trace");
+        let of = |channel| source.launch("hop", channel).unwrap();
+        assert_eq!(of("a/b").file, Path::new("/tmp/one.trace"));
+        assert_eq!(of("a/b").key, "links.hop.trace.files.\"a/b\"");
+        assert_eq!(of("b/a").file, Path::new("/lab/runs/x/traces/b.a.trace"));
+        assert_eq!(of("b/a").key, "links.hop.trace.folder");
         let files_only = TraceSource {
             folder: None,
             ..source
         };
-        assert_eq!(files_only.launch("b/a"), None);
+        assert_eq!(files_only.launch("hop", "b/a"), None);
+    }
+
+    #[test]
+    fn a_trace_is_read_once_and_one_that_vanished_before_is_named_with_its_key() {
+        let folder = std::env::temp_dir().join(format!("hil-trace-source-{}", std::process::id()));
+        fs::create_dir_all(&folder).unwrap();
+        let file = folder.join("a.csv");
+        fs::write(&file, "published_ns,delay_ns\n0,7000\n10,9000\n").unwrap();
+        let source = source(None, "a/b", &file.display().to_string());
+        let launch = || source.launch("hop", "a/b").unwrap();
+        assert_eq!(launch().delay_max, None);
+        assert_eq!(launch().delay_max().unwrap(), Duration::from_micros(9));
+        fs::remove_dir_all(&folder).unwrap();
+        // What was read is still known, to a gateway too.
+        assert_eq!(launch().delay_max().unwrap(), Duration::from_micros(9));
+        let told = serde_json::to_string(&launch()).unwrap();
+        let told: TraceLaunch = serde_json::from_str(&told).unwrap();
+        assert_eq!(told.delay_max().unwrap(), Duration::from_micros(9));
+        // But nothing is replayed that is not there.
+        let anew = TraceSource {
+            noted: NotedDelays::default(),
+            ..source.clone()
+        };
+        let launch = anew.launch("hop", "a/b").unwrap();
+        for error in [
+            launch.delay_max().unwrap_err(),
+            launch.model().unwrap_err(),
+            told.model().unwrap_err(),
+        ] {
+            let text = error.to_string();
+            let start = format!("links.hop.trace.files.\"a/b\": trace {}: ", file.display());
+            assert!(text.starts_with(&start), "{text}");
+        }
     }
 
     #[test]

@@ -163,7 +163,13 @@ fn plots_json(opened: &Opened, made: &[PlotSeries]) -> Value {
     let series = made.iter().map(|one| {
         let columns: Vec<&str> = one.columns.iter().map(|column| column.name).collect();
         let rows: Vec<&[f64]> = one.rows().collect();
-        json!({ "name": one.name, "title": one.title, "columns": columns, "rows": rows })
+        json!({
+            "name": one.name,
+            "title": one.title,
+            "notes": one.notes,
+            "columns": columns,
+            "rows": rows,
+        })
     });
     json!({ "file": opened.path, "series": series.collect::<Vec<_>>() })
 }
@@ -227,20 +233,30 @@ fn converted(trace: &Trace, form: TraceForm) -> Result<(Vec<u8>, String), String
         TraceForm::Csv => Ok((csv::encode(trace).into_bytes(), String::new())),
         TraceForm::Mahimahi => {
             let text = opportunities::encode(trace);
-            let text = text.ok_or("no message has a known arrival, so there is no opportunity")?;
-            let remark = format!("; {}", opportunities::ENCODE_LOSS);
+            let text = text.map_err(|error| error.to_string())?;
+            let remark = format!("; {}; {}", opportunities::ENCODE_LOSS, bound_words(trace));
             Ok((text.into_bytes(), remark))
         }
         TraceForm::Netem => {
             let table = netem::table(trace).ok_or("fewer than two delays, or all are equal")?;
             let remark = format!(
                 "; use it as: netem delay {:.0}us {:.0}us distribution FILE. Not kept: losses, and \
-                 the order of the delays",
+                 the order of the delays; {}",
                 table.mean_ns / 1e3,
-                table.deviation_ns / 1e3
+                table.deviation_ns / 1e3,
+                bound_words(trace)
             );
             Ok((table.text.into_bytes(), remark))
         }
+    }
+}
+
+/// How far the clocks may have led the delays of `trace` astray.
+fn bound_words(trace: &Trace) -> String {
+    match trace.delay_bound_ns() {
+        Some(0) => "delays are of one clock".to_owned(),
+        Some(ns) => format!("each delay within {:.3}us by the clocks", ns as f64 / 1e3),
+        None => "how far the clocks may have led the delays astray is unknown".to_owned(),
     }
 }
 

@@ -1,7 +1,7 @@
 //! pcap and pcapng, whole and broken.
 
 use super::super::writer::{self, PacketToWrite};
-use super::super::{CaptureInterface, Direction, Problem, link_type};
+use super::super::{CARD_CLOCK, CaptureInterface, Direction, Problem, link_type};
 use super::read;
 
 /// Numbers of either byte order.
@@ -311,14 +311,19 @@ fn what_the_writer_wrote_reads_the_same() {
         ..CaptureInterface::default()
     };
     writer::interface(&mut file, &interface, "hil");
+    let card = CaptureInterface {
+        description: Some(format!("{CARD_CLOCK} (/dev/ptp0)")),
+        ..interface.clone()
+    };
+    writer::interface(&mut file, &card, "hil");
     let stamp_ns = 1_790_000_000_987_654_321;
-    for (direction, data) in [
-        (Inbound, [&b"abc"[..], &b"defg"[..]]),
-        (Outbound, [b"", b""]),
-        (Unknown, [b"x", b""]),
+    for (interface_index, direction, data) in [
+        (0, Inbound, [&b"abc"[..], &b"defg"[..]]),
+        (0, Outbound, [b"", b""]),
+        (1, Unknown, [b"x", b""]),
     ] {
         let packet = PacketToWrite {
-            interface_index: 0,
+            interface_index,
             stamp_ns,
             original_bytes: 1500,
             direction,
@@ -326,7 +331,13 @@ fn what_the_writer_wrote_reads_the_same() {
         };
         writer::packet(&mut file, &packet);
     }
-    writer::statistics(&mut file, 0, (stamp_ns - 5, stamp_ns + 5), 12, 2);
+    writer::statistics(
+        &mut file,
+        0,
+        (stamp_ns - 5, stamp_ns + 5),
+        (12, 2),
+        Some("why"),
+    );
     let (packets, faults, interfaces) = read(&file, 11);
     assert_eq!(faults, []);
     assert_eq!(packets[0].data, b"abcdefg");
@@ -336,6 +347,9 @@ fn what_the_writer_wrote_reads_the_same() {
         assert_eq!(packet.stamp_ns, Some(stamp_ns.cast_signed()));
         assert_eq!(packet.original_bytes, 1500);
     }
+    let of_card: Vec<bool> = packets.iter().map(|one| one.is_card_stamped).collect();
+    assert_eq!(of_card, [false, false, true]);
+    assert_eq!(interfaces[1].description, card.description);
     let read_back = &interfaces[0];
     assert_eq!(read_back.name, interface.name);
     assert_eq!(read_back.end_ns, Some((stamp_ns + 5).cast_signed()));

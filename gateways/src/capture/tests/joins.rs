@@ -268,6 +268,7 @@ fn observer_of(packets: &[(usize, Direction, i64, u16)], host: u8) -> Observer {
                 link_type: link_type::ETHERNET,
                 stamp_ns: Some(*stamp_ns),
                 original_bytes: u32::try_from(data.len()).unwrap(),
+                is_card_stamped: false,
                 direction: *direction,
                 data: &data,
             },

@@ -57,7 +57,7 @@ fn sample_pcapng() -> Vec<u8> {
         };
         writer::packet(&mut file, &packet);
     }
-    writer::statistics(&mut file, 1, (0, 9), 3, 0);
+    writer::statistics(&mut file, 1, (0, 9), (3, 0), None);
     file
 }
 

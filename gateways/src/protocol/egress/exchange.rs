@@ -6,7 +6,7 @@ use crate::protocol::refusal::Refusal;
 use crate::protocol::stamps::{ArrivalStamps, StampSource};
 use crate::protocol::wire::FollowUpField;
 
-/// Exchanges remembered; at 50 Hz a response may take 1.28 s.
+/// Exchanges remembered; at the 100 Hz of a clock path a response may take 0.64 s.
 const LENGTH: usize = 64;
 /// Stamps of different kinds on one host are converted with an error; beyond this a response that
 /// was held longer than the whole exchange took is nonsense.

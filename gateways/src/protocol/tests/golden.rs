@@ -8,7 +8,7 @@ use crate::protocol::wire::{
 };
 
 /// Hexadecimal digits to bytes; blanks and line ends are skipped.
-fn bytes(text: &str) -> Vec<u8> {
+pub(super) fn bytes(text: &str) -> Vec<u8> {
     let digits: Vec<u8> = text
         .chars()
         .filter(|c| !c.is_whitespace())

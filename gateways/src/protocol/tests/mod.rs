@@ -1,6 +1,7 @@
 //! Tests of the protocol's parts together; nothing here ships.
 
 mod bridges;
+mod clock_path;
 mod fragments;
 mod golden;
 mod mutation;

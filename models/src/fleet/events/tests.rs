@@ -104,6 +104,23 @@ fn a_repeat_that_had_to_be_waited_for_is_named_with_the_copies_before() {
     // Without a common clock nobody can say how long it took.
     diary.log.set_clocks_differ();
     assert_eq!(diary.told(), []);
+    // Aligned clocks may show a command as sent after it was taken, by as much as they are known.
+    let stamp = |at_ns, bound_ns| {
+        Some(crate::run_log::BroughtStamp {
+            at_ns,
+            bound_ns,
+            is_early: false,
+        })
+    };
+    let late = |channel: &str, ns: i64| match channel {
+        FLEET_TRUTH => stamp(ns, 0),
+        _ => stamp(ns + 50 * MS, 50_000_000),
+    };
+    let source_of = |channel: &str| Some(channel.to_owned());
+    diary.log.bring_to_one_clock(source_of, late).unwrap();
+    let told = diary.told();
+    assert_eq!(told.len(), 1, "{told:?}");
+    assert_eq!(told[0].1, [0, 1, 2], "{told:?}");
 }
 
 #[test]

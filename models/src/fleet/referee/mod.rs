@@ -149,6 +149,16 @@ impl Referee {
         start: Instant,
         end: Instant,
     ) {
+        self.replay_seeing(records, (start, end), &mut |_, _| {});
+    }
+
+    /// As [`Self::replay`]; `see` looks on after every scan.
+    pub(crate) fn replay_seeing(
+        &mut self,
+        records: &mut dyn Iterator<Item = Truth>,
+        (start, end): (Instant, Instant),
+        see: &mut dyn FnMut(Instant, &Self),
+    ) {
         let mut pending = records.next();
         let mut now = start;
         while now <= end {
@@ -157,8 +167,15 @@ impl Referee {
                 pending = records.next();
             }
             self.scan(now);
+            see(now, self);
             now = now + SCAN_PERIOD;
         }
+    }
+
+    /// Robots that are on a mission and have not moved from the last scan but one to the last.
+    pub(crate) fn standing_count(&self) -> usize {
+        let on_mission = self.tracks.iter().filter(|track| track.is_driving);
+        on_mission.filter(|track| !track.has_moved).count()
     }
 
     /// What it has counted.

@@ -11,6 +11,7 @@ use core::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
+use super::check_loss_ratios;
 use crate::case_study::ParameterError;
 use crate::random::RandomStream;
 use crate::time::Instant;
@@ -50,13 +51,7 @@ impl Bursts {
                 return Err(ParameterError::new(key, problem));
             }
         }
-        for (key, ratio) in [
-            ("bad_loss_ratio", self.bad_loss_ratio),
-            ("good_loss_ratio", self.good_loss_ratio),
-        ] {
-            ParameterError::check(key, ratio, 0.0..=1.0, "0..=1")?;
-        }
-        Ok(())
+        check_loss_ratios(self.bad_loss_ratio, self.good_loss_ratio)
     }
 
     /// Share of the time in the bad state in the long run.

@@ -10,6 +10,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::check_loss_ratios;
 use crate::case_study::ParameterError;
 use crate::random::RandomStream;
 
@@ -43,13 +44,7 @@ impl GilbertElliott {
         for (key, step) in [("to_bad", self.to_bad), ("to_good", self.to_good)] {
             ParameterError::check(key, step, 1e-9..=1.0, "1e-9..=1")?;
         }
-        for (key, ratio) in [
-            ("bad_loss_ratio", self.bad_loss_ratio),
-            ("good_loss_ratio", self.good_loss_ratio),
-        ] {
-            ParameterError::check(key, ratio, 0.0..=1.0, "0..=1")?;
-        }
-        Ok(())
+        check_loss_ratios(self.bad_loss_ratio, self.good_loss_ratio)
     }
 
     /// Share of the messages that meet the bad state in the long run.

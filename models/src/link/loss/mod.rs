@@ -71,6 +71,14 @@ impl LossLaw {
     }
 }
 
+/// The shares of the messages lost in either state of a law with two.
+fn check_loss_ratios(bad: f64, good: f64) -> Result<(), ParameterError> {
+    for (key, ratio) in [("bad_loss_ratio", bad), ("good_loss_ratio", good)] {
+        ParameterError::check(key, ratio, 0.0..=1.0, "0..=1")?;
+    }
+    Ok(())
+}
+
 impl Default for LossLaw {
     /// No loss.
     fn default() -> Self {

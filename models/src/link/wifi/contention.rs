@@ -225,7 +225,7 @@ mod tests {
         ] {
             let access = Access::of(category);
             let (attempt, collision) = fixed_point(&access, count);
-            let (slots_attempt, slots_collision) = slotted(&access, count as usize, 400_000, 3);
+            let (slots_attempt, slots_collision) = slotted(&access, count as usize, 1_000_000, 3);
             // Bianchi's own comparison agrees within a few per cent; stations are not independent.
             assert!(
                 (attempt / slots_attempt - 1.0).abs() < 0.05,

@@ -211,6 +211,14 @@ fn a_frame_older_than_its_lifetime_is_given_up_and_the_queue_stays_bounded() {
     );
     let longest = all.iter().flatten().max().unwrap();
     assert!((19_000_000..21_000_000).contains(longest), "{longest}");
+    // What is given up takes no air: the medium serves one frame per exchange and mean back-off, and
+    // one burst of the lifetime's length more at the beginning.
+    let phy = Phy::new(&spec);
+    let exchange_ns = phy.ppdu_ns(11, Phy::air_bytes(100)) + phy.response_ns(11);
+    let service_ns = (exchange_ns + 43_000 + 67_500) as f64;
+    let expected = COUNT as f64 * 50_000.0 / service_ns;
+    let found = counts.delivered_count as f64;
+    assert!((found / expected - 1.0).abs() < 0.003, "{found} {expected}");
 }
 
 #[test]
@@ -288,6 +296,13 @@ fn frames_for_a_dozing_receiver_wait_half_a_beacon_interval_on_average() {
     let rest_ms = 0.043 + 0.0675 + 1e-6 * Phy::new(&spec).ppdu_ns(11, Phy::air_bytes(100)) as f64;
     assert!((mean_ms - 51.2 - rest_ms).abs() < 0.15, "{mean_ms}");
     assert!(longest < 103_000_000, "{longest}");
+    // Any wait up to the interval is as likely as any other.
+    for quarter in 1..4_i64 {
+        let upto_ns = quarter as f64 * 25.6e6 + rest_ms * 1e6;
+        let below = all.iter().flatten().filter(|ns| (**ns as f64) < upto_ns);
+        let share = below.count() as f64 / COUNT as f64;
+        assert!((share - 0.25 * quarter as f64).abs() < 0.0025, "{share}");
+    }
     // The other direction, and a receiver that heard a frame just now, wait for no beacon.
     let stream = |name| RandomStream::new(8, name);
     let mut back = WifiLink::new(&spec, Way::Backward, stream("own"), stream("shared")).unwrap();

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::stage::{MessageFate, Stage};
 use crate::clock::BoundFigures;
-use crate::measure::histogram::Distribution;
+use crate::measure::histogram::{Distribution, DurationBin};
 use crate::measure::statistics::{CONFIDENCE, Interval, IntervalNs, wilson};
 
 /// The latency account of one channel.
@@ -98,6 +98,9 @@ pub struct SegmentFigures {
     pub is_combined: bool,
     /// Its durations.
     pub distribution: Distribution,
+    /// The same durations as a histogram; empty where none was measured.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub bins: Vec<DurationBin>,
     /// How far its durations may be off because it ends on another host's clock than it began on;
     /// `None` within one host.
     #[serde(default)]
@@ -116,6 +119,9 @@ impl SegmentFigures {
 pub struct EndToEnd {
     /// The durations, on the consumer's clock.
     pub distribution: Distribution,
+    /// The same durations as a histogram; empty where none was measured.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub bins: Vec<DurationBin>,
     /// 95 % interval of the median by block bootstrap; `None` below 100 messages.
     pub p50_interval: Option<IntervalNs>,
     /// 95 % interval of the 99th percentile by block bootstrap.

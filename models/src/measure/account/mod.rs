@@ -21,6 +21,7 @@ mod gaps;
 mod join;
 mod outage;
 mod passage;
+mod radio;
 #[cfg(test)]
 mod random_fates;
 mod segments;
@@ -43,11 +44,12 @@ pub use outage::{
     OutageFinder, Standing, foregoing, outages,
 };
 pub use passage::passages;
+pub(crate) use radio::{HandedFate, handed_fates};
 pub use stage::{MessageFate, Side, Stage};
 pub use story::{MessageStory, stories};
 pub use trace::{TRACE_MESSAGES_MAX, TooManyMessages, TraceChannel, link_trace};
 
-use crate::clock::ClockMap;
+use crate::clock::{ClockMap, ClockSettings};
 use crate::measure::histogram::LatencyHistogram;
 use crate::measure::record::{
     EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, TakenRecord,
@@ -132,6 +134,33 @@ impl ChannelPath<'_> {
         }
     }
 
+    /// As [`Self::localise`], and further outside the exchanges too; see
+    /// [`ClockMap::localise_beyond`].
+    pub fn localise_beyond(self, remote: RemoteInstant) -> Option<(Instant, u64)> {
+        match self {
+            Self::Mapped { map } => {
+                let localised = map.localise_beyond(remote)?;
+                Some((localised.instant, localised.bound_ns()))
+            }
+            Self::SharedMemory | Self::Gateway { .. } => self.localise(remote),
+        }
+    }
+
+    /// As [`Self::localise`], and further before the first exchange too, with true beside those that only
+    /// this converts; see [`ClockMap::localise_early`].
+    pub fn localise_early(self, remote: RemoteInstant) -> Option<(Instant, u64, bool)> {
+        match self {
+            Self::Mapped { map } => {
+                let (localised, is_early) = map.localise_early(remote)?;
+                Some((localised.instant, localised.bound_ns(), is_early))
+            }
+            Self::SharedMemory | Self::Gateway { .. } => {
+                let (at, bound_ns) = self.localise(remote)?;
+                Some((at, bound_ns, false))
+            }
+        }
+    }
+
     /// An instant of the consumer's host on the clock of the producer's, with the largest error.
     pub fn to_remote(self, local: Instant) -> Option<(RemoteInstant, u64)> {
         let shifted = |alignment: Alignment| {
@@ -142,6 +171,20 @@ impl ChannelPath<'_> {
             Self::SharedMemory => Some(shifted(Alignment::SAME_CLOCK)),
             Self::Gateway { alignment } => alignment.map(shifted),
             Self::Mapped { map } => map.to_remote(local),
+        }
+    }
+
+    /// How far the two hosts' clocks may have moved against each other between two instants of the
+    /// producer's, by the drift allowance of [`ClockSettings`], which needs no alignment; 0 on one
+    /// clock, `None` across a noticed step.
+    pub fn drift_ns(self, from: RemoteInstant, until: RemoteInstant) -> Option<u64> {
+        match self {
+            _ if self.has_one_clock() => Some(0),
+            Self::Mapped { map } => map.drift_ns(from, until),
+            Self::SharedMemory | Self::Gateway { .. } => {
+                let span_ns = until.as_ns().saturating_sub(from.as_ns());
+                Some(ClockSettings::default().drift_ns(span_ns).unsigned_abs())
+            }
         }
     }
 
@@ -308,6 +351,23 @@ pub fn account(records: &ChannelRecords<'_>, context: &AccountContext<'_>) -> Ch
         loss_bursts: bursts.finish(),
         gaps,
         interruptions: judge.interruptions(&gap_of_interruption),
+    }
+}
+
+/// Hands every message of a channel to `take`, in the order of the producer's starts and numbers: what
+/// is recorded of it, what became of it, and the interruption that cost it, by its place in the context.
+/// A judge remembers the message before, so it sees all of them, whatever the caller wants.
+fn each_judged(
+    records: &ChannelRecords<'_>,
+    context: &AccountContext<'_>,
+    mut take: impl FnMut(&join::Joined<'_>, MessageFate, Option<usize>),
+) {
+    let records = records.on(context.path);
+    let join = join::Join::new(&records);
+    let mut judge = fate::Judge::new(&records, context, &join);
+    for joined in join {
+        let fate = judge.judge(&joined);
+        take(&joined, fate, judge.last_interruption());
     }
 }
 

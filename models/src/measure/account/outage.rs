@@ -6,11 +6,10 @@ use core::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use super::fate::Judge;
-use super::join::{Join, Joined, stamp};
+use super::join::{Joined, stamp};
 use super::stage::{MessageFate, Side};
 use super::story::published_ns;
-use super::{AccountContext, ChannelRecords};
+use super::{AccountContext, ChannelRecords, each_judged};
 use crate::time::{Instant, duration_ns};
 
 /// How long after its end an outage may still show in what a robot does: a session that it ended
@@ -162,14 +161,10 @@ impl OutageFinder {
 /// Every outage of a channel, in the order of its messages. Time and memory grow with the number
 /// of records.
 pub fn outages(records: &ChannelRecords<'_>, context: &AccountContext<'_>) -> Vec<Outage> {
-    let records = records.on(context.path);
-    let join = Join::new(&records);
-    let mut judge = Judge::new(&records, context, &join);
     let mut finder = OutageFinder::default();
-    for joined in join {
-        let fate = judge.judge(&joined);
-        finder.see(&joined, fate, judge.last_interruption());
-    }
+    each_judged(records, context, |joined, fate, interruption| {
+        finder.see(joined, fate, interruption);
+    });
     finder.finish()
 }
 
@@ -206,8 +201,8 @@ pub struct OutageClass {
 /// The longest outage of a channel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LongestOutage {
-    /// Publication of its first lost message, nanoseconds after the start of the run, or on the
-    /// producer's clock when that start is unknown.
+    /// Publication of its first lost message, nanoseconds after the start of the run in a report; on the
+    /// producer's clock where they are drawn up, and when that start is unknown.
     pub start_ns: i64,
     /// Length, nanoseconds.
     pub length_ns: i64,
@@ -220,8 +215,8 @@ pub struct LongestOutage {
 }
 
 impl OutageFigures {
-    /// The figures of `outages`; `start` and `end` of the run are on the producer's clock.
-    pub fn of(outages: &[Outage], start: Option<Instant>, end: Option<Instant>) -> Self {
+    /// The figures of `outages`; `end` of the run is on the producer's clock.
+    pub fn of(outages: &[Outage], end: Option<Instant>) -> Self {
         let mut figures = Self {
             outage_count: outages.len() as u64,
             lost_count: 0,
@@ -246,7 +241,7 @@ impl OutageFigures {
             let is_longest = figures.longest.is_none_or(|one| one.length_ns < length_ns);
             if is_longest {
                 figures.longest = Some(LongestOutage {
-                    start_ns: from_ns.saturating_sub(start.map_or(0, Instant::as_ns)),
+                    start_ns: from_ns,
                     length_ns,
                     lost_count: outage.lost_count,
                     first_sequence: outage.first_sequence,

@@ -1,24 +1,20 @@
 //! The way of every message over the network, from the same join and judgement as the account's.
 //! What the ways amount to is computed in [`crate::measure::network`].
 
-use super::fate::Judge;
-use super::join::{Join, Joined, stamp};
+use super::join::{Joined, stamp};
 use super::stage::MessageFate;
-use super::{AccountContext, ChannelRecords};
+use super::{AccountContext, ChannelRecords, each_judged};
 use crate::measure::network::{Crossing, Passage};
 use crate::time::RemoteInstant;
 
 /// The passages of a channel, in the order of the producer's starts and sequence numbers. Time and
 /// memory grow with the number of records.
 pub fn passages(records: &ChannelRecords<'_>, context: &AccountContext<'_>) -> Vec<Passage> {
-    let records = records.on(context.path);
-    let join = Join::new(&records);
-    let mut judge = Judge::new(&records, context, &join);
-    join.map(|joined| {
-        let fate = judge.judge(&joined);
-        passage(&joined, fate, context)
-    })
-    .collect()
+    let mut found = Vec::new();
+    each_judged(records, context, |joined, fate, _| {
+        found.push(passage(joined, fate, context));
+    });
+    found
 }
 
 fn passage(joined: &Joined<'_>, fate: MessageFate, context: &AccountContext<'_>) -> Passage {

@@ -336,6 +336,7 @@ impl<'a> SegmentBook<'a> {
                     to,
                     is_combined,
                     distribution,
+                    bins: histogram(from, to).map_or_else(Vec::new, LatencyHistogram::bins),
                     bound: BoundFigures::of(self.bounds_ns[cell].clone()),
                 }
             })
@@ -392,6 +393,7 @@ impl<'a> SegmentBook<'a> {
         let exact = self.path.has_one_clock().then_some(0);
         EndToEnd {
             distribution: self.end_to_end.distribution(reason),
+            bins: self.end_to_end.bins(),
             p50_interval: block_bootstrap_quantile(samples, 0.5, CONFIDENCE, random),
             p99_interval: block_bootstrap_quantile(samples, 0.99, CONFIDENCE, random),
             alignment_bound_ns: bound.map(|bound| bound.largest_ns).or(exact),

@@ -5,10 +5,9 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde::{Deserialize, Serialize};
 
-use super::fate::Judge;
-use super::join::{Join, Joined, stamp};
+use super::join::{Joined, stamp};
 use super::stage::MessageFate;
-use super::{AccountContext, ChannelRecords};
+use super::{AccountContext, ChannelRecords, each_judged};
 use crate::measure::record::IngressRecord;
 use crate::time::RemoteInstant;
 
@@ -37,29 +36,24 @@ pub fn stories(
     context: &AccountContext<'_>,
     wanted: &BTreeSet<(u32, u64)>,
 ) -> BTreeMap<(u32, u64), MessageStory> {
-    let records = records.on(context.path);
-    let join = Join::new(&records);
-    let mut judge = Judge::new(&records, context, &join);
     let mut found = BTreeMap::new();
-    // The judge remembers the message before, so it must see all of them.
-    for joined in join {
-        let fate = judge.judge(&joined);
-        let Some(key) = key(&joined).filter(|key| wanted.contains(key)) else {
-            continue;
+    each_judged(records, context, |joined, fate, interruption_index| {
+        let Some(key) = key(joined).filter(|key| wanted.contains(key)) else {
+            return;
         };
-        let delay = delay(&joined, context);
+        let delay = delay(joined, context);
         let story = MessageStory {
             fate,
-            published_ns: published_ns(&joined),
+            published_ns: published_ns(joined),
             delay_ns: delay.map(|(delay_ns, _)| delay_ns),
             delay_bound_ns: delay.map(|(_, bound_ns)| bound_ns),
             is_overtaken: joined
                 .ingress
                 .is_some_and(|ingress| ingress.flags & IngressRecord::REORDERED != 0),
-            interruption_index: judge.last_interruption(),
+            interruption_index,
         };
         found.insert(key, story);
-    }
+    });
     found
 }
 

@@ -3,7 +3,8 @@
 //! robot did at the same time.
 
 use super::delay::at_share;
-use super::{Crossing, Passage};
+use super::{Crossing, Moment, Passage};
+use crate::measure::account::Side;
 use crate::plot::{PlotColumn, PlotSeries};
 
 /// Shortest bin.
@@ -27,16 +28,9 @@ pub fn bin_width_ns(duration_ns: i64) -> i64 {
     }
 }
 
-/// Where a run lies on the clocks of a channel's two hosts.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct SeriesSpan {
-    /// Start of the run on the producer's clock.
-    pub producer_start_ns: i64,
-    /// Start of the run on the consumer's clock.
-    pub consumer_start_ns: i64,
-    /// Length of the run.
-    pub duration_ns: i64,
-}
+/// Puts moments of a channel's two hosts on the axis of the run: nanoseconds after its start, `None`
+/// where the clocks do not say.
+pub type Place<'a> = dyn Fn(Moment) -> Option<i64> + 'a;
 
 /// What happened in one stretch of time.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -51,6 +45,8 @@ pub struct NetworkBin {
     pub delay_p50_ns: Option<i64>,
     /// Largest delay.
     pub delay_max_ns: Option<i64>,
+    /// Largest error of any of these delays from the alignment of the clocks; 0 on one clock.
+    pub delay_bound_ns: Option<u64>,
     /// The longest time since the last reception that was reached in this stretch; `None` before
     /// the first reception.
     pub silence_max_ns: Option<i64>,
@@ -63,23 +59,32 @@ pub struct NetworkBins {
     pub width_ns: i64,
     /// From the start of the run on, without a hole.
     pub bins: Vec<NetworkBin>,
+    /// Messages that are in no bin because the time they were handed over has no place.
+    pub unplaced_count: u64,
 }
 
 impl NetworkBins {
-    /// Messages are put where they were handed to the network, silences where the receiver had
-    /// them. `width_ns` is above zero.
-    pub fn of(passages: &[Passage], span: SeriesSpan, width_ns: i64) -> Self {
+    /// Of a run of `duration_ns`. Messages are put where they were handed to the network, silences
+    /// where the receiver had them. `width_ns` is above zero.
+    pub fn of(
+        passages: &[Passage],
+        (duration_ns, width_ns): (i64, i64),
+        place: &Place<'_>,
+    ) -> Self {
         let width_ns = width_ns.max(1);
-        let count =
-            usize::try_from(span.duration_ns.max(1).saturating_add(width_ns - 1) / width_ns)
-                .unwrap_or(1);
+        let count = usize::try_from(duration_ns.max(1).saturating_add(width_ns - 1) / width_ns)
+            .unwrap_or(1);
         let mut bins = vec![NetworkBin::default(); count];
         let mut delays_ns: Vec<Vec<i64>> = vec![Vec::new(); count];
+        let mut unplaced_count = 0;
         for one in passages {
-            let at_ns = one
-                .offered_ns
-                .map(|ns| ns.saturating_sub(span.producer_start_ns));
-            let Some(index) = at_ns.and_then(|ns| index_of(ns, width_ns, count)) else {
+            let Some(ns) = one.offered_ns else { continue };
+            let side = Side::Producer;
+            let Some(at_ns) = place(Moment { side, ns }) else {
+                unplaced_count += one.count;
+                continue;
+            };
+            let Some(index) = index_of(at_ns, width_ns, count) else {
                 continue;
             };
             let bin = &mut bins[index];
@@ -93,14 +98,20 @@ impl NetworkBins {
                 Crossing::Unknown => {}
             }
             delays_ns[index].extend(one.delay_ns);
+            let bound_ns = one.delay_ns.map(|_| one.delay_bound_ns);
+            bin.delay_bound_ns = bin.delay_bound_ns.max(bound_ns);
         }
         for (bin, delays_ns) in bins.iter_mut().zip(&mut delays_ns) {
             delays_ns.sort_unstable();
             bin.delay_max_ns = delays_ns.last().copied();
             bin.delay_p50_ns = bin.delay_max_ns.map(|_| at_share(delays_ns, 0.5));
         }
-        silences(&mut bins, passages, span, width_ns);
-        Self { width_ns, bins }
+        silences(&mut bins, passages, (duration_ns, width_ns), place);
+        Self {
+            width_ns,
+            bins,
+            unplaced_count,
+        }
     }
 
     /// As a table, one row per bin.
@@ -132,6 +143,11 @@ impl NetworkBins {
                 ),
                 column("delay_s_max", "largest delay", "s"),
                 column(
+                    "delay_s_bound",
+                    "largest error of these delays by the clocks' alignment, 0 on one clock",
+                    "s",
+                ),
+                column(
                     "silence_s_max",
                     "longest time since the last reception that was reached in the bin",
                     "s",
@@ -146,6 +162,7 @@ impl NetworkBins {
                         bin.host_lost_count as f64,
                         seconds(bin.delay_p50_ns),
                         seconds(bin.delay_max_ns),
+                        bin.delay_bound_ns.map_or(f64::NAN, |ns| ns as f64 * 1e-9),
                         seconds(bin.silence_max_ns),
                     ]
                 })
@@ -171,19 +188,25 @@ fn index_of(ns: i64, width_ns: i64, count: usize) -> Option<usize> {
     (index < count).then_some(index)
 }
 
-/// Within a silence its length so far grows from bin to bin.
-fn silences(bins: &mut [NetworkBin], passages: &[Passage], span: SeriesSpan, width_ns: i64) {
-    let mut received_ns: Vec<i64> = passages
-        .iter()
-        .filter_map(|one| Some(one.received_ns?.saturating_sub(span.consumer_start_ns)))
-        .collect();
+/// Within a silence its length so far grows from bin to bin. Where it begins is a place on the axis; how
+/// long it is, the receiver's own clock says.
+fn silences(
+    bins: &mut [NetworkBin],
+    passages: &[Passage],
+    (duration_ns, width_ns): (i64, i64),
+    place: &Place<'_>,
+) {
+    let mut received_ns: Vec<i64> = passages.iter().filter_map(|one| one.received_ns).collect();
     received_ns.sort_unstable();
-    let ends = received_ns
-        .iter()
-        .skip(1)
-        .copied()
-        .chain([span.duration_ns]);
-    for (from_ns, until_ns) in received_ns.iter().copied().zip(ends) {
+    let nexts_ns = received_ns.iter().skip(1).copied().map(Some).chain([None]);
+    for (ns, next_ns) in received_ns.iter().copied().zip(nexts_ns) {
+        let side = Side::Consumer;
+        let Some(from_ns) = place(Moment { side, ns }) else {
+            continue;
+        };
+        let until_ns = next_ns.map_or(duration_ns, |next_ns| {
+            from_ns.saturating_add(next_ns.saturating_sub(ns))
+        });
         let (first, last) = (from_ns.div_euclid(width_ns), until_ns.div_euclid(width_ns));
         let indexes = first.max(0)..=last;
         let skipped = usize::try_from(first.max(0)).unwrap_or(usize::MAX);

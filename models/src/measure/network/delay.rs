@@ -1,12 +1,16 @@
-//! One-way delay of the network and how it varies. The variation needs less of the clocks than
-//! the delay itself: a constant error of their alignment drops out of it.
+//! One-way delay of the network and how it varies, each with how far the clocks may have led it
+//! astray. A variation needs less of them than the delay itself: a constant error of their alignment
+//! drops out of it, and what their rates may differ by is left.
 
 use serde::{Deserialize, Serialize};
 
 use super::{Crossing, Figure, Passage};
+use crate::measure::account::ChannelPath;
+use crate::measure::histogram::{DurationBin, LatencyHistogram};
 use crate::measure::special::ceil_count;
 use crate::measure::statistics::{CONFIDENCE, IntervalNs, block_bootstrap_quantile};
 use crate::random::RandomStream;
+use crate::time::RemoteInstant;
 
 /// Fewest samples beyond a quantile for which resampling says anything about it.
 const TAIL_COUNT_MIN: f64 = 10.0;
@@ -55,6 +59,13 @@ pub struct DelayFigures {
 }
 
 /// Packet delay variation: delay minus the smallest delay of the run (RFC 5481, section 4.2).
+///
+/// Its bound is the smaller one of two. Each delay is off by at most its own bound, so the
+/// difference of two is off by at most twice the largest one: this holds whatever the clocks did. And on
+/// one stretch between noticed steps a constant error of the alignment cancels: what is left is how far
+/// the estimated offset moved during the run, and how far the true one may have, by the drift allowance
+/// over the time from the first to the last message. The second one takes for granted that no clock
+/// was stepped unnoticed. The stamps, of the gateways themselves, are taken as exact.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DelayVariation {
     /// Median.
@@ -67,12 +78,16 @@ pub struct DelayVariation {
     pub p999_ns: i64,
     /// Largest.
     pub max_ns: i64,
+    /// Largest error of any of these from the two clocks; 0 on one clock.
+    pub bound_ns: u64,
+    /// True when that bound is wider than the median.
+    pub is_bound_wider: bool,
 }
 
 /// Difference of the delays of two messages with successive numbers, both of which arrived
 /// (inter-packet delay variation: RFC 3393; RFC 5481, section 4.1), as magnitudes. Each interval
 /// is taken on one clock, so that nothing but the clocks' difference in rate over one interval is
-/// in it.
+/// in it. Pairs with a noticed step of a clock between them are left out.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct SuccessiveVariation {
     /// Pairs.
@@ -83,6 +98,11 @@ pub struct SuccessiveVariation {
     pub p99_ns: i64,
     /// Largest magnitude.
     pub max_ns: i64,
+    /// Largest error of any of these: what the clocks' rates may differ by, over the longest time
+    /// between the messages of a pair; 0 on one clock.
+    pub bound_ns: u64,
+    /// True when that bound is wider than the median.
+    pub is_bound_wider: bool,
     /// Smoothed over messages in the order they came.
     pub jitter: InterarrivalJitter,
 }
@@ -94,9 +114,15 @@ pub struct InterarrivalJitter {
     pub mean_ns: f64,
     /// Largest J.
     pub max_ns: f64,
+    /// Largest error of both: the bounds of the differences, smoothed as they are. 0 on one clock.
+    pub bound_ns: f64,
 }
 
-pub(super) fn delays(passages: &[Passage], random: &mut RandomStream) -> Figure<DelayFigures> {
+pub(super) fn delays(
+    passages: &[Passage],
+    path: ChannelPath<'_>,
+    random: &mut RandomStream,
+) -> Figure<DelayFigures> {
     let arrived = || {
         passages
             .iter()
@@ -125,6 +151,7 @@ pub(super) fn delays(passages: &[Passage], random: &mut RandomStream) -> Figure<
     let [p50, p95, p99, p999] = [0.5, 0.95, 0.99, 0.999].map(&mut quantile);
     let alignment_bound_ns = arrived().map(|one| one.delay_bound_ns).max().unwrap_or(0);
     let above_min = |ns: i64| ns.saturating_sub(min_ns);
+    let bound_ns = variation_bound_ns(arrived(), path, alignment_bound_ns);
     Figure::Measured(DelayFigures {
         count: ascending.len() as u64,
         min_ns,
@@ -134,14 +161,68 @@ pub(super) fn delays(passages: &[Passage], random: &mut RandomStream) -> Figure<
         p999,
         max_ns,
         alignment_bound_ns,
-        is_bound_wider: i128::from(alignment_bound_ns) > i128::from(p50.value_ns),
+        is_bound_wider: exceeds(alignment_bound_ns, p50.value_ns),
         variation: DelayVariation {
             p50_ns: above_min(p50.value_ns),
             p95_ns: above_min(p95.value_ns),
             p99_ns: above_min(p99.value_ns),
             p999_ns: above_min(p999.value_ns),
             max_ns: above_min(max_ns),
+            bound_ns,
+            is_bound_wider: exceeds(bound_ns, above_min(p50.value_ns)),
         },
+    })
+}
+
+/// The delays of the messages that arrived, as a histogram.
+pub(super) fn delay_bins(passages: &[Passage]) -> Vec<DurationBin> {
+    let mut histogram = LatencyHistogram::default();
+    let arrived = passages
+        .iter()
+        .filter(|one| one.crossing == Crossing::Arrived);
+    for delay_ns in arrived.filter_map(|one| one.delay_ns) {
+        histogram.record(delay_ns);
+    }
+    histogram.bins()
+}
+
+/// True when a figure says less than its bound.
+pub(super) fn exceeds(bound_ns: u64, figure_ns: i64) -> bool {
+    i128::from(bound_ns) > i128::from(figure_ns)
+}
+
+/// See [`DelayVariation`]. All errors of delays lie in an interval as wide as this, so that the
+/// difference of any two of their quantiles is off by no more.
+fn variation_bound_ns<'a>(
+    arrived: impl Iterator<Item = &'a Passage>,
+    path: ChannelPath<'_>,
+    alignment_bound_ns: u64,
+) -> u64 {
+    let twice_ns = alignment_bound_ns.saturating_mul(2);
+    let mut sent_ns: Option<(i64, i64)> = None;
+    let mut offset_ns: Option<(i64, i64)> = None;
+    let widen = |ends: &mut Option<(i64, i64)>, ns: i64| {
+        let (low, high) = ends.unwrap_or((ns, ns));
+        *ends = Some((low.min(ns), high.max(ns)));
+    };
+    for one in arrived {
+        let stamps = one.offered_ns.zip(one.received_ns);
+        let Some(((offered_ns, received_ns), delay_ns)) = stamps.zip(one.delay_ns) else {
+            continue;
+        };
+        widen(&mut sent_ns, offered_ns);
+        // What was added to bring the one stamp to the other's clock.
+        let raw_ns = received_ns.saturating_sub(offered_ns);
+        widen(&mut offset_ns, raw_ns.saturating_sub(delay_ns));
+    }
+    let (Some((first_ns, last_ns)), Some((low_ns, high_ns))) = (sent_ns, offset_ns) else {
+        return twice_ns;
+    };
+    let [first, last] = [first_ns, last_ns].map(RemoteInstant::from_ns);
+    let drift_ns = path.drift_ns(first, last);
+    let moved_ns = high_ns.abs_diff(low_ns);
+    drift_ns.map_or(twice_ns, |drift_ns| {
+        twice_ns.min(drift_ns.saturating_add(moved_ns))
     })
 }
 
@@ -151,53 +232,78 @@ pub(super) fn at_share(ascending: &[i64], share: f64) -> i64 {
     ascending[rank - 1]
 }
 
-pub(super) fn successive(passages: &[Passage]) -> Figure<SuccessiveVariation> {
+pub(super) fn successive(
+    passages: &[Passage],
+    path: ChannelPath<'_>,
+) -> Figure<SuccessiveVariation> {
     let mut magnitudes: Vec<i64> = Vec::new();
+    let mut bound_ns = 0;
     for pair in passages.windows(2) {
         let [before, after] = [&pair[0], &pair[1]];
         let follows = !after.begins_epoch_after(before)
             && before.sequence.checked_add(1) == Some(after.sequence);
-        if let Some(ns) = difference_ns(before, after).filter(|_| follows) {
-            magnitudes.push(ns);
+        if let Some(one) = difference(before, after, path).filter(|_| follows) {
+            magnitudes.push(one.magnitude_ns);
+            bound_ns = bound_ns.max(one.bound_ns);
         }
     }
     magnitudes.sort_unstable();
     let Some(max_ns) = magnitudes.last().copied() else {
         return Figure::unavailable("no two successive messages arrived");
     };
+    let p50_ns = at_share(&magnitudes, 0.5);
     Figure::Measured(SuccessiveVariation {
         count: magnitudes.len() as u64,
-        p50_ns: at_share(&magnitudes, 0.5),
+        p50_ns,
         p99_ns: at_share(&magnitudes, 0.99),
         max_ns,
-        jitter: jitter(passages),
+        bound_ns,
+        is_bound_wider: exceeds(bound_ns, p50_ns),
+        jitter: jitter(passages, path),
     })
 }
 
-/// By how much the two delays differ; `None` when one of the messages did not arrive.
-fn difference_ns(before: &Passage, after: &Passage) -> Option<i64> {
-    let between = |from: Option<i64>, to: Option<i64>| Some(to?.saturating_sub(from?));
-    let received = between(before.received_ns, after.received_ns)?;
-    let sent = between(before.offered_ns, after.offered_ns)?;
-    Some(received.saturating_sub(sent).saturating_abs())
+/// By how much two delays differ, and how far that may be off.
+struct Difference {
+    magnitude_ns: i64,
+    bound_ns: u64,
 }
 
-fn jitter(passages: &[Passage]) -> InterarrivalJitter {
+/// `None` when one of the messages did not arrive, or a clock was stepped between them.
+fn difference(before: &Passage, after: &Passage, path: ChannelPath<'_>) -> Option<Difference> {
+    let between = |from: Option<i64>, to: Option<i64>| Some(to?.saturating_sub(from?));
+    let received_ns = between(before.received_ns, after.received_ns)?;
+    let sent_ns = between(before.offered_ns, after.offered_ns)?;
+    let instant = |one: &Passage| one.offered_ns.map(RemoteInstant::from_ns);
+    Some(Difference {
+        magnitude_ns: received_ns.saturating_sub(sent_ns).saturating_abs(),
+        bound_ns: path.drift_ns(instant(before)?, instant(after)?)?,
+    })
+}
+
+fn jitter(passages: &[Passage], path: ChannelPath<'_>) -> InterarrivalJitter {
     let mut arrivals: Vec<&Passage> = passages
         .iter()
         .filter(|one| one.received_ns.is_some() && one.offered_ns.is_some())
         .collect();
     arrivals.sort_by_key(|one| one.received_ns);
     let (mut jitter_ns, mut sum, mut max_ns) = (0.0_f64, 0.0, 0.0_f64);
+    let (mut error_ns, mut bound_ns) = (0.0_f64, 0.0_f64);
+    let mut count = 0_u64;
     for pair in arrivals.windows(2) {
-        let magnitude_ns = difference_ns(pair[0], pair[1]).unwrap_or(0) as f64;
-        jitter_ns += (magnitude_ns - jitter_ns) / 16.0;
+        let Some(one) = difference(pair[0], pair[1], path) else {
+            continue;
+        };
+        jitter_ns += (one.magnitude_ns as f64 - jitter_ns) / 16.0;
+        error_ns += (one.bound_ns as f64 - error_ns) / 16.0;
+        count += 1;
         sum += jitter_ns;
         max_ns = max_ns.max(jitter_ns);
+        bound_ns = bound_ns.max(error_ns);
     }
-    let count = arrivals.len().saturating_sub(1).max(1);
     InterarrivalJitter {
-        mean_ns: sum / count as f64,
+        mean_ns: sum / count.max(1) as f64,
         max_ns,
+        bound_ns,
     }
 }

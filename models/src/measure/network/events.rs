@@ -19,6 +19,10 @@ pub const EVENT_OUTAGE_MIN_NS: i64 = 100_000_000;
 const STEP_MIN_NS: u64 = 1_000_000;
 const SLEW_MAX_RATIO: f64 = 500e-6;
 
+/// How old a gateway's reading of the two clocks as a pair may be when it notes it with a message: the
+/// period of the readings and the longest sleep between two looks at it. What the scheduler adds is not in it.
+pub const CLOCK_READING_AGE_NS_MAX: i64 = 150_000_000;
+
 /// What happened.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case")]
@@ -45,6 +49,9 @@ pub enum NetworkEventKind {
         delay_max_ns: i64,
         /// What they exceeded.
         limit_ns: i64,
+        /// Largest error of the delays among them, and of those that the limit is made of, from the
+        /// alignment of the clocks; 0 on one clock.
+        bound_ns: u64,
     },
     /// Messages came after later ones.
     Reordering {
@@ -161,6 +168,8 @@ fn late(passages: &[Passage]) -> Vec<NetworkEvent> {
     let Some(limit_ns) = delay_limit_ns(passages) else {
         return Vec::new();
     };
+    let with_delay = passages.iter().filter(|one| one.delay_ns.is_some());
+    let bound_ns = with_delay.map(|one| one.delay_bound_ns).max().unwrap_or(0);
     let mut found: Vec<NetworkEvent> = Vec::new();
     let mut since_last = u64::MAX;
     for one in passages {
@@ -195,6 +204,7 @@ fn late(passages: &[Passage]) -> Vec<NetworkEvent> {
                 late_count: 1,
                 delay_max_ns: delay_ns,
                 limit_ns,
+                bound_ns,
             },
             from: producer(offered_ns),
             until_ns: Some(received_ns),
@@ -278,13 +288,16 @@ fn steps(readings: &mut Vec<(i64, i64)>, side: Side) -> Vec<NetworkEvent> {
         let [before, after] = [pair[0], pair[1]];
         let step_ns = after.1.saturating_sub(before.1);
         let passed_ns = after.0.saturating_sub(before.0) as f64;
-        // Readings are refreshed every 100 ms: a step shows up to that much later.
-        let slewed_ns = SLEW_MAX_RATIO * (passed_ns + 1e8);
+        // A step shows up to a reading's age after it happened.
+        let slewed_ns = SLEW_MAX_RATIO * (passed_ns + CLOCK_READING_AGE_NS_MAX as f64);
         let is_step = step_ns.unsigned_abs() > STEP_MIN_NS
             && step_ns.unsigned_abs() as f64 > slewed_ns + STEP_MIN_NS as f64;
         is_step.then_some(NetworkEvent {
             kind: NetworkEventKind::ClockStep { step_ns },
-            from: Moment { side, ns: before.0 },
+            from: Moment {
+                side,
+                ns: before.0.saturating_sub(CLOCK_READING_AGE_NS_MAX),
+            },
             until_ns: Some(after.0),
         })
     };

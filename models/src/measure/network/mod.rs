@@ -10,6 +10,8 @@
 //! beside the network's losses and never among them.
 
 mod bins;
+#[cfg(test)]
+mod bound_tests;
 mod delay;
 mod events;
 mod loss;
@@ -19,19 +21,20 @@ mod tests;
 
 use serde::{Deserialize, Serialize};
 
-pub use bins::{NetworkBin, NetworkBins, SeriesSpan, bin_width_ns};
+pub use bins::{NetworkBin, NetworkBins, Place, bin_width_ns};
 pub(crate) use delay::has_tail;
 pub use delay::{
     DelayFigures, DelayQuantile, DelayVariation, InterarrivalJitter, SuccessiveVariation,
 };
 pub use events::{
-    EVENT_OUTAGE_MIN_NS, NetworkEvent, NetworkEventKind, clock_steps, interruptions, network_events,
+    CLOCK_READING_AGE_NS_MAX, EVENT_OUTAGE_MIN_NS, NetworkEvent, NetworkEventKind, clock_steps,
+    interruptions, network_events,
 };
 pub use loss::{BURST_GAP_MIN, BurstFigures, LongestLoss, LossFigures};
 pub use order::OrderFigures;
 
-use crate::measure::account::Side;
-use crate::measure::histogram::{Distribution, LatencyHistogram};
+use crate::measure::account::{ChannelPath, Side};
+use crate::measure::histogram::{Distribution, DurationBin, LatencyHistogram};
 use crate::random::RandomStream;
 
 /// What the network did to one message.
@@ -109,6 +112,8 @@ impl<T> Figure<T> {
 /// What the passages alone do not say.
 #[derive(Debug, Clone, Copy)]
 pub struct NetworkContext<'a> {
+    /// How the clocks of the two hosts relate.
+    pub path: ChannelPath<'a>,
     /// Start and end of the run on the producer's clock, nanoseconds, where known.
     pub run_ns: Option<(i64, i64)>,
     /// Payload of one message.
@@ -139,13 +144,18 @@ pub struct NetworkFigures {
     pub duplicated_count: Option<u64>,
     /// Messages per second handed to the network, from the first to the last of them.
     pub offered_per_s: Option<f64>,
-    /// Messages per second received, over the same time.
+    /// Messages per second received, from the first reception to the last, on the receiver's clock;
+    /// `None` below two, and without the receiving gateway's records.
     pub arrived_per_s: Option<f64>,
-    /// Payload bytes per second received, without any header.
+    /// Payload bytes per second received over that time, without any header.
     pub arrived_bytes_per_s: Option<f64>,
     /// Handed to the kernel to received by the other gateway.
     pub delay: Figure<DelayFigures>,
-    /// Difference of the delays of successive messages; needs no alignment of clocks.
+    /// The same delays as a histogram; empty where none was measured.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub delay_bins: Vec<DurationBin>,
+    /// Difference of the delays of successive messages; needs no alignment of clocks, only a bound
+    /// of their rates.
     pub successive: Figure<SuccessiveVariation>,
     /// Losses of the network.
     pub loss: Figure<LossFigures>,
@@ -165,8 +175,13 @@ impl NetworkFigures {
         let arrived_count = count(Crossing::Arrived);
         let lost_count = count(Crossing::LostByNetwork);
         let offered_count = arrived_count.saturating_add(lost_count);
-        let span_s = span_s(passages);
-        let per_s = |count: u64| span_s.map(|span_s| count as f64 / span_s);
+        let on_network =
+            |one: &&Passage| matches!(one.crossing, Crossing::Arrived | Crossing::LostByNetwork);
+        let offered = passages.iter().filter(on_network);
+        let arrived = passages
+            .iter()
+            .filter(|one| one.crossing == Crossing::Arrived);
+        let arrived_per_s = rate(arrived.filter_map(|one| Some((one.received_ns?, one.count))));
         let mut random = RandomStream::new(context.seed, "measure.network.bootstrap");
         let mut round_trip = LatencyHistogram::default();
         for round_trip_ns in context.round_trips_ns {
@@ -179,15 +194,15 @@ impl NetworkFigures {
             host_lost_count: count(Crossing::LostByHost),
             unknown_count: count(Crossing::Unknown),
             duplicated_count: context.duplicated_count,
-            // The last of n messages ends n - 1 periods.
-            offered_per_s: per_s(offered_count.saturating_sub(1)),
-            arrived_per_s: per_s(arrived_count.saturating_sub(1)),
+            offered_per_s: rate(offered.filter_map(|one| Some((one.offered_ns?, one.count)))),
+            arrived_per_s,
             arrived_bytes_per_s: context
                 .payload_bytes
-                .zip(per_s(arrived_count.saturating_sub(1)))
+                .zip(arrived_per_s)
                 .map(|(bytes, per_s)| bytes as f64 * per_s),
-            delay: delay::delays(passages, &mut random),
-            successive: delay::successive(passages),
+            delay_bins: delay::delay_bins(passages),
+            delay: delay::delays(passages, context.path, &mut random),
+            successive: delay::successive(passages, context.path),
             loss: loss::losses(passages, context.run_ns),
             order: order::order(passages),
             round_trip: round_trip.distribution("no clock exchange took place"),
@@ -195,18 +210,20 @@ impl NetworkFigures {
     }
 }
 
-/// From the first to the last message that was handed to the network.
-fn span_s(passages: &[Passage]) -> Option<f64> {
-    let on_network =
-        |one: &&Passage| matches!(one.crossing, Crossing::Arrived | Crossing::LostByNetwork);
-    let times = || {
-        passages
-            .iter()
-            .filter(on_network)
-            .filter_map(|one| one.offered_ns)
-    };
-    let (first, last) = times().min().zip(times().max())?;
-    (last > first).then(|| last.saturating_sub(first) as f64 * 1e-9)
+/// Messages per second from the first to the last of them; each with how many it stands for. `None` below
+/// two instants.
+fn rate(messages: impl Iterator<Item = (i64, u64)>) -> Option<f64> {
+    let mut count = 0_u64;
+    let mut ends: Option<(i64, i64)> = None;
+    for (at_ns, of) in messages {
+        let (first, last) = ends.unwrap_or((at_ns, at_ns));
+        ends = Some((first.min(at_ns), last.max(at_ns)));
+        count = count.saturating_add(of);
+    }
+    let (first, last) = ends?;
+    let span_s = last.saturating_sub(first) as f64 * 1e-9;
+    // The last of n messages ends n - 1 periods.
+    (span_s > 0.0).then(|| count.saturating_sub(1) as f64 / span_s)
 }
 
 /// A moment of a channel, on the clock of one of its two hosts.

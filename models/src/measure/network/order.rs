@@ -16,10 +16,11 @@ pub struct OrderFigures {
     /// Their share (RFC 4737, section 4.1).
     pub ratio: f64,
     /// Median extent: how many messages that came before it should have come after (RFC 4737,
-    /// section 4.2), counted in places to the earliest of them; 0 without reordering.
-    pub extent_p50: u64,
-    /// Largest extent: the places a receiver's buffer needs to restore the order.
-    pub extent_max: u64,
+    /// section 4.2), counted in places to the earliest of them; `None` without reordering.
+    pub extent_p50: Option<u64>,
+    /// Largest extent: the places a receiver's buffer needs to restore the order; `None` without
+    /// reordering.
+    pub extent_max: Option<u64>,
 }
 
 pub(super) fn order(passages: &[Passage]) -> Figure<OrderFigures> {
@@ -38,18 +39,14 @@ pub(super) fn order(passages: &[Passage]) -> Figure<OrderFigures> {
         .map(|(_, extent)| i64::try_from(extent).unwrap_or(i64::MAX))
         .collect();
     extents.sort_unstable();
-    let largest = extents.last().copied().unwrap_or(0);
-    let median = if extents.is_empty() {
-        0
-    } else {
-        at_share(&extents, 0.5)
-    };
+    let largest = extents.last().copied();
+    let median = largest.map(|_| at_share(&extents, 0.5));
     Figure::Measured(OrderFigures {
         count: arrivals.len() as u64,
         reordered_count: extents.len() as u64,
         ratio: extents.len() as f64 / arrivals.len() as f64,
-        extent_p50: median.unsigned_abs(),
-        extent_max: largest.unsigned_abs(),
+        extent_p50: median.map(i64::unsigned_abs),
+        extent_max: largest.map(i64::unsigned_abs),
     })
 }
 

@@ -8,7 +8,7 @@ const PERIOD_NS: i64 = 10_000_000;
 const DELAY_NS: i64 = 2_000_000;
 
 /// Message `sequence` of a channel that sends every 10 ms.
-fn arrived(sequence: u64, delay_ns: i64) -> Passage {
+pub(super) fn arrived(sequence: u64, delay_ns: i64) -> Passage {
     let offered_ns = i64::try_from(sequence).unwrap() * PERIOD_NS;
     Passage {
         epoch_rank: 0,
@@ -31,7 +31,7 @@ fn lost(sequence: u64) -> Passage {
     }
 }
 
-fn passages(count: u64, is_lost: impl Fn(u64) -> bool) -> Vec<Passage> {
+pub(super) fn passages(count: u64, is_lost: impl Fn(u64) -> bool) -> Vec<Passage> {
     let one = |sequence| {
         if is_lost(sequence) {
             lost(sequence)
@@ -43,7 +43,12 @@ fn passages(count: u64, is_lost: impl Fn(u64) -> bool) -> Vec<Passage> {
 }
 
 fn figures(passages: &[Passage]) -> NetworkFigures {
+    figures_on(ChannelPath::SharedMemory, passages)
+}
+
+pub(super) fn figures_on(path: ChannelPath<'_>, passages: &[Passage]) -> NetworkFigures {
     let context = NetworkContext {
+        path,
         run_ns: Some((0, i64::try_from(passages.len()).unwrap() * PERIOD_NS)),
         payload_bytes: Some(64),
         duplicated_count: Some(0),
@@ -75,7 +80,28 @@ fn delays_and_their_variation_are_those_that_were_put_in() {
     assert_eq!((successive.count, successive.p50_ns), (9_000, 7_000));
     assert_eq!(successive.max_ns, 8_994_000);
     assert!((found.offered_per_s.unwrap() - 100.0).abs() < 1e-9);
-    assert!((found.arrived_bytes_per_s.unwrap() - 6_400.0).abs() < 1e-6);
+    // Whether messages arrive a little apart or close together is theirs to say.
+    let span_s = 90.0 + (delay(9_000) - delay(0)) as f64 * 1e-9;
+    assert!((found.arrived_per_s.unwrap() - 9_000.0 / span_s).abs() < 1e-9);
+    let bytes_per_s = found.arrived_bytes_per_s.unwrap();
+    assert!((bytes_per_s - 64.0 * 9_000.0 / span_s).abs() < 1e-6);
+}
+
+#[test]
+fn what_arrived_is_counted_over_the_time_in_which_it_arrived() {
+    // 100 per second for 10 s; only the first second gets through.
+    let found = figures(&passages(1_000, |one| one >= 101));
+    assert!((found.offered_per_s.unwrap() - 100.0).abs() < 1e-9);
+    assert!((found.arrived_per_s.unwrap() - 100.0).abs() < 1e-9);
+    let alone = figures(&passages(1_000, |one| one > 0));
+    assert_eq!(alone.arrived_per_s, None, "one arrival has no rate");
+    assert_eq!(alone.arrived_bytes_per_s, None);
+    let mut unseen = passages(100, |_| false);
+    for one in &mut unseen {
+        one.received_ns = None;
+    }
+    let unseen = figures(&unseen);
+    assert_eq!((unseen.arrived_count, unseen.arrived_per_s), (100, None));
 }
 
 #[test]
@@ -266,7 +292,7 @@ fn reordering_has_the_ratio_and_extent_of_rfc_4737() {
     let found = found.measured().unwrap();
     assert_eq!((found.count, found.reordered_count), (11, 3));
     // 4 came four places after 7, 5 five, 6 six.
-    assert_eq!((found.extent_p50, found.extent_max), (5, 6));
+    assert_eq!((found.extent_p50, found.extent_max), (Some(5), Some(6)));
     let event = network_events(&all)
         .into_iter()
         .find(|one| matches!(one.kind, NetworkEventKind::Reordering { .. }));
@@ -276,7 +302,8 @@ fn reordering_has_the_ratio_and_extent_of_rfc_4737() {
     };
     assert_eq!(event.unwrap().kind, expected);
     let straight = figures(&passages(50, |_| false)).order;
-    assert_eq!(straight.measured().unwrap().reordered_count, 0);
+    let straight = straight.measured().unwrap();
+    assert_eq!((straight.reordered_count, straight.extent_p50), (0, None));
 }
 
 #[test]
@@ -285,6 +312,7 @@ fn a_late_message_is_an_event_and_its_neighbours_belong_to_it() {
     for (sequence, delay_ms) in [(1_000_usize, 40), (1_004, 60), (2_000, 30)] {
         all[sequence] = arrived(sequence as u64, delay_ms * 1_000_000);
     }
+    all[7].delay_bound_ns = 15_000;
     let late: Vec<_> = network_events(&all)
         .into_iter()
         .filter_map(|one| match one.kind {
@@ -292,7 +320,8 @@ fn a_late_message_is_an_event_and_its_neighbours_belong_to_it() {
                 late_count,
                 delay_max_ns,
                 limit_ns,
-            } => Some((one.from.ns, late_count, delay_max_ns, limit_ns)),
+                bound_ns,
+            } => Some((one.from.ns, late_count, delay_max_ns, limit_ns, bound_ns)),
             _ => None,
         })
         .collect();
@@ -301,8 +330,8 @@ fn a_late_message_is_an_event_and_its_neighbours_belong_to_it() {
     assert_eq!(
         late,
         [
-            (1_000 * PERIOD_NS, 2, 60_000_000, limit_ns),
-            (2_000 * PERIOD_NS, 1, 30_000_000, limit_ns)
+            (1_000 * PERIOD_NS, 2, 60_000_000, limit_ns, 15_000),
+            (2_000 * PERIOD_NS, 1, 30_000_000, limit_ns, 15_000)
         ]
     );
 }
@@ -344,20 +373,18 @@ fn a_clock_that_was_set_is_an_event_and_one_that_is_slewed_is_not() {
     };
     assert_eq!(
         (steps[0].kind.clone(), steps[0].from.ns),
-        (expected, 119 * PERIOD_NS)
+        (expected, 119 * PERIOD_NS - CLOCK_READING_AGE_NS_MAX)
     );
 }
 
 #[test]
 fn bins_hold_what_happened_in_their_time() {
     // 10 s at 100 Hz, nothing from 3.00 s to 3.55 s.
-    let all = passages(1_000, |one| (300..355).contains(&one));
-    let span = SeriesSpan {
-        producer_start_ns: 0,
-        consumer_start_ns: 0,
-        duration_ns: 1_000 * PERIOD_NS,
-    };
-    let binned = NetworkBins::of(&all, span, bin_width_ns(span.duration_ns));
+    let mut all = passages(1_000, |one| (300..355).contains(&one));
+    all[105].delay_bound_ns = 25_000;
+    let duration_ns = 1_000 * PERIOD_NS;
+    let shape = (duration_ns, bin_width_ns(duration_ns));
+    let binned = NetworkBins::of(&all, shape, &|at: Moment| Some(at.ns));
     assert_eq!((binned.width_ns, binned.bins.len()), (100_000_000, 100));
     let lost: Vec<u64> = binned.bins[29..37]
         .iter()
@@ -370,6 +397,8 @@ fn bins_hold_what_happened_in_their_time() {
     );
     assert_eq!(binned.bins[10].delay_p50_ns, Some(DELAY_NS));
     assert_eq!(binned.bins[31].delay_max_ns, None);
+    let bounds = [9, 10, 31].map(|index| binned.bins[index].delay_bound_ns);
+    assert_eq!(bounds, [Some(0), Some(25_000), None]);
     // The last reception was at 2.992 s, the next one at 3.552 s.
     let silence: Vec<i64> = binned.bins[29..36]
         .iter()
@@ -379,12 +408,38 @@ fn bins_hold_what_happened_in_their_time() {
     let series = binned.to_series("shuttle/command", Vec::new());
     assert_eq!(series.name, "network-shuttle-command");
     let row = series.rows().nth(30).unwrap();
-    assert!((row[0] - 3.0).abs() < 1e-9 && (row[6] - 0.108).abs() < 1e-9);
+    assert!((row[0] - 3.0).abs() < 1e-9 && (row[7] - 0.108).abs() < 1e-9);
     assert_eq!(
         (row[1].to_bits(), row[2].to_bits()),
         (10.0_f64.to_bits(), 10.0_f64.to_bits())
     );
-    assert!(row[4].is_nan());
+    assert!(row[4].is_nan() && row[6].is_nan());
+    assert_eq!(series.columns[6].name, "delay_s_bound");
+    let row = series.rows().nth(10).unwrap();
+    assert!((row[6] - 25e-6).abs() < 1e-12);
+}
+
+#[test]
+fn bins_are_on_the_axis_that_moments_are_put_on() {
+    // 10 s at 100 Hz. The consumer's clock is two minutes ahead; nothing converts in the ninth second.
+    const AHEAD_NS: i64 = 120_000_000_000;
+    let mut all = passages(1_000, |one| (300..355).contains(&one));
+    for one in &mut all {
+        one.received_ns = one.received_ns.map(|ns| ns + AHEAD_NS);
+    }
+    let place = |at: Moment| match at.side {
+        Side::Producer => (at.ns < 900 * PERIOD_NS).then_some(at.ns),
+        Side::Consumer => Some(at.ns - AHEAD_NS),
+    };
+    let binned = NetworkBins::of(&all, (1_000 * PERIOD_NS, 100_000_000), &place);
+    assert_eq!(binned.unplaced_count, 100);
+    let sent_count: u64 = binned.bins.iter().map(|bin| bin.sent_count).sum();
+    assert_eq!(sent_count, 900);
+    let silences: Vec<i64> = binned.bins[29..36]
+        .iter()
+        .map(|bin| bin.silence_max_ns.unwrap() / 1_000_000)
+        .collect();
+    assert_eq!(silences, [10, 108, 208, 308, 408, 508, 560]);
 }
 
 #[test]

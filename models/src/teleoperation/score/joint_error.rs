@@ -31,12 +31,15 @@ pub(crate) struct JointError {
     desired_mean: Joints,
     desired_square: f64,
     has_one_clock: bool,
+    /// What there is to say of the clocks that commands and feedback were stamped by.
+    clock: String,
 }
 
 impl JointError {
     pub(crate) fn read(case: &Teleoperation, log: &RunLog, period_s: f64) -> Self {
         let mut error = Self {
             has_one_clock: log.has_one_clock(),
+            clock: log.clock_words(None),
             ..Self::default()
         };
         if !error.has_one_clock {
@@ -123,6 +126,9 @@ impl JointError {
             ),
         ];
         metrics.extend(self.split(self.unsplit.unwrap_or(missing)));
+        for metric in metrics.iter_mut().filter(|metric| metric.value.is_some()) {
+            metric.method.push_str(&self.clock);
+        }
         metrics
     }
 

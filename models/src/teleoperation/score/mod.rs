@@ -48,7 +48,7 @@ pub(crate) fn score(case: &Teleoperation, log: &RunLog) -> Score {
     let loops = run.counter.count(&run.sent.samples, &run.moved);
     let mut metrics = run.motion_loops(loops.as_ref());
     metrics.extend(JointError::read(case, log, run.period_s).metrics());
-    metrics.push(run.tracking_lag());
+    metrics.push(run.tracking_lag(log));
     metrics.push(run.tool_travel());
     let commanded = run.record.sent_y();
     metrics.extend(path::metrics(
@@ -261,7 +261,7 @@ impl Run {
         ]
     }
 
-    fn tracking_lag(&self) -> Metric {
+    fn tracking_lag(&self, log: &RunLog) -> Metric {
         let names = ("tracking_lag_ms", "tracking lag", "ms");
         if !self.has_one_clock {
             let missing = "commands and feedback were stamped by two clocks that are not aligned";
@@ -272,11 +272,14 @@ impl Run {
             value: lag.value * 1e3,
             interval: lag.interval.map(|(low, high)| (low * 1e3, high * 1e3)),
         };
+        let clock = log.clock_words(lag.map(|lag| lag.value));
         estimated(
             names,
             lag.map(in_ms),
-            "highest cross-correlation of the right tool's y, commanded and measured, on a 4 ms \
-             grid; interval from blocks of the run",
+            format!(
+                "highest cross-correlation of the right tool's y, commanded and measured, on a 4 ms \
+                 grid; interval from blocks of the run{clock}"
+            ),
             "commands and feedback overlap for less than two motion periods, or nothing moved",
         )
     }

@@ -169,14 +169,22 @@ fn paired(
         })
 }
 
-fn notes(rows: Thinned, shift: Option<i64>) -> Vec<String> {
+fn notes(log: &RunLog, rows: Thinned, shift: Option<i64>) -> Vec<String> {
+    let aligned = (log.clock_bound_ns() > 0).then(|| {
+        format!(
+            "commands and feedback were stamped by two clocks; the commands' stamps are on the \
+             robot's, by an alignment within {:.1} us",
+            log.clock_bound_ns() as f64 * 1e-3
+        )
+    });
     let shifted = shift.map(|shift_ns| {
         format!(
             "commands and feedback were stamped by two clocks; {shift_ns} ns were added to the \
              commands' stamps, as if the fastest had taken no time"
         )
     });
-    rows.note().into_iter().chain(shifted).collect()
+    let clocks = shifted.or(aligned);
+    rows.note().into_iter().chain(clocks).collect()
 }
 
 fn tool_y(
@@ -200,7 +208,7 @@ fn tool_y(
     (!values.is_empty()).then(|| PlotSeries {
         name: "fig7-9-tool-y".to_owned(),
         title: "Robot position: y of the right tool, measured and commanded".to_owned(),
-        notes: notes(rows, shift),
+        notes: notes(log, rows, shift),
         columns: vec![
             TIME,
             column("measured_tool_y_m", "measured, robot's body frame", "m"),
@@ -264,7 +272,7 @@ fn joints(
         title: "Desired and measured joint positions".to_owned(),
         notes: [JOINT_NOTE.to_owned()]
             .into_iter()
-            .chain(notes(rows, shift))
+            .chain(notes(log, rows, shift))
             .collect(),
         columns: columns.collect(),
         values,
@@ -287,7 +295,7 @@ fn joint_error(
         title: "Joint position error: desired minus measured".to_owned(),
         notes: [JOINT_NOTE.to_owned()]
             .into_iter()
-            .chain(notes(rows, shift))
+            .chain(notes(log, rows, shift))
             .collect(),
         columns: [TIME].into_iter().chain(ERROR).collect(),
         values,

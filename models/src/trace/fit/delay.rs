@@ -1,7 +1,13 @@
 //! Delay laws fitted to a trace. Each draws delays by itself, so none keeps their order.
 
+use core::time::Duration;
+
 use super::goodness::ks_distance;
 use super::{Fit, REFUSED_BELOW, Ranking, duration_text};
+use crate::case_study::ParameterError;
+use crate::link::delay::{
+    DELAY_MAX, DelayLaw, Exponential, Histogram, LogNormal, Normal, Pareto, Uniform,
+};
 use crate::measure::special::{ceil_count, incomplete_gamma};
 use crate::random::RandomStream;
 
@@ -69,47 +75,55 @@ pub(super) fn rank(delays_s: &[f64], tested: &[f64], seed: u64) -> Ranking {
     }
     let mut ascending = delays_s.to_vec();
     ascending.sort_by(f64::total_cmp);
-    let (min, max) = (ascending[0], ascending[ascending.len() - 1]);
-    let mut fits = Vec::new();
-    if max > min {
-        for (name, estimate, method, numbers) in LAWS {
-            let law = estimate(&ascending);
-            let mut fit = Fit::new(name, method, numbers, Some(law.log_likelihood(&ascending)));
-            fit.parameters = law.words();
-            fit.toml = law.toml();
-            // The test is of the law as fitted to the very delays it looks at.
-            let mut random = RandomStream::new(seed, &format!("trace.fit.{name}"));
-            let (distance, probability) = bootstrap(tested, estimate, &mut random);
-            fit.ks_distance = Some(distance);
-            fit.ks_probability = Some(probability);
-            fits.push(fit);
+    let is_equal = ascending[ascending.len() - 1] <= ascending[0];
+    let (mut fits, mut left_out) = (Vec::new(), Vec::new());
+    for (name, estimate, method, numbers) in LAWS.into_iter().filter(|_| !is_equal) {
+        let law = estimate(&ascending);
+        if let Err(why) = law.spec() {
+            left_out.push(format!("{name}, {why}"));
+            continue;
         }
-        Ranking::sort(&mut fits);
+        let mut fit = Fit::new(name, method, numbers, Some(law.log_likelihood(&ascending)));
+        fit.parameters = law.words();
+        fit.toml = law.toml();
+        // The test is of the law as fitted to the very delays it looks at.
+        let mut random = RandomStream::new(seed, &format!("trace.fit.{name}"));
+        let (distance, probability) = bootstrap(tested, estimate, &mut random);
+        fit.ks_distance = Some(distance);
+        fit.ks_probability = Some(probability);
+        fits.push(fit);
     }
+    Ranking::sort(&mut fits);
     let taken = fits.iter().position(Fit::is_accepted);
-    fits.push(fixed(&ascending));
-    if max <= min {
-        return Ranking {
-            best: Some(0),
-            fits,
-            why: "all delays are equal".to_owned(),
-        };
+    let others = [
+        ("fixed", Some(fixed(&ascending))),
+        ("histogram", (!is_equal).then(|| histogram(&ascending))),
+    ];
+    for (name, fit) in others {
+        match fit {
+            Some(Ok(fit)) => fits.push(fit),
+            Some(Err(why)) => left_out.push(format!("{name}, {why}")),
+            None => {}
+        }
     }
-    fits.push(histogram(&ascending));
-    let why = match taken {
-        Some(_) => format!(
+    let rest = if is_equal { "fixed" } else { "histogram" };
+    let best = taken.or_else(|| fits.iter().position(|fit| fit.law == rest));
+    let mut why = match (taken, best) {
+        (Some(_), _) => format!(
             "smallest AIC among those whose distance has a probability of {REFUSED_BELOW} or more"
         ),
-        None => format!(
+        (None, Some(_)) if is_equal => "all delays are equal".to_owned(),
+        (None, Some(_)) => format!(
             "every law with a formula is refused (probability below {REFUSED_BELOW}); the measured \
              distribution itself remains"
         ),
+        (None, None) => "no law of a link has such delays".to_owned(),
     };
-    Ranking {
-        best: Some(taken.unwrap_or(fits.len() - 1)),
-        fits,
-        why,
+    for reason in left_out {
+        why.push_str("; left out: ");
+        why.push_str(&reason);
     }
+    Ranking { fits, best, why }
 }
 
 /// The distance of `ascending` from the law fitted to it, and its probability when samples of that
@@ -153,7 +167,7 @@ fn normal(ascending: &[f64]) -> Law {
 
 fn log_normal(ascending: &[f64]) -> Law {
     let (smallest, largest) = ends(ascending);
-    let min = smallest - (largest - smallest) / ascending.len() as f64;
+    let min = (smallest - (largest - smallest) / ascending.len() as f64).max(0.0);
     let logarithms = ascending.iter().map(|value| (value - min).ln());
     let (mu, sigma) = mean_of(logarithms);
     Law::LogNormal { min, mu, sigma }
@@ -163,7 +177,7 @@ fn exponential(ascending: &[f64]) -> Law {
     let n = ascending.len() as f64;
     let (mean, _) = mean_of(ascending.iter().copied());
     let mean_excess = ((mean - ascending[0]) * n / (n - 1.0)).max(1e-9);
-    let min = ascending[0] - mean_excess / n;
+    let min = (ascending[0] - mean_excess / n).max(0.0);
     Law::Exponential { min, mean_excess }
 }
 
@@ -252,6 +266,45 @@ impl Law {
         }
     }
 
+    /// The law that a link is told, if there is such a one: what the topology's file would refuse
+    /// is no fit.
+    fn spec(&self) -> Result<DelayLaw, String> {
+        let time = |name: &str, seconds: f64| {
+            let rounded = Duration::try_from_secs_f64((seconds * 1e9).round() * 1e-9);
+            rounded.map_err(|_no_time| format!("whose {name} of {seconds} s is no time"))
+        };
+        let max = DELAY_MAX;
+        let law = match *self {
+            Self::Uniform { min, max } => DelayLaw::Uniform(Uniform {
+                min: time("min", min)?,
+                max: time("max", max)?,
+            }),
+            Self::Normal { mean, deviation } => DelayLaw::Normal(Normal {
+                mean: time("mean", mean)?,
+                deviation: time("deviation", deviation)?,
+                max,
+            }),
+            Self::LogNormal { min, mu, sigma } => DelayLaw::LogNormal(LogNormal {
+                min: time("min", min)?,
+                median: time("median", mu.exp())?,
+                sigma,
+                max,
+            }),
+            Self::Exponential { min, mean_excess } => DelayLaw::Exponential(Exponential {
+                min: time("min", min)?,
+                mean_excess: time("mean_excess", mean_excess)?,
+                max,
+            }),
+            Self::Pareto { min, scale, shape } => DelayLaw::Pareto(Pareto {
+                min: time("min", min)?,
+                scale: time("scale", scale)?,
+                shape,
+                max,
+            }),
+        };
+        checked(law)
+    }
+
     fn words(&self) -> String {
         let ms = |seconds: f64| format!("{:.4} ms", seconds * 1e3);
         match *self {
@@ -302,9 +355,17 @@ impl Law {
     }
 }
 
+/// `law`, when a link takes it.
+fn checked(law: DelayLaw) -> Result<DelayLaw, String> {
+    let refused = |why: ParameterError| format!("as a link refuses it: {why}");
+    law.check().map_err(refused)?;
+    Ok(law)
+}
+
 /// One delay for all, the middle one; how far the others are from it stands beside it.
-fn fixed(ascending: &[f64]) -> Fit {
+fn fixed(ascending: &[f64]) -> Result<Fit, String> {
     let median = ascending[ascending.len() / 2];
+    checked(DelayLaw::fixed(Duration::from_secs_f64(median)))?;
     let (smallest, largest) = (ascending[0], ascending[ascending.len() - 1]);
     let mut fit = Fit::new("fixed", "middle delay", 1, None);
     fit.parameters = format!(
@@ -317,11 +378,11 @@ fn fixed(ascending: &[f64]) -> Fit {
         "\n[links.LINK.delay]\nlaw = \"fixed\"\ndelay = {}\n",
         duration_text(median)
     );
-    fit
+    Ok(fit)
 }
 
 /// Bins of equal weight, as far as the delays differ.
-fn histogram(ascending: &[f64]) -> Fit {
+fn histogram(ascending: &[f64]) -> Result<Fit, String> {
     let n = ascending.len();
     let bins = BINS_MAX.min(n / 5).max(1);
     let nanoseconds = |seconds: f64| (seconds.max(0.0) * 1e9).round();
@@ -337,7 +398,7 @@ fn histogram(ascending: &[f64]) -> Fit {
         edges.push(edges[0] + 1.0);
     }
     let last = edges.len() - 2;
-    let weights = (0..=last).map(|bin| {
+    let counted = (0..=last).map(|bin| {
         let inside = ascending
             .iter()
             .map(|value| nanoseconds(*value))
@@ -349,9 +410,15 @@ fn histogram(ascending: &[f64]) -> Fit {
                 };
                 *ns > from && *ns <= edges[bin + 1]
             });
-        inside.count()
+        inside.count() as f64
     });
-    let weights: Vec<String> = weights.map(|count| format!("{count}.0")).collect();
+    let counted: Vec<f64> = counted.collect();
+    let spec = edges.iter().map(|ns| Duration::from_secs_f64(ns * 1e-9));
+    checked(DelayLaw::Histogram(Histogram {
+        edges: spec.collect(),
+        weights: counted.clone(),
+    }))?;
+    let weights: Vec<String> = counted.iter().map(|count| format!("{count:?}")).collect();
     let edges: Vec<String> = edges.iter().map(|ns| duration_text(ns * 1e-9)).collect();
     let mut fit = Fit::new("histogram", "shares of the delays, no formula", 0, None);
     fit.parameters = format!("{} bins of about equal weight", weights.len());
@@ -360,5 +427,5 @@ fn histogram(ascending: &[f64]) -> Fit {
         edges.join(", "),
         weights.join(", ")
     );
-    fit
+    Ok(fit)
 }

@@ -11,6 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use super::Trace;
 use super::figures::{TraceFigures, known_losses};
+use crate::measure::histogram::Distribution;
 
 pub use goodness::ChiSquare;
 
@@ -107,6 +108,9 @@ pub struct TraceFit {
     pub loss_message_count: usize,
     /// Delays that were used for the test of distribution.
     pub tested_delay_count: usize,
+    /// Largest error of any delay from the clocks, 0 on one clock, and so of the place of every law;
+    /// `None` without delays, and when that of one of them is not known.
+    pub delay_bound_ns: Option<u64>,
     /// Seed of the bootstrap.
     pub seed: u64,
 }
@@ -116,13 +120,19 @@ impl TraceFit {
     pub fn of(trace: &Trace, seed: u64) -> Self {
         let figures = TraceFigures::of(trace, seed);
         let losses = known_losses(trace);
-        let delays_s: Vec<f64> = trace
-            .delays_ns()
-            .iter()
-            .map(|ns| *ns as f64 * 1e-9)
-            .collect();
+        let measured = trace.delays_ns();
+        let delays_s = measured.iter().map(|ns| (*ns).max(0) as f64 * 1e-9);
+        let delays_s: Vec<f64> = delays_s.collect();
         let tested = delay::thinned(&delays_s);
         let mut remarks = Vec::new();
+        let negative_count = measured.iter().filter(|ns| **ns < 0).count();
+        if negative_count > 0 {
+            remarks.push(format!(
+                "{negative_count} of {} delays are below zero, as two clocks within their bound allow; \
+                 the delay laws take them as zero, and so does a replay.",
+                measured.len()
+            ));
+        }
         if let Some(memory) = &figures.delay_memory {
             let first = memory.coefficients.first().copied().unwrap_or(0.0);
             if first.abs() > memory.independent_within {
@@ -132,6 +142,15 @@ impl TraceFit {
                     memory.independent_within
                 ));
             }
+        }
+        remarks.extend(bound_remark(&figures));
+        if let Distribution::Measured(late) = &figures.late_delay {
+            remarks.push(format!(
+                "{} messages arrived and were not published, the slowest after {:.3} ms; the delay \
+                 laws leave them out.",
+                late.count,
+                late.max_ns as f64 * 1e-6
+            ));
         }
         if figures.counts.lost_before_link_count + figures.counts.lost_after_link_count > 0 {
             remarks.push(format!(
@@ -159,6 +178,7 @@ impl TraceFit {
             remarks,
             loss_message_count: losses.len(),
             tested_delay_count: tested.len(),
+            delay_bound_ns: figures.bound_max_ns,
             seed,
         }
     }
@@ -170,12 +190,46 @@ impl TraceFit {
             fit.map(|fit| fit.toml.replace("LINK", link))
                 .unwrap_or_default()
         };
+        let bound = match (self.tested_delay_count, self.delay_bound_ns) {
+            (0, _) | (_, Some(0)) => String::new(),
+            (_, Some(ns)) => format!(
+                "# delays are known to +-{:.3} us, the error of the clocks' alignment\n",
+                ns as f64 * 1e-3
+            ),
+            (_, None) => {
+                "# how far the clocks may have led the delays astray is unknown\n".to_owned()
+            }
+        };
         format!(
-            "[links.{link}]\nvia = \"emulated\"\n{}{}",
-            best(&self.delay),
-            best(&self.loss)
+            "{bound}[links.{link}]\nvia = \"emulated\"\n{}{}",
+            // A ratio of losses is a key of the link and no table: it goes before them.
+            best(&self.loss),
+            best(&self.delay)
         )
     }
+}
+
+/// How far the clocks may have led the delays astray, where that is more than nothing.
+fn bound_remark(figures: &TraceFigures) -> Option<String> {
+    let delay = figures.delay.measured()?;
+    let Some(bound_ns) = figures.bound_max_ns else {
+        return Some(
+            "how far the clocks may have led the delays astray is unknown, and so it is of the laws."
+                .to_owned(),
+        );
+    };
+    let wide = if i128::from(bound_ns) > i128::from(delay.p50_ns) {
+        ", wider than their median: the laws say little of the link"
+    } else {
+        ""
+    };
+    (bound_ns > 0).then(|| {
+        format!(
+            "each delay is known to +-{:.3} us by the clocks' alignment{wide}; the place of a law \
+             may be off by that much, and its width by twice that.",
+            bound_ns as f64 * 1e-3
+        )
+    })
 }
 
 /// A time as a topology writes it, to the nanosecond.

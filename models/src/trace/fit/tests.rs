@@ -245,3 +245,46 @@ fn a_trace_that_never_recovers_or_cannot_be_written_down_drops_the_law_and_says_
     assert!(loss.fits.iter().all(|fit| fit.law != "outages"));
     assert!(loss.why.contains("per_hour"), "{}", loss.why);
 }
+
+#[test]
+fn delays_below_zero_are_taken_as_zero_and_counted() {
+    let mut random = RandomStream::new(3, "negative");
+    let made = trace(&[false; 400], || 0.0002 * random.uniform() - 0.00002);
+    let negative_count = made.delays_ns().iter().filter(|ns| **ns < 0).count();
+    assert!(negative_count > 10);
+    let fit = TraceFit::of(&made, 1);
+    let said = format!("{negative_count} of 400 delays are below zero");
+    assert!(fit.remarks.iter().any(|one| one.contains(&said)), "{fit:?}");
+    let uniform = find(&fit.delay, "uniform");
+    assert!(
+        uniform.parameters.starts_with("0.0000 ms to"),
+        "{uniform:?}"
+    );
+}
+
+#[test]
+fn what_no_link_takes_is_no_fit_and_the_reason_is_said() {
+    let mut random = RandomStream::new(3, "long");
+    let long = trace(&[false; 400], || 9.0 + 4.0 * random.uniform());
+    let ranking = TraceFit::of(&long, 1).delay;
+    let laws: Vec<_> = ranking.fits.iter().map(|fit| fit.law.as_str()).collect();
+    assert!(
+        !laws.contains(&"uniform") && !laws.contains(&"histogram"),
+        "{laws:?}"
+    );
+    assert!(
+        ranking
+            .why
+            .contains("left out: uniform, as a link refuses it: max")
+            && ranking
+                .why
+                .contains("left out: histogram, as a link refuses it: edges"),
+        "{}",
+        ranking.why
+    );
+    // A tail that has no mean beside a sharp edge: the deviation of its logarithm is no link's.
+    let wild = trace(&[false; 400], || 1e-9 * (20.0 * random.uniform()).exp());
+    for fit in &TraceFit::of(&wild, 1).delay.fits {
+        assert!(!fit.toml.is_empty(), "{fit:?}");
+    }
+}

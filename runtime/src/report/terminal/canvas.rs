@@ -16,7 +16,7 @@ pub enum Style {
 
 /// What a piece of text means; the style decides how that looks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Tone {
+pub(crate) enum Tone {
     Plain,
     Strong,
     Good,
@@ -24,6 +24,18 @@ pub(super) enum Tone {
     Bad,
     Faint,
     Bar,
+}
+
+impl Tone {
+    /// Its name where tones are few.
+    pub(crate) const fn word(self) -> &'static str {
+        match self {
+            Self::Good => "good",
+            Self::Caution => "caution",
+            Self::Bad => "bad",
+            Self::Plain | Self::Strong | Self::Faint | Self::Bar => "plain",
+        }
+    }
 }
 
 /// Narrowest and widest page.

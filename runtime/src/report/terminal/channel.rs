@@ -48,6 +48,9 @@ pub(super) fn channel(canvas: &mut Canvas, channel: &ChannelSummary) {
     if let Some(figures) = &channel.emulation {
         super::emulation::emulation(canvas, figures);
     }
+    if let Some(counts) = &channel.trace_replay {
+        super::emulation::replay(canvas, counts);
+    }
     if let Some(figures) = &channel.outages {
         super::outages::outages(canvas, figures);
     }
@@ -288,6 +291,16 @@ fn closing(canvas: &mut Canvas, closing: &Closing) {
                 &format!("closing unavailable: {reason}"),
             );
         }
+    }
+}
+
+/// Whether the account closes, in words; nothing when no message was checked.
+pub(crate) fn closing_text(closing: &Closing) -> Option<String> {
+    match closing {
+        Closing::Checked(figures) => {
+            closing_words(figures).map(|(_, text)| format!("account {text}"))
+        }
+        Closing::Unavailable { reason } => Some(format!("closing unavailable: {reason}")),
     }
 }
 

@@ -7,7 +7,7 @@ use hil_models::measure::histogram::Distribution;
 
 use super::canvas::{Canvas, INDENT, Tone};
 use super::units::{duration, duration_s, grouped};
-use crate::report::clock_summary::{ClockRung, ClockSection, HostPairClock};
+use crate::report::clock_summary::{ClockPathSummary, ClockRung, ClockSection, HostPairClock};
 
 /// Column of the labels.
 const LABEL_WIDTH: usize = 22;
@@ -49,7 +49,7 @@ fn pair_lines(canvas: &mut Canvas, pair: &HostPairClock) {
     let mut line = |label: &str, tone: Tone, text: &str| {
         canvas.field_of(LABEL_WIDTH, label, tone, text);
     };
-    let rung = format!("{}: {}", pair.rung.label(), pair.basis);
+    let rung = format!("{}: {}", pair.rung_words(), pair.basis);
     line("aligned by", tone, &rung);
     if let Some(why) = &pair.contradiction {
         line("invalid", Tone::Bad, why);
@@ -62,16 +62,61 @@ fn pair_lines(canvas: &mut Canvas, pair: &HostPairClock) {
         );
         line("system clocks", Tone::Plain, &text);
     }
+    if let Some(path) = &pair.clock_path {
+        for (label, tone, text) in path_words(path) {
+            line(label, tone, &text);
+        }
+    }
     if let Some(figures) = &pair.exchanges {
-        for (label, text) in exchange_words(figures) {
+        for (label, text) in exchange_words(figures, pair.clock_path.as_ref()) {
             line(label, Tone::Plain, &text);
         }
     }
 }
 
-fn exchange_words(figures: &ClockFigures) -> Vec<(&'static str, String)> {
+/// The clock path, and what each of the two paths bounds by itself.
+fn path_words(path: &ClockPathSummary) -> Vec<(&'static str, Tone, String)> {
+    let alone = |figures: &Option<ClockFigures>| {
+        let bound = figures.as_ref().and_then(|figures| figures.bound);
+        bound.map_or_else(|| "no bound".to_owned(), bound_words)
+    };
+    let tone = if path.has_exchanges() {
+        Tone::Plain
+    } else {
+        Tone::Caution
+    };
+    let mut text = format!("{}; {}", path.describe(), path.state);
+    if let Some(gap_ns) = path.longest_gap_ns {
+        let gap = duration(signed(gap_ns));
+        text.push_str(&["; longest time of the run without an exchange ", &gap].concat());
+    }
+    let bounds = format!(
+        "clock path {}; data path {}",
+        alone(&path.exchanges),
+        alone(&path.data_path)
+    );
+    vec![
+        ("path", tone, text),
+        ("bound by each alone", Tone::Plain, bounds),
+    ]
+}
+
+fn exchange_words(
+    figures: &ClockFigures,
+    path: Option<&ClockPathSummary>,
+) -> Vec<(&'static str, String)> {
     let mut lines = Vec::new();
-    let mut text = format!("{} over the data path", grouped(figures.exchange_count));
+    let of = |figures: &Option<ClockFigures>| {
+        let count = figures.as_ref().map_or(0, |figures| figures.exchange_count);
+        grouped(count)
+    };
+    let mut text = path.map_or_else(
+        || format!("{} over the data path", grouped(figures.exchange_count)),
+        |path| {
+            let (clock, data) = (of(&path.exchanges), of(&path.data_path));
+            format!("{clock} over the clock path, {data} over the data path")
+        },
+    );
     if figures.unused_count > 0 {
         text.push_str(&[", ", &grouped(figures.unused_count), " not used"].concat());
     }
@@ -184,6 +229,7 @@ fn signed(ns: u64) -> i64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::report::clock_summary::ClockPathEnd;
     use crate::report::terminal::Style;
     use hil_models::clock::{ClockMap, ClockSettings, Exchange, Requester};
     use hil_models::measure::record::RoundTripRecord;
@@ -221,6 +267,20 @@ mod tests {
                 exchanges: Some(figures()),
                 disciplined: None,
                 contradiction: Some("the rungs disagree".to_owned()),
+                clock_path: Some(ClockPathSummary {
+                    name: "clock/control-pc-robot-pc".to_owned(),
+                    ends: [("control-pc", "10.78.0.1"), ("robot-pc", "10.78.0.2")].map(
+                        |(host, address)| ClockPathEnd {
+                            host: host.to_owned(),
+                            address: address.to_owned(),
+                            interface: Some("eth1".to_owned()),
+                        },
+                    ),
+                    state: "established".to_owned(),
+                    exchanges: Some(figures()),
+                    data_path: None,
+                    longest_gap_ns: Some(31_000_000),
+                }),
             }],
         };
         let mut canvas = Canvas::new(120, Style::Plain);
@@ -228,12 +288,15 @@ mod tests {
         let text = canvas.finish();
         for words in [
             "control-pc → robot-pc",
-            "exchanges beside the data",
             "+4.000000000 s",
             "guaranteed",
             "400 kernel",
             "skew",
             "the rungs disagree",
+            "exchanges over the clock path, and beside the data:",
+            "clock path 10.78.0.1 (eth1) <-> 10.78.0.2 (eth1); established; longest time of the",
+            "100 over the clock path, 0 over the data path",
+            "data path no bound",
         ] {
             assert!(text.contains(words), "{words:?} is missing:\n{text}");
         }

@@ -1,11 +1,13 @@
 //! How an emulated link was kept, as lines of a report. What follows from it is decided in
 //! `assessment`.
 
+use hil_models::link::trace::ReplayCounts;
 use hil_models::measure::histogram::LatencySummary;
 
 use super::canvas::{Canvas, Tone};
 use super::units::{duration, grouped};
 use crate::report::emulation::EmulationFigures;
+use crate::report::replay::replay_words;
 
 /// Columns of a label.
 const LABEL_WIDTH: usize = 18;
@@ -52,6 +54,12 @@ pub(super) fn emulation(canvas: &mut Canvas, figures: &EmulationFigures) {
         duration(figures.error_max_ns)
     );
     canvas.field_of(LABEL_WIDTH, "scheduling error", tone, &text);
+}
+
+/// What a channel met of the trace that its link replays.
+pub(super) fn replay(canvas: &mut Canvas, counts: &ReplayCounts) {
+    let text = replay_words(counts);
+    canvas.field_of(LABEL_WIDTH, "trace replay", Tone::Plain, &text);
 }
 
 #[cfg(test)]

@@ -16,13 +16,14 @@ mod trace;
 mod units;
 
 pub use canvas::Style;
-pub(crate) use canvas::{shortened, wrapped};
+pub(crate) use canvas::{Tone, shortened, wrapped};
+pub(crate) use channel::closing_text;
 pub(crate) use trace::{render_fit, render_trace, render_trace_plots};
-pub(crate) use units::{JOINT, duration, duration_s, grouped, percent, seconds};
+pub(crate) use units::{JOINT, duration, duration_s, figure, grouped, percent, seconds};
 
 use hil_models::measure::account::OutageFigures;
 
-use canvas::{Canvas, INDENT, Tone};
+use canvas::{Canvas, INDENT};
 
 use super::assessment::{Assessment, NetworkVerdict, SKIPPED_TICK_RATIO_MAX};
 use super::network::NetworkReport;
@@ -131,12 +132,7 @@ fn title(canvas: &mut Canvas, summary: &RunSummary) {
 }
 
 fn verdict(canvas: &mut Canvas, summary: &RunSummary, assessment: &Assessment) {
-    let (tone, word) = match summary.run.outcome {
-        Outcome::Completed => (Tone::Good, "completed"),
-        Outcome::CriterionFailed => (Tone::Bad, "criterion failed"),
-        Outcome::Stopped => (Tone::Caution, "stopped early"),
-        Outcome::Failed => (Tone::Bad, "failed"),
-    };
+    let (tone, word) = outcome_words(summary.run.outcome);
     canvas.field(
         "Outcome",
         tone,
@@ -150,7 +146,18 @@ fn verdict(canvas: &mut Canvas, summary: &RunSummary, assessment: &Assessment) {
     }
 }
 
-fn network_words(verdict: &NetworkVerdict) -> (Tone, String) {
+/// How a run ended, in a word.
+pub(crate) const fn outcome_words(outcome: Outcome) -> (Tone, &'static str) {
+    match outcome {
+        Outcome::Completed => (Tone::Good, "completed"),
+        Outcome::CriterionFailed => (Tone::Bad, "criterion failed"),
+        Outcome::Stopped => (Tone::Caution, "stopped early"),
+        Outcome::Failed => (Tone::Bad, "failed"),
+    }
+}
+
+/// What a run says about a network, in words.
+pub(crate) fn network_words(verdict: &NetworkVerdict) -> (Tone, String) {
     let limit = percent(SKIPPED_TICK_RATIO_MAX);
     match verdict {
         NetworkVerdict::RunFailed => {

@@ -5,7 +5,8 @@ use core::cmp::Ordering;
 use core::fmt::Write;
 
 use hil_models::measure::network::{
-    DelayFigures, DelayQuantile, Figure, LossFigures, NetworkFigures, SuccessiveVariation,
+    DelayFigures, DelayQuantile, Figure, InterarrivalJitter, LossFigures, NetworkFigures,
+    SuccessiveVariation,
 };
 
 use super::canvas::{Canvas, INDENT, Tone, left, right};
@@ -16,8 +17,14 @@ use crate::report::network::{
 use crate::report::score_event::ScoreEvents;
 
 /// Columns of the table behind the channel's name.
-const HEADS: [&str; 7] = ["p50", "p99", "p99.9", "max", "loss", "longest", "reord."];
+const HEADS: [&str; 8] = [
+    "p50", "p99", "p99.9", "max", "bound", "loss", "longest", "reord.",
+];
 const COLUMN_WIDTH: usize = 9;
+/// The column a narrow page does without; it is in the channel's own lines.
+const SPARE: usize = 2;
+/// From here on a page has room for all of them.
+const WIDE: usize = 100;
 
 /// Margin and label of a channel's lines.
 const LINE_MARGIN: usize = INDENT + 2;
@@ -33,16 +40,20 @@ pub(super) fn network(canvas: &mut Canvas, report: &NetworkReport) {
         "Network",
         "from the hand-over to the kernel to the receiving gateway",
     );
-    let name_width = canvas.width() - INDENT - HEADS.len() * COLUMN_WIDTH;
-    let head: String = HEADS.iter().map(|head| right(head, COLUMN_WIDTH)).collect();
+    let is_wide = canvas.width() >= WIDE;
+    let columns = HEADS.len() - usize::from(!is_wide);
+    let name_width = canvas.width() - INDENT - columns * COLUMN_WIDTH;
+    let cells = |all: &[String; 8]| -> String {
+        let shown = all.iter().enumerate();
+        let shown = shown.filter(|(index, _)| is_wide || *index != SPARE);
+        shown.map(|(_, cell)| right(cell, COLUMN_WIDTH)).collect()
+    };
+    let head = cells(&HEADS.map(str::to_owned));
     let line = format!("{:INDENT$}{}{head}", "", left("", name_width));
     let line = canvas.paint(Tone::Faint, &line);
     canvas.line(&line);
     for one in &report.channels {
-        let cells: String = row(&one.figures)
-            .iter()
-            .map(|cell| right(cell, COLUMN_WIDTH))
-            .collect();
+        let cells = cells(&row(&one.figures));
         let name = left(&one.channel, name_width);
         canvas.line(&format!("{:INDENT$}{name}{cells}", ""));
     }
@@ -51,7 +62,7 @@ pub(super) fn network(canvas: &mut Canvas, report: &NetworkReport) {
     }
 }
 
-fn row(figures: &NetworkFigures) -> [String; 7] {
+fn row(figures: &NetworkFigures) -> [String; 8] {
     const NONE: &str = "–";
     let delay = figures.delay.measured();
     let of_delay = |ns: fn(&DelayFigures) -> i64| {
@@ -65,6 +76,10 @@ fn row(figures: &NetworkFigures) -> [String; 7] {
         of_delay(|delay| delay.p99.value_ns),
         of_delay(|delay| delay.p999.value_ns),
         of_delay(|delay| delay.max_ns),
+        delay.map_or_else(
+            || NONE.to_owned(),
+            |delay| format!("±{}", unsigned(delay.alignment_bound_ns)),
+        ),
         loss.map_or_else(|| NONE.to_owned(), |loss| percent(loss.ratio)),
         longest.map_or_else(|| NONE.to_owned(), duration),
         order.map_or_else(|| NONE.to_owned(), |order| grouped(order.reordered_count)),
@@ -145,7 +160,7 @@ fn delay_words(delay: &DelayFigures) -> String {
 }
 
 fn bound_words(delay: &DelayFigures, figures: &NetworkFigures) -> String {
-    let bound = i64::try_from(delay.alignment_bound_ns).unwrap_or(i64::MAX);
+    let bound = delay.alignment_bound_ns;
     match (bound, delay.is_bound_wider) {
         (0, _) => format!(
             "{} messages; one clock, no error of alignment",
@@ -154,11 +169,11 @@ fn bound_words(delay: &DelayFigures, figures: &NetworkFigures) -> String {
         (_, false) => format!(
             "{} messages, each within ±{} by the clocks' alignment",
             grouped(delay.count),
-            duration(bound)
+            unsigned(bound)
         ),
         (_, true) => format!(
             "the clocks' alignment allows ±{}, wider than the median: these figures say little; {}",
-            duration(bound),
+            unsigned(bound),
             round_trip_words(figures)
         ),
     }
@@ -189,20 +204,52 @@ fn variation_words(delay: &DelayFigures) -> String {
         variation.max_ns,
     ]
     .map(duration);
+    let bound = error_words(variation.bound_ns, variation.is_bound_wider);
     format!(
-        "above the smallest delay: p50 {p50} · p95 {p95} · p99 {p99} · p99.9 {p999} · max {max}"
+        "above the smallest delay: p50 {p50} · p95 {p95} · p99 {p99} · p99.9 {p999} · max {max}{bound}"
     )
+}
+
+/// How far the clocks may lead a figure astray; nothing on one clock.
+fn error_words(bound_ns: u64, is_wider: bool) -> String {
+    let wide = if is_wider {
+        ", wider than the median"
+    } else {
+        ""
+    };
+    match bound_ns {
+        0 => String::new(),
+        _ => format!("; each within ±{} by the clocks{wide}", unsigned(bound_ns)),
+    }
+}
+
+fn unsigned(ns: u64) -> String {
+    duration(i64::try_from(ns).unwrap_or(i64::MAX))
 }
 
 fn successive_words(successive: &SuccessiveVariation) -> String {
     format!(
-        "messages differ by p50 {} · p99 {} · max {}; jitter mean {}, max {}",
+        "messages differ by p50 {} · p99 {} · max {}{}; jitter mean {}, max {}{}",
         duration(successive.p50_ns),
         duration(successive.p99_ns),
         duration(successive.max_ns),
+        error_words(successive.bound_ns, successive.is_bound_wider),
         duration_s(successive.jitter.mean_ns * 1e-9),
         duration_s(successive.jitter.max_ns * 1e-9),
+        jitter_bound_words(successive.jitter),
     )
+}
+
+fn jitter_bound_words(jitter: InterarrivalJitter) -> String {
+    if jitter.bound_ns <= 0.0 {
+        return String::new();
+    }
+    let wide = if jitter.bound_ns > jitter.mean_ns {
+        ", wider than the mean"
+    } else {
+        ""
+    };
+    format!(" ±{}{wide}", duration_s(jitter.bound_ns * 1e-9))
 }
 
 fn loss_words(loss: &LossFigures) -> String {
@@ -269,32 +316,37 @@ fn order_words(figures: &NetworkFigures) -> String {
     );
     match &figures.order {
         Figure::Unavailable { reason } => format!("unavailable: {reason}; {copies}"),
-        Figure::Measured(order) if order.reordered_count == 0 => {
-            format!("none of {} reordered; {copies}", grouped(order.count))
+        Figure::Measured(order) => {
+            let Some((p50, max)) = order.extent_p50.zip(order.extent_max) else {
+                return format!("none of {} reordered; {copies}", grouped(order.count));
+            };
+            format!(
+                "{} of {} reordered ({}), by {} places at the median, by up to {}; {copies}",
+                grouped(order.reordered_count),
+                grouped(order.count),
+                percent(order.ratio),
+                grouped(p50),
+                grouped(max),
+            )
         }
-        Figure::Measured(order) => format!(
-            "{} of {} reordered ({}), by {} places at the median, by up to {}; {copies}",
-            grouped(order.reordered_count),
-            grouped(order.count),
-            percent(order.ratio),
-            grouped(order.extent_p50),
-            grouped(order.extent_max),
-        ),
     }
 }
 
 fn rate_words(figures: &NetworkFigures) -> String {
-    let (Some(offered), Some(arrived)) = (figures.offered_per_s, figures.arrived_per_s) else {
-        return "unavailable: fewer than two messages".to_owned();
+    let rate = |per_s: Option<f64>, unit: &str, what: &str| {
+        per_s.map_or_else(
+            || format!("{what} unavailable: fewer than two messages"),
+            |per_s| format!("{}{unit} {what}", figure(per_s)),
+        )
     };
     let bytes = figures.arrived_bytes_per_s.map_or_else(
         || "payload unavailable".to_owned(),
         |bytes| format!("{} B/s of payload", figure(bytes)),
     );
     format!(
-        "{} messages/s handed over, {} received, {bytes}",
-        figure(offered),
-        figure(arrived)
+        "{}, {}, {bytes}",
+        rate(figures.offered_per_s, " messages/s", "handed over"),
+        rate(figures.arrived_per_s, "", "received")
     )
 }
 
@@ -322,7 +374,11 @@ pub(super) fn what_preceded_what(
 }
 
 fn foregoing_words(report: &NetworkReport, events: &ScoreEvents) -> String {
-    let window = duration_s(report.foregoing_s);
+    let bound_s = report.clock_bound_s.filter(|bound_s| *bound_s > 0.0);
+    let slack = bound_s.map_or_else(String::new, |bound_s| {
+        format!(" (±{} by the clocks)", duration_s(bound_s))
+    });
+    let window = duration_s(report.foregoing_s) + &slack;
     let chance = percent(report.foregoing_chance_ratio);
     let noted = report.events.len() as u64 + report.events_dropped_count;
     let known: Vec<_> = events

@@ -104,7 +104,6 @@ mod tests {
     use super::*;
     use crate::report::terminal::Style;
     use hil_models::measure::account::{Outage, OutageFigures};
-    use hil_models::time::Instant;
 
     const MS: i64 = 1_000_000;
 
@@ -123,7 +122,7 @@ mod tests {
                 interruption_index: None,
             })
             .collect();
-        let figures = OutageFigures::of(&found, Some(Instant::ZERO), None);
+        let figures = OutageFigures::of(&found, None);
         let mut canvas = Canvas::new(100, Style::Plain);
         outages(&mut canvas, &figures);
         let page = canvas.finish();
@@ -138,7 +137,7 @@ mod tests {
 ";
         assert_eq!(page, expected, "{page}");
         let mut canvas = Canvas::new(100, Style::Plain);
-        outages(&mut canvas, &OutageFigures::of(&[], None, None));
+        outages(&mut canvas, &OutageFigures::of(&[], None));
         assert_eq!(canvas.finish(), "");
     }
 }

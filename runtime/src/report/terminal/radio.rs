@@ -38,28 +38,7 @@ fn stamp_words(figures: &TransmitStampFigures) -> Option<String> {
 }
 
 fn acknowledgements(canvas: &mut Canvas, figures: &RadioFigures) {
-    let n = |count: u64| grouped(count);
-    let text = if figures.is_arrival_unknown {
-        format!(
-            "{} acknowledged, {} not, {} without a report; what arrived is not known: no records \
-             of the receiving gateway",
-            n(figures.acknowledged_unknown_count),
-            n(figures.unacknowledged_unknown_count),
-            n(figures.unreported_unknown_count)
-        )
-    } else {
-        format!(
-            "{} acknowledged and arrived, {} acknowledged and lost above the radio, {} not \
-             acknowledged and arrived (acknowledgement lost), {} not acknowledged and lost, {} \
-             without a report ({} of them lost)",
-            n(figures.acknowledged_arrived_count),
-            n(figures.acknowledged_lost_count),
-            n(figures.unacknowledged_arrived_count),
-            n(figures.unacknowledged_lost_count),
-            n(figures.unreported_arrived_count + figures.unreported_lost_count),
-            n(figures.unreported_lost_count)
-        )
-    };
+    let text = acknowledgement_words(figures);
     canvas.field("radio", Tone::Plain, &text);
     let mut words = Vec::new();
     if let Some(share) = &figures.unacknowledged_ratio {
@@ -74,6 +53,52 @@ fn acknowledgements(canvas: &mut Canvas, figures: &RadioFigures) {
     if !words.is_empty() {
         canvas.field("", Tone::Faint, &words.join("; "));
     }
+}
+
+/// What the radio said, and what became of the messages of which it said so.
+fn acknowledgement_words(figures: &RadioFigures) -> String {
+    let n = grouped;
+    let rows = [
+        figures.acknowledged,
+        figures.unacknowledged,
+        figures.unreported,
+    ];
+    let [Some(heard), Some(unheard), Some(silent)] = rows.map(|row| row.fates) else {
+        return format!(
+            "{} acknowledged, {} not, {} without a report; what arrived is unavailable: no records \
+             of the receiving gateway",
+            n(figures.acknowledged.count),
+            n(figures.unacknowledged.count),
+            n(figures.unreported.count)
+        );
+    };
+    let text = format!(
+        "{} acknowledged and arrived, {} acknowledged and lost above the radio, {} not acknowledged \
+         and arrived (acknowledgement lost), {} not acknowledged and lost, {} without a report ({} \
+         of them lost)",
+        n(heard.arrived_count),
+        n(heard.lost_count),
+        n(unheard.arrived_count),
+        n(unheard.lost_count),
+        n(figures.unreported.count),
+        n(silent.lost_count)
+    );
+    let all = [heard, unheard, silent];
+    let aside = [
+        (
+            all.iter().map(|one| one.interrupted_count).sum::<u64>(),
+            "lost while a process was down",
+        ),
+        (
+            all.iter().map(|one| one.in_flight_count).sum::<u64>(),
+            "under way at the end",
+        ),
+    ];
+    let aside = aside.into_iter().filter(|(count, _)| *count > 0);
+    let aside: Vec<String> = aside
+        .map(|(count, what)| format!("; {} {what}", n(count)))
+        .collect();
+    text + &aside.concat()
 }
 
 fn share_words(share: &Share) -> String {
@@ -153,6 +178,7 @@ fn station_words(station: &StationSummary) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use hil_models::measure::radio::{RadioFates, RadioRow};
 
     #[test]
     fn a_wired_channel_stamped_at_departure_needs_no_line() {
@@ -171,5 +197,44 @@ mod tests {
         let words = stamp_words(&fallback).unwrap();
         assert!(words.contains("before the queue for 8 of 9"), "{words}");
         assert!(words.contains("none for 1 of 9"), "{words}");
+    }
+
+    #[test]
+    fn messages_that_no_radio_lost_are_told_apart_and_unknown_ones_are_not_zero() {
+        let row = |count, interrupted_count, in_flight_count| RadioRow {
+            count,
+            fates: Some(RadioFates {
+                arrived_count: count - interrupted_count - in_flight_count,
+                lost_count: 0,
+                interrupted_count,
+                in_flight_count,
+            }),
+        };
+        let mut figures = RadioFigures {
+            handed_count: 17,
+            acknowledged: row(10, 0, 0),
+            unacknowledged: row(7, 4, 2),
+            unreported: row(0, 0, 0),
+            unacknowledged_ratio: None,
+            known_loss_ratio: None,
+            lost_ratio: None,
+        };
+        let words = acknowledgement_words(&figures);
+        assert!(words.contains("0 not acknowledged and lost"), "{words}");
+        let aside = "; 4 lost while a process was down; 2 under way at the end";
+        assert!(words.ends_with(aside), "{words}");
+        for row in [
+            &mut figures.acknowledged,
+            &mut figures.unacknowledged,
+            &mut figures.unreported,
+        ] {
+            row.fates = None;
+        }
+        let words = acknowledgement_words(&figures);
+        assert!(
+            words.starts_with("10 acknowledged, 7 not, 0 without"),
+            "{words}"
+        );
+        assert!(words.contains("unavailable"), "{words}");
     }
 }

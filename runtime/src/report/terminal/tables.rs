@@ -127,7 +127,10 @@ pub(super) fn events(canvas: &mut Canvas, events: &[RunEvent]) {
         } else {
             format!("{} ({})", event.what, event.cause)
         };
-        canvas.field(&seconds(event.at_s), Tone::Plain, &text);
+        let at = event
+            .at_s
+            .map_or_else(|| "time unknown".to_owned(), seconds);
+        canvas.field(&at, Tone::Plain, &text);
     }
 }
 

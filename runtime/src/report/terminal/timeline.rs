@@ -7,7 +7,7 @@ use crate::report::network::{Timeline, TimelineRow};
 
 /// Columns of the row's name, of what it shows, and of its scale behind it.
 const WHAT_WIDTH: usize = 9;
-const SCALE_WIDTH: usize = 12;
+const SCALE_WIDTH: usize = 18;
 
 /// Eighths of a block, lowest first.
 const LEVELS: [char; 8] = ['▁', '▂', '▃', '▄', '▅', '▆', '▇', '█'];
@@ -96,6 +96,12 @@ fn level(share: f64) -> usize {
     ((share * 8.0).ceil() - 1.0).clamp(0.0, 7.0) as usize
 }
 
+/// How far any value may be off by the alignment of two clocks; nothing on one.
+fn bound_words(bound_s: Option<f64>) -> String {
+    let bound_s = bound_s.filter(|bound_s| *bound_s > 0.0);
+    bound_s.map_or_else(String::new, |bound_s| format!(" ±{}", duration_s(bound_s)))
+}
+
 /// The largest value of the row.
 fn scale(row: &TimelineRow) -> String {
     let Some(largest) = row.values.iter().flatten().copied().reduce(f64::max) else {
@@ -103,7 +109,7 @@ fn scale(row: &TimelineRow) -> String {
     };
     match row.unit.as_str() {
         _ if largest <= 0.0 => "none".to_owned(),
-        "s" => duration_s(largest),
+        "s" => duration_s(largest) + &bound_words(row.bound),
         "1" if row.of != "robot" => percent(largest),
         "1" => figure(largest),
         unit => format!("{} {unit}", figure(largest)),
@@ -133,6 +139,7 @@ mod tests {
             values: (0..120)
                 .map(|step| Some(if step == at { value } else { 0.0 }))
                 .collect(),
+            bound: (what == "silence").then_some(15e-6),
         };
         let all = Timeline {
             step_s: 0.1,
@@ -158,7 +165,7 @@ mod tests {
             );
             assert!(rows[4].contains("error of the cart's speed"), "{page}");
             assert!(
-                rows[3].ends_with("812 ms") && rows[5].contains("6.000 s"),
+                rows[3].ends_with("812 ms ±15.0 µs") && rows[5].contains("6.000 s"),
                 "{page}"
             );
         }

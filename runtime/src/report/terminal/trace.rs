@@ -60,6 +60,9 @@ pub(crate) fn render_trace(
         let name = format!("  p{}", quantile.quantile * 100.0);
         field(&name, &format!("{}{interval}", duration(quantile.value_ns)));
     }
+    if figures.late_delay.measured().is_some() {
+        field("came too late", &late_words(figures));
+    }
     field(
         "memory of delay",
         &memory_words(figures.delay_memory.as_ref()),
@@ -204,6 +207,21 @@ fn delay_words(figures: &TraceFigures) -> String {
     }
 }
 
+/// Of messages that arrived and were not published.
+fn late_words(figures: &TraceFigures) -> String {
+    use hil_models::measure::histogram::Distribution;
+    match &figures.late_delay {
+        Distribution::Unavailable { reason } => format!("unavailable: {reason}"),
+        Distribution::Measured(late) => format!(
+            "{} arrived and were not published: {} to {}, median {}; in no figure of delays above",
+            grouped(late.count),
+            duration(late.min_ns),
+            duration(late.max_ns),
+            duration(late.p50_ns)
+        ),
+    }
+}
+
 /// The laws fitted to a trace.
 pub(crate) fn render_fit(
     header: &TraceHeader,
@@ -308,9 +326,7 @@ pub(crate) fn render_trace_plots(
     let mut delays = trace.delays_ns();
     delays.sort_unstable();
     section(&mut canvas, "Share of the messages delivered within");
-    if delays.is_empty() {
-        canvas.paragraph(INDENT, Tone::Faint, &delay_words(figures));
-    }
+    canvas.paragraph(INDENT, Tone::Faint, &delay_words(figures));
     for row in 0..PLOT_ROWS.min(delays.len()) {
         // From the smallest delay to the 99.9th percentile, in equal steps.
         let last = delays[(delays.len() - 1) * 999 / 1000];

@@ -94,6 +94,16 @@ fn what_a_radio_cannot_be_is_refused_with_its_reason() {
             "twice",
         ),
         (
+            "wifi = \"wifi6-short-range\"\ntrace = \"runs/x/traces\"",
+            "trace",
+            "say one of them",
+        ),
+        (
+            "wifi = { distance_m = 20 }\ntrace = { files = { \"arm/command\" = \"a.csv\" } }",
+            "trace",
+            "no message would meet the radio",
+        ),
+        (
             "forward = { wifi = \"wifi6-long-range\" }",
             "forward.wifi",
             "is not a known key",

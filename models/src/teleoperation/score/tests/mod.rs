@@ -265,6 +265,35 @@ fn two_clocks_withdraw_error_and_lag_but_not_the_loops() {
         assert_eq!(apart.get(name).unwrap().value, None);
         assert!(apart.get(name).unwrap().method.contains("not aligned"));
     }
+    // An alignment that is off by 15 us brings them back, and they say so.
+    let bound_ns = 15_000;
+    let source_of = |channel: &str| Some(channel.to_owned());
+    let stamp = |at_ns, bound_ns| {
+        Some(crate::run_log::BroughtStamp {
+            at_ns,
+            bound_ns,
+            is_early: false,
+        })
+    };
+    let aligned = log.bring_to_one_clock(source_of, |channel, ns| match channel {
+        EGM_RIGHT_COMMAND => stamp(ns + 77_000_000_000 - 15_000, bound_ns),
+        _ => stamp(ns, 0),
+    });
+    assert_eq!(aligned, Ok(()));
+    let aligned = case.score(&log);
+    for (name, off_max) in [
+        ("joint_error_rad_rms", 1e-4),
+        ("tracking_lag_ms", 0.015 + 1e-6),
+    ] {
+        let [told, truth] = [&aligned, &exact].map(|score| value(score, name));
+        assert!((told - truth).abs() <= off_max, "{name}: {told}, {truth}");
+        let method = &aligned.get(name).unwrap().method;
+        assert!(method.contains("aligned within ±15.0 us"), "{method}");
+        assert!(!exact.get(name).unwrap().method.contains("aligned"));
+    }
+    let plots = series(&case, &log);
+    let noted = |one: &PlotSeries| one.notes.iter().any(|note| note.contains("within 15.0 us"));
+    assert!(plots.iter().any(noted), "{:?}", plots[0].notes);
 }
 
 #[test]

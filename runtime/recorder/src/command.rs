@@ -1,0 +1,201 @@
+//! What each command of the command line does, and the exit code it ends with.
+
+use std::path::Path;
+use std::process::ExitCode;
+use std::time::{Duration, Instant};
+
+use clap::Parser;
+use hil_runtime::console::Console;
+use hil_runtime::signals::{EXIT_INTERRUPTED, Signals};
+
+use crate::cli::{Cli, Command};
+use crate::convert::{ConvertError, convert};
+use crate::info::info;
+use crate::recover::{RecoverError, loss_words, recover};
+use crate::scan::ScanError;
+use crate::writer::{WriteError, check_target};
+
+/// Exit codes, as `--help` lists them; those of `hil-runtime`.
+mod exit {
+    pub(super) const DONE: u8 = 0;
+    pub(super) const FAILED: u8 = 1;
+    pub(super) const USAGE: u8 = 2;
+    pub(super) const INTERNAL: u8 = 70;
+}
+
+/// How long work goes on before it says how far it is.
+const SILENCE: Duration = Duration::from_secs(1);
+
+/// Does what the command line says.
+pub(crate) fn run() -> ExitCode {
+    let cli = Cli::parse();
+    let mut console = Console::new(cli.quiet);
+    let signals = match Signals::install() {
+        Ok(signals) => signals,
+        Err(error) => {
+            console.error(&format!("cannot handle signals: {error}"));
+            return ExitCode::from(exit::INTERNAL);
+        }
+    };
+    let code = match cli.command {
+        Command::Convert { run, output, force } => {
+            let checked = check_target(&output, &run, force);
+            unless_refused(checked, &mut console)
+                .unwrap_or_else(|console| convert_run((&run, &output), &signals, console))
+        }
+        Command::Recover {
+            broken,
+            output,
+            force,
+        } => {
+            let checked = check_target(&output, &broken, force);
+            unless_refused(checked, &mut console)
+                .unwrap_or_else(|console| recover_file((&broken, &output), &signals, console))
+        }
+        Command::Info { file, json } => show(&file, json, &signals, &mut console),
+    };
+    ExitCode::from(code)
+}
+
+/// The exit code of a refusal; the console again when there was none.
+fn unless_refused(
+    checked: Result<(), WriteError>,
+    console: &mut Console,
+) -> Result<u8, &mut Console> {
+    match checked {
+        Ok(()) => Err(console),
+        Err(error) => {
+            console.error(&error.to_string());
+            Ok(exit::USAGE)
+        }
+    }
+}
+
+/// Work that is done in a moment needs no word on how far it is.
+struct Patience {
+    since: Instant,
+}
+
+impl Patience {
+    fn new() -> Self {
+        let since = Instant::now();
+        Self { since }
+    }
+
+    fn progress(&self, console: &mut Console, words: &str) {
+        if self.since.elapsed() >= SILENCE {
+            console.progress(words);
+        }
+    }
+}
+
+fn interrupted() -> u8 {
+    u8::try_from(EXIT_INTERRUPTED).unwrap_or(exit::FAILED)
+}
+
+fn convert_run((run, output): (&Path, &Path), signals: &Signals, console: &mut Console) -> u8 {
+    let patience = Patience::new();
+    let converted = convert(run, output, &mut |words| {
+        patience.progress(console, words);
+        signals.received()
+    });
+    match converted {
+        Ok(converted) => {
+            for words in &converted.words {
+                console.warn(words);
+            }
+            console.result(&format!(
+                "{}: {} messages of the run, {} in all on {} topics\n",
+                output.display(),
+                converted.message_count,
+                converted.written_count,
+                converted.topic_count
+            ));
+            if converted.has_gaps {
+                console.error("the run's folder has gaps, see above; the file says so too");
+                return exit::FAILED;
+            }
+            exit::DONE
+        }
+        Err(error) => {
+            console.error(&error.to_string());
+            match error {
+                ConvertError::Run(_) => exit::USAGE,
+                ConvertError::Write(_) => exit::FAILED,
+                ConvertError::Interrupted(_) => interrupted(),
+            }
+        }
+    }
+}
+
+fn recover_file((broken, output): (&Path, &Path), signals: &Signals, console: &mut Console) -> u8 {
+    let patience = Patience::new();
+    let recovered = recover(broken, output, &mut |offset| {
+        patience.progress(console, &format!("{} MiB read", offset >> 20));
+        signals.received()
+    });
+    let recovered = match recovered {
+        Ok(recovered) => recovered,
+        Err(error) => {
+            console.error(&error.to_string());
+            return match error {
+                RecoverError::Scan(ScanError::Foreign { .. }) => exit::USAGE,
+                RecoverError::Interrupted(_) => interrupted(),
+                _ => exit::FAILED,
+            };
+        }
+    };
+    for loss in &recovered.end.losses {
+        console.warn(&format!("lost: {}", loss_words(loss)));
+    }
+    if recovered.homeless_count > 0 {
+        let count = recovered.homeless_count;
+        console.warn(&format!(
+            "lost: {count} messages whose topic is nowhere described"
+        ));
+    }
+    let lost = match recovered.lost_count() {
+        Some(0) => "none is known to be lost".to_owned(),
+        Some(count) => format!("{count} are known to be lost"),
+        None => "how many were lost nobody counted".to_owned(),
+    };
+    console.result(&format!(
+        "{}: {} messages in {:.3} s recovered; {lost}\n",
+        output.display(),
+        recovered.message_count,
+        recovered.span_s()
+    ));
+    exit::DONE
+}
+
+fn show(file: &Path, json: bool, signals: &Signals, console: &mut Console) -> u8 {
+    let patience = Patience::new();
+    let found = info(file, &mut |offset| {
+        patience.progress(console, &format!("{} MiB read", offset >> 20));
+        signals.received()
+    });
+    match found {
+        Ok(Ok(info)) if json => match serde_json::to_string_pretty(&info) {
+            Ok(text) => {
+                console.result(&format!("{text}\n"));
+                exit::DONE
+            }
+            Err(error) => {
+                console.error(&error.to_string());
+                exit::INTERNAL
+            }
+        },
+        Ok(Ok(info)) => {
+            console.result(&info.text());
+            exit::DONE
+        }
+        Ok(Err(signal)) => {
+            console.error(&format!("ended by {signal}"));
+            interrupted()
+        }
+        Err(error) => {
+            console.error(&error.to_string());
+            exit::USAGE
+        }
+    }
+}

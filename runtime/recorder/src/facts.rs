@@ -1,0 +1,186 @@
+//! What a recording says of its run beside the messages: what ran, on what, by which clocks, and what
+//! is missing. Names and keys are in `docs/recordings.md`; all values are text.
+
+use std::borrow::Cow;
+use std::collections::BTreeMap;
+use std::fs;
+
+use hil_runtime::run_folder::RunFolder;
+use mcap::Attachment;
+use serde_json::Value;
+
+use crate::clocks::Clocks;
+use crate::convert::ChannelTopics;
+use crate::run::Run;
+use crate::topics::Names;
+use crate::writer::{Recording, WriteError};
+
+type Words = BTreeMap<String, String>;
+
+/// When each event of the score was, on the recording's axis; `None` where that is unknown.
+pub(crate) fn event_times(run: &Run, clocks: &Clocks) -> Vec<Option<u64>> {
+    let Some(summary) = &run.summary else {
+        return Vec::new();
+    };
+    let starts = &summary.run.starts_ns;
+    // On one clock an event's time counts from the earliest start, else from that of its own host.
+    let earliest = starts.iter().min_by_key(|(_, start_ns)| **start_ns);
+    let at = |at_s: f64, clock: &str| {
+        let own = starts.get_key_value(clock);
+        let is_one = clocks.has_one_clock == Some(true);
+        let (host, start_ns) = own.filter(|_| !is_one).or(earliest)?;
+        let since_start_ns = (at_s * 1e9).round();
+        // Beyond this a number of seconds is none that a run could have.
+        if !since_start_ns.is_finite() || since_start_ns.abs() > 1e18 {
+            return None;
+        }
+        #[allow(clippy::cast_possible_truncation, reason = "checked just above")]
+        let at_ns = start_ns.checked_add(since_start_ns as i64)?;
+        clocks.host_time_ns(host, at_ns)
+    };
+    let events = summary.score_events.events.iter();
+    events.map(|event| at(event.at_s?, &event.clock)).collect()
+}
+
+/// Writes all of it.
+///
+/// # Errors
+/// When the file cannot be written.
+pub(crate) fn write(
+    recording: &mut Recording,
+    run: &Run,
+    clocks: &Clocks,
+    channels: &[ChannelTopics],
+    names: &Names,
+) -> Result<(), WriteError> {
+    recording.describe("hil.run", run_words(run))?;
+    if let Some(manifest) = &run.manifest {
+        let topology = ("json".to_owned(), manifest.topology.to_string());
+        recording.describe("hil.topology", Words::from([topology]))?;
+        let host = ("json".to_owned(), manifest.host_facts.to_string());
+        recording.describe("hil.host_facts", Words::from([host]))?;
+    }
+    recording.describe("hil.clocks", clock_words(run, clocks))?;
+    recording.describe("hil.channels", channel_words(channels))?;
+    recording.describe("hil.recording", recording_words(run, names))?;
+    attach(recording, &run.folder)
+}
+
+fn run_words(run: &Run) -> Words {
+    let mut words = Words::new();
+    let mut put = |key: &str, value: String| words.insert(key.to_owned(), value);
+    put("name", run.folder.name());
+    if let Some(manifest) = &run.manifest {
+        put("topology_hash", manifest.topology_hash.clone());
+        put("seed", manifest.seed.to_string());
+        put("program", manifest.program.name.clone());
+        put("program_version", manifest.program.version.clone());
+        put("created", manifest.created.clone());
+        put("hosts_here", manifest.hosts_here.join(", "));
+        put(
+            "command_line",
+            Value::from(manifest.command_line.clone()).to_string(),
+        );
+    }
+    if let Some(summary) = &run.summary {
+        put("case", summary.run.case.clone());
+        put("started", summary.run.started.clone());
+        put("duration_s", summary.run.duration_s.to_string());
+        put("exit_reason", summary.run.exit_reason.clone());
+    } else {
+        let why = "no summary: the run was killed, or it cannot be read";
+        put("exit_reason", why.to_owned());
+    }
+    words
+}
+
+fn clock_words(run: &Run, clocks: &Clocks) -> Words {
+    let mut words = Words::new();
+    let mut put = |key: String, value: String| words.insert(key, value);
+    put(
+        "log_time".to_owned(),
+        "instant of publication on the clock of the producer's host, plus offset_ns of that host; \
+         hosts are not aligned with each other"
+            .to_owned(),
+    );
+    let one_clock = clocks.has_one_clock;
+    put(
+        "has_one_clock".to_owned(),
+        one_clock.map_or_else(|| "unknown".to_owned(), |is_one| is_one.to_string()),
+    );
+    for (host, clock) in clocks.hosts() {
+        put(format!("{host}/basis"), clock.basis.words().to_owned());
+        put(format!("{host}/offset_ns"), clock.offset_ns.to_string());
+        if let Some((lowest, highest)) = clock.noted_ns {
+            put(format!("{host}/offset_lowest_ns"), lowest.to_string());
+            put(format!("{host}/offset_highest_ns"), highest.to_string());
+        }
+    }
+    let section = run.summary.as_ref().and_then(|one| one.clocks.as_ref());
+    if let Some(text) = section.and_then(|section| serde_json::to_string(section).ok()) {
+        put("alignment_json".to_owned(), text);
+    }
+    words
+}
+
+fn channel_words(channels: &[ChannelTopics]) -> Words {
+    let describe = |channel: &ChannelTopics| {
+        let message = channel.message.as_deref().unwrap_or("unknown message");
+        let how = match (&channel.own, &channel.untyped) {
+            (None, _) => "no message was recorded".to_owned(),
+            (Some(_), None) => "typed".to_owned(),
+            (Some(_), Some(why)) => format!("kept as bytes: {why}"),
+        };
+        (channel.name.clone(), format!("{message}; {how}"))
+    };
+    channels.iter().map(describe).collect()
+}
+
+fn recording_words(run: &Run, names: &Names) -> Words {
+    let gaps = &run.gaps;
+    let counts = [
+        ("unreadable_file_count", gaps.unreadable_file_count),
+        ("truncated_file_count", gaps.truncated_file_count),
+        ("truncated_bytes", gaps.truncated_bytes),
+        ("misfit_message_count", gaps.misfit_count),
+        ("timeless_record_count", gaps.timeless_count),
+    ];
+    let mut words: Words = counts
+        .iter()
+        .map(|(key, count)| ((*key).to_owned(), count.to_string()))
+        .collect();
+    let version = env!("CARGO_PKG_VERSION").to_owned();
+    words.insert("recorder_version".to_owned(), version);
+    for (channel, count) in &gaps.missing {
+        words.insert(format!("missing {channel}"), count.to_string());
+    }
+    for (gap, number) in gaps.words.iter().zip(1..) {
+        words.insert(format!("gap_{number:04}"), gap.clone());
+    }
+    for (given, wanted) in &names.changed {
+        words.insert(format!("renamed {given}"), format!("{wanted} was taken"));
+    }
+    words
+}
+
+/// Report and figures as they are: whoever has only this file has them too.
+fn attach(recording: &mut Recording, folder: &RunFolder) -> Result<(), WriteError> {
+    for (path, media_type) in [
+        (folder.manifest(), "application/json"),
+        (folder.summary(), "application/json"),
+        (folder.report(), "text/plain"),
+        (folder.events(), "text/plain"),
+    ] {
+        // A killed run lacks some of them, which the metadata say.
+        let Ok(data) = fs::read(&path) else { continue };
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        recording.attach(&Attachment {
+            log_time: 0,
+            create_time: 0,
+            name: name.into_owned(),
+            media_type: media_type.to_owned(),
+            data: Cow::Owned(data),
+        })?;
+    }
+    Ok(())
+}

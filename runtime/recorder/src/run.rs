@@ -1,0 +1,267 @@
+//! A run folder as far as it can be read: what is missing or cut short is said and counted, and the
+//! rest is used. It makes no topic of anything.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use hil_models::trace::{Trace, wire};
+use hil_runtime::manifest::{ChannelDescription, Manifest};
+use hil_runtime::record::{RecordFile, RecordKind};
+use hil_runtime::report::summary::RunSummary;
+use hil_runtime::run_folder::RunFolder;
+
+/// The kinds of records that end in a recording.
+const KINDS: [RecordKind; 6] = [
+    RecordKind::Published,
+    RecordKind::Taken,
+    RecordKind::Egress,
+    RecordKind::Ingress,
+    RecordKind::FollowUp,
+    RecordKind::Message,
+];
+
+/// Why a folder cannot be turned into a recording at all.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum RunError {
+    /// No folder, or one without records.
+    #[error("{path}: not a run's folder: {source}")]
+    Foreign {
+        /// What was looked for.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// Of a run in virtual time.
+    #[error(
+        "{path}: a folder of `simulate` or `tables` has no records; only a run's folder can be \
+         converted"
+    )]
+    Virtual {
+        /// The folder.
+        path: PathBuf,
+    },
+}
+
+/// What could be read of a run.
+#[derive(Debug)]
+pub(crate) struct Run {
+    /// Its folder.
+    pub(crate) folder: RunFolder,
+    /// What was run; `None` when that is missing or damaged.
+    pub(crate) manifest: Option<Manifest>,
+    /// Its figures; `None` for a run that was killed.
+    pub(crate) summary: Option<RunSummary>,
+    /// Record files that count, in the order of their names.
+    pub(crate) files: Vec<RecordFile>,
+    /// What the links did, in the order of their names.
+    pub(crate) traces: Vec<Trace>,
+    /// What could not be read, and how much.
+    pub(crate) gaps: Gaps,
+}
+
+/// What a recording lacks of its run.
+#[derive(Debug, Default)]
+pub(crate) struct Gaps {
+    /// Files left out because they cannot be read.
+    pub(crate) unreadable_file_count: u64,
+    /// Files that end within a record.
+    pub(crate) truncated_file_count: u64,
+    /// Bytes of such ends.
+    pub(crate) truncated_bytes: u64,
+    /// Messages whose size is not that of their channel, left out.
+    pub(crate) misfit_count: u64,
+    /// Messages and records that have no time on the recording's clock, and were left out.
+    pub(crate) timeless_count: u64,
+    /// Numbers below the highest of each start of a producer without a recorded message, by
+    /// channel: its recorder was full, or its process was killed.
+    pub(crate) missing: BTreeMap<String, u64>,
+    /// All of it in words, one line each.
+    pub(crate) words: Vec<String>,
+}
+
+impl Gaps {
+    /// True when anything of the run is not in the recording.
+    pub(crate) const fn is_any(&self) -> bool {
+        self.unreadable_file_count > 0
+            || self.truncated_file_count > 0
+            || self.misfit_count > 0
+            || self.timeless_count > 0
+    }
+}
+
+impl Run {
+    /// Reads the folder at `path`; `goes_on` hears the name of each file, and ends it with false.
+    ///
+    /// # Errors
+    /// When it is no run's folder.
+    pub(crate) fn read(
+        path: &Path,
+        goes_on: &mut dyn FnMut(&str) -> bool,
+    ) -> Result<Self, RunError> {
+        let folder = RunFolder::existing(path);
+        if !folder.records().is_dir() && folder.virtual_report().is_file() {
+            let path = path.to_owned();
+            return Err(RunError::Virtual { path });
+        }
+        let mut gaps = Gaps::default();
+        let paths = listed(&folder.records())?;
+        let mut run = Self {
+            manifest: read_json(&folder.manifest(), "the run's own layouts", &mut gaps),
+            summary: read_summary(&folder, &mut gaps),
+            files: Vec::new(),
+            traces: Vec::new(),
+            gaps,
+            folder,
+        };
+        for path in paths {
+            if !goes_on(&path.display().to_string()) {
+                break;
+            }
+            run.read_records(&path);
+        }
+        if run.folder.traces().is_dir() {
+            for path in listed(&run.folder.traces())? {
+                run.read_trace(&path);
+            }
+        }
+        Ok(run)
+    }
+
+    fn read_records(&mut self, path: &Path) {
+        if path.extension().is_none_or(|extension| extension != "rec") {
+            return;
+        }
+        match RecordFile::read(path) {
+            Ok(file) => {
+                if !KINDS.contains(&file.header.kind) {
+                    return;
+                }
+                if file.truncated_bytes > 0 {
+                    self.gaps.truncated_file_count += 1;
+                    self.gaps.truncated_bytes += file.truncated_bytes as u64;
+                    self.gaps.words.push(format!(
+                        "{}: the last {} bytes are half a record; left out",
+                        path.display(),
+                        file.truncated_bytes
+                    ));
+                }
+                self.files.push(file);
+            }
+            Err(error) => {
+                self.gaps.unreadable_file_count += 1;
+                self.gaps.words.push(format!("{error}; left out"));
+            }
+        }
+    }
+
+    fn read_trace(&mut self, path: &Path) {
+        if path
+            .extension()
+            .is_none_or(|extension| extension != "trace")
+        {
+            return;
+        }
+        let decoded = fs::read(path)
+            .map_err(|error| error.to_string())
+            .and_then(|bytes| wire::decode(&bytes).map_err(|fault| fault.to_string()));
+        match decoded {
+            Ok(decoded) => {
+                if let Some(fault) = decoded.fault {
+                    self.gaps.truncated_file_count += 1;
+                    let words = format!("{}: {fault}; what is before it is kept", path.display());
+                    self.gaps.words.push(words);
+                }
+                self.traces.push(decoded.trace);
+            }
+            Err(why) => {
+                self.gaps.unreadable_file_count += 1;
+                let words = format!("trace {}: {why}; left out", path.display());
+                self.gaps.words.push(words);
+            }
+        }
+    }
+
+    /// What the manifest says of `channel`.
+    pub(crate) fn described(&self, channel: &str) -> Option<&ChannelDescription> {
+        let manifest = self.manifest.as_ref()?;
+        manifest.channels.iter().find(|one| one.name == channel)
+    }
+
+    /// Counts the messages that their producers numbered and nobody recorded.
+    pub(crate) fn count_missing(&mut self) {
+        let mut seen: BTreeMap<(&str, u32), (u64, u64)> = BTreeMap::new();
+        for file in &self.files {
+            for index in 0..file.record_count() {
+                let Some((envelope, _)) = file.message(index) else {
+                    break;
+                };
+                let key = (file.header.channel.as_str(), envelope.epoch);
+                let (given, count) = seen.entry(key).or_default();
+                *given = (*given).max(envelope.sequence.saturating_add(1));
+                *count += 1;
+            }
+        }
+        for ((channel, _), (given, count)) in seen {
+            let missing_count = given.saturating_sub(count);
+            if missing_count > 0 {
+                *self.gaps.missing.entry(channel.to_owned()).or_default() += missing_count;
+            }
+        }
+        for (channel, count) in &self.gaps.missing {
+            let words = format!("{channel}: {count} messages were numbered and not recorded");
+            self.gaps.words.push(words);
+        }
+    }
+
+    /// Names of all channels with records, in order.
+    pub(crate) fn channels(&self) -> Vec<String> {
+        let names = self.files.iter().map(|file| file.header.channel.clone());
+        let mut names: Vec<String> = names.collect();
+        names.sort();
+        names.dedup();
+        names
+    }
+}
+
+fn listed(folder: &Path) -> Result<Vec<PathBuf>, RunError> {
+    let mut paths: Vec<PathBuf> = fs::read_dir(folder)
+        .and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect())
+        .map_err(|source| RunError::Foreign {
+            path: folder.to_owned(),
+            source,
+        })?;
+    // By name, so that the starts of a restarted process come in order.
+    paths.sort();
+    Ok(paths)
+}
+
+fn read_json(path: &Path, what: &str, gaps: &mut Gaps) -> Option<Manifest> {
+    let read = fs::read_to_string(path).map_err(|error| error.to_string());
+    let read = read.and_then(|text| serde_json::from_str(&text).map_err(|e| e.to_string()));
+    read.inspect_err(|why| {
+        gaps.unreadable_file_count += 1;
+        let words = format!("{}: {why}; without {what}", path.display());
+        gaps.words.push(words);
+    })
+    .ok()
+}
+
+/// A run that was killed has none, which is said and is no gap in what was recorded of it.
+fn read_summary(folder: &RunFolder, gaps: &mut Gaps) -> Option<RunSummary> {
+    let path = folder.summary();
+    let Ok(text) = fs::read_to_string(&path) else {
+        let why =
+            "the run was killed, or still goes on; without its events and the links' verdicts";
+        gaps.words.push(format!("no {}: {why}", path.display()));
+        return None;
+    };
+    RunSummary::from_json(&text)
+        .inspect_err(|error| {
+            gaps.unreadable_file_count += 1;
+            let words = format!("{}: {error}; without its events", path.display());
+            gaps.words.push(words);
+        })
+        .ok()
+}

@@ -1,0 +1,149 @@
+//! The events of a run as lists: those of the score with what stood beside them, those of the network,
+//! and what follows what.
+
+use hil_models::case_study::Severity;
+
+use super::data::{Event, EventList};
+use super::drawings;
+use super::words::UNAVAILABLE;
+use crate::report::network::{Correlation, NetworkReport};
+use crate::report::score_event::{ExplainedEvent, ScoreEvents};
+use crate::report::terminal::{self, grouped, percent, seconds};
+
+/// Events of the score and of the network that a page lists.
+const EVENTS_MAX: usize = 200;
+
+pub(super) fn score_events(events: &ScoreEvents) -> EventList {
+    let total = events.events.len();
+    let grave = events
+        .events
+        .iter()
+        .filter(|event| event.severity != Severity::Notice);
+    let grave_count = grave.count() as u64;
+    let mut chosen: Vec<&ExplainedEvent> = events.events.iter().collect();
+    // The gravest stay, in order of time.
+    if total > EVENTS_MAX {
+        let grave = |event: &&ExplainedEvent| {
+            core::cmp::Reverse(match event.severity {
+                Severity::Incident => 2,
+                Severity::Hazard => 1,
+                Severity::Notice => 0,
+            })
+        };
+        chosen.sort_by_key(grave);
+        chosen.truncate(EVENTS_MAX);
+        chosen.sort_by(|a, b| {
+            a.at_s
+                .unwrap_or(f64::MAX)
+                .total_cmp(&b.at_s.unwrap_or(f64::MAX))
+        });
+    }
+    let mut notes = Vec::new();
+    if total > EVENTS_MAX {
+        notes.push(format!(
+            "the {EVENTS_MAX} gravest of {}; all are in events.log",
+            grouped(total as u64)
+        ));
+    }
+    if events.dropped_count > 0 {
+        notes.push(format!(
+            "{} more found no room in the score",
+            grouped(events.dropped_count)
+        ));
+    }
+    if events.clocks_differ {
+        notes.push(
+            "the hosts' clocks are not aligned: each time is on the clock of the host named"
+                .to_owned(),
+        );
+    }
+    EventList {
+        grave_count,
+        events: chosen
+            .into_iter()
+            .map(|event| score_event(event, events.clocks_differ))
+            .collect(),
+        note: notes.join("; "),
+    }
+}
+
+fn score_event(event: &ExplainedEvent, clocks_differ: bool) -> Event {
+    let mut beside: Vec<String> = event
+        .outages
+        .iter()
+        .map(|outage| outage.words.clone())
+        .collect();
+    beside.extend(
+        event
+            .network_beside()
+            .into_iter()
+            .map(|one| one.words.clone()),
+    );
+    if let Some(network) = &event.network {
+        if network.more_count > 0 {
+            beside.push(format!("{} more", grouped(network.more_count)));
+        }
+        if beside.is_empty() {
+            beside.push(network.nothing_words());
+        }
+    }
+    let at = event.at_s.map_or_else(|| UNAVAILABLE.to_owned(), seconds);
+    let clock = if clocks_differ {
+        format!(" ({})", event.clock)
+    } else {
+        String::new()
+    };
+    Event {
+        at: format!("{at}{clock}"),
+        severity: drawings::severity_word(event.severity),
+        what: event.what.clone(),
+        beside,
+    }
+}
+
+pub(super) fn network_events(report: &NetworkReport) -> EventList {
+    let listed = report.events.iter().take(EVENTS_MAX).map(|event| Event {
+        at: seconds(event.from_s),
+        severity: "network",
+        what: event.words(),
+        beside: Vec::new(),
+    });
+    let total = report.events.len() as u64 + report.events_dropped_count;
+    let shown = report.events.len().min(EVENTS_MAX) as u64;
+    let chance = percent(report.foregoing_chance_ratio);
+    let window = terminal::duration_s(report.foregoing_s);
+    let mut note = format!(
+        "{chance} of all moments of the run have such an event in the {window} before them: so much would \
+         stand before an event of the score by chance."
+    );
+    if total > shown {
+        let (shown, total) = (grouped(shown), grouped(total));
+        note.push_str(&[" The first ", &shown, " of ", &total, "."].concat());
+    }
+    EventList {
+        grave_count: 0,
+        events: listed.collect(),
+        note,
+    }
+}
+
+pub(super) fn correlation(report: &NetworkReport) -> Vec<String> {
+    match &report.correlation {
+        Correlation::Unavailable { reason } => vec![format!("{UNAVAILABLE}: {reason}")],
+        Correlation::Tested(tests) => {
+            let count = tests.pairs.len();
+            let found = tests.significant();
+            let words = found
+                .iter()
+                .map(|pair| pair.words(count, tests.shuffle_count));
+            let mut words: Vec<String> = words.collect();
+            if words.is_empty() {
+                words.push(format!(
+                    "no pair of {count} correlates more than chance may give (p ≤ 0.05 in view of all pairs)"
+                ));
+            }
+            words.push("Correlation is not cause: both may follow a third thing.".to_owned());
+            words
+        }
+    }
+}

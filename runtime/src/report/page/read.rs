@@ -1,0 +1,179 @@
+//! Reads a run's folder for a page. What cannot be read is said, and the rest is read all the same.
+
+use std::fs;
+use std::io;
+use std::path::Path;
+
+use serde_json::Value;
+
+use super::material::{Found, Manifest, Material};
+use super::series::{self, Series};
+use crate::report::summary::{Fact, RunSummary};
+use crate::run_folder::RunFolder;
+
+/// Largest series that is read, bytes: an hour of two arms is a tenth of it.
+const SERIES_BYTES_MAX: u64 = 1 << 30;
+/// Largest `report.txt` that goes into a page, bytes.
+const PRINTED_BYTES_MAX: usize = 200_000;
+
+/// Why a folder is none of a run.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum ReadError {
+    /// Nothing in it is known.
+    #[error("{0}: no summary.json, report.json or manifest.json; not a run's folder")]
+    NoRun(String),
+    /// A file is not what it should be.
+    #[error("{path}: {text}")]
+    File {
+        /// Which.
+        path: String,
+        /// Why.
+        text: String,
+    },
+}
+
+/// The material of the folder at `path`.
+///
+/// # Errors
+/// When it is not the folder of a run, or its summary cannot be read.
+pub(crate) fn read(path: &Path) -> Result<Material, ReadError> {
+    let folder = RunFolder::existing(path);
+    let found = found(&folder)?;
+    let mut problems = Vec::new();
+    let series = match &found {
+        Found::Unfinished(_) => Vec::new(),
+        _ => all_series(&folder.series(), &mut problems),
+    };
+    let printed = fs::read_to_string(folder.report()).ok();
+    let printed = printed.filter(|text| text.len() <= PRINTED_BYTES_MAX);
+    let name = path.canonicalize().unwrap_or_else(|_error| path.to_owned());
+    Ok(Material {
+        folder: RunFolder::existing(&name).name(),
+        found,
+        series,
+        printed,
+        problems,
+    })
+}
+
+fn text_of(path: &Path) -> Result<Option<String>, ReadError> {
+    match fs::read_to_string(path) {
+        Ok(text) => Ok(Some(text)),
+        Err(error)
+            if matches!(
+                error.kind(),
+                io::ErrorKind::NotFound | io::ErrorKind::NotADirectory
+            ) =>
+        {
+            Ok(None)
+        }
+        Err(error) => Err(file_error(path, &error.to_string())),
+    }
+}
+
+fn file_error(path: &Path, text: &str) -> ReadError {
+    ReadError::File {
+        path: path.display().to_string(),
+        text: text.to_owned(),
+    }
+}
+
+/// With what it rests on: serde's words alone do not say which field.
+fn with_source(error: &dyn core::error::Error) -> String {
+    error
+        .source()
+        .map_or_else(|| error.to_string(), |source| format!("{error}: {source}"))
+}
+
+fn found(folder: &RunFolder) -> Result<Found, ReadError> {
+    if let Some(text) = text_of(&folder.summary())? {
+        let summary = RunSummary::from_json(&text);
+        let summary =
+            summary.map_err(|error| file_error(&folder.summary(), &with_source(&error)))?;
+        return Ok(Found::Live(Box::new(summary)));
+    }
+    if let Some(text) = text_of(&folder.virtual_report())? {
+        let report = serde_json::from_str(&text);
+        let path = folder.virtual_report();
+        let report = report
+            .map_err(|error| file_error(&path, &format!("not a report of `simulate`: {error}")))?;
+        return Ok(Found::Virtual(Box::new(report)));
+    }
+    let path = folder.manifest();
+    let Some(text) = text_of(&path)? else {
+        return Err(ReadError::NoRun(folder.root().display().to_string()));
+    };
+    let manifest: Value =
+        serde_json::from_str(&text).map_err(|error| file_error(&path, &error.to_string()))?;
+    Ok(Found::Unfinished(manifest_of(&manifest, folder)))
+}
+
+fn manifest_of(manifest: &Value, folder: &RunFolder) -> Manifest {
+    let text = |value: &Value| value.as_str().unwrap_or("unavailable").to_owned();
+    let fact = |one: &Value| {
+        let value = &one["value"];
+        let reason = value["unavailable"]
+            .as_str()
+            .map(|reason| format!("unavailable ({reason})"));
+        let value = value["available"].as_str().map(str::to_owned).or(reason)?;
+        Some(Fact::new(one["label"].as_str()?.replace('_', " "), value))
+    };
+    let list = |value: &Value| value.as_array().cloned().unwrap_or_default();
+    let records = fs::read_dir(folder.records())
+        .into_iter()
+        .flatten()
+        .flatten();
+    let sizes = records.filter_map(|entry| Some(entry.metadata().ok()?.len()));
+    Manifest {
+        name: text(&manifest["topology"]["name"]),
+        case: text(&manifest["topology"]["case"]["name"]),
+        created: text(&manifest["created"]),
+        seed: manifest["seed"].as_u64(),
+        command_line: list(&manifest["command_line"]).iter().map(text).collect(),
+        host_facts: list(&manifest["host_facts"])
+            .iter()
+            .filter_map(fact)
+            .collect(),
+        records: sizes.fold((0, 0), |(count, bytes), size| (count + 1, bytes + size)),
+    }
+}
+
+fn all_series(folder: &Path, problems: &mut Vec<String>) -> Vec<Series> {
+    let Ok(entries) = fs::read_dir(folder) else {
+        return Vec::new();
+    };
+    let readme = fs::read_to_string(folder.join("README.md")).unwrap_or_default();
+    let mut paths: Vec<_> = entries.flatten().map(|entry| entry.path()).collect();
+    paths.retain(|path| path.extension().is_some_and(|ending| ending == "csv"));
+    // As the README lists them, which is the case's order; then by name.
+    let place = |path: &Path| {
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        let place = readme.find(&format!("## {name}"));
+        (place.unwrap_or(usize::MAX), name.into_owned())
+    };
+    paths.sort_by_key(|path| place(path));
+    let mut all = Vec::new();
+    for path in paths {
+        match one_series(&path) {
+            Ok(mut series) => {
+                series.describe(&readme);
+                all.push(series);
+            }
+            Err(text) => {
+                let name = path.file_name().unwrap_or_default().to_string_lossy();
+                problems.push(format!("series/{name} cannot be read: {text}"));
+            }
+        }
+    }
+    all
+}
+
+fn one_series(path: &Path) -> Result<Series, String> {
+    let size = fs::metadata(path).map_err(|error| error.to_string())?.len();
+    if size > SERIES_BYTES_MAX {
+        return Err(format!("{size} bytes, more than {SERIES_BYTES_MAX}"));
+    }
+    let text = fs::read_to_string(path).map_err(|error| error.to_string())?;
+    let name = path.file_stem().unwrap_or_default().to_string_lossy();
+    series::parse(&name, &text)
+}

@@ -1,0 +1,214 @@
+//! A small writer of SVG: it puts shapes and escaped text into a picture and knows no figure. Colours
+//! and widths are classes of one style sheet, so that a page can turn dark and a file stands alone.
+
+use core::fmt::Write;
+
+/// The style sheet of figures, for the page and for files of their own.
+pub(super) const STYLE: &str = include_str!("templates/figure.css");
+
+/// Lines that can be told apart by colour alone, also by the colour-blind (Okabe and Ito, 2008).
+/// Dashes tell further ones apart.
+pub(super) const COLOUR_COUNT: usize = 7;
+
+/// `text` for XML and HTML, within elements and quoted attributes.
+pub(super) fn escaped(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    for c in text.chars() {
+        match c {
+            '&' => out.push_str("&amp;"),
+            '<' => out.push_str("&lt;"),
+            '>' => out.push_str("&gt;"),
+            '"' => out.push_str("&quot;"),
+            '\'' => out.push_str("&#39;"),
+            // XML has no word for these, not even escaped.
+            '\u{0}'..='\u{8}'
+            | '\u{b}'
+            | '\u{c}'
+            | '\u{e}'..='\u{1f}'
+            | '\u{fffe}'
+            | '\u{ffff}' => {
+                out.push('\u{fffd}');
+            }
+            _ => out.push(c),
+        }
+    }
+    out
+}
+
+/// A coordinate: a tenth of a pixel is enough.
+pub(super) fn px(value: f64) -> String {
+    let text = format!("{value:.1}");
+    match text.strip_suffix(".0") {
+        Some("-0") => "0".to_owned(),
+        Some(whole) => whole.to_owned(),
+        None => text,
+    }
+}
+
+/// The classes of the line with this number.
+pub(super) fn line_class(index: usize) -> String {
+    let round = (index / COLOUR_COUNT).min(3);
+    format!("line c{} d{round}", index % COLOUR_COUNT)
+}
+
+/// A picture under way.
+#[derive(Debug)]
+pub(super) struct Svg {
+    width: f64,
+    height: f64,
+    body: String,
+}
+
+/// Where a text is anchored.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Anchor {
+    Start,
+    Middle,
+    End,
+}
+
+impl Svg {
+    pub(super) const fn new(width: f64, height: f64) -> Self {
+        Self {
+            width,
+            height,
+            body: String::new(),
+        }
+    }
+
+    fn put(&mut self, args: core::fmt::Arguments<'_>) {
+        // Writing to a string cannot fail.
+        let _infallible = self.body.write_fmt(args);
+        self.body.push('\n');
+    }
+
+    pub(super) fn line(&mut self, class: &str, from: (f64, f64), to: (f64, f64)) {
+        let [x1, y1, x2, y2] = [from.0, from.1, to.0, to.1].map(px);
+        self.put(format_args!(
+            r#"<line class="{class}" x1="{x1}" y1="{y1}" x2="{x2}" y2="{y2}"/>"#
+        ));
+    }
+
+    /// A rectangle with what a pointer that rests on it is told.
+    pub(super) fn rect(&mut self, class: &str, at: (f64, f64), size: (f64, f64), title: &str) {
+        let [x, y, width, height] = [at.0, at.1, size.0.max(0.0), size.1.max(0.0)].map(px);
+        let title = if title.is_empty() {
+            String::new()
+        } else {
+            format!("<title>{}</title>", escaped(title))
+        };
+        self.put(format_args!(
+            r#"<rect class="{class}" x="{x}" y="{y}" width="{width}" height="{height}">{title}</rect>"#
+        ));
+    }
+
+    pub(super) fn circle(&mut self, class: &str, at: (f64, f64), radius: f64) {
+        let [x, y, r] = [at.0, at.1, radius].map(px);
+        self.put(format_args!(
+            r#"<circle class="{class}" cx="{x}" cy="{y}" r="{r}"/>"#
+        ));
+    }
+
+    /// A path whose `d` the caller made of numbers.
+    pub(super) fn path(&mut self, class: &str, d: &str) {
+        if !d.is_empty() {
+            self.put(format_args!(r#"<path class="{class}" d="{d}"/>"#));
+        }
+    }
+
+    pub(super) fn text(&mut self, class: &str, at: (f64, f64), anchor: Anchor, text: &str) {
+        let anchor = match anchor {
+            Anchor::Start => "start",
+            Anchor::Middle => "middle",
+            Anchor::End => "end",
+        };
+        let ([x, y], text) = ([at.0, at.1].map(px), escaped(text));
+        self.put(format_args!(
+            r#"<text class="{class}" x="{x}" y="{y}" text-anchor="{anchor}">{text}</text>"#
+        ));
+    }
+
+    /// Begins a group; `attributes` are pairs whose values get escaped.
+    pub(super) fn open(&mut self, attributes: &[(&str, &str)]) {
+        let list = attributes
+            .iter()
+            .map(|(name, value)| format!(" {name}=\"{}\"", escaped(value)));
+        let list: String = list.collect();
+        self.put(format_args!("<g{list}>"));
+    }
+
+    pub(super) fn close(&mut self) {
+        self.put(format_args!("</g>"));
+    }
+
+    /// Nothing outside this rectangle is seen of groups that name it.
+    pub(super) fn clip(&mut self, id: &str, at: (f64, f64), size: (f64, f64)) {
+        let [x, y, width, height] = [at.0, at.1, size.0, size.1].map(px);
+        let id = escaped(id);
+        self.put(format_args!(
+            r#"<clipPath id="{id}"><rect x="{x}" y="{y}" width="{width}" height="{height}"/></clipPath>"#
+        ));
+    }
+
+    /// The picture; `attributes` go to its outermost element, `title` is what a reader without eyes
+    /// is told.
+    pub(super) fn finish(self, title: &str, attributes: &[(&str, String)]) -> String {
+        let list = attributes
+            .iter()
+            .map(|(name, value)| format!(" {name}=\"{}\"", escaped(value)));
+        let list: String = list.collect();
+        let ([width, height], title) = ([self.width, self.height].map(px), escaped(title));
+        format!(
+            "<svg xmlns=\"http://www.w3.org/2000/svg\" class=\"figure\" role=\"img\" viewBox=\"0 0 {width} \
+             {height}\"{list}>\n<title>{title}</title>\n{}</svg>\n",
+            self.body
+        )
+    }
+}
+
+/// `svg` as a file of its own: with its style, on white paper.
+pub(super) fn standalone(svg: &str) -> String {
+    let style = format!("<style>{STYLE}\nsvg.figure {{ background: var(--paper); }}</style>");
+    match svg.split_once('\n') {
+        Some((head, rest)) => {
+            format!("<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n{head}\n{style}\n{rest}")
+        }
+        None => svg.to_owned(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn whatever_a_text_holds_stays_text() {
+        assert_eq!(
+            escaped("<b a='1'>\"&\u{0}\u{1b}µ"),
+            "&lt;b a=&#39;1&#39;&gt;&quot;&amp;\u{fffd}\u{fffd}µ"
+        );
+        let mut svg = Svg::new(10.0, 20.0);
+        svg.text("x", (1.0, 2.04), Anchor::Middle, "</text><script>");
+        svg.rect("x", (0.0, 0.0), (-1.0, 2.0), "a<b");
+        let text = svg.finish("<t>", &[("data-x", "\"y".to_owned())]);
+        assert!(text.contains("&lt;/text&gt;&lt;script&gt;"), "{text}");
+        assert!(text.contains("data-x=\"&quot;y\""), "{text}");
+        assert!(text.contains("width=\"0\""), "{text}");
+        assert!(!text.contains("<script"), "{text}");
+    }
+
+    #[test]
+    fn coordinates_are_short() {
+        assert_eq!([0.0, -0.01, 1.25, 3.0].map(px), ["0", "0", "1.2", "3"]);
+    }
+
+    #[test]
+    fn a_file_of_its_own_has_its_style() {
+        let text = standalone(&Svg::new(1.0, 1.0).finish("t", &[]));
+        assert!(text.starts_with("<?xml"), "{text}");
+        assert!(
+            text.contains("<style>") && text.ends_with("</svg>\n"),
+            "{text}"
+        );
+    }
+}
