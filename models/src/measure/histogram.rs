@@ -341,8 +341,18 @@ mod tests {
         assert_eq!(exact.p50_ns, values[2_500]);
         assert_eq!(exact.p99_ns, values[ceil_count(0.99 * 5_001.0) - 1]);
         assert_eq!(
-            (exact.count, exact.negative_count, exact.min_ns, exact.max_ns),
-            (5_001, summary.negative_count, summary.min_ns, summary.max_ns)
+            (
+                exact.count,
+                exact.negative_count,
+                exact.min_ns,
+                exact.max_ns
+            ),
+            (
+                5_001,
+                summary.negative_count,
+                summary.min_ns,
+                summary.max_ns
+            )
         );
         assert!((exact.mean_ns - summary.mean_ns).abs() < 1e-6 * exact.mean_ns.abs());
     }

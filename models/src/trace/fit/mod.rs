@@ -9,8 +9,8 @@ mod loss;
 
 use serde::{Deserialize, Serialize};
 
-use super::{Trace, TraceDirection};
 use super::figures::{TraceFigures, known_losses};
+use super::{Trace, TraceDirection};
 use crate::measure::histogram::Distribution;
 
 pub use goodness::ChiSquare;

@@ -4,7 +4,7 @@
 use hil_models::link::delay::DelayLaw;
 use hil_models::random::RandomStream;
 use hil_models::trace::fit::{Fit, TraceFit};
-use hil_models::trace::{Trace, TraceFate, TraceHeader, TraceRecord};
+use hil_models::trace::{Trace, TraceDirection, TraceFate, TraceHeader, TraceRecord};
 
 use super::faulty::GOOD;
 use super::*;
