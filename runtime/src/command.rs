@@ -233,14 +233,14 @@ fn show_check(path: &Path, topology: &Topology, console: &mut Console) -> u8 {
         ));
         return exit::USAGE;
     }
-    // As comments, so that what follows the first line remains a topology.
+    // As comments, so that what is printed is a topology as a whole.
     let clock_paths = topology.clock_paths().map(|clock| {
         let (asking, answering) = (clock.asking.port(), clock.answering.port());
         let words = clock.describe();
-        format!("\n# {words}, UDP ports {asking} and {answering}")
+        format!("\n# {words}, UDP ports {asking} and {answering}\n")
     });
     console.result(&format!(
-        "{}: the file is valid; it comes to\n\n{}{}",
+        "# {}: the file is valid; it comes to\n\n{}{}",
         path.display(),
         topology.to_toml(),
         clock_paths.collect::<Vec<_>>().concat()

@@ -24,7 +24,7 @@ use serde::{Deserialize, Serialize};
 
 use self::trace::ReplayTally;
 use crate::message::Envelope;
-use crate::time::Instant;
+use crate::time::{Instant, RemoteInstant};
 
 /// What happens to one offered message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -68,6 +68,9 @@ pub struct MessageNumber {
     pub start: u32,
     /// Counted from 0 at each start.
     pub sequence: u64,
+    /// When it was published, on its producer's clock, where that is known. It compares with that of the
+    /// producer's other messages only.
+    pub published: Option<RemoteInstant>,
 }
 
 impl From<&Envelope> for MessageNumber {
@@ -75,6 +78,7 @@ impl From<&Envelope> for MessageNumber {
         Self {
             start: envelope.epoch,
             sequence: envelope.sequence,
+            published: Some(RemoteInstant::from_ns(envelope.published_ns)),
         }
     }
 }

@@ -17,7 +17,7 @@ use hil_gateways::transport::udp::{GrantedOptions, PathMtu, UdpReceiver, UdpSend
 use hil_gateways::transport::{DatagramReceiver, DatagramSender};
 use hil_models::link::trace::ReplayTally;
 use hil_models::link::{Fate, LinkModel, LossCauses, MessageNumber};
-use hil_models::time::Instant;
+use hil_models::time::{Instant, RemoteInstant};
 
 use super::GatewayError;
 use super::stamp_plan::StampPlan;
@@ -267,6 +267,9 @@ fn message_number(bytes: &[u8]) -> Option<MessageNumber> {
     (header.kind == Kind::Data).then_some(MessageNumber {
         start: header.epoch,
         sequence: header.sequence,
+        // The smallest integer stands for a message without a stamp.
+        published: (header.published_ns != i64::MIN)
+            .then(|| RemoteInstant::from_ns(header.published_ns)),
     })
 }
 

@@ -1,13 +1,15 @@
 //! What `hil-runtime trace` does: reads, computes, prints and writes. The figures are
 //! `hil_models::trace`'s, the page is `report::terminal`'s.
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
 
 use hil_models::plot::PlotSeries;
 use hil_models::trace::figures::TraceFigures;
 use hil_models::trace::fit::TraceFit;
-use hil_models::trace::{Trace, csv, netem, opportunities, wire};
+use hil_models::trace::netem::NetemTable;
+use hil_models::trace::{Trace, TraceDirection, csv, netem, opportunities, wire};
 use serde_json::{Value, json};
 
 use super::cli::{TraceCommand, TraceFiles, TraceForm};
@@ -43,11 +45,18 @@ pub(crate) fn work(command: TraceCommand, columns: usize, console: &mut Console)
             console.result(&page);
             Ok(Value::Null)
         }),
-        TraceCommand::Fit { files, seed, link } => {
-            each(&files, console, &mut |opened, is_json, console| {
+        TraceCommand::Fit {
+            files: asked,
+            seed,
+            link,
+        } => {
+            let is_one = files(&asked.files).is_ok_and(|all| all.len() == 1);
+            let mut written = FittedLinks::new(link, is_one);
+            each(&asked, console, &mut |opened, is_json, console| {
                 let fit = TraceFit::of(&opened.trace, seed);
+                let toml = written.toml(opened, &fit);
                 if is_json {
-                    return Ok(json!({ "file": opened.path, "fit": fit, "toml": fit.toml(&link) }));
+                    return Ok(json!({ "file": opened.path, "fit": fit, "toml": toml }));
                 }
                 let header = &opened.trace.header;
                 console.rendered(&terminal::render_fit(
@@ -56,7 +65,7 @@ pub(crate) fn work(command: TraceCommand, columns: usize, console: &mut Console)
                     columns,
                     Style::Coloured,
                 ));
-                console.result(&fit.toml(&link));
+                console.result(&toml);
                 Ok(Value::Null)
             })
         }
@@ -71,6 +80,60 @@ pub(crate) fn work(command: TraceCommand, columns: usize, console: &mut Console)
             to,
             force,
         } => convert(&from, (&into, to, force), console),
+    }
+}
+
+/// The links that were printed so far, so that what several traces come to is one topology.
+struct FittedLinks {
+    /// What the user calls the link; else each trace's own name of it.
+    named: Option<String>,
+    /// One trace speaks for both directions.
+    is_one: bool,
+    tables: BTreeSet<String>,
+}
+
+impl FittedLinks {
+    const fn new(named: Option<String>, is_one: bool) -> Self {
+        Self {
+            named,
+            is_one,
+            tables: BTreeSet::new(),
+        }
+    }
+
+    /// The lines for one trace, and above them where they come from.
+    fn toml(&mut self, opened: &Opened, fit: &TraceFit) -> String {
+        let header = &opened.trace.header;
+        let own = Some(&header.link).filter(|name| !name.is_empty());
+        let link = self.named.as_ref().or(own).map_or("hop", String::as_str);
+        let source = format!(
+            "# {} of {}, direction {}\n",
+            header.channel,
+            opened.path.display(),
+            header.direction.word()
+        );
+        if self.is_one {
+            return format!("{source}{}", fit.toml(link));
+        }
+        let toml = fit.toml_of_direction(link, header.direction);
+        let is_first = self.tables.insert(link.to_owned());
+        let opening = if is_first && header.direction != TraceDirection::Unknown {
+            format!("[links.{link}]\nvia = \"emulated\"\n\n")
+        } else {
+            String::new()
+        };
+        if self
+            .tables
+            .insert(format!("{link}.{}", header.direction.word()))
+        {
+            return format!("{opening}{source}{toml}\n");
+        }
+        // A second table of one name would make the file invalid.
+        let lines = toml.lines().map(|line| format!("# {line}\n"));
+        format!(
+            "{source}# another channel's fit of this direction stands above; to take this one instead:\n{}\n",
+            lines.collect::<String>()
+        )
     }
 }
 
@@ -241,14 +304,29 @@ fn converted(trace: &Trace, form: TraceForm) -> Result<(Vec<u8>, String), String
             let table = netem::table(trace).ok_or("fewer than two delays, or all are equal")?;
             let remark = format!(
                 "; use it as: netem delay {:.0}us {:.0}us distribution FILE. Not kept: losses, and \
-                 the order of the delays; {}",
+                 the order of the delays{}; {}",
                 table.mean_ns / 1e3,
                 table.deviation_ns / 1e3,
+                cut_words(&table),
                 bound_words(trace)
             );
             Ok((table.text.into_bytes(), remark))
         }
     }
+}
+
+/// What of the delays no table of netem's can say.
+fn cut_words(table: &NetemTable) -> String {
+    if table.cut_count == 0 {
+        return String::new();
+    }
+    let share = 100.0 * table.cut_count as f64 / netem::TABLE_COUNT as f64;
+    let most_ns = table.mean_ns + 4.0 * table.deviation_ns;
+    format!(
+        ". Cut: {share:.2} % of the delays, more than four deviations from the mean, where the table \
+         ends ({:.3} ms)",
+        most_ns / 1e6
+    )
 }
 
 /// How far the clocks may have led the delays of `trace` astray.
