@@ -350,7 +350,12 @@ fn slow_loads(code: &mut Assembler) {
 fn accept(code: &mut Assembler, purpose: &Purpose<'_>) {
     code.here(Label::Accepted);
     draw_slot(code, purpose);
-    stamp_and_mark(code, purpose.is_outbound);
+    if purpose.is_outbound {
+        code.put(set_word(R3, flag::OUTBOUND));
+    } else {
+        stamp_arrival(code);
+    }
+    mark(code);
     let snap = i32::try_from(purpose.shape.snap_bytes).expect("checked when the tap is opened");
     // R4: bytes to keep.
     code.put(store(Width::Word, R7, signed(slot::LENGTH), R9));
@@ -370,6 +375,11 @@ fn accept(code: &mut Assembler, purpose: &Purpose<'_>) {
     code.put(set(R1, 0));
     code.put(store(Width::Word, R7, signed(slot::KEPT), R1));
     code.here(Label::Copied);
+    if purpose.is_outbound {
+        // As late as can be: nearer to the wire by the copy.
+        code.put(call(helper::KTIME_GET_TAI_NS));
+        code.put(store(Width::Double, R7, signed(slot::STAMP), R0));
+    }
     // The state makes the slot the reader's.
     code.put(add(R8, 1));
     publish(code);
@@ -417,19 +427,20 @@ fn draw_slot(code: &mut Assembler, purpose: &Purpose<'_>) {
     code.put(add_register(R7, R1));
 }
 
-/// Stamp, direction and VLAN tag.
-fn stamp_and_mark(code: &mut Assembler, is_outbound: bool) {
-    let plain = if is_outbound { flag::OUTBOUND } else { 0 };
-    if !is_outbound {
-        // The stack's stamp of an arrival; the kernel gives 0 here for a time of departure.
-        code.put(load(Width::Double, R0, R6, context::TSTAMP));
-        code.put(set_word(R3, plain | flag::STACK_STAMP));
-        code.jump(when::NOT_ZERO, (R0, R0), 0, Label::Stamped);
-    }
+/// An arrival's stamp, and flags in R3.
+fn stamp_arrival(code: &mut Assembler) {
+    // The stack's stamp; the kernel gives 0 here for a time of departure.
+    code.put(load(Width::Double, R0, R6, context::TSTAMP));
+    code.put(set_word(R3, flag::STACK_STAMP));
+    code.jump(when::NOT_ZERO, (R0, R0), 0, Label::Stamped);
     code.put(call(helper::KTIME_GET_TAI_NS));
-    code.put(set_word(R3, plain));
+    code.put(set_word(R3, 0));
     code.here(Label::Stamped);
     code.put(store(Width::Double, R7, signed(slot::STAMP), R0));
+}
+
+/// The flags of R3, with the VLAN tag if there is one.
+fn mark(code: &mut Assembler) {
     // A tag that the kernel keeps beside the packet.
     code.put(load(Width::Word, R1, R6, context::VLAN_PRESENT));
     code.jump(when::ZERO, (R1, R0), 0, Label::Untagged);
