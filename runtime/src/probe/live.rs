@@ -10,12 +10,12 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use hil_gateways::capture::flow::FlowFilter;
 use hil_gateways::capture::writer::{self, PacketToWrite};
 use hil_gateways::capture::{CaptureInterface, Direction, link_type as link};
-use hil_gateways::transport::packet_ring::{
-    PacketRing, RingCounters, RingError, RingSettings, RingStamps,
-};
+use hil_gateways::transport::live_tap::{LiveTap, TapEngine};
+use hil_gateways::transport::packet_ring::{RingCounters, RingError, RingSettings, RingStamps};
 use hil_gateways::transport::ring_frame::{RingPacket, StampSource};
 
 use super::card_tap::{CardResult, CardTap};
+use super::tap::{self, TapChoice};
 use crate::console::Console;
 use crate::signals::Signals;
 
@@ -39,6 +39,7 @@ pub(super) struct Request {
     pub(super) ring_bytes: usize,
     /// Whose stamps the file is to have, besides the kernel's.
     pub(super) stamps: RingStamps,
+    pub(super) tap: TapChoice,
 }
 
 /// Why a capture failed. What was written until then is a file of whole blocks.
@@ -63,10 +64,15 @@ pub(super) enum LiveError {
 #[derive(Debug, Clone, Default)]
 pub(super) struct InterfaceResult {
     pub(super) name: String,
+    /// What took the packets, in words.
+    pub(super) tapped: String,
     pub(super) inbound_count: u64,
     pub(super) outbound_count: u64,
-    /// Stamped by the tap itself, because the kernel had not yet.
+    /// Stamped by the tap itself, because the kernel had not yet; departures by eBPF, which are
+    /// always, are not counted.
     pub(super) late_stamp_count: u64,
+    /// How often the clock of the tap's own stamps was set anew.
+    pub(super) step_count: u64,
     pub(super) counters: RingCounters,
     /// The interface was taken down or has gone.
     pub(super) has_failed: bool,
@@ -85,7 +91,7 @@ pub(super) struct LiveResult {
 }
 
 struct Tap {
-    ring: PacketRing,
+    ring: LiveTap,
     card: Option<CardTap>,
     /// When the interface had gone, nanoseconds since 1970.
     gone_ns: Option<u64>,
@@ -139,7 +145,8 @@ pub(super) fn capture(
         } = tap.result.counters;
         let span = (start_ns, tap.gone_ns.unwrap_or(end_ns).max(start_ns));
         let counts = (matched_count, dropped_count);
-        writer::statistics(&mut file.buffer, index, span, counts, None);
+        let comment = Some(tap.result.tapped.as_str());
+        writer::statistics(&mut file.buffer, index, span, counts, comment);
         if let Some(card) = tap.card.take() {
             let index = tap_count + index;
             tap.result.card = Some(card.finish(index, span, &mut file.buffer)?);
@@ -162,7 +169,11 @@ fn open_taps(request: &Request, console: &mut Console) -> Result<Vec<Tap>, LiveE
     };
     let mut taps: Vec<Tap> = Vec::with_capacity(request.interfaces.len());
     for name in &request.interfaces {
-        let ring = PacketRing::open(name, &request.flows, &settings)?;
+        let (ring, tapped, is_second_best) =
+            tap::open(request.tap, name, &request.flows, &settings)?;
+        if is_second_best {
+            console.say(&format!("{name}: {tapped}"));
+        }
         let card = match request.stamps {
             RingStamps::Kernel => None,
             RingStamps::Card => {
@@ -183,6 +194,7 @@ fn open_taps(request: &Request, console: &mut Console) -> Result<Vec<Tap>, LiveE
             gone_ns: None,
             result: InterfaceResult {
                 name: name.clone(),
+                tapped,
                 ..InterfaceResult::default()
             },
         });
@@ -199,6 +211,7 @@ fn describe(buffer: &mut Vec<u8>, request: &Request, taps: &[Tap]) {
     for tap in taps {
         let interface = CaptureInterface {
             name: Some(tap.result.name.clone()),
+            description: Some(tap.result.tapped.clone()),
             link_type: tap.ring.link_type(),
             snap_bytes: request.snap_bytes,
             ..CaptureInterface::default()
@@ -226,15 +239,16 @@ fn drain(
     }
     let link_type = tap.ring.link_type();
     let Tap { ring, result, .. } = tap;
+    let stamps_departures = ring.engine() == TapEngine::Bpf;
     // A ring that fills as fast as it is emptied must not keep the others waiting.
     for _ in 0..ring.frame_count() {
         let buffer = &mut file.buffer;
         let is_there = ring.next_packet(|packet| {
-            match packet.direction {
-                Direction::Outbound => result.outbound_count += 1,
-                _ => result.inbound_count += 1,
-            }
-            result.late_stamp_count += u64::from(packet.source == StampSource::Tap);
+            let is_outbound = packet.direction == Direction::Outbound;
+            result.outbound_count += u64::from(is_outbound);
+            result.inbound_count += u64::from(!is_outbound);
+            let is_late = packet.source == StampSource::Tap && !(is_outbound && stamps_departures);
+            result.late_stamp_count += u64::from(is_late);
             append(buffer, index, packet, link_type);
         });
         if !is_there {
@@ -293,13 +307,18 @@ pub(super) fn append(
 }
 
 fn count(tap: &mut Tap) -> Result<(), LiveError> {
-    tap.result.counters = counters_of(&mut tap.ring, &tap.result.name)?;
+    tap.result.counters = told(tap.ring.counters(), &tap.result.name)?;
+    tap.result.step_count = tap.ring.step_count();
     Ok(())
 }
 
-pub(super) fn counters_of(ring: &mut PacketRing, name: &str) -> Result<RingCounters, LiveError> {
-    ring.counters().map_err(|source| LiveError::Counters {
-        interface: name.to_owned(),
+/// What the kernel counted, if it told.
+pub(super) fn told(
+    counters: io::Result<RingCounters>,
+    interface: &str,
+) -> Result<RingCounters, LiveError> {
+    counters.map_err(|source| LiveError::Counters {
+        interface: interface.to_owned(),
         source,
     })
 }
