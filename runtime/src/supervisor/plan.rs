@@ -1,13 +1,14 @@
 //! From a checked topology to what this supervisor starts: domains, channels, processes. It
 //! starts nothing itself.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use hil_models::egm::messages::Side as ArmSide;
 use hil_models::egm::parameters::{ControllerSettings, EgmParameters};
+use hil_models::link::condition::order_channel;
 use nix::unistd::{AccessFlags, Uid, access};
 
 use super::clock_path;
@@ -36,6 +37,8 @@ pub(crate) struct HostPlan {
     pub(crate) name: String,
     /// Channels in shared memory with an end on this host.
     pub(crate) channels: Vec<Channel>,
+    /// Channels for orders to the directions of emulated links that are emulated here.
+    pub(crate) orders: BTreeSet<String>,
 }
 
 /// A process to start here.
@@ -119,6 +122,7 @@ pub(crate) fn plan(topology: &Topology, hosts: &[&Host]) -> Plan {
         HostPlan {
             name: host.name.clone(),
             channels: channels.cloned().collect(),
+            orders: order_channels(topology, host),
         }
     });
     let clock_paths = hosts.iter().flat_map(|host| clock_path::on(topology, host));
@@ -135,6 +139,17 @@ pub(crate) fn plan(topology: &Topology, hosts: &[&Host]) -> Plan {
         hosts: host_plans.collect(),
         processes,
     }
+}
+
+/// The channels for orders to what is emulated on `host`: it receives.
+fn order_channels(topology: &Topology, host: &Host) -> BTreeSet<String> {
+    let seed = topology.run().seed;
+    topology
+        .crossings()
+        .filter(|crossing| crossing.to_host.name == host.name)
+        .filter_map(|crossing| EmulationLaunch::of(&crossing, seed))
+        .map(|emulation| order_channel(&emulation.link, emulation.way))
+        .collect()
 }
 
 /// What the gateway process of `link` on `host` is called, in reports and in record files.
