@@ -16,8 +16,8 @@
 //! 1. [`topology`]: what runs where; [`supervisor`]: starts, watches and ends it.
 //! 2. [`process`], [`gateway`] and [`face`]: what runs inside each started process.
 //! 3. [`channel`]: shared memory between them; [`mod@record`]: the notes they keep.
-//! 4. [`link`]: what emulated links do, changed while a run goes on.
-//! 5. [`report`]: from the notes to what a person reads.
+//! 4. [`report`]: from the notes to what a person reads.
+//! 5. [`watch`]: looking on while a run goes; [`link`]: changing its emulated links.
 //! 6. [`realtime`], [`clock`], [`wait`], [`host_facts`], [`doctor`]: the machine.
 
 mod analysis;
@@ -52,6 +52,7 @@ pub mod supervisor;
 pub mod topology;
 pub mod trace;
 pub mod wait;
+pub mod watch;
 
 use std::process::ExitCode;
 
