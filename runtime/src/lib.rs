@@ -28,6 +28,7 @@ pub mod cli;
 pub mod clock;
 pub mod clock_discipline;
 mod command;
+pub mod compare;
 pub mod console;
 pub mod doctor;
 pub mod face;
