@@ -5,6 +5,8 @@ use std::path::PathBuf;
 
 use clap::{ArgGroup, Args, Parser, Subcommand};
 
+use crate::compare::cli::{self as compare_cli, CompareArgs};
+use crate::link::cli::LinkCommand;
 use crate::probe::arguments::ProbeArgs;
 use crate::report::page::Format;
 use crate::trace::cli::TraceCommand;
@@ -172,7 +174,8 @@ pub struct ReportArgs {
     /// The folders of the runs.
     #[arg(required = true, value_name = "RUN")]
     pub runs: Vec<PathBuf>,
-    /// Print summary.json instead of the table.
+    /// Print summary.json as the run wrote it; --format json prints the data of a page instead, in a
+    /// layout of its own.
     #[arg(long, conflicts_with_all = ["output", "format", "template", "figure"])]
     pub json: bool,
     /// Write the report to this file (or figures to this folder) instead of printing it.
@@ -254,6 +257,9 @@ pub enum Command {
     /// Print the report of a finished run again, or write it as a page, tables or figures.
     #[command(after_help = REPORT_EXAMPLES)]
     Report(ReportArgs),
+    /// Compare two runs, or two sets of repetitions: delays, losses and scores, with intervals.
+    #[command(after_help = compare_cli::EXAMPLES)]
+    Compare(CompareArgs),
     /// Run the robot of a finished run again in virtual time and compare every message.
     #[command(after_help = REPLAY_EXAMPLES)]
     Replay {
@@ -271,6 +277,15 @@ pub enum Command {
         /// What to do with them.
         #[command(subcommand)]
         command: TraceCommand,
+    },
+    /// Show the links of a run that goes on, and change emulated ones.
+    #[command(
+        after_help = "Examples:\n  hil-runtime link show\n  hil-runtime link set hop --delay 50ms --loss 0.1\n  hil-runtime link reset hop"
+    )]
+    Link {
+        /// What to do with them.
+        #[command(subcommand)]
+        command: LinkCommand,
     },
     /// Say what this host can measure and what to change.
     #[command(
