@@ -10,6 +10,7 @@ mod cli;
 mod clocks;
 mod command;
 mod convert;
+mod disk;
 mod encode;
 mod facts;
 mod info;

@@ -2,8 +2,9 @@
 //! each, and what a kill leaves can be recovered up to the last flush.
 
 use std::collections::BTreeMap;
-use std::fs;
+use std::panic::resume_unwind;
 use std::path::{Path, PathBuf};
+use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use crate::schema::Schema;
@@ -44,7 +45,8 @@ pub(crate) struct Files {
     topics: Vec<KnownTopic>,
     done: Vec<PathBuf>,
     done_bytes: u64,
-    written_count: u64,
+    /// Files on their way to the disk, which takes its time.
+    closing: Vec<JoinHandle<Result<u64, WriteError>>>,
 }
 
 /// Where the `number`th file of a recording that is split goes: before the extension.
@@ -82,7 +84,7 @@ impl Files {
             topics: Vec::new(),
             done: Vec::new(),
             done_bytes: 0,
-            written_count: 0,
+            closing: Vec::new(),
         })
     }
 
@@ -107,16 +109,18 @@ impl Files {
         Ok((is_large || is_old) && self.open.message_count() > 0)
     }
 
-    /// Completes the open file and begins the next.
+    /// Begins the next file and completes the one that was open meanwhile.
     ///
     /// # Errors
-    /// When one of them cannot be written.
+    /// When the next cannot be begun; how the other ended is said by [`Self::finish`].
     pub(crate) fn next(&mut self) -> Result<(), WriteError> {
         let path = numbered(&self.target, self.done.len() + 2);
         check_target(&path, Path::new(""), self.may_replace)?;
         let next = Recording::create_live(&path)?;
         let finished = core::mem::replace(&mut self.open, next);
-        self.finish_one(finished)?;
+        self.done_bytes += finished.size_bytes();
+        self.done.push(finished.path().to_owned());
+        self.closing.push(thread::spawn(move || finished.finish()));
         self.begun = Instant::now();
         for topic in &mut self.topics {
             topic.number = None;
@@ -130,17 +134,13 @@ impl Files {
     /// When it cannot be written.
     pub(crate) fn finish(mut self) -> Result<(Vec<PathBuf>, u64), WriteError> {
         let last = self.open.path().to_owned();
-        self.written_count += self.open.finish()?;
+        let mut written_count = self.open.finish()?;
         self.done.push(last);
-        Ok((self.done, self.written_count))
-    }
-
-    fn finish_one(&mut self, recording: Recording) -> Result<(), WriteError> {
-        let path = recording.path().to_owned();
-        self.written_count += recording.finish()?;
-        self.done_bytes += fs::metadata(&path).map_or(0, |data| data.len());
-        self.done.push(path);
-        Ok(())
+        for closing in self.closing {
+            let closed = closing.join();
+            written_count += closed.unwrap_or_else(|panic| resume_unwind(panic))?;
+        }
+        Ok((self.done, written_count))
     }
 
     /// Bytes of all files so far, as of the last flush.
@@ -196,6 +196,7 @@ impl Sink for Files {
 mod tests {
     use super::*;
     use crate::schema;
+    use std::fs;
 
     #[test]
     fn every_file_of_a_split_recording_is_whole_by_itself() {

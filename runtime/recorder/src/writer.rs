@@ -3,13 +3,16 @@
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
-use std::io::{self, BufWriter};
+use std::io;
 use std::path::{Path, PathBuf};
 use std::process;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{Attachment, Compression, McapError, WriteOptions, Writer};
 
+use crate::disk::QueuedFile;
 use crate::schema::Schema;
 
 /// Messages of about this size are compressed together. The smaller, the less is lost when a file
@@ -79,12 +82,13 @@ impl Stamp {
 
 /// A file being written.
 pub(crate) struct Recording {
-    writer: Option<Writer<BufWriter<File>>>,
+    writer: Option<Writer<QueuedFile>>,
     partial: PathBuf,
     path: PathBuf,
     message_count: u64,
     /// What is not completed stays beside the place where it was to go.
     is_live: bool,
+    length: Arc<AtomicU64>,
 }
 
 /// Says that `path` may be written, before any work is done for it.
@@ -134,7 +138,8 @@ impl Recording {
     }
 
     fn begin(path: &Path, partial: PathBuf, is_live: bool) -> Result<Self, WriteError> {
-        let file = File::create(&partial).map_err(|source| WriteError::Io {
+        let file = File::create(&partial).and_then(QueuedFile::new);
+        let file = file.map_err(|source| WriteError::Io {
             path: partial.clone(),
             source,
         })?;
@@ -145,12 +150,15 @@ impl Recording {
             path: path.to_owned(),
             message_count: 0,
             is_live,
+            length: file.length(),
         };
         let writer = WriteOptions::new()
             .compression(Some(Compression::Zstd))
             .chunk_size(Some(CHUNK_BYTES))
             .library(library)
-            .create(BufWriter::new(file))
+            // A chunk reaches the file whole.
+            .disable_seeking(true)
+            .create(file)
             .map_err(|source| recording.refused(source))?;
         recording.writer = Some(writer);
         Ok(recording)
@@ -166,9 +174,9 @@ impl Recording {
         self.message_count
     }
 
-    /// Size of the file by what has left this process, bytes.
+    /// Size of the file, bytes; what is not compressed yet is not in it.
     pub(crate) fn size_bytes(&self) -> u64 {
-        fs::metadata(&self.partial).map_or(0, |data| data.len())
+        self.length.load(Ordering::Relaxed)
     }
 
     /// The error of having more topics than the container can number.
@@ -186,7 +194,7 @@ impl Recording {
 
     fn with<T>(
         &mut self,
-        work: impl FnOnce(&mut Writer<BufWriter<File>>) -> Result<T, McapError>,
+        work: impl FnOnce(&mut Writer<QueuedFile>) -> Result<T, McapError>,
     ) -> Result<T, WriteError> {
         let writer = self.writer.as_mut();
         let worked = writer.map_or(Err(McapError::AttemptedWriteAfterFailure), work);
@@ -290,10 +298,8 @@ impl Recording {
             source,
         };
         if let Some(writer) = self.writer.take() {
-            let file = writer.into_inner().into_inner();
-            let file = file.map_err(|error| failed(&self.partial, error.into_error()))?;
-            file.sync_all()
-                .map_err(|error| failed(&self.partial, error))?;
+            let written = writer.into_inner().finish();
+            written.map_err(|error| failed(&self.partial, error))?;
         }
         fs::rename(&self.partial, &self.path).map_err(|error| failed(&self.path, error))?;
         Ok(self.message_count)
