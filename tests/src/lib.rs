@@ -7,6 +7,7 @@ pub mod arms;
 pub mod binary;
 pub mod child;
 pub mod lab;
+pub mod mcap_file;
 pub mod run_folder;
 pub mod shuttle;
 pub mod source_tree;

@@ -3,13 +3,16 @@
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
-use std::io::{self, BufWriter};
+use std::io;
 use std::path::{Path, PathBuf};
 use std::process;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{Attachment, Compression, McapError, WriteOptions, Writer};
 
+use crate::disk::QueuedFile;
 use crate::schema::Schema;
 
 /// Messages of about this size are compressed together. The smaller, the less is lost when a file
@@ -22,6 +25,12 @@ pub(crate) enum WriteError {
     /// There is something already.
     #[error("{path} exists already; --force replaces it")]
     Exists {
+        /// The file.
+        path: PathBuf,
+    },
+    /// A killed recorder left it.
+    #[error("{path} is there: `hil-recorder recover` makes a whole file of it; then remove it")]
+    Unfinished {
         /// The file.
         path: PathBuf,
     },
@@ -73,10 +82,13 @@ impl Stamp {
 
 /// A file being written.
 pub(crate) struct Recording {
-    writer: Option<Writer<BufWriter<File>>>,
+    writer: Option<Writer<QueuedFile>>,
     partial: PathBuf,
     path: PathBuf,
     message_count: u64,
+    /// What is not completed stays beside the place where it was to go.
+    is_live: bool,
+    length: Arc<AtomicU64>,
 }
 
 /// Says that `path` may be written, before any work is done for it.
@@ -107,7 +119,27 @@ impl Recording {
     pub(crate) fn create(path: &Path) -> Result<Self, WriteError> {
         let name = path.file_name().unwrap_or_default().to_string_lossy();
         let partial = path.with_file_name(format!(".{name}.{}.partial", process::id()));
-        let file = File::create(&partial).map_err(|source| WriteError::Io {
+        Self::begin(path, partial, false)
+    }
+
+    /// Begins a file that will be called `path` and is called `<path>.partial` until then, where
+    /// whoever looks for it after a kill finds it.
+    ///
+    /// # Errors
+    /// When there is no room, no right or no folder for it, or such a file is there already: what a
+    /// killed recorder left is not written over.
+    pub(crate) fn create_live(path: &Path) -> Result<Self, WriteError> {
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        let partial = path.with_file_name(format!("{name}.partial"));
+        if fs::symlink_metadata(&partial).is_ok() {
+            return Err(WriteError::Unfinished { path: partial });
+        }
+        Self::begin(path, partial, true)
+    }
+
+    fn begin(path: &Path, partial: PathBuf, is_live: bool) -> Result<Self, WriteError> {
+        let file = File::create(&partial).and_then(QueuedFile::new);
+        let file = file.map_err(|source| WriteError::Io {
             path: partial.clone(),
             source,
         })?;
@@ -117,15 +149,39 @@ impl Recording {
             partial,
             path: path.to_owned(),
             message_count: 0,
+            is_live,
+            length: file.length(),
         };
         let writer = WriteOptions::new()
             .compression(Some(Compression::Zstd))
             .chunk_size(Some(CHUNK_BYTES))
             .library(library)
-            .create(BufWriter::new(file))
+            // A chunk reaches the file whole.
+            .disable_seeking(true)
+            .create(file)
             .map_err(|source| recording.refused(source))?;
         recording.writer = Some(writer);
         Ok(recording)
+    }
+
+    /// Where the file will be.
+    pub(crate) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Messages so far.
+    pub(crate) const fn message_count(&self) -> u64 {
+        self.message_count
+    }
+
+    /// Size of the file, bytes; what is not compressed yet is not in it.
+    pub(crate) fn size_bytes(&self) -> u64 {
+        self.length.load(Ordering::Relaxed)
+    }
+
+    /// The error of having more topics than the container can number.
+    pub(crate) fn full(&self) -> WriteError {
+        self.refused(McapError::TooManyChannels)
     }
 
     fn refused(&self, source: McapError) -> WriteError {
@@ -138,7 +194,7 @@ impl Recording {
 
     fn with<T>(
         &mut self,
-        work: impl FnOnce(&mut Writer<BufWriter<File>>) -> Result<T, McapError>,
+        work: impl FnOnce(&mut Writer<QueuedFile>) -> Result<T, McapError>,
     ) -> Result<T, WriteError> {
         let writer = self.writer.as_mut();
         let worked = writer.map_or(Err(McapError::AttemptedWriteAfterFailure), work);
@@ -242,10 +298,8 @@ impl Recording {
             source,
         };
         if let Some(writer) = self.writer.take() {
-            let file = writer.into_inner().into_inner();
-            let file = file.map_err(|error| failed(&self.partial, error.into_error()))?;
-            file.sync_all()
-                .map_err(|error| failed(&self.partial, error))?;
+            let written = writer.into_inner().finish();
+            written.map_err(|error| failed(&self.partial, error))?;
         }
         fs::rename(&self.partial, &self.path).map_err(|error| failed(&self.path, error))?;
         Ok(self.message_count)
@@ -256,6 +310,9 @@ impl Drop for Recording {
     fn drop(&mut self) {
         // Before the file goes: the writer completes it when it is dropped.
         drop(self.writer.take());
+        if self.is_live {
+            return;
+        }
         // After `finish` there is none any more.
         let _is_gone = fs::remove_file(&self.partial).is_ok();
     }
