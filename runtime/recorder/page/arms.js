@@ -3,9 +3,9 @@
 import { FONT, age, make, quantity, surface, write } from "./format.js";
 
 const START = { turn: -0.62, tilt: 0.36, zoom: 1 };
-const CENTRE = [0.22, 0, 0.3];
+const CENTRE = [0.2, 0, 0.26];
 const DISTANCE_M = 2.6;
-const FLOOR_M = { x: [-0.4, 0.9], y: [-0.8, 0.8], step: 0.1 };
+const FLOOR_M = { x: [-0.3, 0.7], y: [-0.6, 0.6], step: 0.1 };
 const TRAIL_S = 2;
 const NEAR_M = 0.2;
 
@@ -48,18 +48,16 @@ export class ArmScene {
   draw(arms, colours, trails) {
     const { context, width, height } = surface(this.canvas);
     this.colours = colours;
-    this.size = Math.min(height * 1.62, width * 1.7);
-    this.middle = [width / 2, height * 0.52];
+    this.size = Math.min(height * 2.3, width * 2.2);
+    this.middle = [width / 2, height * 0.5];
     this.tools = [];
     this.floor(context);
     if (!arms) return;
     const parts = [...this.bodyParts(arms)];
-    for (const arm of arms.arms) {
-      this.linkParts(arm.measured_frames, arms.shapes, this.colourOf(arm, "measured"), false, parts);
-      this.linkParts(arm.desired_frames, arms.shapes, colours.series[1], true, parts);
-    }
+    for (const arm of arms.arms) parts.push(...this.armParts(arm.measured_frames, arms.shapes, this.colourOf(arm)));
     parts.sort((one, other) => other.depth - one.depth);
-    for (const part of parts) part.draw(context);
+    for (const part of parts) paint(context, part, colours);
+    this.ghost(context, arms, width, height);
     for (const arm of arms.arms) this.tool(context, arm, trails?.[arm.side]);
     this.axes(context, height);
     this.list(arms);
@@ -86,67 +84,53 @@ export class ArmScene {
   }
 
   // A plain column to which the arms are mounted, for orientation; its size is not the robot's.
-  *bodyParts(arms) {
+  bodyParts(arms) {
     const mounts = arms.arms.map((arm) => (arm.measured_frames ?? arm.desired_frames)?.[0]).filter(Boolean);
-    if (mounts.length === 0) return;
+    if (mounts.length === 0) return [];
     const top = mounts.reduce((sum, mount) => sum.map((value, axis) => value + mount[axis] / mounts.length), [0, 0, 0]);
-    const foot = [top[0] - 0.03, top[1], 0];
-    yield* this.capsule(foot, top, 0.07, this.colours.faint, false, 0.55);
-    for (const mount of mounts) yield* this.capsule(top, mount.slice(0, 3), 0.055, this.colours.faint, false, 0.55);
+    const column = this.rod([top[0] - 0.02, top[1], 0.03], top, 0.06, this.colours.faint);
+    return [column, ...mounts.map((mount) => this.rod(top, mount, 0.05, this.colours.faint))].filter(Boolean);
   }
 
-  linkParts(frames, shapes, colour, isGhost, parts) {
-    if (!frames) return;
-    for (const shape of shapes) {
-      const [from, to] = [frames[shape.from], frames[shape.to]];
-      if (from && to) parts.push(...this.capsule(from, to, shape.radius_m, colour, isGhost, 1));
-    }
-    const flange = frames[frames.length - 1];
-    if (flange) parts.push(...this.gripper(flange, colour, isGhost));
+  armParts(frames, shapes, colour) {
+    if (!frames) return [];
+    const rods = shapes.map((shape) => this.rod(frames[shape.from], frames[shape.to], shape.radius_m, colour));
+    return [...rods, ...this.fingers(frames.at(-1), colour)].filter(Boolean);
   }
 
   // Two fingers along the tool's z axis, so that its turn can be seen.
-  gripper(frame, colour, isGhost) {
+  fingers(frame, colour) {
     const across = rotate(frame, [0.02, 0, 0]);
     const along = rotate(frame, [0, 0, 0.06]);
     const add = (sign, share) => [0, 1, 2].map((axis) => frame[axis] + sign * across[axis] + share * along[axis]);
-    return [-1, 1].flatMap((sign) => this.capsule(add(sign, 0), add(sign, 1), 0.008, colour, isGhost, 1));
+    return [-1, 1].map((sign) => this.rod(add(sign, 0), add(sign, 1), 0.008, colour));
   }
 
-  // A rod with round ends: a thick line, shaded by a lighter thin one.
-  capsule(from, to, radius, colour, isGhost, strength) {
-    const [a, b] = [this.project(from), this.project(to)];
-    if (!a || !b) return [];
-    const width = Math.max(radius * (a.scale + b.scale), 2);
-    const stroke = (context, style, line, alpha, shift = 0) => {
-      context.globalAlpha = alpha;
-      context.strokeStyle = style;
-      context.lineWidth = line;
-      context.beginPath();
-      context.moveTo(a.x + shift, a.y + shift);
-      context.lineTo(b.x + shift, b.y + shift);
-      context.stroke();
-      context.globalAlpha = 1;
-    };
-    const { panel, ink } = this.colours;
-    const draw = (context) => {
-      context.lineCap = "round";
-      if (isGhost) {
-        context.setLineDash([]);
-        stroke(context, colour, width * 1.12 + 2, 0.2);
-        context.setLineDash([5, 5]);
-        stroke(context, colour, 1.6, 0.95);
-        context.setLineDash([]);
-        return;
-      }
-      stroke(context, panel, width + 3, 1);
-      stroke(context, colour, width, strength);
-      stroke(context, ink, width * 0.98, 0.1);
-      stroke(context, colour, width * 0.72, strength, -width * 0.06);
-      stroke(context, "#ffffff", width * 0.2, 0.3 * strength, -width * 0.16);
-    };
-    // Outlines lie a little nearer, so that a robot that follows exactly still shows both.
-    return [{ depth: (a.depth + b.depth) / 2 - (isGhost ? 0.02 : 0), draw }];
+  // A rod with round ends as the screen has it; undefined when it is behind the eye.
+  rod(from, to, radius, colour) {
+    const [a, b] = [from && this.project(from), to && this.project(to)];
+    if (!a || !b) return undefined;
+    return { a, b, colour, width: Math.max(radius * (a.scale + b.scale), 2), depth: (a.depth + b.depth) / 2 };
+  }
+
+  // What was commanded, as the outline of the whole arm: drawn thick, then hollowed out.
+  ghost(context, arms, width, height) {
+    const layer = (this.layer ??= document.createElement("canvas"));
+    layer.width = this.canvas.width;
+    layer.height = this.canvas.height;
+    const pen = layer.getContext("2d");
+    const ratio = layer.width / width;
+    pen.setTransform(ratio, 0, 0, ratio, 0, 0);
+    pen.lineCap = "round";
+    const colour = this.colours.series[1];
+    const rods = arms.arms.flatMap((arm) => this.armParts(arm.desired_frames, arms.shapes, colour));
+    for (const rod of rods) stroke(pen, rod, colour, rod.width + 1.6, 1);
+    pen.globalCompositeOperation = "destination-out";
+    for (const rod of rods) stroke(pen, rod, "#000", Math.max(rod.width - 1.6, 0.5), 1);
+    pen.globalCompositeOperation = "destination-over";
+    for (const rod of rods) stroke(pen, rod, colour, rod.width, 0.05);
+    pen.globalCompositeOperation = "source-over";
+    context.drawImage(layer, 0, 0, width, height);
   }
 
   tool(context, arm, trail) {
@@ -227,6 +211,28 @@ export class ArmScene {
     const each = arms.arms.map((arm) => `${arm.side} arm: tool error ${quantity(arm.tool_error_mm, "mm", 1)}`);
     return `The arms in space. ${each.join("; ")}.`;
   }
+}
+
+function stroke(context, { a, b }, style, width, alpha, shift = 0) {
+  context.globalAlpha = alpha;
+  context.strokeStyle = style;
+  context.lineWidth = width;
+  context.beginPath();
+  context.moveTo(a.x + shift, a.y + shift);
+  context.lineTo(b.x + shift, b.y + shift);
+  context.stroke();
+  context.globalAlpha = 1;
+}
+
+// A thick line, darker at its edge and with a light along it.
+function paint(context, rod, colours) {
+  const { width, colour } = rod;
+  context.lineCap = "round";
+  stroke(context, rod, colours.panel, width + 3, 1);
+  stroke(context, rod, colour, width, 1);
+  stroke(context, rod, "#000000", width, 0.16);
+  stroke(context, rod, colour, width * 0.72, 0.9, -width * 0.05);
+  stroke(context, rod, "#ffffff", width * 0.2, 0.28, -width * 0.15);
 }
 
 // A vector turned by a frame's quaternion [.., w, x, y, z].

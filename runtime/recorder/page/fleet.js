@@ -14,7 +14,7 @@ export class FleetScene {
 
   legend() {
     const entry = (kind, words, text = "") => make("li", {}, make("i", { class: kind }, text), words);
-    return [entry("thick", "way granted"), entry("dashed", "planned way"), entry("area", "critical section, colour of who may pass"),
+    return [entry("thick", "way granted"), entry("dashed", "planned way"), entry("area", "critical section: colour of who may pass"),
       entry("both", "more than one may pass"), entry("stale", "stale"), entry("cross", "collision", "×")];
   }
 

@@ -8,16 +8,16 @@ const known = (value) => typeof value === "number" && Number.isFinite(value);
 export function figures(value) {
   const size = Math.abs(value);
   if (size === 0) return "0";
-  const digits = Math.max(0, 2 - Math.floor(Math.log10(size)));
+  const digits = Math.max(0, 2 - Math.floor(Math.log10(size * 1.0005)));
   return value.toFixed(Math.min(digits, 6));
 }
 
 export function microseconds(value) {
   if (!known(value)) return UNAVAILABLE;
   const size = Math.abs(value);
-  if (size >= 1e6) return `${figures(value / 1e6)} s`;
-  if (size >= 1e3) return `${figures(value / 1e3)} ms`;
-  if (size >= 1 || size === 0) return `${figures(value)} µs`;
+  if (size >= 0.9995e6) return `${figures(value / 1e6)} s`;
+  if (size >= 0.9995e3) return `${figures(value / 1e3)} ms`;
+  if (size >= 0.9995 || size === 0) return `${figures(value)} µs`;
   return `${figures(value * 1e3)} ns`;
 }
 

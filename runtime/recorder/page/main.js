@@ -153,7 +153,8 @@ function drawPanels(moment) {
   const run = shelves.run.at(moment)?.value ?? shelves.run.at(Infinity)?.value;
   if (!run) return;
   showRun(run, elapsedAt(moment));
-  const samples = shelves.channels.between(moment - strips.span_s - 1, moment);
+  const stretch_s = strips.stretch(moment - (shelves.channels.oldest ?? moment));
+  const samples = shelves.channels.between(moment - stretch_s - 1, moment);
   const newest = samples.at(-1)?.value ?? at("channels", moment);
   showFacts(run, newest);
   showWarnings(run.warnings);
@@ -164,6 +165,8 @@ function drawPanels(moment) {
     table.show(newest.channels, run, strips.choice.value);
     strips.offer(newest.channels.map((channel) => channel.name));
     strips.draw(samples, losses, moment, colours);
+    write(byId("axis-start"), `${Math.round(stretch_s)} s before`);
+    write(byId("axis-end"), view.isPaused ? "moment shown" : "now");
   }
   const fleet = scene === "fleet" ? at("fleet", moment) : undefined;
   showEvents(losses, fleet?.collisions ?? [], (at_s) => at_s);

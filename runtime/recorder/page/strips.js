@@ -5,10 +5,11 @@ import { FONT, UNAVAILABLE, make, microseconds, surface, write } from "./format.
 const WHOLE = "published to taken";
 const LEFT_PX = 58;
 const SMALLEST_US = 1;
+const SHORTEST_S = 10;
 
 export class Strips {
   constructor(list, choice) {
-    Object.assign(this, { list, choice, strips: new Map(), names: "", isLog: true, span_s: 60 });
+    Object.assign(this, { list, choice, strips: new Map(), names: "", isLog: true, span_s: 60, drawn_s: SHORTEST_S });
   }
 
   // The channels to choose from; "" is all of them at once.
@@ -41,12 +42,18 @@ export class Strips {
     return isOne ? segments : [whole(chosen, WHOLE), ...segments];
   }
 
+  // The stretch drawn: what was chosen, or what there is yet.
+  stretch(kept_s) {
+    this.drawn_s = Math.min(this.span_s, Math.max(kept_s, SHORTEST_S));
+    return this.drawn_s;
+  }
+
   draw(samples, losses, moment, colours) {
     const newest = samples.at(-1)?.value;
     if (!newest) return;
     const wanted = this.wanted(newest);
     const present = new Set();
-    this.list.style.setProperty("--strip", `${wanted.length > 5 ? 44 : wanted.length > 3 ? 62 : 84}px`);
+    this.list.style.setProperty("--strip", `${wanted.length > 6 ? 40 : wanted.length > 3 ? 58 : 84}px`);
     for (const one of wanted) {
       const key = `${one.channel}\n${one.label}`;
       present.add(key);
@@ -64,7 +71,7 @@ export class Strips {
     const values = make("output", { "data-strip": `${one.channel} ${one.label}` });
     const canvas = make("canvas", { role: "img" });
     const label = make("div", { class: "label" }, make("span", {}, one.label), values);
-    const item = make("li", { class: "strip" }, label, canvas);
+    const item = make("li", { class: "strip" }, label, make("div", { class: "plot" }, canvas));
     this.list.append(item);
     return { item, values, canvas };
   }
@@ -83,15 +90,15 @@ export class Strips {
     write(strip.values, words);
     strip.values.dataset.points = points.filter((point) => point.figures?.p50_us != null).length;
     if (isEmpty) return;
-    strip.canvas.setAttribute("aria-label", `${one.channel}, ${one.label}, last ${this.span_s} s: ${words}`);
+    strip.canvas.setAttribute("aria-label", `${one.channel}, ${one.label}, last ${Math.round(this.drawn_s)} s: ${words}`);
     const ticks = losses.filter((loss) => loss.channel === one.channel);
     this.paint(strip.canvas, points, ticks, moment, colours);
   }
 
   paint(canvas, points, ticks, moment, colours) {
     const { context, width, height } = surface(canvas);
-    const from = moment - this.span_s;
-    const x = (time) => LEFT_PX + ((time - from) / this.span_s) * (width - LEFT_PX - 2);
+    const from = moment - this.drawn_s;
+    const x = (time) => LEFT_PX + ((time - from) / this.drawn_s) * (width - LEFT_PX - 2);
     const scale = this.isLog ? logScale(points, height) : linearScale(points, height);
     this.grid(context, scale, x, width, height, from, colours);
     this.silences(context, points, x, height, colours);
@@ -134,7 +141,7 @@ export class Strips {
       context.fillStyle = colours.faint;
       context.fillText(value === 0 ? "0" : microseconds(value).replace(/\.0+ /, " "), LEFT_PX - 6, Math.min(Math.max(y, 7), height - 7));
     }
-    const step = this.span_s / 6;
+    const step = this.drawn_s / 6;
     context.strokeStyle = colours.rule;
     for (let number = 1; number < 6; number += 1) {
       context.beginPath();
