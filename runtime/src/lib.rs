@@ -17,7 +17,8 @@
 //! 2. [`process`], [`gateway`] and [`face`]: what runs inside each started process.
 //! 3. [`channel`]: shared memory between them; [`mod@record`]: the notes they keep.
 //! 4. [`report`]: from the notes to what a person reads.
-//! 5. [`realtime`], [`clock`], [`wait`], [`host_facts`], [`doctor`]: the machine.
+//! 5. [`watch`]: looking on while a run goes.
+//! 6. [`realtime`], [`clock`], [`wait`], [`host_facts`], [`doctor`]: the machine.
 
 mod analysis;
 pub mod card_clock;
@@ -50,6 +51,7 @@ pub mod supervisor;
 pub mod topology;
 pub mod trace;
 pub mod wait;
+pub mod watch;
 
 use std::process::ExitCode;
 

@@ -187,7 +187,16 @@ impl RecordHeader {
         Ok(bytes)
     }
 
-    fn decode(path: &Path, bytes: &[u8]) -> Result<Self, RecordFileError> {
+    /// The name of the process that wrote the file called `name`, which has this header; `None`
+    /// when the name is not made as [`RecordHeader::file_name`] makes it.
+    pub fn writer<'a>(&self, name: &'a str) -> Option<&'a str> {
+        let start = format!("{}.{}.", self.channel.replace('/', "."), self.kind.row().2);
+        let end = format!(".{}.rec", self.instance);
+        name.strip_prefix(&start)?.strip_suffix(&end)
+    }
+
+    /// Reads a header off the beginning of a file.
+    pub(crate) fn decode(path: &Path, bytes: &[u8]) -> Result<Self, RecordFileError> {
         let Some(header) = bytes.first_chunk::<HEADER_BYTES>() else {
             return Err(malformed(
                 path,

@@ -1,17 +1,25 @@
 //! The shared-memory domains a supervisor owns: one per host that runs here, with every channel
 //! created and held, so that the processes it starts only ever open.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::thread;
+use std::time::{Duration, Instant as WallInstant};
 
 use super::plan::{HostPlan, domain_base, domain_root};
 use crate::channel::{ChannelError, ChannelHolder, ChannelSettings, Domain, DomainError, TypeInfo};
+use crate::topology::Channel;
+use crate::watch::observer_depth;
 
 /// Writers at a time: one, and its successor while the dead one is not cleaned up yet.
 const WRITERS_MAX: usize = 2;
 /// Readers at a time: consumer or gateway, its successor, and room for four observers.
 const READERS_MAX: usize = 6;
+/// Observers look about fifty times a second and leave when they see that the run is over; one that
+/// does not has its memory taken from under it.
+const OBSERVERS_LEAVE_WITHIN: Duration = Duration::from_millis(500);
+const OBSERVERS_PAUSE: Duration = Duration::from_millis(5);
 
 /// Why a domain could not be made.
 #[derive(Debug, thiserror::Error)]
@@ -87,6 +95,20 @@ impl Domains {
         }
     }
 
+    /// Waits until all observers have left, a little while at most: what leaves in order leaves
+    /// nothing behind.
+    pub(crate) fn let_observers_leave(&self) {
+        let deadline = WallInstant::now() + OBSERVERS_LEAVE_WITHIN;
+        let is_observed = || {
+            self.hosts
+                .iter()
+                .any(|host| host.domain.observer_count() > 0)
+        };
+        while is_observed() && WallInstant::now() < deadline {
+            thread::sleep(OBSERVERS_PAUSE);
+        }
+    }
+
     /// Deletes everything; says what could not be deleted.
     pub(crate) fn remove(self) -> Vec<String> {
         let mut left = Vec::new();
@@ -133,6 +155,18 @@ fn sweep(base: &Path) {
     }
 }
 
+/// What the channel allows, not what its consumer asks for: observers of messages that nobody
+/// records come by less often than a consumer.
+fn depth_max(channel: &Channel, observed: &BTreeSet<String>) -> usize {
+    if observed.contains(&channel.name) {
+        channel
+            .depth
+            .max(observer_depth(channel.message.size_bytes))
+    } else {
+        channel.depth
+    }
+}
+
 fn create_host(
     plan: &HostPlan,
     base: Option<&PathBuf>,
@@ -153,7 +187,7 @@ fn create_host(
                 size_bytes: channel.message.size_bytes,
                 alignment_bytes: channel.message.alignment_bytes,
             },
-            depth_max: channel.depth,
+            depth_max: depth_max(channel, &plan.observed),
             writers_max: WRITERS_MAX,
             readers_max: READERS_MAX,
         };
