@@ -7,8 +7,11 @@ use std::path::{Path, PathBuf};
 use std::thread;
 use std::time::{Duration, Instant as WallInstant};
 
+use hil_models::link::condition::{LinkOrder, ORDER_TYPE_NAME};
+
 use super::plan::{HostPlan, domain_base, domain_root};
 use crate::channel::{ChannelError, ChannelHolder, ChannelSettings, Domain, DomainError, TypeInfo};
+use crate::gateway::link_control::ORDERS_MAX;
 use crate::topology::Channel;
 use crate::watch::observer_depth;
 
@@ -179,18 +182,19 @@ fn create_host(
         source,
     })?;
     let mut holders = Vec::new();
-    for channel in &plan.channels {
-        let settings = ChannelSettings {
-            name: channel.name.clone(),
-            message: TypeInfo {
-                name: channel.message.name.clone(),
-                size_bytes: channel.message.size_bytes,
-                alignment_bytes: channel.message.alignment_bytes,
-            },
-            depth_max: depth_max(channel, &plan.observed),
-            writers_max: WRITERS_MAX,
-            readers_max: READERS_MAX,
-        };
+    let of_messages = plan.channels.iter().map(|channel| ChannelSettings {
+        name: channel.name.clone(),
+        message: TypeInfo {
+            name: channel.message.name.clone(),
+            size_bytes: channel.message.size_bytes,
+            alignment_bytes: channel.message.alignment_bytes,
+        },
+        depth_max: depth_max(channel, &plan.observed),
+        writers_max: WRITERS_MAX,
+        readers_max: READERS_MAX,
+    });
+    let of_orders = plan.orders.iter().map(|name| order_settings(name));
+    for settings in of_messages.chain(of_orders) {
         let holder =
             ChannelHolder::create(&domain, &settings).map_err(|source| DomainsError::Channel {
                 host: host.clone(),
@@ -203,4 +207,19 @@ fn create_host(
         holders,
         domain,
     })
+}
+
+/// A channel for orders to an emulated link: one gives them at a time, the gateway takes them.
+fn order_settings(name: &str) -> ChannelSettings {
+    ChannelSettings {
+        name: name.to_owned(),
+        message: TypeInfo {
+            name: ORDER_TYPE_NAME.to_owned(),
+            size_bytes: size_of::<LinkOrder>(),
+            alignment_bytes: align_of::<LinkOrder>(),
+        },
+        depth_max: ORDERS_MAX,
+        writers_max: WRITERS_MAX,
+        readers_max: WRITERS_MAX,
+    }
 }

@@ -8,6 +8,7 @@ use std::time::Duration;
 
 use hil_models::egm::messages::Side as ArmSide;
 use hil_models::egm::parameters::{ControllerSettings, EgmParameters};
+use hil_models::link::condition::order_channel;
 use nix::unistd::{AccessFlags, Uid, access};
 
 use super::clock_path;
@@ -40,6 +41,8 @@ pub(crate) struct HostPlan {
     /// Names of those whose messages no process here records: who wants to see them looks into
     /// the shared memory of this host.
     pub(crate) observed: BTreeSet<String>,
+    /// Channels for orders to the directions of emulated links that are emulated here.
+    pub(crate) orders: BTreeSet<String>,
 }
 
 /// A process to start here.
@@ -128,6 +131,7 @@ pub(crate) fn plan(topology: &Topology, hosts: &[&Host]) -> Plan {
             name: host.name.clone(),
             observed: observed.map(|channel| channel.name.clone()).collect(),
             channels: channels.cloned().collect(),
+            orders: order_channels(topology, host),
         }
     });
     let clock_paths = hosts.iter().flat_map(|host| clock_path::on(topology, host));
@@ -144,6 +148,17 @@ pub(crate) fn plan(topology: &Topology, hosts: &[&Host]) -> Plan {
         hosts: host_plans.collect(),
         processes,
     }
+}
+
+/// The channels for orders to what is emulated on `host`: it receives.
+fn order_channels(topology: &Topology, host: &Host) -> BTreeSet<String> {
+    let seed = topology.run().seed;
+    topology
+        .crossings()
+        .filter(|crossing| crossing.to_host.name == host.name)
+        .filter_map(|crossing| EmulationLaunch::of(&crossing, seed))
+        .map(|emulation| order_channel(&emulation.link, emulation.way))
+        .collect()
 }
 
 /// What the gateway process of `link` on `host` is called, in reports and in record files.
