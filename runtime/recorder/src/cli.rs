@@ -1,5 +1,6 @@
 //! The command line: definitions only. What a command does is in [`crate::command`].
 
+use std::net::IpAddr;
 use std::path::PathBuf;
 
 use clap::{Parser, Subcommand};
@@ -12,6 +13,8 @@ Examples:
       topics, counts, times, and what the file says of its run
   hil-recorder recover broken.mcap -o whole.mcap
       a whole file of what a killed writer left
+  hil-recorder serve runs/fleet-emulated-20261122-101806 --loop
+      a run in the browser, and in whatever speaks the Foxglove WebSocket
 
 Exit codes:
   0  done                              70  internal error
@@ -19,6 +22,16 @@ Exit codes:
      gaps; or it could not be done     131 interrupted twice
   2  wrong arguments, or not a run's
      folder or an MCAP file";
+
+const SERVE_EXAMPLES: &str = "\
+Examples:
+  hil-recorder serve runs/fleet-emulated-20261122-101806 --loop
+      a finished run again and again; the page is at http://127.0.0.1:8766/
+  ssh -L 8765:localhost:8765 -L 8766:localhost:8766 control-pc
+      from another PC, then the same address; nothing is open to the network
+
+Lichtblick and Foxglove connect to ws://127.0.0.1:8765. Topics and fields are in docs/live-view.md.
+It ends with Ctrl-C; the exit code is 0 then.";
 
 const CONVERT_EXAMPLES: &str = "\
 Examples:
@@ -87,4 +100,32 @@ pub(crate) enum Command {
         #[arg(long)]
         json: bool,
     },
+    /// Show a run in the browser and in viewers that speak the Foxglove WebSocket.
+    #[command(after_help = SERVE_EXAMPLES)]
+    Serve {
+        /// The run's folder.
+        #[arg(value_name = "RUN")]
+        run: PathBuf,
+        /// Address to listen at; another than this machine's own lets others in.
+        #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1")]
+        host: IpAddr,
+        /// Port of the socket; 0 takes one that is free.
+        #[arg(long, value_name = "PORT", default_value_t = 8765)]
+        port: u16,
+        /// Port of the page; 0 takes one that is free.
+        #[arg(long, value_name = "PORT", default_value_t = 8766)]
+        http_port: u16,
+        /// How fast a finished run is played back, 0.01 to 100.
+        #[arg(long, value_name = "FACTOR", default_value_t = 1.0, value_parser = speed)]
+        speed: f64,
+        /// Play a finished run again and again.
+        #[arg(long = "loop")]
+        repeats: bool,
+    },
+}
+
+fn speed(text: &str) -> Result<f64, String> {
+    let speed = text.parse::<f64>().ok();
+    let speed = speed.filter(|speed| (0.01..=100.0).contains(speed));
+    speed.ok_or_else(|| "must be a number from 0.01 to 100".to_owned())
 }

@@ -13,6 +13,7 @@ use crate::convert::{ConvertError, convert};
 use crate::info::info;
 use crate::recover::{RecoverError, loss_words, recover};
 use crate::scan::ScanError;
+use crate::serve::{ServeError, ServeOptions, serve};
 use crate::writer::{WriteError, check_target};
 
 /// Exit codes, as `--help` lists them; those of `hil-runtime`.
@@ -53,6 +54,24 @@ pub(crate) fn run() -> ExitCode {
                 .unwrap_or_else(|console| recover_file((&broken, &output), &signals, console))
         }
         Command::Info { file, json } => show(&file, json, &signals, &mut console),
+        Command::Serve {
+            run,
+            host,
+            port,
+            http_port,
+            speed,
+            repeats,
+        } => {
+            let options = ServeOptions {
+                run,
+                host,
+                port,
+                http_port,
+                speed,
+                repeats,
+            };
+            serve_run(&options, &signals, &mut console)
+        }
     };
     ExitCode::from(code)
 }
@@ -85,6 +104,19 @@ impl Patience {
     fn progress(&self, console: &mut Console, words: &str) {
         if self.since.elapsed() >= SILENCE {
             console.progress(words);
+        }
+    }
+}
+
+fn serve_run(options: &ServeOptions, signals: &Signals, console: &mut Console) -> u8 {
+    match serve(options, signals, console) {
+        Ok(code) => u8::try_from(code).unwrap_or(exit::FAILED),
+        Err(error) => {
+            console.error(&error.to_string());
+            match error {
+                ServeError::Run(_) => exit::USAGE,
+                _ => exit::FAILED,
+            }
         }
     }
 }

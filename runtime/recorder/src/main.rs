@@ -12,11 +12,13 @@ mod convert;
 mod encode;
 mod facts;
 mod info;
+mod live;
 mod net;
 mod recover;
 mod run;
 mod scan;
 mod schema;
+mod serve;
 mod topics;
 mod writer;
 

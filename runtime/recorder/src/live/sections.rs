@@ -1,0 +1,117 @@
+//! Critical sections as ground: for two robots on their paths, where their vehicles can meet, who
+//! is in it and whose grant reaches into it. Who should go first is the coordinator's business.
+
+use std::collections::BTreeMap;
+
+use hil_models::fleet::geometry::{Footprint, Pose};
+use hil_models::fleet::path::{Path, PathId};
+use hil_models::fleet::section::Side;
+use hil_models::fleet::world::World;
+use serde_json::{Value, json};
+
+use super::polygon::{Point, hull, shared};
+use super::rounded;
+
+/// Poses of a path's part whose ground makes its hull.
+const POSES_MAX: usize = 40;
+/// Areas that are remembered; beyond, all are forgotten and worked out again.
+const AREAS_MAX: usize = 20_000;
+
+/// The ground of critical sections, worked out once each.
+#[derive(Debug)]
+pub(crate) struct Areas {
+    vehicle: Footprint,
+    known: BTreeMap<(u32, u32, usize), Vec<Point>>,
+}
+
+impl Areas {
+    /// Of vehicles with this ground plan.
+    pub(crate) const fn new(vehicle: Footprint) -> Self {
+        Self {
+            vehicle,
+            known: BTreeMap::new(),
+        }
+    }
+
+    /// The ground of a section of two paths of `world`, by its place among theirs: what both
+    /// vehicles can cover, as a convex polygon around it. Empty when there is no such section.
+    pub(crate) fn of(
+        &mut self,
+        world: &World,
+        (one, other): (PathId, PathId),
+        section: usize,
+    ) -> &[Point] {
+        if self.known.len() > AREAS_MAX {
+            self.known.clear();
+        }
+        let vehicle = self.vehicle;
+        let key = (one.0, other.0, section);
+        self.known.entry(key).or_insert_with(|| {
+            let sections = world.sections.between(one, other);
+            let Some(section) = sections.get(section) else {
+                return Vec::new();
+            };
+            let ground = |side, path: PathId| {
+                let part = (section.start(side), section.end(side));
+                hull(covered(world.path(path), part, &vehicle))
+            };
+            let area = shared(&ground(Side::First, one), &ground(Side::Second, other));
+            area.iter().map(|point| point.map(rounded)).collect()
+        })
+    }
+}
+
+/// Corners of the vehicle at poses of the path's part, its ends among them.
+fn covered(path: &Path, (from, to): (usize, usize), vehicle: &Footprint) -> Vec<Point> {
+    let to = to.min(path.last_index());
+    let step = to.saturating_sub(from).div_ceil(POSES_MAX).max(1);
+    let poses = path.poses();
+    let part = (from..to).step_by(step).chain([to]);
+    let at = |pose: &Pose| vehicle.at(pose).corners();
+    part.flat_map(|index| at(&poses[index])).collect()
+}
+
+/// A robot on a mission.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct OnPath {
+    /// Its number.
+    pub(crate) robot: u32,
+    /// Its path.
+    pub(crate) path: PathId,
+    /// The last pose it passed.
+    pub(crate) index: usize,
+    /// The last pose it may reach.
+    pub(crate) granted: usize,
+}
+
+/// The sections that two robots of `fleet` still have before them or are in, as `/live/fleet`
+/// lists them.
+pub(crate) fn of_pair(
+    world: &World,
+    areas: &mut Areas,
+    fleet: u32,
+    (one, other): (&OnPath, &OnPath),
+    list: &mut Vec<Value>,
+) {
+    let sections = world.sections.between(one.path, other.path);
+    for (index, section) in sections.iter().enumerate() {
+        let sides = [(one, Side::First), (other, Side::Second)];
+        if sides.iter().any(|(robot, side)| robot.index > section.end(*side)) {
+            continue;
+        }
+        let that = |is: &dyn Fn(&OnPath, Side) -> bool| -> Vec<u32> {
+            let robots = sides.iter().filter(|(robot, side)| is(robot, *side));
+            robots.map(|(robot, _)| robot.robot).collect()
+        };
+        let inside = that(&|robot, side| robot.index >= section.start(side));
+        let may_pass = that(&|robot, side| robot.granted >= section.start(side));
+        list.push(json!({
+            "id": format!("{fleet}:{}-{}:{index}", one.robot, other.robot),
+            "fleet": fleet,
+            "robots": [one.robot, other.robot],
+            "may_pass": may_pass,
+            "inside": inside,
+            "polygon": areas.of(world, (one.path, other.path), index),
+        }));
+    }
+}

@@ -1,0 +1,123 @@
+//! Figures over the last second: counts of what happened in it and percentiles of what was measured
+//! in it. It knows no clock; "now" is an argument.
+
+use std::collections::VecDeque;
+
+use serde_json::{Value, json};
+
+/// How far back figures look, nanoseconds.
+pub(crate) const WINDOW_NS: i64 = 1_000_000_000;
+
+/// Values kept at most; beyond, the oldest go, and figures are of the newest.
+const SAMPLES_MAX: usize = 4096;
+
+/// Instants within the window.
+#[derive(Debug, Default)]
+pub(crate) struct Recent {
+    /// Count per slot of a tenth of the window, so that any rate costs the same.
+    slots: VecDeque<(i64, u64)>,
+}
+
+/// A slot's length, nanoseconds.
+const SLOT_NS: i64 = WINDOW_NS / 20;
+
+impl Recent {
+    /// `count` things happened at `at_ns`.
+    pub(crate) fn add(&mut self, at_ns: i64, count: u64) {
+        let slot = at_ns.div_euclid(SLOT_NS);
+        match self.slots.back_mut() {
+            // What comes late counts where the newest is: it was learned then.
+            Some((last, sum)) if *last >= slot => *sum += count,
+            _ => self.slots.push_back((slot, count)),
+        }
+    }
+
+    /// How many happened in the window before `now_ns`.
+    pub(crate) fn count(&mut self, now_ns: i64) -> u64 {
+        let oldest = (now_ns - WINDOW_NS).div_euclid(SLOT_NS);
+        while self.slots.front().is_some_and(|(slot, _)| *slot <= oldest) {
+            self.slots.pop_front();
+        }
+        self.slots.iter().map(|(_, count)| count).sum()
+    }
+}
+
+/// Durations measured within the window.
+#[derive(Debug, Default)]
+pub(crate) struct Samples {
+    values: VecDeque<(i64, i64)>,
+    /// True once there was one: whether this host has the two stages at all.
+    pub(crate) is_available: bool,
+    sorted: Vec<i64>,
+}
+
+impl Samples {
+    /// `value_ns` was learned at `at_ns`.
+    pub(crate) fn add(&mut self, at_ns: i64, value_ns: i64) {
+        self.is_available = true;
+        if self.values.len() == SAMPLES_MAX {
+            self.values.pop_front();
+        }
+        self.values.push_back((at_ns, value_ns));
+    }
+
+    /// `p50_us`, `p99_us`, `max_us`, `count` and `is_available` of the window before `now_ns`.
+    pub(crate) fn figures(&mut self, now_ns: i64) -> Value {
+        let oldest_ns = now_ns - WINDOW_NS;
+        while self.values.front().is_some_and(|(at, _)| *at <= oldest_ns) {
+            self.values.pop_front();
+        }
+        self.sorted.clear();
+        self.sorted.extend(self.values.iter().map(|(_, value)| value));
+        self.sorted.sort_unstable();
+        let at = |share: f64| {
+            let rank = (share * self.sorted.len() as f64).ceil() as usize;
+            let value = self.sorted.get(rank.saturating_sub(1));
+            value.map(|ns| microseconds(*ns))
+        };
+        json!({
+            "p50_us": at(0.5), "p99_us": at(0.99), "max_us": at(1.0),
+            "count": self.sorted.len(), "is_available": self.is_available,
+        })
+    }
+}
+
+/// To a tenth, as far as any stamp means something.
+fn microseconds(ns: i64) -> f64 {
+    (ns as f64 / 100.0).round() / 10.0
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_older_than_a_second_does_not_count() {
+        let mut recent = Recent::default();
+        for tick in 0..300 {
+            recent.add(tick * 10_000_000, 1);
+        }
+        let count = recent.count(3_000_000_000);
+        assert!((95..=105).contains(&count), "{count}");
+        assert_eq!(recent.count(9_000_000_000), 0);
+    }
+
+    #[test]
+    fn percentiles_are_those_of_the_window() {
+        let mut samples = Samples::default();
+        assert_eq!(samples.figures(0)["is_available"], false);
+        assert_eq!(samples.figures(0)["p50_us"], Value::Null);
+        samples.add(0, 900_000);
+        for index in 1..=100 {
+            samples.add(WINDOW_NS + index, index * 1000);
+        }
+        let figures = samples.figures(WINDOW_NS + 200);
+        assert_eq!(figures["count"], 100);
+        assert_eq!(figures["p50_us"], 50.0);
+        assert_eq!(figures["p99_us"], 99.0);
+        assert_eq!(figures["max_us"], 100.0);
+        let later = samples.figures(3 * WINDOW_NS);
+        assert_eq!((&later["count"], &later["max_us"]), (&json!(0), &Value::Null));
+        assert_eq!(later["is_available"], true);
+    }
+}
