@@ -15,6 +15,7 @@ const PANELS_EVERY_MS = 150;
 const SILENT_S = 3;
 const CONFIG_RETRY_MS = 1500;
 const STEP_S = 0.5;
+const SCENES = { fleet: "fleet", teleoperation: "arms" };
 
 const shelves = {
   run: new Shelf({ eager: true }),
@@ -93,10 +94,12 @@ function runChanged(run) {
     view.goLive();
     document.body.dataset.scene = "none";
     scene = undefined;
+    shelves.map.clear();
     byId("robots").replaceChildren();
   }
   shownRun = run.name;
-  conditions.offer(run.links);
+  conditions.offer(run.links ?? []);
+  if (!scene) document.body.dataset.scene = SCENES[run.case] || run.case === null ? "none" : "absent";
   setState(run.state === "waiting" ? "waiting" : "live", "connected");
 }
 

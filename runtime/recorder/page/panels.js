@@ -39,7 +39,7 @@ export function showFacts(run, channels) {
     ["topology", run.topology_hash === null ? "" : String(run.topology_hash).slice(0, 12)],
     ["seed", run.seed === null ? "" : String(run.seed)],
     ["recording", recorder.file ?? ""],
-    ["read", `${count(recorder.read_count)} messages, ${count(recorder.missed_count)} missed`],
+    ["read", `${count(recorder.read_count)} messages${recorder.missed_count === null ? "" : `, ${count(recorder.missed_count)} missed`}`],
     ["viewers", `${count(recorder.viewer_count)}${recorder.viewer_dropped_count > 0 ? `, ${count(recorder.viewer_dropped_count)} messages dropped for slow ones` : ""}`],
   ];
   const list = byId("facts");
@@ -106,10 +106,11 @@ export class ChannelTable {
 }
 
 function figuresOf(channel, described) {
-  const way = described ? `${described.from ?? "nobody"} → ${described.to ?? "record"}` : "";
+  const isKnown = described && (described.from !== null || described.to !== null);
+  const way = isKnown ? `${described.from ?? "nobody"} → ${described.to ?? "record"}` : UNAVAILABLE;
   const kind = described ? VIA[described.via] ?? described.via : "";
   const link = described?.link ? `${described.link}, ${kind}` : kind;
-  const silent = channel.link_state === "silent" ? `, silent for ${seconds(channel.silent_s)}` : "";
+  const silent = channel.link_state !== "silent" ? "" : channel.silent_s === null ? ", silent" : `, silent for ${seconds(channel.silent_s)}`;
   const crosses = described ? described.via !== "shared-memory" && described.via !== "record" : channel.lost_count !== null;
   const time = (name) => (channel.one_way === null ? UNAVAILABLE : channel.one_way[name] === null ? "–" : microseconds(channel.one_way[name]));
   return {

@@ -30,7 +30,7 @@ export class Strips {
   wanted(newest) {
     const channels = newest.channels;
     const chosen = channels.find((channel) => channel.name === this.choice.value);
-    const whole = (channel, label) => ({ label, channel: channel.name, unknown: "published and taken are not on one clock here",
+    const whole = (channel, label) => ({ label, channel: channel.name, unknown: channel.taken_count === null ? "nobody takes it on this host" : "its ends have no common clock",
       take: (entry) => entry.one_way });
     if (!chosen) return channels.map((channel) => whole(channel, channel.name));
     const segments = chosen.segments.map((segment) => ({
