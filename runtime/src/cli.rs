@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use clap::{ArgGroup, Args, Parser, Subcommand};
 
+use crate::link::cli::LinkCommand;
 use crate::probe::arguments::ProbeArgs;
 use crate::report::page::Format;
 use crate::trace::cli::TraceCommand;
@@ -271,6 +272,15 @@ pub enum Command {
         /// What to do with them.
         #[command(subcommand)]
         command: TraceCommand,
+    },
+    /// Show the links of a run that goes on, and change emulated ones.
+    #[command(
+        after_help = "Examples:\n  hil-runtime link show\n  hil-runtime link set hop --delay 50ms --loss 0.1\n  hil-runtime link reset hop"
+    )]
+    Link {
+        /// What to do with them.
+        #[command(subcommand)]
+        command: LinkCommand,
     },
     /// Say what this host can measure and what to change.
     #[command(

@@ -24,6 +24,7 @@ use crate::console::Console;
 use crate::doctor::{self, ClockQuestion, DoctorRequest, StampCapabilities};
 use crate::face;
 use crate::gateway;
+use crate::link;
 use crate::probe;
 use crate::process::emulation_room::check_emulation;
 use crate::process::{component, own_program};
@@ -91,6 +92,11 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
             trace::work::End::Done => exit::RAN,
             trace::work::End::Failed => exit::FAILED,
             trace::work::End::Refused => exit::USAGE,
+        },
+        Command::Link { command } => match link::work::work(&command, console) {
+            link::work::End::Done => exit::RAN,
+            link::work::End::Failed => exit::FAILED,
+            link::work::End::Refused => exit::USAGE,
         },
         Command::Doctor {
             topology,

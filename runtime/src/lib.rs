@@ -16,8 +16,10 @@
 //! 1. [`topology`]: what runs where; [`supervisor`]: starts, watches and ends it.
 //! 2. [`process`], [`gateway`] and [`face`]: what runs inside each started process.
 //! 3. [`channel`]: shared memory between them; [`mod@record`]: the notes they keep.
-//! 4. [`report`]: from the notes to what a person reads.
-//! 5. [`realtime`], [`clock`], [`wait`], [`host_facts`], [`doctor`]: the machine.
+//! 4. [`link`]: what emulated links do, changed while a run goes on.
+//! 5. [`report`]: from the notes to what a person reads.
+//! 6. [`watch`]: looking on while a run goes.
+//! 7. [`realtime`], [`clock`], [`wait`], [`host_facts`], [`doctor`]: the machine.
 
 mod analysis;
 pub mod card_clock;
@@ -32,6 +34,7 @@ pub mod doctor;
 pub mod face;
 pub mod gateway;
 pub mod host_facts;
+pub mod link;
 pub mod manifest;
 pub mod probe;
 pub mod process;
@@ -50,6 +53,7 @@ pub mod supervisor;
 pub mod topology;
 pub mod trace;
 pub mod wait;
+pub mod watch;
 
 use std::process::ExitCode;
 

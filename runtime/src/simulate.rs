@@ -216,7 +216,7 @@ impl Simulated {
         fs::create_dir_all(folder).map_err(|error| failed(folder.to_owned(), error))?;
         let files = RunFolder::existing(folder);
         let page = self.page(REPORT_FILE_WIDTH, Style::Plain);
-        let events = event_log::text(&self.topology_name, &self.events);
+        let events = event_log::text(&self.topology_name, &self.events, &[]);
         for (path, text) in [
             (files.report(), page),
             (files.virtual_report(), self.json()),

@@ -5,6 +5,7 @@ pub mod bernoulli;
 pub mod chain;
 #[cfg(test)]
 mod chain_tests;
+pub mod condition;
 pub mod delay;
 pub mod impaired;
 pub mod in_series;
@@ -13,6 +14,7 @@ pub mod outages;
 pub mod rate;
 pub mod reordering;
 pub mod spec;
+pub mod switched;
 pub mod trace;
 mod trace_offers;
 mod trace_ticks;
@@ -97,6 +99,11 @@ pub trait LinkModel: Debug + Send {
         self.offer(now, length_bytes)
     }
 
+    /// Tells what time it is while nothing is offered, for a link that changes by itself.
+    fn attend(&mut self, now: Instant) {
+        let _ = now;
+    }
+
     /// What the replay of a trace met so far; `None` for a model that replays none.
     fn replay_tally(&self) -> Option<ReplayTally> {
         None
@@ -121,6 +128,10 @@ impl<L: LinkModel + ?Sized> LinkModel for Box<L> {
         message: MessageNumber,
     ) -> Fate {
         (**self).offer_numbered(now, length_bytes, message)
+    }
+
+    fn attend(&mut self, now: Instant) {
+        (**self).attend(now);
     }
 
     fn replay_tally(&self) -> Option<ReplayTally> {

@@ -8,6 +8,7 @@ mod clocks;
 mod events;
 mod faces;
 mod figures;
+pub(crate) mod link_changes;
 pub(crate) mod network;
 pub(crate) mod outages;
 mod radio;
@@ -85,6 +86,7 @@ pub(crate) fn conclude(
         .iter()
         .map(|event| run_event(&axis, event))
         .collect();
+    summary.link_changes = link_changes::of_run(topology, &records, &axis);
     summary.channels = topology
         .channels()
         .iter()
@@ -122,7 +124,11 @@ pub(crate) fn conclude(
     let network_series = network_series.unwrap_or_default();
     write_series(&mut summary, result, (case, network_series), records);
     let path = result.folder.events();
-    let text = event_log::text(&summary.run.name, &summary.score_events);
+    let text = event_log::text(
+        &summary.run.name,
+        &summary.score_events,
+        &summary.link_changes,
+    );
     fs::write(&path, text).map_err(|source| AnalysisError::Write { path, source })?;
     summary.write(&result.folder.summary())?;
     let plain = terminal::render(&summary, REPORT_FILE_WIDTH, Style::Plain);

@@ -392,6 +392,12 @@ impl Crew {
         self.listen();
     }
 
+    /// Names of the processes.
+    pub(crate) fn names(&self) -> Vec<String> {
+        let members = self.members.iter();
+        members.map(|member| member.plan.name.clone()).collect()
+    }
+
     /// The processes with their history.
     pub(crate) fn members(&self) -> &[Member] {
         &self.members

@@ -18,4 +18,5 @@ mod session;
 pub use domains::DomainsError;
 pub use meet::PeerError;
 pub use outcome::{Outcome, RunError, RunOptions, RunResult};
+pub(crate) use plan::domain_base_candidates;
 pub use session::run;

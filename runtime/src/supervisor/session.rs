@@ -28,6 +28,7 @@ use crate::process::emulation_room::check_emulation;
 use crate::run_folder::{RunFolder, utc_text};
 use crate::signals::Signals;
 use crate::topology::{Host, Topology};
+use crate::watch::Announcement;
 
 /// How often the supervisor looks after everything.
 const WATCH_PERIOD: Duration = Duration::from_millis(5);
@@ -64,20 +65,30 @@ pub fn run(
     let folder = make_folder(topology, &hosts)?;
     let facts = HostFacts::gather();
     let discipline = HostDiscipline::gather().ok();
-    manifest::write(topology, options, &folder, &facts).map_err(|source| RunError::Folder {
+    let unwritable = |source| RunError::Folder {
         folder: folder.root().to_owned(),
         source,
-    })?;
+    };
+    manifest::write(topology, options, &folder, &facts).map_err(unwritable)?;
     let run = folder.root().to_string_lossy();
     let domains = Domains::create(&plan.hosts, options.domain_root.as_ref(), &run)?;
     console.say(&format!("run folder {}", folder.root().display()));
     let peers = gather_peers(topology, &hosts, &domains, (signals, console))?;
     let here = clock_id()?;
     let crew = Crew::new(plan.processes, domains.addresses(), &folder)?;
+    let announcement = Announcement::make(
+        topology,
+        &folder,
+        domains.addresses(),
+        crew.names(),
+        clocks_known(topology, &hosts, &peers, here),
+    );
+    let announcement = announcement.map_err(unwritable)?;
     // Before the gateways: they find out by sending what the cards deliver.
     let cards = CardWatch::start(topology, &hosts, &folder.records());
     let mut session = Session {
         topology,
+        announcement,
         cards,
         is_first_host: topology
             .hosts()
@@ -108,6 +119,12 @@ pub fn run(
 
 fn is_here(host: &Host, hosts: &[&Host]) -> bool {
     hosts.iter().any(|here| here.name == host.name)
+}
+
+/// Whether all hosts read one clock, where this host has met them all.
+fn clocks_known(topology: &Topology, hosts: &[&Host], peers: &[Peer], here: u64) -> Option<bool> {
+    let has_met_all = peers.len() + hosts.len() == topology.hosts().len();
+    has_met_all.then(|| peers.iter().all(|peer| peer.hello.clock_id == here))
 }
 
 fn make_folder(topology: &Topology, hosts: &[&Host]) -> Result<RunFolder, RunError> {
@@ -171,6 +188,8 @@ fn gather_peers(
 
 struct Session<'a> {
     topology: &'a Topology,
+    // Before the domains: its files lie beside theirs.
+    announcement: Announcement,
     cards: CardWatch,
     is_first_host: bool,
     /// All hosts of the run read one clock.
@@ -234,6 +253,8 @@ impl Session<'_> {
             if is_ready && may_begin {
                 let has_one_clock = self.has_one_clock;
                 self.say_to_all(&PeerMessage::Start { has_one_clock });
+                // Only observers read it; they do without.
+                let _is_said = self.announcement.say_clock(has_one_clock).is_ok();
                 self.crew.begin();
                 return Ok(());
             }
@@ -417,6 +438,8 @@ impl Session<'_> {
         }
         let has_one_clock = self.has_one_clock;
         drop(self.crew);
+        self.announcement.withdraw();
+        self.domains.let_observers_leave();
         let left = self.domains.remove();
         problems.extend(
             left.into_iter()

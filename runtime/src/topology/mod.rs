@@ -53,6 +53,8 @@ pub use model::{
 };
 pub use model_links::{Emulation, Gateway, Hop, Link, Timestamps, Via};
 
+pub(crate) use units::parse_duration;
+
 use check::Needs;
 use errors::Place;
 use layers::Layers;

@@ -109,11 +109,15 @@ impl Account {
             Body::Published(one) => {
                 count(&mut self.counts.published);
                 self.rate.add(at_ns, 1);
-                self.update((one.epoch, one.sequence), at_ns, &|joined| joined.published(one));
+                self.update((one.epoch, one.sequence), at_ns, &|joined| {
+                    joined.published(one)
+                });
             }
             Body::Taken(one) => {
                 count(&mut self.counts.taken);
-                self.update((one.epoch, one.sequence), at_ns, &|joined| joined.taken(one));
+                self.update((one.epoch, one.sequence), at_ns, &|joined| {
+                    joined.taken(one)
+                });
             }
             Body::Egress(one) => {
                 count(&mut self.counts.sent);
@@ -154,7 +158,9 @@ impl Account {
             let from = newest.saturating_add(1).max(sequence.saturating_sub(1000));
             for number in from..sequence {
                 let key = (epoch, number);
-                self.under_way.entry(key).or_insert_with(|| Joined::new(key, at_ns));
+                self.under_way
+                    .entry(key)
+                    .or_insert_with(|| Joined::new(key, at_ns));
             }
         }
     }
@@ -164,10 +170,13 @@ impl Account {
         let joined = joined.or_insert_with(|| Joined::new(key, at_ns));
         change(joined);
         let (segments, whole) = (&mut self.segments, &mut self.whole);
-        joined.news((self.has_link, self.has_one_clock), &mut |segment, length_ns| {
-            let samples = segment.and_then(|index| segments.get_mut(index));
-            samples.unwrap_or(whole).add(at_ns, length_ns);
-        });
+        joined.news(
+            (self.has_link, self.has_one_clock),
+            &mut |segment, length_ns| {
+                let samples = segment.and_then(|index| segments.get_mut(index));
+                samples.unwrap_or(whole).add(at_ns, length_ns);
+            },
+        );
         if self.under_way.len() > UNDER_WAY_MAX {
             self.under_way.pop_first();
             self.counts.forgotten += 1;
@@ -207,7 +216,8 @@ impl Account {
             return false;
         }
         let newest = self.newest.get(&key.0);
-        joined.has_left() || newest.is_some_and(|newest| *newest > key.1 && self.counts.sent.is_none())
+        joined.has_left()
+            || newest.is_some_and(|newest| *newest > key.1 && self.counts.sent.is_none())
     }
 
     /// Stamps of some messages whose way is over, since the last call.
@@ -221,7 +231,11 @@ impl Account {
         let mut lost = core::mem::take(&mut self.untold);
         lost.sort_unstable();
         let first_ns = lost.iter().filter_map(|(_, published)| *published).min();
-        let sequences: Vec<u64> = lost.iter().map(|(number, _)| *number).take(LISTED_MAX).collect();
+        let sequences: Vec<u64> = lost
+            .iter()
+            .map(|(number, _)| *number)
+            .take(LISTED_MAX)
+            .collect();
         (!lost.is_empty()).then(|| {
             json!({
                 "at_s": at_s, "channel": name, "sequences": sequences, "count": lost.len(),
@@ -253,7 +267,10 @@ impl Account {
         });
         let can_tell = self.has_link && self.counts.received.is_some();
         let window_lost = self.window_lost.count(now_ns);
-        let silent_ns = self.arrived_ns.filter(|_| self.has_link).map(|ns| now_ns - ns);
+        let silent_ns = self
+            .arrived_ns
+            .filter(|_| self.has_link)
+            .map(|ns| now_ns - ns);
         let rate_hz = self.rate.count(now_ns) as f64 * 1e9 / WINDOW_NS as f64;
         let counts = &self.counts;
         json!({
@@ -279,7 +296,9 @@ impl Account {
         };
         let patience_ns = (SILENT_PERIODS * self.period_ns).max(SILENT_NS);
         // A channel on which nobody spoke is not silent because of its link.
-        let was_offered = self.left_ns.is_none_or(|left_ns| left_ns > arrived_ns + patience_ns / 2);
+        let was_offered = self
+            .left_ns
+            .is_none_or(|left_ns| left_ns > arrived_ns + patience_ns / 2);
         if now_ns - arrived_ns > patience_ns && was_offered {
             "silent"
         } else {

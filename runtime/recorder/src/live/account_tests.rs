@@ -98,11 +98,20 @@ fn what_was_sent_and_did_not_arrive_is_lost_after_a_second() {
     assert_eq!(account.take_losses("x", 1.0, 0), None);
     account.settle(1900 * MS);
     let losses = account.take_losses("x", 1.9, 0).unwrap();
-    assert_eq!((&losses["sequences"], &losses["count"]), (&json!([3, 8]), &json!(2)));
+    assert_eq!(
+        (&losses["sequences"], &losses["count"]),
+        (&json!([3, 8]), &json!(2))
+    );
     assert_eq!(losses["first_at_s"], 0.3);
     let figures = account.figures("x", 1900 * MS);
-    assert_eq!((&figures["lost_count"], &figures["published_count"]), (&json!(2), &json!(10)));
-    assert_eq!((&figures["received_count"], &figures["taken_count"]), (&json!(8), &json!(8)));
+    assert_eq!(
+        (&figures["lost_count"], &figures["published_count"]),
+        (&json!(2), &json!(10))
+    );
+    assert_eq!(
+        (&figures["received_count"], &figures["taken_count"]),
+        (&json!(8), &json!(8))
+    );
     // One of them comes after all.
     account.take(&received(8, 1950 * MS));
     assert_eq!(account.figures("x", 1950 * MS)["lost_count"], 1);
@@ -118,7 +127,10 @@ fn a_receiver_alone_knows_the_lost_by_the_numbers_passed_over() {
     let losses = account.take_losses("x", 3.0, 0).unwrap();
     assert_eq!(losses["sequences"], json!([7, 10, 11]));
     assert_eq!(losses["first_at_s"], Value::Null);
-    assert_eq!(account.figures("x", 3000 * MS)["published_count"], Value::Null);
+    assert_eq!(
+        account.figures("x", 3000 * MS)["published_count"],
+        Value::Null
+    );
 }
 
 #[test]
@@ -135,11 +147,18 @@ fn a_sender_alone_knows_of_no_loss() {
 #[test]
 fn each_segment_is_counted_once_as_soon_as_its_ends_are_known() {
     let mut account = account(true);
-    for one in [taken(0, 2 * MS), received(0, MS), published(0, 0), sent(0, 10_000)] {
+    for one in [
+        taken(0, 2 * MS),
+        received(0, MS),
+        published(0, 0),
+        sent(0, 10_000),
+    ] {
         account.take(&one);
     }
     let figures = account.figures("x", 3 * MS);
-    let counts: Vec<_> = (0..7).map(|index| &figures["segments"][index]["count"]).collect();
+    let counts: Vec<_> = (0..7)
+        .map(|index| &figures["segments"][index]["count"])
+        .collect();
     assert_eq!(counts, [1, 1, 0, 0, 0, 1, 1]);
     assert_eq!(figures["segments"][1]["p50_us"], 5.0);
     assert_eq!(figures["segments"][2]["is_available"], false);
@@ -153,7 +172,8 @@ fn a_cut_link_is_silent_and_an_idle_one_is_not() {
         account.take(&sent(sequence, sequence as i64 * 10 * MS));
         account.take(&received(sequence, sequence as i64 * 10 * MS + MS));
     }
-    let state = |account: &mut Account, ms: i64| account.figures("x", ms * MS)["link_state"].clone();
+    let state =
+        |account: &mut Account, ms: i64| account.figures("x", ms * MS)["link_state"].clone();
     assert_eq!(state(&mut account, 100), "up");
     assert_eq!(state(&mut account, 5000), "up");
     for sequence in 10..200 {
@@ -173,5 +193,8 @@ fn shared_memory_has_one_segment_and_loses_nothing_that_we_know_of() {
     let figures = account.figures("x", 10 * MS);
     assert_eq!(figures["segments"].as_array().map(Vec::len), Some(1));
     assert_eq!(figures["segments"][0]["p50_us"], 2000.0);
-    assert_eq!((&figures["lost_count"], &figures["link_state"]), (&Value::Null, &json!("none")));
+    assert_eq!(
+        (&figures["lost_count"], &figures["link_state"]),
+        (&Value::Null, &json!("none"))
+    );
 }

@@ -110,7 +110,10 @@ impl OneArm {
             (EgmFeedback::HOLDING, "holding"),
             (EgmFeedback::AT_POSITION_LIMIT, "at-position-limit"),
             (EgmFeedback::SPEED_LIMITED, "speed-limited"),
-            (EgmFeedback::SPEED_DEVIATION_LIMITED, "speed-deviation-limited"),
+            (
+                EgmFeedback::SPEED_DEVIATION_LIMITED,
+                "speed-deviation-limited",
+            ),
             (EgmFeedback::CONVERGED, "converged"),
         ];
         let of_command = [
@@ -168,8 +171,14 @@ mod tests {
         view.take("egm/right/feedback", EgmFeedback::NAME, bytes, 500_000_000);
         let picture = view.picture(1_000_000_000, 0);
         let [right, left] = [0, 1].map(|arm| &picture["arms"][arm]);
-        assert_eq!((&right["state"], &right["flags"]), (&json!("running"), &json!(["holding"])));
-        assert_eq!((&right["desired_age_s"], &right["measured_age_s"]), (&json!(1.0), &json!(0.5)));
+        assert_eq!(
+            (&right["state"], &right["flags"]),
+            (&json!("running"), &json!(["holding"]))
+        );
+        assert_eq!(
+            (&right["desired_age_s"], &right["measured_age_s"]),
+            (&json!(1.0), &json!(0.5))
+        );
         assert_eq!(right["tool_error_mm"], 0.0);
         let tool = Pose::from(Arm::right().tool(&RIGHT_START_RAD)).position_m;
         let frame = &right["measured_frames"][7];
@@ -187,9 +196,21 @@ mod tests {
         command.position_rad = RIGHT_START_RAD;
         feedback.measured_rad = RIGHT_START_RAD;
         feedback.measured_rad[0] += 0.01;
-        view.take("egm/right/command", EgmCommand::NAME, bytemuck::bytes_of(&command), 0);
-        view.take("egm/right/feedback", EgmFeedback::NAME, bytemuck::bytes_of(&feedback), 0);
-        let error_mm = view.picture(0, 0)["arms"][0]["tool_error_mm"].as_f64().unwrap();
+        view.take(
+            "egm/right/command",
+            EgmCommand::NAME,
+            bytemuck::bytes_of(&command),
+            0,
+        );
+        view.take(
+            "egm/right/feedback",
+            EgmFeedback::NAME,
+            bytemuck::bytes_of(&feedback),
+            0,
+        );
+        let error_mm = view.picture(0, 0)["arms"][0]["tool_error_mm"]
+            .as_f64()
+            .unwrap();
         // The tool is some tenths of a metre off the first joint's axis.
         assert!((1.0..8.0).contains(&error_mm), "{error_mm}");
     }

@@ -62,7 +62,10 @@ impl Collisions {
         let Some(referee) = &mut self.referee else {
             return;
         };
-        let first = self.waiting.front().map(|truth| Instant::from_ns(truth.at_ns));
+        let first = self
+            .waiting
+            .front()
+            .map(|truth| Instant::from_ns(truth.at_ns));
         let Some(begin) = self.next.or(first) else {
             return;
         };
@@ -139,7 +142,10 @@ fn scan(
 ) -> Instant {
     let mut at = begin;
     while at.as_ns() + BEHIND_NS <= now_ns {
-        while waiting.front().is_some_and(|truth| truth.at_ns <= at.as_ns()) {
+        while waiting
+            .front()
+            .is_some_and(|truth| truth.at_ns <= at.as_ns())
+        {
             if let Some(truth) = waiting.pop_front() {
                 referee.on_truth(&truth);
             }

@@ -102,7 +102,9 @@ impl RunFacts {
         for channel in &mut facts.channels {
             let [from, to] = &channel.hosts;
             let from_ns = clocks.offset_ns(from.as_deref());
-            let to_ns = to.as_deref().map_or(from_ns, |to| clocks.offset_ns(Some(to)));
+            let to_ns = to
+                .as_deref()
+                .map_or(from_ns, |to| clocks.offset_ns(Some(to)));
             channel.offsets_ns = [from_ns, to_ns];
         }
         facts

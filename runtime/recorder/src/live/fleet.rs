@@ -59,14 +59,17 @@ impl Robot {
 
     fn path_of(&self, mission: u32) -> Option<PathId> {
         let known = self.missions.iter().find(|(known, _)| *known == mission);
-        known.filter(|_| mission != 0).map(|(_, path)| PathId(*path))
+        known
+            .filter(|_| mission != 0)
+            .map(|(_, path)| PathId(*path))
     }
 }
 
 impl FleetView {
     /// A fleet with these `[case.parameters]`; its ground is made from now on.
     pub(crate) fn new(parameters: &Value) -> Self {
-        let world = serde_json::from_value::<hil_models::fleet::FleetParameters>(parameters.clone());
+        let world =
+            serde_json::from_value::<hil_models::fleet::FleetParameters>(parameters.clone());
         let vehicle = world.as_ref().ok().map(|one| one.world.vehicle().footprint);
         Self {
             robots: BTreeMap::new(),
@@ -153,7 +156,8 @@ impl FleetView {
     pub(crate) fn picture(&mut self, now_ns: i64, origin_ns: i64) -> Value {
         let at_s = seconds(now_ns - origin_ns);
         let offset_ns = self.offset_ns;
-        self.collisions.look(now_ns - offset_ns, origin_ns - offset_ns);
+        self.collisions
+            .look(now_ns - offset_ns, origin_ns - offset_ns);
         self.look_at_states(now_ns, at_s);
         let scene = self.ground.as_ref().map(|ground| &ground.scene);
         let robots: Vec<Value> = self
@@ -190,7 +194,8 @@ impl FleetView {
         for (fleet, robots) in fleets {
             let known = robots.len() <= PAIRED_MAX;
             if known {
-                self.collisions.look_at_states(fleet, &robots, &vehicle, at_s);
+                self.collisions
+                    .look_at_states(fleet, &robots, &vehicle, at_s);
             }
         }
     }
@@ -201,7 +206,10 @@ impl FleetView {
         let areas = self.areas.as_mut()?;
         let mut fleets: BTreeMap<u32, Vec<OnPath>> = BTreeMap::new();
         for ((fleet, id), robot) in &self.robots {
-            fleets.entry(*fleet).or_default().extend(on_path(*id, robot, world));
+            fleets
+                .entry(*fleet)
+                .or_default()
+                .extend(on_path(*id, robot, world));
         }
         let mut list = Vec::new();
         for (fleet, robots) in &fleets {
@@ -227,7 +235,9 @@ fn on_path(id: u32, robot: &Robot, world: &hil_models::fleet::world::World) -> O
         Phase::of(state.phase),
         Some(Phase::Driving | Phase::AtPoint)
     );
-    let path = robot.path_of(state.header.mission_id).filter(|_| is_under_way)?;
+    let path = robot
+        .path_of(state.header.mission_id)
+        .filter(|_| is_under_way)?;
     let index = usize::try_from(state.path_index).ok()?;
     let granted = granted(&state, world.paths.get(path)?).unwrap_or(index);
     Some(OnPath {
@@ -243,7 +253,9 @@ fn granted(state: &State, path: &Path) -> Option<usize> {
     match state.authority_index {
         TO_GOAL => Some(path.last_index()),
         NO_AUTHORITY => None,
-        index => usize::try_from(index).ok().map(|index| index.min(path.last_index())),
+        index => usize::try_from(index)
+            .ok()
+            .map(|index| index.min(path.last_index())),
     }
 }
 
@@ -272,7 +284,9 @@ fn picture_of((fleet, id): Id, robot: &Robot, scene: Option<&Scene>, now_ns: i64
     let id = robot.path_of(mission);
     let path = id.and_then(|id| scene?.world.paths.get(id));
     if let (Some(id), Some(path)) = (id, path) {
-        let here = usize::try_from(state.path_index).unwrap_or(0).min(path.last_index());
+        let here = usize::try_from(state.path_index)
+            .unwrap_or(0)
+            .min(path.last_index());
         let granted = granted(&state, path);
         let route = scene.and_then(|scene| scene.world.routes.iter().find(|one| one.path == id));
         picture["path"] = json!(id.0);

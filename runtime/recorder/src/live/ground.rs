@@ -70,7 +70,10 @@ impl Making {
 fn make(parameters: Value) -> Result<Box<Ground>, String> {
     let parameters: FleetParameters =
         serde_json::from_value(parameters).map_err(|error| error.to_string())?;
-    let scene = parameters.world.build().map_err(|error| error.to_string())?;
+    let scene = parameters
+        .world
+        .build()
+        .map_err(|error| error.to_string())?;
     let map = map(&parameters, &scene).map_err(|error| error.to_string())?;
     Ok(Box::new(Ground {
         scene,
@@ -86,11 +89,17 @@ fn map(
     let known = parameters.world.map()?;
     let world = &scene.world;
     let vehicle = &world.vehicle.footprint;
-    let bounds = known.as_ref().map_or_else(|| around(scene), |map| map.bounds);
+    let bounds = known
+        .as_ref()
+        .map_or_else(|| around(scene), |map| map.bounds);
     let bays = world.bays.iter().enumerate();
     let bays: Vec<_> = bays
         .map(|(id, bay)| {
-            let Pose { x_m, y_m, heading_rad } = bay.pose;
+            let Pose {
+                x_m,
+                y_m,
+                heading_rad,
+            } = bay.pose;
             json!({ "id": id, "x_m": rounded(x_m), "y_m": rounded(y_m),
                     "heading_rad": rounded(heading_rad) })
         })

@@ -147,7 +147,8 @@ fn stamp(ns: i64) -> Option<i64> {
 }
 
 fn minus(ns: Option<i64>, offset_ns: Option<i64>) -> Option<i64> {
-    ns.zip(offset_ns).and_then(|(ns, offset)| ns.checked_sub(offset))
+    ns.zip(offset_ns)
+        .and_then(|(ns, offset)| ns.checked_sub(offset))
 }
 
 fn span(from_ns: Option<i64>, to_ns: Option<i64>) -> Option<i64> {

@@ -20,7 +20,11 @@ pub(crate) fn hull(mut points: Vec<Point>) -> Vec<Point> {
     let mut corners: Vec<Point> = Vec::with_capacity(points.len());
     let half = |corners: &mut Vec<Point>, point: Point, floor: usize| {
         while corners.len() >= floor + 2
-            && turn(corners[corners.len() - 2], corners[corners.len() - 1], point) <= 0.0
+            && turn(
+                corners[corners.len() - 2],
+                corners[corners.len() - 1],
+                point,
+            ) <= 0.0
         {
             corners.pop();
         }
@@ -72,7 +76,8 @@ mod tests {
 
     #[test]
     fn a_hull_has_the_corners_only() {
-        let inside = (0..50).map(|n| [f64::from(n % 7) / 7.0 + 0.05, f64::from(n % 5) / 5.0 + 0.05]);
+        let inside =
+            (0..50).map(|n| [f64::from(n % 7) / 7.0 + 0.05, f64::from(n % 5) / 5.0 + 0.05]);
         let mut points: Vec<Point> = inside.collect();
         points.extend([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [0.5, 0.0]]);
         let corners = hull(points);
@@ -83,7 +88,8 @@ mod tests {
 
     #[test]
     fn squares_share_their_overlap() {
-        let square = |x: f64, y: f64| hull(vec![[x, y], [x + 2.0, y], [x + 2.0, y + 2.0], [x, y + 2.0]]);
+        let square =
+            |x: f64, y: f64| hull(vec![[x, y], [x + 2.0, y], [x + 2.0, y + 2.0], [x, y + 2.0]]);
         let both = shared(&square(0.0, 0.0), &square(1.5, 1.0));
         assert!((area(&both) - 0.5).abs() < 1e-12, "{both:?}");
         assert!(shared(&square(0.0, 0.0), &square(5.0, 0.0)).is_empty());

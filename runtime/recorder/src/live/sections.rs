@@ -96,7 +96,10 @@ pub(crate) fn of_pair(
     let sections = world.sections.between(one.path, other.path);
     for (index, section) in sections.iter().enumerate() {
         let sides = [(one, Side::First), (other, Side::Second)];
-        if sides.iter().any(|(robot, side)| robot.index > section.end(*side)) {
+        if sides
+            .iter()
+            .any(|(robot, side)| robot.index > section.end(*side))
+        {
             continue;
         }
         let that = |is: &dyn Fn(&OnPath, Side) -> bool| -> Vec<u32> {

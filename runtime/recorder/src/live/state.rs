@@ -73,14 +73,18 @@ impl RunState {
         let Some(channel) = self.facts.channels.get(record.channel) else {
             return;
         };
-        if self.origin_ns.is_none_or(|origin_ns| record.at_ns < origin_ns) {
+        if self
+            .origin_ns
+            .is_none_or(|origin_ns| record.at_ns < origin_ns)
+        {
             self.origin_ns = Some(record.at_ns);
         }
         self.accounts[record.channel].take(record);
         if let Body::Message(_, payload) = &record.body {
             self.read_count += 1;
             let message = channel.message.as_deref().unwrap_or_default();
-            self.arms.take(&channel.name, message, payload, record.at_ns);
+            self.arms
+                .take(&channel.name, message, payload, record.at_ns);
             if let Some(fleet) = &mut self.fleet {
                 fleet.take(message, payload, (record.at_ns, channel.offsets_ns[0]));
             }
@@ -89,7 +93,8 @@ impl RunState {
 
     /// Seconds since the first record.
     pub(crate) fn elapsed_s(&self, now_ns: i64) -> Option<f64> {
-        self.origin_ns.map(|origin_ns| seconds((now_ns - origin_ns).max(0)))
+        self.origin_ns
+            .map(|origin_ns| seconds((now_ns - origin_ns).max(0)))
     }
 
     /// `/live/run`, without what only the server knows.
@@ -154,6 +159,8 @@ impl RunState {
     /// `/live/arms`.
     pub(crate) fn arms(&self, now_ns: i64) -> Option<Value> {
         let origin_ns = self.origin_ns?;
-        self.arms.is_known().then(|| self.arms.picture(now_ns, origin_ns))
+        self.arms
+            .is_known()
+            .then(|| self.arms.picture(now_ns, origin_ns))
     }
 }

@@ -68,7 +68,8 @@ impl Samples {
             self.values.pop_front();
         }
         self.sorted.clear();
-        self.sorted.extend(self.values.iter().map(|(_, value)| value));
+        self.sorted
+            .extend(self.values.iter().map(|(_, value)| value));
         self.sorted.sort_unstable();
         let at = |share: f64| {
             let rank = (share * self.sorted.len() as f64).ceil() as usize;
@@ -117,7 +118,10 @@ mod tests {
         assert_eq!(figures["p99_us"], 99.0);
         assert_eq!(figures["max_us"], 100.0);
         let later = samples.figures(3 * WINDOW_NS);
-        assert_eq!((&later["count"], &later["max_us"]), (&json!(0), &Value::Null));
+        assert_eq!(
+            (&later["count"], &later["max_us"]),
+            (&json!(0), &Value::Null)
+        );
         assert_eq!(later["is_available"], true);
     }
 }

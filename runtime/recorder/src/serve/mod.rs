@@ -60,7 +60,9 @@ pub(crate) enum ServeError {
     #[error(transparent)]
     Run(#[from] crate::run::RunError),
     /// The socket.
-    #[error("cannot listen for viewers at {address}: {why}; --port takes another, 0 any that is free")]
+    #[error(
+        "cannot listen for viewers at {address}: {why}; --port takes another, 0 any that is free"
+    )]
     Socket {
         /// Where.
         address: SocketAddr,
@@ -68,7 +70,9 @@ pub(crate) enum ServeError {
         why: String,
     },
     /// The page.
-    #[error("cannot serve the page at {address}: {why}; --http-port takes another, 0 any that is free")]
+    #[error(
+        "cannot serve the page at {address}: {why}; --http-port takes another, 0 any that is free"
+    )]
     Page {
         /// Where.
         address: SocketAddr,

@@ -91,7 +91,11 @@ fn found(kind: &'static str, content: Bytes) -> Response<Full<Bytes>> {
 }
 
 fn plain(status: StatusCode, words: &'static str) -> Response<Full<Bytes>> {
-    with_headers(status, "text/plain; charset=utf-8", Bytes::from_static(words.as_bytes()))
+    with_headers(
+        status,
+        "text/plain; charset=utf-8",
+        Bytes::from_static(words.as_bytes()),
+    )
 }
 
 fn with_headers(status: StatusCode, kind: &'static str, content: Bytes) -> Response<Full<Bytes>> {
@@ -137,10 +141,22 @@ mod tests {
     fn the_page_is_served_and_nothing_else() {
         let page = get("/");
         assert_eq!(page.status(), StatusCode::OK);
-        assert_eq!(page.headers()[header::CONTENT_TYPE], "text/html; charset=utf-8");
+        assert_eq!(
+            page.headers()[header::CONTENT_TYPE],
+            "text/html; charset=utf-8"
+        );
         assert_eq!(page.headers()[header::CONTENT_SECURITY_POLICY], POLICY);
-        assert_eq!(get("/config.json").headers()[header::CONTENT_TYPE], "application/json");
-        for path in ["/../Cargo.toml", "/etc/passwd", "//index.html", "/%2e%2e/Cargo.toml", ""] {
+        assert_eq!(
+            get("/config.json").headers()[header::CONTENT_TYPE],
+            "application/json"
+        );
+        for path in [
+            "/../Cargo.toml",
+            "/etc/passwd",
+            "//index.html",
+            "/%2e%2e/Cargo.toml",
+            "",
+        ] {
             assert_eq!(get(path).status(), StatusCode::NOT_FOUND, "{path}");
         }
         let put = answer(&Method::PUT, "/", &Bytes::new());

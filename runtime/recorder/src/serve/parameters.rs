@@ -38,7 +38,9 @@ impl Links {
     /// Every parameter with its present value; those called `names` only, if there are any.
     pub(crate) fn list(&self, names: &[String]) -> Vec<Parameter> {
         let mut control = self.lock();
-        let all = control.as_mut().map_or_else(Vec::new, |control| control.list());
+        let all = control
+            .as_mut()
+            .map_or_else(Vec::new, |control| control.list());
         let is_asked = |one: &Parameter| names.is_empty() || names.contains(&one.name);
         all.into_iter().filter(is_asked).collect()
     }

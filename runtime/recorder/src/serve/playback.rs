@@ -103,7 +103,11 @@ impl Playback {
         };
         let run = &summary.run;
         let outcome = serde_json::to_value(&run.outcome).unwrap_or_default();
-        format!("{}: {}", outcome.as_str().unwrap_or("ended"), run.exit_reason)
+        format!(
+            "{}: {}",
+            outcome.as_str().unwrap_or("ended"),
+            run.exit_reason
+        )
     }
 }
 
@@ -116,7 +120,11 @@ impl Source for Playback {
     fn poll(&mut self, take: &mut dyn FnMut(&LiveRecord)) -> Progress {
         let now_ns = self.now_ns();
         for _ in 0..RECORDS_MAX {
-            let Some(step) = self.steps.get(self.next).filter(|step| step.at_ns <= now_ns) else {
+            let Some(step) = self
+                .steps
+                .get(self.next)
+                .filter(|step| step.at_ns <= now_ns)
+            else {
                 break;
             };
             self.next += 1;

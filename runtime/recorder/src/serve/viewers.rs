@@ -168,10 +168,16 @@ impl Viewers {
         names: &mut Names,
         words: &mut Vec<String>,
     ) -> Result<Topics, FoxgloveError> {
-        let message = facts.message.as_deref().unwrap_or("message of unknown type");
+        let message = facts
+            .message
+            .as_deref()
+            .unwrap_or("message of unknown type");
         let typed = Encoder::typed(message, &facts.fields, facts.size_bytes);
         let (encoder, schema) = typed.unwrap_or_else(|fault| {
-            words.push(format!("{}: shown as bytes: {message}: {fault}", facts.name));
+            words.push(format!(
+                "{}: shown as bytes: {message}: {fault}",
+                facts.name
+            ));
             (Encoder::Opaque, schema::opaque())
         });
         let base = topic_of(&facts.name);
