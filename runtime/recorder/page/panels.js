@@ -1,6 +1,6 @@
 // Head of the page, table of channels, warnings and events: what is written rather than drawn.
 
-import { UNAVAILABLE, count, make, microseconds, quantity, seconds, share, write } from "./format.js";
+import { UNAVAILABLE, count, keepAt, make, microseconds, quantity, seconds, share, write } from "./format.js";
 import { boundText } from "./strips.js";
 
 const byId = (id) => document.getElementById(id);
@@ -15,7 +15,7 @@ export function showRun(run, elapsed_s) {
   document.title = `${run.name ?? "waiting"} · hil-runtime live`;
   const [words, tone] = STATES[run.state] ?? [run.state, ""];
   const badge = byId("run-state");
-  const ended = run.state === "ended" && run.how ? `ended: ${run.how}` : words;
+  const ended = run.state === "ended" && run.how ? `ended, ${run.how}` : words;
   write(badge, run.is_playback ? `playback${run.speed === 1 ? "" : ` × ${run.speed}`}, ${ended}` : ended);
   badge.className = `badge ${tone}`;
   write(byId("run-case"), run.case ? `case ${run.case}` : "");
@@ -76,9 +76,10 @@ export class ChannelTable {
       row.row.remove();
       this.rows.delete(name);
     }
-    for (const channel of channels) {
+    for (const [index, channel] of channels.entries()) {
       if (!this.rows.has(channel.name)) this.rows.set(channel.name, this.row(channel.name));
       const { row, cells } = this.rows.get(channel.name);
+      keepAt(this.body, index, row);
       row.classList.toggle("chosen", channel.name === chosen);
       const texts = figuresOf(channel, described.get(channel.name));
       for (const [name, text] of Object.entries(texts)) {
@@ -100,7 +101,6 @@ export class ChannelTable {
       cells[label] = make("td", { "data-label": label, class: isText ? undefined : "n" });
       row.append(cells[label]);
     }
-    this.body.append(row);
     return { row, cells };
   }
 }
