@@ -11,7 +11,7 @@ import { Socket } from "./socket.js";
 import { Strips } from "./strips.js";
 
 const byId = (id) => document.getElementById(id);
-const PANELS_EVERY_MS = 150;
+const PANELS_EVERY_MS = 200;
 const SILENT_S = 3;
 const CONFIG_RETRY_MS = 1500;
 const STEP_S = 0.5;
@@ -39,13 +39,14 @@ let socket;
 let colours = palette();
 let scene; // "fleet", "arms" or undefined
 let heardAt = performance.now();
-let isStale = true;
+let isStale = true; // something written is older than what is known
+let isSceneStale = true; // something drawn is
 let panelsAt = 0;
 let pointer;
 let shownRun;
 
 function redraw() {
-  isStale = true;
+  isStale = isSceneStale = true;
   panelsAt = 0;
 }
 
@@ -74,6 +75,7 @@ const handlers = {
     heardAt = performance.now();
     isStale = true;
     if (shelf === shelves.run) runChanged(shelf.read(shelf.times.length - 1));
+    if (shelf !== shelves.channels && !view.isPaused) isSceneStale = true;
     if (shelf === shelves.fleet || shelf === shelves.arms) showScene(shelf === shelves.fleet ? "fleet" : "arms");
   },
   parameters(list) {
@@ -222,10 +224,10 @@ function watchSilence(now) {
 function frame(now) {
   requestAnimationFrame(frame);
   watchSilence(now);
-  if (!isStale) return;
   const moment = view.moment;
-  drawScene(moment);
-  if (now - panelsAt < PANELS_EVERY_MS) return;
+  if (isSceneStale) drawScene(moment);
+  isSceneStale = false;
+  if (!isStale || now - panelsAt < PANELS_EVERY_MS) return;
   isStale = false;
   panelsAt = now;
   drawTransport(moment);
@@ -299,7 +301,7 @@ async function start() {
     reset: () => act((one) => one.reset()),
     point: (x, y) => {
       pointer = x === undefined ? undefined : [x, y];
-      isStale = true;
+      isSceneStale = true;
     },
   });
   requestAnimationFrame(frame);

@@ -20,7 +20,7 @@ export function showRun(run, elapsed_s) {
   badge.className = `badge ${tone}`;
   write(byId("run-case"), run.case ? `case ${run.case}` : "");
   write(byId("elapsed"), elapsed_s === null ? "–" : seconds(elapsed_s));
-  write(byId("duration"), run.duration_s === null ? "no fixed end" : seconds(run.duration_s, run.duration_s % 1 ? 1 : 0));
+  write(byId("duration"), run.state === "waiting" ? "–" : run.duration_s === null ? "no fixed end" : seconds(run.duration_s, run.duration_s % 1 ? 1 : 0));
   const bar = byId("progress");
   const part = run.duration_s ? Math.min(100, (100 * (elapsed_s ?? 0)) / run.duration_s) : 0;
   bar.setAttribute("aria-valuenow", part.toFixed(0));
