@@ -1,5 +1,5 @@
 //! Our pages in a browser: the live page of `hil-recorder serve` beside a run that goes on, and the pages of
-//! `hil-runtime report`. What a user does is done with mouse and keys, what he reads is read off the page.
+//! `hil-runtime report`. Clicks and keys go through the browser's own input, figures are read off the page.
 //!
 //! Needs Chromium; without one the tests say so and are skipped, and in CI they fail. `HIL_BROWSER` names
 //! another one, and empty leaves them out. Pictures go to `HIL_SCREENSHOTS`, else to the target folder.
@@ -183,18 +183,24 @@ fn check_numbers(page: &mut Page<'_>, channel: &str) {
     }
 }
 
-/// Asks for a delay of a link's way with the slider; the server says that it is set, and the run feels it.
+/// Types a delay of a link's way; the server says that it is set, and the run feels it.
 fn check_condition(page: &mut Page<'_>, way: &str, channel: &str) {
-    page.wait_until("hil.snapshot().run.links.length > 0");
     let parameter = format!("link.{way}.delay_ms");
-    let slider = format!("document.querySelector(\"[data-link='{way}'] input[type=range]\")");
+    let field = format!("[id='set-{parameter}']");
     page.wait_until(&format!(
-        "{slider} && hil.snapshot().conditions['{parameter}'] !== undefined"
+        "document.querySelector(\"{field}\") && hil.snapshot().conditions['{parameter}'] !== undefined"
     ));
-    assert_eq!(page.value(&format!("{slider}.matches(':disabled')")), false);
-    page.value(&format!(
-        "(() => {{ {slider}.value = 80; {slider}.dispatchEvent(new Event('input')); }})()"
-    ));
+    assert_eq!(
+        page.value(&format!(
+            "document.querySelector(\"{field}\").matches(':disabled')"
+        )),
+        false
+    );
+    page.click(&field);
+    page.value("document.activeElement.select()");
+    for key in ["8", "0", "Enter"] {
+        page.press(key);
+    }
     page.wait_until(&format!(
         "document.querySelector(\"[data-parameter='{parameter}']\").textContent === '80 ms, confirmed'"
     ));

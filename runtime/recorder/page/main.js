@@ -171,7 +171,7 @@ function drawPanels(moment) {
     strips.offer(newest.channels.map((channel) => channel.name));
     strips.draw(samples, losses, moment, colours);
     write(byId("axis-start"), `${Math.round(stretch_s)} s before`);
-    write(byId("axis-end"), view.isPaused ? "moment shown" : "now");
+    write(byId("axis-end"), view.isPaused ? "moment shown" : document.body.dataset.state === "lost" ? "last heard" : "now");
   }
   const fleet = scene === "fleet" ? at("fleet", moment) : undefined;
   showEvents(losses, fleet?.collisions ?? [], (at_s) => at_s);
@@ -208,7 +208,8 @@ function drawTransport(moment) {
   const [past, back] = [view.newest - view.oldest, view.newest - moment];
   scrub.min = (-past).toFixed(1);
   scrub.value = (-back).toFixed(1);
-  const words = view.isPaused ? `paused, ${seconds(back)} ago` : `live, ${seconds(past, 0)} kept`;
+  const isLost = document.body.dataset.state === "lost";
+  const words = view.isPaused ? `paused, ${seconds(back)} ago` : `${isLost ? "last heard" : "live"}, ${seconds(past, 0)} kept`;
   const elapsed = elapsedAt(moment);
   scrub.setAttribute("aria-valuetext", words);
   write(byId("moment"), elapsed === null ? words : `at ${seconds(elapsed)} · ${words}`);

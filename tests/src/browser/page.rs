@@ -144,12 +144,13 @@ impl<'a> Page<'a> {
         }
     }
 
-    /// Presses a key, e.g. `" "` or `ArrowLeft`.
+    /// Presses a key, e.g. `" "`, `8`, `Enter` or `ArrowLeft`.
     pub fn press(&mut self, key: &str) {
         let code = if key == " " { "Space" } else { key };
         let mut down = json!({"type": "keyDown", "key": key, "code": code});
-        if key.chars().count() == 1 {
-            down["text"] = key.into();
+        let is_enter = key == "Enter";
+        if is_enter || key.chars().count() == 1 {
+            down["text"] = if is_enter { "\r" } else { key }.into();
         }
         self.ask("Input.dispatchKeyEvent", &down);
         let up = json!({"type": "keyUp", "key": key, "code": code});
