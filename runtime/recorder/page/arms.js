@@ -5,7 +5,7 @@ import { FONT, age, make, quantity, surface, write } from "./format.js";
 const START = { turn: -0.62, tilt: 0.36, zoom: 1 };
 const CENTRE = [0.2, 0, 0.26];
 const DISTANCE_M = 2.6;
-const FLOOR_M = { x: [-0.3, 0.7], y: [-0.6, 0.6], step: 0.1 };
+const FLOOR_M = { x: [-0.2, 0.6], y: [-0.5, 0.5], step: 0.1 };
 const TRAIL_S = 2;
 const NEAR_M = 0.2;
 
@@ -49,7 +49,7 @@ export class ArmScene {
     const { context, width, height } = surface(this.canvas);
     this.colours = colours;
     this.size = Math.min(height * 2.3, width * 2.2);
-    this.middle = [width / 2, height * 0.5];
+    this.middle = [width / 2, height * 0.47];
     this.tools = [];
     this.floor(context);
     if (!arms) return;

@@ -2,7 +2,7 @@
 
 import { FONT, age, make, quantity, surface, write } from "./format.js";
 
-const PADDING_PX = 12;
+const PADDING_PX = 14;
 const NUMBER_FITS_PX = 15;
 const FRESH_COLLISION_S = 5;
 const MOST_ZOOM = 12;
@@ -14,8 +14,8 @@ export class FleetScene {
 
   legend() {
     const entry = (kind, words, text = "") => make("li", {}, make("i", { class: kind }, text), words);
-    return [entry("thick", "way granted"), entry("dashed", "planned way"), entry("area", "critical section: colour of who may pass"),
-      entry("both", "more than one may pass"), entry("stale", "stale"), entry("cross", "collision", "×")];
+    return [entry("thick", "way granted"), entry("dashed", "planned way"), entry("area", "section, colour: who may pass"),
+      entry("both", "several may pass"), entry("stale", "stale"), entry("cross", "collision", "×")];
   }
 
   drag(dx, dy) {
@@ -54,6 +54,7 @@ export class FleetScene {
     const { context, width, height } = surface(this.canvas);
     this.drawn = [];
     if (!map || !map.bounds) return;
+    this.canvas.style.setProperty("--ground", aspect(map.bounds));
     this.fit(map.bounds, width, height);
     this.colours = colours;
     this.ground(context, map, width, height);
@@ -64,7 +65,7 @@ export class FleetScene {
     for (const robot of robots) this.vehicle(context, robot, map.footprint);
     for (const hit of (fleet?.collisions ?? []).filter(shown)) this.collision(context, hit, fleet.at_s);
     for (const robot of robots) this.outsideLabel(context, robot);
-    this.scaleBar(context, height);
+    this.scaleBar(context, width, height);
     this.list(robots, fleet);
   }
 
@@ -167,14 +168,14 @@ export class FleetScene {
     if (robot.ahead?.length > 1) {
       context.setLineDash([4, 4]);
       context.globalAlpha = 0.6;
-      context.lineWidth = 1.3;
+      context.lineWidth = 1.2;
       this.trace(context, robot.ahead, false);
       context.stroke();
     }
     context.setLineDash([]);
     if (robot.granted?.length > 1) {
-      context.globalAlpha = 0.8;
-      context.lineWidth = 3.2;
+      context.globalAlpha = 0.5;
+      context.lineWidth = 2.6;
       this.trace(context, robot.granted, false);
       context.stroke();
     }
@@ -195,8 +196,8 @@ export class FleetScene {
     context.fillStyle = robot.is_stale ? this.colours.panel : colour;
     context.fill();
     context.setLineDash(robot.is_stale ? [3, 2] : []);
-    context.strokeStyle = robot.is_stale ? colour : this.colours.panel;
-    context.lineWidth = robot.is_stale ? 1.6 : 1;
+    context.strokeStyle = robot.is_stale ? colour : this.colours.ink;
+    context.lineWidth = robot.is_stale ? 1.6 : 1.2;
     context.stroke();
     context.setLineDash([]);
     // The bow: a light wedge at the end that goes first.
@@ -256,11 +257,12 @@ export class FleetScene {
     context.globalAlpha = 1;
   }
 
-  scaleBar(context, height) {
+  // In the middle, for bays and their numbers are at the sides.
+  scaleBar(context, width, height) {
     const wanted_m = 90 / this.scale;
     const decade = 10 ** Math.floor(Math.log10(wanted_m));
     const length_m = [5, 2, 1].map((step) => step * decade).find((step) => step <= wanted_m);
-    const [left, bottom] = [PADDING_PX + 8, height - PADDING_PX - 8];
+    const [left, bottom] = [width / 2 - (length_m * this.scale) / 2, height - 3];
     context.strokeStyle = context.fillStyle = this.colours.faint;
     context.lineWidth = 1.5;
     context.beginPath();
@@ -272,7 +274,7 @@ export class FleetScene {
     context.font = `12px ${FONT}`;
     context.textAlign = "left";
     context.textBaseline = "alphabetic";
-    context.fillText(`${length_m} m`, left + 4, bottom - 5);
+    context.fillText(`${length_m} m`, left + length_m * this.scale + 6, bottom);
   }
 
   // The same in words, for those who do not see the drawing, and for tests.
@@ -324,4 +326,10 @@ export class FleetScene {
     const driving = robots.filter((robot) => robot.phase === "driving").length;
     return `Fleet ${this.fleet} from above: ${robots.length} robots, ${driving} driving; collisions of all fleets so far: ${fleet.collision_count}.`;
   }
+}
+
+// Width to height of the canvas in which the ground fits without empty bands.
+function aspect(bounds) {
+  const ratio = (bounds.x_max_m - bounds.x_min_m) / Math.max(bounds.y_max_m - bounds.y_min_m, 1);
+  return Math.min(Math.max(ratio, 1), 3).toFixed(3);
 }

@@ -61,6 +61,11 @@ export function make(tag, attributes = {}, ...children) {
   return element;
 }
 
+// Puts a child at its place among its parent's others, and touches nothing when it is there.
+export function keepAt(parent, index, child) {
+  if (parent.children[index] !== child) parent.insertBefore(child, parent.children[index] ?? null);
+}
+
 // The page's colours as the stylesheet has them now; they change with the system's light or dark.
 export function palette() {
   const style = getComputedStyle(document.documentElement);

@@ -107,9 +107,11 @@ export class View {
   get isPaused() { return this.frozen !== undefined; }
 
   get newest() {
-    const times = Object.values(this.shelves).map((shelf) => shelf.newest);
+    const { fleet, arms, channels, run } = this.shelves;
+    const times = [fleet, arms, channels].map((shelf) => shelf.newest);
+    if (times.every((time) => time === undefined)) return run.newest;
     const found = times.filter((time) => time !== undefined);
-    return found.length > 0 ? Math.max(...found) : undefined;
+    return Math.max(...found);
   }
 
   // Where the past begins: with the scene, where there is one, lest one scrubs to an empty one.

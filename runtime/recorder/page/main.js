@@ -11,10 +11,11 @@ import { Socket } from "./socket.js";
 import { Strips } from "./strips.js";
 
 const byId = (id) => document.getElementById(id);
-const PANELS_EVERY_MS = 150;
+const PANELS_EVERY_MS = 200;
 const SILENT_S = 3;
 const CONFIG_RETRY_MS = 1500;
 const STEP_S = 0.5;
+const SCENES = { fleet: "fleet", teleoperation: "arms" };
 
 const shelves = {
   run: new Shelf({ eager: true }),
@@ -38,13 +39,14 @@ let socket;
 let colours = palette();
 let scene; // "fleet", "arms" or undefined
 let heardAt = performance.now();
-let isStale = true;
+let isStale = true; // something written is older than what is known
+let isSceneStale = true; // something drawn is
 let panelsAt = 0;
 let pointer;
 let shownRun;
 
 function redraw() {
-  isStale = true;
+  isStale = isSceneStale = true;
   panelsAt = 0;
 }
 
@@ -73,6 +75,7 @@ const handlers = {
     heardAt = performance.now();
     isStale = true;
     if (shelf === shelves.run) runChanged(shelf.read(shelf.times.length - 1));
+    if (shelf !== shelves.channels && !view.isPaused) isSceneStale = true;
     if (shelf === shelves.fleet || shelf === shelves.arms) showScene(shelf === shelves.fleet ? "fleet" : "arms");
   },
   parameters(list) {
@@ -93,10 +96,12 @@ function runChanged(run) {
     view.goLive();
     document.body.dataset.scene = "none";
     scene = undefined;
+    shelves.map.clear();
     byId("robots").replaceChildren();
   }
   shownRun = run.name;
-  conditions.offer(run.links);
+  conditions.offer(run.links ?? []);
+  if (!scene) document.body.dataset.scene = SCENES[run.case] || run.case === null ? "none" : "absent";
   setState(run.state === "waiting" ? "waiting" : "live", "connected");
 }
 
@@ -166,7 +171,7 @@ function drawPanels(moment) {
     strips.offer(newest.channels.map((channel) => channel.name));
     strips.draw(samples, losses, moment, colours);
     write(byId("axis-start"), `${Math.round(stretch_s)} s before`);
-    write(byId("axis-end"), view.isPaused ? "moment shown" : "now");
+    write(byId("axis-end"), view.isPaused ? "moment shown" : document.body.dataset.state === "lost" ? "last heard" : "now");
   }
   const fleet = scene === "fleet" ? at("fleet", moment) : undefined;
   showEvents(losses, fleet?.collisions ?? [], (at_s) => at_s);
@@ -203,7 +208,8 @@ function drawTransport(moment) {
   const [past, back] = [view.newest - view.oldest, view.newest - moment];
   scrub.min = (-past).toFixed(1);
   scrub.value = (-back).toFixed(1);
-  const words = view.isPaused ? `paused, ${seconds(back)} ago` : `live, ${seconds(past, 0)} kept`;
+  const isLost = document.body.dataset.state === "lost";
+  const words = view.isPaused ? `paused, ${seconds(back)} ago` : `${isLost ? "last heard" : "live"}, ${seconds(past, 0)} kept`;
   const elapsed = elapsedAt(moment);
   scrub.setAttribute("aria-valuetext", words);
   write(byId("moment"), elapsed === null ? words : `at ${seconds(elapsed)} · ${words}`);
@@ -219,10 +225,10 @@ function watchSilence(now) {
 function frame(now) {
   requestAnimationFrame(frame);
   watchSilence(now);
-  if (!isStale) return;
   const moment = view.moment;
-  drawScene(moment);
-  if (now - panelsAt < PANELS_EVERY_MS) return;
+  if (isSceneStale) drawScene(moment);
+  isSceneStale = false;
+  if (!isStale || now - panelsAt < PANELS_EVERY_MS) return;
   isStale = false;
   panelsAt = now;
   drawTransport(moment);
@@ -296,7 +302,7 @@ async function start() {
     reset: () => act((one) => one.reset()),
     point: (x, y) => {
       pointer = x === undefined ? undefined : [x, y];
-      isStale = true;
+      isSceneStale = true;
     },
   });
   requestAnimationFrame(frame);

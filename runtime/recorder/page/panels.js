@@ -1,6 +1,6 @@
 // Head of the page, table of channels, warnings and events: what is written rather than drawn.
 
-import { UNAVAILABLE, count, make, microseconds, quantity, seconds, share, write } from "./format.js";
+import { UNAVAILABLE, count, keepAt, make, microseconds, quantity, seconds, share, write } from "./format.js";
 import { boundText } from "./strips.js";
 
 const byId = (id) => document.getElementById(id);
@@ -15,12 +15,12 @@ export function showRun(run, elapsed_s) {
   document.title = `${run.name ?? "waiting"} · hil-runtime live`;
   const [words, tone] = STATES[run.state] ?? [run.state, ""];
   const badge = byId("run-state");
-  const ended = run.state === "ended" && run.how ? `ended: ${run.how}` : words;
+  const ended = run.state === "ended" && run.how ? `ended, ${run.how}` : words;
   write(badge, run.is_playback ? `playback${run.speed === 1 ? "" : ` × ${run.speed}`}, ${ended}` : ended);
   badge.className = `badge ${tone}`;
   write(byId("run-case"), run.case ? `case ${run.case}` : "");
   write(byId("elapsed"), elapsed_s === null ? "–" : seconds(elapsed_s));
-  write(byId("duration"), run.duration_s === null ? "no fixed end" : seconds(run.duration_s, run.duration_s % 1 ? 1 : 0));
+  write(byId("duration"), run.state === "waiting" ? "–" : run.duration_s === null ? "no fixed end" : seconds(run.duration_s, run.duration_s % 1 ? 1 : 0));
   const bar = byId("progress");
   const part = run.duration_s ? Math.min(100, (100 * (elapsed_s ?? 0)) / run.duration_s) : 0;
   bar.setAttribute("aria-valuenow", part.toFixed(0));
@@ -39,7 +39,7 @@ export function showFacts(run, channels) {
     ["topology", run.topology_hash === null ? "" : String(run.topology_hash).slice(0, 12)],
     ["seed", run.seed === null ? "" : String(run.seed)],
     ["recording", recorder.file ?? ""],
-    ["read", `${count(recorder.read_count)} messages, ${count(recorder.missed_count)} missed`],
+    ["read", `${count(recorder.read_count)} messages${recorder.missed_count === null ? "" : `, ${count(recorder.missed_count)} missed`}`],
     ["viewers", `${count(recorder.viewer_count)}${recorder.viewer_dropped_count > 0 ? `, ${count(recorder.viewer_dropped_count)} messages dropped for slow ones` : ""}`],
   ];
   const list = byId("facts");
@@ -76,9 +76,10 @@ export class ChannelTable {
       row.row.remove();
       this.rows.delete(name);
     }
-    for (const channel of channels) {
+    for (const [index, channel] of channels.entries()) {
       if (!this.rows.has(channel.name)) this.rows.set(channel.name, this.row(channel.name));
       const { row, cells } = this.rows.get(channel.name);
+      keepAt(this.body, index, row);
       row.classList.toggle("chosen", channel.name === chosen);
       const texts = figuresOf(channel, described.get(channel.name));
       for (const [name, text] of Object.entries(texts)) {
@@ -100,16 +101,16 @@ export class ChannelTable {
       cells[label] = make("td", { "data-label": label, class: isText ? undefined : "n" });
       row.append(cells[label]);
     }
-    this.body.append(row);
     return { row, cells };
   }
 }
 
 function figuresOf(channel, described) {
-  const way = described ? `${described.from ?? "nobody"} → ${described.to ?? "record"}` : "";
+  const isKnown = described && (described.from !== null || described.to !== null);
+  const way = isKnown ? `${described.from ?? "nobody"} → ${described.to ?? "record"}` : UNAVAILABLE;
   const kind = described ? VIA[described.via] ?? described.via : "";
   const link = described?.link ? `${described.link}, ${kind}` : kind;
-  const silent = channel.link_state === "silent" ? `, silent for ${seconds(channel.silent_s)}` : "";
+  const silent = channel.link_state !== "silent" ? "" : channel.silent_s === null ? ", silent" : `, silent for ${seconds(channel.silent_s)}`;
   const crosses = described ? described.via !== "shared-memory" && described.via !== "record" : channel.lost_count !== null;
   const time = (name) => (channel.one_way === null ? UNAVAILABLE : channel.one_way[name] === null ? "–" : microseconds(channel.one_way[name]));
   return {

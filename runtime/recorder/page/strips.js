@@ -1,6 +1,6 @@
 // Strip charts of delays: one strip per segment of a channel, or per channel, over the last stretch of time.
 
-import { FONT, UNAVAILABLE, make, microseconds, surface, write } from "./format.js";
+import { FONT, UNAVAILABLE, keepAt, make, microseconds, surface, write } from "./format.js";
 
 const WHOLE = "published to taken";
 const LEFT_PX = 58;
@@ -30,9 +30,11 @@ export class Strips {
   wanted(newest) {
     const channels = newest.channels;
     const chosen = channels.find((channel) => channel.name === this.choice.value);
-    const whole = (channel, label) => ({ label, channel: channel.name, unknown: "published and taken are not on one clock here",
+    const whole = (channel, label) => ({ label, channel: channel.name, unknown: channel.taken_count === null ? "nobody takes it on this host" : "its ends have no common clock",
       take: (entry) => entry.one_way });
-    if (!chosen) return channels.map((channel) => whole(channel, channel.name));
+    // What only the record keeps has no time to draw; chosen by name, it says so.
+    const isTaken = (channel) => channel.one_way !== null || channel.taken_count !== null || channel.link_state !== "none";
+    if (!chosen) return channels.filter(isTaken).map((channel) => whole(channel, channel.name));
     const segments = chosen.segments.map((segment) => ({
       label: segment.name.replace(/-(?=[a-zA-Z])/, " → "), channel: chosen.name,
       unknown: "this host has no such stage",
@@ -54,10 +56,11 @@ export class Strips {
     const wanted = this.wanted(newest);
     const present = new Set();
     this.list.style.setProperty("--strip", `${wanted.length > 6 ? 40 : wanted.length > 3 ? 58 : 84}px`);
-    for (const one of wanted) {
+    for (const [index, one] of wanted.entries()) {
       const key = `${one.channel}\n${one.label}`;
       present.add(key);
       if (!this.strips.has(key)) this.strips.set(key, this.strip(one));
+      keepAt(this.list, index, this.strips.get(key).item);
       this.drawOne(this.strips.get(key), one, samples, losses, moment, colours);
     }
     for (const [key, strip] of this.strips) {
