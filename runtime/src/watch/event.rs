@@ -1,6 +1,5 @@
 //! What an observer hears of a run, one thing at a time.
 
-use hil_models::link::condition::LinkConditionRecord;
 use hil_models::measure::card_clock::CardClockRecord;
 use hil_models::measure::record::{
     EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
@@ -86,8 +85,6 @@ pub enum Record {
     CardClock(CardClockRecord),
     /// A radio was asked, or said something.
     Radio(RadioRecord),
-    /// An emulated link was told to change, and what became of it.
-    LinkCondition(LinkConditionRecord),
 }
 
 impl Record {
@@ -108,12 +105,8 @@ impl Record {
             }
             RecordKind::CardClock => batch.records().for_each(|one| take(Self::CardClock(one))),
             RecordKind::Radio => batch.records().for_each(|one| take(Self::Radio(one))),
-            RecordKind::LinkCondition => {
-                batch
-                    .records()
-                    .for_each(|one| take(Self::LinkCondition(one)));
-            }
-            RecordKind::Message => {}
+            // Changes of links are asked of `crate::link`, which knows what is in force.
+            RecordKind::Message | RecordKind::LinkCondition => {}
         }
     }
 }
