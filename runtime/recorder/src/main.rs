@@ -4,7 +4,7 @@
 //! Read in this order: [`run`] and [`clocks`], what there is and when it was; [`schema`] and
 //! [`encode`], what a message looks like; [`topics`] and [`net`], what is made of it; [`writer`],
 //! the file; [`convert`], all of them together. [`scan`] reads files, for [`recover`] and [`info`].
-//! [`live`] is the state of a run that goes on, [`serve`] shows it.
+//! [`view`] is the state of a run that goes on, [`serve`] shows it.
 
 mod cli;
 mod clocks;
@@ -13,7 +13,6 @@ mod convert;
 mod encode;
 mod facts;
 mod info;
-mod live;
 mod net;
 mod recover;
 mod run;
@@ -21,6 +20,7 @@ mod scan;
 mod schema;
 mod serve;
 mod topics;
+mod view;
 mod writer;
 
 #[cfg(test)]
