@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, Sender, channel};
+use std::time::Duration;
 
 use foxglove::websocket::{ChannelView, Client, ParameterHandler, ServerListener};
 use foxglove::{
@@ -24,6 +25,9 @@ use crate::view::facts::{ChannelFacts, RunFacts};
 
 /// Messages that wait for one viewer at most; then its oldest go.
 const WAITING_MAX: usize = 4096;
+
+/// How long a viewer may take to hear that it is over.
+const GOODBYE_WITHIN: Duration = Duration::from_secs(1);
 
 /// Topics of JSON, all of them offered from the beginning.
 pub(crate) const LIVE_TOPICS: [&str; 6] = [
@@ -290,6 +294,8 @@ impl Viewers {
     /// Says goodbye to all.
     pub(crate) fn end(self, runtime: &Handle) {
         let stopped = self.server.stop();
-        runtime.block_on(stopped.wait());
+        // One that does not read would keep it for ever.
+        let goodbye = async { tokio::time::timeout(GOODBYE_WITHIN, stopped.wait()).await };
+        let _is_polite = runtime.block_on(goodbye).is_ok();
     }
 }
