@@ -21,6 +21,7 @@ fn main() -> io::Result<()> {
     files.sort();
     let mut table = String::from("pub(crate) static PAGE_FILES: &[(&str, &[u8])] = &[\n");
     for (name, path) in files {
+        let path = path.to_string_lossy().into_owned();
         let _infallible = writeln!(table, "    ({name:?}, include_bytes!({path:?})),");
     }
     table.push_str("];\n");

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use clap::{ArgGroup, Args, Parser, Subcommand};
 
+use crate::compare::cli::{self as compare_cli, CompareArgs};
 use crate::link::cli::LinkCommand;
 use crate::probe::arguments::ProbeArgs;
 use crate::report::page::Format;
@@ -255,6 +256,9 @@ pub enum Command {
     /// Print the report of a finished run again, or write it as a page, tables or figures.
     #[command(after_help = REPORT_EXAMPLES)]
     Report(ReportArgs),
+    /// Compare two runs, or two sets of repetitions: delays, losses and scores, with intervals.
+    #[command(after_help = compare_cli::EXAMPLES)]
+    Compare(CompareArgs),
     /// Run the robot of a finished run again in virtual time and compare every message.
     #[command(after_help = REPLAY_EXAMPLES)]
     Replay {

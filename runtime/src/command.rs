@@ -20,6 +20,7 @@ use crate::analysis;
 use crate::card_clock::guard;
 use crate::cases;
 use crate::cli::{Cli, Command, RunArgs};
+use crate::compare;
 use crate::console::Console;
 use crate::doctor::{self, ClockQuestion, DoctorRequest, StampCapabilities};
 use crate::face;
@@ -88,6 +89,11 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
         Command::Calibrate(args) => case_work::calibrate(args, registry),
         Command::Replay { run, json } => case_work::replay(&run, json, registry, console),
         Command::Report(args) => report_work::report(&args, console),
+        Command::Compare(args) => match compare::work::work(&args, console) {
+            compare::work::End::Passed => exit::RAN,
+            compare::work::End::Failed => exit::FAILED,
+            compare::work::End::Refused => exit::USAGE,
+        },
         Command::Trace { command } => match trace::work::work(command, columns(), console) {
             trace::work::End::Done => exit::RAN,
             trace::work::End::Failed => exit::FAILED,

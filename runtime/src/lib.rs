@@ -16,10 +16,9 @@
 //! 1. [`topology`]: what runs where; [`supervisor`]: starts, watches and ends it.
 //! 2. [`process`], [`gateway`] and [`face`]: what runs inside each started process.
 //! 3. [`channel`]: shared memory between them; [`mod@record`]: the notes they keep.
-//! 4. [`link`]: what emulated links do, changed while a run goes on.
-//! 5. [`report`]: from the notes to what a person reads.
-//! 6. [`watch`]: looking on while a run goes.
-//! 7. [`realtime`], [`clock`], [`wait`], [`host_facts`], [`doctor`]: the machine.
+//! 4. [`report`]: from the notes to what a person reads.
+//! 5. [`watch`]: looking on while a run goes; [`link`]: changing its emulated links.
+//! 6. [`realtime`], [`clock`], [`wait`], [`host_facts`], [`doctor`]: the machine.
 
 mod analysis;
 pub mod card_clock;
@@ -29,6 +28,7 @@ pub mod cli;
 pub mod clock;
 pub mod clock_discipline;
 mod command;
+pub mod compare;
 pub mod console;
 pub mod doctor;
 pub mod face;

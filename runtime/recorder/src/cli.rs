@@ -13,8 +13,8 @@ Examples:
       topics, counts, times, and what the file says of its run
   hil-recorder recover broken.mcap -o whole.mcap
       a whole file of what a killed writer left
-  hil-recorder serve runs/fleet-emulated-20261122-101806 --loop
-      a run in the browser, and in whatever speaks the Foxglove WebSocket
+  hil-recorder serve
+      the run that goes on, in the browser and in whatever speaks the Foxglove WebSocket
 
 Exit codes:
   0  done                              70  internal error
@@ -25,8 +25,12 @@ Exit codes:
 
 const SERVE_EXAMPLES: &str = "\
 Examples:
+  hil-recorder serve
+      the run that goes on here; the page is at http://127.0.0.1:8766/
+  hil-recorder serve --wait
+      the next one, and the one after it
   hil-recorder serve runs/fleet-emulated-20261122-101806 --loop
-      a finished run again and again; the page is at http://127.0.0.1:8766/
+      a finished run again and again
   ssh -L 8765:localhost:8765 -L 8766:localhost:8766 control-pc
       from another PC, then the same address; nothing is open to the network
 
@@ -103,9 +107,13 @@ pub(crate) enum Command {
     /// Show a run in the browser and in viewers that speak the Foxglove WebSocket.
     #[command(after_help = SERVE_EXAMPLES)]
     Serve {
-        /// The run's folder.
+        /// The beginning of the name of a run that goes on, or the folder of any run; without, the
+        /// only one that goes on here.
         #[arg(value_name = "RUN")]
-        run: PathBuf,
+        run: Option<String>,
+        /// Wait for a run if none goes on, and for the next one when it is over.
+        #[arg(long)]
+        wait: bool,
         /// Address to listen at; another than this machine's own lets others in.
         #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1")]
         host: IpAddr,

@@ -56,6 +56,7 @@ pub(crate) fn run() -> ExitCode {
         Command::Info { file, json } => show(&file, json, &signals, &mut console),
         Command::Serve {
             run,
+            wait,
             host,
             port,
             http_port,
@@ -64,6 +65,7 @@ pub(crate) fn run() -> ExitCode {
         } => {
             let options = ServeOptions {
                 run,
+                waits: wait,
                 host,
                 port,
                 http_port,
@@ -114,7 +116,7 @@ fn serve_run(options: &ServeOptions, signals: &Signals, console: &mut Console) -
         Err(error) => {
             console.error(&error.to_string());
             match error {
-                ServeError::Run(_) => exit::USAGE,
+                ServeError::Run(_) | ServeError::Select(_) => exit::USAGE,
                 _ => exit::FAILED,
             }
         }

@@ -4,6 +4,7 @@
 //! Read in this order: [`run`] and [`clocks`], what there is and when it was; [`schema`] and
 //! [`encode`], what a message looks like; [`topics`] and [`net`], what is made of it; [`writer`],
 //! the file; [`convert`], all of them together. [`scan`] reads files, for [`recover`] and [`info`].
+//! [`live`] is the state of a run that goes on, [`serve`] shows it.
 
 mod cli;
 mod clocks;

@@ -11,6 +11,7 @@ use super::{Confirmed, LinkDirection, LinkError, RunLinks};
 use crate::clock::MonotonicClock;
 use crate::console::Console;
 use crate::topology::parse_duration;
+use crate::watch;
 
 /// How it ended; the caller knows the exit codes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -94,8 +95,9 @@ fn open(choice: &RunChoice) -> Outcome<RunLinks> {
 fn folder(run: Option<&str>) -> Outcome<PathBuf> {
     match run.map(PathBuf::from) {
         Some(folder) if folder.join("manifest.json").is_file() => Ok(folder),
-        Some(folder) => Err(refused(format!("{}: no run's folder", folder.display()))),
-        None => Err(refused("name the run's folder")),
+        _ => watch::select(run)
+            .map(|run| run.run_folder().root().to_owned())
+            .map_err(refused),
     }
 }
 

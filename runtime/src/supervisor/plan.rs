@@ -38,11 +38,11 @@ pub(crate) struct HostPlan {
     pub(crate) name: String,
     /// Channels in shared memory with an end on this host.
     pub(crate) channels: Vec<Channel>,
+    /// Channels for orders to the directions of emulated links that are emulated here.
+    pub(crate) orders: BTreeSet<String>,
     /// Names of those whose messages no process here records: who wants to see them looks into
     /// the shared memory of this host.
     pub(crate) observed: BTreeSet<String>,
-    /// Channels for orders to the directions of emulated links that are emulated here.
-    pub(crate) orders: BTreeSet<String>,
 }
 
 /// A process to start here.

@@ -61,7 +61,7 @@ use layers::Layers;
 
 /// A duration as topology files write it, such as `40 s`; `None` when it is none.
 pub fn read_duration(text: &str) -> Option<std::time::Duration> {
-    units::parse_duration(text).ok()
+    parse_duration(text).ok()
 }
 
 /// Reads the topology file at `path` and all it extends, lays the `overrides` (each

@@ -105,7 +105,8 @@ impl Record {
             }
             RecordKind::CardClock => batch.records().for_each(|one| take(Self::CardClock(one))),
             RecordKind::Radio => batch.records().for_each(|one| take(Self::Radio(one))),
-            RecordKind::Message => {}
+            // Changes of links are asked of `crate::link`, which knows what is in force.
+            RecordKind::Message | RecordKind::LinkCondition => {}
         }
     }
 }

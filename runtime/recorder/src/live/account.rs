@@ -96,11 +96,16 @@ impl Account {
         }
     }
 
+    /// Stamps of both ends compare from now on.
+    pub(crate) const fn compare_clocks(&mut self) {
+        self.has_one_clock = true;
+    }
+
     /// Takes a record of the channel.
     pub(crate) fn take(&mut self, record: &LiveRecord) {
         let at_ns = record.at_ns;
         match &record.body {
-            Body::Message(..) => {
+            Body::Message(_) => {
                 if self.is_by_message {
                     count(&mut self.counts.published);
                     self.rate.add(at_ns, 1);
@@ -110,13 +115,13 @@ impl Account {
                 count(&mut self.counts.published);
                 self.rate.add(at_ns, 1);
                 self.update((one.epoch, one.sequence), at_ns, &|joined| {
-                    joined.published(one)
+                    joined.published(one);
                 });
             }
             Body::Taken(one) => {
                 count(&mut self.counts.taken);
                 self.update((one.epoch, one.sequence), at_ns, &|joined| {
-                    joined.taken(one)
+                    joined.taken(one);
                 });
             }
             Body::Egress(one) => {

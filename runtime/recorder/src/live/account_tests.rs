@@ -86,7 +86,7 @@ fn taken(sequence: u64, at_ns: i64) -> LiveRecord {
 fn what_was_sent_and_did_not_arrive_is_lost_after_a_second() {
     let mut account = account(true);
     for sequence in 0..10_u64 {
-        let at_ns = sequence as i64 * 100 * MS;
+        let at_ns = sequence.cast_signed() * 100 * MS;
         account.take(&published(sequence, at_ns));
         account.take(&sent(sequence, at_ns));
         if sequence % 5 != 3 {
@@ -121,7 +121,7 @@ fn what_was_sent_and_did_not_arrive_is_lost_after_a_second() {
 fn a_receiver_alone_knows_the_lost_by_the_numbers_passed_over() {
     let mut account = account(true);
     for sequence in [5_u64, 6, 9, 8, 12] {
-        account.take(&received(sequence, sequence as i64 * MS));
+        account.take(&received(sequence, sequence.cast_signed() * MS));
     }
     account.settle(3000 * MS);
     let losses = account.take_losses("x", 3.0, 0).unwrap();
@@ -169,15 +169,15 @@ fn each_segment_is_counted_once_as_soon_as_its_ends_are_known() {
 fn a_cut_link_is_silent_and_an_idle_one_is_not() {
     let mut account = account(true);
     for sequence in 0..10_u64 {
-        account.take(&sent(sequence, sequence as i64 * 10 * MS));
-        account.take(&received(sequence, sequence as i64 * 10 * MS + MS));
+        account.take(&sent(sequence, sequence.cast_signed() * 10 * MS));
+        account.take(&received(sequence, sequence.cast_signed() * 10 * MS + MS));
     }
     let state =
         |account: &mut Account, ms: i64| account.figures("x", ms * MS)["link_state"].clone();
     assert_eq!(state(&mut account, 100), "up");
     assert_eq!(state(&mut account, 5000), "up");
     for sequence in 10..200 {
-        account.take(&sent(sequence, sequence as i64 * 10 * MS));
+        account.take(&sent(sequence, sequence.cast_signed() * 10 * MS));
     }
     assert_eq!(state(&mut account, 2000), "silent");
     assert_eq!(account.figures("x", 2091 * MS)["silent_s"], 2.0);

@@ -18,7 +18,6 @@ pub(crate) mod state;
 mod window;
 
 use hil_models::measure::record::{EgressRecord, IngressRecord, PublishedRecord, TakenRecord};
-use hil_models::message::Envelope;
 
 /// Something that a process of the run recorded.
 #[derive(Debug, Clone)]
@@ -35,7 +34,7 @@ pub(crate) struct LiveRecord {
 #[derive(Debug, Clone)]
 pub(crate) enum Body {
     /// A message itself.
-    Message(Envelope, Vec<u8>),
+    Message(Vec<u8>),
     /// Its producer published it.
     Published(PublishedRecord),
     /// Its consumer took it.

@@ -68,7 +68,7 @@ mod tests {
 
     fn area(corners: &[Point]) -> f64 {
         let count = corners.len();
-        let parts = (1..count.saturating_sub(1));
+        let parts = 1..count.saturating_sub(1);
         0.5 * parts
             .map(|index| turn(corners[0], corners[index], corners[index + 1]))
             .sum::<f64>()

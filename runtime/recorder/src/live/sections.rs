@@ -14,6 +14,9 @@ use super::rounded;
 
 /// Poses of a path's part whose ground makes its hull.
 const POSES_MAX: usize = 40;
+/// Lengths of the vehicle from which on a section is drawn as a strip along the first path: the hull
+/// of a long shared lane would cover the hall.
+const STRIP_LENGTHS: f64 = 2.0;
 /// Areas that are remembered; beyond, all are forgotten and worked out again.
 const AREAS_MAX: usize = 20_000;
 
@@ -34,7 +37,7 @@ impl Areas {
     }
 
     /// The ground of a section of two paths of `world`, by its place among theirs: what both
-    /// vehicles can cover, as a convex polygon around it. Empty when there is no such section.
+    /// vehicles can cover, as a polygon around it. Empty when there is no such section.
     pub(crate) fn of(
         &mut self,
         world: &World,
@@ -55,6 +58,12 @@ impl Areas {
                 let part = (section.start(side), section.end(side));
                 hull(covered(world.path(path), part, &vehicle))
             };
+            let (from, to) = (section.start(Side::First), section.end(Side::First));
+            let path = world.path(one);
+            let long_m = STRIP_LENGTHS * vehicle.length_m + vehicle.width_m;
+            if path.way_to_m(to.min(path.last_index())) - path.way_to_m(from) > long_m {
+                return strip(path, (from, to), &vehicle);
+            }
             let area = shared(&ground(Side::First, one), &ground(Side::Second, other));
             area.iter().map(|point| point.map(rounded)).collect()
         })
@@ -69,6 +78,44 @@ fn covered(path: &Path, (from, to): (usize, usize), vehicle: &Footprint) -> Vec<
     let part = (from..to).step_by(step).chain([to]);
     let at = |pose: &Pose| vehicle.at(pose).corners();
     part.flat_map(|index| at(&poses[index])).collect()
+}
+
+/// The strip that a vehicle covers along the path's part.
+fn strip(path: &Path, (from, to): (usize, usize), vehicle: &Footprint) -> Vec<Point> {
+    let to = to.min(path.last_index());
+    let step = to.saturating_sub(from).div_ceil(POSES_MAX).max(1);
+    let part = (from..to).step_by(step).chain([to]);
+    let beside = |index: usize, side: f64| {
+        let pose = &path.poses()[index];
+        let (sine, cosine) = pose.heading_rad.sin_cos();
+        let across_m = 0.5 * side * vehicle.width_m;
+        // A vehicle at an end of the part reaches beyond it by half its length.
+        let along_m = match index {
+            index if index == from => -0.5 * vehicle.length_m,
+            index if index == to => 0.5 * vehicle.length_m,
+            _ => 0.0,
+        };
+        // Backwards, the way goes against the heading.
+        let along_m = if is_backwards(path) {
+            -along_m
+        } else {
+            along_m
+        };
+        let x_m = pose.x_m + along_m * cosine - across_m * sine;
+        let y_m = pose.y_m + along_m * sine + across_m * cosine;
+        [rounded(x_m), rounded(y_m)]
+    };
+    let indices: Vec<usize> = part.collect();
+    let left = indices.iter().map(|index| beside(*index, 1.0));
+    let right = indices.iter().rev().map(|index| beside(*index, -1.0));
+    left.chain(right).collect()
+}
+
+/// True when the vehicle reverses along the path.
+fn is_backwards(path: &Path) -> bool {
+    let [one, other] = [&path.poses()[0], &path.poses()[1]];
+    let (sine, cosine) = one.heading_rad.sin_cos();
+    (other.x_m - one.x_m) * cosine + (other.y_m - one.y_m) * sine < 0.0
 }
 
 /// A robot on a mission.
@@ -108,12 +155,17 @@ pub(crate) fn of_pair(
         };
         let inside = that(&|robot, side| robot.index >= section.start(side));
         let may_pass = that(&|robot, side| robot.granted >= section.start(side));
+        // One may follow the other through it, as long as no two poses that they may take meet.
+        let other_way = (other.index, other.granted);
+        let meeting = section.first_conflict(Side::First, one.index, other_way);
+        let is_contested = meeting.is_some_and(|pose| pose <= one.granted);
         list.push(json!({
             "id": format!("{fleet}:{}-{}:{index}", one.robot, other.robot),
             "fleet": fleet,
             "robots": [one.robot, other.robot],
             "may_pass": may_pass,
             "inside": inside,
+            "is_contested": is_contested,
             "polygon": areas.of(world, (one.path, other.path), index),
         }));
     }

@@ -15,7 +15,7 @@ const MANY_ROBOTS: usize = 64;
 
 /// How a run stands.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) enum Standing {
+enum Standing {
     /// Records come.
     Running,
     /// None comes any more, and how it ended.
@@ -28,12 +28,13 @@ pub(crate) struct RunState {
     /// What was known before.
     pub(crate) facts: RunFacts,
     /// How it stands.
-    pub(crate) standing: Standing,
+    standing: Standing,
     accounts: Vec<Account>,
     fleet: Option<FleetView>,
     arms: ArmsView,
     /// The first record's time.
     origin_ns: Option<i64>,
+    ended_ns: Option<i64>,
     read_count: u64,
 }
 
@@ -49,6 +50,7 @@ impl RunState {
             arms: ArmsView::new(),
             standing: Standing::Running,
             origin_ns: None,
+            ended_ns: None,
             read_count: 0,
             facts,
         }
@@ -64,8 +66,17 @@ impl RunState {
             fleet.rewind();
         }
         self.origin_ns = None;
+        self.ended_ns = None;
         self.standing = Standing::Running;
         self.read_count = 0;
+    }
+
+    /// Stamps of all hosts compare from now on.
+    pub(crate) fn compare_clocks(&mut self) {
+        self.facts.has_one_clock = true;
+        for account in &mut self.accounts {
+            account.compare_clocks();
+        }
     }
 
     /// Takes a record.
@@ -80,7 +91,7 @@ impl RunState {
             self.origin_ns = Some(record.at_ns);
         }
         self.accounts[record.channel].take(record);
-        if let Body::Message(_, payload) = &record.body {
+        if let Body::Message(payload) = &record.body {
             self.read_count += 1;
             let message = channel.message.as_deref().unwrap_or_default();
             self.arms
@@ -91,8 +102,18 @@ impl RunState {
         }
     }
 
-    /// Seconds since the first record.
+    /// It ended, and how; true when that is news.
+    pub(crate) fn end(&mut self, how: String, now_ns: i64) -> bool {
+        let standing = Standing::Ended(how);
+        let is_news = self.standing != standing;
+        self.ended_ns.get_or_insert(now_ns);
+        self.standing = standing;
+        is_news
+    }
+
+    /// Seconds from the first record to now or to the end.
     pub(crate) fn elapsed_s(&self, now_ns: i64) -> Option<f64> {
+        let now_ns = self.ended_ns.unwrap_or(now_ns);
         self.origin_ns
             .map(|origin_ns| seconds((now_ns - origin_ns).max(0)))
     }
@@ -104,8 +125,6 @@ impl RunState {
             Standing::Running => ("running", None),
             Standing::Ended(how) => ("ended", Some(how)),
         };
-        let problem = self.fleet.as_ref().and_then(|fleet| fleet.problem.as_ref());
-        let problem = problem.map(|what| json!({ "process": null, "what": what }));
         json!({
             "name": facts.name, "case": facts.case, "state": state, "how": how,
             "elapsed_s": self.elapsed_s(now_ns),
@@ -114,9 +133,18 @@ impl RunState {
             "topology_hash": facts.identity.as_ref().map(|(hash, _)| hash),
             "seed": facts.identity.as_ref().map(|(_, seed)| seed),
             "channels": facts.channels_json(),
-            "warnings": problem.into_iter().collect::<Vec<_>>(),
             "recorder": { "read_count": self.read_count },
         })
+    }
+
+    /// True when no more records come.
+    pub(crate) fn is_over(&self) -> bool {
+        self.standing != Standing::Running
+    }
+
+    /// What went wrong in here.
+    pub(crate) fn problem(&self) -> Option<&str> {
+        self.fleet.as_ref()?.problem.as_deref()
     }
 
     /// `/live/channels`, and each `/live/losses` since the last call.

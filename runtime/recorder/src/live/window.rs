@@ -71,13 +71,13 @@ impl Samples {
         self.sorted
             .extend(self.values.iter().map(|(_, value)| value));
         self.sorted.sort_unstable();
-        let at = |share: f64| {
-            let rank = (share * self.sorted.len() as f64).ceil() as usize;
+        let at = |percent: usize| {
+            let rank = (percent * self.sorted.len()).div_ceil(100);
             let value = self.sorted.get(rank.saturating_sub(1));
             value.map(|ns| microseconds(*ns))
         };
         json!({
-            "p50_us": at(0.5), "p99_us": at(0.99), "max_us": at(1.0),
+            "p50_us": at(50), "p99_us": at(99), "max_us": at(100),
             "count": self.sorted.len(), "is_available": self.is_available,
         })
     }

@@ -11,7 +11,7 @@ use super::parameters::Links;
 use super::source::{Progress, Source};
 use super::viewers::Viewers;
 use crate::live::facts::RunFacts;
-use crate::live::state::{RunState, Standing};
+use crate::live::state::RunState;
 use crate::live::{Body, LiveRecord};
 
 /// Between two pictures of robots and arms.
@@ -72,10 +72,6 @@ impl Shown {
         }
     }
 
-    fn is_over(&self) -> bool {
-        self.state.standing != Standing::Running
-    }
-
     fn look_for_warnings(&mut self) {
         let own = self.state.problem().map(|what| (None, what.to_owned()));
         let warnings = self.source.warnings().into_iter().chain(own);
@@ -118,7 +114,7 @@ impl Engine {
     /// Name of the run that is shown, and whether it is over.
     pub(crate) fn showing(&self) -> Option<(&str, bool)> {
         let shown = self.shown.as_ref()?;
-        Some((&shown.state.facts.name, shown.is_over()))
+        Some((&shown.state.facts.name, shown.state.is_over()))
     }
 
     /// The viewers, at the end.
@@ -132,7 +128,8 @@ impl Engine {
         let Some(shown) = &mut self.shown else {
             let now_ns = realtime_ns();
             if is_due(&mut self.due.run, RUN_PERIOD) {
-                self.viewers.live("/live/run", now_ns, waiting(self.viewers.count()));
+                self.viewers
+                    .live("/live/run", now_ns, waiting(self.viewers.count()));
             }
             self.viewers.welcome(now_ns);
             return;
@@ -172,9 +169,7 @@ fn read(shown: &mut Shown, viewers: &mut Viewers, due: &mut Due, console: &mut C
             *due = Due::default();
         }
         Progress::Ended(how) => {
-            let standing = Standing::Ended(how);
-            if state.standing != standing {
-                state.standing = standing;
+            if state.end(how, source.now_ns()) {
                 due.run = None;
             }
         }
@@ -182,7 +177,7 @@ fn read(shown: &mut Shown, viewers: &mut Viewers, due: &mut Due, console: &mut C
 }
 
 fn pictures(shown: &mut Shown, viewers: &mut Viewers, due: &mut Due, now_ns: i64) {
-    let is_over = shown.is_over();
+    let is_over = shown.state.is_over();
     let state = &mut shown.state;
     if let Some(map) = state.new_map() {
         viewers.live("/live/map", now_ns, map);
@@ -220,7 +215,7 @@ fn pictures(shown: &mut Shown, viewers: &mut Viewers, due: &mut Due, now_ns: i64
 
 /// `/live/run`.
 fn words(shown: &Shown, links: &Links, viewer_count: usize, now_ns: i64) -> Value {
-    let is_over = shown.is_over() || shown.playback_speed.is_some();
+    let is_over = shown.state.is_over() || shown.playback_speed.is_some();
     let listed = shown.state.facts.links.iter().map(|link| {
         let ways = ["forward", "backward"];
         let ways = ways.map(|way| links.describe(&link.name, &link.via, way, is_over));
@@ -255,12 +250,14 @@ fn waiting(viewer_count: usize) -> Value {
 
 fn realtime_ns() -> i64 {
     let since = SystemTime::now().duration_since(UNIX_EPOCH);
-    since.map_or(0, |since| i64::try_from(since.as_nanos()).unwrap_or(i64::MAX))
+    since.map_or(0, |since| {
+        i64::try_from(since.as_nanos()).unwrap_or(i64::MAX)
+    })
 }
 
 /// Hands a message on to those who look at its topic.
 fn hand_on(state: &RunState, viewers: &mut Viewers, record: &LiveRecord) {
-    let Body::Message(_, payload) = &record.body else {
+    let Body::Message(payload) = &record.body else {
         return;
     };
     if let Some(channel) = state.facts.channels.get(record.channel) {

@@ -2,45 +2,43 @@
 //! records, works out the state and hands it to the socket; the socket and the page have a runtime of
 //! their own.
 
+mod engine;
 mod page;
 mod parameters;
 mod playback;
+mod running;
 mod source;
 mod viewers;
 
 use std::net::{IpAddr, SocketAddr};
-use std::path::PathBuf;
+use std::path::Path;
+use std::sync::Arc;
 use std::thread;
 use std::time::{Duration, Instant};
 
 use hil_runtime::console::Console;
 use hil_runtime::signals::{EXIT_INTERRUPTED, Signals};
-use serde_json::{Value, json};
+use hil_runtime::watch::{FeedError, LiveRun, SelectError, select};
 use tokio::runtime::Runtime;
 
-use crate::live::state::{RunState, Standing};
-use crate::live::{Body, LiveRecord};
+use engine::{Engine, Shown};
 use parameters::Links;
 use playback::Playback;
-use source::{Progress, Source};
+use running::Running;
 use viewers::Viewers;
 
 /// Between two looks at the records.
 const LOOK_PERIOD: Duration = Duration::from_millis(10);
-/// Between two pictures of robots and arms.
-const PICTURE_PERIOD: Duration = Duration::from_millis(50);
-/// Between two pictures of fleets of many robots.
-const LARGE_PICTURE_PERIOD: Duration = Duration::from_millis(200);
-/// Between two accounts of the channels.
-const CHANNELS_PERIOD: Duration = Duration::from_millis(100);
-/// Between two words on the run.
-const RUN_PERIOD: Duration = Duration::from_secs(1);
+/// Between two looks for a run that begins.
+const WAIT_PERIOD: Duration = Duration::from_millis(300);
 
 /// What the command line says.
 #[derive(Debug)]
 pub(crate) struct ServeOptions {
-    /// A run's folder.
-    pub(crate) run: PathBuf,
+    /// A run's folder, or the beginning of the name of one that goes on; without, the only one.
+    pub(crate) run: Option<String>,
+    /// Wait for a run where there is none, and for the next one at the end.
+    pub(crate) waits: bool,
     /// Where to listen.
     pub(crate) host: IpAddr,
     /// Of the socket; 0 takes a free one.
@@ -56,9 +54,15 @@ pub(crate) struct ServeOptions {
 /// Why nothing is served.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum ServeError {
-    /// Nothing to show.
+    /// Nothing to play back.
     #[error(transparent)]
     Run(#[from] crate::run::RunError),
+    /// No run goes on, or it is not clear which is meant.
+    #[error("{0}; --wait waits for one, and the folder of a finished run is played back")]
+    Select(#[from] SelectError),
+    /// A run that goes on cannot be watched.
+    #[error(transparent)]
+    Feed(#[from] FeedError),
     /// The socket.
     #[error(
         "cannot listen for viewers at {address}: {why}; --port takes another, 0 any that is free"
@@ -93,43 +97,99 @@ pub(crate) fn serve(
     signals: &Signals,
     console: &mut Console,
 ) -> Result<i32, ServeError> {
-    let how = (options.speed, options.repeats);
-    let read = Playback::read(&options.run, how, &mut |_| signals.received().is_none());
-    let (playback, facts) = read?;
+    let shown = first(options, signals, console)?;
     if signals.received().is_some() {
         return Ok(EXIT_INTERRUPTED);
     }
-    for words in playback.words() {
-        console.warn(words);
-    }
-    let links = Links::default();
+    let links = Links::begin();
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(2)
         .thread_name("viewers")
         .enable_all()
         .build()?;
-    let mut viewers = open(options, &runtime, &links, console)?;
-    let state = RunState::new(facts);
-    let words = viewers.offer(&state.facts);
-    for words in words.unwrap_or_else(|error| vec![error.to_string()]) {
-        console.warn(&words);
+    let viewers = open(options, &runtime, &links, console)?;
+    let mut engine = Engine::new(viewers, links);
+    match shown {
+        Some(shown) => engine.show(shown, console),
+        None => console.say("no run goes on here; waiting for one"),
     }
-    let mut engine = Engine {
-        state,
-        source: Box::new(playback),
-        viewers,
-        playback_speed: Some(options.speed),
-        due: Due::default(),
-    };
+    let mut looked = Instant::now();
     while signals.received().is_none() {
-        engine.round();
+        if options.waits && looked.elapsed() >= WAIT_PERIOD {
+            looked = Instant::now();
+            show_next(options, &mut engine, console);
+        }
+        engine.round(console);
         thread::sleep(LOOK_PERIOD);
     }
-    links.replace(None);
-    engine.viewers.end(runtime.handle());
+    engine.into_viewers().end(runtime.handle());
     runtime.shutdown_timeout(Duration::from_secs(1));
     console.say("ended");
     Ok(0)
+}
+
+/// What is shown first; `None` when it has to be waited for.
+fn first(
+    options: &ServeOptions,
+    signals: &Signals,
+    console: &mut Console,
+) -> Result<Option<Shown>, ServeError> {
+    let wanted = options.run.as_deref();
+    let folder = wanted.map(Path::new).filter(|path| path.is_dir());
+    if let Some(folder) = folder.filter(|folder| !goes_on(folder)) {
+        let how = (options.speed, options.repeats);
+        let read = Playback::read(folder, how, &mut |_| signals.received().is_none());
+        let (playback, facts) = read?;
+        for words in playback.words() {
+            console.warn(words);
+        }
+        let source = Box::new(playback);
+        return Ok(Some(Shown::new(facts, source, Some(options.speed), None)));
+    }
+    match select(wanted) {
+        Ok(run) => Ok(Some(watch(run)?)),
+        Err(error) if options.waits && is_none_yet(&error) => Ok(None),
+        Err(error) => Err(error.into()),
+    }
+}
+
+fn goes_on(folder: &Path) -> bool {
+    LiveRun::read(folder).is_ok_and(|run| run.is_held())
+}
+
+const fn is_none_yet(error: &SelectError) -> bool {
+    matches!(error, SelectError::NoneRuns | SelectError::NoSuch { .. })
+}
+
+fn watch(run: LiveRun) -> Result<Shown, ServeError> {
+    let folder = run.folder.clone();
+    let (running, facts) = Running::open(run)?;
+    let topology = running.topology().clone();
+    let links = Some((folder, topology));
+    Ok(Shown::new(facts, Box::new(running), None, links))
+}
+
+/// Shows a run that has begun, where none is shown or the one shown is over.
+fn show_next(options: &ServeOptions, engine: &mut Engine, console: &mut Console) {
+    let showing = engine.showing();
+    if showing.is_some_and(|(_, is_over)| !is_over) {
+        return;
+    }
+    let Ok(run) = select(options.run.as_deref()) else {
+        return;
+    };
+    if showing.is_some_and(|(name, _)| name == run.name) {
+        return;
+    }
+    let name = run.name.clone();
+    match watch(run) {
+        Ok(shown) => {
+            console.say(&format!("showing {name}"));
+            engine.show(shown, console);
+        }
+        // It may be over already, or not quite there: the next look tells.
+        Err(error) => console.warn(&error.to_string()),
+    }
 }
 
 /// Opens socket and page and says where they are.
@@ -140,7 +200,7 @@ fn open(
     console: &mut Console,
 ) -> Result<Viewers, ServeError> {
     let address = SocketAddr::new(options.host, options.port);
-    let handler = std::sync::Arc::new(links.clone());
+    let handler = Arc::new(links.clone());
     let viewers = Viewers::begin(runtime.handle(), address, handler).map_err(|error| {
         let why = error.to_string();
         ServeError::Socket { address, why }
@@ -157,121 +217,4 @@ fn open(
     }
     console.result(&format!("page    http://{page}/\nviewers ws://{socket}\n"));
     Ok(viewers)
-}
-
-/// When the next of each is due.
-#[derive(Debug, Default)]
-struct Due {
-    picture: Option<Instant>,
-    channels: Option<Instant>,
-    run: Option<Instant>,
-}
-
-/// True when `due` has come; it is then due again in `period`.
-fn is_due(due: &mut Option<Instant>, period: Duration) -> bool {
-    let now = Instant::now();
-    if due.is_some_and(|due| now < due) {
-        return false;
-    }
-    *due = Some(now + period);
-    true
-}
-
-/// A run on its way to the viewers.
-struct Engine {
-    state: RunState,
-    source: Box<dyn Source>,
-    viewers: Viewers,
-    playback_speed: Option<f64>,
-    due: Due,
-}
-
-impl Engine {
-    /// Reads what came and shows what is due.
-    fn round(&mut self) {
-        let Self {
-            state,
-            source,
-            viewers,
-            ..
-        } = self;
-        let progress = source.poll(&mut |record| {
-            state.take(record);
-            show(state, viewers, record);
-        });
-        match progress {
-            Progress::Going => {}
-            Progress::Rewound => {
-                self.state.rewind();
-                self.due = Due::default();
-            }
-            Progress::Ended(how) => {
-                if self.state.standing == Standing::Running {
-                    self.state.standing = Standing::Ended(how);
-                    self.due.run = None;
-                }
-            }
-        }
-        self.pictures();
-        self.viewers.welcome(self.source.now_ns());
-    }
-
-    fn pictures(&mut self) {
-        let now_ns = self.source.now_ns();
-        if let Some(map) = self.state.new_map() {
-            self.viewers.live("/live/map", now_ns, map);
-        }
-        let is_over = self.state.standing != Standing::Running;
-        let period = if self.state.is_small() {
-            PICTURE_PERIOD
-        } else {
-            LARGE_PICTURE_PERIOD
-        };
-        // After the end the last picture stays.
-        if !is_over && is_due(&mut self.due.picture, period) {
-            if let Some(fleet) = self.state.fleet(now_ns) {
-                self.viewers.live("/live/fleet", now_ns, fleet);
-            }
-            if let Some(arms) = self.state.arms(now_ns) {
-                self.viewers.live("/live/arms", now_ns, arms);
-            }
-        }
-        if !is_over && is_due(&mut self.due.channels, CHANNELS_PERIOD) {
-            let (channels, losses) = self.state.channels(now_ns);
-            self.viewers.live("/live/channels", now_ns, channels);
-            for loss in losses {
-                self.viewers.live("/live/losses", now_ns, loss);
-            }
-            for place in 0..self.state.facts.channels.len() {
-                for stamps in self.state.shown(place) {
-                    self.viewers.latency(place, now_ns, &stamps);
-                }
-            }
-        }
-        if is_due(&mut self.due.run, RUN_PERIOD) {
-            let run = self.run_words(now_ns);
-            self.viewers.live("/live/run", now_ns, run);
-        }
-    }
-
-    fn run_words(&mut self, now_ns: i64) -> Value {
-        let mut run = self.state.run(now_ns);
-        run["is_playback"] = json!(self.playback_speed.is_some());
-        run["speed"] = json!(self.playback_speed.unwrap_or(1.0));
-        run["recorder"]["file"] = Value::Null;
-        run["recorder"]["missed_count"] = json!(self.source.missed_count());
-        run["recorder"]["viewer_count"] = json!(self.viewers.count());
-        run
-    }
-}
-
-/// Hands a message on to those who look at its topic.
-fn show(state: &RunState, viewers: &mut Viewers, record: &LiveRecord) {
-    let Body::Message(envelope, payload) = &record.body else {
-        return;
-    };
-    if let Some(channel) = state.facts.channels.get(record.channel) {
-        let name = channel.name.as_str();
-        viewers.message((record.channel, name), record.at_ns, envelope, payload);
-    }
 }

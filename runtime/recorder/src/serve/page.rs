@@ -20,7 +20,7 @@ use tokio::runtime::Handle;
 include!(concat!(env!("OUT_DIR"), "/page_files.rs"));
 
 /// Nothing from elsewhere is loaded or run; the socket may be on any port that a tunnel gives it.
-const POLICY: &str = "default-src 'self'; connect-src 'self' ws:; object-src 'none'; \
+const POLICY: &str = "default-src 'self'; connect-src 'self' ws:; img-src 'self' data:; object-src 'none'; \
                       base-uri 'none'; frame-ancestors 'none'; form-action 'none'";
 
 /// Connections at once; more wait.

@@ -6,9 +6,12 @@ use std::time::Instant;
 use hil_models::measure::record::{
     EgressRecord, IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE,
 };
+use hil_models::time::duration_ns;
 use hil_runtime::record::{RecordFile, RecordKind};
+use hil_runtime::report::assessment::Assessment;
+use hil_runtime::report::summary::RunSummary;
 
-use super::source::{Progress, Source};
+use super::source::{Progress, Source, Warning};
 use crate::clocks::Clocks;
 use crate::live::facts::RunFacts;
 use crate::live::{Body, LiveRecord};
@@ -29,6 +32,7 @@ pub(crate) struct Playback {
     began: Instant,
     speed: f64,
     repeats: bool,
+    has_one_clock: bool,
 }
 
 /// A record and its time on the recording's axis.
@@ -80,6 +84,7 @@ impl Playback {
             began: Instant::now(),
             speed,
             repeats,
+            has_one_clock: facts.has_one_clock,
         };
         Ok((playback, facts))
     }
@@ -98,23 +103,22 @@ impl Playback {
     }
 
     fn how(&self) -> String {
-        let Some(summary) = &self.run.summary else {
-            return "no summary: it was killed, or goes on elsewhere".to_owned();
-        };
-        let run = &summary.run;
-        let outcome = serde_json::to_value(&run.outcome).unwrap_or_default();
-        format!(
-            "{}: {}",
-            outcome.as_str().unwrap_or("ended"),
-            run.exit_reason
-        )
+        let unknown = || "no summary: it was killed, or goes on elsewhere".to_owned();
+        self.run.summary.as_ref().map_or_else(unknown, how_ended)
     }
+}
+
+/// How a run ended, in words.
+pub(super) fn how_ended(summary: &RunSummary) -> String {
+    let outcome = serde_json::to_value(summary.run.outcome).unwrap_or_default();
+    let outcome = outcome.as_str().unwrap_or("ended");
+    format!("{outcome}: {}", summary.run.exit_reason)
 }
 
 impl Source for Playback {
     fn now_ns(&self) -> i64 {
-        let since_s = self.began.elapsed().as_secs_f64() * self.speed;
-        self.begin_ns().saturating_add((since_s * 1e9) as i64)
+        let since = self.began.elapsed().mul_f64(self.speed);
+        self.begin_ns().saturating_add(duration_ns(since))
     }
 
     fn poll(&mut self, take: &mut dyn FnMut(&LiveRecord)) -> Progress {
@@ -132,7 +136,7 @@ impl Source for Playback {
                 What::Other(body) => Some(body.clone()),
                 What::Message { file, index } => self.run.files[*file]
                     .message(*index)
-                    .map(|(envelope, payload)| Body::Message(envelope, payload.to_vec())),
+                    .map(|(_, payload)| Body::Message(payload.to_vec())),
             };
             if let Some(body) = body {
                 take(&LiveRecord {
@@ -152,6 +156,18 @@ impl Source for Playback {
             return Progress::Rewound;
         }
         Progress::Ended(self.how())
+    }
+
+    fn has_one_clock(&self) -> bool {
+        self.has_one_clock
+    }
+
+    fn warnings(&self) -> Vec<Warning> {
+        let Some(summary) = &self.run.summary else {
+            return Vec::new();
+        };
+        let warnings = Assessment::of(summary).warnings.into_iter();
+        warnings.map(|what| (None, what)).collect()
     }
 }
 

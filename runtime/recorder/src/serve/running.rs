@@ -70,6 +70,11 @@ impl Running {
         Ok((running, facts))
     }
 
+    /// The topology with every default spelled out.
+    pub(crate) const fn topology(&self) -> &serde_json::Value {
+        &self.feed.manifest().topology
+    }
+
     /// What the account at the end says of how it ended.
     fn how(&self, has_summary: bool) -> String {
         let path = self.feed.run().run_folder().summary();
@@ -124,7 +129,7 @@ impl Source for Running {
                         // What another host sends at the end has been, and is not shown as new.
                         Origin::OtherHost => return,
                     };
-                    let body = Body::Message(*envelope, payload.to_vec());
+                    let body = Body::Message(payload.to_vec());
                     give(&channel.description.name, own_ns, body);
                 }
                 Event::Record {
@@ -151,9 +156,9 @@ impl Source for Running {
         }
         match (&self.ended, self.is_silent) {
             (Some(how), _) => Progress::Ended(how.clone()),
-            (None, true) => {
-                Progress::Ended("all processes have ended; the account is being drawn up".to_owned())
-            }
+            (None, true) => Progress::Ended(
+                "all processes have ended; the account is being drawn up".to_owned(),
+            ),
             (None, false) => Progress::Going,
         }
     }
@@ -187,8 +192,13 @@ impl Source for Running {
             let Ok(text) = fs::read_to_string(&path) else {
                 continue;
             };
-            let process = path.file_stem().map(|name| name.to_string_lossy().into_owned());
-            let lines: Vec<&str> = text.lines().filter(|line| !line.trim().is_empty()).collect();
+            let process = path
+                .file_stem()
+                .map(|name| name.to_string_lossy().into_owned());
+            let lines: Vec<&str> = text
+                .lines()
+                .filter(|line| !line.trim().is_empty())
+                .collect();
             let last = lines.len().saturating_sub(LINES_MAX);
             for line in &lines[last..] {
                 warnings.push((process.clone(), (*line).to_owned()));

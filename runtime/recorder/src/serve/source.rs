@@ -13,6 +13,9 @@ pub(crate) enum Progress {
     Ended(String),
 }
 
+/// What is amiss: with which process, where that is known, and what.
+pub(crate) type Warning = (Option<String>, String);
+
 /// A run's records as they come.
 pub(crate) trait Source {
     /// Now, on the axis of the records' times.
@@ -25,6 +28,12 @@ pub(crate) trait Source {
     fn missed_count(&self) -> Option<u64> {
         None
     }
+
+    /// True when the stamps of all hosts compare; may become true while a run goes on.
+    fn has_one_clock(&self) -> bool;
+
+    /// What is amiss with the run or its host, as far as it is known by now.
+    fn warnings(&self) -> Vec<Warning>;
 
     /// What could not be read since the last call.
     fn take_problems(&mut self) -> Vec<String> {

@@ -12,7 +12,6 @@ use foxglove::{
     ChannelBuilder, Context, FoxgloveError, PartialMetadata, RawChannel, SinkId, WebSocketServer,
     WebSocketServerHandle,
 };
-use hil_models::message::Envelope;
 use prost::Message as _;
 use serde_json::{Value, json};
 use tokio::runtime::Handle;
@@ -187,12 +186,11 @@ impl Viewers {
             let topic = names.claim(format!("{}{base}", view.prefix()));
             views.push((*view, self.topic(topic, view.schema())?));
         }
-        let latency = match facts.via.as_str() {
-            "record" => None,
-            _ => {
-                let topic = names.claim(format!("/net{base}/latency"));
-                Some(self.topic(topic, net::latency_schema())?)
-            }
+        let latency = if facts.via == "record" {
+            None
+        } else {
+            let topic = names.claim(format!("/net{base}/latency"));
+            Some(self.topic(topic, net::latency_schema())?)
         };
         Ok(Topics {
             own: Some((channel, encoder)),
@@ -211,13 +209,7 @@ impl Viewers {
     }
 
     /// A message of the channel with this place, published at `at_ns` on the axis of a recording.
-    pub(crate) fn message(
-        &mut self,
-        (place, name): (usize, &str),
-        at_ns: i64,
-        _envelope: &Envelope,
-        payload: &[u8],
-    ) {
+    pub(crate) fn message(&mut self, (place, name): (usize, &str), at_ns: i64, payload: &[u8]) {
         let Some(topics) = self.channels.get(place) else {
             return;
         };
