@@ -53,8 +53,9 @@ function redraw() {
 }
 
 function setState(state, words) {
-  document.body.dataset.state = state;
   write(byId("connection"), words);
+  if (document.body.dataset.state === state) return;
+  document.body.dataset.state = state;
   byId("lost").hidden = state !== "lost";
   redraw();
 }
