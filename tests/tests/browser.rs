@@ -56,10 +56,13 @@ impl Shown {
     }
 }
 
+/// Shows the run of this folder as soon as it goes on.
 fn serve(root: &Path, host: Option<&LabHost>, options: &[&str]) -> (ChildGuard, String) {
+    let name = root.file_name().unwrap();
     let binary = hil_recorder_binary();
     let mut command = host.map_or_else(|| Command::new(binary), |host| host.command(binary));
-    let mut recorder = ChildGuard::spawn(command.arg("serve").arg(root).args(options)).unwrap();
+    let mut recorder =
+        ChildGuard::spawn(command.args(["serve", "--wait"]).arg(name).args(options)).unwrap();
     let printed = recorder.wait_for_output("http://", LIMIT);
     assert!(printed.is_ok(), "{}", printed.unwrap_err());
     let words = recorder.stdout_so_far() + &recorder.stderr_so_far();
@@ -296,7 +299,7 @@ fn the_live_page_shows_arms_where_there_is_no_network() {
     page.wait_until("document.body.dataset.state === 'live' && hil.snapshot().tools.length === 2");
     keep(&mut page, "toolsThen", "hil.snapshot().tools");
     page.wait_until(
-        "hil.snapshot().tools.every((one, index) => \
+        "hil.snapshot().tools.some((one, index) => \
          Math.hypot(one.x_px - toolsThen[index].x_px, one.y_px - toolsThen[index].y_px) > 2)",
     );
     let points =

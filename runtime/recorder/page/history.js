@@ -19,6 +19,7 @@ export class Shelf {
     this.sizes = [];
     this.start = 0;
     this.bytes = 0;
+    this.held = -Infinity;
     this.cached = undefined;
   }
 
@@ -28,7 +29,7 @@ export class Shelf {
 
   push(time, bytes) {
     const body = this.eager ? JSON.parse(decoder.decode(bytes)) : bytes.slice();
-    if (this.length > 1 && this.newest - this.times[this.times.length - 2] < this.spacing) this.pop();
+    if (this.isBetween()) this.pop();
     this.times.push(time);
     this.bodies.push(body);
     this.sizes.push(bytes.length);
@@ -40,6 +41,11 @@ export class Shelf {
   isFull(time) {
     return this.length > this.maxMessages || this.bytes > this.maxBytes
       || this.times[this.start + 1] < time - this.seconds;
+  }
+
+  // Whether the newest is too near to the one before it to be kept. What a pause shows is.
+  isBetween() {
+    return this.length > 1 && this.newest > this.held && this.newest - this.times[this.times.length - 2] < this.spacing;
   }
 
   pop() {
@@ -128,7 +134,15 @@ export class View {
   pauseAt(time) {
     if (this.newest === undefined) return;
     this.frozen = Math.min(Math.max(time, this.oldest), this.newest);
+    this.hold(this.frozen);
   }
 
-  goLive() { this.frozen = undefined; }
+  goLive() {
+    this.frozen = undefined;
+    this.hold(-Infinity);
+  }
+
+  hold(time) {
+    for (const shelf of Object.values(this.shelves)) shelf.held = time;
+  }
 }

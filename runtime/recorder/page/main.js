@@ -12,6 +12,7 @@ import { Strips } from "./strips.js";
 
 const byId = (id) => document.getElementById(id);
 const PANELS_EVERY_MS = 200;
+const STRIP_MS_PER_S = 2.5;
 const SILENT_S = 3;
 const CONFIG_RETRY_MS = 1500;
 const STEP_S = 0.5;
@@ -42,17 +43,19 @@ let heardAt = performance.now();
 let isStale = true; // something written is older than what is known
 let isSceneStale = true; // something drawn is
 let panelsAt = 0;
+let stripsAt = 0;
 let pointer;
 let shownRun;
 
 function redraw() {
   isStale = isSceneStale = true;
-  panelsAt = 0;
+  panelsAt = stripsAt = 0;
 }
 
 function setState(state, words) {
-  document.body.dataset.state = state;
   write(byId("connection"), words);
+  if (document.body.dataset.state === state) return;
+  document.body.dataset.state = state;
   byId("lost").hidden = state !== "lost";
   redraw();
 }
@@ -169,7 +172,7 @@ function drawPanels(moment) {
   if (newest) {
     table.show(newest.channels, run, strips.choice.value);
     strips.offer(newest.channels.map((channel) => channel.name));
-    strips.draw(samples, losses, moment, colours);
+    drawStrips(samples, losses, moment);
     write(byId("axis-start"), `${Math.round(stretch_s)} s before`);
     write(byId("axis-end"), view.isPaused ? "moment shown" : document.body.dataset.state === "lost" ? "last heard" : "now");
   }
@@ -177,6 +180,14 @@ function drawPanels(moment) {
   showEvents(losses, fleet?.collisions ?? [], (at_s) => at_s);
   if (scene) canvas.setAttribute("aria-label", scenes[scene].summary(at(scene, moment)));
   offerFleets();
+}
+
+// A pixel of a long stretch is seconds wide: drawing it more often would show nothing new.
+function drawStrips(samples, losses, moment) {
+  const now = performance.now();
+  if (now < stripsAt + strips.drawn_s * STRIP_MS_PER_S) return;
+  stripsAt = now;
+  strips.draw(samples, losses, moment, colours);
 }
 
 function offerFleets() {

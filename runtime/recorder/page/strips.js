@@ -80,7 +80,9 @@ export class Strips {
   }
 
   drawOne(strip, one, samples, losses, moment, colours) {
-    const entryOf = (sample) => sample.value.channels.find((channel) => channel.name === one.channel);
+    const isIt = (channel) => channel?.name === one.channel;
+    const place = samples.at(-1).value.channels.findIndex(isIt);
+    const entryOf = ({ value: { channels } }) => (isIt(channels[place]) ? channels[place] : channels.find(isIt));
     const points = samples.map((sample) => {
       const entry = entryOf(sample);
       return { time: sample.time, entry, figures: entry && one.take(entry) };
@@ -105,12 +107,12 @@ export class Strips {
     const scale = this.isLog ? logScale(points, height) : linearScale(points, height);
     this.grid(context, scale, x, width, height, from, colours);
     this.silences(context, points, x, height, colours);
-    const drawable = points.filter((point) => x(point.time) >= LEFT_PX);
     context.save();
     context.beginPath();
     context.rect(LEFT_PX, 0, width - LEFT_PX, height);
     context.clip();
-    for (const piece of pieces(drawable)) {
+    for (const whole of pieces(points)) {
+      const piece = thinned(whole, this.drawn_s / (width - LEFT_PX));
       context.fillStyle = context.strokeStyle = colours.series[0];
       context.globalAlpha = 0.22;
       context.beginPath();
@@ -184,6 +186,30 @@ function pieces(points) {
   }
   if (piece.length > 0) found.push(piece);
   return found;
+}
+
+// Where several points share a pixel: the lowest and the highest p50 of them, and the highest p99.
+function thinned(points, pixel_s) {
+  if (points.length < 2 || points[1].time - points[0].time > pixel_s / 2) return points;
+  const kept = [];
+  let group = [];
+  const close = () => {
+    if (group.length === 0) return;
+    const p50s = group.map((point) => point.figures.p50_us);
+    const p99_us = Math.max(...group.map((point) => point.figures.p99_us));
+    const ends = [Math.min(...p50s), Math.max(...p50s)];
+    if (group[0].figures.p50_us > group.at(-1).figures.p50_us) ends.reverse();
+    for (const p50_us of ends) kept.push({ time: group[0].time, figures: { p50_us, p99_us } });
+    group = [];
+  };
+  for (const point of points) {
+    // Columns of the axis, not of the window, so that a curve does not flicker while it moves.
+    const column = Math.floor(point.time / pixel_s);
+    if (group.length > 0 && column !== Math.floor(group[0].time / pixel_s)) close();
+    group.push(point);
+  }
+  close();
+  return kept;
 }
 
 function extremes(points) {

@@ -118,12 +118,14 @@ impl<'a> Page<'a> {
     pub fn wait_until(&mut self, expression: &str) {
         let deadline = Instant::now() + LIMIT;
         while self.value(&format!("Boolean({expression})")) != true {
-            assert!(
-                Instant::now() < deadline,
-                "{expression}: not within {LIMIT:?}; load {}; the page says {:?}",
-                load_average(),
-                self.complaints()
-            );
+            if Instant::now() >= deadline {
+                let shown = self.value("document.body.innerText.slice(0, 600)");
+                panic!(
+                    "{expression}: not within {LIMIT:?}; load {}; the console has {:?}; the page shows {shown}",
+                    load_average(),
+                    self.complaints()
+                );
+            }
             thread::sleep(POLL_INTERVAL);
         }
     }
