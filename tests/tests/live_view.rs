@@ -227,7 +227,9 @@ fn a_fleet_is_seen_driving_and_its_link_is_changed() {
         .file_name()
         .unwrap()
         .to_owned();
-    let server = Server::start(&["--wait", name.to_str().unwrap()]);
+    let record = folder.path().join("live.mcap");
+    let words = ["--wait", name.to_str().unwrap(), "--record"];
+    let server = Server::start(&[&words[..], &[record.to_str().unwrap()]].concat());
     let mut viewer = Viewer::connect(&server);
     viewer.until("robots and a map", |viewer| {
         let last = viewer.last("/live/fleet");
@@ -294,7 +296,12 @@ fn a_fleet_is_seen_driving_and_its_link_is_changed() {
     late.until("the last picture", |late| {
         late.run_state().as_deref() == Some("ended") && late.last("/live/fleet").is_some()
     });
+    assert_eq!(run["recorder"]["file"], json!(record));
     server.end();
+    let bytes = std::fs::read(&record).unwrap();
+    let summary = mcap::Summary::read(&bytes).unwrap().unwrap();
+    let mut topics = summary.channels.values().map(|channel| &channel.topic);
+    assert!(topics.any(|topic| topic == "/fleet/state"));
 }
 
 /// Loses everything on the way of the commands, and sees that it is lost.

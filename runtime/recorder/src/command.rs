@@ -8,13 +8,13 @@ use clap::Parser;
 use hil_runtime::console::Console;
 use hil_runtime::signals::{EXIT_INTERRUPTED, Signals};
 
-use crate::cli::{Cli, Command};
+use crate::cli::{Cli, Command, ServeOptions};
 use crate::convert::{ConvertError, convert};
 use crate::info::info;
 use crate::record::{Progress, RecordError, Request, record};
 use crate::recover::{RecoverError, loss_words, recover};
 use crate::scan::ScanError;
-use crate::serve::{ServeError, ServeOptions, serve};
+use crate::serve::{ServeError, serve};
 use crate::split::Split;
 use crate::writer::{WriteError, check_target};
 
@@ -80,26 +80,7 @@ pub(crate) fn run() -> ExitCode {
                 .unwrap_or_else(|console| recover_file((&broken, &output), &signals, console))
         }
         Command::Info { file, json } => show(&file, json, &signals, &mut console),
-        Command::Serve {
-            run,
-            wait,
-            host,
-            port,
-            http_port,
-            speed,
-            repeats,
-        } => {
-            let options = ServeOptions {
-                run,
-                waits: wait,
-                host,
-                port,
-                http_port,
-                speed,
-                repeats,
-            };
-            serve_run(&options, &signals, &mut console)
-        }
+        Command::Serve(options) => serve_run(&options, &signals, &mut console),
     };
     ExitCode::from(code)
 }

@@ -9,6 +9,7 @@ use hil_runtime::console::Console;
 use serde_json::{Value, json};
 
 use super::parameters::Links;
+use super::recording::Recording;
 use super::source::{Progress, Source};
 use super::viewers::Viewers;
 use crate::view::facts::RunFacts;
@@ -88,17 +89,22 @@ pub(crate) struct Engine {
     links: Links,
     /// Parameters as they were told last.
     told: Vec<Parameter>,
+    /// Where what is shown is recorded, and the recording.
+    target: Option<PathBuf>,
+    recording: Option<Recording>,
     due: Due,
 }
 
 impl Engine {
     /// Nothing is shown yet.
-    pub(crate) fn new(viewers: Viewers, links: Links) -> Self {
+    pub(crate) fn new(viewers: Viewers, links: Links, target: Option<PathBuf>) -> Self {
         Self {
             shown: None,
             viewers,
             links,
             told: Vec::new(),
+            target,
+            recording: None,
             due: Due::default(),
         }
     }
@@ -111,6 +117,12 @@ impl Engine {
             console.warn(&words);
         }
         self.links.show(shown.links.clone());
+        if let Some(mut before) = self.recording.take() {
+            before.end(console);
+        }
+        // What is played back is on record already.
+        let target = self.target.as_ref().filter(|_| shown.links.is_some());
+        self.recording = target.map(|path| Recording::begin(&shown.state.facts.name, path));
         self.shown = Some(shown);
         self.due = Due::default();
     }
@@ -122,8 +134,11 @@ impl Engine {
     }
 
     /// The viewers, at the end.
-    pub(crate) fn into_viewers(self) -> Viewers {
+    pub(crate) fn into_viewers(self, console: &mut Console) -> Viewers {
         self.links.show(None);
+        if let Some(mut recording) = self.recording {
+            recording.end(console);
+        }
         self.viewers
     }
 
@@ -143,7 +158,12 @@ impl Engine {
         pictures(shown, &mut self.viewers, &mut self.due, now_ns);
         if is_due(&mut self.due.run, RUN_PERIOD) {
             shown.look_for_warnings();
-            let run = words(shown, &self.links, self.viewers.count(), now_ns);
+            if let Some(recording) = &mut self.recording {
+                recording.look(console);
+            }
+            let mut run = words(shown, &self.links, self.viewers.count(), now_ns);
+            let file = self.recording.as_ref().map(|recording| &recording.path);
+            run["recorder"]["file"] = json!(file);
             self.viewers.live("/live/run", now_ns, run);
             let parameters = self.links.list();
             if parameters != self.told {
@@ -234,7 +254,6 @@ fn words(shown: &Shown, links: &Links, viewer_count: usize, now_ns: i64) -> Valu
     run["is_playback"] = json!(shown.playback_speed.is_some());
     run["speed"] = json!(shown.playback_speed.unwrap_or(1.0));
     run["warnings"] = json!(shown.warnings);
-    run["recorder"]["file"] = Value::Null;
     run["recorder"]["missed_count"] = json!(shown.source.missed_count());
     run["recorder"]["viewer_count"] = json!(viewer_count);
     run

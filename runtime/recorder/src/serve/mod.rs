@@ -6,11 +6,12 @@ mod engine;
 mod page;
 mod parameters;
 mod playback;
+mod recording;
 mod running;
 mod source;
 mod viewers;
 
-use std::net::{IpAddr, SocketAddr};
+use std::net::SocketAddr;
 use std::path::Path;
 use std::sync::Arc;
 use std::thread;
@@ -21,6 +22,7 @@ use hil_runtime::signals::{EXIT_INTERRUPTED, Signals};
 use hil_runtime::watch::{FeedError, LiveRun, SelectError, select};
 use tokio::runtime::Runtime;
 
+use crate::cli::ServeOptions;
 use engine::{Engine, Shown};
 use parameters::Links;
 use playback::Playback;
@@ -31,25 +33,6 @@ use viewers::Viewers;
 const LOOK_PERIOD: Duration = Duration::from_millis(10);
 /// Between two looks for a run that begins.
 const WAIT_PERIOD: Duration = Duration::from_millis(300);
-
-/// What the command line says.
-#[derive(Debug)]
-pub(crate) struct ServeOptions {
-    /// A run's folder, or the beginning of the name of one that goes on; without, the only one.
-    pub(crate) run: Option<String>,
-    /// Wait for a run where there is none, and for the next one at the end.
-    pub(crate) waits: bool,
-    /// Where to listen.
-    pub(crate) host: IpAddr,
-    /// Of the socket; 0 takes a free one.
-    pub(crate) port: u16,
-    /// Of the page; 0 takes a free one.
-    pub(crate) http_port: u16,
-    /// Of a run that is played back.
-    pub(crate) speed: f64,
-    /// Begin again at the end.
-    pub(crate) repeats: bool,
-}
 
 /// Why nothing is served.
 #[derive(Debug, thiserror::Error)]
@@ -108,21 +91,21 @@ pub(crate) fn serve(
         .enable_all()
         .build()?;
     let viewers = open(options, &runtime, &links, console)?;
-    let mut engine = Engine::new(viewers, links);
+    let mut engine = Engine::new(viewers, links, options.record.clone());
     match shown {
         Some(shown) => engine.show(shown, console),
         None => console.say("no run goes on here; waiting for one"),
     }
     let mut looked = Instant::now();
     while signals.received().is_none() {
-        if options.waits && looked.elapsed() >= WAIT_PERIOD {
+        if options.wait && looked.elapsed() >= WAIT_PERIOD {
             looked = Instant::now();
             show_next(options, &mut engine, console);
         }
         engine.round(console);
         thread::sleep(LOOK_PERIOD);
     }
-    engine.into_viewers().end(runtime.handle());
+    engine.into_viewers(console).end(runtime.handle());
     runtime.shutdown_timeout(Duration::from_secs(1));
     console.say("ended");
     Ok(0)
@@ -148,7 +131,7 @@ fn first(
     }
     match select(wanted) {
         Ok(run) => Ok(Some(watch(run)?)),
-        Err(error) if options.waits && is_none_yet(&error) => Ok(None),
+        Err(error) if options.wait && is_none_yet(&error) => Ok(None),
         Err(error) => Err(error.into()),
     }
 }
