@@ -20,12 +20,12 @@ use crate::analysis;
 use crate::card_clock::guard;
 use crate::cases;
 use crate::cli::{Cli, Command, RunArgs};
-use crate::compare;
+use crate::compare::{self, cli::CompareArgs};
 use crate::console::Console;
 use crate::doctor::{self, ClockQuestion, DoctorRequest, StampCapabilities};
 use crate::face;
 use crate::gateway;
-use crate::link;
+use crate::link::{self, cli::LinkCommand};
 use crate::probe;
 use crate::process::emulation_room::check_emulation;
 use crate::process::{component, own_program};
@@ -89,21 +89,13 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
         Command::Calibrate(args) => case_work::calibrate(args, registry),
         Command::Replay { run, json } => case_work::replay(&run, json, registry, console),
         Command::Report(args) => report_work::report(&args, console),
-        Command::Compare(args) => match compare::work::work(&args, console) {
-            compare::work::End::Passed => exit::RAN,
-            compare::work::End::Failed => exit::FAILED,
-            compare::work::End::Refused => exit::USAGE,
-        },
+        Command::Compare(args) => compare(&args, console),
         Command::Trace { command } => match trace::work::work(command, columns(), console) {
             trace::work::End::Done => exit::RAN,
             trace::work::End::Failed => exit::FAILED,
             trace::work::End::Refused => exit::USAGE,
         },
-        Command::Link { command } => match link::work::work(&command, console) {
-            link::work::End::Done => exit::RAN,
-            link::work::End::Failed => exit::FAILED,
-            link::work::End::Refused => exit::USAGE,
-        },
+        Command::Link { command } => change_link(&command, console),
         Command::Doctor {
             topology,
             host,
@@ -128,6 +120,22 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
             swing_bvh(period, amplitude, rate),
             console,
         ),
+    }
+}
+
+fn compare(args: &CompareArgs, console: &mut Console) -> u8 {
+    match compare::work::work(args, console) {
+        compare::work::End::Passed => exit::RAN,
+        compare::work::End::Failed => exit::FAILED,
+        compare::work::End::Refused => exit::USAGE,
+    }
+}
+
+fn change_link(command: &LinkCommand, console: &mut Console) -> u8 {
+    match link::work::work(command, console) {
+        link::work::End::Done => exit::RAN,
+        link::work::End::Failed => exit::FAILED,
+        link::work::End::Refused => exit::USAGE,
     }
 }
 

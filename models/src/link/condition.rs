@@ -15,7 +15,7 @@ pub const ORDER_VERSION: u32 = 1;
 /// Name of the message type of the channel that orders travel on.
 pub const ORDER_TYPE_NAME: &str = "hil.LinkOrder.v1";
 /// Longest delay that can be asked for.
-pub const DELAY_MAX: Duration = Duration::from_secs(60);
+pub const DELAY_MAX: Duration = Duration::from_mins(1);
 
 const TOPOLOGY: u32 = 0;
 const FIXED: u32 = 1;

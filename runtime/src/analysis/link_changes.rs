@@ -4,7 +4,9 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use hil_models::link::condition::{LinkConditionRecord, OrderOutcome, order_channel};
+use hil_models::link::condition::{
+    LinkCondition, LinkConditionRecord, OrderOutcome, order_channel,
+};
 use hil_models::link::spec::Way;
 use hil_models::time::Instant;
 
@@ -65,6 +67,6 @@ pub(super) fn longest_delay(
 ) -> Duration {
     let delays = in_force_on(topology, records, crossing)
         .filter_map(LinkConditionRecord::condition)
-        .map(|condition| condition.delay());
+        .map(LinkCondition::delay);
     delays.max().unwrap_or(Duration::ZERO)
 }

@@ -123,6 +123,12 @@ pub(crate) fn conclude(
     let case = case.as_ref().map(|(_, case)| case.as_ref());
     let network_series = network_series.unwrap_or_default();
     write_series(&mut summary, result, (case, network_series), records);
+    write_texts(&summary, result)?;
+    Ok(summary)
+}
+
+/// Writes the summary, the events and the report into the run's folder.
+fn write_texts(summary: &RunSummary, result: &RunResult) -> Result<(), AnalysisError> {
     let path = result.folder.events();
     let text = event_log::text(
         &summary.run.name,
@@ -131,10 +137,9 @@ pub(crate) fn conclude(
     );
     fs::write(&path, text).map_err(|source| AnalysisError::Write { path, source })?;
     summary.write(&result.folder.summary())?;
-    let plain = terminal::render(&summary, REPORT_FILE_WIDTH, Style::Plain);
+    let plain = terminal::render(summary, REPORT_FILE_WIDTH, Style::Plain);
     let path = result.folder.report();
-    fs::write(&path, plain).map_err(|source| AnalysisError::Write { path, source })?;
-    Ok(summary)
+    fs::write(&path, plain).map_err(|source| AnalysisError::Write { path, source })
 }
 
 /// The outages of every channel, their figures put into the summary.

@@ -248,13 +248,12 @@ impl Condition {
         let more = (figure.difference, figure.difference_interval);
         Ok(match (figure.kind, self.unit.as_str()) {
             (FigureKind::Delay | FigureKind::Score, "x") => quotient,
-            (FigureKind::Delay, "ns") => new,
+            (FigureKind::Delay, "ns") | (FigureKind::Score, "") => new,
             (FigureKind::Delay, "us" | "µs") => scaled(new, 1e-3),
             (FigureKind::Delay, "ms") => scaled(new, 1e-6),
             (FigureKind::Delay, "s") => scaled(new, 1e-9),
             (FigureKind::Loss, "%") => scaled(new, 100.0),
             (FigureKind::Loss, "pp") => scaled(more, 100.0),
-            (FigureKind::Score, "") => new,
             (kind, unit) => {
                 return Err(ConditionError::Unit {
                     text: self.text.clone(),

@@ -69,7 +69,7 @@ fn delays_of(run: &ComparedRun) -> BTreeMap<DelayKey, (Estimate, &'static str)> 
         let own = [whole.p50_interval, whole.p99_interval, None, None];
         let mut add = |place: usize, name: &str, parts: Parts<'_>| {
             for (index, metric) in METRICS.iter().enumerate() {
-                if let Some(estimate) = delay(*metric, index, &parts) {
+                if let Some(estimate) = delay(metric, index, &parts) {
                     let key = (channel.to_owned(), place, name.to_owned(), index);
                     found.insert(key, estimate);
                 }

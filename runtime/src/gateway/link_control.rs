@@ -126,7 +126,7 @@ impl ControlLine {
 
     fn obey(&mut self, order: &LinkOrder) {
         self.number += 1;
-        let outcome = self.book.open().and_then(|()| Ok(self.try_obey(order)));
+        let outcome = self.book.open().map(|()| self.try_obey(order));
         let said = match outcome {
             Ok(record) => self.book.write(&record),
             Err(error) => Err(error),
@@ -246,11 +246,15 @@ impl ConditionBook {
     }
 }
 
+/// Size of a record, in the header's form.
+#[expect(clippy::cast_possible_truncation, reason = "56 bytes")]
+const RECORD_BYTES: u32 = size_of::<LinkConditionRecord>() as u32;
+
 fn condition_header(channel: &str, instance: u32) -> RecordHeader {
     RecordHeader {
         kind: RecordKind::LinkCondition,
         channel: channel.to_owned(),
-        record_bytes: size_of::<LinkConditionRecord>() as u32,
+        record_bytes: RECORD_BYTES,
         instance,
     }
 }

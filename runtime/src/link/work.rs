@@ -189,7 +189,7 @@ fn set(
         });
         return pretty(&rows.collect());
     }
-    let lines = done.iter().map(|(direction, confirmed)| {
+    let said = done.iter().map(|(direction, confirmed)| {
         format!(
             "{}: {}, confirmed by {} (change {})",
             direction.name(),
@@ -198,7 +198,7 @@ fn set(
             confirmed.number
         )
     });
-    Ok(lines.collect::<Vec<_>>().join("\n"))
+    Ok(said.collect::<Vec<_>>().join("\n"))
 }
 
 fn condition_json(condition: LinkCondition) -> Value {

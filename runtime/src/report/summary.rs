@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 
 use hil_models::case_study::{Metric, Score};
 use hil_models::link::trace::ReplayCounts;
-use hil_models::measure::account::{ChannelAccount, OutageFigures};
+use hil_models::measure::account::{ChannelAccount, MessageFate, OutageFigures};
 use serde::{Deserialize, Serialize};
 
 use super::assessment::Assessment;
@@ -320,6 +320,16 @@ impl LinkKind {
             Self::Tcp => "TCP",
             Self::Emulated => "emulated link",
             Self::RecordOnly => "recorded only",
+        }
+    }
+}
+
+impl LinkKind {
+    /// The words for a fate of a message on it: what an emulated link lost, no wire did.
+    pub const fn fate_label(self, fate: MessageFate) -> &'static str {
+        match (self, fate) {
+            (Self::Emulated, MessageFate::LostOnWire) => "lost by the emulated link",
+            (_, fate) => fate.label(),
         }
     }
 }

@@ -192,7 +192,7 @@ fn live_facts(summary: &RunSummary) -> Vec<FactGroup> {
     let changes: Vec<Fact> = changes
         .map(|change| Fact::new(change.time(), change.what()))
         .collect();
-    let changed = (!changes.is_empty()).then(|| group("Links changed by hand", changes));
+    let by_hand = (!changes.is_empty()).then(|| group("Links changed by hand", changes));
     let groups = vec![
         group("Run", facts),
         group(
@@ -208,7 +208,7 @@ fn live_facts(summary: &RunSummary) -> Vec<FactGroup> {
             or_none(&summary.host_facts, UNAVAILABLE),
         ),
     ];
-    groups.into_iter().chain(changed).collect()
+    groups.into_iter().chain(by_hand).collect()
 }
 
 fn live_channel(key: &str, one: &ChannelSummary, summary: &RunSummary) -> Channel {
@@ -240,6 +240,7 @@ fn live_channel(key: &str, one: &ChannelSummary, summary: &RunSummary) -> Channe
     let sources = Sources {
         crosses: network.is_some() || !is_local,
         account: one.account.as_ref(),
+        link: Some(one.link),
         network: network.map(|network| &network.figures),
         outages: one.outages.as_ref(),
         ..Sources::default()

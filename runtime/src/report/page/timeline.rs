@@ -45,9 +45,9 @@ pub(super) fn over_run(
         });
     }
     let bands = bands(report);
-    let changed = changes.iter().filter_map(changed_at);
+    let by_hand = changes.iter().filter_map(changed_at);
     let moments = events.events.iter().filter_map(moment);
-    let moments: Vec<Mark> = moments.chain(changed).collect();
+    let moments: Vec<Mark> = moments.chain(by_hand).collect();
     let caption = run_caption(report, (step_s, width_s), bands.len() == BANDS_MAX);
     let plot = Plot {
         axis: format!("{key}-run"),
