@@ -135,7 +135,7 @@ fn take_turns(
     let mut lots = RandomStream::new(SEED, "turns");
     let (mut rounds, mut work) = (Vec::new(), Work::default());
     for _ in 0..round_count {
-        let is_first = lots.next_u64() % 2 == 0;
+        let is_first = lots.next_u64().is_multiple_of(2);
         let mut round: Round = [0..0, 0..0];
         for is_recorded in [is_first, !is_first] {
             round[usize::from(is_recorded)] = if is_recorded {

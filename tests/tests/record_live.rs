@@ -154,16 +154,31 @@ fn both_hosts_of_a_split_run_record_all_of_it() {
         return;
     };
     let folder = RunFolder::new("live-split");
-    let trial = Trial::shipped("split.toml", folder.path()).set("run.duration=\"5 s\"");
-    let outputs = HOSTS.map(|host| folder.join(format!("{host}.mcap")));
-    let mut recorders = [0, 1].map(|index| {
+    let output = RunFolder::new("live-split-files");
+    let trial = Trial::shipped("split.toml", folder.path()).set("run.duration=\"7 s\"");
+    let outputs = HOSTS.map(|host| output.join(format!("{host}.mcap")));
+    let start = |index: usize, file: &Path| {
         let mut command = lab.host(index).command(hil_recorder_binary());
-        command
-            .args(["record", "--wait", "-o"])
-            .arg(&outputs[index]);
+        command.args(["record", "--wait", "-o"]).arg(file);
         ChildGuard::spawn(&mut command).unwrap()
-    });
+    };
+    let mut recorders = [0, 1].map(|index| start(index, &outputs[index]));
     let mut hosts = [0, 1].map(|index| trial.start_on(lab.host(index)));
+    // Killed with a hold on the shared memory of each host, several times: whatever such a recorder
+    // had is freed, and those that come after it find room.
+    for round in 0..3 {
+        let files = [0, 1].map(|index| output.join(format!("killed-{index}-{round}.mcap")));
+        let mut killed = [0, 1].map(|index| start(index, &files[index]));
+        for file in &files {
+            wait_until(LIMIT, "a recorder's file", || partial(file).is_file());
+        }
+        thread::sleep(Duration::from_millis(300));
+        for one in &mut killed {
+            assert!(one.is_running(), "{}", one.stderr_so_far());
+            one.signal(Signal::SIGKILL).unwrap();
+            one.wait_within(LIMIT).unwrap();
+        }
+    }
     for host in &mut hosts {
         host.wait_within(LIMIT).unwrap().assert_success();
     }
@@ -178,7 +193,7 @@ fn both_hosts_of_a_split_run_record_all_of_it() {
         let summary = files.summary();
         assert_every_message_is_accounted_for(&summary);
         assert_accounts_close(&summary);
-        let expected = converted(&files, &folder.join(format!("{host}-converted.mcap")));
+        let expected = converted(&files, &output.join(format!("{host}-converted.mcap")));
         check_same(&counts(&outputs[index]), &files, &expected);
     }
 }
