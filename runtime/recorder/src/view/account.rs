@@ -231,8 +231,13 @@ impl Account {
     }
 
     /// What was found lost since the last call, as `/live/losses` has it; `origin_ns` is the run's
-    /// beginning on the producer's clock, `at_s` now.
-    pub(crate) fn take_losses(&mut self, name: &str, at_s: f64, origin_ns: i64) -> Option<Value> {
+    /// beginning on the producer's clock, where that is known, `at_s` now.
+    pub(crate) fn take_losses(
+        &mut self,
+        name: &str,
+        at_s: f64,
+        origin_ns: Option<i64>,
+    ) -> Option<Value> {
         let mut lost = core::mem::take(&mut self.untold);
         lost.sort_unstable();
         let first_ns = lost.iter().filter_map(|(_, published)| *published).min();
@@ -244,7 +249,9 @@ impl Account {
         (!lost.is_empty()).then(|| {
             json!({
                 "at_s": at_s, "channel": name, "sequences": sequences, "count": lost.len(),
-                "first_at_s": first_ns.map(|ns| seconds(ns.saturating_sub(origin_ns))),
+                "first_at_s": first_ns
+                    .zip(origin_ns)
+                    .map(|(ns, origin_ns)| seconds(ns.saturating_sub(origin_ns))),
             })
         })
     }

@@ -95,9 +95,9 @@ fn what_was_sent_and_did_not_arrive_is_lost_after_a_second() {
         }
     }
     account.settle(1000 * MS);
-    assert_eq!(account.take_losses("x", 1.0, 0), None);
+    assert_eq!(account.take_losses("x", 1.0, Some(0)), None);
     account.settle(1900 * MS);
-    let losses = account.take_losses("x", 1.9, 0).unwrap();
+    let losses = account.take_losses("x", 1.9, Some(0)).unwrap();
     assert_eq!(
         (&losses["sequences"], &losses["count"]),
         (&json!([3, 8]), &json!(2))
@@ -124,7 +124,7 @@ fn a_receiver_alone_knows_the_lost_by_the_numbers_passed_over() {
         account.take(&received(sequence, sequence.cast_signed() * MS));
     }
     account.settle(3000 * MS);
-    let losses = account.take_losses("x", 3.0, 0).unwrap();
+    let losses = account.take_losses("x", 3.0, Some(0)).unwrap();
     assert_eq!(losses["sequences"], json!([7, 10, 11]));
     assert_eq!(losses["first_at_s"], Value::Null);
     assert_eq!(
@@ -141,7 +141,7 @@ fn a_sender_alone_knows_of_no_loss() {
     let figures = account.figures("x", 5000 * MS);
     assert_eq!(figures["lost_count"], Value::Null);
     assert_eq!(figures["link_state"], "none");
-    assert_eq!(account.take_losses("x", 5.0, 0), None);
+    assert_eq!(account.take_losses("x", 5.0, Some(0)), None);
 }
 
 #[test]

@@ -154,7 +154,13 @@ impl RunState {
         for (account, facts) in self.accounts.iter_mut().zip(&self.facts.channels) {
             account.settle(now_ns);
             channels.push(account.figures(&facts.name, now_ns));
-            let origin_ns = self.origin_ns.unwrap_or(now_ns) - facts.offsets_ns[0];
+            // Another host's clock may be anything.
+            let from_host = facts.hosts[0].as_ref();
+            let is_here = from_host.is_some_and(|host| self.facts.hosts_here.contains(host));
+            let origin_ns = self
+                .origin_ns
+                .filter(|_| is_here || self.facts.has_one_clock);
+            let origin_ns = origin_ns.map(|origin_ns| origin_ns - facts.offsets_ns[0]);
             losses.extend(account.take_losses(&facts.name, at_s.unwrap_or(0.0), origin_ns));
         }
         let channels = json!({ "at_s": at_s, "window_s": 1, "channels": channels });
