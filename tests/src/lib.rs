@@ -5,6 +5,7 @@
 pub mod account;
 pub mod arms;
 pub mod binary;
+pub mod browser;
 pub mod child;
 pub mod lab;
 pub mod mcap_file;

@@ -1,9 +1,10 @@
 //! The command line: definitions only. What a command does is in [`crate::command`].
 
+use std::net::IpAddr;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use clap::{Parser, Subcommand};
+use clap::{Args, Parser, Subcommand};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -15,6 +16,8 @@ Examples:
       topics, counts, times, and what the file says of its run
   hil-recorder recover broken.mcap -o whole.mcap
       a whole file of what a killed writer left
+  hil-recorder serve
+      the run that goes on, in the browser and in whatever speaks the Foxglove WebSocket
 
 Exit codes:
   0  done                              70  internal error
@@ -23,6 +26,20 @@ Exit codes:
      or it could not be done           131 interrupted twice
   2  wrong arguments, or not a run's
      folder or an MCAP file";
+
+const SERVE_EXAMPLES: &str = "\
+Examples:
+  hil-recorder serve
+      the run that goes on here; the page is at http://127.0.0.1:8766/
+  hil-recorder serve --wait --record recordings/
+      the next one, and the one after it, each recorded as well
+  hil-recorder serve runs/fleet-emulated-20261122-101806 --loop
+      a finished run again and again
+  ssh -L 8765:localhost:8765 -L 8766:localhost:8766 control-pc
+      from another PC, then the same address; nothing is open to the network
+
+Lichtblick and Foxglove connect to ws://127.0.0.1:8765. Topics and fields are in docs/live-view.md.
+It ends with Ctrl-C; the exit code is 0 then.";
 
 const CONVERT_EXAMPLES: &str = "\
 Examples:
@@ -132,6 +149,46 @@ pub(crate) enum Command {
         #[arg(long)]
         json: bool,
     },
+    /// Show a run in the browser and in viewers that speak the Foxglove WebSocket.
+    #[command(after_help = SERVE_EXAMPLES)]
+    Serve(ServeOptions),
+}
+
+/// What is served, and where.
+#[derive(Debug, Args)]
+pub(crate) struct ServeOptions {
+    /// The beginning of the name of a run that goes on, or the folder of any run; without, the
+    /// only one that goes on here.
+    #[arg(value_name = "RUN")]
+    pub(crate) run: Option<String>,
+    /// Wait for a run if none goes on, and for the next one when it is over.
+    #[arg(long)]
+    pub(crate) wait: bool,
+    /// Address to listen at; another than this machine's own lets others in.
+    #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1")]
+    pub(crate) host: IpAddr,
+    /// Port of the socket; 0 takes one that is free.
+    #[arg(long, value_name = "PORT", default_value_t = 8765)]
+    pub(crate) port: u16,
+    /// Port of the page; 0 takes one that is free.
+    #[arg(long, value_name = "PORT", default_value_t = 8766)]
+    pub(crate) http_port: u16,
+    /// Record what is shown while it goes on, as `record` does: a file, or a folder for one file
+    /// per run.
+    #[arg(long, value_name = "FILE")]
+    pub(crate) record: Option<PathBuf>,
+    /// How fast a finished run is played back, 0.01 to 100.
+    #[arg(long, value_name = "FACTOR", default_value_t = 1.0, value_parser = speed)]
+    pub(crate) speed: f64,
+    /// Play a finished run again and again.
+    #[arg(long = "loop")]
+    pub(crate) repeats: bool,
+}
+
+fn speed(text: &str) -> Result<f64, String> {
+    let speed = text.parse::<f64>().ok();
+    let speed = speed.filter(|speed| (0.01..=100.0).contains(speed));
+    speed.ok_or_else(|| "must be a number from 0.01 to 100".to_owned())
 }
 
 /// Units of sizes, bytes each; the longer word of two that end alike comes first.

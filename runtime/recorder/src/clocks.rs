@@ -136,6 +136,13 @@ impl Clocks {
         Self::at(self.hosts.get(host)?.offset_ns, monotonic_ns)
     }
 
+    /// From the monotonic clock of `host` to the recording's times, nanoseconds; 0 where no relation
+    /// is known.
+    pub(crate) fn offset_ns(&self, host: Option<&str>) -> i64 {
+        let clock = self.hosts.get(host.unwrap_or(UNKNOWN_HOST));
+        clock.map_or(0, |clock| clock.offset_ns)
+    }
+
     fn at(offset_ns: i64, monotonic_ns: i64) -> Option<u64> {
         if monotonic_ns == UNAVAILABLE {
             return None;

@@ -8,12 +8,13 @@ use clap::Parser;
 use hil_runtime::console::Console;
 use hil_runtime::signals::{EXIT_INTERRUPTED, Signals};
 
-use crate::cli::{Cli, Command};
+use crate::cli::{Cli, Command, ServeOptions};
 use crate::convert::{ConvertError, convert};
 use crate::info::info;
 use crate::record::{Progress, RecordError, Request, record};
 use crate::recover::{RecoverError, loss_words, recover};
 use crate::scan::ScanError;
+use crate::serve::{ServeError, serve};
 use crate::split::Split;
 use crate::writer::{WriteError, check_target};
 
@@ -79,6 +80,7 @@ pub(crate) fn run() -> ExitCode {
                 .unwrap_or_else(|console| recover_file((&broken, &output), &signals, console))
         }
         Command::Info { file, json } => show(&file, json, &signals, &mut console),
+        Command::Serve(options) => serve_run(&options, &signals, &mut console),
     };
     ExitCode::from(code)
 }
@@ -111,6 +113,19 @@ impl Patience {
     fn progress(&self, console: &mut Console, words: &str) {
         if self.since.elapsed() >= SILENCE {
             console.progress(words);
+        }
+    }
+}
+
+fn serve_run(options: &ServeOptions, signals: &Signals, console: &mut Console) -> u8 {
+    match serve(options, signals, console) {
+        Ok(code) => u8::try_from(code).unwrap_or(exit::FAILED),
+        Err(error) => {
+            console.error(&error.to_string());
+            match error {
+                ServeError::Run(_) | ServeError::Select(_) => exit::USAGE,
+                _ => exit::FAILED,
+            }
         }
     }
 }

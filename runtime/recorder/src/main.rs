@@ -5,6 +5,7 @@
 //! [`encode`], what a message looks like; [`topics`] and [`net`], what is made of it; [`writer`],
 //! the file; [`convert`], all of them together. While a run goes, [`live`] makes the same topics of its
 //! events for any [`sink`], and [`record`] puts them into files. [`scan`] reads files, for [`recover`] and [`info`].
+//! [`view`] is the state of a run that goes on, [`serve`] shows it.
 
 mod cli;
 mod clocks;
@@ -23,9 +24,11 @@ mod recover;
 mod run;
 mod scan;
 mod schema;
+mod serve;
 mod sink;
 mod split;
 mod topics;
+mod view;
 mod writer;
 
 #[cfg(test)]
