@@ -170,7 +170,7 @@ fn check_past(page: &mut Page<'_>, scene: &str) {
 fn check_numbers(page: &mut Page<'_>, channel: &str) {
     let cell = |label: &str| format!("tr[data-channel='{channel}'] [data-label='{label}']");
     let published = format!(
-        "Number(document.querySelector({:?}).textContent.replaceAll(',', ''))",
+        "Number((document.querySelector({:?})?.textContent ?? '').replaceAll(',', ''))",
         cell("published")
     );
     page.wait_until(&format!("{published} > 0"));
@@ -303,7 +303,7 @@ fn the_live_page_shows_arms_where_there_is_no_network() {
          Math.hypot(one.x_px - toolsThen[index].x_px, one.y_px - toolsThen[index].y_px) > 2)",
     );
     let points =
-        "Number(document.querySelector(\"[data-strip^='egm/right/command']\").dataset.points)";
+        "Number(document.querySelector(\"[data-strip^='egm/right/command']\")?.dataset.points)";
     page.wait_until(&format!("{points} > 3"));
     let before = number(&mut page, points);
     page.wait_until(&format!("{points} > {before} + 10"));
