@@ -75,8 +75,9 @@ impl Server {
     }
 }
 
-/// A viewer that subscribes to everything.
+/// A viewer that subscribes to everything, or to topics that begin alike.
 struct Viewer {
+    wanted: &'static str,
     socket: WebSocket<TcpStream>,
     topics: BTreeMap<u32, String>,
     schemas: BTreeMap<String, (String, String)>,
@@ -86,6 +87,10 @@ struct Viewer {
 
 impl Viewer {
     fn connect(server: &Server) -> Self {
+        Self::of_topics(server, "/")
+    }
+
+    fn of_topics(server: &Server, wanted: &'static str) -> Self {
         let stream = TcpStream::connect(&server.socket).unwrap();
         stream
             .set_read_timeout(Some(Duration::from_secs(20)))
@@ -103,6 +108,7 @@ impl Viewer {
             "foxglove.sdk.v1"
         );
         Self {
+            wanted,
             socket,
             topics: BTreeMap::new(),
             schemas: BTreeMap::new(),
@@ -144,6 +150,9 @@ impl Viewer {
             let text = |key: &str| channel[key].as_str().unwrap_or_default().to_owned();
             let kind = (text("encoding"), text("schemaName"));
             self.schemas.insert(topic.clone(), kind);
+            if !topic.starts_with(self.wanted) {
+                continue;
+            }
             let id = u32::try_from(self.topics.len() + 1).unwrap();
             self.topics.insert(id, topic);
             subscriptions.push(json!({ "id": id, "channelId": channel["id"] }));
@@ -326,7 +335,7 @@ fn change_the_link(viewer: &mut Viewer) {
         }
     };
     assert!(viewer.texts.iter().any(refused("outside 0 to 1")));
-    assert!(viewer.texts.iter().any(refused("no link `nowhere`")));
+    assert!(viewer.texts.iter().any(refused("no link `nowhere")));
 }
 
 #[test]
@@ -437,7 +446,8 @@ fn check_the_page(server: &Server) {
 /// The same run, finished, through the same socket, again and again.
 fn play_back(run: &str) {
     let server = Server::start(&[run, "--speed", "50", "--loop"]);
-    let mut viewer = Viewer::connect(&server);
+    // All topics at such a speed are more than a test reads; the newest would crowd out the rest.
+    let mut viewer = Viewer::of_topics(&server, "/live/");
     viewer.until("two rounds", |viewer| {
         let runs = viewer.live("/live/run");
         let elapsed = runs.iter().filter_map(|run| run["elapsed_s"].as_f64());

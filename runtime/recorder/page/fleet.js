@@ -15,7 +15,7 @@ export class FleetScene {
   legend() {
     const entry = (kind, words, text = "") => make("li", {}, make("i", { class: kind }, text), words);
     return [entry("thick", "way granted"), entry("dashed", "planned way"), entry("area", "section, colour: who may pass"),
-      entry("both", "several may pass"), entry("stale", "stale"), entry("cross", "collision", "×")];
+      entry("both", "granted to both at once"), entry("stale", "stale"), entry("cross", "collision", "×")];
   }
 
   drag(dx, dy) {
@@ -147,8 +147,9 @@ export class FleetScene {
 
   section(context, section) {
     const { colours } = this;
-    const [one, another] = section.may_pass;
-    const isContested = another !== undefined;
+    // A robot may follow another through: contested is where their grants meet.
+    const [one] = section.may_pass;
+    const isContested = section.is_contested;
     const colour = isContested ? colours.bad : one === undefined ? colours.faint : colours.series[one % 7];
     this.trace(context, section.polygon, true);
     context.fillStyle = colour;

@@ -2,6 +2,7 @@
 
 use std::net::IpAddr;
 use std::path::PathBuf;
+use std::time::Duration;
 
 use clap::{Parser, Subcommand};
 
@@ -9,6 +10,8 @@ const EXAMPLES: &str = "\
 Examples:
   hil-recorder convert runs/teleop-local-20261121-101500 -o run.mcap
       a run's folder as one file for Lichtblick, Foxglove, PlotJuggler or Python
+  hil-recorder record -o run.mcap
+      the run that goes on this host, while it goes
   hil-recorder info run.mcap
       topics, counts, times, and what the file says of its run
   hil-recorder recover broken.mcap -o whole.mcap
@@ -18,8 +21,9 @@ Examples:
 
 Exit codes:
   0  done                              70  internal error
-  1  done, but the run's folder has    130 interrupted: no file
-     gaps; or it could not be done     131 interrupted twice
+  1  done, but the run's folder has    130 interrupted: no file; of
+     gaps, or something was missed;        `record`: a whole one
+     or it could not be done           131 interrupted twice
   2  wrong arguments, or not a run's
      folder or an MCAP file";
 
@@ -44,6 +48,19 @@ Examples:
 
 Works for a run that was killed too: what is cut short is left out, counted, and said in the
 file; the exit code is 1 then. Topics and schemas are in docs/recordings.md.";
+
+const RECORD_EXAMPLES: &str = "\
+Examples:
+  hil-recorder record -o run.mcap
+      the only run that goes on this host, until it ends or Ctrl-C
+  hil-recorder record --wait -o recordings/ &
+      started before the run: waits for it; the file gets the run's name
+  hil-recorder record teleop-split -o long.mcap --split-size 1GiB --split-time 10min
+      long_0001.mcap, long_0002.mcap and so on, each whole by itself
+
+Until it is whole, a file is called FILE.partial. When the recorder is killed,
+`hil-recorder recover FILE.partial -o FILE` gets back all but the last --flush. What was missed is
+counted by channel, here and in the file; the exit code is 1 then. See docs/recordings.md.";
 
 const RECOVER_EXAMPLES: &str = "\
 Example:
@@ -79,6 +96,34 @@ pub(crate) enum Command {
         #[arg(long, short, value_name = "FILE")]
         output: PathBuf,
         /// Replace the file if it exists.
+        #[arg(long)]
+        force: bool,
+    },
+    /// Record a run while it goes.
+    #[command(after_help = RECORD_EXAMPLES)]
+    Record {
+        /// Name of the run, the beginning of it, or its folder; the only one if left out.
+        #[arg(value_name = "RUN")]
+        run: Option<String>,
+        /// The file to write, or the folder to write it into.
+        #[arg(long, short, value_name = "FILE")]
+        output: PathBuf,
+        /// Wait for a run to begin.
+        #[arg(long)]
+        wait: bool,
+        /// Leave out what the run recorded before; otherwise a recorder that comes late catches up.
+        #[arg(long)]
+        from_now: bool,
+        /// Begin another file when one is larger, e.g. 1GiB; looked at with every flush.
+        #[arg(long, value_name = "SIZE", value_parser = size)]
+        split_size: Option<u64>,
+        /// Begin another file when one was written for longer, e.g. 10min.
+        #[arg(long, value_name = "TIME", value_parser = time)]
+        split_time: Option<Duration>,
+        /// What a kill of the recorder may lose at most, 100ms to 60s.
+        #[arg(long, value_name = "TIME", value_parser = flush, default_value = "1s")]
+        flush: Duration,
+        /// Replace files that exist.
         #[arg(long)]
         force: bool,
     },
@@ -136,4 +181,81 @@ fn speed(text: &str) -> Result<f64, String> {
     let speed = text.parse::<f64>().ok();
     let speed = speed.filter(|speed| (0.01..=100.0).contains(speed));
     speed.ok_or_else(|| "must be a number from 0.01 to 100".to_owned())
+}
+
+/// Units of sizes, bytes each; the longer word of two that end alike comes first.
+const SIZES: [(&str, f64); 7] = [
+    ("KiB", 1024.0),
+    ("MiB", 1_048_576.0),
+    ("GiB", 1_073_741_824.0),
+    ("kB", 1e3),
+    ("MB", 1e6),
+    ("GB", 1e9),
+    ("B", 1.0),
+];
+/// Units of times, seconds each.
+const TIMES: [(&str, f64); 4] = [("ms", 1e-3), ("min", 60.0), ("s", 1.0), ("h", 3600.0)];
+
+/// A number with one of `units` behind it, in the smallest of them.
+fn measured(text: &str, units: &[(&str, f64)]) -> Result<f64, String> {
+    let names: Vec<&str> = units.iter().map(|(name, _)| *name).collect();
+    let unit = units.iter().find(|(name, _)| text.ends_with(name));
+    let value = unit.and_then(|(name, factor)| {
+        let number: f64 = text.strip_suffix(name)?.trim_end().parse().ok()?;
+        Some(number * factor)
+    });
+    let value = value.filter(|value| value.is_finite() && *value > 0.0);
+    value.ok_or_else(|| {
+        format!(
+            "a number above 0 with one of {} behind it",
+            names.join(", ")
+        )
+    })
+}
+
+fn size(text: &str) -> Result<u64, String> {
+    let bytes = measured(text, &SIZES)?;
+    if !(1.0..=1e18).contains(&bytes) {
+        return Err("1B to 1000000000GB".to_owned());
+    }
+    #[allow(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "checked just above"
+    )]
+    Ok(bytes as u64)
+}
+
+fn time(text: &str) -> Result<Duration, String> {
+    let seconds = measured(text, &TIMES)?;
+    Duration::try_from_secs_f64(seconds).map_err(|error| error.to_string())
+}
+
+fn flush(text: &str) -> Result<Duration, String> {
+    let flush = time(text)?;
+    let range = Duration::from_millis(100)..=Duration::from_mins(1);
+    if range.contains(&flush) {
+        Ok(flush)
+    } else {
+        Err("100ms to 60s".to_owned())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sizes_and_times_are_read_with_their_units_and_never_without() {
+        assert_eq!(size("1GiB"), Ok(1 << 30));
+        assert_eq!(size("1.5 kB"), Ok(1500));
+        assert_eq!(time("10min"), Ok(Duration::from_mins(10)));
+        assert_eq!(time("250ms"), Ok(Duration::from_millis(250)));
+        assert_eq!(flush("0.5 s"), Ok(Duration::from_millis(500)));
+        for text in ["10", "0s", "-1s", "s", "1 d", "nans", "infs"] {
+            assert!(time(text).is_err(), "{text}");
+        }
+        assert!(size("0.5B").is_err() && size("1").is_err());
+        assert!(flush("10ms").is_err() && flush("2min").is_err());
+    }
 }

@@ -18,6 +18,8 @@ pub(crate) enum Basis {
     Manifest,
     /// That of another host, which reads the same clock.
     OtherHost,
+    /// Its clock is another one: its messages have the times at which they arrived here.
+    Arrival,
     /// Nothing is known: times are those of its monotonic clock.
     None,
 }
@@ -29,6 +31,7 @@ impl Basis {
             Self::Gateways => "real time, by what the gateways noted beside the messages",
             Self::Manifest => "real time, by a read of both clocks before the run",
             Self::OtherHost => "real time, by another host that reads the same clock",
+            Self::Arrival => "real time of arrival on the recording host: its own clock is another",
             Self::None => "monotonic clock, not real time: no relation was noted",
         }
     }

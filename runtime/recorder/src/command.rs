@@ -11,9 +11,11 @@ use hil_runtime::signals::{EXIT_INTERRUPTED, Signals};
 use crate::cli::{Cli, Command};
 use crate::convert::{ConvertError, convert};
 use crate::info::info;
+use crate::record::{Progress, RecordError, Request, record};
 use crate::recover::{RecoverError, loss_words, recover};
 use crate::scan::ScanError;
 use crate::serve::{ServeError, ServeOptions, serve};
+use crate::split::Split;
 use crate::writer::{WriteError, check_target};
 
 /// Exit codes, as `--help` lists them; those of `hil-runtime`.
@@ -43,6 +45,30 @@ pub(crate) fn run() -> ExitCode {
             let checked = check_target(&output, &run, force);
             unless_refused(checked, &mut console)
                 .unwrap_or_else(|console| convert_run((&run, &output), &signals, console))
+        }
+        Command::Record {
+            run,
+            output,
+            wait,
+            from_now,
+            split_size,
+            split_time,
+            flush,
+            force,
+        } => {
+            let request = Request {
+                run,
+                output,
+                waits: wait,
+                from_now,
+                split: Split {
+                    size_bytes: split_size,
+                    time: split_time,
+                },
+                flush,
+                force,
+            };
+            record_run(&request, &signals, &mut console)
         }
         Command::Recover {
             broken,
@@ -160,6 +186,71 @@ fn convert_run((run, output): (&Path, &Path), signals: &Signals, console: &mut C
             }
         }
     }
+}
+
+fn record_run(request: &Request, signals: &Signals, console: &mut Console) -> u8 {
+    let recorded = record(request, &mut |progress| {
+        console.progress(&progress_words(progress));
+        signals.received()
+    });
+    let recorded = match recorded {
+        Ok(recorded) => recorded,
+        Err(error) => {
+            console.error(&error.to_string());
+            return match error {
+                RecordError::Select(_)
+                | RecordError::Write(WriteError::Exists { .. } | WriteError::Unfinished { .. }) => {
+                    exit::USAGE
+                }
+                RecordError::Interrupted(_) => interrupted(),
+                RecordError::Feed(_) | RecordError::Write(_) => exit::FAILED,
+            };
+        }
+    };
+    for words in &recorded.words {
+        console.warn(words);
+    }
+    for (channel, count) in &recorded.missed {
+        console.warn(&format!("{channel}: missed {count} messages"));
+    }
+    let files: Vec<String> = recorded
+        .paths
+        .iter()
+        .map(|path| path.display().to_string())
+        .collect();
+    console.result(&format!(
+        "{}: {} messages of the run, {} in all on {} topics; missed {}\n",
+        files.join(", "),
+        recorded.message_count,
+        recorded.written_count,
+        recorded.topic_count,
+        recorded.missed.values().sum::<u64>()
+    ));
+    if recorded.signal.is_some() {
+        return interrupted();
+    }
+    if recorded.has_gaps {
+        console.error("something of the run is not in the file, see above; the file says so too");
+        return exit::FAILED;
+    }
+    exit::DONE
+}
+
+fn progress_words(progress: &Progress<'_>) -> String {
+    if progress.run.is_empty() {
+        return "waiting for a run".to_owned();
+    }
+    let file = match progress.file_count {
+        1 => String::new(),
+        count => format!("  file {count}"),
+    };
+    format!(
+        "{}  {:.0} messages/s  {:.1} MiB{file}  missed {}",
+        progress.run,
+        progress.rate_hz,
+        progress.size_bytes as f64 / f64::from(1 << 20),
+        progress.missed_count
+    )
 }
 
 fn recover_file((broken, output): (&Path, &Path), signals: &Signals, console: &mut Console) -> u8 {

@@ -4,7 +4,7 @@
 use std::path::Path;
 
 use hil_models::message::Envelope;
-use hil_models::trace::{Trace, UNAVAILABLE_NS};
+use hil_models::trace::Trace;
 use hil_runtime::record::{RecordFile, RecordKind};
 use prost::Message as _;
 
@@ -299,14 +299,16 @@ impl Conversion {
             }
             if let Some((trace, whole)) = trace_of(run, name) {
                 for index in 0..whole.records.len() {
-                    let at_ns = published_ns(whole, index);
+                    let at_ns = net::published_ns(whole, index);
                     let at_ns = at_ns.and_then(|ns| clocks.time_ns(name, ns));
                     put(at_ns, channel, What::Link { trace, index });
                 }
             }
         }
         let after_all = self.channels.len();
-        for (index, at_ns) in facts::event_times(run, clocks).into_iter().enumerate() {
+        let mut time_ns = |host: &str, at_ns| clocks.host_time_ns(host, at_ns);
+        let events = facts::event_times(run, clocks.has_one_clock, &mut time_ns);
+        for (index, at_ns) in events.into_iter().enumerate() {
             put(at_ns, after_all, What::Event { index });
         }
         self.timeless_count = timeless_count;
@@ -403,13 +405,4 @@ fn is_of(file: &RecordFile, channel: &str, kind: RecordKind) -> bool {
 fn trace_of<'a>(run: &'a Run, channel: &str) -> Option<(usize, &'a Trace)> {
     let mut traces = run.traces.iter().enumerate();
     traces.find(|(_, trace)| trace.header.channel == channel)
-}
-
-/// On the sender's monotonic clock; `None` where the trace does not know when the run began.
-fn published_ns(trace: &Trace, index: usize) -> Option<i64> {
-    let origin_ns = trace.header.origin_ns;
-    let since_start_ns = trace.records[index].published_ns;
-    (origin_ns != UNAVAILABLE_NS)
-        .then(|| origin_ns.checked_add(since_start_ns))
-        .flatten()
 }

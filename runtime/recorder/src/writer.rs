@@ -25,6 +25,12 @@ pub(crate) enum WriteError {
         /// The file.
         path: PathBuf,
     },
+    /// A killed recorder left it.
+    #[error("{path} is there: `hil-recorder recover` makes a whole file of it; then remove it")]
+    Unfinished {
+        /// The file.
+        path: PathBuf,
+    },
     /// What is to be read would be replaced.
     #[error("{path} is what is read; give the result another name")]
     IsInput {
@@ -77,6 +83,8 @@ pub(crate) struct Recording {
     partial: PathBuf,
     path: PathBuf,
     message_count: u64,
+    /// What is not completed stays beside the place where it was to go.
+    is_live: bool,
 }
 
 /// Says that `path` may be written, before any work is done for it.
@@ -107,6 +115,25 @@ impl Recording {
     pub(crate) fn create(path: &Path) -> Result<Self, WriteError> {
         let name = path.file_name().unwrap_or_default().to_string_lossy();
         let partial = path.with_file_name(format!(".{name}.{}.partial", process::id()));
+        Self::begin(path, partial, false)
+    }
+
+    /// Begins a file that will be called `path` and is called `<path>.partial` until then, where
+    /// whoever looks for it after a kill finds it.
+    ///
+    /// # Errors
+    /// When there is no room, no right or no folder for it, or such a file is there already: what a
+    /// killed recorder left is not written over.
+    pub(crate) fn create_live(path: &Path) -> Result<Self, WriteError> {
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        let partial = path.with_file_name(format!("{name}.partial"));
+        if fs::symlink_metadata(&partial).is_ok() {
+            return Err(WriteError::Unfinished { path: partial });
+        }
+        Self::begin(path, partial, true)
+    }
+
+    fn begin(path: &Path, partial: PathBuf, is_live: bool) -> Result<Self, WriteError> {
         let file = File::create(&partial).map_err(|source| WriteError::Io {
             path: partial.clone(),
             source,
@@ -117,6 +144,7 @@ impl Recording {
             partial,
             path: path.to_owned(),
             message_count: 0,
+            is_live,
         };
         let writer = WriteOptions::new()
             .compression(Some(Compression::Zstd))
@@ -126,6 +154,26 @@ impl Recording {
             .map_err(|source| recording.refused(source))?;
         recording.writer = Some(writer);
         Ok(recording)
+    }
+
+    /// Where the file will be.
+    pub(crate) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Messages so far.
+    pub(crate) const fn message_count(&self) -> u64 {
+        self.message_count
+    }
+
+    /// Size of the file by what has left this process, bytes.
+    pub(crate) fn size_bytes(&self) -> u64 {
+        fs::metadata(&self.partial).map_or(0, |data| data.len())
+    }
+
+    /// The error of having more topics than the container can number.
+    pub(crate) fn full(&self) -> WriteError {
+        self.refused(McapError::TooManyChannels)
     }
 
     fn refused(&self, source: McapError) -> WriteError {
@@ -256,6 +304,9 @@ impl Drop for Recording {
     fn drop(&mut self) {
         // Before the file goes: the writer completes it when it is dropped.
         drop(self.writer.take());
+        if self.is_live {
+            return;
+        }
         // After `finish` there is none any more.
         let _is_gone = fs::remove_file(&self.partial).is_ok();
     }

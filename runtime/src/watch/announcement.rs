@@ -7,7 +7,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
-use super::live::{LIVE_VERSION, LiveChannel, LiveRun, Source, start_ticks};
+use super::live::{LIVE_VERSION, LiveChannel, LiveRun, Source, Stage, start_ticks};
 use crate::channel::DomainAddress;
 use crate::run_folder::{RunFolder, utc_text};
 use crate::topology::{Channel, Program, Topology};
@@ -35,6 +35,7 @@ impl Announcement {
             Some(LiveChannel {
                 name: channel.name.clone(),
                 source: source(topology, channel, &is_here)?,
+                noted: noted(topology, channel, &is_here),
             })
         });
         let pid = std::process::id();
@@ -122,4 +123,27 @@ pub(crate) fn source(
         host: consumer.host.clone(),
         is_forwarded: true,
     })
+}
+
+/// What the processes here note of each message of `channel`. Own programs note nothing.
+fn noted(topology: &Topology, channel: &Channel, is_here: &dyn Fn(&str) -> bool) -> Vec<Stage> {
+    let ends = [Some(channel.from.as_str()), channel.to.as_deref()];
+    let [producer, consumer] = ends.map(|name| topology.process(name?));
+    let (Some(producer), Some(consumer)) = (producer, consumer) else {
+        return Vec::new();
+    };
+    let keeps_records = |program: &Program| !matches!(program, Program::Command { .. });
+    let crosses = producer.host != consumer.host;
+    let (from_here, to_here) = (is_here(&producer.host), is_here(&consumer.host));
+    let stages = [
+        (
+            Stage::Published,
+            from_here && keeps_records(&producer.program),
+        ),
+        (Stage::Sent, from_here && crosses),
+        (Stage::Received, to_here && crosses),
+        (Stage::Taken, to_here && keeps_records(&consumer.program)),
+    ];
+    let noted = stages.into_iter().filter(|(_, is_noted)| *is_noted);
+    noted.map(|(stage, _)| stage).collect()
 }

@@ -161,6 +161,12 @@ impl Feed {
         Ok(feed)
     }
 
+    /// Passes over everything that is in the records by now, for those who want to see what happens
+    /// and not what happened.
+    pub fn skip_to_now(&mut self) {
+        self.follower.skip_to_end();
+    }
+
     /// The run.
     pub const fn run(&self) -> &LiveRun {
         &self.run

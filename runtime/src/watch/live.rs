@@ -57,6 +57,23 @@ pub struct LiveChannel {
     pub name: String,
     /// Where.
     pub source: Source,
+    /// What the processes here note of each of its messages.
+    #[serde(default)]
+    pub noted: Vec<Stage>,
+}
+
+/// A step on the way of a message that a process notes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Stage {
+    /// Its producer published it.
+    Published,
+    /// A gateway sent it.
+    Sent,
+    /// A gateway received it.
+    Received,
+    /// Its consumer took it.
+    Taken,
 }
 
 /// Where the messages of a channel can be had while the run goes.
@@ -195,6 +212,7 @@ mod tests {
                     host: "a".to_owned(),
                     is_forwarded: true,
                 },
+                noted: vec![Stage::Received, Stage::Taken],
             }],
         };
         let text = serde_json::to_string(&run).unwrap();

@@ -30,7 +30,7 @@ pub(crate) use announcement::{Announcement, source};
 pub use event::{Event, Origin, Record};
 pub use feed::{Feed, FeedError, Poll, WatchedChannel};
 pub use follow::{Batch, RecordFollower};
-pub use live::{LIVE_VERSION, LiveChannel, LiveRun, Source};
+pub use live::{LIVE_VERSION, LiveChannel, LiveRun, Source, Stage};
 pub use passive::{PassiveCounters, PassiveReader, observer_depth};
 pub use seen::Seen;
 pub use select::{SelectError, running_runs, running_runs_below, select};

@@ -136,6 +136,12 @@ fn new_files_are_found_and_a_foreign_one_is_said_once() {
     assert_eq!(count(&mut follower), 1);
     assert!(follower.take_problems().is_empty());
     assert_eq!(follower.file_count(), 3);
+    append(&folder, &header, "two", bytes_of(&published(3)));
+    append(&folder, &header, "three", bytes_of(&published(0)));
+    follower.skip_to_end();
+    assert_eq!(count(&mut follower), 0);
+    append(&folder, &header, "three", bytes_of(&published(1)));
+    assert_eq!(count(&mut follower), 1);
 }
 
 const CHANNELS: [&str; 3] = ["own", "forwarded", "elsewhere"];
@@ -171,6 +177,7 @@ fn announced(place: &Place) -> (Domain, Vec<ChannelHolder>, LiveRun) {
             host: "b".to_owned(),
             is_forwarded,
         },
+        noted: Vec::new(),
     };
     let run = LiveRun {
         schema_version: LIVE_VERSION,

@@ -4,15 +4,16 @@
 use std::path::PathBuf;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
+use foxglove::websocket::Parameter;
 use hil_runtime::console::Console;
 use serde_json::{Value, json};
 
 use super::parameters::Links;
 use super::source::{Progress, Source};
 use super::viewers::Viewers;
-use crate::live::facts::RunFacts;
-use crate::live::state::RunState;
-use crate::live::{Body, LiveRecord};
+use crate::view::facts::RunFacts;
+use crate::view::state::RunState;
+use crate::view::{Body, LiveRecord};
 
 /// Between two pictures of robots and arms.
 const PICTURE_PERIOD: Duration = Duration::from_millis(50);
@@ -85,6 +86,8 @@ pub(crate) struct Engine {
     shown: Option<Shown>,
     viewers: Viewers,
     links: Links,
+    /// Parameters as they were told last.
+    told: Vec<Parameter>,
     due: Due,
 }
 
@@ -95,6 +98,7 @@ impl Engine {
             shown: None,
             viewers,
             links,
+            told: Vec::new(),
             due: Due::default(),
         }
     }
@@ -141,9 +145,10 @@ impl Engine {
             shown.look_for_warnings();
             let run = words(shown, &self.links, self.viewers.count(), now_ns);
             self.viewers.live("/live/run", now_ns, run);
-            let changed = self.links.list();
-            if !changed.is_empty() {
-                self.viewers.server().publish_parameter_values(changed);
+            let parameters = self.links.list();
+            if parameters != self.told {
+                self.told.clone_from(&parameters);
+                self.viewers.server().publish_parameter_values(parameters);
             }
         }
         self.viewers.welcome(now_ns);

@@ -13,9 +13,9 @@ use hil_runtime::report::summary::RunSummary;
 
 use super::source::{Progress, Source, Warning};
 use crate::clocks::Clocks;
-use crate::live::facts::RunFacts;
-use crate::live::{Body, LiveRecord};
 use crate::run::{Run, RunError};
+use crate::view::facts::RunFacts;
+use crate::view::{Body, LiveRecord};
 
 /// Records given out per call at most, so that a signal is heard and pictures are drawn.
 const RECORDS_MAX: usize = 50_000;

@@ -9,8 +9,8 @@ use hil_runtime::watch::{self, Event, Feed, FeedError, LiveRun, Origin, Poll, Re
 use super::playback::how_ended;
 use super::source::{Progress, Source, Warning};
 use crate::clocks::Clocks;
-use crate::live::facts::RunFacts;
-use crate::live::{Body, LiveRecord};
+use crate::view::facts::RunFacts;
+use crate::view::{Body, LiveRecord};
 
 /// Polls per look, so that a long past does not keep signals and pictures waiting.
 const POLLS_MAX: usize = 16;

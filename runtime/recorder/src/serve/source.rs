@@ -1,6 +1,6 @@
 //! Where the records of a served run come from: a finished run's folder, or one that goes on.
 
-use crate::live::LiveRecord;
+use crate::view::LiveRecord;
 
 /// How it goes on after a look.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -1,11 +1,12 @@
 //! Everybody who looks on, over the Foxglove WebSocket: topics are offered and fed here. A viewer
 //! that is too slow loses its oldest messages; nobody waits for it. What a topic says is decided in
-//! [`crate::live`].
+//! [`crate::view`].
 
 use std::collections::BTreeMap;
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, Sender, channel};
+use std::time::Duration;
 
 use foxglove::websocket::{ChannelView, Client, ParameterHandler, ServerListener};
 use foxglove::{
@@ -17,13 +18,16 @@ use serde_json::{Value, json};
 use tokio::runtime::Handle;
 
 use crate::encode::Encoder;
-use crate::live::facts::{ChannelFacts, RunFacts};
 use crate::net::{self, MessageLatency};
 use crate::schema::{self, Schema};
 use crate::topics::{Names, View, topic_of};
+use crate::view::facts::{ChannelFacts, RunFacts};
 
 /// Messages that wait for one viewer at most; then its oldest go.
 const WAITING_MAX: usize = 4096;
+
+/// How long a viewer may take to hear that it is over.
+const GOODBYE_WITHIN: Duration = Duration::from_secs(1);
 
 /// Topics of JSON, all of them offered from the beginning.
 pub(crate) const LIVE_TOPICS: [&str; 6] = [
@@ -43,6 +47,14 @@ const KEPT: [&str; 5] = [
     "/live/fleet",
     "/live/arms",
 ];
+
+/// As the library joins it with a port.
+fn bracketed(ip: IpAddr) -> String {
+    match ip {
+        IpAddr::V4(ip) => ip.to_string(),
+        IpAddr::V6(ip) => format!("[{ip}]"),
+    }
+}
 
 /// Subscriptions, as they happen.
 struct Listener {
@@ -109,7 +121,7 @@ impl Viewers {
         let (tell, subscribed) = channel();
         let server = WebSocketServer::new()
             .name(concat!("hil-recorder ", env!("CARGO_PKG_VERSION")))
-            .bind(address.ip().to_string(), address.port())
+            .bind(bracketed(address.ip()), address.port())
             .message_backlog_size(WAITING_MAX)
             .listener(Arc::new(Listener { tell }))
             .parameter_handler(parameters)
@@ -282,6 +294,8 @@ impl Viewers {
     /// Says goodbye to all.
     pub(crate) fn end(self, runtime: &Handle) {
         let stopped = self.server.stop();
-        runtime.block_on(stopped.wait());
+        // One that does not read would keep it for ever.
+        let goodbye = async { tokio::time::timeout(GOODBYE_WITHIN, stopped.wait()).await };
+        let _is_polite = runtime.block_on(goodbye).is_ok();
     }
 }

@@ -312,3 +312,7 @@ fn picture_of((fleet, id): Id, robot: &Robot, scene: Option<&Scene>, now_ns: i64
 fn read<M: Message>(payload: &[u8]) -> Option<M> {
     bytemuck::try_pod_read_unaligned(payload).ok()
 }
+
+#[cfg(test)]
+#[path = "fleet_tests.rs"]
+mod tests;

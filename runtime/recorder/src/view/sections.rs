@@ -170,3 +170,96 @@ pub(crate) fn of_pair(
         }));
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use hil_models::fleet::scenario::{Scenario, Scene, WorldParameters};
+
+    fn crossing() -> Scene {
+        let parameters = WorldParameters {
+            scenario: Scenario::Crossing,
+            path_spacing_m: 0.1,
+            ..WorldParameters::default()
+        };
+        parameters.build().unwrap()
+    }
+
+    fn at(robot: u32, (index, granted): (usize, usize)) -> OnPath {
+        OnPath {
+            robot,
+            path: PathId(2 * robot),
+            index,
+            granted,
+        }
+    }
+
+    fn listed(scene: &Scene, one: &OnPath, other: &OnPath) -> Vec<Value> {
+        let mut areas = Areas::new(scene.world.vehicle.footprint);
+        let mut list = Vec::new();
+        of_pair(&scene.world, &mut areas, 0, (one, other), &mut list);
+        list
+    }
+
+    #[test]
+    fn a_crossing_is_the_square_that_both_can_cover() {
+        let scene = crossing();
+        let mut areas = Areas::new(scene.world.vehicle.footprint);
+        let area = areas.of(&scene.world, (PathId(0), PathId(2)), 0);
+        let spread = |axis: usize| {
+            let values = area.iter().map(|point| point[axis]);
+            values.clone().fold(f64::MIN, f64::max) - values.fold(f64::MAX, f64::min)
+        };
+        assert!(
+            (spread(0) - 0.5).abs() < 1e-9 && (spread(1) - 0.5).abs() < 1e-9,
+            "{area:?}"
+        );
+        assert!(areas.of(&scene.world, (PathId(0), PathId(2)), 9).is_empty());
+    }
+
+    #[test]
+    fn who_is_granted_the_crossing_may_pass_and_two_contest_it() {
+        let scene = crossing();
+        // The section has the poses 188 to 212 of both.
+        let list = listed(&scene, &at(0, (190, 400)), &at(1, (150, 180)));
+        assert_eq!(
+            (&list[0]["may_pass"], &list[0]["inside"]),
+            (&json!([0]), &json!([0]))
+        );
+        assert_eq!(
+            (&list[0]["is_contested"], &list[0]["id"]),
+            (&json!(false), &json!("0:0-1:0"))
+        );
+        let both = listed(&scene, &at(0, (150, 400)), &at(1, (150, 400)));
+        assert_eq!(
+            (&both[0]["may_pass"], &both[0]["is_contested"]),
+            (&json!([0, 1]), &json!(true))
+        );
+        assert_eq!(
+            listed(&scene, &at(0, (213, 400)), &at(1, (150, 400))),
+            Vec::<Value>::new()
+        );
+    }
+
+    #[test]
+    fn a_long_lane_is_a_strip_as_wide_as_the_vehicle() {
+        let parameters = WorldParameters {
+            scenario: Scenario::HeadOn,
+            ..WorldParameters::default()
+        };
+        let scene = parameters.build().unwrap();
+        let mut areas = Areas::new(scene.world.vehicle.footprint);
+        let area = areas.of(&scene.world, (PathId(0), PathId(2)), 0);
+        let path = scene.world.path(PathId(0));
+        assert!(area.len() > 20);
+        // Its corners stand by twos beside the path.
+        for (left, right) in area.iter().zip(area.iter().rev()) {
+            let wide_m = (left[0] - right[0]).hypot(left[1] - right[1]);
+            assert!(
+                (wide_m - scene.world.vehicle.footprint.width_m).abs() < 0.01,
+                "{wide_m}"
+            );
+        }
+        assert!(path.length_m() > 20.0);
+    }
+}

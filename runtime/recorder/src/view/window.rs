@@ -11,34 +11,39 @@ pub(crate) const WINDOW_NS: i64 = 1_000_000_000;
 /// Values kept at most; beyond, the oldest go, and figures are of the newest.
 const SAMPLES_MAX: usize = 4096;
 
-/// Instants within the window.
+/// Records are read some time after they were written; a window that ends now would lack the newest.
+/// It ends with the newest that is known, but no longer ago than this, nanoseconds.
+const READ_LATE_NS: i64 = 250_000_000;
+
+/// Instants kept apart at most; of a faster channel several count as one.
+const INSTANTS_MAX: usize = 8192;
+
+/// How many things happened within the window.
 #[derive(Debug, Default)]
 pub(crate) struct Recent {
-    /// Count per slot of a tenth of the window, so that any rate costs the same.
-    slots: VecDeque<(i64, u64)>,
+    instants: VecDeque<(i64, u64)>,
 }
-
-/// A slot's length, nanoseconds.
-const SLOT_NS: i64 = WINDOW_NS / 20;
 
 impl Recent {
     /// `count` things happened at `at_ns`.
     pub(crate) fn add(&mut self, at_ns: i64, count: u64) {
-        let slot = at_ns.div_euclid(SLOT_NS);
-        match self.slots.back_mut() {
-            // What comes late counts where the newest is: it was learned then.
-            Some((last, sum)) if *last >= slot => *sum += count,
-            _ => self.slots.push_back((slot, count)),
+        let is_full = self.instants.len() >= INSTANTS_MAX;
+        match self.instants.back_mut() {
+            // What comes out of order counts with the newest: it was learned then.
+            Some((last, sum)) if is_full || *last >= at_ns => *sum += count,
+            _ => self.instants.push_back((at_ns, count)),
         }
     }
 
     /// How many happened in the window before `now_ns`.
     pub(crate) fn count(&mut self, now_ns: i64) -> u64 {
-        let oldest = (now_ns - WINDOW_NS).div_euclid(SLOT_NS);
-        while self.slots.front().is_some_and(|(slot, _)| *slot <= oldest) {
-            self.slots.pop_front();
+        let newest_ns = self.instants.back().map_or(now_ns, |(at, _)| *at);
+        let end_ns = newest_ns.clamp(now_ns - READ_LATE_NS, now_ns.max(newest_ns));
+        let begin_ns = end_ns - WINDOW_NS;
+        while self.instants.front().is_some_and(|(at, _)| *at <= begin_ns) {
+            self.instants.pop_front();
         }
-        self.slots.iter().map(|(_, count)| count).sum()
+        self.instants.iter().map(|(_, count)| count).sum()
     }
 }
 
@@ -98,8 +103,9 @@ mod tests {
         for tick in 0..300 {
             recent.add(tick * 10_000_000, 1);
         }
-        let count = recent.count(3_000_000_000);
-        assert!((95..=105).contains(&count), "{count}");
+        assert_eq!(recent.count(3_000_000_000), 100);
+        assert_eq!(recent.count(3_200_000_000), 100);
+        assert_eq!(recent.count(3_500_000_000), 74);
         assert_eq!(recent.count(9_000_000_000), 0);
     }
 
