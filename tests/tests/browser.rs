@@ -90,6 +90,8 @@ fn assert_clean(page: &mut Page<'_>, name: &str) {
 /// Pictures as on a desk, in the dark and on a phone, where nothing may stick out sideways.
 fn take_pictures(page: &mut Page<'_>, name: &str) {
     let folder = screenshot_folder();
+    page.value("scrollTo(0, 0)");
+    settle(page);
     page.screenshot(&folder.join(format!("{name}-desktop.png")));
     page.set_dark(true);
     settle(page);
