@@ -1,4 +1,4 @@
-//! A headless Chromium for tests of our pages, spoken to over a pair of pipes in the DevTools protocol:
+//! A headless Chromium for tests of our pages, spoken to over a pair of pipes in its own debugging protocol:
 //! no driver, no port. It opens pages, clicks, types, takes pictures, and keeps what a page wrote to the
 //! console and what it asked the network for. What pages must show is the tests' business.
 

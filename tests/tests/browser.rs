@@ -90,6 +90,8 @@ fn assert_clean(page: &mut Page<'_>, name: &str) {
 /// Pictures as on a desk, in the dark and on a phone, where nothing may stick out sideways.
 fn take_pictures(page: &mut Page<'_>, name: &str) {
     let folder = screenshot_folder();
+    page.value("scrollTo(0, 0)");
+    settle(page);
     page.screenshot(&folder.join(format!("{name}-desktop.png")));
     page.set_dark(true);
     settle(page);
@@ -170,7 +172,7 @@ fn check_past(page: &mut Page<'_>, scene: &str) {
 fn check_numbers(page: &mut Page<'_>, channel: &str) {
     let cell = |label: &str| format!("tr[data-channel='{channel}'] [data-label='{label}']");
     let published = format!(
-        "Number(document.querySelector({:?}).textContent.replaceAll(',', ''))",
+        "Number((document.querySelector({:?})?.textContent ?? '').replaceAll(',', ''))",
         cell("published")
     );
     page.wait_until(&format!("{published} > 0"));
@@ -303,7 +305,7 @@ fn the_live_page_shows_arms_where_there_is_no_network() {
          Math.hypot(one.x_px - toolsThen[index].x_px, one.y_px - toolsThen[index].y_px) > 2)",
     );
     let points =
-        "Number(document.querySelector(\"[data-strip^='egm/right/command']\").dataset.points)";
+        "Number(document.querySelector(\"[data-strip^='egm/right/command']\")?.dataset.points)";
     page.wait_until(&format!("{points} > 3"));
     let before = number(&mut page, points);
     page.wait_until(&format!("{points} > {before} + 10"));

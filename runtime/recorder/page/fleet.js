@@ -53,6 +53,7 @@ export class FleetScene {
   draw(map, fleet, colours) {
     const { context, width, height } = surface(this.canvas);
     this.drawn = [];
+    this.labels = [];
     if (!map || !map.bounds) return;
     this.canvas.style.setProperty("--ground", aspect(map.bounds));
     this.fit(map.bounds, width, height);
@@ -225,16 +226,26 @@ export class FleetScene {
     const words = [wide >= NUMBER_FITS_PX ? "" : String(robot.id), robot.is_stale ? age(robot.age_s) : ""].filter(Boolean).join(" · ");
     if (!words) return;
     const rise = Math.abs(Math.sin(robot.heading_rad)) * long / 2 + Math.abs(Math.cos(robot.heading_rad)) * wide / 2;
-    const y = y_px - rise - 7 < 8 ? y_px + rise + 8 : y_px - rise - 7;
     context.font = `600 12px ${FONT}`;
+    const [x, y] = this.freePlace(x_px, y_px, rise, context.measureText(words).width);
     context.textAlign = "center";
     context.textBaseline = "middle";
     context.lineWidth = 3;
     context.lineJoin = "round";
     context.strokeStyle = this.colours.paper;
-    context.strokeText(words, x_px, y);
+    context.strokeText(words, x, y);
     context.fillStyle = this.colourOf(robot);
-    context.fillText(words, x_px, y);
+    context.fillText(words, x, y);
+  }
+
+  // Above, below or beside a vehicle: the first place without another's label; above, if there is none.
+  freePlace(x, y, rise, width) {
+    const [up, aside] = [rise + 7, rise + 8 + width / 2];
+    const places = [[x, y - up], [x, y + up], [x - aside, y], [x + aside, y], [x, y - up - 12]];
+    const isFree = ([left, top]) => top > 8 && this.labels.every((label) => Math.abs(label[0] - left) > (label[2] + width) / 2 || Math.abs(label[1] - top) > 12);
+    const place = places.find(isFree) ?? places[0];
+    this.labels.push([...place, width]);
+    return place;
   }
 
   collision(context, hit, at_s) {

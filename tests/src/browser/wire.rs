@@ -1,4 +1,4 @@
-//! The pipes to the browser: commands and answers of the DevTools protocol, JSON that ends in a zero
+//! The pipes to the browser: commands and answers of its debugging protocol, JSON that ends in a zero
 //! byte. Events are kept in the order in which they came.
 
 use std::io::{BufRead, BufReader, Write};
