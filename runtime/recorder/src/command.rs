@@ -1,16 +1,18 @@
 //! What each command of the command line does, and the exit code it ends with.
 
+use std::fs;
 use std::path::Path;
 use std::process::ExitCode;
-use std::time::{Duration, Instant};
 
 use clap::Parser;
 use hil_runtime::console::Console;
+use hil_runtime::progress::Progress;
 use hil_runtime::signals::{EXIT_INTERRUPTED, Signals};
 
 use crate::cli::{Cli, Command};
 use crate::convert::{ConvertError, convert};
 use crate::info::info;
+use crate::play::{PlayEnd, PlayError, PlayOptions, SourceError, TargetError, play};
 use crate::recover::{RecoverError, loss_words, recover};
 use crate::scan::ScanError;
 use crate::writer::{WriteError, check_target};
@@ -22,9 +24,6 @@ mod exit {
     pub(super) const USAGE: u8 = 2;
     pub(super) const INTERNAL: u8 = 70;
 }
-
-/// How long work goes on before it says how far it is.
-const SILENCE: Duration = Duration::from_secs(1);
 
 /// Does what the command line says.
 pub(crate) fn run() -> ExitCode {
@@ -53,6 +52,22 @@ pub(crate) fn run() -> ExitCode {
                 .unwrap_or_else(|console| recover_file((&broken, &output), &signals, console))
         }
         Command::Info { file, json } => show(&file, json, &signals, &mut console),
+        Command::Play {
+            file,
+            only,
+            speed,
+            is_looped,
+            into,
+        } => {
+            let options = PlayOptions {
+                file,
+                only,
+                speed,
+                is_looped,
+                into,
+            };
+            play_file(&options, &signals, &mut console)
+        }
     };
     ExitCode::from(code)
 }
@@ -71,22 +86,11 @@ fn unless_refused(
     }
 }
 
-/// Work that is done in a moment needs no word on how far it is.
-struct Patience {
-    since: Instant,
-}
-
-impl Patience {
-    fn new() -> Self {
-        let since = Instant::now();
-        Self { since }
-    }
-
-    fn progress(&self, console: &mut Console, words: &str) {
-        if self.since.elapsed() >= SILENCE {
-            console.progress(words);
-        }
-    }
+/// How much of the file at `path` is read by byte `offset`.
+fn show_read(progress: Progress, console: &mut Console, (path, offset): (&Path, u64)) {
+    let size_bytes = fs::metadata(path).map_or(0, |file| file.len());
+    let share = (size_bytes > 0).then(|| offset as f64 / size_bytes as f64);
+    progress.show(console, share, &format!("{} MiB read", offset >> 20));
 }
 
 fn interrupted() -> u8 {
@@ -94,9 +98,9 @@ fn interrupted() -> u8 {
 }
 
 fn convert_run((run, output): (&Path, &Path), signals: &Signals, console: &mut Console) -> u8 {
-    let patience = Patience::new();
-    let converted = convert(run, output, &mut |words| {
-        patience.progress(console, words);
+    let progress = Progress::begin();
+    let converted = convert(run, output, &mut |share, words| {
+        progress.show(console, share, words);
         signals.received()
     });
     match converted {
@@ -129,9 +133,9 @@ fn convert_run((run, output): (&Path, &Path), signals: &Signals, console: &mut C
 }
 
 fn recover_file((broken, output): (&Path, &Path), signals: &Signals, console: &mut Console) -> u8 {
-    let patience = Patience::new();
+    let progress = Progress::begin();
     let recovered = recover(broken, output, &mut |offset| {
-        patience.progress(console, &format!("{} MiB read", offset >> 20));
+        show_read(progress, console, (broken, offset));
         signals.received()
     });
     let recovered = match recovered {
@@ -169,9 +173,9 @@ fn recover_file((broken, output): (&Path, &Path), signals: &Signals, console: &m
 }
 
 fn show(file: &Path, json: bool, signals: &Signals, console: &mut Console) -> u8 {
-    let patience = Patience::new();
+    let progress = Progress::begin();
     let found = info(file, &mut |offset| {
-        patience.progress(console, &format!("{} MiB read", offset >> 20));
+        show_read(progress, console, (file, offset));
         signals.received()
     });
     match found {
@@ -196,6 +200,26 @@ fn show(file: &Path, json: bool, signals: &Signals, console: &mut Console) -> u8
         Err(error) => {
             console.error(&error.to_string());
             exit::USAGE
+        }
+    }
+}
+
+fn play_file(options: &PlayOptions, signals: &Signals, console: &mut Console) -> u8 {
+    match play(options, signals, console) {
+        Ok(PlayEnd::Done) => exit::DONE,
+        Ok(PlayEnd::Interrupted(signal)) => {
+            console.say(&format!("ended by {signal}"));
+            interrupted()
+        }
+        Err(error) => {
+            console.error(&error.to_string());
+            match error {
+                PlayError::Source(SourceError::Message { .. })
+                | PlayError::Target(TargetError::Domain(_) | TargetError::Channel(_)) => {
+                    exit::FAILED
+                }
+                PlayError::Source(_) | PlayError::Target(_) => exit::USAGE,
+            }
         }
     }
 }

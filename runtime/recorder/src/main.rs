@@ -3,16 +3,19 @@
 //!
 //! Read in this order: [`run`] and [`clocks`], what there is and when it was; [`schema`] and
 //! [`encode`], what a message looks like; [`topics`] and [`net`], what is made of it; [`writer`],
-//! the file; [`convert`], all of them together. [`scan`] reads files, for [`recover`] and [`info`].
+//! the file; [`convert`], all of them together. [`scan`] reads files, for [`recover`] and [`info`], and
+//! [`play`] feeds what [`decode`] makes of them into a run.
 
 mod cli;
 mod clocks;
 mod command;
 mod convert;
+mod decode;
 mod encode;
 mod facts;
 mod info;
 mod net;
+mod play;
 mod recover;
 mod run;
 mod scan;
