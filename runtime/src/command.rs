@@ -1,6 +1,8 @@
 //! What each command of the command line does, and the exit code it ends with.
 
 mod case_work;
+mod live_work;
+mod play_work;
 mod report_work;
 
 use std::collections::BTreeMap;
@@ -87,7 +89,8 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
             case_work::tables(&topology, &overrides, batch, registry)
         }
         Command::Calibrate(args) => case_work::calibrate(args, registry),
-        Command::Replay { run, json } => case_work::replay(&run, json, registry, console),
+        Command::Replay(args) if play_work::is_recording(&args) => play_work::play(&args, console),
+        Command::Replay(args) => case_work::replay(&args.run, args.json, registry, console),
         Command::Report(args) => report_work::report(&args, console),
         Command::Compare(args) => compare(&args, console),
         Command::Trace { command } => match trace::work::work(command, columns(), console) {
@@ -105,6 +108,8 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
             Ok(request) => examine(&request, (strict, json), console),
             Err(code) => code,
         },
+        Command::Channel(args) => live_work::channel(args, registry, console),
+        Command::Top(args) => live_work::top(&args, registry, console),
         Command::Probe(args) => probe::run(&args, console),
         Command::Cases => {
             console.result(&cases::list(registry));

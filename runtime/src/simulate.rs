@@ -18,6 +18,7 @@ use hil_models::link::trace::{ReplayCounts, ReplayTally};
 use hil_models::measure::account::OutageFigures;
 use hil_models::plot::PlotSeries;
 use hil_models::simulation::{Carrier, Simulation, SimulationResult};
+use hil_models::time::Instant;
 
 use crate::analysis::outages::OutageStory;
 use crate::process::launch::EmulationLaunch;
@@ -79,13 +80,14 @@ pub(crate) struct Simulated {
     network_series: Vec<PlotSeries>,
 }
 
-/// Runs the topology's case in virtual time.
+/// Runs the topology's case in virtual time; tells `watch` now and then which share of it is over.
 ///
 /// # Errors
 /// When the topology has no case, or a link that only a real run shows.
 pub(crate) fn simulate(
     topology: &Topology,
     registry: &Registry,
+    watch: &mut dyn FnMut(f64),
 ) -> Result<Simulated, SimulateError> {
     let refused = |text: String| SimulateError::Topology(text);
     let made = registry
@@ -120,7 +122,13 @@ pub(crate) fn simulate(
         .collect::<Option<Vec<_>>>()
         .ok_or_else(|| refused("the case lists a role it cannot make".to_owned()))?;
     let result = Simulation::of_roles(entry.name, entry.channels, roles, carriers)
-        .and_then(|simulation| simulation.run(topology.run().duration))
+        .and_then(|simulation| {
+            let duration = topology.run().duration;
+            simulation.run_watched(duration, &mut |now| {
+                let passed = now.saturating_duration_since(Instant::ZERO);
+                watch(passed.as_secs_f64() / duration.as_secs_f64());
+            })
+        })
         .map_err(|error| refused(error.to_string()))?;
     let score = case.score(&result.log);
     let duration = topology.run().duration;

@@ -18,6 +18,8 @@ Examples:
       a whole file of what a killed writer left
   hil-recorder serve
       the run that goes on, in the browser and in whatever speaks the Foxglove WebSocket
+  hil-recorder play run.mcap --only human/frame --speed 2 --loop
+      a recorded channel into a run that goes on, in place of its producer
 
 Exit codes:
   0  done                              70  internal error
@@ -69,6 +71,18 @@ Example:
 Every chunk whose check sum is right is copied, the last one as far as it goes. Each loss is said
 with the byte at which it begins, here and in the new file under `hil.recovery`. The exit code is
 0 when there is a new file, whatever was lost.";
+
+const PLAY_EXAMPLES: &str = "\
+Examples:
+  hil-recorder play run.mcap --only human/frame --loop
+      as the program of a process in a topology: into the run that started it
+  hil-recorder play run.mcap --only human/frame --into teleop-local-20261121-101500
+      by hand, into a channel that has no writer
+
+Messages are rebuilt byte for byte and leave at their recorded spacing, with numbers and times of
+their own. A channel with a living writer is refused. Messages that leave late are counted and
+said at the end. As a process of a run it stays, silent, when the recording is over, because its
+end would end the run. docs/terminal.md has an example.";
 
 /// Turns the runs of hil-runtime into MCAP files, which other people's tools read.
 #[derive(Debug, Parser)]
@@ -152,6 +166,25 @@ pub(crate) enum Command {
     /// Show a run in the browser and in viewers that speak the Foxglove WebSocket.
     #[command(after_help = SERVE_EXAMPLES)]
     Serve(ServeOptions),
+    /// Feed recorded channels into a run that goes on, at their recorded spacing.
+    #[command(after_help = PLAY_EXAMPLES)]
+    Play {
+        /// The MCAP file.
+        #[arg(value_name = "FILE")]
+        file: PathBuf,
+        /// Play this channel; may be repeated.
+        #[arg(long, value_name = "CHANNEL", required = true)]
+        only: Vec<String>,
+        /// How much faster than recorded, 0.01 to 100.
+        #[arg(long, value_name = "FACTOR", value_parser = speed, default_value = "1")]
+        speed: f64,
+        /// Begin again at the end, until the run ends.
+        #[arg(long = "loop")]
+        is_looped: bool,
+        /// Name or folder of the run; otherwise the run that started this program, or the only one.
+        #[arg(long, value_name = "RUN")]
+        into: Option<String>,
+    },
 }
 
 /// What is served, and where.

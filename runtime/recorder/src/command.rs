@@ -1,17 +1,19 @@
 //! What each command of the command line does, and the exit code it ends with.
 
+use std::fs;
 use std::path::Path;
 use std::process::ExitCode;
-use std::time::{Duration, Instant};
 
 use clap::Parser;
 use hil_runtime::console::Console;
+use hil_runtime::progress::Progress;
 use hil_runtime::signals::{EXIT_INTERRUPTED, Signals};
 
 use crate::cli::{Cli, Command, ServeOptions};
 use crate::convert::{ConvertError, convert};
 use crate::info::info;
-use crate::record::{Progress, RecordError, Request, record};
+use crate::play::{PlayEnd, PlayError, PlayOptions, SourceError, TargetError, play};
+use crate::record::{Progress as RecordProgress, RecordError, Request, record};
 use crate::recover::{RecoverError, loss_words, recover};
 use crate::scan::ScanError;
 use crate::serve::{ServeError, serve};
@@ -25,9 +27,6 @@ mod exit {
     pub(super) const USAGE: u8 = 2;
     pub(super) const INTERNAL: u8 = 70;
 }
-
-/// How long work goes on before it says how far it is.
-const SILENCE: Duration = Duration::from_secs(1);
 
 /// Does what the command line says.
 pub(crate) fn run() -> ExitCode {
@@ -81,6 +80,22 @@ pub(crate) fn run() -> ExitCode {
         }
         Command::Info { file, json } => show(&file, json, &signals, &mut console),
         Command::Serve(options) => serve_run(&options, &signals, &mut console),
+        Command::Play {
+            file,
+            only,
+            speed,
+            is_looped,
+            into,
+        } => {
+            let options = PlayOptions {
+                file,
+                only,
+                speed,
+                is_looped,
+                into,
+            };
+            play_file(&options, &signals, &mut console)
+        }
     };
     ExitCode::from(code)
 }
@@ -99,22 +114,11 @@ fn unless_refused(
     }
 }
 
-/// Work that is done in a moment needs no word on how far it is.
-struct Patience {
-    since: Instant,
-}
-
-impl Patience {
-    fn new() -> Self {
-        let since = Instant::now();
-        Self { since }
-    }
-
-    fn progress(&self, console: &mut Console, words: &str) {
-        if self.since.elapsed() >= SILENCE {
-            console.progress(words);
-        }
-    }
+/// How much of the file at `path` is read by byte `offset`.
+fn show_read(progress: Progress, console: &mut Console, (path, offset): (&Path, u64)) {
+    let size_bytes = fs::metadata(path).map_or(0, |file| file.len());
+    let share = (size_bytes > 0).then(|| offset as f64 / size_bytes as f64);
+    progress.show(console, share, &format!("{} MiB read", offset >> 20));
 }
 
 fn serve_run(options: &ServeOptions, signals: &Signals, console: &mut Console) -> u8 {
@@ -135,9 +139,9 @@ fn interrupted() -> u8 {
 }
 
 fn convert_run((run, output): (&Path, &Path), signals: &Signals, console: &mut Console) -> u8 {
-    let patience = Patience::new();
-    let converted = convert(run, output, &mut |words| {
-        patience.progress(console, words);
+    let progress = Progress::begin();
+    let converted = convert(run, output, &mut |share, words| {
+        progress.show(console, share, words);
         signals.received()
     });
     match converted {
@@ -217,7 +221,7 @@ fn record_run(request: &Request, signals: &Signals, console: &mut Console) -> u8
     exit::DONE
 }
 
-fn progress_words(progress: &Progress<'_>) -> String {
+fn progress_words(progress: &RecordProgress<'_>) -> String {
     if progress.run.is_empty() {
         return "waiting for a run".to_owned();
     }
@@ -235,9 +239,9 @@ fn progress_words(progress: &Progress<'_>) -> String {
 }
 
 fn recover_file((broken, output): (&Path, &Path), signals: &Signals, console: &mut Console) -> u8 {
-    let patience = Patience::new();
+    let progress = Progress::begin();
     let recovered = recover(broken, output, &mut |offset| {
-        patience.progress(console, &format!("{} MiB read", offset >> 20));
+        show_read(progress, console, (broken, offset));
         signals.received()
     });
     let recovered = match recovered {
@@ -275,9 +279,9 @@ fn recover_file((broken, output): (&Path, &Path), signals: &Signals, console: &m
 }
 
 fn show(file: &Path, json: bool, signals: &Signals, console: &mut Console) -> u8 {
-    let patience = Patience::new();
+    let progress = Progress::begin();
     let found = info(file, &mut |offset| {
-        patience.progress(console, &format!("{} MiB read", offset >> 20));
+        show_read(progress, console, (file, offset));
         signals.received()
     });
     match found {
@@ -302,6 +306,26 @@ fn show(file: &Path, json: bool, signals: &Signals, console: &mut Console) -> u8
         Err(error) => {
             console.error(&error.to_string());
             exit::USAGE
+        }
+    }
+}
+
+fn play_file(options: &PlayOptions, signals: &Signals, console: &mut Console) -> u8 {
+    match play(options, signals, console) {
+        Ok(PlayEnd::Done) => exit::DONE,
+        Ok(PlayEnd::Interrupted(signal)) => {
+            console.say(&format!("ended by {signal}"));
+            interrupted()
+        }
+        Err(error) => {
+            console.error(&error.to_string());
+            match error {
+                PlayError::Source(SourceError::Message { .. })
+                | PlayError::Target(TargetError::Domain(_) | TargetError::Channel(_)) => {
+                    exit::FAILED
+                }
+                PlayError::Source(_) | PlayError::Target(_) => exit::USAGE,
+            }
         }
     }
 }

@@ -81,11 +81,11 @@ type Item = (u64, usize, What);
 pub(crate) fn convert(
     from: &Path,
     to: &Path,
-    look: &mut dyn FnMut(&str) -> Option<&'static str>,
+    look: &mut dyn FnMut(Option<f64>, &str) -> Option<&'static str>,
 ) -> Result<Converted, ConvertError> {
     let mut stopped = None;
     let mut run = Run::read(from, &mut |path| {
-        stopped = look(&format!("reading {path}"));
+        stopped = look(None, &format!("reading {path}"));
         stopped.is_none()
     })?;
     if let Some(signal) = stopped {
@@ -105,8 +105,9 @@ pub(crate) fn convert(
     for (count, item) in items.iter().enumerate() {
         if count % 4096 == 0 {
             let (done, all) = (count as u64, items.len() as u64);
-            let progress = format!("writing {} %, {done} of {all}", 100 * done / all.max(1));
-            if let Some(signal) = look(&progress) {
+            let words = format!("writing {done} of {all}");
+            let share = done as f64 / all.max(1) as f64;
+            if let Some(signal) = look(Some(share), &words) {
                 return Err(ConvertError::Interrupted(signal));
             }
         }

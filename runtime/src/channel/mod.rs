@@ -20,6 +20,7 @@
 //! Ports are not [`Send`]: open each in the thread that uses it. A [`Domain`] can be shared.
 
 mod ahead;
+mod census;
 mod degradation;
 mod domain;
 mod error;
@@ -35,6 +36,7 @@ mod wake;
 #[cfg(test)]
 mod tests;
 
+pub use census::Census;
 pub use domain::{Cleanup, Domain, DomainAddress, ROOT_PATH_LENGTH_MAX, Removal};
 pub use error::{ChannelError, DomainError};
 pub use holder::{ChannelHolder, ChannelSettings};

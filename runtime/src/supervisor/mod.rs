@@ -14,6 +14,7 @@ pub(crate) mod peer;
 pub(crate) mod plan;
 mod progress_line;
 mod session;
+mod teller;
 
 pub use domains::DomainsError;
 pub use meet::PeerError;

@@ -16,13 +16,14 @@ use super::meet::{Meeting, meet};
 use super::outcome::{Heard, Outcome, RunError, RunOptions, RunResult};
 use super::peer::{Peer, PeerEvent};
 use super::plan::{ProcessPlan, plan};
-use super::progress_line;
+use super::teller::Teller;
 use crate::card_clock::CardWatch;
 use crate::channel::clock_id;
 use crate::clock::MonotonicClock;
 use crate::clock_discipline::HostDiscipline;
 use crate::console::Console;
 use crate::host_facts::HostFacts;
+use crate::live::status::Phase;
 use crate::manifest;
 use crate::process::emulation_room::check_emulation;
 use crate::run_folder::{RunFolder, utc_text};
@@ -36,7 +37,6 @@ const WATCH_PERIOD: Duration = Duration::from_millis(5);
 /// restarted process is to be back.
 const CLEANUP_PERIOD: Duration = Duration::from_millis(100);
 const ALIVE_PERIOD: Duration = Duration::from_millis(500);
-const PROGRESS_PERIOD: Duration = Duration::from_millis(500);
 /// How long components and gateways may take to end in order.
 const STOP_PATIENCE: Duration = Duration::from_secs(3);
 /// How long the other hosts wait for the first host's word that the time is up.
@@ -86,6 +86,7 @@ pub fn run(
     let announcement = announcement.map_err(unwritable)?;
     // Before the gateways: they find out by sending what the cards deliver.
     let cards = CardWatch::start(topology, &hosts, &folder.records());
+    let teller = Teller::new(folder.root());
     let mut session = Session {
         topology,
         announcement,
@@ -103,7 +104,7 @@ pub fn run(
         discipline,
         cleaned: WallInstant::now(),
         greeted: WallInstant::now(),
-        told: WallInstant::now(),
+        teller,
     };
     let begun = session.begin(topology.run().start_timeout);
     let start = MonotonicClock::now();
@@ -204,7 +205,7 @@ struct Session<'a> {
     discipline: Option<HostDiscipline>,
     cleaned: WallInstant,
     greeted: WallInstant,
-    told: WallInstant,
+    teller: Teller,
 }
 
 impl Session<'_> {
@@ -227,6 +228,7 @@ impl Session<'_> {
                 Some(Outcome::EndedEarly(text)) => return Err(Outcome::Failed(text)),
                 Some(outcome) => return Err(outcome),
             }
+            self.tell(Phase::Starting);
             let is_ready = self.crew.is_ready();
             if is_ready && !has_told && !self.is_first_host {
                 self.say_to_all(&PeerMessage::Ready);
@@ -292,7 +294,7 @@ impl Session<'_> {
             if elapsed >= duration + grace {
                 return Outcome::Completed;
             }
-            self.show_progress(elapsed, duration);
+            self.tell(Phase::Running);
             thread::sleep(WATCH_PERIOD);
         }
     }
@@ -362,22 +364,15 @@ impl Session<'_> {
         heard
     }
 
-    fn show_progress(&mut self, elapsed: Duration, duration: Duration) {
-        if self.told.elapsed() < PROGRESS_PERIOD {
-            return;
-        }
-        self.told = WallInstant::now();
-        let members = self.crew.members().iter();
-        let progress = members.flat_map(|member| &member.progress);
-        let channels = progress_line::of_channels(self.topology, progress);
-        let (elapsed_s, total_s) = (elapsed.as_secs_f64(), duration.as_secs_f64());
-        self.console
-            .progress(&format!("{elapsed_s:6.1} / {total_s:.0} s  {channels}"));
+    fn tell(&mut self, phase: Phase) {
+        let run = (self.topology, &self.crew);
+        self.teller.tell(phase, run, self.console);
     }
 
     /// Ends components everywhere first, then gateways, so that what is under way arrives, and last
     /// the clock paths, so that an exchange follows the last message.
     fn stop(&mut self, outcome: &Outcome) {
+        self.tell(Phase::Ending);
         let reason = outcome.text();
         let meaning = outcome.meaning();
         self.say_to_all(&PeerMessage::Stop { reason, meaning });
@@ -438,6 +433,7 @@ impl Session<'_> {
         }
         let has_one_clock = self.has_one_clock;
         drop(self.crew);
+        drop(self.teller);
         self.announcement.withdraw();
         self.domains.let_observers_leave();
         let left = self.domains.remove();

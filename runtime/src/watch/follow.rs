@@ -61,6 +61,8 @@ struct Followed {
     path: PathBuf,
     /// Of the first byte that was not given out.
     offset: u64,
+    /// Whole records before this many bytes are passed over.
+    passed_bytes: u64,
     is_given_up: bool,
 }
 
@@ -75,12 +77,28 @@ pub struct RecordFollower {
     next: usize,
     buffer: Vec<u8>,
     problems: Vec<String>,
+    /// What is in files found now was written before.
+    passes_over: bool,
 }
 
 impl RecordFollower {
     /// Follows the files in `folder` from their beginning.
     pub fn new(folder: &Path) -> Self {
+        Self::of(folder, false)
+    }
+
+    /// Follows the files in `folder` from what is written next: for who looks at the present of a
+    /// run that may have gone for hours.
+    pub fn from_now(folder: &Path) -> Self {
+        let mut follower = Self::of(folder, true);
+        follower.look_for_files();
+        follower.passes_over = false;
+        follower
+    }
+
+    fn of(folder: &Path, passes_over: bool) -> Self {
         Self {
+            passes_over,
             folder: folder.to_owned(),
             files: Vec::new(),
             known: BTreeSet::new(),
@@ -179,6 +197,10 @@ impl RecordFollower {
             self.known.insert(name);
             match File::open(&path) {
                 Ok(file) => self.files.push(Followed {
+                    passed_bytes: match file.metadata() {
+                        Ok(metadata) if self.passes_over => metadata.len(),
+                        _ => 0,
+                    },
                     file,
                     writer: String::new(),
                     header: None,
@@ -239,7 +261,9 @@ fn has_header(one: &mut Followed) -> Result<bool, String> {
         .and_then(|name| header.writer(name))
         .unwrap_or_default()
         .to_owned();
-    one.offset = HEADER_BYTES as u64;
+    let record_bytes = u64::from(header.record_bytes).max(1);
+    let passed_bytes = one.passed_bytes.saturating_sub(HEADER_BYTES as u64);
+    one.offset = HEADER_BYTES as u64 + passed_bytes - passed_bytes % record_bytes;
     one.header = Some(header);
     Ok(true)
 }
