@@ -213,7 +213,10 @@ struct Killed {
 fn record_and_kill(run: &str, file: &Path, after: Duration) -> Killed {
     let mut child = record(&[run], file);
     let partial = partial(file);
-    wait_until(LIMIT, "the file of a recorder", || partial.is_file());
+    // It says so after its first flush: from then on a kill loses a second, not all there was before.
+    wait_until(LIMIT, "the first words of a recorder", || {
+        child.stderr_so_far().contains("messages/s")
+    });
     thread::sleep(after);
     assert!(child.is_running(), "{}", child.stderr_so_far());
     child.signal(Signal::SIGKILL).unwrap();
@@ -292,7 +295,7 @@ fn ten_killed_recorders_lose_a_second_each_and_the_run_nothing() {
     let name = unique("kills");
     let trial = Trial::shipped("local.toml", folder.path())
         .set(&format!("name=\"{name}\""))
-        .set("run.duration=\"16 s\"");
+        .set("run.duration=\"20 s\"");
     let mut child = trial.start_here();
     let files = trial.folder("", LIMIT);
     wait_until(LIMIT, "the first records", || {
@@ -306,7 +309,7 @@ fn ten_killed_recorders_lose_a_second_each_and_the_run_nothing() {
             scope.spawn(move || {
                 let mut random = RandomStream::new(seed, series);
                 let one = |index: usize| {
-                    let after = Duration::from_millis(1000 + random.next_u64() % 1000);
+                    let after = Duration::from_millis(500 + random.next_u64() % 1000);
                     record_and_kill(name, &output.join(format!("{series}-{index}.mcap")), after)
                 };
                 (0..5).map(one).collect::<Vec<Killed>>()
