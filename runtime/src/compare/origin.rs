@@ -7,7 +7,7 @@ use crate::report::assessment::{Assessment, NetworkVerdict};
 use crate::report::summary::{Outcome, RunSummary};
 
 /// Facts of a host that change what it can measure.
-const HOST_FACTS: [&str; 4] = ["kernel", "cpu", "governor", "virtual"];
+const HOST_FACTS: [&str; 4] = ["kernel", "cpu model", "governor", "virtual machine"];
 
 /// What both sides share, and what they do not.
 pub(super) fn of(base: &[ComparedRun], new: &[ComparedRun]) -> (Vec<String>, Vec<String>) {
@@ -37,7 +37,7 @@ pub(super) fn of(base: &[ComparedRun], new: &[ComparedRun]) -> (Vec<String>, Vec
     let labels: BTreeSet<&str> = labels.map(|fact| fact.label.as_str()).collect();
     for label in labels {
         let lower = label.to_lowercase();
-        if HOST_FACTS.iter().any(|known| lower.contains(known)) {
+        if HOST_FACTS.contains(&lower.as_str()) {
             check(label, &|one| {
                 let mut facts = one.host_facts.iter();
                 let found = facts.find(|fact| fact.label == label);

@@ -24,7 +24,7 @@ pub(crate) enum End {
 pub(crate) fn work(args: &CompareArgs, console: &mut Console) -> End {
     match compared(args) {
         Ok((text, has_failed)) => {
-            console.result(&text);
+            console.result(&format!("{text}\n"));
             if has_failed {
                 console.error("a condition of --fail-if holds");
                 return End::Failed;

@@ -35,7 +35,7 @@ pub(crate) fn work(command: &LinkCommand, console: &mut Console) -> End {
     };
     match outcome {
         Ok(text) => {
-            console.result(&text);
+            console.result(&format!("{text}\n"));
             End::Done
         }
         Err((end, text)) => {
