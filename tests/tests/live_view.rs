@@ -237,13 +237,11 @@ fn a_fleet_is_seen_driving_and_its_link_is_changed() {
     });
     check_the_map(&viewer);
 
+    let first = robots(&viewer.last("/live/fleet").unwrap());
     viewer.until("a robot on its way", |viewer| {
-        let pictures = viewer.live("/live/fleet");
-        let moved = |at: usize| {
-            let (first, last) = (robots(&pictures[0]), robots(pictures.last().unwrap()));
-            first.len() > at && (first[at].0 - last[at].0).abs() > 0.5
-        };
-        !pictures.is_empty() && (0..7).any(moved)
+        let last = robots(&viewer.last("/live/fleet").unwrap());
+        let mut pairs = first.iter().zip(&last);
+        pairs.any(|(first, last)| (first.0 - last.0).abs() > 0.5)
     });
     let picture = viewer.last("/live/fleet").unwrap();
     let is_driving = |robot: &&Value| robot["phase"] == "driving";
@@ -369,13 +367,15 @@ fn arms_are_seen_moving_and_the_page_is_served() {
     check_the_page(&server);
     let mut viewer = Viewer::connect(&server);
     let right = |picture: &Value| picture["arms"][0].clone();
+    let frames = |viewer: &Viewer| {
+        let picture = viewer.last("/live/arms")?;
+        let frames = right(&picture)["measured_frames"].as_array()?.clone();
+        Some((right(&picture)["state"].clone(), frames))
+    };
+    viewer.until("an arm", |viewer| frames(viewer).is_some());
+    let (_, first) = frames(&viewer).unwrap();
     viewer.until("a session and an arm that moves", |viewer| {
-        let pictures = viewer.live("/live/arms");
-        let frames = |picture: &Value| right(picture)["measured_frames"][7].clone();
-        let first = pictures.iter().find(|one| frames(one).is_array());
-        pictures.last().zip(first).is_some_and(|(last, first)| {
-            right(last)["state"] == "running" && frames(last) != frames(first)
-        })
+        frames(viewer).is_some_and(|(state, last)| state == "running" && last[7] != first[7])
     });
     let last = right(&viewer.last("/live/arms").unwrap());
     assert_eq!(last["desired_rad"].as_array().map(Vec::len), Some(7));
