@@ -235,27 +235,13 @@ fn a_fleet_is_seen_driving_and_its_link_is_changed() {
         let last = viewer.last("/live/fleet");
         last.is_some_and(|last| robots(&last).len() == 7) && viewer.last("/live/map").is_some()
     });
-    let map = viewer.last("/live/map").unwrap();
-    assert_eq!(map["footprint"]["length_m"], 2.0);
-    assert_eq!(map["bounds"]["x_max_m"], 80.0);
-    assert!(map["paths"].as_array().unwrap().len() > 20);
-    assert!(!map["conflict_areas"].as_array().unwrap().is_empty());
-    let kind = |topic: &str| viewer.schemas[topic].clone();
-    let protobuf = |name: &str| ("protobuf".to_owned(), name.to_owned());
-    assert_eq!(kind("/fleet/state"), protobuf("hil.FleetState.v1"));
-    assert_eq!(
-        kind("/net/fleet/state/latency"),
-        protobuf("hil.MessageLatency.v1")
-    );
-    assert_eq!(kind("/live/fleet").0, "json");
+    check_the_map(&viewer);
 
+    let first = robots(&viewer.last("/live/fleet").unwrap());
     viewer.until("a robot on its way", |viewer| {
-        let pictures = viewer.live("/live/fleet");
-        let moved = |at: usize| {
-            let (first, last) = (robots(&pictures[0]), robots(pictures.last().unwrap()));
-            first.len() > at && (first[at].0 - last[at].0).abs() > 0.5
-        };
-        !pictures.is_empty() && (0..7).any(moved)
+        let last = robots(&viewer.last("/live/fleet").unwrap());
+        let mut pairs = first.iter().zip(&last);
+        pairs.any(|(first, last)| (first.0 - last.0).abs() > 0.5)
     });
     let picture = viewer.last("/live/fleet").unwrap();
     let is_driving = |robot: &&Value| robot["phase"] == "driving";
@@ -279,29 +265,50 @@ fn a_fleet_is_seen_driving_and_its_link_is_changed() {
     });
     change_the_link(&mut viewer);
 
-    let mut run = viewer.last("/live/run").unwrap();
+    let run = viewer.last("/live/run").unwrap();
     assert_eq!(
         (&run["state"], &run["case"]),
         (&json!("running"), &json!("fleet"))
     );
-    child.signal(Signal::SIGINT).unwrap();
-    viewer.until("the end", |viewer| {
-        viewer.run_state().as_deref() == Some("ended")
-    });
-    run = viewer.last("/live/run").unwrap();
-    assert!(run["how"].is_string(), "{run}");
-    let _ended = child.wait_within(LIMIT).unwrap();
-    // Who comes after the end still sees how it ended and where the robots stood.
-    let mut late = Viewer::connect(&server);
-    late.until("the last picture", |late| {
-        late.run_state().as_deref() == Some("ended") && late.last("/live/fleet").is_some()
-    });
     assert_eq!(run["recorder"]["file"], json!(record));
+    child.signal(Signal::SIGINT).unwrap();
+    see_the_end(&mut viewer, &server);
+    let _ended = child.wait_within(LIMIT).unwrap();
     server.end();
     let bytes = std::fs::read(&record).unwrap();
     let summary = mcap::Summary::read(&bytes).unwrap().unwrap();
     let mut topics = summary.channels.values().map(|channel| &channel.topic);
     assert!(topics.any(|topic| topic == "/fleet/state"));
+}
+
+/// The ground of the shipped warehouse, and of what kind the topics are.
+fn check_the_map(viewer: &Viewer) {
+    let map = viewer.last("/live/map").unwrap();
+    assert_eq!(map["footprint"]["length_m"], 2.0);
+    assert_eq!(map["bounds"]["x_max_m"], 80.0);
+    assert!(map["paths"].as_array().unwrap().len() > 20);
+    assert!(!map["conflict_areas"].as_array().unwrap().is_empty());
+    let kind = |topic: &str| viewer.schemas[topic].clone();
+    let protobuf = |name: &str| ("protobuf".to_owned(), name.to_owned());
+    assert_eq!(kind("/fleet/state"), protobuf("hil.FleetState.v1"));
+    assert_eq!(
+        kind("/net/fleet/state/latency"),
+        protobuf("hil.MessageLatency.v1")
+    );
+    assert_eq!(kind("/live/fleet").0, "json");
+}
+
+/// The last word and picture, also for who comes after the end.
+fn see_the_end(viewer: &mut Viewer, server: &Server) {
+    viewer.until("the end", |viewer| {
+        viewer.run_state().as_deref() == Some("ended")
+    });
+    let run = viewer.last("/live/run").unwrap();
+    assert!(run["how"].is_string(), "{run}");
+    let mut late = Viewer::connect(server);
+    late.until("the last picture", |late| {
+        late.run_state().as_deref() == Some("ended") && late.last("/live/fleet").is_some()
+    });
 }
 
 /// Loses everything on the way of the commands, and sees that it is lost.
@@ -360,13 +367,15 @@ fn arms_are_seen_moving_and_the_page_is_served() {
     check_the_page(&server);
     let mut viewer = Viewer::connect(&server);
     let right = |picture: &Value| picture["arms"][0].clone();
+    let frames = |viewer: &Viewer| {
+        let picture = viewer.last("/live/arms")?;
+        let frames = right(&picture)["measured_frames"].as_array()?.clone();
+        Some((right(&picture)["state"].clone(), frames))
+    };
+    viewer.until("an arm", |viewer| frames(viewer).is_some());
+    let (_, first) = frames(&viewer).unwrap();
     viewer.until("a session and an arm that moves", |viewer| {
-        let pictures = viewer.live("/live/arms");
-        let frames = |picture: &Value| right(picture)["measured_frames"][7].clone();
-        let first = pictures.iter().find(|one| frames(one).is_array());
-        pictures.last().zip(first).is_some_and(|(last, first)| {
-            right(last)["state"] == "running" && frames(last) != frames(first)
-        })
+        frames(viewer).is_some_and(|(state, last)| state == "running" && last[7] != first[7])
     });
     let last = right(&viewer.last("/live/arms").unwrap());
     assert_eq!(last["desired_rad"].as_array().map(Vec::len), Some(7));
