@@ -120,6 +120,16 @@ fn channels_of_a_running_run_are_listed_counted_shown_and_timed() {
     end(going);
 }
 
+/// Ctrl-C gives the totals so far.
+fn gives_totals_when_interrupted(run_folder: &str) {
+    let mut child = start(&["channel", "hz", COMMAND, run_folder, "--window", "100 ms"]);
+    child.wait_for_output(" Hz", LIMIT).unwrap();
+    child.signal(Signal::SIGINT).unwrap();
+    let finished = child.wait_within(LIMIT).unwrap();
+    assert_code(&finished, 130);
+    assert!(finished.stdout.contains("in all"), "{finished:?}");
+}
+
 #[test]
 fn messages_are_shown_by_their_fields_and_wrong_questions_say_what_there_is() {
     let record = RunFolder::new("terminal-echo");
@@ -186,14 +196,7 @@ fn messages_are_shown_by_their_fields_and_wrong_questions_say_what_there_is() {
         assert_code(&refused, 2);
         assert!(refused.stderr.contains(words), "{words}: {refused:?}");
     }
-
-    // Ctrl-C gives the totals so far.
-    let mut child = start(&["channel", "hz", COMMAND, run_folder, "--window", "100 ms"]);
-    child.wait_for_output(" Hz", LIMIT).unwrap();
-    child.signal(Signal::SIGINT).unwrap();
-    let finished = child.wait_within(LIMIT).unwrap();
-    assert_code(&finished, 130);
-    assert!(finished.stdout.contains("in all"), "{finished:?}");
+    gives_totals_when_interrupted(run_folder);
     end(going);
 }
 

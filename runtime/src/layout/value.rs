@@ -10,6 +10,8 @@ use serde::{Serialize, Serializer};
 use super::{LayoutFault, check, checked_element_bytes};
 use crate::manifest::{FieldDescription, KindDescription};
 
+const NEVER_FAILS: &str = "writing to a string cannot fail";
+
 /// What a message, or a part of one, says.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Value {
@@ -90,16 +92,16 @@ impl Value {
 
     fn write_lines(&self, indent: usize, text: &mut String) {
         let Self::Record(fields) = self else {
-            text.push_str(&format!("{:indent$}{self}\n", ""));
+            writeln!(text, "{:indent$}{self}", "").expect(NEVER_FAILS);
             return;
         };
         for (name, value) in fields {
             match value {
                 Self::Record(_) => {
-                    text.push_str(&format!("{:indent$}{name}:\n", ""));
+                    writeln!(text, "{:indent$}{name}:", "").expect(NEVER_FAILS);
                     value.write_lines(indent + 2, text);
                 }
-                _ => text.push_str(&format!("{:indent$}{name}: {value}\n", "")),
+                _ => writeln!(text, "{:indent$}{name}: {value}", "").expect(NEVER_FAILS),
             }
         }
     }
@@ -291,7 +293,7 @@ fn element(kind: &KindDescription, bytes: &[u8]) -> Value {
 /// `bytes` as two digits each, for messages whose layout nobody stated.
 pub fn hex(bytes: &[u8]) -> String {
     bytes.iter().fold(String::new(), |mut text, byte| {
-        write!(text, "{byte:02x}").expect("writing to a string cannot fail");
+        write!(text, "{byte:02x}").expect(NEVER_FAILS);
         text
     })
 }

@@ -88,7 +88,8 @@ pub(crate) fn run(
     let open = |run: Option<&str>| Observer::open(run, registry);
     match args.command {
         ChannelCommand::List { run, json, window } => {
-            list(open(run.as_deref())?, (window, json), signals, console)
+            let observer = open(run.as_deref())?;
+            Ok(list(observer, (window, json), signals, console))
         }
         ChannelCommand::Hz(args) => {
             hz::run(open(args.which.run.as_deref())?, &args, signals, console)
@@ -129,7 +130,7 @@ fn list(
     (window, is_json): (Duration, bool),
     signals: &Signals,
     console: &mut Console,
-) -> Result<End, ChannelError> {
+) -> End {
     let channels = observer.manifest().channels.clone();
     // Before this program becomes a reader of some.
     let ends: Vec<Vec<HostEnds>> = channels
@@ -143,7 +144,9 @@ fn list(
     let rows = channels.iter().zip(ends).map(|(one, ends)| {
         let arrivals = observer.arrivals(&one.name).unwrap_or_default();
         let mut pace = Pace::default();
-        arrivals.iter().for_each(|arrival| pace.take(arrival));
+        for arrival in &arrivals {
+            pace.take(arrival);
+        }
         let topology = observer.topology();
         Row {
             name: one.name.clone(),
@@ -169,11 +172,11 @@ fn list(
     for problem in observer.problems() {
         console.warn(problem);
     }
-    Ok(if is_whole {
+    if is_whole {
         End::Done
     } else {
         End::Interrupted
-    })
+    }
 }
 
 fn ends(observer: &mut Observer, channel: &ChannelDescription) -> Vec<HostEnds> {

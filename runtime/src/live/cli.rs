@@ -128,7 +128,7 @@ pub struct EchoArgs {
     /// End after so many messages.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     pub count: Option<u64>,
-    /// Show one field only, e.g. tool.position_m or measured_rad.0.
+    /// Show one field only, e.g. `tool.position_m` or `measured_rad.0`.
     #[arg(long, value_name = "NAME", conflicts_with = "raw")]
     pub field: Option<String>,
     /// Show the bytes instead of the fields.

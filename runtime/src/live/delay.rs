@@ -4,6 +4,7 @@
 use core::fmt::Write as _;
 use std::time::Duration;
 
+use hil_models::clock::ClockMap;
 use hil_models::measure::account::{ChannelAccount, Closing, MessageFate};
 use hil_models::measure::histogram::{Distribution, LatencySummary};
 use serde::Serialize;
@@ -18,6 +19,8 @@ use crate::signals::Signals;
 
 /// The totals reach back no further: they are of messages that are kept in memory.
 const TOTAL_MAX: Duration = Duration::from_mins(10);
+
+const NEVER_FAILS: &str = "writing to a string cannot fail";
 
 pub(super) fn run(
     mut observer: Observer,
@@ -89,7 +92,7 @@ fn clock(observer: &Observer, channel: &str) -> Clock {
         return one;
     }
     let map = observer.clock_map(&from, &to);
-    let figures = map.as_ref().map(|map| map.figures());
+    let figures = map.as_ref().map(ClockMap::figures);
     Clock {
         relation: if figures.is_some() {
             "exchanges"
@@ -184,12 +187,16 @@ fn quantiles(distribution: &Distribution) -> Value {
 fn text(head: &str, account: &ChannelAccount, clock: &Clock) -> String {
     let mut text = format!("{head}: {} messages", grouped(account.published_count));
     for (fate, count) in account.fates.iter() {
-        if fate != MessageFate::Taken {
-            text.push_str(&format!(", {} {fate}", grouped(count)));
-        }
+        let words = match fate {
+            MessageFate::Taken => continue,
+            // The account speaks of runs that are over.
+            MessageFate::InFlight => "still under way",
+            fate => fate.label(),
+        };
+        write!(text, ", {} {words}", grouped(count)).expect(NEVER_FAILS);
     }
     let mut add = |row: String| {
-        write!(text, "\n  {row}").expect("writing to a string cannot fail");
+        write!(text, "\n  {row}").expect(NEVER_FAILS);
     };
     add(format!(
         "{:42} {:>9} {:>9} {:>9} {:>9}",

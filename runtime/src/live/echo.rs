@@ -135,15 +135,11 @@ fn form(channel: &ChannelDescription, args: &EchoArgs) -> Result<Form, ChannelEr
 }
 
 fn place(observer: &mut Observer, channel: &ChannelDescription) -> Result<Place, ChannelError> {
-    match observer.source(&channel.name).cloned() {
-        Some(Source::SharedMemory { host, .. }) => {
-            Ok(Place::SharedMemory(observer.reader(&host, channel)?))
-        }
-        _ => {
-            let records = observer.run().run_folder().records();
-            Ok(Place::Records(RecordFollower::from_now(&records)))
-        }
+    if let Some(Source::SharedMemory { host, .. }) = observer.source(&channel.name).cloned() {
+        return Ok(Place::SharedMemory(observer.reader(&host, channel)?));
     }
+    let records = observer.run().run_folder().records();
+    Ok(Place::Records(RecordFollower::from_now(&records)))
 }
 
 impl Place {

@@ -61,7 +61,9 @@ pub(super) fn run(
     loop {
         let is_whole = observer.poll_for(args.window, signals);
         let arrivals = observer.take_arrivals(&name);
-        arrivals.iter().for_each(|arrival| pace.take(arrival));
+        for arrival in &arrivals {
+            pace.take(arrival);
+        }
         observer.trim(args.window);
         if is_whole {
             let figures = pace.turn();
@@ -94,27 +96,24 @@ pub(super) fn run(
 /// The figures on one line.
 fn words(channel: &str, figures: &PaceFigures) -> String {
     let count = grouped(figures.message_count);
-    let mut text = format!("{channel}  {count} messages");
+    let mut parts = vec![channel.to_owned(), format!("{count} messages")];
     if let (Some(rate_hz), Some(gap)) = (figures.rate_hz, &figures.gap) {
+        let [min, p99, max] = [gap.min_ns, gap.p99_ns, gap.max_ns].map(duration);
         let mean = rounded(gap.mean_ns);
-        let jitter = rounded(gap.jitter_ns);
-        text.push_str(&format!(
-            "  {rate_hz:.2} Hz  gaps {} to {}, mean {mean}, p99 {}  jitter {jitter}",
-            duration(gap.min_ns),
-            duration(gap.max_ns),
-            duration(gap.p99_ns),
-        ));
+        parts.push(format!("{rate_hz:.2} Hz"));
+        parts.push(format!("gaps {min} to {max}, mean {mean}, p99 {p99}"));
+        parts.push(format!("jitter {}", rounded(gap.jitter_ns)));
     }
-    text.push_str(&format!("  missed {}", figures.missed_count));
+    parts.push(format!("missed {}", figures.missed_count));
     for (count, what) in [
         (figures.reordered_count, "out of order"),
         (figures.restart_count, "restarts"),
     ] {
         if count > 0 {
-            text.push_str(&format!("  {count} {what}"));
+            parts.push(format!("{count} {what}"));
         }
     }
-    text.replace(JOINT, " ")
+    parts.join("  ").replace(JOINT, " ")
 }
 
 #[allow(

@@ -32,9 +32,9 @@ struct Gaps {
 
 #[derive(Debug, Clone, Copy, Default)]
 struct Counted {
-    missed_count: u64,
-    restart_count: u64,
-    reordered_count: u64,
+    missed: u64,
+    restarts: u64,
+    reordered: u64,
 }
 
 /// Figures of a window or of all time; what needs two messages is `None` before.
@@ -56,6 +56,7 @@ pub(crate) struct PaceFigures {
 
 /// Times between successive messages, nanoseconds.
 #[derive(Debug, Clone, PartialEq, Serialize)]
+#[allow(clippy::struct_field_names, reason = "the unit belongs to the name")]
 pub(crate) struct GapFigures {
     /// Smallest.
     pub(crate) min_ns: i64,
@@ -108,9 +109,9 @@ impl Pace {
     fn counted(&self) -> Counted {
         let counters = self.tracker.counters();
         Counted {
-            missed_count: counters.missed_count,
-            restart_count: counters.restart_count,
-            reordered_count: counters.reordered_count,
+            missed: counters.missed_count,
+            restarts: counters.restart_count,
+            reordered: counters.reordered_count,
         }
     }
 }
@@ -119,9 +120,9 @@ impl Counted {
     /// A late message may have filled a gap of an earlier window: nothing is missing then.
     const fn since(self, before: Self) -> Self {
         Self {
-            missed_count: self.missed_count.saturating_sub(before.missed_count),
-            restart_count: self.restart_count - before.restart_count,
-            reordered_count: self.reordered_count - before.reordered_count,
+            missed: self.missed.saturating_sub(before.missed),
+            restarts: self.restarts - before.restarts,
+            reordered: self.reordered - before.reordered,
         }
     }
 }
@@ -154,9 +155,9 @@ impl Gaps {
             message_count: self.message_count,
             rate_hz: mean_ns.filter(|mean| *mean > 0.0).map(|mean| 1e9 / mean),
             gap,
-            missed_count: counted.missed_count,
-            reordered_count: counted.reordered_count,
-            restart_count: counted.restart_count,
+            missed_count: counted.missed,
+            reordered_count: counted.reordered,
+            restart_count: counted.restarts,
         }
     }
 }

@@ -4,6 +4,8 @@
 use std::path::Path;
 use std::time::{Duration, Instant as WallInstant};
 
+use hil_models::time::Instant;
+
 use super::child::Child;
 use super::crew::{Crew, Member};
 use super::progress_line;
@@ -49,7 +51,7 @@ impl Teller {
         let processes = crew.members().iter().map(process);
         let duration_ns = u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX);
         let mut status = RunStatus::new(phase, duration_ns, processes.collect());
-        status.start_ns = crew.started.map(|start| start.as_ns());
+        status.start_ns = crew.started.map(Instant::as_ns);
         if let Some(complaint) = self.file.write(&status) {
             console.warn(&complaint);
         }

@@ -38,22 +38,18 @@ pub(crate) enum SourceError {
     },
     /// Another message, or the same with another layout.
     #[error(
-        "{}: topic {topic} has messages of {found}, and channel {channel} of the run carries {wanted}{laid_out}",
+        "{}: its messages of {channel} are {found}, and that channel of the run carries {wanted}",
         path.display()
     )]
     OtherMessage {
         /// The file.
         path: PathBuf,
-        /// The topic.
-        topic: String,
-        /// What the file has.
-        found: String,
         /// The channel.
         channel: String,
+        /// What the file has.
+        found: String,
         /// What the channel carries.
         wanted: String,
-        /// What differs when the names are equal.
-        laid_out: &'static str,
     },
     /// One of its messages.
     #[error("{}: message {place} of topic {topic}: {fault}", path.display())]
@@ -231,17 +227,16 @@ impl<'a> Reading<'a> {
         {
             return Ok(());
         }
+        let laid_out = if name == wanted.schema.name {
+            " with other fields"
+        } else {
+            ""
+        };
         Err(SourceError::OtherMessage {
             path: self.path.to_owned(),
-            topic: wanted.topic.clone(),
-            found: name.to_owned(),
             channel: wanted.channel.clone(),
-            wanted: wanted.schema.name.clone(),
-            laid_out: if name == wanted.schema.name {
-                " with other fields"
-            } else {
-                ""
-            },
+            found: name.to_owned(),
+            wanted: format!("{}{laid_out}", wanted.schema.name),
         })
     }
 }

@@ -53,9 +53,9 @@ pub(crate) struct Line {
     style: Style,
 }
 
-fn line(text: String, style: Style) -> Line {
+fn line(text: impl AsRef<str>, style: Style) -> Line {
     // No line breaks here, so a blank that forbids it is a blank.
-    let text = text.replace(JOINT, " ");
+    let text = text.as_ref().replace(JOINT, " ");
     Line { text, style }
 }
 
@@ -133,7 +133,7 @@ FIGURES
   The little bars are the 99th percentiles of the delay in the windows before.";
     let rows = text.lines().map(|row| {
         let is_title = !row.starts_with(' ') && !row.is_empty();
-        line(row.to_owned(), if is_title { TITLE } else { NORMAL })
+        line(row, if is_title { TITLE } else { NORMAL })
     });
     rows.collect()
 }

@@ -8,8 +8,8 @@ use ratatui::backend::TestBackend;
 use super::*;
 use crate::live::top::view::{ClockRow, LinkRow, RunView, SegmentRow};
 
-fn quantiles(p50_ns: i64, p99_ns: i64) -> Option<Quantiles> {
-    Some(Quantiles { p50_ns, p99_ns })
+fn quantiles(p50_ns: i64, p99_ns: i64) -> Quantiles {
+    Quantiles { p50_ns, p99_ns }
 }
 
 fn process(name: &str, state: &str, restart_count: u32) -> ProcessRow {
@@ -53,11 +53,14 @@ fn view() -> View {
                 via: "hop".to_owned(),
                 rate_hz: Some(249.96),
                 lost_count: Some(3),
-                delay: quantiles(310_000, 1_250_000),
+                delay: Some(quantiles(310_000, 1_250_000)),
                 why_no_delay: None,
                 bound_ns: Some(12_000),
                 segments: vec![
-                    segment("published → taken by gateway", quantiles(21_000, 80_000)),
+                    segment(
+                        "published → taken by gateway",
+                        Some(quantiles(21_000, 80_000)),
+                    ),
                     segment("TX stamp → RX stamp", None),
                 ],
                 history_ns: vec![Some(1_000), None, Some(500), Some(800), Some(0)],

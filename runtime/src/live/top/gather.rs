@@ -4,6 +4,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
+use hil_models::clock::ClockMap;
 use hil_models::measure::account::{ChannelAccount, MessageFate};
 use hil_models::measure::histogram::Distribution;
 
@@ -150,7 +151,9 @@ fn process_row(
 fn channel_row(observer: &Observer, name: &str, account: Option<&ChannelAccount>) -> ChannelRow {
     let rate_hz = observer.arrivals(name).and_then(|arrivals| {
         let mut pace = Pace::default();
-        arrivals.iter().for_each(|arrival| pace.take(arrival));
+        for arrival in &arrivals {
+            pace.take(arrival);
+        }
         pace.turn().rate_hz
     });
     let topology = observer.topology();
@@ -173,6 +176,9 @@ fn channel_row(observer: &Observer, name: &str, account: Option<&ChannelAccount>
         why_no_delay: match end_to_end.map(|one| &one.distribution) {
             Some(Distribution::Measured(_)) => None,
             Some(Distribution::Unavailable { reason }) => Some(reason.clone()),
+            None if channel.is_some_and(Channel::is_recorded_only) => {
+                Some("its messages only go to the record".to_owned())
+            }
             None => Some("nothing of it was recorded here yet".to_owned()),
         },
         bound_ns: end_to_end.and_then(|one| one.alignment_bound_ns),
@@ -294,7 +300,7 @@ fn clock_row(observer: &Observer, from: String, to: String) -> ClockRow {
         };
     }
     let map = observer.clock_map(&from, &to);
-    let figures = map.as_ref().map(|map| map.figures());
+    let figures = map.as_ref().map(ClockMap::figures);
     ClockRow {
         rung: match figures {
             Some(figures) => format!("{} exchanges of half a minute", figures.exchange_count),
