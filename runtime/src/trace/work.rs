@@ -129,10 +129,10 @@ impl FittedLinks {
             return format!("{opening}{source}{toml}\n");
         }
         // A second table of one name would make the file invalid.
-        let lines = toml.lines().map(|line| format!("# {line}\n"));
+        let lines: Vec<String> = toml.lines().map(|line| format!("# {line}")).collect();
         format!(
-            "{source}# another channel's fit of this direction stands above; to take this one instead:\n{}\n",
-            lines.collect::<String>()
+            "{source}# another channel's fit of this direction stands above; to take this one instead:\n{}\n\n",
+            lines.join("\n")
         )
     }
 }

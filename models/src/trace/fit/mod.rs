@@ -104,9 +104,10 @@ impl Ranking {
         fixed.map_or_else(String::new, |fit| {
             let lines = fit.toml.replace("LINK", table);
             let lines = lines.lines().filter(|line| !line.is_empty());
-            let lines: String = lines.map(|line| format!("#   {line}\n")).collect();
+            let lines: Vec<String> = lines.map(|line| format!("#   {line}")).collect();
+            let lines = lines.join("\n");
             format!(
-                "\n# 98 % of the delays are within {} % of their middle. If such a spread is the hosts' own:\n{lines}",
+                "\n# 98 % of the delays are within {} % of their middle. If such a spread is the hosts' own:\n{lines}\n",
                 NEARLY_FIXED * 100.0
             )
         })
