@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 use hil_tests::binary::hil_recorder_binary;
 use hil_tests::child::ChildGuard;
 use hil_tests::run_folder::RunFolder;
-use hil_tests::trial::Trial;
+use hil_tests::trial::{RunFiles, Trial};
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 use tungstenite::client::IntoClientRequest;
@@ -212,6 +212,20 @@ fn robots(picture: &Value) -> Vec<(f64, f64)> {
         .collect()
 }
 
+fn name_of(trial: &Trial) -> String {
+    let files = trial.folder("", LIMIT);
+    let name = files.root().file_name().unwrap();
+    name.to_str().unwrap().to_owned()
+}
+
+/// An observer is no part of a run, so its account does not know of one.
+fn check_that_nobody_was_in_the_way(child: &mut ChildGuard, files: &RunFiles) {
+    let ended = child.wait_within(LIMIT).unwrap();
+    assert!(!ended.stderr.contains("still used"), "{ended:?}");
+    let summary = files.read("summary.json");
+    assert!(!summary.contains("still used"), "{summary}");
+}
+
 #[test]
 fn a_fleet_is_seen_driving_and_its_link_is_changed() {
     let folder = RunFolder::new("live-fleet");
@@ -221,14 +235,9 @@ fn a_fleet_is_seen_driving_and_its_link_is_changed() {
         .set("links.commands.port=7860")
         .set("links.states.port=7870");
     let mut child = trial.start_here();
-    let name = trial
-        .folder("", LIMIT)
-        .root()
-        .file_name()
-        .unwrap()
-        .to_owned();
+    let name = name_of(&trial);
     let record = folder.path().join("live.mcap");
-    let words = ["--wait", name.to_str().unwrap(), "--record"];
+    let words = ["--wait", &name, "--record"];
     let server = Server::start(&[&words[..], &[record.to_str().unwrap()]].concat());
     let mut viewer = Viewer::connect(&server);
     viewer.until("robots and a map", |viewer| {
@@ -273,7 +282,7 @@ fn a_fleet_is_seen_driving_and_its_link_is_changed() {
     assert_eq!(run["recorder"]["file"], json!(record));
     child.signal(Signal::SIGINT).unwrap();
     see_the_end(&mut viewer, &server);
-    let _ended = child.wait_within(LIMIT).unwrap();
+    check_that_nobody_was_in_the_way(&mut child, &trial.folder(&name, LIMIT));
     server.end();
     let bytes = std::fs::read(&record).unwrap();
     let summary = mcap::Summary::read(&bytes).unwrap().unwrap();
@@ -357,13 +366,8 @@ fn arms_are_seen_moving_and_the_page_is_served() {
     let folder = RunFolder::new("live-arms");
     let trial = Trial::shipped("local.toml", folder.path()).set("run.duration=\"25 s\"");
     let mut child = trial.start_here();
-    let name = trial
-        .folder("", LIMIT)
-        .root()
-        .file_name()
-        .unwrap()
-        .to_owned();
-    let server = Server::start(&["--wait", name.to_str().unwrap()]);
+    let name = name_of(&trial);
+    let server = Server::start(&["--wait", &name]);
     check_the_page(&server);
     let mut viewer = Viewer::connect(&server);
     let right = |picture: &Value| picture["arms"][0].clone();
@@ -390,10 +394,7 @@ fn arms_are_seen_moving_and_the_page_is_served() {
         viewer.seen.contains_key("/joints/egm/right/feedback")
     });
     let run = viewer.last("/live/run").unwrap();
-    assert_eq!(
-        (&run["name"], &run["links"]),
-        (&json!(name.to_str().unwrap()), &json!([]))
-    );
+    assert_eq!((&run["name"], &run["links"]), (&json!(name), &json!([])));
     let channels = run["channels"].as_array().unwrap();
     let frame = channels
         .iter()
@@ -404,7 +405,7 @@ fn arms_are_seen_moving_and_the_page_is_served() {
         (&json!("human"), &json!("shared-memory"))
     );
     child.signal(Signal::SIGINT).unwrap();
-    let _ended = child.wait_within(LIMIT).unwrap();
+    check_that_nobody_was_in_the_way(&mut child, &trial.folder(&name, LIMIT));
     server.end();
     play_back(&trial.folder("", LIMIT).root().display().to_string());
 }

@@ -213,7 +213,8 @@ pub(super) fn attach(
     descriptor(bpf(command::LINK_CREATE, &mut attribute)?)
 }
 
-/// Programs of anyone that run for the packets of an interface.
+/// Programs of anyone that run for the packets of an interface. The kernel lists numbers; it tells whose
+/// they are only who may administer the system, so they are counted and not named.
 pub(super) fn attached_count(interface_index: c_uint, place: Place) -> io::Result<u32> {
     let mut attribute = ProgQuery {
         target_ifindex: interface_index,

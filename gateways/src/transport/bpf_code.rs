@@ -158,7 +158,8 @@ mod when {
     pub(super) const ALWAYS: u8 = 0x05;
     pub(super) const ZERO: u8 = 0x15;
     pub(super) const NOT_ZERO: u8 = 0x55;
-    pub(super) const AT_LEAST: u8 = 0x35;
+    /// Of signed numbers.
+    pub(super) const AT_LEAST: u8 = 0x75;
     pub(super) const AT_MOST: u8 = 0xb5;
     pub(super) const BELOW: u8 = 0xa5;
     pub(super) const ABOVE_REGISTER: u8 = 0x2d;
@@ -411,7 +412,11 @@ fn draw_slot(code: &mut Assembler, purpose: &Purpose<'_>) {
     first.registers |= PSEUDO_MAP_VALUE << 4;
     code.put(first);
     code.put(op(0, (R0, R0), 0, 0));
-    // Slots in use: drawn less given back.
+    // Slots in use: drawn less given back. A program that is held between the two loads may find more
+    // given back than it knows to be drawn: less than none, so the comparison has a sign. The other
+    // order of loads would never be below zero, but would take a ring for full that was emptied
+    // meanwhile. Too small a number is no danger: what was drawn since HEAD was read is drawn by
+    // programs between looking and drawing, for which the margin is there.
     code.put(load(Width::Double, R1, R7, signed(at::HEAD)));
     code.put(load(Width::Double, R2, R7, signed(at::TAIL)));
     code.put(subtract_register(R1, R2));

@@ -43,12 +43,16 @@ pub struct BpfTap {
     shape: Shape,
     /// Keeps stamping on, and the card open for frames of other addresses.
     socket: OwnedFd,
-    interface: String,
+    /// Of the interface; a name may be given to another.
+    interface_index: u32,
     link_type: u16,
+    /// Programs of others that see what leaves before ours does.
+    earlier_program_count: u32,
     /// International atomic time less the system clock, nanoseconds.
     atomic_ahead_ns: i64,
     is_new_look: bool,
     was_up: bool,
+    is_gone: bool,
     step_count: u64,
 }
 
@@ -74,7 +78,8 @@ impl BpfTap {
             source: io::ErrorKind::Unsupported.into(),
         };
         // First, as the answer of a kernel that is too old is plainest here.
-        bpf_call::attached_count(index, Place::Departures).map_err(refused(ASKING))?;
+        let earlier_program_count =
+            bpf_call::attached_count(index, Place::Departures).map_err(refused(ASKING))?;
         let filter = compile(link_type, flows, settings.snap_bytes).ok_or_else(unknown)?;
         let margin = AT_ONCE * bpf_call::processor_count();
         let shape = Shape::new(snap_bytes, settings.ring_bytes, margin);
@@ -104,11 +109,13 @@ impl BpfTap {
             reader: TapReader::new(shape),
             shape,
             socket,
-            interface: interface.to_owned(),
+            interface_index: index,
             link_type,
+            earlier_program_count,
             atomic_ahead_ns,
             is_new_look: true,
             was_up: true,
+            is_gone: false,
             step_count: 0,
         })
     }
@@ -158,12 +165,18 @@ impl BpfTap {
     }
 
     /// What has happened to the interface since it was last asked: `ENETDOWN` when it was taken down,
-    /// another when it has gone. Packets come again if it does.
+    /// another when it has gone, once. Packets come again if it comes up, under whatever name; not when
+    /// one of its name is made anew.
     ///
     /// # Errors
     /// What happened.
     pub fn check(&mut self) -> io::Result<()> {
-        let is_up = packet_socket::is_up(&self.socket, &self.interface)?;
+        if self.is_gone {
+            return Ok(());
+        }
+        let asked = packet_socket::is_up(&self.socket, self.interface_index);
+        self.is_gone = asked.is_err();
+        let is_up = asked?;
         let went_down = self.was_up && !is_up;
         self.was_up = is_up;
         if went_down {
@@ -179,6 +192,12 @@ impl BpfTap {
             matched_count: kept + dropped_count,
             dropped_count,
         }
+    }
+
+    /// Programs of anyone that were there before, and see what leaves before this tap does: what they
+    /// keep back or send elsewhere never gets here. Arrivals it sees first.
+    pub fn earlier_program_count(&self) -> u32 {
+        self.earlier_program_count
     }
 
     /// How often the kernel was told another difference of atomic time and system clock, as a time

@@ -1,6 +1,7 @@
 //! The eBPF programs of a tap, run by the kernel for made-up packets. It takes the right to load them;
 //! without, the tests say that they were skipped.
 
+use core::sync::atomic::Ordering;
 use std::os::fd::{AsRawFd, OwnedFd};
 
 use hil_models::random::RandomStream;
@@ -8,7 +9,7 @@ use nix::time::{ClockId, clock_gettime};
 
 use super::bpf_call::{SharedWords, create_map, load_program, run_once};
 use super::bpf_code::{Purpose, TCX_NEXT, program};
-use super::tap_ring::{Shape, TapReader, counts};
+use super::tap_ring::{Shape, TapReader, at, counts};
 use crate::capture::flow::FlowFilter;
 use crate::capture::program::compile;
 use crate::capture::tests::programs::{FLOW_SETS, is_of, made_up_frame, run};
@@ -165,6 +166,24 @@ fn what_the_ring_has_no_room_for_is_counted() {
         assert_eq!(read_count, room);
         assert_eq!(counts(loaded.shared.words()), (lap * room as u64, lap * 5));
     }
+}
+
+#[test]
+fn a_reader_that_is_ahead_of_what_a_program_knows_is_no_full_ring() {
+    let Some(mut loaded) = Loaded::new(&flows(&["hil"]), link_type::ETHERNET) else {
+        return;
+    };
+    let mut random = RandomStream::new(10, "passed");
+    let ours = flows(&["hil"]);
+    let frame = (1..100)
+        .map(|case| made_up_frame(&mut random, case, link_type::ETHERNET))
+        .find(|frame| is_of(&ours, link_type::ETHERNET, frame));
+    let frame = frame.expect("one of a hundred is ours");
+    // What a program finds that was held between its two loads.
+    loaded.shared.words()[usize::from(at::TAIL) / 8].store(5, Ordering::SeqCst);
+    loaded.arrive(&frame);
+    assert!(loaded.reader.take(loaded.shared.words()).is_some());
+    assert_eq!(counts(loaded.shared.words()), (1, 0));
 }
 
 #[test]

@@ -129,6 +129,14 @@ impl LiveTap {
         }
     }
 
+    /// See [`BpfTap::earlier_program_count`]; 0 for a packet ring, which looks behind all of them.
+    pub fn earlier_program_count(&self) -> u32 {
+        match self {
+            Self::Packet(_) => 0,
+            Self::Bpf(tap) => tap.earlier_program_count(),
+        }
+    }
+
     /// See [`BpfTap::step_count`]; 0 for a packet ring, which reads no other clock.
     pub fn step_count(&self) -> u64 {
         match self {

@@ -109,17 +109,31 @@ pub(super) fn listen_to_all(socket: &OwnedFd, interface_index: c_uint) -> io::Re
     )
 }
 
-/// Whether the interface is up; an error when it has gone.
-#[allow(unsafe_code, reason = "nix lists all interfaces or none")]
-pub(super) fn is_up(socket: &OwnedFd, interface: &str) -> io::Result<bool> {
-    let mut name = [0; libc::IFNAMSIZ];
-    for (to, from) in name[..libc::IFNAMSIZ - 1].iter_mut().zip(interface.bytes()) {
-        *to = libc::c_char::from_ne_bytes([from]);
+/// Whether the interface of a number is up, whatever it is called by now; `ENODEV` when it has gone.
+/// One of the same name that was made since has another number.
+pub(super) fn is_up(socket: &OwnedFd, interface_index: c_uint) -> io::Result<bool> {
+    let index = c_int::try_from(interface_index).map_err(io::Error::other)?;
+    match ask_is_up(socket, index) {
+        // It may have got another name between the two questions.
+        Err(error) if error.raw_os_error() == Some(libc::ENODEV) => ask_is_up(socket, index),
+        told => told,
     }
+}
+
+#[allow(
+    unsafe_code,
+    reason = "nix lists all interfaces or none, and takes a missing one for one without a name"
+)]
+fn ask_is_up(socket: &OwnedFd, interface_index: c_int) -> io::Result<bool> {
     let mut request = libc::ifreq {
-        ifr_name: name,
-        ifr_ifru: libc::__c_anonymous_ifr_ifru { ifru_flags: 0 },
+        ifr_name: [0; libc::IFNAMSIZ],
+        ifr_ifru: libc::__c_anonymous_ifr_ifru {
+            ifru_ifindex: interface_index,
+        },
     };
+    // SAFETY: the kernel reads the number and writes the name of a live structure of its size.
+    let result = unsafe { libc::ioctl(socket.as_raw_fd(), libc::SIOCGIFNAME, &raw mut request) };
+    outcome(result)?;
     // SAFETY: the kernel reads the name and writes the flags of a live structure of its size.
     let result = unsafe { libc::ioctl(socket.as_raw_fd(), libc::SIOCGIFFLAGS, &raw mut request) };
     outcome(result)?;

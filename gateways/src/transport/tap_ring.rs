@@ -225,15 +225,23 @@ mod tests {
             &self.0[usize::from(offset) / WORD_BYTES]
         }
 
-        /// Draws a number, or counts a drop.
-        fn draw(&self) -> Option<u64> {
-            let (head, tail) = (self.at(at::HEAD), self.at(at::TAIL));
-            let filled = head.load(Ordering::SeqCst) - tail.load(Ordering::SeqCst);
-            if filled >= SHAPE.room() as u64 {
+        fn head(&self) -> u64 {
+            self.at(at::HEAD).load(Ordering::SeqCst)
+        }
+
+        /// Draws a number, or counts a drop, by the `head` that was read before.
+        fn draw_after(&self, head: u64) -> Option<u64> {
+            let tail = self.at(at::TAIL).load(Ordering::SeqCst);
+            let filled = head.wrapping_sub(tail).cast_signed();
+            if filled >= i64::try_from(SHAPE.room()).unwrap() {
                 self.at(at::DROPPED).fetch_add(1, Ordering::SeqCst);
                 return None;
             }
-            Some(head.fetch_add(1, Ordering::SeqCst))
+            Some(self.at(at::HEAD).fetch_add(1, Ordering::SeqCst))
+        }
+
+        fn draw(&self) -> Option<u64> {
+            self.draw_after(self.head())
         }
 
         fn put(&self, number: u64, offset: u16, bytes: &[u8]) {
@@ -340,6 +348,23 @@ mod tests {
         assert_eq!(reader.take(&memory.0), None);
         assert!(memory.write(0, b"room again"));
         assert_eq!(reader.take(&memory.0).unwrap().data, b"room again");
+    }
+
+    #[test]
+    fn a_program_that_the_reader_has_passed_finds_room() {
+        let (memory, mut reader) = (Memory::new(), TapReader::new(SHAPE));
+        let head = memory.head();
+        // Held there, while others fill the ring and it is emptied, twice.
+        for _ in 0..2 {
+            while memory.write(0, b"other") {}
+            while reader.take(&memory.0).is_some() {}
+        }
+        let dropped_before = counts(&memory.0).1;
+        let number = memory.draw_after(head).expect("the ring is empty");
+        memory.fill(number, 0, b"held");
+        memory.publish(number);
+        assert_eq!(reader.take(&memory.0).unwrap().data, b"held");
+        assert_eq!(counts(&memory.0).1, dropped_before);
     }
 
     #[test]

@@ -89,10 +89,7 @@ pub fn newcombe(base: Share, new: Share, confidence: f64) -> Option<Interval> {
 /// # Panics
 /// When `confidence` is not inside 0..1.
 pub fn welch(base: &[f64], new: &[f64], confidence: f64) -> Option<Interval> {
-    assert!(
-        confidence > 0.0 && confidence < 1.0,
-        "confidence {confidence} is outside 0..1"
-    );
+    assert_inside(confidence);
     let (base, new) = (Moments::of(base)?, Moments::of(new)?);
     let (b, n) = (base.variance / base.count, new.variance / new.count);
     let error = (b + n).sqrt();
@@ -109,6 +106,36 @@ pub fn welch(base: &[f64], new: &[f64], confidence: f64) -> Option<Interval> {
     })
 }
 
+/// The interval of the mean of repetitions (Student 1908). `None` below two, when none differs at all,
+/// and when one is not finite.
+///
+/// # Panics
+/// When `confidence` is not inside 0..1.
+pub fn mean_interval(values: &[f64], confidence: f64) -> Option<Interval> {
+    assert_inside(confidence);
+    let Moments {
+        count,
+        mean,
+        variance,
+    } = Moments::of(values)?;
+    let error = (variance / count).sqrt();
+    if !error.is_finite() || error <= 0.0 {
+        return None;
+    }
+    let reach = student_quantile(0.5 + 0.5 * confidence, count - 1.0) * error;
+    Some(Interval {
+        low: mean - reach,
+        high: mean + reach,
+    })
+}
+
+fn assert_inside(confidence: f64) {
+    assert!(
+        confidence > 0.0 && confidence < 1.0,
+        "confidence {confidence} is outside 0..1"
+    );
+}
+
 struct Moments {
     count: f64,
     mean: f64,
@@ -117,11 +144,12 @@ struct Moments {
 
 impl Moments {
     fn of(values: &[f64]) -> Option<Self> {
-        if values.len() < 2 {
+        let (&[first, ..], true) = (values, values.len() > 1) else {
             return None;
-        }
+        };
         let count = values.len() as f64;
-        let mean = values.iter().sum::<f64>() / count;
+        // From the first, so that equal values have no variance by rounding.
+        let mean = first + values.iter().map(|value| value - first).sum::<f64>() / count;
         let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
         Some(Self {
             count,
@@ -213,6 +241,27 @@ mod tests {
         close(found.high, 2.0 + 2.267, 2e-3);
         assert_eq!(welch(&[1.0], &[1.0, 2.0], 0.95), None);
         assert_eq!(welch(&[1.0, 1.0], &[1.0, 1.0], 0.95), None);
+    }
+
+    #[test]
+    fn a_mean_of_repetitions_has_students_interval() {
+        // Mean 10, variance 1, three: error 0.57735, t of 2 is 4.30265.
+        let found = mean_interval(&[9.0, 10.0, 11.0], 0.95).unwrap();
+        close(found.low, 10.0 - 2.4841, 1e-3);
+        close(found.high, 10.0 + 2.4841, 1e-3);
+        // Mean 3, two that are 2 apart: error 1, t of 1 is 12.7062.
+        let found = mean_interval(&[2.0, 4.0], 0.95).unwrap();
+        close(found.low, 3.0 - 12.7062, 1e-3);
+        close(found.high, 3.0 + 12.7062, 1e-3);
+        for values in [
+            vec![],
+            vec![1.0],
+            vec![0.1, 0.1, 0.1],
+            vec![1.0, f64::NEG_INFINITY],
+            vec![1.0, f64::NAN],
+        ] {
+            assert_eq!(mean_interval(&values, 0.95), None, "{values:?}");
+        }
     }
 
     #[test]

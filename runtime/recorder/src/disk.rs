@@ -8,7 +8,7 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 
-/// Bytes handed over at a time.
+/// Bytes handed over at a time, at most.
 const BLOCK_BYTES: usize = 128 << 10;
 /// Blocks that may wait: 64 MiB, or a disk that stands still for half a minute at 2 MiB/s. When they
 /// all wait, so does the one who writes.
@@ -104,13 +104,16 @@ fn write_all(mut file: File, waiting: &Receiver<Vec<u8>>, failure: &Failure) -> 
 }
 
 impl Write for QueuedFile {
+    /// Takes what has room in the block.
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        if self.block.len() + bytes.len() > BLOCK_BYTES {
+        if self.block.len() >= BLOCK_BYTES {
             self.hand_over()?;
         }
-        self.block.extend_from_slice(bytes);
-        self.length.fetch_add(bytes.len() as u64, Ordering::Relaxed);
-        Ok(bytes.len())
+        // No block is larger than another, however much comes at once: what waits is bounded.
+        let count = bytes.len().min(BLOCK_BYTES - self.block.len());
+        self.block.extend_from_slice(&bytes[..count]);
+        self.length.fetch_add(count as u64, Ordering::Relaxed);
+        Ok(count)
     }
 
     /// Hands over what there is; the disk may take its time.
@@ -161,6 +164,18 @@ mod tests {
         file.finish().unwrap();
         assert!(fs::read(&path).unwrap() == expected);
         fs::remove_file(path).unwrap();
+    }
+
+    #[test]
+    fn no_more_than_a_block_is_taken_at_once() {
+        let nowhere = File::options().write(true).open("/dev/null").unwrap();
+        let mut file = QueuedFile::new(nowhere).unwrap();
+        let much = vec![7_u8; 3 * BLOCK_BYTES];
+        file.write_all(b"x").unwrap();
+        assert_eq!(file.write(&much).unwrap(), BLOCK_BYTES - 1);
+        assert_eq!(file.write(&much).unwrap(), BLOCK_BYTES);
+        assert_eq!(file.block.len(), BLOCK_BYTES);
+        assert_eq!(file.stream_position().unwrap(), 2 * BLOCK_BYTES as u64);
     }
 
     #[test]

@@ -202,20 +202,22 @@ impl LiveRecording {
                     self.next_file()?;
                 }
             }
+            // Before a signal is asked for: a run that is over was not interrupted.
+            if polled == Poll::Over {
+                return Ok(None);
+            }
             let since_told = now.duration_since(told);
             if since_told >= PROGRESS_PERIOD {
                 let count = self.topics.counts().message_count;
                 let rate_hz = (count - told_count) as f64 / since_told.as_secs_f64();
                 (told, told_count) = (now, count);
                 if let Some(signal) = look(&self.progress(rate_hz)) {
-                    self.catch_up()?;
-                    return Ok(Some(signal));
+                    let is_over = self.catch_up()? == Poll::Over;
+                    return Ok((!is_over).then_some(signal));
                 }
             }
-            match polled {
-                Poll::Over => return Ok(None),
-                Poll::Busy => {}
-                Poll::Idle => thread::sleep(PAUSE),
+            if polled == Poll::Idle {
+                thread::sleep(PAUSE);
             }
         }
     }
@@ -263,11 +265,15 @@ impl LiveRecording {
         failed.map_or(Ok(polled), Err)
     }
 
-    /// What was published before the signal is to be in the file.
-    fn catch_up(&mut self) -> Result<(), WriteError> {
+    /// What was published before the signal is to be in the file; what the last poll came to.
+    fn catch_up(&mut self) -> Result<Poll, WriteError> {
         thread::sleep(RINGS_EMPTY_WITHIN);
-        while self.poll()? == Poll::Busy {}
-        self.topics.flush_joins(&mut self.files)
+        let mut polled = self.poll()?;
+        while polled == Poll::Busy {
+            polled = self.poll()?;
+        }
+        self.topics.flush_joins(&mut self.files)?;
+        Ok(polled)
     }
 
     fn next_file(&mut self) -> Result<(), WriteError> {

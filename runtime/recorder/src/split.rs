@@ -1,7 +1,7 @@
 //! A live recording as one file or several, each whole by itself: topics and schemas are repeated in
 //! each, and what a kill leaves can be recovered up to the last flush.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::panic::resume_unwind;
 use std::path::{Path, PathBuf};
 use std::thread::{self, JoinHandle};
@@ -10,6 +10,10 @@ use std::time::{Duration, Instant};
 use crate::schema::Schema;
 use crate::sink::Sink;
 use crate::writer::{Recording, Stamp, WriteError, check_target};
+
+/// Files that may be on their way to the disk beside the open one: each has a queue of its own in
+/// memory.
+const CLOSING_MAX: usize = 2;
 
 /// When to begin another file.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -35,6 +39,52 @@ struct KnownTopic {
     number: Option<u16>,
 }
 
+/// Files on their way to the disk, which takes its time; oldest first. None of them is left alone:
+/// when the process ended before them, they would not be whole.
+#[derive(Debug, Default)]
+struct Closing {
+    files: VecDeque<JoinHandle<Result<u64, WriteError>>>,
+    /// Messages in those that have arrived.
+    written_count: u64,
+}
+
+impl Closing {
+    /// Waits until one more may be on its way.
+    fn make_room(&mut self) -> Result<(), WriteError> {
+        while self.files.len() >= CLOSING_MAX {
+            self.join_oldest()?;
+        }
+        Ok(())
+    }
+
+    /// Waits for all, whatever became of one; how many messages they hold, or the first failure.
+    fn join_all(&mut self) -> Result<u64, WriteError> {
+        let mut first = Ok(());
+        while !self.files.is_empty() {
+            let joined = self.join_oldest();
+            first = first.and(joined);
+        }
+        first.map(|()| self.written_count)
+    }
+
+    fn join_oldest(&mut self) -> Result<(), WriteError> {
+        if let Some(file) = self.files.pop_front() {
+            let closed = file.join();
+            self.written_count += closed.unwrap_or_else(|panic| resume_unwind(panic))?;
+        }
+        Ok(())
+    }
+}
+
+impl Drop for Closing {
+    /// After a failure elsewhere, which is what is said then.
+    fn drop(&mut self) {
+        for file in self.files.drain(..) {
+            let _is_joined = file.join().is_ok();
+        }
+    }
+}
+
 /// Files of one recording, one open at a time.
 pub(crate) struct Files {
     target: PathBuf,
@@ -45,8 +95,7 @@ pub(crate) struct Files {
     topics: Vec<KnownTopic>,
     done: Vec<PathBuf>,
     done_bytes: u64,
-    /// Files on their way to the disk, which takes its time.
-    closing: Vec<JoinHandle<Result<u64, WriteError>>>,
+    closing: Closing,
 }
 
 /// Where the `number`th file of a recording that is split goes: before the extension.
@@ -84,7 +133,7 @@ impl Files {
             topics: Vec::new(),
             done: Vec::new(),
             done_bytes: 0,
-            closing: Vec::new(),
+            closing: Closing::default(),
         })
     }
 
@@ -109,18 +158,22 @@ impl Files {
         Ok((is_large || is_old) && self.open.message_count() > 0)
     }
 
-    /// Begins the next file and completes the one that was open meanwhile.
+    /// Begins the next file and completes the one that was open meanwhile; waits when the disk is
+    /// more than so many files behind.
     ///
     /// # Errors
-    /// When the next cannot be begun; how the other ended is said by [`Self::finish`].
+    /// When the next cannot be begun, or one of those before was not completed; how the others
+    /// ended is said by [`Self::finish`].
     pub(crate) fn next(&mut self) -> Result<(), WriteError> {
+        self.closing.make_room()?;
         let path = numbered(&self.target, self.done.len() + 2);
         check_target(&path, Path::new(""), self.may_replace)?;
         let next = Recording::create_live(&path)?;
         let finished = core::mem::replace(&mut self.open, next);
         self.done_bytes += finished.size_bytes();
         self.done.push(finished.path().to_owned());
-        self.closing.push(thread::spawn(move || finished.finish()));
+        let closing = thread::spawn(move || finished.finish());
+        self.closing.files.push_back(closing);
         self.begun = Instant::now();
         for topic in &mut self.topics {
             topic.number = None;
@@ -128,18 +181,18 @@ impl Files {
         Ok(())
     }
 
-    /// Completes the open file; the paths of all, and how many messages they hold.
+    /// Completes the open file and waits for those before; the paths of all, and how many messages
+    /// they hold.
     ///
     /// # Errors
-    /// When it cannot be written.
+    /// When one cannot be written; the others are complete then.
     pub(crate) fn finish(mut self) -> Result<(Vec<PathBuf>, u64), WriteError> {
         let last = self.open.path().to_owned();
-        let mut written_count = self.open.finish()?;
+        // Both before either failure is said.
+        let last_count = self.open.finish();
+        let earlier_count = self.closing.join_all();
+        let written_count = earlier_count? + last_count?;
         self.done.push(last);
-        for closing in self.closing {
-            let closed = closing.join();
-            written_count += closed.unwrap_or_else(|panic| resume_unwind(panic))?;
-        }
         Ok((self.done, written_count))
     }
 
@@ -197,6 +250,8 @@ mod tests {
     use super::*;
     use crate::schema;
     use std::fs;
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicBool, Ordering};
 
     #[test]
     fn every_file_of_a_split_recording_is_whole_by_itself() {
@@ -209,17 +264,19 @@ mod tests {
         let mut files = Files::begin(&folder.join("a.mcap"), split, false).unwrap();
         let nothing = BTreeMap::new();
         let topic = files.add_topic("/a", &schema::opaque(), &nothing).unwrap();
-        for number in 0..3 {
+        for number in 0..5 {
             if number > 0 {
                 assert!(files.flush().unwrap());
                 files.next().unwrap();
+                assert!(files.closing.files.len() <= CLOSING_MAX);
             }
             files.write(topic, Stamp::new(5, number), b"x").unwrap();
         }
         let (paths, count) = files.finish().unwrap();
         let names: Vec<_> = paths.iter().filter_map(|path| path.file_name()).collect();
-        assert_eq!(names, ["a_0001.mcap", "a_0002.mcap", "a_0003.mcap"]);
-        assert_eq!((fs::read_dir(&folder).unwrap().count(), count), (3, 3));
+        let expected = [1, 2, 3, 4, 5].map(|number| format!("a_000{number}.mcap"));
+        assert_eq!(names, expected.each_ref().map(String::as_str));
+        assert_eq!((fs::read_dir(&folder).unwrap().count(), count), (5, 5));
         for path in &paths {
             let bytes = fs::read(path).unwrap();
             let mut messages = mcap::MessageStream::new(&bytes).unwrap();
@@ -232,5 +289,31 @@ mod tests {
             Err(WriteError::Exists { .. })
         ));
         fs::remove_dir_all(folder).unwrap();
+    }
+
+    /// A file that takes a while to close, and then says so.
+    fn slow(is_closed: &Arc<AtomicBool>) -> JoinHandle<Result<u64, WriteError>> {
+        let is_closed = Arc::clone(is_closed);
+        thread::spawn(move || {
+            thread::sleep(Duration::from_millis(50));
+            is_closed.store(true, Ordering::Relaxed);
+            Ok(1)
+        })
+    }
+
+    #[test]
+    fn every_file_is_waited_for_whatever_became_of_another() {
+        let is_closed = Arc::new(AtomicBool::new(false));
+        let mut closing = Closing::default();
+        let path = PathBuf::from("a.mcap");
+        let failed = thread::spawn(move || Err(WriteError::Exists { path }));
+        closing.files.extend([failed, slow(&is_closed)]);
+        assert!(matches!(closing.join_all(), Err(WriteError::Exists { .. })));
+        assert!(is_closed.load(Ordering::Relaxed));
+        let is_closed = Arc::new(AtomicBool::new(false));
+        let mut closing = Closing::default();
+        closing.files.push_back(slow(&is_closed));
+        drop(closing);
+        assert!(is_closed.load(Ordering::Relaxed));
     }
 }

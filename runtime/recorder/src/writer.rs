@@ -28,8 +28,11 @@ pub(crate) enum WriteError {
         /// The file.
         path: PathBuf,
     },
-    /// A killed recorder left it.
-    #[error("{path} is there: `hil-recorder recover` makes a whole file of it; then remove it")]
+    /// Another recorder writes it, or a killed one left it.
+    #[error(
+        "{path} is there: unless a recorder still writes it, `hil-recorder recover` makes a whole \
+         file of it; then remove it"
+    )]
     Unfinished {
         /// The file.
         path: PathBuf,
@@ -131,17 +134,23 @@ impl Recording {
     pub(crate) fn create_live(path: &Path) -> Result<Self, WriteError> {
         let name = path.file_name().unwrap_or_default().to_string_lossy();
         let partial = path.with_file_name(format!("{name}.partial"));
-        if fs::symlink_metadata(&partial).is_ok() {
-            return Err(WriteError::Unfinished { path: partial });
-        }
         Self::begin(path, partial, true)
     }
 
     fn begin(path: &Path, partial: PathBuf, is_live: bool) -> Result<Self, WriteError> {
-        let file = File::create(&partial).and_then(QueuedFile::new);
-        let file = file.map_err(|source| WriteError::Io {
-            path: partial.clone(),
-            source,
+        let file = if is_live {
+            // Whoever makes it has it: two recorders that begin together must not write one file.
+            File::options().write(true).create_new(true).open(&partial)
+        } else {
+            File::create(&partial)
+        };
+        let file = file.and_then(QueuedFile::new).map_err(|source| {
+            let path = partial.clone();
+            if is_live && source.kind() == io::ErrorKind::AlreadyExists {
+                WriteError::Unfinished { path }
+            } else {
+                WriteError::Io { path, source }
+            }
         })?;
         let library = concat!("hil-recorder ", env!("CARGO_PKG_VERSION"));
         let mut recording = Self {
@@ -352,6 +361,24 @@ mod tests {
             .map(Result::unwrap)
             .collect();
         assert_eq!((messages[0].log_time, messages[0].sequence), (5, 2));
+        fs::remove_dir_all(folder).unwrap();
+    }
+
+    #[test]
+    fn a_live_file_has_one_writer_and_what_a_kill_left_is_kept() {
+        let folder = folder("live");
+        let path = folder.join("a.mcap");
+        let partial = folder.join("a.mcap.partial");
+        let begin = || Recording::create_live(&path);
+        let first = begin().unwrap();
+        let second = begin().map(|_| ());
+        assert!(matches!(second, Err(WriteError::Unfinished { .. })));
+        assert_eq!(first.finish().unwrap(), 0);
+        assert!(path.is_file() && !partial.exists());
+        fs::write(&partial, "left").unwrap();
+        let again = begin().map(|_| ());
+        assert!(matches!(again, Err(WriteError::Unfinished { .. })));
+        assert_eq!(fs::read(&partial).unwrap(), b"left");
         fs::remove_dir_all(folder).unwrap();
     }
 

@@ -329,6 +329,8 @@ mod tests {
             unit: String::new(),
             base: estimate(1.0),
             new: estimate(value),
+            base_count: 1,
+            new_count: 1,
             ratio: Some(value),
             ratio_interval: interval,
             difference: Some(value),

@@ -121,10 +121,15 @@ pub(crate) struct ComparedFigure {
     pub(crate) kind: FigureKind,
     /// The unit of both: `ns`, `1`, or the score's.
     pub(crate) unit: String,
-    /// Of the base: one run's figure, or the mean of repetitions (of delays, the geometric one).
+    /// Of the base: one run's figure, or the mean of repetitions (of delays, the geometric one), with
+    /// its own interval if all of its runs have the figure.
     pub(crate) base: Option<Estimate>,
     /// Of the new runs.
     pub(crate) new: Option<Estimate>,
+    /// Runs of the base that have the figure.
+    pub(crate) base_count: usize,
+    /// New runs that have it.
+    pub(crate) new_count: usize,
     /// New by base; `None` where the base is zero, and for shares.
     pub(crate) ratio: Option<f64>,
     /// Interval of the ratio.
@@ -159,13 +164,16 @@ impl Comparison {
     pub(crate) fn of(base: &[ComparedRun], new: &[ComparedRun]) -> Self {
         let folders = |runs: &[ComparedRun]| runs.iter().map(|run| run.folder.clone()).collect();
         let (same, differences) = origin::of(base, new);
+        let figures = figures::of(base, new);
+        let mut cautions = origin::cautions(base, new);
+        cautions.extend(figures::cautions(&figures, [base.len(), new.len()]));
         Self {
             base: folders(base),
             new: folders(new),
             same,
             differences,
-            cautions: origin::cautions(base, new),
-            figures: figures::of(base, new),
+            cautions,
+            figures,
         }
     }
 }

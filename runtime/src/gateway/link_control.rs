@@ -3,7 +3,7 @@
 //! priority; nobody gives orders as a rule, and then it only looks.
 
 use std::fs::{self, File};
-use std::io::Write;
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -15,7 +15,7 @@ use hil_models::time::Instant;
 
 use super::GatewayError;
 use super::link_switch::SwitchHandle;
-use crate::channel::{Domain, RawInput};
+use crate::channel::{ChannelError, Domain, RawInput};
 use crate::clock::MonotonicClock;
 use crate::process::launch::GatewayLaunch;
 use crate::process::pipe::{FromProcess, say};
@@ -41,6 +41,8 @@ struct ControlLine {
     switches: Vec<SwitchHandle>,
     book: ConditionBook,
     number: u64,
+    /// One complaint about its channel is enough.
+    has_complained: bool,
 }
 
 impl LinkControl {
@@ -67,6 +69,7 @@ impl LinkControl {
                 switches: vec![switch],
                 book: ConditionBook::new(launch, name),
                 number: 0,
+                has_complained: false,
             });
         }
         for line in &mut lines {
@@ -94,13 +97,26 @@ impl ControlLine {
             match taken {
                 Ok(true) => waiting.extend(order),
                 Ok(false) => break,
-                // Its messages go on as they are; who gave the order sees that nothing answers.
-                Err(_broken) => return,
+                // Its messages go on as they are, and what was taken before is obeyed.
+                Err(error) => {
+                    self.complain(&error);
+                    break;
+                }
             }
         }
         for order in waiting {
             self.obey(&order);
         }
+    }
+
+    /// Says that no orders come any more; who gives one sees only that nothing answers.
+    fn complain(&mut self, error: &ChannelError) {
+        if self.has_complained {
+            return;
+        }
+        self.has_complained = true;
+        let text = format!("{}: orders cannot be taken: {error}", self.book.channel);
+        say(&FromProcess::Warning(text));
     }
 
     /// Goes on in the condition that an earlier start of this gateway was in.
@@ -205,16 +221,24 @@ impl ConditionBook {
         condition_header(&self.channel, instance)
     }
 
-    /// What earlier starts of this gateway wrote.
+    /// What earlier starts of this gateway wrote. A start without an order wrote nothing; what cannot
+    /// be read is said: the link may go on in another condition than it was left in.
     fn earlier(&self) -> Vec<LinkConditionRecord> {
-        let paths = (0..self.instance).map(|instance| {
+        let mut found = Vec::new();
+        for instance in 0..self.instance {
             let name = self.header(instance).file_name(&self.process);
-            self.folder.join(name)
-        });
-        paths
-            .filter_map(|path| RecordFile::read(&path).ok())
-            .flat_map(|file| file.records::<LinkConditionRecord>().collect::<Vec<_>>())
-            .collect()
+            match RecordFile::read(&self.folder.join(name)) {
+                Ok(file) => found.extend(file.records::<LinkConditionRecord>()),
+                Err(RecordFileError::Io { source, .. })
+                    if source.kind() == io::ErrorKind::NotFound => {}
+                Err(error) => {
+                    let channel = &self.channel;
+                    let text = format!("{channel}: earlier changes are not known: {error}");
+                    say(&FromProcess::Warning(text));
+                }
+            }
+        }
+        found
     }
 
     fn open(&mut self) -> Result<(), RecordFileError> {

@@ -170,7 +170,6 @@ pub struct RunLinks {
     directions: Vec<LinkDirection>,
     /// Every link of the topology and what carries it.
     carried: BTreeMap<String, String>,
-    domains: BTreeMap<String, Domain>,
 }
 
 impl RunLinks {
@@ -196,7 +195,6 @@ impl RunLinks {
             records: run.records(),
             directions,
             carried: carried(&manifest.topology),
-            domains: BTreeMap::new(),
         })
     }
 
@@ -302,8 +300,11 @@ impl RunLinks {
                 longest_s: longest.as_secs_f64(),
             });
         }
-        let domain = self.domain(&direction.domain)?;
-        let mut output = RawOutput::open(domain, &direction.order_channel(), false)?;
+        let address: DomainAddress = direction.domain.parse().map_err(LinkError::Over)?;
+        // Only until the order is confirmed, and as one who is no part of the run: whoever gives
+        // orders may live on when the run's memory goes.
+        let domain = Domain::observe(&address).map_err(LinkError::Over)?;
+        let mut output = RawOutput::open(&domain, &direction.order_channel(), false)?;
         let now = MonotonicClock::now();
         // Two who give orders within one nanosecond are told apart by their processes.
         let request = now.as_ns().unsigned_abs() ^ (u64::from(std::process::id()) << 40);
@@ -314,15 +315,6 @@ impl RunLinks {
         let order = LinkOrder::new(condition, request);
         output.publish(&envelope, bytemuck::bytes_of(&order))?;
         self.wait_for(direction, request)
-    }
-
-    fn domain(&mut self, address: &str) -> Result<&Domain, LinkError> {
-        if !self.domains.contains_key(address) {
-            let parsed: DomainAddress = address.parse().map_err(LinkError::Over)?;
-            let domain = Domain::open(&parsed).map_err(LinkError::Over)?;
-            self.domains.insert(address.to_owned(), domain);
-        }
-        Ok(&self.domains[address])
     }
 
     /// Waits for the record of `request`, and until what it says holds.
@@ -452,7 +444,6 @@ mod tests {
             records: PathBuf::new(),
             directions: vec![direction(Way::Backward), direction(Way::Forward)],
             carried: carried(&topology),
-            domains: BTreeMap::new(),
         }
     }
 

@@ -54,6 +54,9 @@ pub(crate) enum ChannelError {
         /// Asked for.
         wanted_count: u64,
     },
+    /// The channel broke while the run went on.
+    #[error("cannot read on: {0}")]
+    Broken(#[source] crate::channel::ChannelError),
     /// An answer that is no JSON.
     #[error("cannot write JSON: {0}")]
     Json(#[from] serde_json::Error),
@@ -64,7 +67,7 @@ impl ChannelError {
     pub(crate) const fn is_usage(&self) -> bool {
         !matches!(
             self,
-            Self::Nothing { .. } | Self::Ended { .. } | Self::Json(_)
+            Self::Nothing { .. } | Self::Ended { .. } | Self::Broken(_) | Self::Json(_)
         )
     }
 }
@@ -76,6 +79,21 @@ pub(crate) enum End {
     Done,
     /// By a signal; the totals so far were printed.
     Interrupted,
+}
+
+/// How many of an observer's problems the user was told.
+#[derive(Debug, Default)]
+pub(super) struct Told(usize);
+
+impl Told {
+    /// Tells those that are new.
+    pub(super) fn tell(&mut self, observer: &Observer, console: &mut Console) {
+        let problems = observer.problems();
+        for problem in problems.iter().skip(self.0) {
+            console.warn(problem);
+        }
+        self.0 = problems.len();
+    }
 }
 
 /// Answers.

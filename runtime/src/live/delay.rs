@@ -10,7 +10,7 @@ use hil_models::measure::histogram::{Distribution, LatencySummary};
 use serde::Serialize;
 use serde_json::{Value, json};
 
-use super::channel::{ChannelError, End};
+use super::channel::{ChannelError, End, Told};
 use super::cli::WindowArgs;
 use super::observer::Observer;
 use crate::console::Console;
@@ -29,9 +29,12 @@ pub(super) fn run(
     console: &mut Console,
 ) -> Result<End, ChannelError> {
     let name = observer.channel(&args.which.channel)?.name.clone();
+    let mut told = Told::default();
+    told.tell(&observer, console);
     observer.settle(signals);
     loop {
         let is_whole = observer.poll_for(args.window, signals);
+        told.tell(&observer, console);
         let is_last = !is_whole || observer.is_over();
         if is_whole {
             let account = observer.account(&name, args.window);

@@ -9,6 +9,7 @@ use serde::Serialize;
 use super::channel::{ChannelError, End};
 use super::cli::EchoArgs;
 use super::observer::Observer;
+use crate::channel;
 use crate::console::Console;
 use crate::layout::{Decoder, Selection, Value, hex};
 use crate::manifest::ChannelDescription;
@@ -72,7 +73,7 @@ pub(super) fn run(
     let end = loop {
         let is_over = observer.is_over();
         let mut texts = Vec::new();
-        place.look(&channel.name, &mut |envelope, payload| {
+        let looked = place.look(&channel.name, &mut |envelope, payload| {
             if wanted.is_none_or(|wanted| shown_count < wanted) {
                 shown_count += 1;
                 texts.push(text(&channel, &form, args.json, (envelope, payload)));
@@ -88,23 +89,22 @@ pub(super) fn run(
         if wanted.is_some_and(|wanted| shown_count >= wanted) {
             break End::Done;
         }
+        for problem in place.take_problems() {
+            console.warn(&problem);
+        }
         if signals.received().is_some() {
             break End::Interrupted;
         }
-        if is_over {
-            break End::Done;
-        }
-        thread::sleep(LOOK_PERIOD);
-    };
-    let missed = match &place {
-        Place::Records(_) => String::new(),
-        Place::SharedMemory(reader) => {
-            let counters = reader.counters();
-            format!(", {} missed by their numbers", counters.gap_count)
+        match looked {
+            // Channels break when their run ends.
+            Err(error) if !observer.is_over() => return Err(ChannelError::Broken(error)),
+            Err(_) => break End::Done,
+            Ok(()) if is_over => break End::Done,
+            Ok(()) => thread::sleep(LOOK_PERIOD),
         }
     };
     if wanted.is_none() {
-        console.say(&format!("{shown_count} messages{missed}"));
+        console.say(&format!("{shown_count} messages{}", place.missed()));
     }
     match wanted {
         Some(wanted) if shown_count < wanted && end == End::Done => Err(ChannelError::Ended {
@@ -144,7 +144,14 @@ fn place(observer: &mut Observer, channel: &ChannelDescription) -> Result<Place,
 
 impl Place {
     /// Hands every message that came since the last look to `take`.
-    fn look(&mut self, channel: &str, take: &mut dyn FnMut(&Envelope, &[u8])) {
+    ///
+    /// # Errors
+    /// When the channel is broken.
+    fn look(
+        &mut self,
+        channel: &str,
+        take: &mut dyn FnMut(&Envelope, &[u8]),
+    ) -> Result<(), channel::ChannelError> {
         match self {
             Self::Records(follower) => {
                 follower.poll(LOOK_BYTES_MAX, &mut |batch| {
@@ -155,9 +162,28 @@ impl Place {
                     }
                 });
             }
-            // A channel that breaks is a run that ends, which is noticed.
             Self::SharedMemory(reader) => {
-                let _is_broken = reader.poll(LOOK_MESSAGES_MAX, take).is_err();
+                reader.poll(LOOK_MESSAGES_MAX, take)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// What went wrong since the last call.
+    fn take_problems(&mut self) -> Vec<String> {
+        match self {
+            Self::Records(follower) => follower.take_problems(),
+            Self::SharedMemory(_) => Vec::new(),
+        }
+    }
+
+    /// Messages that it did not see, in words that follow their number; empty where it sees all.
+    fn missed(&self) -> String {
+        match self {
+            Self::Records(_) => String::new(),
+            Self::SharedMemory(reader) => {
+                let counters = reader.counters();
+                format!(", {} missed by their numbers", counters.gap_count)
             }
         }
     }

@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use super::channel::{ChannelError, End};
+use super::channel::{ChannelError, End, Told};
 use super::cli::WindowArgs;
 use super::observer::Observer;
 use super::pace::{Pace, PaceFigures};
@@ -38,11 +38,10 @@ pub(super) fn run(
         _ => "publication",
     };
     observer.count_unrecorded(&name);
-    if let Some(problem) = observer.problems().last() {
-        console.warn(problem);
-    }
+    let mut told = Told::default();
+    told.tell(&observer, console);
     let mut pace = Pace::default();
-    let mut answer = |of, figures: &PaceFigures| {
+    let answer = |console: &mut Console, of, figures: &PaceFigures| {
         let answer = Answer {
             channel: &name,
             seen_at,
@@ -60,6 +59,7 @@ pub(super) fn run(
     };
     loop {
         let is_whole = observer.poll_for(args.window, signals);
+        told.tell(&observer, console);
         let arrivals = observer.take_arrivals(&name);
         for arrival in &arrivals {
             pace.take(arrival);
@@ -67,7 +67,7 @@ pub(super) fn run(
         observer.trim(args.window);
         if is_whole {
             let figures = pace.turn();
-            if !answer("window", &figures)? {
+            if !answer(console, "window", &figures)? {
                 return Ok(End::Done);
             }
             if args.once {
@@ -83,7 +83,7 @@ pub(super) fn run(
             }
         }
         if !is_whole || observer.is_over() {
-            answer("total", &pace.total())?;
+            answer(console, "total", &pace.total())?;
             return Ok(if is_whole {
                 End::Done
             } else {

@@ -3,6 +3,7 @@
 
 pub(crate) mod channel;
 pub mod cli;
+mod conditions;
 mod delay;
 mod echo;
 mod hz;

@@ -6,6 +6,8 @@ use std::thread;
 use std::time::{Duration, Instant as WallInstant};
 
 use hil_models::clock::{ClockMap, ClockSettings, Exchange, Requester};
+use hil_models::link::condition::{LinkCondition, LinkConditionRecord};
+use hil_models::link::spec::Way;
 use hil_models::measure::account::{
     AccountContext, ChannelAccount, ChannelPath, FLIGHT_TIME_MAX, RunSpan,
 };
@@ -13,11 +15,11 @@ use hil_models::measure::record::RoundTripRecord;
 use hil_models::message::Envelope;
 use hil_models::time::{Alignment, Instant};
 
+use super::conditions::LinkConditions;
 use super::tail::ChannelTail;
 use crate::channel::{Domain, DomainError};
 use crate::clock::MonotonicClock;
 use crate::manifest::{ChannelDescription, Manifest};
-use crate::process::launch::EmulationLaunch;
 use crate::record::RecordKind;
 use crate::registry::Registry;
 use crate::signals::Signals;
@@ -35,8 +37,6 @@ const EXCHANGES_SPAN_NS: i64 = 30_000_000_000;
 /// The processes of a run write their records every 20 ms, each at its own time: a message is
 /// missed only when its records are late by more than this.
 const WRITING: Duration = Duration::from_millis(100);
-/// Share of the messages of an emulated link that are not under way for longer than is allowed for.
-const FLIGHT_QUANTILE: f64 = 0.9999;
 
 /// Why a run cannot be observed.
 #[derive(Debug, thiserror::Error)]
@@ -91,8 +91,7 @@ pub(crate) struct Observer {
     // Before the domains: readers go first.
     passive: BTreeMap<String, PassiveReader>,
     domains: BTreeMap<String, Domain>,
-    /// How long emulated links keep the messages of a channel under way on purpose.
-    flight_times: BTreeMap<String, Duration>,
+    conditions: LinkConditions,
     problems: Vec<String>,
 }
 
@@ -132,9 +131,17 @@ impl Observer {
         let topology = topology_of(&manifest, registry)
             .map_err(|why| problems.push(format!("its topology is not known here: {why}")))
             .ok();
+        let records = run.run_folder().records();
+        // Before the orders on record are read: none falls between.
+        let follower = RecordFollower::from_now(&records);
+        let mut conditions = topology
+            .as_ref()
+            .map(LinkConditions::of)
+            .unwrap_or_default();
+        problems.extend(conditions.read(&records));
         Ok(Self {
-            follower: RecordFollower::from_now(&run.run_folder().records()),
-            flight_times: topology.as_ref().map(flight_times).unwrap_or_default(),
+            follower,
+            conditions,
             run,
             manifest,
             topology,
@@ -265,6 +272,7 @@ impl Observer {
             round_trips,
             arrivals,
             passive,
+            conditions,
             problems,
             ..
         } = self;
@@ -279,6 +287,9 @@ impl Observer {
                     let known = arrivals.entry(channel.to_owned()).or_default();
                     let each = batch.messages();
                     known.extend(each.map(|(envelope, _)| Arrival::from(&envelope)));
+                }
+                RecordKind::LinkCondition => {
+                    conditions.add(channel, batch.records::<LinkConditionRecord>());
                 }
                 _ => tails.entry(channel.to_owned()).or_default().add(batch),
             }
@@ -398,12 +409,21 @@ impl Observer {
         is_whole || self.run.has_one_clock == Some(true)
     }
 
-    /// Both hosts of a channel that crosses a link.
+    /// Both hosts of a channel that crosses a link; without a topology, of one between two hosts.
     pub(crate) fn hosts_of(&self, channel: &str) -> Option<(String, String)> {
         let (from, to) = self.ends(channel);
-        let topology = self.topology.as_ref()?;
-        topology.crossing(topology.channel(channel)?)?;
-        Some((from?.clone(), to?.clone()))
+        let (from, to) = (from?, to?);
+        let is_between = match &self.topology {
+            Some(topology) => topology.crossing(topology.channel(channel)?).is_some(),
+            // Two hosts may have two clocks: they are one only where that is known.
+            None => from != to,
+        };
+        is_between.then(|| (from.clone(), to.clone()))
+    }
+
+    /// What the direction `way` of `link` was ordered to do, as far as this host knows.
+    pub(crate) fn link_condition(&self, link: &str, way: Way) -> LinkCondition {
+        self.conditions.now(link, way)
     }
 
     /// Polls for as long as the first messages of the first window need to be written down by all
@@ -413,14 +433,12 @@ impl Observer {
     }
 
     fn longest_settling(&self) -> Duration {
-        let flight_time = self.flight_times.values().max().copied();
-        WRITING + flight_time.unwrap_or_default()
+        WRITING + self.conditions.longest_flight_time()
     }
 
-    /// How long after its publication a message may still be under way, or on its way to a file.
+    /// How long after its publication a message may still be on its way, or that to a file.
     fn settling(&self, channel: &str) -> Duration {
-        let flight_time = self.flight_times.get(channel).copied();
-        WRITING + flight_time.unwrap_or_default()
+        WRITING + self.conditions.flight_time(channel)
     }
 
     fn ends(&self, channel: &str) -> (Option<&String>, Option<&String>) {
@@ -459,10 +477,11 @@ impl Observer {
     /// The host that asks and the host that answers in the exchanges recorded as `name`: of a
     /// channel, whose sending gateway asks, or of a clock path.
     fn exchanging_hosts(&self, name: &str) -> Option<(String, String)> {
-        let topology = self.topology.as_ref()?;
-        let clock_path = topology.clock_paths().find(|path| path.name() == name);
-        if let Some(path) = clock_path {
-            return Some((path.from.name.clone(), path.to.name.clone()));
+        if let Some(topology) = &self.topology {
+            let clock_path = topology.clock_paths().find(|path| path.name() == name);
+            if let Some(path) = clock_path {
+                return Some((path.from.name.clone(), path.to.name.clone()));
+            }
         }
         self.hosts_of(name)
     }
@@ -470,16 +489,6 @@ impl Observer {
 
 fn nanoseconds(time: Duration) -> i64 {
     i64::try_from(time.as_nanos()).unwrap_or(i64::MAX)
-}
-
-/// How long emulated links keep messages under way on purpose, by channel.
-fn flight_times(topology: &Topology) -> BTreeMap<String, Duration> {
-    let times = topology.crossings().filter_map(|crossing| {
-        let emulation = EmulationLaunch::of(&crossing, topology.run().seed)?;
-        let time = emulation.flight_time(FLIGHT_QUANTILE).ok()?;
-        Some((crossing.channel.name.clone(), time))
-    });
-    times.collect()
 }
 
 /// The topology that a run wrote into its manifest.

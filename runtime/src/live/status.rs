@@ -105,7 +105,7 @@ pub fn has_begun(folder: &Path) -> bool {
 pub(crate) struct StatusFile {
     path: PathBuf,
     /// One complaint is enough.
-    is_broken: bool,
+    has_complained: bool,
 }
 
 impl StatusFile {
@@ -113,25 +113,27 @@ impl StatusFile {
     pub(crate) fn of(folder: &Path) -> Self {
         Self {
             path: folder.join(FILE_NAME),
-            is_broken: false,
+            has_complained: false,
         }
     }
 
-    /// Writes `status`, so that a reader finds it whole. Gives the complaint, once.
+    /// Writes `status`, so that a reader finds it whole. Gives the complaint, once; what hindered it
+    /// may be over the next time.
     pub(crate) fn write(&mut self, status: &RunStatus) -> Option<String> {
-        if self.is_broken {
-            return None;
-        }
         let new = self.path.with_extension("json.new");
         let written = serde_json::to_string(status)
             .map_err(io::Error::other)
             .and_then(|text| fs::write(&new, text))
             .and_then(|()| fs::rename(&new, &self.path));
         let error = written.err()?;
-        self.is_broken = true;
+        if self.has_complained {
+            return None;
+        }
+        self.has_complained = true;
         let path = self.path.display();
         Some(format!(
-            "{path}: {error}; `hil-runtime top` sees no processes"
+            "{path}: {error}; until it can be written, `hil-runtime top` does not see how the \
+             processes stand"
         ))
     }
 }
@@ -174,5 +176,10 @@ mod tests {
                 .is_some_and(|why| why.contains("status.json"))
         );
         assert_eq!(nowhere.write(&status), None, "one complaint is enough");
+        fs::create_dir_all(&folder).unwrap();
+        assert_eq!(nowhere.write(&status), None);
+        assert_eq!(RunStatus::read(&folder).unwrap(), status);
+        drop(nowhere);
+        fs::remove_dir_all(&folder).unwrap();
     }
 }

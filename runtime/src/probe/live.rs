@@ -93,6 +93,8 @@ pub(super) struct LiveResult {
 struct Tap {
     ring: LiveTap,
     card: Option<CardTap>,
+    /// Number of the interface when it was opened: names are given anew.
+    index: Option<u32>,
     /// When the interface had gone, nanoseconds since 1970.
     gone_ns: Option<u64>,
     result: InterfaceResult,
@@ -169,9 +171,9 @@ fn open_taps(request: &Request, console: &mut Console) -> Result<Vec<Tap>, LiveE
     };
     let mut taps: Vec<Tap> = Vec::with_capacity(request.interfaces.len());
     for name in &request.interfaces {
-        let (ring, tapped, is_second_best) =
-            tap::open(request.tap, name, &request.flows, &settings)?;
-        if is_second_best {
+        let index = nix::net::if_::if_nametoindex(name.as_str()).ok();
+        let (ring, tapped, is_news) = tap::open(request.tap, name, &request.flows, &settings)?;
+        if is_news {
             console.say(&format!("{name}: {tapped}"));
         }
         let card = match request.stamps {
@@ -191,6 +193,7 @@ fn open_taps(request: &Request, console: &mut Console) -> Result<Vec<Tap>, LiveE
         taps.push(Tap {
             ring,
             card,
+            index,
             gone_ns: None,
             result: InterfaceResult {
                 name: name.clone(),
@@ -259,20 +262,33 @@ fn drain(
     Ok(())
 }
 
-/// Says what has happened to the interface of a tap. One that is down may come up again; one that has
-/// gone does not come back under its number.
+/// Says what has happened to the interface of a tap, once. One that is down may come up again, under
+/// another name too; one that has gone does not come back under its number.
 fn watch(tap: &mut Tap, now_ns: u64, console: &mut Console) {
-    let Err(error) = tap.ring.check() else {
+    if tap.gone_ns.is_some() {
         return;
-    };
+    }
+    let told = tap.ring.check().err();
+    // Of an interface that was down before, the kernel does not tell a packet ring that it has gone.
+    let is_gone = (told.is_some() || tap.result.has_failed) && !is_there(tap.index);
+    if told.is_none() && !is_gone {
+        return;
+    }
     tap.result.has_failed = true;
-    let what = if nix::net::if_::if_nametoindex(tap.result.name.as_str()).is_ok() {
-        "nothing is captured until it is up again"
-    } else {
-        tap.gone_ns.get_or_insert(now_ns);
+    let what = if is_gone {
+        tap.gone_ns = Some(now_ns);
         "it has gone, and its part of the capture ends here"
+    } else {
+        "nothing is captured until it is up again"
     };
-    console.warn(&format!("{}: {error}: {what}", tap.result.name));
+    let why = told.map_or_else(String::new, |error| format!("{error}: "));
+    console.warn(&format!("{}: {why}{what}", tap.result.name));
+}
+
+/// Whether there is an interface of this number. For one that is missing `nix` gives an empty name.
+fn is_there(index: Option<u32>) -> bool {
+    let name = index.map(nix::net::if_::if_indextoname);
+    name.is_some_and(|name| name.is_ok_and(|name| !name.is_empty()))
 }
 
 /// Puts a packet into the file as it was on the wire, with the VLAN tag the kernel took out.
@@ -447,6 +463,14 @@ fn whole_blocks(buffer: &[u8], there_bytes: u64) -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_interface_is_known_by_its_number() {
+        let loopback = nix::net::if_::if_nametoindex("lo").ok();
+        assert!(loopback.is_some() && is_there(loopback));
+        assert!(!is_there(Some(0x7fff_fff0)), "nothing has that number");
+        assert!(!is_there(None));
+    }
 
     #[test]
     fn a_file_that_could_not_grow_is_cut_behind_its_last_whole_block() {

@@ -16,7 +16,8 @@ pub(crate) enum TapChoice {
     Packet,
 }
 
-/// Opens a tap; gives it with what took it, in words, and whether that is second best.
+/// Opens a tap; gives it with what took it, in words, and whether the person who watches should know
+/// at once: it is second best, or others come before it.
 pub(super) fn open(
     choice: TapChoice,
     interface: &str,
@@ -29,19 +30,30 @@ pub(super) fn open(
         TapChoice::Bpf => (by(TapEngine::Bpf)?, None),
         TapChoice::Packet => (by(TapEngine::Packet)?, None),
     };
-    let words = in_words(tap.engine(), reason.as_ref());
-    Ok((tap, words, reason.is_some()))
+    let earlier_count = tap.earlier_program_count();
+    let words = in_words(tap.engine(), earlier_count, reason.as_ref());
+    Ok((tap, words, reason.is_some() || earlier_count > 0))
 }
 
-fn in_words(engine: TapEngine, reason: Option<&RingError>) -> String {
+fn in_words(engine: TapEngine, earlier_count: u32, reason: Option<&RingError>) -> String {
     match (engine, reason) {
-        (TapEngine::Bpf, _) => {
-            "tapped by eBPF programs, what leaves stamped by them before the queueing discipline"
-                .to_owned()
-        }
+        (TapEngine::Bpf, _) => format!(
+            "tapped by eBPF programs, what leaves stamped by them before the queueing discipline{}",
+            earlier(earlier_count)
+        ),
         (TapEngine::Packet, None) => "tapped by a packet ring".to_owned(),
         (TapEngine::Packet, Some(reason)) => format!("tapped by a packet ring: {reason}"),
     }
+}
+
+/// Programs that were at the interface before, and may hide departures.
+fn earlier(count: u32) -> String {
+    let whose = match count {
+        0 => return String::new(),
+        1 => "1 other program (TCX) sees what leaves".to_owned(),
+        several => format!("{several} other programs (TCX) see what leaves"),
+    };
+    format!("; {whose} before them and may keep packets from them")
 }
 
 #[cfg(test)]
@@ -59,12 +71,27 @@ mod tests {
             hint: " (Linux 6.6 is the first that can)",
         };
         assert_eq!(
-            in_words(TapEngine::Packet, Some(&reason)),
+            in_words(TapEngine::Packet, 0, Some(&reason)),
             "tapped by a packet ring: no eBPF tap on `eth0`: attaching its program: Invalid argument \
              (os error 22) (Linux 6.6 is the first that can)"
         );
-        let plain = in_words(TapEngine::Packet, None);
+        let plain = in_words(TapEngine::Packet, 0, None);
         assert_eq!(plain, "tapped by a packet ring");
-        assert!(in_words(TapEngine::Bpf, None).contains("eBPF"));
+    }
+
+    #[test]
+    fn programs_that_come_before_are_told() {
+        let alone = in_words(TapEngine::Bpf, 0, None);
+        assert!(
+            alone.contains("eBPF") && !alone.contains("other"),
+            "{alone}"
+        );
+        for (count, words) in [
+            (1, "; 1 other program (TCX) sees what leaves before them"),
+            (3, "; 3 other programs (TCX) see what leaves before them"),
+        ] {
+            let text = in_words(TapEngine::Bpf, count, None);
+            assert!(text.contains(words), "{text}");
+        }
     }
 }

@@ -42,7 +42,7 @@ pub enum ChangedTo {
     },
     /// Nothing gets through.
     Cut,
-    /// The record is of another version.
+    /// The record is of another version, or its loss is no number.
     Unknown,
 }
 
@@ -55,17 +55,15 @@ impl LinkChange {
     ) -> Self {
         let to = match record.condition() {
             Some(LinkCondition::Topology) => ChangedTo::Topology,
-            Some(LinkCondition::Fixed { delay, loss_ratio }) => ChangedTo::Fixed {
-                delay_s: delay.as_secs_f64(),
-                // JSON has no word for what is no number; the gateway refused it.
-                loss_ratio: if loss_ratio.is_finite() {
-                    loss_ratio
-                } else {
-                    -1.0
-                },
-            },
+            Some(LinkCondition::Fixed { delay, loss_ratio }) if loss_ratio.is_finite() => {
+                ChangedTo::Fixed {
+                    delay_s: delay.as_secs_f64(),
+                    loss_ratio,
+                }
+            }
             Some(LinkCondition::Cut) => ChangedTo::Cut,
-            None => ChangedTo::Unknown,
+            // JSON has no word for a ratio that is no number; the gateway refused it.
+            Some(LinkCondition::Fixed { .. }) | None => ChangedTo::Unknown,
         };
         let refused = match record.outcome() {
             Some(OrderOutcome::InForce) => None,
@@ -99,7 +97,7 @@ impl LinkChange {
                 loss_ratio,
             } => format!("delay {}, loss {loss_ratio}", duration_s(delay_s)),
             ChangedTo::Cut => "cut".to_owned(),
-            ChangedTo::Unknown => "to what this version does not know".to_owned(),
+            ChangedTo::Unknown => "an unknown condition".to_owned(),
         };
         let mut text = match &self.refused {
             None => format!("link {link}.{way} changed by hand: {to}"),
@@ -173,5 +171,12 @@ mod tests {
         assert_eq!(serde_json::from_str::<LinkChange>(&text).unwrap(), change);
         let reset = of(LinkCondition::Topology, OrderOutcome::InForce);
         assert!(reset.what().ends_with("as the topology says again"));
+        let strange = LinkCondition::Fixed {
+            delay: Duration::ZERO,
+            loss_ratio: f64::NAN,
+        };
+        let strange = of(strange, OrderOutcome::Malformed);
+        assert_eq!(strange.to, ChangedTo::Unknown);
+        assert!(strange.what().contains("was not changed"));
     }
 }

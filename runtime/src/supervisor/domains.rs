@@ -13,7 +13,7 @@ use super::plan::{HostPlan, domain_base, domain_root};
 use crate::channel::{ChannelError, ChannelHolder, ChannelSettings, Domain, DomainError, TypeInfo};
 use crate::gateway::link_control::ORDERS_MAX;
 use crate::topology::Channel;
-use crate::watch::observer_depth;
+use crate::watch::{observer_depth, withdraw_abandoned};
 
 /// Writers at a time: one, and its successor while the dead one is not cleaned up yet.
 const WRITERS_MAX: usize = 2;
@@ -148,10 +148,17 @@ fn sweep(base: &Path) {
     let Ok(entries) = fs::read_dir(base) else {
         return;
     };
-    for entry in entries.flatten() {
+    let paths = entries.flatten().map(|entry| entry.path());
+    let roots: Vec<PathBuf> = paths.filter(|path| Domain::is_at(path)).collect();
+    // All of them first: a run is announced in the domain of each of its hosts, and goes on for
+    // observers while any of these is locked.
+    for root in &roots {
+        withdraw_abandoned(root);
+    }
+    for root in &roots {
         // A domain in use is locked and refuses; anything else there is not a domain's folder.
-        if Domain::is_at(&entry.path())
-            && let Ok(domain) = Domain::create(&entry.path())
+        if Domain::is_at(root)
+            && let Ok(domain) = Domain::create(root)
         {
             domain.remove();
         }

@@ -18,6 +18,8 @@ use crate::topology::{Crossing, Direction, Topology, Via};
 
 /// What a trace of clocks without a relation says of them.
 pub(crate) const NOT_ALIGNED: &str = "clocks not aligned";
+/// What follows the name of a link that was changed while the run went on, before how often.
+pub(super) const CHANGED_BY_HAND: &str = " (changed by hand";
 
 /// The file of `channel` in a folder of traces.
 pub(crate) fn file_name(channel: &str) -> String {
@@ -112,8 +114,8 @@ fn link_words(topology: &Topology, crossing: &Crossing<'_>, records: &RunRecords
     let count = link_changes::in_force_on(topology, records, crossing).count();
     let words = match count {
         0 => return cut(name, TraceHeader::LINK_BYTES),
-        1 => " (changed by hand once)".to_owned(),
-        count => format!(" (changed by hand {count} times)"),
+        1 => format!("{CHANGED_BY_HAND} once)"),
+        count => format!("{CHANGED_BY_HAND} {count} times)"),
     };
     let room = TraceHeader::LINK_BYTES - words.len();
     cut(name, room) + &words

@@ -1,6 +1,7 @@
 //! What `hil-runtime trace` does: reads, computes, prints and writes. The figures are
 //! `hil_models::trace`'s, the page is `report::terminal`'s.
 
+use core::fmt::Write as _;
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
@@ -12,6 +13,7 @@ use hil_models::trace::netem::NetemTable;
 use hil_models::trace::{Trace, TraceDirection, csv, netem, opportunities, wire};
 use serde_json::{Value, json};
 
+use super::capture::CHANGED_BY_HAND;
 use super::cli::{TraceCommand, TraceFiles, TraceForm};
 use super::open::{Opened, files, open};
 use super::plots;
@@ -104,19 +106,28 @@ impl FittedLinks {
     /// The lines for one trace, and above them where they come from.
     fn toml(&mut self, opened: &Opened, fit: &TraceFit) -> String {
         let header = &opened.trace.header;
-        let own = Some(&header.link).filter(|name| !name.is_empty());
-        let link = self.named.as_ref().or(own).map_or("hop", String::as_str);
+        let (own, is_changed) = match header.link.split_once(CHANGED_BY_HAND) {
+            Some((name, _)) => (name, true),
+            None => (header.link.as_str(), false),
+        };
+        let own = Some(own).filter(|name| !name.is_empty());
+        let link = key(self.named.as_deref().or(own).unwrap_or("hop"));
+        let changed = if is_changed {
+            "# the link was changed by hand: the fit mixes its conditions\n"
+        } else {
+            ""
+        };
         let source = format!(
-            "# {} of {}, direction {}\n",
+            "# {} of {}, direction {}\n{changed}",
             header.channel,
             opened.path.display(),
             header.direction.word()
         );
         if self.is_one {
-            return format!("{source}{}", fit.toml(link));
+            return format!("{source}{}", fit.toml(&link));
         }
-        let toml = fit.toml_of_direction(link, header.direction);
-        let is_first = self.tables.insert(link.to_owned());
+        let toml = fit.toml_of_direction(&link, header.direction);
+        let is_first = self.tables.insert(link.clone());
         let opening = if is_first && header.direction != TraceDirection::Unknown {
             format!("[links.{link}]\nvia = \"emulated\"\n\n")
         } else {
@@ -135,6 +146,26 @@ impl FittedLinks {
             lines.join("\n")
         )
     }
+}
+
+/// `name` as a key of TOML: quoted where a bare key cannot say it.
+fn key(name: &str) -> String {
+    let is_bare = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_');
+    if !name.is_empty() && name.chars().all(is_bare) {
+        return name.to_owned();
+    }
+    let mut quoted = String::from("\"");
+    for c in name.chars() {
+        match c {
+            '"' | '\\' => quoted.extend(['\\', c]),
+            c if c.is_control() => {
+                write!(quoted, "\\u{:04X}", u32::from(c)).expect("writing to a string cannot fail");
+            }
+            c => quoted.push(c),
+        }
+    }
+    quoted.push('"');
+    quoted
 }
 
 /// Opens every file and hands it on; what is wrong with one is said and does not keep the others.
@@ -351,6 +382,26 @@ fn form_of(path: &Path) -> Option<TraceForm> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_link_of_any_name_is_one_key() {
+        for name in [
+            "hop",
+            "a-b_9",
+            "a.b",
+            "",
+            "two words",
+            "say \"x\\\"",
+            "tab\t",
+            "µ",
+        ] {
+            let text = format!("[links.{}]\nvia = \"emulated\"\n", key(name));
+            let table: toml::Table = toml::from_str(&text).unwrap();
+            assert_eq!(table["links"][name]["via"].as_str(), Some("emulated"));
+        }
+        assert_eq!(key("hop"), "hop");
+        assert_eq!(key("a.b"), "\"a.b\"");
+    }
 
     #[test]
     fn a_form_is_told_by_the_ending() {

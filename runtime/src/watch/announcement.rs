@@ -2,10 +2,12 @@
 //! when the run is over.
 
 use std::collections::BTreeMap;
-use std::fs;
+use std::fs::{self, File};
 use std::io;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
+
+use nix::fcntl::{Flock, FlockArg};
 
 use super::live::{LIVE_VERSION, LiveChannel, LiveRun, Source, Stage, start_ticks};
 use crate::channel::DomainAddress;
@@ -94,6 +96,25 @@ impl Drop for Announcement {
             // Where it cannot be removed, observers see by the domain's lock that the run is over.
             let _is_gone = fs::remove_file(path(folder)).is_ok();
         }
+    }
+}
+
+/// Takes back what a killed supervisor said in the domain's folder `root`; what a living one says
+/// stays. Before anybody locks the folder to clear it away: with the announcement in it, observers
+/// would take who does for its supervisor.
+pub(crate) fn withdraw_abandoned(root: &Path) {
+    let announced = path(root);
+    if !announced.exists() {
+        return;
+    }
+    let Ok(directory) = File::open(root) else {
+        return;
+    };
+    // Shared, as observers ask for it: to them the domain is not held meanwhile. A living supervisor
+    // has had the lock to itself since before it announced anything.
+    if let Ok(lock) = Flock::lock(directory, FlockArg::LockSharedNonblock) {
+        let _is_gone = fs::remove_file(announced).is_ok();
+        drop(lock);
     }
 }
 

@@ -12,6 +12,7 @@ use super::follow::{Batch, RecordFollower};
 use super::live::{LiveRun, Source};
 use super::passive::{PassiveCounters, PassiveReader};
 use super::seen::Seen;
+use super::since::Since;
 use crate::channel::{ChannelError, Domain, DomainError};
 use crate::clock::MonotonicClock;
 use crate::manifest::{ChannelDescription, Manifest};
@@ -110,6 +111,8 @@ pub struct Feed {
     shared: BTreeMap<String, Shared>,
     domains: BTreeMap<String, Domain>,
     follower: RecordFollower,
+    /// `None` when all of the run is to be given out.
+    since: Option<Since>,
     stage: Stage,
     asked: WallInstant,
     problems: Vec<String>,
@@ -152,6 +155,7 @@ impl Feed {
             channels,
             manifest,
             run,
+            since: None,
             stage: Stage::Running,
             asked: WallInstant::now(),
             problems: Vec::new(),
@@ -162,8 +166,10 @@ impl Feed {
     }
 
     /// Passes over everything that is in the records by now, for those who want to see what happens
-    /// and not what happened.
+    /// and not what happened. What other hosts send at the end is given out from the first message
+    /// on that was heard of here.
     pub fn skip_to_now(&mut self) {
+        self.since = Some(Since::default());
         self.follower.skip_to_end();
     }
 
@@ -305,6 +311,9 @@ impl Feed {
             let Some(open) = reader else { continue };
             let polled = open.poll(POLL_MESSAGES_MAX, &mut |envelope, payload| {
                 if seen.insert(envelope.epoch, envelope.sequence) {
+                    if let Some(since) = &mut self.since {
+                        since.admits(name, (envelope.epoch, envelope.sequence), true);
+                    }
                     take(Event::Message {
                         channel,
                         origin: Origin::SharedMemory,
@@ -330,6 +339,7 @@ impl Feed {
             channels,
             shared,
             follower,
+            since,
             problems,
             ..
         } = self;
@@ -338,6 +348,11 @@ impl Feed {
             let is_of_this_host = run.processes.iter().any(|one| one == batch.writer);
             let mut shared = shared.get_mut(name);
             Record::each(batch, &mut |record| {
+                if let Some(since) = since.as_mut()
+                    && !since.admits_record(name, &record, is_of_this_host)
+                {
+                    return;
+                }
                 if let (Record::Ingress(one), Some(shared), true) =
                     (&record, shared.as_deref_mut(), is_of_this_host)
                 {
@@ -351,7 +366,13 @@ impl Feed {
                 });
             });
             match channels.get(name) {
-                Some(channel) => give_messages(batch, channel, shared, take),
+                Some(channel) => {
+                    let mut admits = |message: (u32, u64)| {
+                        let since = since.as_mut();
+                        since.is_none_or(|since| since.admits(name, message, is_of_this_host))
+                    };
+                    give_messages(batch, channel, shared, &mut admits, take);
+                }
                 None if batch.messages().next().is_some() => {
                     problems.push(format!("{name}: no channel of the manifest; left out"));
                 }
@@ -394,6 +415,7 @@ fn give_messages(
     batch: &Batch<'_>,
     channel: &WatchedChannel,
     mut shared: Option<&mut Shared>,
+    admits: &mut dyn FnMut((u32, u64)) -> bool,
     take: &mut dyn FnMut(Event<'_>),
 ) {
     let origin = match channel.source {
@@ -401,6 +423,9 @@ fn give_messages(
         Some(Source::SharedMemory { .. }) | None => Origin::OtherHost,
     };
     for (envelope, payload) in batch.messages() {
+        if !admits((envelope.epoch, envelope.sequence)) {
+            continue;
+        }
         let is_new = shared
             .as_deref_mut()
             .is_none_or(|shared| shared.seen.insert(envelope.epoch, envelope.sequence));

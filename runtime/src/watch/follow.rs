@@ -20,6 +20,10 @@ const LOOK_PERIOD: Duration = Duration::from_millis(100);
 /// Largest piece read at once, unless one record is larger: a file that grew long does not keep
 /// the others waiting.
 const PIECE_BYTES: usize = 128 << 10;
+/// Most records read at once, so that each file gets the same number of them at its turn: with as many
+/// bytes, the files of short records would run ahead while one catches up, and messages would look
+/// as if they had been lost.
+pub(super) const PIECE_RECORDS: usize = 512;
 
 /// Whole records of one file, in the order in which they were written.
 #[derive(Debug, Clone, Copy)]
@@ -230,7 +234,7 @@ fn read_piece(
     if buffer.len() < record_bytes {
         buffer.resize(record_bytes, 0);
     }
-    let whole = buffer.len() - buffer.len() % record_bytes;
+    let whole = (buffer.len() / record_bytes).clamp(1, PIECE_RECORDS) * record_bytes;
     let failed = |error: io::Error| format!("{}: {error}", one.path.display());
     let count = read_up_to(&one.file, &mut buffer[..whole], one.offset).map_err(failed)?;
     let count = count - count % record_bytes;

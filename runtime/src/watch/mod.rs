@@ -22,11 +22,12 @@ mod live;
 mod passive;
 mod seen;
 mod select;
+mod since;
 
 #[cfg(test)]
 mod tests;
 
-pub(crate) use announcement::{Announcement, source};
+pub(crate) use announcement::{Announcement, source, withdraw_abandoned};
 pub use event::{Event, Origin, Record};
 pub use feed::{Feed, FeedError, Poll, WatchedChannel};
 pub use follow::{Batch, RecordFollower};

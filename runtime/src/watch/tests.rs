@@ -144,6 +144,29 @@ fn new_files_are_found_and_a_foreign_one_is_said_once() {
     assert_eq!(count(&mut follower), 1);
 }
 
+#[test]
+fn files_of_larger_and_smaller_records_are_caught_up_with_abreast() {
+    const COUNT: usize = 5000;
+    let place = Place::new("abreast");
+    let folder = place.run().join("records");
+    let small = header(RecordKind::Published, "c", size_of::<PublishedRecord>());
+    let large = header(RecordKind::Ingress, "c", size_of::<IngressRecord>());
+    let all: Vec<PublishedRecord> = (0..COUNT as u64).map(published).collect();
+    append(&folder, &small, "robot", bytemuck::cast_slice(&all));
+    let all: Vec<IngressRecord> = (0..COUNT as u64).map(ingress).collect();
+    append(&folder, &large, "gateway", bytemuck::cast_slice(&all));
+    let mut follower = RecordFollower::new(&folder);
+    let (mut small_count, mut large_count) = (0_usize, 0_usize);
+    // One piece at a time.
+    while follower.poll(1, &mut |batch| {
+        small_count += batch.records::<PublishedRecord>().count();
+        large_count += batch.records::<IngressRecord>().count();
+    }) {
+        assert!(small_count.abs_diff(large_count) <= follow::PIECE_RECORDS);
+    }
+    assert_eq!((small_count, large_count), (COUNT, COUNT));
+}
+
 const CHANNELS: [&str; 3] = ["own", "forwarded", "elsewhere"];
 
 /// A domain and a run's folder that announce a run with one channel of each source.
@@ -250,6 +273,8 @@ fn a_run_is_found_while_its_supervisor_holds_it_and_not_when_it_was_killed() {
     assert_eq!(running_runs_below(&place.0), std::slice::from_ref(&run));
     let folder = place.run();
     assert_eq!(select(folder.to_str()).unwrap(), run);
+    withdraw_abandoned(&place.0.join("d"));
+    assert!(run.is_announced());
     drop(holders);
     domain.remove();
     // What a killed supervisor leaves: the file, and nobody who holds the lock.
@@ -260,6 +285,8 @@ fn a_run_is_found_while_its_supervisor_holds_it_and_not_when_it_was_killed() {
         select(folder.to_str()),
         Err(SelectError::Over { .. })
     ));
+    withdraw_abandoned(&place.0.join("d"));
+    assert!(!run.is_announced());
 }
 
 #[test]
@@ -329,6 +356,48 @@ fn messages_come_once_from_memory_or_from_records_and_what_was_missed_is_counted
     while heard.poll(&mut feed) != Poll::Over {}
     assert_eq!(heard.words.last(), Some(&"ended"));
     drop((own, forwarded, holders));
+    drop(other);
+    assert_eq!(domain.remove().remained, [] as [PathBuf; 0]);
+}
+
+#[test]
+fn who_looks_from_now_on_gets_of_other_hosts_what_came_since() {
+    let place = Place::new("now");
+    let (domain, holders, run) = announced(&place);
+    let other = Domain::open(domain.address()).unwrap();
+    let mut forwarded = RawOutput::open(&other, "forwarded", false).unwrap();
+    let mut feed = Feed::open(run).unwrap();
+    feed.skip_to_now();
+    // Three were published before; number 4 is lost in the network.
+    for sequence in [3, 5] {
+        let envelope = envelope(sequence, Envelope::FORWARDED);
+        forwarded.publish(&envelope, &[2; 8]).unwrap();
+    }
+    let mut heard = Heard::default();
+    while heard.poll(&mut feed) == Poll::Busy {}
+    let records = place.run().join("records");
+    let kept = header(RecordKind::Message, "forwarded", size_of::<Envelope>() + 8);
+    let noted = header(
+        RecordKind::Published,
+        "forwarded",
+        size_of::<PublishedRecord>(),
+    );
+    for sequence in 0..6 {
+        append(&records, &kept, "robot", bytes_of(&envelope(sequence, 0)));
+        append(&records, &kept, "robot", &[2; 8]);
+        append(&records, &noted, "robot", bytes_of(&published(sequence)));
+    }
+    for folder in [place.0.join("d"), place.run()] {
+        fs::remove_file(folder.join(LiveRun::FILE_NAME)).unwrap();
+    }
+    while !heard.words.contains(&"silent") {
+        heard.poll(&mut feed);
+    }
+    let heard_numbers = heard.of("forwarded").into_iter();
+    let heard_numbers: Vec<u64> = heard_numbers.map(|(_, sequence)| sequence).collect();
+    assert_eq!(heard_numbers, [3, 5, 4]);
+    assert_eq!(heard.words, ["record", "record", "record", "silent"]);
+    drop((forwarded, holders));
     drop(other);
     assert_eq!(domain.remove().remained, [] as [PathBuf; 0]);
 }

@@ -81,14 +81,15 @@ pub(crate) fn play(
     let mut player = Player {
         outlets: outlets.collect::<Result<_, _>>()?,
         schedule: schedule_of(&material, options.speed),
-        kept: Punctuality::default(),
+        kept: Punctuality::of(channels.len()),
+        looked: MonotonicClock::now(),
         target: &target,
         signals,
     };
     console.say(&announcement(&options.file, &material, &target));
     let end = player.play(&material, options.is_looped)?;
     console.say(&player.account());
-    if player.kept.late_count > 0 {
+    if player.kept.late_count > 0 || player.kept.bunched_count > 0 {
         console.warn(&player.lateness());
     }
     if end.is_none() && target.is_ours() && !target.is_over() {
@@ -118,6 +119,8 @@ struct Player<'a> {
     outlets: Vec<Outlet>,
     schedule: Schedule,
     kept: Punctuality,
+    /// When it last asked whether the run is over.
+    looked: Instant,
     target: &'a Target,
     signals: &'a Signals,
 }
@@ -142,7 +145,7 @@ impl Player<'_> {
                 self.outlets[message.channel].publish(&message.payload)?;
                 let at_ns = at.saturating_duration_since(start).as_nanos();
                 let at_ns = u64::try_from(at_ns).unwrap_or(u64::MAX);
-                self.kept.note(due_ns, at_ns);
+                self.kept.note(message.channel, (due_ns, at_ns));
             }
             if !is_looped {
                 break;
@@ -158,18 +161,22 @@ impl Player<'_> {
         self.target.is_over().then_some(PlayEnd::Done)
     }
 
-    /// Sleeps until `due`; gives why it should not go on.
-    fn sleep_until(&self, due: Instant) -> Option<PlayEnd> {
+    /// Sleeps until `due`; gives why it should not go on. It asks for the end of the run every
+    /// [`SLEEP_MAX`], however soon messages follow each other.
+    fn sleep_until(&mut self, due: Instant) -> Option<PlayEnd> {
         loop {
             if let Some(signal) = self.signals.received() {
                 return Some(PlayEnd::Interrupted(signal));
             }
-            let look = MonotonicClock::now() + SLEEP_MAX;
-            if due > look {
-                let (Wake::Due | Wake::Interrupted) = MonotonicClock::sleep_until(look);
+            let look = self.looked + SLEEP_MAX;
+            if MonotonicClock::now() >= look {
                 if self.target.is_over() {
                     return Some(PlayEnd::Done);
                 }
+                // After the answer: a slow one must not be asked for without end.
+                self.looked = MonotonicClock::now();
+            } else if due > look {
+                let (Wake::Due | Wake::Interrupted) = MonotonicClock::sleep_until(look);
             } else if MonotonicClock::sleep_until(due) == Wake::Due {
                 return None;
             }
@@ -192,11 +199,11 @@ impl Player<'_> {
             bunched_count,
             worst_ns,
             ..
-        } = self.kept;
-        let worst_ms = worst_ns as f64 / 1e6;
+        } = &self.kept;
+        let worst_ms = *worst_ns as f64 / 1e6;
         format!(
             "{late_count} messages left more than 1 ms late, at worst {worst_ms:.1} ms, and \
-             {bunched_count} of all less than half their time after the one before"
+             {bunched_count} of all less than half their time after the one before on their channel"
         )
     }
 }

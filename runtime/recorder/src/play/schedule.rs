@@ -17,18 +17,19 @@ pub(crate) struct Schedule {
 }
 
 /// How well the grid was kept.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Punctuality {
     /// Messages published.
     pub(crate) published_count: u64,
     /// Those that left more than a millisecond after they were due.
     pub(crate) late_count: u64,
-    /// Those that left less than half as long after the one before as they were due, because that
-    /// one was late: receivers saw them closer together than they were recorded.
+    /// Those that left less than half as long after the one before on their channel as they were
+    /// due, because that one was late: receivers saw them closer together than they were recorded.
     pub(crate) bunched_count: u64,
     /// Largest lateness, nanoseconds.
     pub(crate) worst_ns: u64,
-    last: Option<(u64, u64)>,
+    /// When the last one was due and when it left, by channel.
+    last: Vec<Option<(u64, u64)>>,
 }
 
 impl Schedule {
@@ -58,18 +59,30 @@ impl Schedule {
 }
 
 impl Punctuality {
-    /// A message that was due at `due_ns` left at `at_ns`, both since the first one was due.
-    pub(crate) fn note(&mut self, due_ns: u64, at_ns: u64) {
+    /// For messages on `channel_count` channels.
+    pub(crate) fn of(channel_count: usize) -> Self {
+        Self {
+            published_count: 0,
+            late_count: 0,
+            bunched_count: 0,
+            worst_ns: 0,
+            last: vec![None; channel_count],
+        }
+    }
+
+    /// A message on `channel` that was due at `due_ns` left at `at_ns`, both since the first one of
+    /// all was due.
+    pub(crate) fn note(&mut self, channel: usize, (due_ns, at_ns): (u64, u64)) {
         self.published_count += 1;
         let late_ns = at_ns.saturating_sub(due_ns);
         self.worst_ns = self.worst_ns.max(late_ns);
         self.late_count += u64::from(u128::from(late_ns) > LATE.as_nanos());
-        if let Some((due_before_ns, before_ns)) = self.last {
+        let before = self.last[channel].replace((due_ns, at_ns));
+        if let Some((due_before_ns, before_ns)) = before {
             let wanted_ns = due_ns.saturating_sub(due_before_ns);
             let had_ns = at_ns.saturating_sub(before_ns);
             self.bunched_count += u64::from(2 * had_ns < wanted_ns);
         }
-        self.last = Some((due_ns, at_ns));
     }
 }
 
@@ -103,12 +116,23 @@ mod tests {
 
     #[test]
     fn what_was_late_and_what_was_pressed_together_is_counted() {
-        let mut kept = Punctuality::default();
+        let mut kept = Punctuality::of(1);
         for (due, at) in [(0, 0), (8, 8), (16, 26), (24, 27), (32, 32)] {
-            kept.note(due * MS, at * MS);
+            kept.note(0, (due * MS, at * MS));
         }
         assert_eq!(kept.published_count, 5);
         assert_eq!((kept.late_count, kept.bunched_count), (2, 1));
         assert_eq!(kept.worst_ns, 10 * MS);
+    }
+
+    #[test]
+    fn a_late_message_of_one_channel_presses_none_of_another() {
+        let mut kept = Punctuality::of(2);
+        for (channel, due, at) in [(0, 0, 0), (1, 4, 7), (0, 8, 8), (1, 12, 12)] {
+            kept.note(channel, (due * MS, at * MS));
+        }
+        assert_eq!((kept.late_count, kept.bunched_count), (1, 0));
+        kept.note(1, (20 * MS, 15 * MS));
+        assert_eq!(kept.bunched_count, 1);
     }
 }

@@ -82,6 +82,17 @@ impl Shown {
     }
 }
 
+/// Which run is shown, and how it stands.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Showing<'a> {
+    /// Its name.
+    pub(crate) name: &'a str,
+    /// No more records come.
+    pub(crate) is_over: bool,
+    /// It is played back.
+    pub(crate) is_playback: bool,
+}
+
 /// From records to viewers.
 pub(crate) struct Engine {
     shown: Option<Shown>,
@@ -127,10 +138,14 @@ impl Engine {
         self.due = Due::default();
     }
 
-    /// Name of the run that is shown, and whether it is over.
-    pub(crate) fn showing(&self) -> Option<(&str, bool)> {
+    /// The run that is shown.
+    pub(crate) fn showing(&self) -> Option<Showing<'_>> {
         let shown = self.shown.as_ref()?;
-        Some((&shown.state.facts.name, shown.state.is_over()))
+        Some(Showing {
+            name: &shown.state.facts.name,
+            is_over: shown.state.is_over(),
+            is_playback: shown.playback_speed.is_some(),
+        })
     }
 
     /// The viewers, at the end.
@@ -153,9 +168,10 @@ impl Engine {
             self.viewers.welcome(now_ns);
             return;
         };
-        read(shown, &mut self.viewers, &mut self.due, console);
+        let is_last = read(shown, &mut self.viewers, &mut self.due, console);
         let now_ns = shown.source.now_ns();
-        pictures(shown, &mut self.viewers, &mut self.due, now_ns);
+        let due = &mut self.due;
+        pictures(shown, &mut self.viewers, due, (now_ns, is_last));
         if is_due(&mut self.due.run, RUN_PERIOD) {
             shown.look_for_warnings();
             if let Some(recording) = &mut self.recording {
@@ -175,7 +191,8 @@ impl Engine {
     }
 }
 
-fn read(shown: &mut Shown, viewers: &mut Viewers, due: &mut Due, console: &mut Console) {
+/// Takes what came; true when it was the last.
+fn read(shown: &mut Shown, viewers: &mut Viewers, due: &mut Due, console: &mut Console) -> bool {
     let Shown { state, source, .. } = shown;
     if !state.facts.has_one_clock && source.has_one_clock() {
         state.compare_clocks();
@@ -194,21 +211,32 @@ fn read(shown: &mut Shown, viewers: &mut Viewers, due: &mut Due, console: &mut C
             *due = Due::default();
         }
         Progress::Ended(how) => {
+            let is_last = !state.is_over();
             if state.end(how, source.now_ns()) {
                 due.run = None;
             }
+            if is_last {
+                *due = Due::default();
+            }
+            return is_last;
         }
     }
+    false
 }
 
-fn pictures(shown: &mut Shown, viewers: &mut Viewers, due: &mut Due, now_ns: i64) {
+fn pictures(
+    shown: &mut Shown,
+    viewers: &mut Viewers,
+    due: &mut Due,
+    (now_ns, is_last): (i64, bool),
+) {
     let is_over = shown.state.is_over();
     let state = &mut shown.state;
     if let Some(map) = state.new_map() {
         viewers.live("/live/map", now_ns, map);
     }
-    // After the end the last picture stays.
-    if is_over {
+    // After the end the last picture stays, the one with what came in the last look.
+    if is_over && !is_last {
         return;
     }
     let period = if state.is_small() {

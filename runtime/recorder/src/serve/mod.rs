@@ -11,19 +11,21 @@ mod running;
 mod source;
 mod viewers;
 
+use std::fs;
 use std::net::SocketAddr;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::thread;
 use std::time::{Duration, Instant};
 
 use hil_runtime::console::Console;
+use hil_runtime::run_folder::RunFolder;
 use hil_runtime::signals::{EXIT_INTERRUPTED, Signals};
 use hil_runtime::watch::{FeedError, LiveRun, SelectError, select};
 use tokio::runtime::Runtime;
 
 use crate::cli::ServeOptions;
-use engine::{Engine, Shown};
+use engine::{Engine, Showing, Shown};
 use parameters::Links;
 use playback::Playback;
 use running::Running;
@@ -40,6 +42,12 @@ pub(crate) enum ServeError {
     /// Nothing to play back.
     #[error(transparent)]
     Run(#[from] crate::run::RunError),
+    /// A run's folder in which nothing is yet.
+    #[error("the run in {folder} has not begun yet; --wait waits for it")]
+    NotBegun {
+        /// The folder.
+        folder: PathBuf,
+    },
     /// No run goes on, or it is not clear which is meant.
     #[error("{0}; --wait waits for one, and the folder of a finished run is played back")]
     Select(#[from] SelectError),
@@ -97,10 +105,11 @@ pub(crate) fn serve(
         None => console.say("no run goes on here; waiting for one"),
     }
     let mut looked = Instant::now();
+    let mut said = None;
     while signals.received().is_none() {
         if options.wait && looked.elapsed() >= WAIT_PERIOD {
             looked = Instant::now();
-            show_next(options, &mut engine, console);
+            show_next(options, &mut engine, &mut said, console);
         }
         engine.round(console);
         thread::sleep(LOOK_PERIOD);
@@ -119,6 +128,15 @@ fn first(
 ) -> Result<Option<Shown>, ServeError> {
     let wanted = options.run.as_deref();
     let folder = wanted.map(Path::new).filter(|path| path.is_dir());
+    // Asked before whether it goes on, so that one that begins in between is not played back.
+    if let Some(folder) = folder.filter(|folder| has_not_begun(folder)) {
+        let folder = folder.to_owned();
+        return if options.wait {
+            Ok(None)
+        } else {
+            Err(ServeError::NotBegun { folder })
+        };
+    }
     if let Some(folder) = folder.filter(|folder| !goes_on(folder)) {
         let how = (options.speed, options.repeats);
         let read = Playback::read(folder, how, &mut |_| signals.received().is_none());
@@ -140,6 +158,15 @@ fn goes_on(folder: &Path) -> bool {
     LiveRun::read(folder).is_ok_and(|run| run.is_held())
 }
 
+/// True for the folder of a run whose supervisor has only just made it: nothing is announced or
+/// recorded. A finished run has records.
+fn has_not_begun(folder: &Path) -> bool {
+    let run = RunFolder::existing(folder);
+    let is_told = folder.join(LiveRun::FILE_NAME).exists() || run.summary().exists();
+    let records = fs::read_dir(run.records());
+    !is_told && records.is_ok_and(|mut records| records.next().is_none())
+}
+
 const fn is_none_yet(error: &SelectError) -> bool {
     matches!(error, SelectError::NoneRuns | SelectError::NoSuch { .. })
 }
@@ -152,16 +179,33 @@ fn watch(run: LiveRun) -> Result<Shown, ServeError> {
     Ok(Shown::new(facts, Box::new(running), None, links))
 }
 
-/// Shows a run that has begun, where none is shown or the one shown is over.
-fn show_next(options: &ServeOptions, engine: &mut Engine, console: &mut Console) {
+/// Shows a run that has begun, where none is shown or the one shown gives way to it. `said` is what
+/// was said last of why none can be chosen.
+fn show_next(
+    options: &ServeOptions,
+    engine: &mut Engine,
+    said: &mut Option<String>,
+    console: &mut Console,
+) {
     let showing = engine.showing();
-    if showing.is_some_and(|(_, is_over)| !is_over) {
+    if showing.is_some_and(|showing| !showing.is_over && !showing.is_playback) {
         return;
     }
-    let Ok(run) = select(options.run.as_deref()) else {
-        return;
+    let run = match select(options.run.as_deref()) {
+        Ok(run) => run,
+        Err(error @ SelectError::Several { .. }) => {
+            // Asked three times a second: once for each choice of runs.
+            let words = error.to_string();
+            if said.as_ref() != Some(&words) {
+                console.warn(&words);
+                *said = Some(words);
+            }
+            return;
+        }
+        // None has begun, which is what is waited for.
+        Err(_) => return,
     };
-    if showing.is_some_and(|(name, _)| name == run.name) {
+    if showing.is_some_and(|showing| !gives_way(showing, &run.name)) {
         return;
     }
     let name = run.name.clone();
@@ -172,6 +216,16 @@ fn show_next(options: &ServeOptions, engine: &mut Engine, console: &mut Console)
         }
         // It may be over already, or not quite there: the next look tells.
         Err(error) => console.warn(&error.to_string()),
+    }
+}
+
+/// True when what is shown makes room for the run called `name`, which goes on. What is played back
+/// under that name was looked at before the run began.
+fn gives_way(showing: Showing<'_>, name: &str) -> bool {
+    if showing.name == name {
+        showing.is_playback
+    } else {
+        showing.is_over
     }
 }
 
@@ -200,4 +254,40 @@ fn open(
     }
     console.result(&format!("page    http://{page}/\nviewers ws://{socket}\n"));
     Ok(viewers)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_folder_with_nothing_in_it_yet_is_not_that_of_a_finished_run() {
+        let name = format!("hil-recorder-not-begun-{}", std::process::id());
+        let folder = std::env::temp_dir().join(name);
+        let run = RunFolder::existing(&folder);
+        // One of a program that keeps no records.
+        fs::create_dir_all(&folder).unwrap();
+        assert!(!has_not_begun(&folder));
+        fs::create_dir(run.records()).unwrap();
+        assert!(has_not_begun(&folder));
+        fs::write(run.summary(), "{}").unwrap();
+        assert!(!has_not_begun(&folder));
+        fs::remove_file(run.summary()).unwrap();
+        fs::write(run.records().join("x.rec"), "").unwrap();
+        assert!(!has_not_begun(&folder));
+        fs::remove_dir_all(&folder).unwrap();
+    }
+
+    #[test]
+    fn a_run_that_goes_on_takes_the_place_of_its_own_playback_and_of_what_is_over() {
+        let showing = |is_over, is_playback| Showing {
+            name: "x-1",
+            is_over,
+            is_playback,
+        };
+        assert!(gives_way(showing(false, true), "x-1"));
+        assert!(!gives_way(showing(true, false), "x-1"));
+        assert!(gives_way(showing(true, false), "x-2"));
+        assert!(!gives_way(showing(false, true), "x-2"));
+    }
 }

@@ -4,6 +4,7 @@
 use std::convert::Infallible;
 use std::io;
 use std::net::SocketAddr;
+use std::time::Duration;
 
 use http_body_util::Full;
 use hyper::body::{Bytes, Incoming};
@@ -11,7 +12,7 @@ use hyper::header::{self, HeaderValue};
 use hyper::server::conn::http1;
 use hyper::service::service_fn;
 use hyper::{Method, Request, Response, StatusCode};
-use hyper_util::rt::TokioIo;
+use hyper_util::rt::{TokioIo, TokioTimer};
 use serde_json::json;
 use tokio::net::TcpListener;
 use tokio::runtime::Handle;
@@ -25,6 +26,9 @@ const POLICY: &str = "default-src 'self'; connect-src 'self' ws:; img-src 'self'
 
 /// Connections at once; more wait.
 const CONNECTIONS_MAX: usize = 64;
+/// How long a browser may take to say what it wants; one that says nothing would keep its place
+/// from the others.
+const REQUEST_WITHIN: Duration = Duration::from_secs(5);
 
 /// Serves the page at `address` from now on; where it really is. The page will look for the socket
 /// at `ws_port` of the same host.
@@ -44,7 +48,7 @@ pub(crate) fn serve(runtime: &Handle, address: SocketAddr, ws_port: u16) -> io::
             };
             let Ok((stream, _)) = listener.accept().await else {
                 // Out of file descriptors, mostly: others must close first.
-                tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+                tokio::time::sleep(Duration::from_millis(50)).await;
                 continue;
             };
             let config = config.clone();
@@ -53,11 +57,13 @@ pub(crate) fn serve(runtime: &Handle, address: SocketAddr, ws_port: u16) -> io::
                     let answer = answer(request.method(), request.uri().path(), &config);
                     async move { Ok::<_, Infallible>(answer) }
                 });
+                let connection = http1::Builder::new()
+                    .timer(TokioTimer::new())
+                    .header_read_timeout(REQUEST_WITHIN)
+                    .keep_alive(false)
+                    .serve_connection(TokioIo::new(stream), service);
                 // A browser that goes away in the middle is nobody's fault.
-                let _is_served = http1::Builder::new()
-                    .serve_connection(TokioIo::new(stream), service)
-                    .await
-                    .is_ok();
+                let _is_served = connection.await.is_ok();
                 drop(place);
             });
         }

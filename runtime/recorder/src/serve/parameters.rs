@@ -9,7 +9,9 @@
 //! | `is_cut` | true, false | nothing gets through |
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::ffi::OsString;
+use std::fs;
+use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread;
@@ -38,13 +40,54 @@ const CUT: &str = "is_cut";
 struct Wish {
     delay_ms: Option<f64>,
     loss_ratio: Option<f64>,
+    /// Somebody set a number: both hold in place of the topology's law.
+    is_set: bool,
     is_cut: bool,
 }
 
+impl Wish {
+    /// The same with the value of `parameter` as its part called `what`.
+    fn with(mut self, what: &str, parameter: &Parameter) -> Result<Self, String> {
+        match (what, number(parameter), &parameter.value) {
+            (DELAY, Some(ms), _) => {
+                self.delay_ms = Some(within(ms, 60_000.0, "ms")?);
+                self.is_set = true;
+            }
+            (LOSS, Some(ratio), _) => {
+                self.loss_ratio = Some(within(ratio, 1.0, "")?);
+                self.is_set = true;
+            }
+            (CUT, _, Some(ParameterValue::Bool(is_cut))) => self.is_cut = *is_cut,
+            (DELAY | LOSS, ..) => return Err("must be a number".to_owned()),
+            (CUT, ..) => return Err("must be true or false".to_owned()),
+            _ => return Err(format!("there is {DELAY}, {LOSS} and {CUT}")),
+        }
+        Ok(self)
+    }
+
+    /// What the gateway is asked for. A cut link stays cut; what it does after that is remembered
+    /// here. Numbers that are only the topology's stand beside its law, not in place of it.
+    fn condition(self) -> LinkCondition {
+        if self.is_cut {
+            return LinkCondition::Cut;
+        }
+        if !self.is_set {
+            return LinkCondition::Topology;
+        }
+        LinkCondition::Fixed {
+            delay: Duration::from_secs_f64(self.delay_ms.unwrap_or(0.0) / 1e3),
+            loss_ratio: self.loss_ratio.unwrap_or(0.0),
+        }
+    }
+}
+
+/// The run whose links are shown from now on: its folder and resolved topology, or none.
+struct Change(Option<(PathBuf, Value)>);
+
 /// Something to do for a viewer, or for the run's sake.
 enum Request {
-    /// Another run is shown, or one whose links are as they were.
-    Show(Option<(PathBuf, Value)>),
+    /// Another run is shown.
+    Wake,
     Get(Vec<String>, GetParametersResponder),
     Set(Vec<Parameter>, AnyClient, SetParametersResponder),
 }
@@ -53,6 +96,8 @@ enum Request {
 #[derive(Clone)]
 pub(crate) struct Links {
     ask: SyncSender<Request>,
+    /// Beside the queue, so that it is not lost when viewers fill that.
+    change: Arc<Mutex<Option<Change>>>,
     known: Arc<Mutex<BTreeMap<(String, String), Wish>>>,
 }
 
@@ -60,34 +105,34 @@ impl Links {
     /// Begins without a run. The thread ends with the last of its clones.
     pub(crate) fn begin() -> Self {
         let (ask, asked) = sync_channel(WAITING_MAX);
+        let change = Arc::new(Mutex::new(None));
         let known = Arc::new(Mutex::new(BTreeMap::new()));
         let worker = Worker {
             run: None,
             folder: None,
+            launches: BTreeMap::new(),
+            change: Arc::clone(&change),
             known: Arc::clone(&known),
             topology: Value::Null,
             wishes: BTreeMap::new(),
         };
         thread::spawn(move || worker.work(&asked));
-        Self { ask, known }
+        Self { ask, change, known }
     }
 
     /// From now on, the links of the run in `folder` with this resolved topology; those of no run
     /// with `None`.
     pub(crate) fn show(&self, run: Option<(PathBuf, Value)>) {
-        // A full queue means that the thread is about to look anyway; it is empty when runs change.
-        let _is_heard = self.ask.try_send(Request::Show(run)).is_ok();
-    }
-
-    fn known(&self) -> MutexGuard<'_, BTreeMap<(String, String), Wish>> {
-        self.known.lock().unwrap_or_else(PoisonError::into_inner)
+        *locked(&self.change) = Some(Change(run));
+        // A full queue wakes the thread as well.
+        let _is_heard = self.ask.try_send(Request::Wake).is_ok();
     }
 
     /// What the direction `way` of `link` does: `condition`, `is_settable` and `why_not` of
     /// `/live/run`.
     pub(crate) fn describe(&self, link: &str, via: &str, way: &str, is_over: bool) -> Value {
         let key = (link.to_owned(), way.to_owned());
-        let wish = self.known().get(&key).copied();
+        let wish = locked(&self.known).get(&key).copied();
         let condition = wish
             .map(|wish| json!({ DELAY: wish.delay_ms, LOSS: wish.loss_ratio, CUT: wish.is_cut }));
         let why_not = match wish {
@@ -104,7 +149,7 @@ impl Links {
 
     /// Every parameter with its present value.
     pub(crate) fn list(&self) -> Vec<Parameter> {
-        let known = self.known();
+        let known = locked(&self.known);
         known
             .iter()
             .flat_map(|(key, wish)| parameters_of(key, wish))
@@ -143,6 +188,9 @@ impl ParameterHandler for Links {
 struct Worker {
     run: Option<RunLinks>,
     folder: Option<PathBuf>,
+    /// The launch files when the links were opened.
+    launches: BTreeMap<OsString, u64>,
+    change: Arc<Mutex<Option<Change>>>,
     known: Arc<Mutex<BTreeMap<(String, String), Wish>>>,
     topology: Value,
     wishes: BTreeMap<(String, String), Wish>,
@@ -151,8 +199,13 @@ struct Worker {
 impl Worker {
     fn work(mut self, asked: &Receiver<Request>) {
         loop {
-            match asked.recv_timeout(LOOK_PERIOD) {
-                Ok(Request::Show(run)) => self.show(run),
+            let request = asked.recv_timeout(LOOK_PERIOD);
+            let change = locked(&self.change).take();
+            if let Some(Change(run)) = change {
+                self.show(run);
+            }
+            match request {
+                Ok(Request::Wake) => {}
                 Ok(Request::Get(names, responder)) => {
                     self.look();
                     responder.respond(self.named(&names));
@@ -184,16 +237,25 @@ impl Worker {
         self.look();
     }
 
+    /// Gateways begin after the run is announced, one after the other, and may begin again. The
+    /// links are opened anew only then: to open one that replays a trace is to read the trace.
+    fn open(&mut self) {
+        let Some(folder) = &self.folder else {
+            return;
+        };
+        let launches = launches_in(folder);
+        if self.run.is_some() && launches == self.launches {
+            return;
+        }
+        if let Ok(run) = RunLinks::open(folder) {
+            self.run = Some(run);
+            self.launches = launches;
+        }
+    }
+
     /// Takes over what the gateways have on record.
     fn look(&mut self) {
-        // Gateways begin after the run is announced.
-        let is_empty = self
-            .run
-            .as_ref()
-            .is_none_or(|run| run.directions().is_empty());
-        if let Some(folder) = self.folder.as_ref().filter(|_| is_empty) {
-            self.run = RunLinks::open(folder).ok();
-        }
+        self.open();
         if let Some(run) = &self.run {
             for direction in run.directions() {
                 let Ok((condition, _)) = run.condition(direction) else {
@@ -205,8 +267,7 @@ impl Worker {
                 self.wishes.insert(key, wish);
             }
         }
-        let mut known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
-        known.clone_from(&self.wishes);
+        locked(&self.known).clone_from(&self.wishes);
     }
 
     fn named(&self, names: &[String]) -> Vec<Parameter> {
@@ -225,30 +286,29 @@ impl Worker {
             .ok_or("no run goes on whose links could be changed")?;
         let (direction, what) = meant(run, &parameter.name)?;
         let key = key_of(&direction);
-        let mut wish = self.wishes.get(&key).copied().unwrap_or_default();
-        match (what.as_str(), number(parameter), &parameter.value) {
-            (DELAY, Some(ms), _) => wish.delay_ms = Some(within(ms, 60_000.0, "ms")?),
-            (LOSS, Some(ratio), _) => wish.loss_ratio = Some(within(ratio, 1.0, "")?),
-            (CUT, _, Some(ParameterValue::Bool(is_cut))) => wish.is_cut = *is_cut,
-            (DELAY | LOSS, ..) => return Err("must be a number".to_owned()),
-            (CUT, ..) => return Err("must be true or false".to_owned()),
-            _ => return Err(format!("there is {DELAY}, {LOSS} and {CUT}")),
-        }
-        // A cut link stays cut; what it will do after that is remembered.
-        let has_numbers = wish.delay_ms.is_some() || wish.loss_ratio.is_some();
-        let condition = match wish {
-            wish if wish.is_cut => LinkCondition::Cut,
-            _ if !has_numbers => LinkCondition::Topology,
-            wish => LinkCondition::Fixed {
-                delay: Duration::from_secs_f64(wish.delay_ms.unwrap_or(0.0) / 1e3),
-                loss_ratio: wish.loss_ratio.unwrap_or(0.0),
-            },
-        };
-        run.set(&direction, condition)
+        let wish = self.wishes.get(&key).copied().unwrap_or_default();
+        let wish = wish.with(&what, parameter)?;
+        run.set(&direction, wish.condition())
             .map_err(|error| error.to_string())?;
         self.wishes.insert(key, wish);
         Ok(())
     }
+}
+
+fn locked<T>(shared: &Mutex<T>) -> MutexGuard<'_, T> {
+    shared.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Names and lengths of the launch files of the run in `folder`: they change with every start of a
+/// process, and while a file is being written.
+fn launches_in(folder: &Path) -> BTreeMap<OsString, u64> {
+    let entries = fs::read_dir(folder.join("launch"));
+    let entries = entries.into_iter().flatten().flatten();
+    let files = entries.filter_map(|entry| {
+        let length = entry.metadata().ok()?.len();
+        Some((entry.file_name(), length))
+    });
+    files.collect()
 }
 
 fn key_of(direction: &LinkDirection) -> (String, String) {
@@ -291,27 +351,32 @@ fn wish_of(
     condition: LinkCondition,
     before: Option<Wish>,
     topology: &Value,
-    (link, way): &(String, String),
+    key: &(String, String),
 ) -> Wish {
     match condition {
         LinkCondition::Fixed { delay, loss_ratio } => Wish {
             delay_ms: Some(delay.as_secs_f64() * 1e3),
             loss_ratio: Some(loss_ratio),
+            is_set: true,
             is_cut: false,
         },
         LinkCondition::Cut => Wish {
             is_cut: true,
-            ..before.unwrap_or_default()
+            ..before.unwrap_or_else(|| of_topology(topology, key))
         },
-        LinkCondition::Topology => {
-            let spec = &topology["links"][link][way];
-            let delay = spec["delay"].as_str().and_then(read_duration);
-            Wish {
-                delay_ms: delay.map(|delay| delay.as_secs_f64() * 1e3),
-                loss_ratio: spec["loss_ratio"].as_f64(),
-                is_cut: false,
-            }
-        }
+        LinkCondition::Topology => of_topology(topology, key),
+    }
+}
+
+/// What the topology gives numbers for.
+fn of_topology(topology: &Value, (link, way): &(String, String)) -> Wish {
+    let spec = &topology["links"][link][way];
+    let delay = spec["delay"].as_str().and_then(read_duration);
+    Wish {
+        delay_ms: delay.map(|delay| delay.as_secs_f64() * 1e3),
+        loss_ratio: spec["loss_ratio"].as_f64(),
+        is_set: false,
+        is_cut: false,
     }
 }
 
@@ -331,4 +396,55 @@ fn parameters_of((link, way): &(String, String), wish: &Wish) -> Vec<Parameter> 
         value: Some(ParameterValue::Bool(wish.is_cut)),
     };
     numbers.chain([cut]).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn after(wish: Wish, what: &str, value: ParameterValue) -> Wish {
+        let parameter = Parameter {
+            name: what.to_owned(),
+            r#type: None,
+            value: Some(value),
+        };
+        wish.with(what, &parameter).unwrap()
+    }
+
+    /// What the gateway is asked for when the link is cut and then no longer, with a look at its
+    /// record between.
+    fn cut_and_back(wish: Wish) -> LinkCondition {
+        let key = ("hop".to_owned(), "forward".to_owned());
+        let cut = after(wish, CUT, ParameterValue::Bool(true));
+        assert_eq!(cut.condition(), LinkCondition::Cut);
+        let seen = wish_of(LinkCondition::Cut, Some(cut), &Value::Null, &key);
+        after(seen, CUT, ParameterValue::Bool(false)).condition()
+    }
+
+    #[test]
+    fn a_link_that_was_cut_does_afterwards_what_it_did_before() {
+        let key = ("hop".to_owned(), "forward".to_owned());
+        let topology = json!({ "links": { "hop": { "forward": {
+            "delay": "5 ms", "loss_ratio": 0.1,
+        }}}});
+        let wish = wish_of(LinkCondition::Topology, None, &topology, &key);
+        assert_eq!(wish.loss_ratio, Some(0.1));
+        assert_eq!(cut_and_back(wish), LinkCondition::Topology);
+
+        let set = after(wish, LOSS, ParameterValue::Float64(0.5));
+        let condition = set.condition();
+        assert!(matches!(condition, LinkCondition::Fixed { .. }));
+        assert_eq!(cut_and_back(set), condition);
+
+        let fixed = LinkCondition::Fixed {
+            delay: Duration::from_millis(250),
+            loss_ratio: 0.25,
+        };
+        let others = wish_of(fixed, Some(wish), &topology, &key);
+        assert_eq!(cut_and_back(others), fixed);
+        // Somebody cut it before anybody looked.
+        let unseen = wish_of(LinkCondition::Cut, None, &topology, &key);
+        let uncut = after(unseen, CUT, ParameterValue::Bool(false));
+        assert_eq!(uncut.condition(), LinkCondition::Topology);
+    }
 }

@@ -1,6 +1,8 @@
 //! A run that goes on on this host, as its feed tells of it.
 
-use std::fs;
+use std::fs::{self, File};
+use std::io::{self, Read, Seek, SeekFrom};
+use std::path::Path;
 
 use hil_runtime::clock::MonotonicClock;
 use hil_runtime::report::summary::RunSummary;
@@ -16,6 +18,8 @@ use crate::view::{Body, LiveRecord};
 const POLLS_MAX: usize = 16;
 /// Lines shown of what a process said.
 const LINES_MAX: usize = 3;
+/// As much of the end of a log is read: it is looked at every second, and may become long.
+const LOG_END_BYTES: u64 = 64 * 1024;
 
 /// A run that goes on.
 #[derive(Debug)]
@@ -189,7 +193,7 @@ impl Source for Running {
         paths.sort();
         let mut warnings = Vec::new();
         for path in paths {
-            let Ok(text) = fs::read_to_string(&path) else {
+            let Ok(text) = end_of(&path) else {
                 continue;
             };
             let process = path
@@ -206,6 +210,18 @@ impl Source for Running {
         }
         warnings
     }
+}
+
+/// The last lines of the log at `path`, whatever bytes a program wrote there.
+fn end_of(path: &Path) -> io::Result<String> {
+    let mut file = File::open(path)?;
+    let begin = file.metadata()?.len().saturating_sub(LOG_END_BYTES);
+    file.seek(SeekFrom::Start(begin))?;
+    let mut bytes = Vec::new();
+    file.take(LOG_END_BYTES).read_to_end(&mut bytes)?;
+    let text = String::from_utf8_lossy(&bytes);
+    let whole_lines = text.split_once('\n').filter(|_| begin > 0);
+    Ok(whole_lines.map_or(&*text, |(_, rest)| rest).to_owned())
 }
 
 /// What of a record is shown, and when it was on the clock of its process.

@@ -24,7 +24,7 @@ use crate::topics::{Names, View, topic_of};
 use crate::view::facts::{ChannelFacts, RunFacts};
 
 /// Messages that wait for one viewer at most; then its oldest go.
-const WAITING_MAX: usize = 4096;
+const WAITING_MAX: usize = 512;
 
 /// How long a viewer may take to hear that it is over.
 const GOODBYE_WITHIN: Duration = Duration::from_secs(1);

@@ -63,6 +63,15 @@ struct Counts {
     forgotten: u64,
 }
 
+impl Counts {
+    /// Records of a stage are written by a process of its own and may be read before those of the
+    /// stage before: what was received or taken was published.
+    fn published(&self) -> Option<u64> {
+        let later = self.received.max(self.taken).unwrap_or(0);
+        self.published.map(|count| count.max(later))
+    }
+}
+
 fn count(of: &mut Option<u64>) {
     *of = Some(of.unwrap_or(0) + 1);
 }
@@ -288,7 +297,7 @@ impl Account {
         json!({
             "name": name,
             "rate_hz": rate_hz,
-            "published_count": counts.published,
+            "published_count": counts.published(),
             "received_count": counts.received,
             "taken_count": counts.taken,
             "lost_count": can_tell.then_some(counts.lost),

@@ -118,6 +118,27 @@ fn what_was_sent_and_did_not_arrive_is_lost_after_a_second() {
 }
 
 #[test]
+fn what_was_taken_or_received_was_published() {
+    let mut account = account(true);
+    account.take(&taken(0, 2 * MS));
+    account.take(&taken(1, 3 * MS));
+    let published_count =
+        |account: &mut Account| account.figures("x", 4 * MS)["published_count"].clone();
+    // Nobody here notes what is published, as far as is known.
+    assert_eq!(published_count(&mut account), Value::Null);
+    account.take(&published(0, 0));
+    assert_eq!(published_count(&mut account), 2);
+    for sequence in 0..3 {
+        account.take(&received(sequence, MS));
+    }
+    assert_eq!(published_count(&mut account), 3);
+    for sequence in 1..5 {
+        account.take(&published(sequence, MS));
+    }
+    assert_eq!(published_count(&mut account), 5);
+}
+
+#[test]
 fn a_receiver_alone_knows_the_lost_by_the_numbers_passed_over() {
     let mut account = account(true);
     for sequence in [5_u64, 6, 9, 8, 12] {

@@ -2,9 +2,12 @@
 //! supervisor says of them and from what the kernel does.
 
 use std::collections::BTreeMap;
+use std::io;
 use std::time::Duration;
 
 use hil_models::clock::ClockMap;
+use hil_models::link::condition::LinkCondition;
+use hil_models::link::spec::{LinkSpec, Way};
 use hil_models::measure::account::{ChannelAccount, MessageFate};
 use hil_models::measure::histogram::Distribution;
 
@@ -17,7 +20,10 @@ use crate::live::observer::Observer;
 use crate::live::pace::Pace;
 use crate::live::process;
 use crate::live::status::{ProcessStatus, RunStatus};
-use crate::topology::{Channel, Link, Topology};
+use crate::topology::{Channel, Direction, Link, Topology};
+
+/// The supervisor tells of its processes twice a second; what is older than this is said to be old.
+const STATUS_AGE_MAX: Duration = Duration::from_secs(2);
 
 /// What a look remembers for the next one.
 #[derive(Debug, Default)]
@@ -33,12 +39,8 @@ impl Gatherer {
     pub(crate) fn look(&mut self, observer: &Observer, window: Duration) -> View {
         let status = RunStatus::read(&observer.run().folder);
         let mut problems = observer.problems().to_vec();
-        if let Err(error) = &status
-            && !observer.is_over()
-        {
-            problems.push(format!(
-                "the supervisor does not tell of its processes: {error}"
-            ));
+        if !observer.is_over() {
+            problems.extend(status_problem(status.as_ref()));
         }
         let status = status.ok();
         let accounts: BTreeMap<&str, ChannelAccount> = observer
@@ -97,6 +99,25 @@ impl Gatherer {
         });
         rows.collect()
     }
+}
+
+/// What is wrong with what the supervisor tells.
+fn status_problem(status: Result<&RunStatus, &io::Error>) -> Option<String> {
+    let status = match status {
+        Ok(status) => status,
+        Err(error) => {
+            return Some(format!(
+                "the supervisor does not tell of its processes: {error}"
+            ));
+        }
+    };
+    let now_ns = MonotonicClock::now().as_ns();
+    let elapsed_ns = now_ns.saturating_sub(status.written_ns).max(0);
+    let age = Duration::from_nanos(elapsed_ns.unsigned_abs());
+    (age > STATUS_AGE_MAX).then(|| {
+        let seconds = age.as_secs_f64();
+        format!("what the supervisor tells of its processes is {seconds:.1} s old")
+    })
 }
 
 fn run_view(observer: &Observer, status: Option<&RunStatus>, window: Duration) -> RunView {
@@ -259,8 +280,9 @@ fn link_row(
         via: link.via.word().to_owned(),
         state: state.to_owned(),
         condition: link.emulation().map(|emulation| {
-            let there = emulation.forward.describe();
-            let back = emulation.backward.describe();
+            let words = |way, spec| condition_words(observer, (topology, link), (way, spec));
+            let there = words(Way::Forward, &emulation.forward);
+            let back = words(Way::Backward, &emulation.backward);
             if there == back {
                 there
             } else {
@@ -268,6 +290,35 @@ fn link_row(
             }
         }),
         loss_ratio: (known_count > 0).then(|| lost_count as f64 / known_count as f64),
+    }
+}
+
+/// What one direction of an emulated link does at present.
+fn condition_words(
+    observer: &Observer,
+    (topology, link): (&Topology, &Link),
+    (way, spec): (Way, &LinkSpec),
+) -> String {
+    let ordered = observer.link_condition(&link.name, way);
+    if ordered != LinkCondition::Topology {
+        return format!("{ordered}, changed by hand");
+    }
+    let is_this_way = |direction: Direction| match way {
+        Way::Forward => direction == Direction::Forward,
+        Way::Backward => direction == Direction::Backward,
+    };
+    let mut crossings = topology.crossings();
+    let crossing = crossings.find(|one| one.link.name == link.name && is_this_way(one.direction));
+    // Changes are on record where the gateway is that emulates the direction.
+    let is_known = crossing.is_none_or(|crossing| {
+        let mut here = observer.run().hosts();
+        here.any(|host| host == crossing.to_host.name)
+    });
+    let words = spec.describe();
+    if is_known {
+        words
+    } else {
+        format!("{words}, by the topology")
     }
 }
 

@@ -21,7 +21,14 @@ pub(super) fn run(
     signals: &Signals,
 ) -> io::Result<TopEnd> {
     // Also sets a hook that restores the terminal before a panic is printed.
-    let mut terminal = ratatui::try_init()?;
+    let mut terminal = match ratatui::try_init() {
+        Ok(terminal) => terminal,
+        Err(error) => {
+            // It may have failed half way, in raw mode; why it failed is what the user needs.
+            let _is_restored = ratatui::try_restore().is_ok();
+            return Err(error);
+        }
+    };
     let mut screen = Screen {
         view: None,
         chosen: 0,
