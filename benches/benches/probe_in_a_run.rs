@@ -1,11 +1,11 @@
 //! What a probe costs a whole run: the shuttle on two hosts with a switch between them, with its own
 //! processes and gateways, whose wire is in turns not tapped, tapped at a mirror port of the switch,
-//! and tapped on the hosts' own interfaces. Each round of turns gives one ratio, in an order drawn by
+//! and tapped on the hosts' own interfaces, by a packet ring and by eBPF programs. Each round of turns gives one ratio, in an order drawn by
 //! lot, so that what the machine does meanwhile hits all alike. Not a test: it states the aim and
 //! whether it was met, or that the rounds were too few to tell, and ends with code 0.
 //!
 //! `cargo bench -p hil-benches --bench probe_in_a_run -- [--rounds N] [--rate HZ] [--set KEY=VALUE]...`,
-//! about 6 s a round. Namespaces and taps take root; without, it says what is missing. What the taps
+//! about 8 s a round. Namespaces and taps take root; without, it says what is missing. What the taps
 //! cost a bare hop, back to back, is measured by `probe_overhead`.
 #![allow(clippy::print_stdout, reason = "a bench prints its result")]
 
@@ -21,6 +21,7 @@ use hil_benches::gateway::network::Network;
 use hil_benches::gateway::parties::{MachineTime, stolen_text};
 use hil_benches::gateway::tap::Drainer;
 use hil_benches::{HostFacts, MedianInterval, Quantiles};
+use hil_gateways::transport::live_tap::TapEngine;
 use hil_models::measure::record::{TakenRecord, UNAVAILABLE};
 use hil_models::random::RandomStream;
 use hil_runtime::clock::MonotonicClock;
@@ -78,11 +79,14 @@ enum Tap {
     None,
     /// At a mirror port of the switch between the hosts: no datagram's way leads through it.
     Mirror,
-    /// On the hosts' own interfaces: every datagram's way leads through two.
+    /// By packet rings on the hosts' own interfaces: every datagram's way leads through two.
     Hosts,
+    /// By eBPF programs there.
+    HostsBpf,
 }
 
-const TAPS: [Tap; 3] = [Tap::None, Tap::Mirror, Tap::Hosts];
+const TAPS: [Tap; 4] = [Tap::None, Tap::Mirror, Tap::Hosts, Tap::HostsBpf];
+const TAP_COUNT: usize = TAPS.len();
 
 impl Tap {
     const fn name(self) -> &'static str {
@@ -90,6 +94,14 @@ impl Tap {
             Self::None => "alone",
             Self::Mirror => "mirror",
             Self::Hosts => "hosts",
+            Self::HostsBpf => "hosts, bpf",
+        }
+    }
+
+    const fn engine(self) -> TapEngine {
+        match self {
+            Self::HostsBpf => TapEngine::Bpf,
+            _ => TapEngine::Packet,
         }
     }
 
@@ -98,22 +110,22 @@ impl Tap {
         match self {
             Self::None => Vec::new(),
             Self::Mirror => vec![(0, mirror)],
-            Self::Hosts => vec![(0, INTERFACE), (1, INTERFACE)],
+            Self::Hosts | Self::HostsBpf => vec![(0, INTERFACE), (1, INTERFACE)],
         }
     }
 }
 
 /// One turn of each kind, in the order of [`TAPS`].
-type Round = [Turn; 3];
+type Round = [Turn; TAP_COUNT];
 
 /// What one latency of one channel did over all rounds.
 #[derive(Debug)]
 struct Outcome {
     name: String,
     /// In the order of [`TAPS`].
-    quantiles: [Quantiles; 3],
-    /// Median and 99th percentile against the turns alone; mirror, then hosts.
-    ratios: [[MedianInterval; 2]; 2],
+    quantiles: [Quantiles; TAP_COUNT],
+    /// Median and 99th percentile against the turns alone; the taps in their order.
+    ratios: [[MedianInterval; 2]; TAP_COUNT - 1],
 }
 
 fn wait_turn() -> Turn {
@@ -137,15 +149,16 @@ fn take_turns(
     let mut lots = RandomStream::new(SEED, "turns");
     let (mut rounds, mut tapped) = (Vec::new(), Tapped::default());
     for _ in 0..round_count {
-        let mut order = [0, 1, 2];
+        let mut order: [usize; TAP_COUNT] = core::array::from_fn(|index| index);
         for last in (1..order.len()).rev() {
             let chosen = lots.next_u64() % (last as u64 + 1);
             order.swap(last, usize::try_from(chosen)?);
         }
-        let mut round: Round = [0..0, 0..0, 0..0];
+        let mut round: Round = core::array::from_fn(|_| 0..0);
         for index in order {
             let places = TAPS[index].places(mirror);
-            let (turn, counters) = drainer.while_tapped_at(network, &places, wait_turn)?;
+            let (turn, counters) =
+                drainer.while_tapped_at(network, (TAPS[index].engine(), &places), wait_turn)?;
             tapped.matched_count += counters.matched_count;
             tapped.dropped_count += counters.dropped_count;
             round[index] = turn;
@@ -195,15 +208,18 @@ fn judge(
     rounds: &[Round],
     (name, latency): (&str, Latency),
 ) -> Option<Outcome> {
-    let mut all: [Vec<u64>; 3] = Default::default();
-    let mut ratios: [[Vec<f64>; 2]; 2] = Default::default();
+    let mut all: [Vec<u64>; TAP_COUNT] = Default::default();
+    let mut ratios: [[Vec<f64>; 2]; TAP_COUNT - 1] = Default::default();
     for round in rounds {
         let mut during = round.each_ref().map(|turn| samples(records, turn, latency));
-        let [alone, mirror, hosts] = during.each_mut().map(|some| Quantiles::of(some));
-        let (Some(alone), Some(mirror), Some(hosts)) = (alone, mirror, hosts) else {
+        let found = during.each_mut().map(|some| Quantiles::of(some));
+        let [Some(alone), tapped @ ..] = &found else {
             continue;
         };
-        for (ratios, tapped) in ratios.iter_mut().zip([mirror, hosts]) {
+        if tapped.iter().any(Option::is_none) {
+            continue;
+        }
+        for (ratios, tapped) in ratios.iter_mut().zip(tapped.iter().flatten()) {
             ratios[0].push(tapped.p50_ns as f64 / alone.p50_ns as f64);
             ratios[1].push(tapped.p99_ns as f64 / alone.p99_ns as f64);
         }
@@ -211,14 +227,16 @@ fn judge(
             all.append(some);
         }
     }
-    let [alone, mirror, hosts] = all.each_mut().map(|some| Quantiles::of(some));
-    let [of_mirror, of_hosts] = ratios.map(|[p50, p99]| -> Option<[MedianInterval; 2]> {
-        Some([MedianInterval::of(p50)?, MedianInterval::of(p99)?])
-    });
+    let quantiles: Option<Vec<Quantiles>> =
+        all.iter_mut().map(|some| Quantiles::of(some)).collect();
+    let ratios: Option<Vec<[MedianInterval; 2]>> = ratios
+        .into_iter()
+        .map(|[p50, p99]| Some([MedianInterval::of(p50)?, MedianInterval::of(p99)?]))
+        .collect();
     Some(Outcome {
         name: format!("{channel}, {name}"),
-        quantiles: [alone?, mirror?, hosts?],
-        ratios: [of_mirror?, of_hosts?],
+        quantiles: quantiles?.try_into().ok()?,
+        ratios: ratios?.try_into().ok()?,
     })
 }
 
@@ -227,7 +245,7 @@ fn print(outcome: &Outcome) {
     for (tap, found) in TAPS.iter().zip(&outcome.quantiles) {
         let us = |ns: u64| ns as f64 * 1e-3;
         println!(
-            "  {:<7} p50 {:8.2} us   p99 {:8.2} us   p99.9 {:9.2} us   {} messages",
+            "  {:<10} p50 {:8.2} us   p99 {:8.2} us   p99.9 {:9.2} us   {} messages",
             tap.name(),
             us(found.p50_ns),
             us(found.p99_ns),
@@ -276,7 +294,8 @@ fn measure(arguments: &Arguments) -> Result<(), SetupError> {
     lab.put_bridge_between();
     let mirror = lab.add_mirror_port();
     let record = RunFolder::new(BENCH);
-    let span_s = TURN.as_secs_f64() * 3.1 * arguments.round_count as f64 + 10.0;
+    let span_s =
+        TURN.as_secs_f64() * (TAP_COUNT as f64 + 0.1) * arguments.round_count as f64 + 10.0;
     let mut trial = Trial::shipped("shuttle-split.toml", record.path())
         .set(&format!("run.duration=\"{span_s} s\""))
         .set(&format!("case.parameters.rate_hz={:?}", arguments.rate_hz));

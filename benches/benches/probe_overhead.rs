@@ -1,8 +1,8 @@
 //! What a probe at both ends costs the gateways it watches: round trips between gateways, and one
-//! hop at 1 kHz, each alone and tapped in every round, so that ratios are of neighbours in time. Not
-//! a test: it states the aim and whether it was met, and ends with code 0.
+//! hop at 1 kHz, each alone and tapped by either engine in every round, so that ratios are of
+//! neighbours in time. Not a test: it states the aim and whether it was met, and ends with code 0.
 //!
-//! `cargo bench -p hil-benches --bench probe_overhead -- [--rounds N]`, about 40 s. Namespaces,
+//! `cargo bench -p hil-benches --bench probe_overhead -- [--rounds N]`, about 60 s. Namespaces,
 //! taps and real-time priority take root; without, it says what is missing.
 #![allow(clippy::print_stdout, reason = "a bench prints its result")]
 
@@ -20,6 +20,7 @@ use hil_benches::gateway::tap::Drainer;
 use hil_benches::gateway::turns::{STOP, Turns, pace, ping};
 use hil_benches::gateway::verdict::Verdict;
 use hil_benches::{Case, Comparison, compare, json_line, table};
+use hil_gateways::transport::live_tap::TapEngine;
 
 const BENCH: &str = "probe_overhead";
 /// Tapped against alone, median and 99th percentile.
@@ -27,25 +28,43 @@ const RATIO_MAX: f64 = 1.02;
 const SLICE: Duration = Duration::from_millis(60);
 const PACED_SLICE: Duration = Duration::from_millis(240);
 
-/// What is measured: title of the case, names of its two rows.
-const MEASURED: [(&str, [&str; 2]); 4] = [
+/// What is measured: title of the case, names of its rows: alone, then by each of [`ENGINES`].
+const MEASURED: [(&str, [&str; 3]); 4] = [
     (
         "gateways block 64 B stamps",
-        ["gateways block, alone", "gateways block, tapped"],
+        [
+            "gateways block, alone",
+            "gateways block, packet",
+            "gateways block, bpf",
+        ],
     ),
     (
         "gateways spin 64 B stamps",
-        ["gateways spin, alone", "gateways spin, tapped"],
+        [
+            "gateways spin, alone",
+            "gateways spin, packet",
+            "gateways spin, bpf",
+        ],
     ),
     (
         "one hop spin 64 B 1 kHz",
-        ["one hop spin 1 kHz, alone", "one hop spin 1 kHz, tapped"],
+        [
+            "one hop spin 1 kHz, alone",
+            "one hop spin 1 kHz, packet",
+            "one hop spin 1 kHz, bpf",
+        ],
     ),
     (
         "one hop block 64 B 1 kHz",
-        ["one hop block 1 kHz, alone", "one hop block 1 kHz, tapped"],
+        [
+            "one hop block 1 kHz, alone",
+            "one hop block 1 kHz, packet",
+            "one hop block 1 kHz, bpf",
+        ],
     ),
 ];
+const ENGINES: [TapEngine; 2] = [TapEngine::Packet, TapEngine::Bpf];
+const ROWS_PER_CASE: usize = 1 + ENGINES.len();
 
 /// Those measured, each after the case whose gateways it shares.
 fn plans(cpu_count: usize) -> Vec<CasePlan> {
@@ -121,28 +140,31 @@ fn run(
         count.set(number);
         found
     };
-    let under_tap = |index: usize| match drainer.while_tapped(network, || once(index)) {
-        Ok((samples, counters)) => {
-            tapped
-                .matched_count
-                .set(tapped.matched_count.get() + counters.matched_count);
-            tapped
-                .dropped_count
-                .set(tapped.dropped_count.get() + counters.dropped_count);
-            samples
-        }
-        Err(error) => {
-            *tapped.refusal.borrow_mut() = Some(error.to_string());
-            Vec::new()
-        }
-    };
+    let under_tap =
+        |engine, index: usize| match drainer.while_tapped(network, engine, || once(index)) {
+            Ok((samples, counters)) => {
+                tapped
+                    .matched_count
+                    .set(tapped.matched_count.get() + counters.matched_count);
+                tapped
+                    .dropped_count
+                    .set(tapped.dropped_count.get() + counters.dropped_count);
+                samples
+            }
+            Err(error) => {
+                *tapped.refusal.borrow_mut() = Some(error.to_string());
+                Vec::new()
+            }
+        };
     let mut rounds: Vec<(&'static str, Round<'_>)> = Vec::new();
     for (title, names) in MEASURED {
         let index = cases.iter().position(|case| case.title == title);
         let Some(index) = index else { continue };
         let (once, under_tap) = (&once, &under_tap);
         rounds.push((names[0], Box::new(move || once(index))));
-        rounds.push((names[1], Box::new(move || under_tap(index))));
+        for (name, engine) in names[1..].iter().zip(ENGINES) {
+            rounds.push((name, Box::new(move || under_tap(engine, index))));
+        }
     }
     let mut contestants: Vec<Case<'_>> = rounds
         .iter_mut()
@@ -159,21 +181,24 @@ fn run(
 type Round<'a> = Box<dyn FnMut() -> Vec<u64> + 'a>;
 
 fn report(outcome: &Comparison) {
-    let references: Vec<usize> = (0..outcome.rows.len()).map(|index| index & !1).collect();
+    let alone = |index: usize| index - index % ROWS_PER_CASE;
+    let references: Vec<usize> = (0..outcome.rows.len()).map(alone).collect();
     for (row, reference) in outcome.rows.iter().zip(&references) {
         println!(
             "{}",
             json_line(BENCH, outcome, row, &outcome.rows[*reference])
         );
     }
-    println!(
-        "\nround trips (one way for `one hop`); the reference of a tapped row is the one above"
-    );
+    println!("\nround trips (one way for `one hop`); a tapped row's reference is its case alone");
     println!("{}", table(outcome, &references));
-    for pair in outcome.rows.chunks_exact(2) {
+    for (row, reference) in outcome.rows.iter().zip(&references) {
+        let alone = &outcome.rows[*reference];
+        if row.name == alone.name {
+            continue;
+        }
         let ratios = [
-            ("p50", pair[1].p50_ratio_to(&pair[0])),
-            ("p99", pair[1].p99_ratio_to(&pair[0])),
+            ("p50", row.p50_ratio_to(alone)),
+            ("p99", row.p99_ratio_to(alone)),
         ];
         for (name, ratio) in ratios {
             let quartiles = ratio.map_or(String::new(), |ratio| {
@@ -181,7 +206,7 @@ fn report(outcome: &Comparison) {
                 format!(" (quartiles {low:.3} to {high:.3})")
             });
             let verdict = Verdict {
-                name: format!("{} {name}{quartiles}", pair[1].name),
+                name: format!("{} {name}{quartiles}", row.name),
                 measured: ratio.map(|ratio| ratio.median),
                 aim_max: RATIO_MAX,
                 note: "x".to_owned(),

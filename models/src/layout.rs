@@ -50,6 +50,9 @@ impl FieldKind {
     }
 }
 
+/// Name of filler that means nothing; whoever shows or sends fields leaves it out.
+pub const RESERVED: &str = "reserved";
+
 /// One field.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Field {
@@ -85,11 +88,6 @@ impl Field {
             Some(count) => self.kind.size_bytes() * count,
             None => self.kind.size_bytes(),
         }
-    }
-
-    /// True for filler that means nothing.
-    pub fn is_reserved(&self) -> bool {
-        self.name == "reserved"
     }
 }
 

@@ -19,6 +19,8 @@ use crate::time::Instant;
 /// Endpoints may answer each other without delay this often at one instant before the driver
 /// calls it an endless loop.
 const ROUNDS_PER_INSTANT_MAX: u32 = 10_000;
+/// Turns from one word on the time that has come to the next.
+const TURNS_PER_WORD: u64 = 16_384;
 
 /// What carries messages in virtual time: a link model, or in tests the real wire codec.
 pub trait Carrier: core::fmt::Debug {
@@ -210,12 +212,25 @@ impl Simulation {
     ///
     /// # Errors
     /// [`SimulationError::ZeroDelayLoop`].
-    pub fn run(mut self, duration: Duration) -> Result<SimulationResult, SimulationError> {
+    pub fn run(self, duration: Duration) -> Result<SimulationResult, SimulationError> {
+        self.run_watched(duration, &mut |_| {})
+    }
+
+    /// As [`Self::run`]; tells `watch` now and then which instant has come.
+    ///
+    /// # Errors
+    /// As [`Self::run`].
+    pub fn run_watched(
+        mut self,
+        duration: Duration,
+        watch: &mut dyn FnMut(Instant),
+    ) -> Result<SimulationResult, SimulationError> {
         let end = Instant::ZERO + duration;
         for endpoint in &mut self.endpoints {
             endpoint.start(Instant::ZERO);
         }
         let (mut now, mut rounds) = (Instant::ZERO, 0);
+        let mut turn_count = 0_u64;
         while let Some(next) = self
             .endpoints
             .iter()
@@ -230,6 +245,10 @@ impl Simulation {
                 return Err(SimulationError::ZeroDelayLoop { at: now });
             }
             now = now.max(next);
+            turn_count += 1;
+            if turn_count.is_multiple_of(TURNS_PER_WORD) {
+                watch(now);
+            }
             for endpoint in &mut self.endpoints {
                 if endpoint.next_wakeup().is_some_and(|due| due <= now) {
                     match endpoint.poll(now) {

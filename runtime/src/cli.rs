@@ -5,6 +5,9 @@ use std::path::PathBuf;
 
 use clap::{ArgGroup, Args, Parser, Subcommand};
 
+use crate::compare::cli::{self as compare_cli, CompareArgs};
+use crate::link::cli::LinkCommand;
+use crate::live::cli::{ChannelArgs, TopArgs};
 use crate::probe::arguments::ProbeArgs;
 use crate::report::page::Format;
 use crate::trace::cli::TraceCommand;
@@ -23,6 +26,8 @@ Examples:
       the published tables of case study 1 beside our own, in virtual time
   hil-runtime calibrate teleoperation --mlr 0.008
       the outages under which case study 2 loses 0.8 % of its motion loops
+  hil-runtime top
+      the run that goes on this host at a glance; `channel` for one channel
   hil-runtime report runs/teleop-local-20261121-101500
       print a finished run's report again
   hil-runtime replay runs/teleop-local-20261121-101500
@@ -48,10 +53,13 @@ Equal seeds give equal tables, whatever the number of threads. Ctrl-C prints wha
 complete. Exit code 1 when the value cannot be reached or a criterion is missed.";
 
 const REPLAY_EXAMPLES: &str = "\
-Example:
+Examples:
   hil-runtime replay runs/teleop-local-20261121-101500
+      run its robot again in virtual time and compare every message
+  hil-runtime replay run.mcap --only human/frame --speed 2 --loop
+      feed a recorded channel into the run that goes on here (starts hil-recorder)
 
-Reads the manifest and the records of the run, and nothing else. Exit code 0 when every
+Of a folder it reads the manifest and the records of the run, and nothing else. Exit code 0 when every
 message is the same to the last bit, 1 when one differs or records are missing, 2 when the
 folder cannot be replayed at all.";
 
@@ -172,7 +180,8 @@ pub struct ReportArgs {
     /// The folders of the runs.
     #[arg(required = true, value_name = "RUN")]
     pub runs: Vec<PathBuf>,
-    /// Print summary.json instead of the table.
+    /// Print summary.json as the run wrote it; --format json prints the data of a page instead, in a
+    /// layout of its own.
     #[arg(long, conflicts_with_all = ["output", "format", "template", "figure"])]
     pub json: bool,
     /// Write the report to this file (or figures to this folder) instead of printing it.
@@ -190,6 +199,28 @@ pub struct ReportArgs {
     /// Overwrite --output whatever it is.
     #[arg(long)]
     pub force: bool,
+}
+
+/// Arguments of a replay.
+#[derive(Debug, Args)]
+pub struct ReplayArgs {
+    /// The run's folder, of either host; or an MCAP file to play into a run that goes on.
+    pub run: PathBuf,
+    /// Print JSON instead of text.
+    #[arg(long, conflicts_with_all = ["only", "speed", "is_looped", "into"])]
+    pub json: bool,
+    /// Of an MCAP file: play this channel; may be repeated.
+    #[arg(long, value_name = "CHANNEL")]
+    pub only: Vec<String>,
+    /// Of an MCAP file: how much faster than recorded.
+    #[arg(long, value_name = "FACTOR")]
+    pub speed: Option<f64>,
+    /// Of an MCAP file: begin again at the end.
+    #[arg(long = "loop")]
+    pub is_looped: bool,
+    /// Of an MCAP file: name or folder of the run to play into.
+    #[arg(long, value_name = "RUN")]
+    pub into: Option<String>,
 }
 
 /// How a network card was found, in the kernel's numbers (`struct hwtstamp_config`).
@@ -254,15 +285,13 @@ pub enum Command {
     /// Print the report of a finished run again, or write it as a page, tables or figures.
     #[command(after_help = REPORT_EXAMPLES)]
     Report(ReportArgs),
-    /// Run the robot of a finished run again in virtual time and compare every message.
+    /// Compare two runs, or two sets of repetitions: delays, losses and scores, with intervals.
+    #[command(after_help = compare_cli::EXAMPLES)]
+    Compare(CompareArgs),
+    /// Run the robot of a finished run again and compare every message, or play recorded channels
+    /// into a run that goes on.
     #[command(after_help = REPLAY_EXAMPLES)]
-    Replay {
-        /// The run's folder, of either host.
-        run: PathBuf,
-        /// Print JSON instead of text.
-        #[arg(long)]
-        json: bool,
-    },
+    Replay(ReplayArgs),
     /// Describe, fit, plot and convert link traces.
     #[command(
         after_help = "Examples:\n  hil-runtime trace info runs/NAME      # what its links did\n  hil-runtime trace fit runs/NAME/traces/shuttle.command.trace"
@@ -272,6 +301,19 @@ pub enum Command {
         #[command(subcommand)]
         command: TraceCommand,
     },
+    /// Show the links of a run that goes on, and change emulated ones.
+    #[command(
+        after_help = "Examples:\n  hil-runtime link show\n  hil-runtime link set hop --delay 50ms --loss 0.1\n  hil-runtime link reset hop"
+    )]
+    Link {
+        /// What to do with them.
+        #[command(subcommand)]
+        command: LinkCommand,
+    },
+    /// Look at the channels of a run while it goes: list, rate, messages, delay.
+    Channel(ChannelArgs),
+    /// Look at a run while it goes: processes, channels, links, clocks.
+    Top(TopArgs),
     /// Say what this host can measure and what to change.
     #[command(
         after_help = "Examples:\n  hil-runtime doctor --strict   # exit code 78 when something must be fixed\n  hil-runtime doctor --topology deploy/topologies/split.toml   # its clock path as well"

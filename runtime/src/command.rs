@@ -1,6 +1,8 @@
 //! What each command of the command line does, and the exit code it ends with.
 
 mod case_work;
+mod live_work;
+mod play_work;
 mod report_work;
 
 use std::collections::BTreeMap;
@@ -20,10 +22,12 @@ use crate::analysis;
 use crate::card_clock::guard;
 use crate::cases;
 use crate::cli::{Cli, Command, RunArgs};
+use crate::compare::{self, cli::CompareArgs};
 use crate::console::Console;
 use crate::doctor::{self, ClockQuestion, DoctorRequest, StampCapabilities};
 use crate::face;
 use crate::gateway;
+use crate::link::{self, cli::LinkCommand};
 use crate::probe;
 use crate::process::emulation_room::check_emulation;
 use crate::process::{component, own_program};
@@ -85,13 +89,16 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
             case_work::tables(&topology, &overrides, batch, registry)
         }
         Command::Calibrate(args) => case_work::calibrate(args, registry),
-        Command::Replay { run, json } => case_work::replay(&run, json, registry, console),
+        Command::Replay(args) if play_work::is_recording(&args) => play_work::play(&args, console),
+        Command::Replay(args) => case_work::replay(&args.run, args.json, registry, console),
         Command::Report(args) => report_work::report(&args, console),
+        Command::Compare(args) => compare(&args, console),
         Command::Trace { command } => match trace::work::work(command, columns(), console) {
             trace::work::End::Done => exit::RAN,
             trace::work::End::Failed => exit::FAILED,
             trace::work::End::Refused => exit::USAGE,
         },
+        Command::Link { command } => change_link(&command, console),
         Command::Doctor {
             topology,
             host,
@@ -101,6 +108,8 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
             Ok(request) => examine(&request, (strict, json), console),
             Err(code) => code,
         },
+        Command::Channel(args) => live_work::channel(args, registry, console),
+        Command::Top(args) => live_work::top(&args, registry, console),
         Command::Probe(args) => probe::run(&args, console),
         Command::Cases => {
             console.result(&cases::list(registry));
@@ -116,6 +125,22 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
             swing_bvh(period, amplitude, rate),
             console,
         ),
+    }
+}
+
+fn compare(args: &CompareArgs, console: &mut Console) -> u8 {
+    match compare::work::work(args, console) {
+        compare::work::End::Passed => exit::RAN,
+        compare::work::End::Failed => exit::FAILED,
+        compare::work::End::Refused => exit::USAGE,
+    }
+}
+
+fn change_link(command: &LinkCommand, console: &mut Console) -> u8 {
+    match link::work::work(command, console) {
+        link::work::End::Done => exit::RAN,
+        link::work::End::Failed => exit::FAILED,
+        link::work::End::Refused => exit::USAGE,
     }
 }
 
@@ -233,14 +258,14 @@ fn show_check(path: &Path, topology: &Topology, console: &mut Console) -> u8 {
         ));
         return exit::USAGE;
     }
-    // As comments, so that what follows the first line remains a topology.
+    // As comments, so that what is printed is a topology as a whole.
     let clock_paths = topology.clock_paths().map(|clock| {
         let (asking, answering) = (clock.asking.port(), clock.answering.port());
         let words = clock.describe();
-        format!("\n# {words}, UDP ports {asking} and {answering}")
+        format!("\n# {words}, UDP ports {asking} and {answering}\n")
     });
     console.result(&format!(
-        "{}: the file is valid; it comes to\n\n{}{}",
+        "# {}: the file is valid; it comes to\n\n{}{}",
         path.display(),
         topology.to_toml(),
         clock_paths.collect::<Vec<_>>().concat()

@@ -77,10 +77,11 @@ impl Console {
         }
     }
 
-    /// Gives a result; colours are dropped where the output cannot show them.
-    pub fn result(&mut self, text: &str) {
+    /// Gives a result; colours are dropped where the output cannot show them. False when nobody
+    /// reads it any more, which ends what would go on for ever.
+    pub fn result(&mut self, text: &str) -> bool {
         self.close_line();
-        write_to(&mut anstream::stdout(), text);
+        write_to(&mut anstream::stdout(), text)
     }
 
     /// Says text that is already laid out, such as an annotated piece of a file.
@@ -116,12 +117,11 @@ fn terminal_columns() -> Option<usize> {
     (width.0 > 0).then(|| usize::from(width.0))
 }
 
-/// A reader that left (a closed pipe) is no reason to fail a run.
-fn write_to(out: &mut impl Write, text: &str) {
-    let _left = out
-        .write_all(text.as_bytes())
+/// False when the reader left (a closed pipe), which is no reason to fail a run.
+fn write_to(out: &mut impl Write, text: &str) -> bool {
+    out.write_all(text.as_bytes())
         .and_then(|()| out.flush())
-        .is_err();
+        .is_ok()
 }
 
 #[cfg(test)]

@@ -17,7 +17,8 @@
 //! 2. [`process`], [`gateway`] and [`face`]: what runs inside each started process.
 //! 3. [`channel`]: shared memory between them; [`mod@record`]: the notes they keep.
 //! 4. [`report`]: from the notes to what a person reads.
-//! 5. [`realtime`], [`clock`], [`wait`], [`host_facts`], [`doctor`]: the machine.
+//! 5. [`watch`]: looking on while a run goes; [`link`]: changing its emulated links.
+//! 6. [`realtime`], [`clock`], [`wait`], [`host_facts`], [`doctor`]: the machine.
 
 mod analysis;
 pub mod card_clock;
@@ -27,14 +28,19 @@ pub mod cli;
 pub mod clock;
 pub mod clock_discipline;
 mod command;
+pub mod compare;
 pub mod console;
 pub mod doctor;
 pub mod face;
 pub mod gateway;
 pub mod host_facts;
+pub mod layout;
+pub mod link;
+pub mod live;
 pub mod manifest;
 pub mod probe;
 pub mod process;
+pub mod progress;
 pub mod radio;
 pub mod realtime;
 pub mod record;
@@ -50,6 +56,7 @@ pub mod supervisor;
 pub mod topology;
 pub mod trace;
 pub mod wait;
+pub mod watch;
 
 use std::process::ExitCode;
 

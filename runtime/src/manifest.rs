@@ -7,7 +7,7 @@ use std::io;
 use std::time::SystemTime;
 
 use hil_gateways::transport::clock_pair::ClockPair;
-use hil_models::layout::{Field, FieldKind};
+use hil_models::layout::{Field, FieldKind, RESERVED};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
@@ -157,6 +157,13 @@ pub enum KindDescription {
         /// Its fields.
         fields: Vec<FieldDescription>,
     },
+}
+
+impl FieldDescription {
+    /// True for filler that means nothing.
+    pub fn is_reserved(&self) -> bool {
+        self.name == RESERVED
+    }
 }
 
 impl From<&Field> for FieldDescription {

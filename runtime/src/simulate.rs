@@ -11,13 +11,15 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use hil_models::case_study::Score;
 use hil_models::link::LinkModel;
 use hil_models::link::trace::{ReplayCounts, ReplayTally};
 use hil_models::measure::account::OutageFigures;
 use hil_models::plot::PlotSeries;
-use hil_models::simulation::{Carrier, Simulation, SimulationResult};
+use hil_models::simulation::{Carrier, Simulation, SimulationError, SimulationResult};
+use hil_models::time::Instant;
 
 use crate::analysis::outages::OutageStory;
 use crate::process::launch::EmulationLaunch;
@@ -79,13 +81,14 @@ pub(crate) struct Simulated {
     network_series: Vec<PlotSeries>,
 }
 
-/// Runs the topology's case in virtual time.
+/// Runs the topology's case in virtual time; tells `watch` now and then which share of it is over.
 ///
 /// # Errors
 /// When the topology has no case, or a link that only a real run shows.
 pub(crate) fn simulate(
     topology: &Topology,
     registry: &Registry,
+    watch: &mut dyn FnMut(f64),
 ) -> Result<Simulated, SimulateError> {
     let refused = |text: String| SimulateError::Topology(text);
     let made = registry
@@ -93,13 +96,7 @@ pub(crate) fn simulate(
         .map_err(|error| refused(error.to_string()))?;
     let no_case = "the topology names no case; only a case can be simulated";
     let (entry, case) = made.ok_or_else(|| refused(no_case.to_owned()))?;
-    let mut processes = topology.processes().iter();
-    if let Some(face) = processes.find(|one| matches!(one.program, Program::Egm { .. })) {
-        let name = &face.name;
-        return Err(refused(format!(
-            "process `{name}` speaks with a foreign program, which knows no virtual time"
-        )));
-    }
+    refuse_faces(topology).map_err(refused)?;
     let mut watches = Vec::new();
     let mut carriers: BTreeMap<String, Box<dyn Carrier>> = BTreeMap::new();
     let mut replays = BTreeMap::new();
@@ -120,7 +117,7 @@ pub(crate) fn simulate(
         .collect::<Option<Vec<_>>>()
         .ok_or_else(|| refused("the case lists a role it cannot make".to_owned()))?;
     let result = Simulation::of_roles(entry.name, entry.channels, roles, carriers)
-        .and_then(|simulation| simulation.run(topology.run().duration))
+        .and_then(|simulation| run_watched(simulation, topology.run().duration, watch))
         .map_err(|error| refused(error.to_string()))?;
     let score = case.score(&result.log);
     let duration = topology.run().duration;
@@ -156,6 +153,29 @@ pub(crate) fn simulate(
         replays,
         outages,
         links,
+    })
+}
+
+/// Runs for `duration`; tells `watch` which share of it is over.
+fn run_watched(
+    simulation: Simulation,
+    duration: Duration,
+    watch: &mut dyn FnMut(f64),
+) -> Result<SimulationResult, SimulationError> {
+    simulation.run_watched(duration, &mut |now| {
+        let passed = now.saturating_duration_since(Instant::ZERO);
+        watch(passed.as_secs_f64() / duration.as_secs_f64());
+    })
+}
+
+fn refuse_faces(topology: &Topology) -> Result<(), String> {
+    let mut processes = topology.processes().iter();
+    let face = processes.find(|one| matches!(one.program, Program::Egm { .. }));
+    face.map_or(Ok(()), |face| {
+        let name = &face.name;
+        Err(format!(
+            "process `{name}` speaks with a foreign program, which knows no virtual time"
+        ))
     })
 }
 
@@ -216,7 +236,7 @@ impl Simulated {
         fs::create_dir_all(folder).map_err(|error| failed(folder.to_owned(), error))?;
         let files = RunFolder::existing(folder);
         let page = self.page(REPORT_FILE_WIDTH, Style::Plain);
-        let events = event_log::text(&self.topology_name, &self.events);
+        let events = event_log::text(&self.topology_name, &self.events, &[]);
         for (path, text) in [
             (files.report(), page),
             (files.virtual_report(), self.json()),

@@ -5,8 +5,10 @@
 pub mod account;
 pub mod arms;
 pub mod binary;
+pub mod browser;
 pub mod child;
 pub mod lab;
+pub mod mcap_file;
 pub mod run_folder;
 pub mod shuttle;
 pub mod source_tree;

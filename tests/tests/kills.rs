@@ -2,12 +2,15 @@
 //! is to end the run, and of a whole supervisor.
 #![allow(clippy::unwrap_used, clippy::print_stdout, reason = "tests")]
 
+use std::fs;
+use std::process::Command;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use hil_models::measure::account::InterruptionFigures;
 use hil_runtime::report::summary::{Outcome, RunSummary};
 use hil_tests::account::{account, assert_every_message_is_accounted_for, carried, describe};
+use hil_tests::binary::hil_runtime_binary;
 use hil_tests::child::{ChildGuard, Finished};
 use hil_tests::lab::Lab;
 use hil_tests::run_folder::RunFolder;
@@ -273,6 +276,17 @@ fn kill_supervisor(lab: Lab, victim: usize) -> Lab {
         println!("{} alone: {said:?}", HOSTS[other]);
     }
     assert!(account(&summary, "egm/right/command").published_count > 0);
+    let page = record.join("page.html");
+    let made = Command::new(hil_runtime_binary())
+        .arg("report")
+        .arg(split.files[other].root())
+        .arg("-o")
+        .arg(&page)
+        .output()
+        .unwrap();
+    assert!(made.status.success(), "{made:?}");
+    let page = fs::read_to_string(page).unwrap();
+    assert!(page.contains(&vanished) && page.len() < 3_000_000);
     split.lab
 }
 

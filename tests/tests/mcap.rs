@@ -2,18 +2,12 @@
 //! code with it, and is what the run recorded. The container's own reader in Rust always; with
 //! `HIL_MCAP_PYTHON`, which names a Python with `tests/mcap_reader/requirements.txt`, the Python
 //! packages `mcap` and `mcap-protobuf-support` as well.
-#![allow(
-    clippy::unwrap_used,
-    clippy::print_stdout,
-    clippy::print_stderr,
-    reason = "tests"
-)]
+#![allow(clippy::unwrap_used, reason = "tests")]
 
 use std::collections::BTreeMap;
-use std::env;
 use std::fs;
 use std::path::Path;
-use std::process::{Command, Output};
+use std::process::Output;
 use std::time::Duration;
 
 use hil_models::egm::messages::EgmFeedback;
@@ -21,14 +15,12 @@ use hil_models::measure::account::MessageFate;
 use hil_models::message::Envelope;
 use hil_runtime::record::RecordFile;
 use hil_runtime::report::summary::RunSummary;
-use hil_tests::binary::{hil_recorder_binary, workspace_folder};
+use hil_tests::mcap_file::{assert_code, python, read_back, recorder, words};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::{RunFiles, Trial};
 use prost::Message;
 use serde_json::Value;
 
-/// Names the Python to read with.
-const PYTHON_VARIABLE: &str = "HIL_MCAP_PYTHON";
 const LIMIT: Duration = Duration::from_mins(1);
 const FEEDBACK: &str = "egm/right/feedback";
 
@@ -61,23 +53,8 @@ struct Latency {
     delay_ns: Option<i64>,
 }
 
-fn recorder(arguments: &[&str], paths: &[&Path]) -> Output {
-    let mut command = Command::new(hil_recorder_binary());
-    command.args(arguments).args(paths);
-    command.output().unwrap()
-}
-
 fn convert(run: &Path, to: &Path) -> Output {
     recorder(&["convert", "--output"], &[to, run])
-}
-
-fn words(output: &Output) -> String {
-    let text = [&output.stdout[..], &output.stderr[..]].concat();
-    String::from_utf8_lossy(&text).into_owned()
-}
-
-fn assert_code(output: &Output, code: i32) {
-    assert_eq!(output.status.code(), Some(code), "{}", words(output));
 }
 
 /// Starts a run on this machine and waits for its end.
@@ -85,18 +62,6 @@ fn run(trial: &Trial) -> RunFiles {
     let finished = trial.start_here().wait_within(LIMIT).unwrap();
     assert!(finished.status.success(), "{}", finished.stderr);
     trial.folder("", LIMIT)
-}
-
-/// Every message by topic, as the container's own reader has it.
-fn read_back(file: &Path) -> BTreeMap<String, Vec<mcap::Message<'static>>> {
-    let bytes: &'static [u8] = fs::read(file).unwrap().leak();
-    let mut topics: BTreeMap<String, Vec<mcap::Message<'static>>> = BTreeMap::new();
-    for message in mcap::MessageStream::new(bytes).unwrap() {
-        let message = message.unwrap();
-        let topic = message.channel.topic.clone();
-        topics.entry(topic).or_default().push(message);
-    }
-    topics
 }
 
 /// The messages of a channel as its one record file has them.
@@ -128,23 +93,6 @@ fn counts(summary: &RunSummary) -> BTreeMap<String, u64> {
         (format!("/{}", channel.name), count)
     });
     counted.filter(|(_, count)| *count > 0).collect()
-}
-
-/// What the Python packages make of the file; `None`, with the reason printed, where none is named.
-fn python(file: &Path, topics: &[&str]) -> Option<Value> {
-    let python = env::var(PYTHON_VARIABLE)
-        .ok()
-        .filter(|name| !name.is_empty());
-    let Some(python) = python else {
-        eprintln!("read in Rust only: {PYTHON_VARIABLE} names no Python with mcap");
-        return None;
-    };
-    let mut command = Command::new(python);
-    let script = workspace_folder().join("tests/mcap_reader/read.py");
-    command.env("PYTHONDONTWRITEBYTECODE", "1").arg(script);
-    let output = command.arg(file).args(topics).output().unwrap();
-    assert!(output.status.success(), "{}", words(&output));
-    Some(serde_json::from_slice(&output.stdout).unwrap())
 }
 
 #[test]

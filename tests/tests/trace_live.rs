@@ -162,10 +162,8 @@ fn places(instants_ns: impl Iterator<Item = i64>, origin_ns: i64) -> Vec<f64> {
     instants_ns.map(place).collect()
 }
 
-/// Later than this share of a period, a message may be taken for the next tick's.
+/// Published later than this share of a period, a message may be taken for the next tick's.
 const LATE: f64 = 0.3;
-/// After a late one that took the next tick, as many may be pushed on before a gap makes room.
-const AFTER_LATE: usize = 8;
 /// First messages by which the replay finds the grid; a few may meet a record beside theirs.
 const YOUNG_COUNT: usize = 16;
 
@@ -198,34 +196,34 @@ fn check_ticks(files: &RunFiles, name: &str, trace: &Trace) -> (usize, usize) {
         .collect();
     assert_eq!(tick_met.len(), record_of.len());
     let arrivals = records::<IngressRecord>(files, name, "ingress");
-    let instants = arrivals.iter().map(|one| one.emulated_ns);
-    let offered = on_grid(&places(instants, arrivals[0].emulated_ns));
-    let (mut compared_count, mut off, mut newest_late) = (0, Vec::new(), None::<usize>);
-    for (arrival, (_, lateness)) in arrivals.iter().zip(offered) {
+    let (mut compared_count, mut off) = (0, Vec::new());
+    for arrival in &arrivals {
         let met = tick_met[&(arrival.due_ns - arrival.emulated_ns)];
         assert_eq!(record_of[&met].fate, TraceFate::Delivered);
         let place = of_sequence[&arrival.sequence];
         compared_count += 1;
-        if lateness.max(producer[place].1) > LATE {
-            newest_late = Some(place);
-        }
         if met != tick_of(place) {
             off.push((place, met, tick_of(place)));
-            let is_beside_late = newest_late.is_some_and(|late| place - late <= AFTER_LATE);
+            let lateness = producer[place].1;
             assert!(
-                is_beside_late || place - first < YOUNG_COUNT,
+                lateness > LATE || place - first < YOUNG_COUNT,
                 "{name}: message {place} of tick {} met that of {met}, late by {lateness}",
                 tick_of(place)
             );
         }
     }
-    // What did not arrive was at a tick whose record was lost, or that has none. When it was offered
-    // nobody recorded, so a few may have been late.
+    // What did not arrive was at a tick whose record was lost, or that has none.
     let lost = own.records.iter().zip(0..);
     for (_, place) in lost.filter(|(one, _)| one.fate == TraceFate::LostInNetwork) {
         compared_count += 1;
         let record = record_of.get(&tick_of(place));
         if record.is_some_and(|record| record.fate == TraceFate::Delivered) {
+            let lateness = producer[place].1;
+            assert!(
+                lateness > LATE || place - first < YOUNG_COUNT,
+                "{name}: message {place} of tick {} was lost, late by {lateness}",
+                tick_of(place)
+            );
             off.push((place, u64::MAX, tick_of(place)));
         }
     }

@@ -1,4 +1,4 @@
-//! A probe at both ends of the wire for as long as it is wanted: the product's rings, filter and
+//! A probe at both ends of the wire for as long as it is wanted: the product's taps, filter and
 //! writer, drained as `hil-runtime probe` drains them, by an ordinary thread. It measures nothing.
 
 use std::sync::Arc;
@@ -9,7 +9,8 @@ use std::time::Duration;
 
 use hil_gateways::capture::flow::FlowFilter;
 use hil_gateways::capture::writer::{self, PacketToWrite};
-use hil_gateways::transport::packet_ring::{PacketRing, RingCounters, RingSettings, RingStamps};
+use hil_gateways::transport::live_tap::{LiveTap, TapEngine};
+use hil_gateways::transport::packet_ring::{RingCounters, RingSettings, RingStamps};
 use hil_tests::lab::INTERFACE;
 
 use super::hosts::SetupError;
@@ -22,7 +23,7 @@ const LOOK_PERIOD: Duration = Duration::from_millis(20);
 /// it would inherit.
 #[derive(Debug)]
 pub struct Drainer {
-    rings: Sender<Vec<PacketRing>>,
+    rings: Sender<Vec<LiveTap>>,
     counts: Receiver<RingCounters>,
     is_wanted: Arc<AtomicBool>,
     thread: JoinHandle<()>,
@@ -31,7 +32,7 @@ pub struct Drainer {
 impl Drainer {
     /// Starts the thread; it sleeps until there are rings.
     pub fn start() -> Self {
-        let (rings, incoming) = channel::<Vec<PacketRing>>();
+        let (rings, incoming) = channel::<Vec<LiveTap>>();
         let (done, counts) = channel();
         let is_wanted = Arc::new(AtomicBool::new(false));
         let thread = thread::spawn({
@@ -71,9 +72,11 @@ impl Drainer {
     pub fn while_tapped<T>(
         &self,
         network: &Network,
+        engine: TapEngine,
         work: impl FnOnce() -> T,
     ) -> Result<(T, RingCounters), SetupError> {
-        self.while_tapped_at(network, &[(0, INTERFACE), (1, INTERFACE)], work)
+        let places = [(0, INTERFACE), (1, INTERFACE)];
+        self.while_tapped_at(network, (engine, &places), work)
     }
 
     /// Taps interfaces of hosts while `work` runs; gives what it gave, and what the kernel counted.
@@ -83,7 +86,7 @@ impl Drainer {
     pub fn while_tapped_at<T>(
         &self,
         network: &Network,
-        places: &[(usize, &str)],
+        (engine, places): (TapEngine, &[(usize, &str)]),
         work: impl FnOnce() -> T,
     ) -> Result<(T, RingCounters), SetupError> {
         let flows = [FlowFilter::hil()];
@@ -93,9 +96,9 @@ impl Drainer {
             stamps: RingStamps::Kernel,
         };
         let open = |(host, name): &(usize, &str)| {
-            network.on(*host, || PacketRing::open(name, &flows, &settings))
+            network.on(*host, || LiveTap::open(engine, name, &flows, &settings))
         };
-        let taps: Result<Vec<PacketRing>, _> = places.iter().map(open).collect();
+        let taps: Result<Vec<LiveTap>, _> = places.iter().map(open).collect();
         let taps = taps?;
         self.is_wanted.store(true, Ordering::Release);
         let sent = self.rings.send(taps);
@@ -112,7 +115,7 @@ impl Drainer {
     }
 }
 
-fn drain(ring: &mut PacketRing, file: &mut Vec<u8>) {
+fn drain(ring: &mut LiveTap, file: &mut Vec<u8>) {
     while ring.next_packet(|packet| {
         let packet = PacketToWrite {
             interface_index: 0,

@@ -24,23 +24,23 @@ pub struct Instruction {
 }
 
 /// Operation codes, by their names in the kernel's documentation.
-pub(super) mod code {
-    pub(in super::super) const LD_H_ABS: u16 = 0x28;
-    pub(in super::super) const LD_B_ABS: u16 = 0x30;
-    pub(in super::super) const LD_W_IND: u16 = 0x40;
-    pub(in super::super) const LD_H_IND: u16 = 0x48;
-    pub(in super::super) const LD_B_IND: u16 = 0x50;
-    pub(in super::super) const LD_IMM: u16 = 0x00;
-    pub(in super::super) const LD_MEM: u16 = 0x60;
-    pub(in super::super) const LDX_MEM: u16 = 0x61;
-    pub(in super::super) const ST: u16 = 0x02;
-    pub(in super::super) const AND: u16 = 0x54;
-    pub(in super::super) const LSH: u16 = 0x64;
-    pub(in super::super) const ADD_X: u16 = 0x0c;
-    pub(in super::super) const JA: u16 = 0x05;
-    pub(in super::super) const JEQ: u16 = 0x15;
-    pub(in super::super) const JSET: u16 = 0x45;
-    pub(in super::super) const RET: u16 = 0x06;
+pub(crate) mod code {
+    pub(crate) const LD_H_ABS: u16 = 0x28;
+    pub(crate) const LD_B_ABS: u16 = 0x30;
+    pub(crate) const LD_W_IND: u16 = 0x40;
+    pub(crate) const LD_H_IND: u16 = 0x48;
+    pub(crate) const LD_B_IND: u16 = 0x50;
+    pub(crate) const LD_IMM: u16 = 0x00;
+    pub(crate) const LD_MEM: u16 = 0x60;
+    pub(crate) const LDX_MEM: u16 = 0x61;
+    pub(crate) const ST: u16 = 0x02;
+    pub(crate) const AND: u16 = 0x54;
+    pub(crate) const LSH: u16 = 0x64;
+    pub(crate) const ADD_X: u16 = 0x0c;
+    pub(crate) const JA: u16 = 0x05;
+    pub(crate) const JEQ: u16 = 0x15;
+    pub(crate) const JSET: u16 = 0x45;
+    pub(crate) const RET: u16 = 0x06;
 }
 
 /// Scratch cells: where IP begins, its ethertype, where UDP begins.

@@ -236,6 +236,7 @@ impl<R: DatagramReceiver> DatagramReceiver for EmulatedReceiver<R> {
     }
 
     fn attend(&mut self, now: Instant) {
+        self.link.attend(now);
         self.inner.attend(now);
     }
 

@@ -7,51 +7,40 @@
 //! descriptor, which the kernel would do at the expense of the sender: look into the ring now and
 //! then instead. The ring holds what arrives in between, and the kernel counts what found no room.
 //!
-//! `unsafe` is allowed here because the ring is memory that the kernel writes, and three socket
-//! options take structures that no crate wraps.
+//! `unsafe` is allowed here because the ring is memory that the kernel writes, and no crate wraps its
+//! counters.
 
 use core::ffi::{c_int, c_uint};
 use core::num::NonZeroUsize;
 use core::ptr::NonNull;
 use core::sync::atomic::{AtomicU32, Ordering};
 use std::io;
-use std::os::fd::{AsRawFd, FromRawFd, OwnedFd};
+use std::os::fd::{AsRawFd, OwnedFd};
 
 use nix::net::if_::if_nametoindex;
 use nix::sys::mman::{MapFlags, ProtFlags, mmap, munmap};
 use nix::sys::socket::{getsockopt, setsockopt, sockopt};
 use thiserror::Error;
 
+use super::packet_socket::{self, bind, link_of, listen_to_all, option_length, set_option};
 use super::ring_frame::RingPacket;
 use crate::capture::flow::FlowFilter;
-use crate::capture::link_type;
 use crate::capture::program::compile;
 
 /// Smallest and largest ring, bytes.
 pub const RING_BYTES: core::ops::RangeInclusive<usize> = (1 << 16)..=(1 << 28);
+/// Fewest and most bytes kept of a packet.
+pub(super) const SNAP_BYTES: (usize, usize) = (64, 65_536);
 /// The kernel gives the ring in pieces of this size.
 const BLOCK_BYTES: usize = 1 << 16;
 /// Room in a frame before the packet: the kernel's header and address, and what aligns them.
 const FRAME_HEADER_BYTES: usize = 96;
 
-/// `ETH_P_ALL` and `AF_PACKET` as a link address has them, `PACKET_MR_PROMISC` below.
+/// `ETH_P_ALL` as a link address has it.
 const EVERY_PROTOCOL: u16 = 3;
-const PACKET_FAMILY: u16 = 17;
 const _: () = assert!(EVERY_PROTOCOL as c_int == libc::ETH_P_ALL);
-const _: () = assert!(PACKET_FAMILY as c_int == libc::AF_PACKET);
-const _: () = assert!(1 == libc::PACKET_MR_PROMISC);
 /// `linux/if_packet.h`; since Linux 4.20.
 const PACKET_IGNORE_OUTGOING: c_int = 23;
-const NO_ADDRESS: libc::sockaddr_ll = libc::sockaddr_ll {
-    sll_family: 0,
-    sll_protocol: 0,
-    sll_ifindex: 0,
-    sll_hatype: 0,
-    sll_pkttype: 0,
-    sll_halen: 0,
-    sll_addr: [0; 8],
-};
-
 /// How a tap is opened.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RingSettings {
@@ -113,6 +102,18 @@ pub enum RingError {
         /// Largest.
         max: usize,
     },
+    /// The host does not do what an eBPF tap needs.
+    #[error("no eBPF tap on `{interface}`: {step}: {source}{hint}")]
+    Program {
+        /// Its name.
+        interface: String,
+        /// What was tried.
+        step: &'static str,
+        /// What the kernel said.
+        source: io::Error,
+        /// What that usually means, or nothing.
+        hint: &'static str,
+    },
     /// The kernel refused a step.
     #[error("cannot tap `{interface}`: {step}: {source}")]
     Refused {
@@ -156,7 +157,7 @@ impl PacketRing {
         flows: &[FlowFilter],
         settings: &RingSettings,
     ) -> Result<Self, RingError> {
-        check("snap_bytes", settings.snap_bytes as usize, (64, 65_536))?;
+        check("snap_bytes", settings.snap_bytes as usize, SNAP_BYTES)?;
         let (least, most) = (*RING_BYTES.start(), *RING_BYTES.end());
         check("ring_bytes", settings.ring_bytes, (least, most))?;
         let index = if_nametoindex(interface).map_err(|errno| RingError::Interface {
@@ -170,7 +171,7 @@ impl PacketRing {
                 source,
             }
         };
-        let socket = open_socket().map_err(|error| {
+        let socket = packet_socket::open().map_err(|error| {
             if error.kind() == io::ErrorKind::PermissionDenied {
                 RingError::Rights {
                     interface: interface.to_owned(),
@@ -181,7 +182,8 @@ impl PacketRing {
         })?;
         // Without a protocol it hears nothing yet, but tells the link layer.
         bind(&socket, index, 0).map_err(refused("bind"))?;
-        let hardware_type = hardware_type(&socket).map_err(refused("getsockname"))?;
+        let hardware_type =
+            packet_socket::hardware_type(&socket).map_err(refused("getsockname"))?;
         let unknown = || RingError::LinkLayer {
             interface: interface.to_owned(),
             hardware_type,
@@ -225,7 +227,7 @@ impl PacketRing {
         })
     }
 
-    /// The link layer its packets begin with; see [`link_type`].
+    /// The link layer its packets begin with; see [`crate::capture::link_type`].
     pub fn link_type(&self) -> u16 {
         self.link_type
     }
@@ -297,7 +299,11 @@ impl PacketRing {
     }
 }
 
-fn check(what: &'static str, value: usize, (min, max): (usize, usize)) -> Result<(), RingError> {
+pub(super) fn check(
+    what: &'static str,
+    value: usize,
+    (min, max): (usize, usize),
+) -> Result<(), RingError> {
     if (min..=max).contains(&value) {
         return Ok(());
     }
@@ -309,90 +315,12 @@ fn check(what: &'static str, value: usize, (min, max): (usize, usize)) -> Result
     })
 }
 
-/// The capture link type of a kernel hardware type.
-const fn link_of(hardware_type: u16) -> Option<u16> {
-    match hardware_type {
-        libc::ARPHRD_ETHER | libc::ARPHRD_LOOPBACK => Some(link_type::ETHERNET),
-        libc::ARPHRD_NONE => Some(link_type::RAW),
-        _ => None,
-    }
-}
-
 const fn tpacket_version() -> c_int {
     libc::tpacket_versions::TPACKET_V2 as c_int
 }
 
 fn narrow(value: usize) -> c_uint {
     c_uint::try_from(value).expect("a ring is at most 256 MiB")
-}
-
-fn option_length<T>() -> libc::socklen_t {
-    libc::socklen_t::try_from(size_of::<T>()).expect("an option is a few bytes long")
-}
-
-#[allow(unsafe_code, reason = "nix opens packet sockets only with a protocol")]
-fn open_socket() -> io::Result<OwnedFd> {
-    let kind = libc::SOCK_RAW | libc::SOCK_CLOEXEC | libc::SOCK_NONBLOCK;
-    // SAFETY: the call takes three numbers.
-    let descriptor = unsafe { libc::socket(libc::AF_PACKET, kind, 0) };
-    if descriptor < 0 {
-        return Err(io::Error::last_os_error());
-    }
-    // SAFETY: the kernel has just given this descriptor, and nobody else knows it.
-    Ok(unsafe { OwnedFd::from_raw_fd(descriptor) })
-}
-
-#[allow(unsafe_code, reason = "nix cannot make a link address")]
-fn bind(socket: &OwnedFd, interface_index: c_uint, protocol_be: u16) -> io::Result<()> {
-    let mut address = NO_ADDRESS;
-    address.sll_family = PACKET_FAMILY;
-    address.sll_protocol = protocol_be;
-    address.sll_ifindex = c_int::try_from(interface_index).map_err(io::Error::other)?;
-    let length = option_length::<libc::sockaddr_ll>();
-    let pointer = (&raw const address).cast();
-    // SAFETY: the kernel reads `length` bytes at `pointer`, a live address of that size.
-    let result = unsafe { libc::bind(socket.as_raw_fd(), pointer, length) };
-    outcome(result)
-}
-
-/// The kernel's type of the interface a socket is bound to.
-#[allow(
-    unsafe_code,
-    reason = "nix refuses a link address shorter than its structure"
-)]
-fn hardware_type(socket: &OwnedFd) -> io::Result<u16> {
-    let mut address = NO_ADDRESS;
-    let mut length = option_length::<libc::sockaddr_ll>();
-    let pointer = (&raw mut address).cast();
-    // SAFETY: the kernel writes at most `length` bytes at `pointer`, a live address of that size.
-    let result = unsafe { libc::getsockname(socket.as_raw_fd(), pointer, &raw mut length) };
-    outcome(result)?;
-    Ok(address.sll_hatype)
-}
-
-#[allow(unsafe_code, reason = "no crate wraps the options of packet sockets")]
-fn set_option<T>(socket: &OwnedFd, level: c_int, name: c_int, value: &T) -> io::Result<()> {
-    let (pointer, length) = ((&raw const *value).cast(), option_length::<T>());
-    let descriptor = socket.as_raw_fd();
-    // SAFETY: the kernel reads `length` bytes at `pointer`, a live value of that size.
-    let result = unsafe { libc::setsockopt(descriptor, level, name, pointer, length) };
-    outcome(result)
-}
-
-/// Lets the card pass frames of other addresses, as on a mirror port, until the socket is closed.
-fn listen_to_all(socket: &OwnedFd, interface_index: c_uint) -> io::Result<()> {
-    let membership = libc::packet_mreq {
-        mr_ifindex: c_int::try_from(interface_index).map_err(io::Error::other)?,
-        mr_type: 1,
-        mr_alen: 0,
-        mr_address: [0; 8],
-    };
-    set_option(
-        socket,
-        libc::SOL_PACKET,
-        libc::PACKET_ADD_MEMBERSHIP,
-        &membership,
-    )
 }
 
 /// Gives arriving packets the card's stamp where there is one, and leaves out what leaves.
@@ -419,14 +347,6 @@ fn attach(socket: &OwnedFd, program: &[crate::capture::program::Instruction]) ->
     };
     // The kernel copies the program before it returns.
     set_option(socket, libc::SOL_SOCKET, libc::SO_ATTACH_FILTER, &program)
-}
-
-fn outcome(result: c_int) -> io::Result<()> {
-    if result == 0 {
-        Ok(())
-    } else {
-        Err(io::Error::last_os_error())
-    }
 }
 
 /// The ring's memory.

@@ -5,6 +5,7 @@ pub mod bernoulli;
 pub mod chain;
 #[cfg(test)]
 mod chain_tests;
+pub mod condition;
 pub mod delay;
 pub mod impaired;
 pub mod in_series;
@@ -13,6 +14,7 @@ pub mod outages;
 pub mod rate;
 pub mod reordering;
 pub mod spec;
+pub mod switched;
 pub mod trace;
 mod trace_offers;
 mod trace_ticks;
@@ -24,7 +26,7 @@ use serde::{Deserialize, Serialize};
 
 use self::trace::ReplayTally;
 use crate::message::Envelope;
-use crate::time::Instant;
+use crate::time::{Instant, RemoteInstant};
 
 /// What happens to one offered message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -68,6 +70,9 @@ pub struct MessageNumber {
     pub start: u32,
     /// Counted from 0 at each start.
     pub sequence: u64,
+    /// When it was published, on its producer's clock, where that is known. It compares with that of the
+    /// producer's other messages only.
+    pub published: Option<RemoteInstant>,
 }
 
 impl From<&Envelope> for MessageNumber {
@@ -75,6 +80,7 @@ impl From<&Envelope> for MessageNumber {
         Self {
             start: envelope.epoch,
             sequence: envelope.sequence,
+            published: Some(RemoteInstant::from_ns(envelope.published_ns)),
         }
     }
 }
@@ -95,6 +101,11 @@ pub trait LinkModel: Debug + Send {
     ) -> Fate {
         let _ = message;
         self.offer(now, length_bytes)
+    }
+
+    /// Tells what time it is while nothing is offered, for a link that changes by itself.
+    fn attend(&mut self, now: Instant) {
+        let _ = now;
     }
 
     /// What the replay of a trace met so far; `None` for a model that replays none.
@@ -121,6 +132,10 @@ impl<L: LinkModel + ?Sized> LinkModel for Box<L> {
         message: MessageNumber,
     ) -> Fate {
         (**self).offer_numbered(now, length_bytes, message)
+    }
+
+    fn attend(&mut self, now: Instant) {
+        (**self).attend(now);
     }
 
     fn replay_tally(&self) -> Option<ReplayTally> {

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use crate::link::trace_offers::{OfferGrid, Offered};
 use crate::link::trace_ticks::Ticks;
 use crate::link::{Fate, LinkModel, MessageNumber};
-use crate::time::Instant;
+use crate::time::{Instant, RemoteInstant};
 use crate::trace::{Trace, TraceFate, TraceRecord, UNAVAILABLE_NS};
 
 /// Which record a message meets.
@@ -175,9 +175,18 @@ pub struct TraceLink {
     offered: Offered<Met>,
     /// Where records are matched by ticks.
     ticks: Option<Ticks>,
-    /// The grid of the messages offered, and the tick of the last.
-    offers: Option<(OfferGrid, u64)>,
+    offers: Option<Offers>,
     cells: Arc<Cells>,
+}
+
+/// Where a replay by ticks stands.
+#[derive(Debug, Clone, Copy)]
+struct Offers {
+    grid: OfferGrid,
+    /// The tick of the last message.
+    last: u64,
+    /// The grid is that of publications on the producer's clock, not of arrivals.
+    is_published: bool,
 }
 
 impl TraceLink {
@@ -247,7 +256,7 @@ impl TraceLink {
         let met = match self.replay.matching {
             TraceMatch::Index => self.counted(self.by_index(number)),
             TraceMatch::Time => self.counted(self.by_time(now)),
-            TraceMatch::Tick => self.by_tick(now, number, is_restarted),
+            TraceMatch::Tick => self.by_tick((now, message.published), number, is_restarted),
         };
         self.offered.keep(number, met);
         if let Met::Record(record) = met
@@ -306,22 +315,41 @@ impl TraceLink {
     }
 
     /// As the others, with its count: a message may have no record of its own.
-    fn by_tick(&mut self, now: Instant, number: u64, is_restarted: bool) -> Met {
+    fn by_tick(
+        &mut self,
+        (now, published): (Instant, Option<RemoteInstant>),
+        number: u64,
+        is_restarted: bool,
+    ) -> Met {
         let ticks = self.ticks.as_ref().expect("matching by ticks has them");
-        let at_ns = now.as_ns();
+        // As in the trace itself, what counts is when a message was published. Its arrival, which the
+        // hosts and the hop below have shifted, stands in only where nothing else is known.
+        let at_ns = published.map_or(now.as_ns(), RemoteInstant::as_ns);
+        let is_published = published.is_some();
+        let begun = |tick| Offers {
+            grid: OfferGrid::new(at_ns, tick, ticks.period_ns),
+            last: tick,
+            is_published,
+        };
         let (offered, is_repeated) = match &mut self.offers {
             None => {
-                self.offers = Some((OfferGrid::new(at_ns, number, ticks.period_ns), number));
+                self.offers = Some(begun(number));
                 (number, false)
             }
-            Some((grid, last)) => {
+            // The two clocks have nothing in common.
+            Some(offers) if offers.is_published != is_published => {
+                let tick = offers.last.saturating_add(1);
+                *offers = begun(tick);
+                (tick, false)
+            }
+            Some(offers) => {
                 if is_restarted {
-                    *grid = grid.restarted(at_ns);
+                    offers.grid = offers.grid.restarted(at_ns);
                 } else {
-                    grid.tick(at_ns);
+                    offers.grid.tick(at_ns);
                 }
-                let tick = grid.newest();
-                (tick, core::mem::replace(last, tick) == tick)
+                let tick = offers.grid.newest();
+                (tick, core::mem::replace(&mut offers.last, tick) == tick)
             }
         };
         let is_beyond = offered >= ticks.count();

@@ -170,6 +170,7 @@ impl<T: Copy> Offered<T> {
         MessageNumber {
             start,
             sequence: self.next.saturating_sub(first),
+            published: None,
         }
     }
 
@@ -313,7 +314,13 @@ mod tests {
     #[test]
     fn messages_are_numbered_over_all_starts() {
         let mut offered = Offered::<()>::new();
-        let mut number = |start, sequence| offered.number(MessageNumber { start, sequence });
+        let mut number = |start, sequence| {
+            offered.number(MessageNumber {
+                start,
+                sequence,
+                published: None,
+            })
+        };
         assert_eq!(number(9, 3), (3, false));
         assert_eq!(number(9, 5), (5, false));
         // The new start's first message was lost before the link.

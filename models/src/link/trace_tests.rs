@@ -30,7 +30,11 @@ fn at(ms: i64) -> Instant {
 }
 
 fn number(start: u32, sequence: u64) -> MessageNumber {
-    MessageNumber { start, sequence }
+    MessageNumber {
+        start,
+        sequence,
+        published: None,
+    }
 }
 
 fn met(ms: i64) -> Vec<Fate> {
@@ -152,6 +156,38 @@ fn by_tick_a_message_meets_the_record_of_its_tick_and_what_nobody_published_is_l
     assert_eq!(counts.offered_count, 103);
     let without_period = TraceLink::new(Arc::new(trace()), replay).unwrap();
     assert_eq!(without_period.tally().counts().matching, TraceMatch::Index);
+}
+
+#[test]
+fn by_tick_what_counts_is_when_a_message_was_published_not_when_it_arrived() {
+    let mut ticking = trace();
+    ticking.records = (0..100)
+        .map(|tick| TraceRecord::published(tick * 10 * MS, 0, 1).delivered(tick, 0))
+        .collect();
+    let replay = TraceReplay {
+        matching: TraceMatch::Tick,
+        end: TraceEnd::Perfect,
+        delay_otherwise: None,
+    };
+    let mut link = TraceLink::new(Arc::new(ticking), replay).unwrap();
+    let mut now = at(0);
+    for tick in 0..100 {
+        // Held up on the way by up to three periods, so that several come at once; the producer's clock
+        // is another.
+        now = now.max(at(tick * 10 + tick * 37 % 30));
+        let message = MessageNumber {
+            published: Some(RemoteInstant::from_ns(-900_000 * MS + tick * 10 * MS)),
+            ..number(1, tick.unsigned_abs())
+        };
+        let expected = Fate::Delivered(Instant::from_ns(now.as_ns() + tick));
+        assert_eq!(
+            link.offer_numbered(now, 1, message),
+            expected,
+            "tick {tick}"
+        );
+    }
+    let counts = link.tally().counts();
+    assert_eq!((counts.met_count, counts.repeated_count), (100, 0));
 }
 
 #[test]

@@ -223,7 +223,8 @@ fn at_rank(histogram: &Histogram<u64>, rank: u64) -> u64 {
     histogram.value_at_quantile((rank as f64 - 0.5) / histogram.len() as f64)
 }
 
-/// The figures of one histogram. Minimum and maximum are exact, quantiles within 0.1 %.
+/// The figures of one histogram, or of samples. Minimum and maximum are exact; quantiles are exact
+/// of samples, and within 0.1 % of a histogram.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct LatencySummary {
     /// Values recorded.
@@ -246,6 +247,33 @@ pub struct LatencySummary {
     pub mean_ns: f64,
 }
 
+impl LatencySummary {
+    /// The exact figures of all of `samples_ns`, in any order; `None` when there are none. Where an
+    /// interval is drawn from the samples, its figure must be too: a histogram's may lie beside it.
+    pub fn of_samples(samples_ns: &[i64]) -> Option<Self> {
+        let mut ascending = samples_ns.to_vec();
+        ascending.sort_unstable();
+        let (min_ns, max_ns) = ascending.first().copied().zip(ascending.last().copied())?;
+        let count = ascending.len();
+        let at = |quantile: f64| {
+            let rank = ceil_count(quantile * count as f64).clamp(1, count);
+            ascending[rank - 1]
+        };
+        let sum_ns: i128 = ascending.iter().copied().map(i128::from).sum();
+        Some(Self {
+            count: count as u64,
+            negative_count: ascending.partition_point(|ns| *ns < 0) as u64,
+            min_ns,
+            p50_ns: at(0.5),
+            p90_ns: at(0.9),
+            p99_ns: at(0.99),
+            p999_ns: at(0.999),
+            max_ns,
+            mean_ns: sum_ns as f64 / count as f64,
+        })
+    }
+}
+
 /// Figures, or why there are none.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "state", rename_all = "snake_case")]
@@ -265,6 +293,12 @@ impl Distribution {
         Self::Unavailable {
             reason: reason.to_owned(),
         }
+    }
+
+    /// The exact figures of `samples_ns`, or none because of `reason`.
+    pub fn of_samples(samples_ns: &[i64], reason: &str) -> Self {
+        LatencySummary::of_samples(samples_ns)
+            .map_or_else(|| Self::unavailable(reason), Self::Measured)
     }
 
     /// The figures, if any.
@@ -303,6 +337,24 @@ mod tests {
         }
         let summary = histogram.summary().unwrap();
         assert_eq!((summary.min_ns, summary.max_ns), (values[0], values[5_000]));
+        let exact = LatencySummary::of_samples(&values).unwrap();
+        assert_eq!(exact.p50_ns, values[2_500]);
+        assert_eq!(exact.p99_ns, values[ceil_count(0.99 * 5_001.0) - 1]);
+        assert_eq!(
+            (
+                exact.count,
+                exact.negative_count,
+                exact.min_ns,
+                exact.max_ns
+            ),
+            (
+                5_001,
+                summary.negative_count,
+                summary.min_ns,
+                summary.max_ns
+            )
+        );
+        assert!((exact.mean_ns - summary.mean_ns).abs() < 1e-6 * exact.mean_ns.abs());
     }
 
     #[test]
@@ -324,6 +376,7 @@ mod tests {
     fn an_empty_histogram_is_unavailable_not_zero() {
         let histogram = LatencyHistogram::default();
         assert_eq!(histogram.summary(), None);
+        assert_eq!(LatencySummary::of_samples(&[]), None);
         let none = histogram.distribution("no message arrived");
         assert_eq!(none, Distribution::unavailable("no message arrived"));
         assert_eq!(none.measured(), None);

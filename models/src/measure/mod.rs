@@ -6,6 +6,7 @@
 
 pub mod account;
 pub mod card_clock;
+pub mod comparison;
 pub mod correlation;
 pub mod histogram;
 pub mod network;

@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use super::{Trace, TraceCounts, TraceFate, TraceRecord, UNAVAILABLE_NS};
-use crate::measure::histogram::{Distribution, LatencyHistogram};
+use crate::measure::histogram::Distribution;
 use crate::measure::network::has_tail;
 use crate::measure::statistics::{
     CONFIDENCE, Interval, IntervalNs, block_bootstrap_quantile, wilson,
@@ -107,14 +107,6 @@ impl TraceFigures {
         let counts = trace.counts();
         let known_count = counts.message_count - counts.unknown_count;
         let delays_ns = trace.delays_ns();
-        let histogram = |delays_ns: &[i64]| {
-            let mut histogram = LatencyHistogram::default();
-            for delay_ns in delays_ns {
-                histogram.record(*delay_ns);
-            }
-            histogram
-        };
-        let late = histogram(&trace.late_delays_ns());
         let reason = if counts.delivered_count == 0 {
             "no message was delivered"
         } else if trace.header.clock.is_empty() {
@@ -135,8 +127,11 @@ impl TraceFigures {
             delivery_runs: runs(false),
             loss_memory: memory(&as_numbers),
             delay_memory: memory(&delays),
-            delay: histogram(&delays_ns).distribution(reason),
-            late_delay: late.distribution("no message is known to have come too late"),
+            delay: Distribution::of_samples(&delays_ns, reason),
+            late_delay: Distribution::of_samples(
+                &trace.late_delays_ns(),
+                "no message is known to have come too late",
+            ),
             quantiles: quantiles(&delays_ns, seed),
             bound_max_ns: trace.delay_bound_ns(),
             longest_outage: longest_outage(&trace.records),

@@ -20,6 +20,9 @@ pub struct NetemTable {
     pub mean_ns: f64,
     /// Standard deviation, for its second argument.
     pub deviation_ns: f64,
+    /// Entries whose deviate is beyond the 16 bits of a table, four deviations from the mean: they are
+    /// written as the farthest that fits, so `netem` makes no delay beyond it.
+    pub cut_count: usize,
     /// Largest error of both from the clocks, 0 on one clock; `None` when it is not known.
     pub bound_ns: Option<u64>,
 }
@@ -55,12 +58,15 @@ pub fn table(trace: &Trace) -> Option<NetemTable> {
             "# how far the clocks may have led both astray is unknown"
         ),
     };
+    let mut cut_count = 0;
     for index in 0..TABLE_COUNT {
         // The middle of each of 4096 equal shares.
         let rank = (2 * index + 1) * delays_ns.len() / (2 * TABLE_COUNT);
         let deviate = (delays_ns[rank] as f64 - mean_ns) / deviation_ns;
         // The kernel holds 16 bits.
-        let written = (deviate * SCALE).round().clamp(-32_768.0, 32_767.0);
+        let wanted = (deviate * SCALE).round();
+        let written = wanted.clamp(-32_768.0, 32_767.0);
+        cut_count += usize::from(wanted.to_bits() != written.to_bits());
         let end = if index % 8 == 7 { '\n' } else { ' ' };
         let _infallible = write!(text, "{written}{end}");
     }
@@ -68,6 +74,7 @@ pub fn table(trace: &Trace) -> Option<NetemTable> {
         text,
         mean_ns,
         deviation_ns,
+        cut_count,
         bound_ns,
     })
 }

@@ -200,6 +200,16 @@ impl Arm {
         self.mount * self.chain.at(q_rad).tool()
     }
 
+    /// The frames of mount and links in the body frame, metres, at joint angles `q_rad`; the last
+    /// is the tool.
+    pub fn frames(&self, q_rad: &Joints) -> [Isometry3<f64>; JOINT_COUNT + 1] {
+        let links = self.chain.at(q_rad).links;
+        core::array::from_fn(|frame| match frame {
+            0 => self.mount,
+            link => self.mount * links[link - 1],
+        })
+    }
+
     /// A pose of the body frame seen from the arm's mounting frame.
     pub fn from_body(&self, pose: &Isometry3<f64>) -> Isometry3<f64> {
         self.mount.inv_mul(pose)

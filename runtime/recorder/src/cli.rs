@@ -1,24 +1,47 @@
 //! The command line: definitions only. What a command does is in [`crate::command`].
 
+use std::net::IpAddr;
 use std::path::PathBuf;
+use std::time::Duration;
 
-use clap::{Parser, Subcommand};
+use clap::{Args, Parser, Subcommand};
 
 const EXAMPLES: &str = "\
 Examples:
   hil-recorder convert runs/teleop-local-20261121-101500 -o run.mcap
       a run's folder as one file for Lichtblick, Foxglove, PlotJuggler or Python
+  hil-recorder record -o run.mcap
+      the run that goes on this host, while it goes
   hil-recorder info run.mcap
       topics, counts, times, and what the file says of its run
   hil-recorder recover broken.mcap -o whole.mcap
       a whole file of what a killed writer left
+  hil-recorder serve
+      the run that goes on, in the browser and in whatever speaks the Foxglove WebSocket
+  hil-recorder play run.mcap --only human/frame --speed 2 --loop
+      a recorded channel into a run that goes on, in place of its producer
 
 Exit codes:
   0  done                              70  internal error
-  1  done, but the run's folder has    130 interrupted: no file
-     gaps; or it could not be done     131 interrupted twice
+  1  done, but the run's folder has    130 interrupted: no file; of
+     gaps, or something was missed;        `record`: a whole one
+     or it could not be done           131 interrupted twice
   2  wrong arguments, or not a run's
      folder or an MCAP file";
+
+const SERVE_EXAMPLES: &str = "\
+Examples:
+  hil-recorder serve
+      the run that goes on here; the page is at http://127.0.0.1:8766/
+  hil-recorder serve --wait --record recordings/
+      the next one, and the one after it, each recorded as well
+  hil-recorder serve runs/fleet-emulated-20261122-101806 --loop
+      a finished run again and again
+  ssh -L 8765:localhost:8765 -L 8766:localhost:8766 control-pc
+      from another PC, then the same address; nothing is open to the network
+
+Lichtblick and Foxglove connect to ws://127.0.0.1:8765. Topics and fields are in docs/live-view.md.
+It ends with Ctrl-C; the exit code is 0 then.";
 
 const CONVERT_EXAMPLES: &str = "\
 Examples:
@@ -28,6 +51,19 @@ Examples:
 Works for a run that was killed too: what is cut short is left out, counted, and said in the
 file; the exit code is 1 then. Topics and schemas are in docs/recordings.md.";
 
+const RECORD_EXAMPLES: &str = "\
+Examples:
+  hil-recorder record -o run.mcap
+      the only run that goes on this host, until it ends or Ctrl-C
+  hil-recorder record --wait -o recordings/ &
+      started before the run: waits for it; the file gets the run's name
+  hil-recorder record teleop-split -o long.mcap --split-size 1GiB --split-time 10min
+      long_0001.mcap, long_0002.mcap and so on, each whole by itself
+
+Until it is whole, a file is called FILE.partial. When the recorder is killed,
+`hil-recorder recover FILE.partial -o FILE` gets back all but the last --flush. What was missed is
+counted by channel, here and in the file; the exit code is 1 then. See docs/recordings.md.";
+
 const RECOVER_EXAMPLES: &str = "\
 Example:
   hil-recorder recover broken.mcap -o whole.mcap
@@ -35,6 +71,18 @@ Example:
 Every chunk whose check sum is right is copied, the last one as far as it goes. Each loss is said
 with the byte at which it begins, here and in the new file under `hil.recovery`. The exit code is
 0 when there is a new file, whatever was lost.";
+
+const PLAY_EXAMPLES: &str = "\
+Examples:
+  hil-recorder play run.mcap --only human/frame --loop
+      as the program of a process in a topology: into the run that started it
+  hil-recorder play run.mcap --only human/frame --into teleop-local-20261121-101500
+      by hand, into a channel that has no writer
+
+Messages are rebuilt byte for byte and leave at their recorded spacing, with numbers and times of
+their own. A channel with a living writer is refused. Messages that leave late are counted and
+said at the end. As a process of a run it stays, silent, when the recording is over, because its
+end would end the run. docs/terminal.md has an example.";
 
 /// Turns the runs of hil-runtime into MCAP files, which other people's tools read.
 #[derive(Debug, Parser)]
@@ -65,6 +113,34 @@ pub(crate) enum Command {
         #[arg(long)]
         force: bool,
     },
+    /// Record a run while it goes.
+    #[command(after_help = RECORD_EXAMPLES)]
+    Record {
+        /// Name of the run, the beginning of it, or its folder; the only one if left out.
+        #[arg(value_name = "RUN")]
+        run: Option<String>,
+        /// The file to write, or the folder to write it into.
+        #[arg(long, short, value_name = "FILE")]
+        output: PathBuf,
+        /// Wait for a run to begin.
+        #[arg(long)]
+        wait: bool,
+        /// Leave out what the run recorded before; otherwise a recorder that comes late catches up.
+        #[arg(long)]
+        from_now: bool,
+        /// Begin another file when one is larger, e.g. 1GiB; looked at with every flush.
+        #[arg(long, value_name = "SIZE", value_parser = size)]
+        split_size: Option<u64>,
+        /// Begin another file when one was written for longer, e.g. 10min.
+        #[arg(long, value_name = "TIME", value_parser = time)]
+        split_time: Option<Duration>,
+        /// What a kill of the recorder may lose at most, 100ms to 60s.
+        #[arg(long, value_name = "TIME", value_parser = flush, default_value = "1s")]
+        flush: Duration,
+        /// Replace files that exist.
+        #[arg(long)]
+        force: bool,
+    },
     /// Make a whole MCAP file of what is left of a broken one.
     #[command(after_help = RECOVER_EXAMPLES)]
     Recover {
@@ -87,4 +163,140 @@ pub(crate) enum Command {
         #[arg(long)]
         json: bool,
     },
+    /// Show a run in the browser and in viewers that speak the Foxglove WebSocket.
+    #[command(after_help = SERVE_EXAMPLES)]
+    Serve(ServeOptions),
+    /// Feed recorded channels into a run that goes on, at their recorded spacing.
+    #[command(after_help = PLAY_EXAMPLES)]
+    Play {
+        /// The MCAP file.
+        #[arg(value_name = "FILE")]
+        file: PathBuf,
+        /// Play this channel; may be repeated.
+        #[arg(long, value_name = "CHANNEL", required = true)]
+        only: Vec<String>,
+        /// How much faster than recorded, 0.01 to 100.
+        #[arg(long, value_name = "FACTOR", value_parser = speed, default_value = "1")]
+        speed: f64,
+        /// Begin again at the end, until the run ends.
+        #[arg(long = "loop")]
+        is_looped: bool,
+        /// Name or folder of the run; otherwise the run that started this program, or the only one.
+        #[arg(long, value_name = "RUN")]
+        into: Option<String>,
+    },
+}
+
+/// What is served, and where.
+#[derive(Debug, Args)]
+pub(crate) struct ServeOptions {
+    /// The beginning of the name of a run that goes on, or the folder of any run; without, the
+    /// only one that goes on here.
+    #[arg(value_name = "RUN")]
+    pub(crate) run: Option<String>,
+    /// Wait for a run if none goes on, and for the next one when it is over.
+    #[arg(long)]
+    pub(crate) wait: bool,
+    /// Address to listen at; another than this machine's own lets others in.
+    #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1")]
+    pub(crate) host: IpAddr,
+    /// Port of the socket; 0 takes one that is free.
+    #[arg(long, value_name = "PORT", default_value_t = 8765)]
+    pub(crate) port: u16,
+    /// Port of the page; 0 takes one that is free.
+    #[arg(long, value_name = "PORT", default_value_t = 8766)]
+    pub(crate) http_port: u16,
+    /// Record what is shown while it goes on, as `record` does: a file, or a folder for one file
+    /// per run.
+    #[arg(long, value_name = "FILE")]
+    pub(crate) record: Option<PathBuf>,
+    /// How fast a finished run is played back, 0.01 to 100.
+    #[arg(long, value_name = "FACTOR", default_value_t = 1.0, value_parser = speed)]
+    pub(crate) speed: f64,
+    /// Play a finished run again and again.
+    #[arg(long = "loop")]
+    pub(crate) repeats: bool,
+}
+
+fn speed(text: &str) -> Result<f64, String> {
+    let speed = text.parse::<f64>().ok();
+    let speed = speed.filter(|speed| (0.01..=100.0).contains(speed));
+    speed.ok_or_else(|| "must be a number from 0.01 to 100".to_owned())
+}
+
+/// Units of sizes, bytes each; the longer word of two that end alike comes first.
+const SIZES: [(&str, f64); 7] = [
+    ("KiB", 1024.0),
+    ("MiB", 1_048_576.0),
+    ("GiB", 1_073_741_824.0),
+    ("kB", 1e3),
+    ("MB", 1e6),
+    ("GB", 1e9),
+    ("B", 1.0),
+];
+/// Units of times, seconds each.
+const TIMES: [(&str, f64); 4] = [("ms", 1e-3), ("min", 60.0), ("s", 1.0), ("h", 3600.0)];
+
+/// A number with one of `units` behind it, in the smallest of them.
+fn measured(text: &str, units: &[(&str, f64)]) -> Result<f64, String> {
+    let names: Vec<&str> = units.iter().map(|(name, _)| *name).collect();
+    let unit = units.iter().find(|(name, _)| text.ends_with(name));
+    let value = unit.and_then(|(name, factor)| {
+        let number: f64 = text.strip_suffix(name)?.trim_end().parse().ok()?;
+        Some(number * factor)
+    });
+    let value = value.filter(|value| value.is_finite() && *value > 0.0);
+    value.ok_or_else(|| {
+        format!(
+            "a number above 0 with one of {} behind it",
+            names.join(", ")
+        )
+    })
+}
+
+fn size(text: &str) -> Result<u64, String> {
+    let bytes = measured(text, &SIZES)?;
+    if !(1.0..=1e18).contains(&bytes) {
+        return Err("1B to 1000000000GB".to_owned());
+    }
+    #[allow(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "checked just above"
+    )]
+    Ok(bytes as u64)
+}
+
+fn time(text: &str) -> Result<Duration, String> {
+    let seconds = measured(text, &TIMES)?;
+    Duration::try_from_secs_f64(seconds).map_err(|error| error.to_string())
+}
+
+fn flush(text: &str) -> Result<Duration, String> {
+    let flush = time(text)?;
+    let range = Duration::from_millis(100)..=Duration::from_mins(1);
+    if range.contains(&flush) {
+        Ok(flush)
+    } else {
+        Err("100ms to 60s".to_owned())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sizes_and_times_are_read_with_their_units_and_never_without() {
+        assert_eq!(size("1GiB"), Ok(1 << 30));
+        assert_eq!(size("1.5 kB"), Ok(1500));
+        assert_eq!(time("10min"), Ok(Duration::from_mins(10)));
+        assert_eq!(time("250ms"), Ok(Duration::from_millis(250)));
+        assert_eq!(flush("0.5 s"), Ok(Duration::from_millis(500)));
+        for text in ["10", "0s", "-1s", "s", "1 d", "nans", "infs"] {
+            assert!(time(text).is_err(), "{text}");
+        }
+        assert!(size("0.5B").is_err() && size("1").is_err());
+        assert!(flush("10ms").is_err() && flush("2min").is_err());
+    }
 }

@@ -18,6 +18,8 @@ pub(crate) enum Basis {
     Manifest,
     /// That of another host, which reads the same clock.
     OtherHost,
+    /// Its clock is another one: its messages have the times at which they arrived here.
+    Arrival,
     /// Nothing is known: times are those of its monotonic clock.
     None,
 }
@@ -29,6 +31,7 @@ impl Basis {
             Self::Gateways => "real time, by what the gateways noted beside the messages",
             Self::Manifest => "real time, by a read of both clocks before the run",
             Self::OtherHost => "real time, by another host that reads the same clock",
+            Self::Arrival => "real time of arrival on the recording host: its own clock is another",
             Self::None => "monotonic clock, not real time: no relation was noted",
         }
     }
@@ -131,6 +134,13 @@ impl Clocks {
     /// The same of an instant on the clock of `host`.
     pub(crate) fn host_time_ns(&self, host: &str, monotonic_ns: i64) -> Option<u64> {
         Self::at(self.hosts.get(host)?.offset_ns, monotonic_ns)
+    }
+
+    /// From the monotonic clock of `host` to the recording's times, nanoseconds; 0 where no relation
+    /// is known.
+    pub(crate) fn offset_ns(&self, host: Option<&str>) -> i64 {
+        let clock = self.hosts.get(host.unwrap_or(UNKNOWN_HOST));
+        clock.map_or(0, |clock| clock.offset_ns)
     }
 
     fn at(offset_ns: i64, monotonic_ns: i64) -> Option<u64> {

@@ -1,18 +1,23 @@
 //! What each command of the command line does, and the exit code it ends with.
 
+use std::fs;
 use std::path::Path;
 use std::process::ExitCode;
-use std::time::{Duration, Instant};
 
 use clap::Parser;
 use hil_runtime::console::Console;
+use hil_runtime::progress::Progress;
 use hil_runtime::signals::{EXIT_INTERRUPTED, Signals};
 
-use crate::cli::{Cli, Command};
+use crate::cli::{Cli, Command, ServeOptions};
 use crate::convert::{ConvertError, convert};
 use crate::info::info;
+use crate::play::{PlayEnd, PlayError, PlayOptions, SourceError, TargetError, play};
+use crate::record::{Progress as RecordProgress, RecordError, Request, record};
 use crate::recover::{RecoverError, loss_words, recover};
 use crate::scan::ScanError;
+use crate::serve::{ServeError, serve};
+use crate::split::Split;
 use crate::writer::{WriteError, check_target};
 
 /// Exit codes, as `--help` lists them; those of `hil-runtime`.
@@ -22,9 +27,6 @@ mod exit {
     pub(super) const USAGE: u8 = 2;
     pub(super) const INTERNAL: u8 = 70;
 }
-
-/// How long work goes on before it says how far it is.
-const SILENCE: Duration = Duration::from_secs(1);
 
 /// Does what the command line says.
 pub(crate) fn run() -> ExitCode {
@@ -43,6 +45,30 @@ pub(crate) fn run() -> ExitCode {
             unless_refused(checked, &mut console)
                 .unwrap_or_else(|console| convert_run((&run, &output), &signals, console))
         }
+        Command::Record {
+            run,
+            output,
+            wait,
+            from_now,
+            split_size,
+            split_time,
+            flush,
+            force,
+        } => {
+            let request = Request {
+                run,
+                output,
+                waits: wait,
+                from_now,
+                split: Split {
+                    size_bytes: split_size,
+                    time: split_time,
+                },
+                flush,
+                force,
+            };
+            record_run(&request, &signals, &mut console)
+        }
         Command::Recover {
             broken,
             output,
@@ -53,6 +79,23 @@ pub(crate) fn run() -> ExitCode {
                 .unwrap_or_else(|console| recover_file((&broken, &output), &signals, console))
         }
         Command::Info { file, json } => show(&file, json, &signals, &mut console),
+        Command::Serve(options) => serve_run(&options, &signals, &mut console),
+        Command::Play {
+            file,
+            only,
+            speed,
+            is_looped,
+            into,
+        } => {
+            let options = PlayOptions {
+                file,
+                only,
+                speed,
+                is_looped,
+                into,
+            };
+            play_file(&options, &signals, &mut console)
+        }
     };
     ExitCode::from(code)
 }
@@ -71,20 +114,22 @@ fn unless_refused(
     }
 }
 
-/// Work that is done in a moment needs no word on how far it is.
-struct Patience {
-    since: Instant,
+/// How much of the file at `path` is read by byte `offset`.
+fn show_read(progress: Progress, console: &mut Console, (path, offset): (&Path, u64)) {
+    let size_bytes = fs::metadata(path).map_or(0, |file| file.len());
+    let share = (size_bytes > 0).then(|| offset as f64 / size_bytes as f64);
+    progress.show(console, share, &format!("{} MiB read", offset >> 20));
 }
 
-impl Patience {
-    fn new() -> Self {
-        let since = Instant::now();
-        Self { since }
-    }
-
-    fn progress(&self, console: &mut Console, words: &str) {
-        if self.since.elapsed() >= SILENCE {
-            console.progress(words);
+fn serve_run(options: &ServeOptions, signals: &Signals, console: &mut Console) -> u8 {
+    match serve(options, signals, console) {
+        Ok(code) => u8::try_from(code).unwrap_or(exit::FAILED),
+        Err(error) => {
+            console.error(&error.to_string());
+            match error {
+                ServeError::Run(_) | ServeError::Select(_) => exit::USAGE,
+                _ => exit::FAILED,
+            }
         }
     }
 }
@@ -94,9 +139,9 @@ fn interrupted() -> u8 {
 }
 
 fn convert_run((run, output): (&Path, &Path), signals: &Signals, console: &mut Console) -> u8 {
-    let patience = Patience::new();
-    let converted = convert(run, output, &mut |words| {
-        patience.progress(console, words);
+    let progress = Progress::begin();
+    let converted = convert(run, output, &mut |share, words| {
+        progress.show(console, share, words);
         signals.received()
     });
     match converted {
@@ -128,10 +173,75 @@ fn convert_run((run, output): (&Path, &Path), signals: &Signals, console: &mut C
     }
 }
 
+fn record_run(request: &Request, signals: &Signals, console: &mut Console) -> u8 {
+    let recorded = record(request, &mut |progress| {
+        console.progress(&progress_words(progress));
+        signals.received()
+    });
+    let recorded = match recorded {
+        Ok(recorded) => recorded,
+        Err(error) => {
+            console.error(&error.to_string());
+            return match error {
+                RecordError::Select(_)
+                | RecordError::Write(WriteError::Exists { .. } | WriteError::Unfinished { .. }) => {
+                    exit::USAGE
+                }
+                RecordError::Interrupted(_) => interrupted(),
+                RecordError::Feed(_) | RecordError::Write(_) => exit::FAILED,
+            };
+        }
+    };
+    for words in &recorded.words {
+        console.warn(words);
+    }
+    for (channel, count) in &recorded.missed {
+        console.warn(&format!("{channel}: missed {count} messages"));
+    }
+    let files: Vec<String> = recorded
+        .paths
+        .iter()
+        .map(|path| path.display().to_string())
+        .collect();
+    console.result(&format!(
+        "{}: {} messages of the run, {} in all on {} topics; missed {}\n",
+        files.join(", "),
+        recorded.message_count,
+        recorded.written_count,
+        recorded.topic_count,
+        recorded.missed.values().sum::<u64>()
+    ));
+    if recorded.signal.is_some() {
+        return interrupted();
+    }
+    if recorded.has_gaps {
+        console.error("something of the run is not in the file, see above; the file says so too");
+        return exit::FAILED;
+    }
+    exit::DONE
+}
+
+fn progress_words(progress: &RecordProgress<'_>) -> String {
+    if progress.run.is_empty() {
+        return "waiting for a run".to_owned();
+    }
+    let file = match progress.file_count {
+        1 => String::new(),
+        count => format!("  file {count}"),
+    };
+    format!(
+        "{}  {:.0} messages/s  {:.1} MiB{file}  missed {}",
+        progress.run,
+        progress.rate_hz,
+        progress.size_bytes as f64 / f64::from(1 << 20),
+        progress.missed_count
+    )
+}
+
 fn recover_file((broken, output): (&Path, &Path), signals: &Signals, console: &mut Console) -> u8 {
-    let patience = Patience::new();
+    let progress = Progress::begin();
     let recovered = recover(broken, output, &mut |offset| {
-        patience.progress(console, &format!("{} MiB read", offset >> 20));
+        show_read(progress, console, (broken, offset));
         signals.received()
     });
     let recovered = match recovered {
@@ -169,9 +279,9 @@ fn recover_file((broken, output): (&Path, &Path), signals: &Signals, console: &m
 }
 
 fn show(file: &Path, json: bool, signals: &Signals, console: &mut Console) -> u8 {
-    let patience = Patience::new();
+    let progress = Progress::begin();
     let found = info(file, &mut |offset| {
-        patience.progress(console, &format!("{} MiB read", offset >> 20));
+        show_read(progress, console, (file, offset));
         signals.received()
     });
     match found {
@@ -196,6 +306,26 @@ fn show(file: &Path, json: bool, signals: &Signals, console: &mut Console) -> u8
         Err(error) => {
             console.error(&error.to_string());
             exit::USAGE
+        }
+    }
+}
+
+fn play_file(options: &PlayOptions, signals: &Signals, console: &mut Console) -> u8 {
+    match play(options, signals, console) {
+        Ok(PlayEnd::Done) => exit::DONE,
+        Ok(PlayEnd::Interrupted(signal)) => {
+            console.say(&format!("ended by {signal}"));
+            interrupted()
+        }
+        Err(error) => {
+            console.error(&error.to_string());
+            match error {
+                PlayError::Source(SourceError::Message { .. })
+                | PlayError::Target(TargetError::Domain(_) | TargetError::Channel(_)) => {
+                    exit::FAILED
+                }
+                PlayError::Source(_) | PlayError::Target(_) => exit::USAGE,
+            }
         }
     }
 }

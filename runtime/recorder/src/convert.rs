@@ -4,7 +4,7 @@
 use std::path::Path;
 
 use hil_models::message::Envelope;
-use hil_models::trace::{Trace, UNAVAILABLE_NS};
+use hil_models::trace::Trace;
 use hil_runtime::record::{RecordFile, RecordKind};
 use prost::Message as _;
 
@@ -81,11 +81,11 @@ type Item = (u64, usize, What);
 pub(crate) fn convert(
     from: &Path,
     to: &Path,
-    look: &mut dyn FnMut(&str) -> Option<&'static str>,
+    look: &mut dyn FnMut(Option<f64>, &str) -> Option<&'static str>,
 ) -> Result<Converted, ConvertError> {
     let mut stopped = None;
     let mut run = Run::read(from, &mut |path| {
-        stopped = look(&format!("reading {path}"));
+        stopped = look(None, &format!("reading {path}"));
         stopped.is_none()
     })?;
     if let Some(signal) = stopped {
@@ -105,8 +105,9 @@ pub(crate) fn convert(
     for (count, item) in items.iter().enumerate() {
         if count % 4096 == 0 {
             let (done, all) = (count as u64, items.len() as u64);
-            let progress = format!("writing {} %, {done} of {all}", 100 * done / all.max(1));
-            if let Some(signal) = look(&progress) {
+            let words = format!("writing {done} of {all}");
+            let share = done as f64 / all.max(1) as f64;
+            if let Some(signal) = look(Some(share), &words) {
                 return Err(ConvertError::Interrupted(signal));
             }
         }
@@ -299,14 +300,16 @@ impl Conversion {
             }
             if let Some((trace, whole)) = trace_of(run, name) {
                 for index in 0..whole.records.len() {
-                    let at_ns = published_ns(whole, index);
+                    let at_ns = net::published_ns(whole, index);
                     let at_ns = at_ns.and_then(|ns| clocks.time_ns(name, ns));
                     put(at_ns, channel, What::Link { trace, index });
                 }
             }
         }
         let after_all = self.channels.len();
-        for (index, at_ns) in facts::event_times(run, clocks).into_iter().enumerate() {
+        let mut time_ns = |host: &str, at_ns| clocks.host_time_ns(host, at_ns);
+        let events = facts::event_times(run, clocks.has_one_clock, &mut time_ns);
+        for (index, at_ns) in events.into_iter().enumerate() {
             put(at_ns, after_all, What::Event { index });
         }
         self.timeless_count = timeless_count;
@@ -403,13 +406,4 @@ fn is_of(file: &RecordFile, channel: &str, kind: RecordKind) -> bool {
 fn trace_of<'a>(run: &'a Run, channel: &str) -> Option<(usize, &'a Trace)> {
     let mut traces = run.traces.iter().enumerate();
     traces.find(|(_, trace)| trace.header.channel == channel)
-}
-
-/// On the sender's monotonic clock; `None` where the trace does not know when the run began.
-fn published_ns(trace: &Trace, index: usize) -> Option<i64> {
-    let origin_ns = trace.header.origin_ns;
-    let since_start_ns = trace.records[index].published_ns;
-    (origin_ns != UNAVAILABLE_NS)
-        .then(|| origin_ns.checked_add(since_start_ns))
-        .flatten()
 }

@@ -1,10 +1,11 @@
 //! Messages as they lie in memory, written as protobuf by their layout. Schemas are made in
 //! [`crate::schema`]; the two agree because both number fields by position.
 
+use hil_runtime::layout::{LayoutFault, checked_element_bytes};
 use hil_runtime::manifest::{FieldDescription, KindDescription};
 use prost::encoding::{WireType, encode_key, encode_varint};
 
-use crate::schema::{self, LayoutFault, Schema};
+use crate::schema::{self, Schema};
 
 /// How the messages of one channel are written.
 #[derive(Debug)]
@@ -53,10 +54,10 @@ impl Encoder {
 /// `message` has at least the bytes that `fields` describe.
 fn encode_record(fields: &[FieldDescription], message: &[u8], out: &mut Vec<u8>) {
     for (field, number) in fields.iter().zip(1..) {
-        if schema::is_reserved(field) {
+        if field.is_reserved() {
             continue;
         }
-        let element = schema::checked_element_bytes(&field.kind);
+        let element = checked_element_bytes(&field.kind);
         let count = field.count.unwrap_or(1);
         let bytes = &message[field.offset_bytes..field.offset_bytes + element * count];
         if let KindDescription::Record { fields, .. } = &field.kind {

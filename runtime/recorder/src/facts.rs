@@ -15,19 +15,24 @@ use crate::run::Run;
 use crate::topics::Names;
 use crate::writer::{Recording, WriteError};
 
-type Words = BTreeMap<String, String>;
+pub(crate) type Words = BTreeMap<String, String>;
 
 /// When each event of the score was, on the recording's axis; `None` where that is unknown.
-pub(crate) fn event_times(run: &Run, clocks: &Clocks) -> Vec<Option<u64>> {
+/// `time_ns` gives the time of an instant on the clock of a host.
+pub(crate) fn event_times(
+    run: &Run,
+    has_one_clock: Option<bool>,
+    time_ns: &mut dyn FnMut(&str, i64) -> Option<u64>,
+) -> Vec<Option<u64>> {
     let Some(summary) = &run.summary else {
         return Vec::new();
     };
     let starts = &summary.run.starts_ns;
     // On one clock an event's time counts from the earliest start, else from that of its own host.
     let earliest = starts.iter().min_by_key(|(_, start_ns)| **start_ns);
-    let at = |at_s: f64, clock: &str| {
+    let mut at = |at_s: f64, clock: &str| {
         let own = starts.get_key_value(clock);
-        let is_one = clocks.has_one_clock == Some(true);
+        let is_one = has_one_clock == Some(true);
         let (host, start_ns) = own.filter(|_| !is_one).or(earliest)?;
         let since_start_ns = (at_s * 1e9).round();
         // Beyond this a number of seconds is none that a run could have.
@@ -36,7 +41,7 @@ pub(crate) fn event_times(run: &Run, clocks: &Clocks) -> Vec<Option<u64>> {
         }
         #[allow(clippy::cast_possible_truncation, reason = "checked just above")]
         let at_ns = start_ns.checked_add(since_start_ns as i64)?;
-        clocks.host_time_ns(host, at_ns)
+        time_ns(host, at_ns)
     };
     let events = summary.score_events.events.iter();
     events.map(|event| at(event.at_s?, &event.clock)).collect()
@@ -66,7 +71,8 @@ pub(crate) fn write(
     attach(recording, &run.folder)
 }
 
-fn run_words(run: &Run) -> Words {
+/// What ran.
+pub(crate) fn run_words(run: &Run) -> Words {
     let mut words = Words::new();
     let mut put = |key: &str, value: String| words.insert(key.to_owned(), value);
     put("name", run.folder.name());
@@ -164,7 +170,10 @@ fn recording_words(run: &Run, names: &Names) -> Words {
 }
 
 /// Report and figures as they are: whoever has only this file has them too.
-fn attach(recording: &mut Recording, folder: &RunFolder) -> Result<(), WriteError> {
+///
+/// # Errors
+/// When the file cannot be written.
+pub(crate) fn attach(recording: &mut Recording, folder: &RunFolder) -> Result<(), WriteError> {
     for (path, media_type) in [
         (folder.manifest(), "application/json"),
         (folder.summary(), "application/json"),

@@ -3,21 +3,35 @@
 //!
 //! Read in this order: [`run`] and [`clocks`], what there is and when it was; [`schema`] and
 //! [`encode`], what a message looks like; [`topics`] and [`net`], what is made of it; [`writer`],
-//! the file; [`convert`], all of them together. [`scan`] reads files, for [`recover`] and [`info`].
+//! the file; [`convert`], all of them together. While a run goes, [`live`] makes the same topics of its
+//! events for any [`sink`], and [`record`] puts them into files. [`scan`] reads files, for [`recover`] and [`info`];
+//! [`play`] feeds what [`decode`] makes of them into a run.
+//! [`view`] is the state of a run that goes on, [`serve`] shows it.
 
 mod cli;
 mod clocks;
 mod command;
 mod convert;
+mod decode;
+mod disk;
 mod encode;
 mod facts;
 mod info;
+mod joining;
+mod live;
+mod live_clocks;
 mod net;
+mod play;
+mod record;
 mod recover;
 mod run;
 mod scan;
 mod schema;
+mod serve;
+mod sink;
+mod split;
 mod topics;
+mod view;
 mod writer;
 
 #[cfg(test)]

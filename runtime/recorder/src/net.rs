@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use hil_models::measure::record::{
     EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE,
 };
-use hil_models::trace::{Trace, TraceFate, TraceRecord, UNBOUNDED_NS};
+use hil_models::trace::{Trace, TraceFate, TraceRecord, UNAVAILABLE_NS, UNBOUNDED_NS};
 use hil_runtime::record::{RecordFile, RecordKind};
 use prost_types::field_descriptor_proto::Type;
 
@@ -227,18 +227,21 @@ fn entry(joined: &mut Latencies, epoch: u32, sequence: u64) -> &mut MessageLaten
         })
 }
 
-fn published(joined: &mut Latencies, record: &PublishedRecord) {
+/// Puts a record beside the others of its message.
+pub(crate) fn published(joined: &mut Latencies, record: &PublishedRecord) {
     let one = entry(joined, record.epoch, record.sequence);
     one.published_ns = stamp(record.published_ns);
 }
 
-fn taken(joined: &mut Latencies, record: &TakenRecord) {
+/// Puts a record beside the others of its message.
+pub(crate) fn taken(joined: &mut Latencies, record: &TakenRecord) {
     let one = entry(joined, record.epoch, record.sequence);
     one.published_ns = one.published_ns.or(stamp(record.published_ns));
     one.taken_ns = stamp(record.taken_ns);
 }
 
-fn sent(joined: &mut Latencies, record: &EgressRecord) {
+/// Puts a record beside the others of its message.
+pub(crate) fn sent(joined: &mut Latencies, record: &EgressRecord) {
     let one = entry(joined, record.epoch, record.sequence);
     one.published_ns = one.published_ns.or(stamp(record.published_ns));
     one.gateway_taken_ns = stamp(record.taken_ns);
@@ -248,7 +251,8 @@ fn sent(joined: &mut Latencies, record: &EgressRecord) {
     one.sender_realtime_offset_ns = stamp(record.realtime_offset_ns);
 }
 
-fn received(joined: &mut Latencies, record: &IngressRecord) {
+/// Puts a record beside the others of its message.
+pub(crate) fn received(joined: &mut Latencies, record: &IngressRecord) {
     // A second copy says nothing of the way of the first.
     if record.flags & IngressRecord::DUPLICATE != 0 {
         return;
@@ -317,4 +321,14 @@ fn starts(joined: &Latencies) -> Vec<u32> {
     let mut starts: Vec<(i64, u32)> = first.into_iter().map(|(epoch, at)| (at, epoch)).collect();
     starts.sort_unstable();
     starts.into_iter().map(|(_, epoch)| epoch).collect()
+}
+
+/// When the message was published, on the sender's monotonic clock; `None` where the trace does not
+/// know when the run began.
+pub(crate) fn published_ns(trace: &Trace, index: usize) -> Option<i64> {
+    let origin_ns = trace.header.origin_ns;
+    let since_start_ns = trace.records[index].published_ns;
+    (origin_ns != UNAVAILABLE_NS)
+        .then(|| origin_ns.checked_add(since_start_ns))
+        .flatten()
 }

@@ -105,28 +105,42 @@ impl Run {
             let path = path.to_owned();
             return Err(RunError::Virtual { path });
         }
-        let mut gaps = Gaps::default();
         let paths = listed(&folder.records())?;
-        let mut run = Self {
-            manifest: read_json(&folder.manifest(), "the run's own layouts", &mut gaps),
-            summary: read_summary(&folder, &mut gaps),
-            files: Vec::new(),
-            traces: Vec::new(),
-            gaps,
-            folder,
-        };
+        let mut run = Self::without_records(folder);
         for path in paths {
             if !goes_on(&path.display().to_string()) {
                 break;
             }
             run.read_records(&path);
         }
-        if run.folder.traces().is_dir() {
-            for path in listed(&run.folder.traces())? {
-                run.read_trace(&path);
+        run.read_traces()?;
+        Ok(run)
+    }
+
+    /// What the folder tells beside its records and traces.
+    pub(crate) fn without_records(folder: RunFolder) -> Self {
+        let mut gaps = Gaps::default();
+        Self {
+            manifest: read_json(&folder.manifest(), "the run's own layouts", &mut gaps),
+            summary: read_summary(&folder, &mut gaps),
+            files: Vec::new(),
+            traces: Vec::new(),
+            gaps,
+            folder,
+        }
+    }
+
+    /// Reads what the links did.
+    ///
+    /// # Errors
+    /// When the folder of traces cannot be listed.
+    pub(crate) fn read_traces(&mut self) -> Result<(), RunError> {
+        if self.folder.traces().is_dir() {
+            for path in listed(&self.folder.traces())? {
+                self.read_trace(&path);
             }
         }
-        Ok(run)
+        Ok(())
     }
 
     fn read_records(&mut self, path: &Path) {

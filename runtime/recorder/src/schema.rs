@@ -7,6 +7,7 @@
 
 use std::collections::BTreeSet;
 
+use hil_runtime::layout::{self, LayoutFault};
 use hil_runtime::manifest::{FieldDescription, KindDescription};
 use prost::Message as _;
 use prost_types::field_descriptor_proto::{Label, Type};
@@ -15,13 +16,6 @@ use prost_types::{
     OneofDescriptorProto,
 };
 
-/// Deepest nesting of structures: no message of ours has more than two.
-const DEPTH_MAX: usize = 8;
-/// Largest message: a bound on what a damaged manifest may ask for.
-const MESSAGE_BYTES_MAX: usize = 1 << 26;
-/// Highest field number below the range that protobuf keeps for itself.
-const FIELD_NUMBER_MAX: usize = 18_999;
-
 /// What a channel's messages look like to a reader.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Schema {
@@ -29,84 +23,6 @@ pub(crate) struct Schema {
     pub(crate) name: String,
     /// Its file descriptor set.
     pub(crate) data: Vec<u8>,
-}
-
-/// Why a layout cannot be used.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub(crate) enum LayoutFault {
-    /// Nobody stated the fields.
-    #[error("its fields are not known")]
-    Unknown,
-    /// The fields do not cover the message.
-    #[error("field {field} begins at byte {found}, where the one before it ends at {expected}")]
-    Gap {
-        /// Which.
-        field: String,
-        /// Where it begins.
-        found: usize,
-        /// Where it should.
-        expected: usize,
-    },
-    /// The fields end elsewhere than the message.
-    #[error("its fields end at byte {found}, and it has {expected} bytes")]
-    End {
-        /// Where they end.
-        found: usize,
-        /// Size of the message.
-        expected: usize,
-    },
-    /// Nested too deeply, too long, or too many fields.
-    #[error("it is nested more than {DEPTH_MAX} deep, or too large")]
-    TooLarge,
-}
-
-/// Size of one element, bytes.
-fn element_bytes(kind: &KindDescription, depth: usize) -> Result<usize, LayoutFault> {
-    Ok(match kind {
-        KindDescription::U8 | KindDescription::I8 => 1,
-        KindDescription::U16 | KindDescription::I16 => 2,
-        KindDescription::U32 | KindDescription::I32 | KindDescription::F32 => 4,
-        KindDescription::U64 | KindDescription::I64 | KindDescription::F64 => 8,
-        // A structure without fields could be there any number of times in no bytes at all.
-        KindDescription::Record { fields, .. } if fields.is_empty() => {
-            return Err(LayoutFault::Unknown);
-        }
-        KindDescription::Record { fields, .. } => end_bytes(fields, depth + 1)?,
-    })
-}
-
-/// Where the last of `fields` ends, when they follow each other without gap.
-fn end_bytes(fields: &[FieldDescription], depth: usize) -> Result<usize, LayoutFault> {
-    if depth > DEPTH_MAX || fields.len() > FIELD_NUMBER_MAX {
-        return Err(LayoutFault::TooLarge);
-    }
-    let mut end = 0_usize;
-    for field in fields {
-        if field.offset_bytes != end {
-            return Err(LayoutFault::Gap {
-                field: field.name.clone(),
-                found: field.offset_bytes,
-                expected: end,
-            });
-        }
-        let element = element_bytes(&field.kind, depth)?;
-        let size = element.checked_mul(field.count.unwrap_or(1));
-        end = size
-            .and_then(|size| end.checked_add(size))
-            .filter(|end| *end <= MESSAGE_BYTES_MAX)
-            .ok_or(LayoutFault::TooLarge)?;
-    }
-    Ok(end)
-}
-
-/// Size of one element of a checked layout, bytes.
-pub(crate) fn checked_element_bytes(kind: &KindDescription) -> usize {
-    element_bytes(kind, 0).unwrap_or(0)
-}
-
-/// True for filler that means nothing.
-pub(crate) fn is_reserved(field: &FieldDescription) -> bool {
-    field.name == "reserved"
 }
 
 /// The schema of the message called `message`, of `size_bytes` and with these fields.
@@ -118,16 +34,7 @@ pub(crate) fn of_layout(
     fields: &[FieldDescription],
     size_bytes: usize,
 ) -> Result<Schema, LayoutFault> {
-    if fields.is_empty() {
-        return Err(LayoutFault::Unknown);
-    }
-    let end = end_bytes(fields, 0)?;
-    if end != size_bytes {
-        return Err(LayoutFault::End {
-            found: end,
-            expected: size_bytes,
-        });
-    }
+    layout::check(fields, size_bytes)?;
     let (package, name) = protobuf_name(message);
     let full = full_name(&package, &name);
     let proto = record(&name, &format!(".{full}"), fields);
@@ -205,7 +112,7 @@ fn record(name: &str, path: &str, fields: &[FieldDescription]) -> DescriptorProt
     let mut taken = BTreeSet::new();
     let mut nested: Vec<(&KindDescription, String)> = Vec::new();
     for (field, number) in fields.iter().zip(1..) {
-        if is_reserved(field) {
+        if field.is_reserved() {
             continue;
         }
         let field_name = unique(identifier(&field.name), &mut taken);

@@ -78,7 +78,7 @@ impl Folder {
     }
 
     fn convert(&self) -> Result<Converted, ConvertError> {
-        convert(&self.at("run"), &self.at("run.mcap"), &mut |_| None)
+        convert(&self.at("run"), &self.at("run.mcap"), &mut |_, _| None)
     }
 
     fn recover(&self, bytes: &[u8]) -> Result<Recovered, String> {
@@ -205,7 +205,7 @@ fn a_signal_leaves_no_file() {
     let folder = Folder::new();
     folder.record("a", 0..9000);
     for wanted in ["reading", "writing"] {
-        let mut stop = |words: &str| words.starts_with(wanted).then_some("Ctrl-C");
+        let mut stop = |_: Option<f64>, words: &str| words.starts_with(wanted).then_some("Ctrl-C");
         let stopped = convert(&folder.at("run"), &folder.at("run.mcap"), &mut stop);
         assert!(matches!(stopped, Err(ConvertError::Interrupted("Ctrl-C"))));
         assert_eq!(fs::read_dir(&folder.0).unwrap().count(), 1);

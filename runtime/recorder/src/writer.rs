@@ -3,13 +3,16 @@
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
-use std::io::{self, BufWriter};
+use std::io;
 use std::path::{Path, PathBuf};
 use std::process;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{Attachment, Compression, McapError, WriteOptions, Writer};
 
+use crate::disk::QueuedFile;
 use crate::schema::Schema;
 
 /// Messages of about this size are compressed together. The smaller, the less is lost when a file
@@ -22,6 +25,15 @@ pub(crate) enum WriteError {
     /// There is something already.
     #[error("{path} exists already; --force replaces it")]
     Exists {
+        /// The file.
+        path: PathBuf,
+    },
+    /// Another recorder writes it, or a killed one left it.
+    #[error(
+        "{path} is there: unless a recorder still writes it, `hil-recorder recover` makes a whole \
+         file of it; then remove it"
+    )]
+    Unfinished {
         /// The file.
         path: PathBuf,
     },
@@ -73,10 +85,13 @@ impl Stamp {
 
 /// A file being written.
 pub(crate) struct Recording {
-    writer: Option<Writer<BufWriter<File>>>,
+    writer: Option<Writer<QueuedFile>>,
     partial: PathBuf,
     path: PathBuf,
     message_count: u64,
+    /// What is not completed stays beside the place where it was to go.
+    is_live: bool,
+    length: Arc<AtomicU64>,
 }
 
 /// Says that `path` may be written, before any work is done for it.
@@ -107,9 +122,35 @@ impl Recording {
     pub(crate) fn create(path: &Path) -> Result<Self, WriteError> {
         let name = path.file_name().unwrap_or_default().to_string_lossy();
         let partial = path.with_file_name(format!(".{name}.{}.partial", process::id()));
-        let file = File::create(&partial).map_err(|source| WriteError::Io {
-            path: partial.clone(),
-            source,
+        Self::begin(path, partial, false)
+    }
+
+    /// Begins a file that will be called `path` and is called `<path>.partial` until then, where
+    /// whoever looks for it after a kill finds it.
+    ///
+    /// # Errors
+    /// When there is no room, no right or no folder for it, or such a file is there already: what a
+    /// killed recorder left is not written over.
+    pub(crate) fn create_live(path: &Path) -> Result<Self, WriteError> {
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        let partial = path.with_file_name(format!("{name}.partial"));
+        Self::begin(path, partial, true)
+    }
+
+    fn begin(path: &Path, partial: PathBuf, is_live: bool) -> Result<Self, WriteError> {
+        let file = if is_live {
+            // Whoever makes it has it: two recorders that begin together must not write one file.
+            File::options().write(true).create_new(true).open(&partial)
+        } else {
+            File::create(&partial)
+        };
+        let file = file.and_then(QueuedFile::new).map_err(|source| {
+            let path = partial.clone();
+            if is_live && source.kind() == io::ErrorKind::AlreadyExists {
+                WriteError::Unfinished { path }
+            } else {
+                WriteError::Io { path, source }
+            }
         })?;
         let library = concat!("hil-recorder ", env!("CARGO_PKG_VERSION"));
         let mut recording = Self {
@@ -117,15 +158,39 @@ impl Recording {
             partial,
             path: path.to_owned(),
             message_count: 0,
+            is_live,
+            length: file.length(),
         };
         let writer = WriteOptions::new()
             .compression(Some(Compression::Zstd))
             .chunk_size(Some(CHUNK_BYTES))
             .library(library)
-            .create(BufWriter::new(file))
+            // A chunk reaches the file whole.
+            .disable_seeking(true)
+            .create(file)
             .map_err(|source| recording.refused(source))?;
         recording.writer = Some(writer);
         Ok(recording)
+    }
+
+    /// Where the file will be.
+    pub(crate) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Messages so far.
+    pub(crate) const fn message_count(&self) -> u64 {
+        self.message_count
+    }
+
+    /// Size of the file, bytes; what is not compressed yet is not in it.
+    pub(crate) fn size_bytes(&self) -> u64 {
+        self.length.load(Ordering::Relaxed)
+    }
+
+    /// The error of having more topics than the container can number.
+    pub(crate) fn full(&self) -> WriteError {
+        self.refused(McapError::TooManyChannels)
     }
 
     fn refused(&self, source: McapError) -> WriteError {
@@ -138,7 +203,7 @@ impl Recording {
 
     fn with<T>(
         &mut self,
-        work: impl FnOnce(&mut Writer<BufWriter<File>>) -> Result<T, McapError>,
+        work: impl FnOnce(&mut Writer<QueuedFile>) -> Result<T, McapError>,
     ) -> Result<T, WriteError> {
         let writer = self.writer.as_mut();
         let worked = writer.map_or(Err(McapError::AttemptedWriteAfterFailure), work);
@@ -242,10 +307,8 @@ impl Recording {
             source,
         };
         if let Some(writer) = self.writer.take() {
-            let file = writer.into_inner().into_inner();
-            let file = file.map_err(|error| failed(&self.partial, error.into_error()))?;
-            file.sync_all()
-                .map_err(|error| failed(&self.partial, error))?;
+            let written = writer.into_inner().finish();
+            written.map_err(|error| failed(&self.partial, error))?;
         }
         fs::rename(&self.partial, &self.path).map_err(|error| failed(&self.path, error))?;
         Ok(self.message_count)
@@ -256,6 +319,9 @@ impl Drop for Recording {
     fn drop(&mut self) {
         // Before the file goes: the writer completes it when it is dropped.
         drop(self.writer.take());
+        if self.is_live {
+            return;
+        }
         // After `finish` there is none any more.
         let _is_gone = fs::remove_file(&self.partial).is_ok();
     }
@@ -295,6 +361,24 @@ mod tests {
             .map(Result::unwrap)
             .collect();
         assert_eq!((messages[0].log_time, messages[0].sequence), (5, 2));
+        fs::remove_dir_all(folder).unwrap();
+    }
+
+    #[test]
+    fn a_live_file_has_one_writer_and_what_a_kill_left_is_kept() {
+        let folder = folder("live");
+        let path = folder.join("a.mcap");
+        let partial = folder.join("a.mcap.partial");
+        let begin = || Recording::create_live(&path);
+        let first = begin().unwrap();
+        let second = begin().map(|_| ());
+        assert!(matches!(second, Err(WriteError::Unfinished { .. })));
+        assert_eq!(first.finish().unwrap(), 0);
+        assert!(path.is_file() && !partial.exists());
+        fs::write(&partial, "left").unwrap();
+        let again = begin().map(|_| ());
+        assert!(matches!(again, Err(WriteError::Unfinished { .. })));
+        assert_eq!(fs::read(&partial).unwrap(), b"left");
         fs::remove_dir_all(folder).unwrap();
     }
 

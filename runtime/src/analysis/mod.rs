@@ -8,6 +8,7 @@ mod clocks;
 mod events;
 mod faces;
 mod figures;
+pub(crate) mod link_changes;
 pub(crate) mod network;
 pub(crate) mod outages;
 mod radio;
@@ -85,6 +86,7 @@ pub(crate) fn conclude(
         .iter()
         .map(|event| run_event(&axis, event))
         .collect();
+    summary.link_changes = link_changes::of_run(topology, &records, &axis);
     summary.channels = topology
         .channels()
         .iter()
@@ -121,14 +123,23 @@ pub(crate) fn conclude(
     let case = case.as_ref().map(|(_, case)| case.as_ref());
     let network_series = network_series.unwrap_or_default();
     write_series(&mut summary, result, (case, network_series), records);
+    write_texts(&summary, result)?;
+    Ok(summary)
+}
+
+/// Writes the summary, the events and the report into the run's folder.
+fn write_texts(summary: &RunSummary, result: &RunResult) -> Result<(), AnalysisError> {
     let path = result.folder.events();
-    let text = event_log::text(&summary.run.name, &summary.score_events);
+    let text = event_log::text(
+        &summary.run.name,
+        &summary.score_events,
+        &summary.link_changes,
+    );
     fs::write(&path, text).map_err(|source| AnalysisError::Write { path, source })?;
     summary.write(&result.folder.summary())?;
-    let plain = terminal::render(&summary, REPORT_FILE_WIDTH, Style::Plain);
+    let plain = terminal::render(summary, REPORT_FILE_WIDTH, Style::Plain);
     let path = result.folder.report();
-    fs::write(&path, plain).map_err(|source| AnalysisError::Write { path, source })?;
-    Ok(summary)
+    fs::write(&path, plain).map_err(|source| AnalysisError::Write { path, source })
 }
 
 /// The outages of every channel, their figures put into the summary.

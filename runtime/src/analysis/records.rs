@@ -6,6 +6,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use hil_models::link::condition::LinkConditionRecord;
 use hil_models::measure::account::{
     AccountContext, ChannelAccount, ChannelPath, ChannelRecords, FLIGHT_TIME_MAX, Interruption,
     MessageStory, ORDER_TOLERANCE_NS, Outage, PathProcess, RunSpan, TooManyMessages, TraceChannel,
@@ -24,6 +25,7 @@ use hil_models::trace::TraceRecord;
 
 use super::AnalysisError;
 use super::clocks::HostClocks;
+use super::link_changes;
 use crate::face::record::{FaceReceivedRecord, FaceSentRecord};
 use crate::process::launch::EmulationLaunch;
 use crate::radio::record::RadioRecord;
@@ -59,6 +61,8 @@ pub(crate) struct RunRecords {
     clocks: HostClocks,
     /// Records of radios, by `<process>/<interface>`.
     pub(super) radios: BTreeMap<String, Vec<RadioRecord>>,
+    /// Orders to emulated links, by the channel on which they were given.
+    link_orders: BTreeMap<String, Vec<LinkConditionRecord>>,
     /// Files that could not be read, with the reason.
     pub(crate) problems: Vec<String>,
 }
@@ -80,6 +84,13 @@ impl RunRecords {
         if file.header.kind == RecordKind::Radio {
             let radio = self.radios.entry(file.header.channel.clone());
             radio.or_default().extend(file.records::<RadioRecord>());
+            return;
+        }
+        if file.header.kind == RecordKind::LinkCondition {
+            let orders = self.link_orders.entry(file.header.channel.clone());
+            orders
+                .or_default()
+                .extend(file.records::<LinkConditionRecord>());
             return;
         }
         let channel = self
@@ -105,8 +116,13 @@ impl RunRecords {
             }
             RecordKind::Message => file.append_messages(&mut self.log),
             // They belong to no channel, see above.
-            RecordKind::CardClock | RecordKind::Radio => {}
+            RecordKind::CardClock | RecordKind::Radio | RecordKind::LinkCondition => {}
         }
+    }
+
+    /// Orders to emulated links that were given on `channel`, in the order of the gateway's count.
+    pub(super) fn link_orders(&self, channel: &str) -> &[LinkConditionRecord] {
+        self.link_orders.get(channel).map_or(&[], Vec::as_slice)
     }
 
     /// The clock of a card, as [`crate::card_clock`] names it; `None` when it was not read.
@@ -312,6 +328,9 @@ impl RunRecords {
             ChannelPath::SharedMemory
         };
         // A link that delays on purpose keeps messages under way for that much longer.
+        let changed = crossing
+            .as_ref()
+            .map(|crossing| link_changes::longest_delay(topology, self, crossing));
         let delay = crossing
             .and_then(|crossing| EmulationLaunch::of(&crossing, topology.run().seed))
             .map(|emulation| {
@@ -324,7 +343,7 @@ impl RunRecords {
             interruptions: &interruptions,
             producer_run: span_of(&channel.from),
             consumer_run: channel.to.as_deref().and_then(span_of),
-            flight_time_max: FLIGHT_TIME_MAX + delay.unwrap_or(Duration::ZERO),
+            flight_time_max: FLIGHT_TIME_MAX + delay.max(changed).unwrap_or(Duration::ZERO),
             cards_share_clock,
             round_trips_ns: &round_trips_ns,
             seed: topology.run().seed,

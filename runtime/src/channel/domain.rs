@@ -11,16 +11,17 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use iceoryx2::config::Config;
-use iceoryx2::node::{Node, NodeBuilder, NodeState};
+use iceoryx2::node::{Node, NodeBuilder};
 use iceoryx2::prelude::{
-    CallbackProgression, FileName, LogLevel, Path as IceoryxPath, SemanticString,
-    SignalHandlingMode, ipc, set_log_level,
+    FileName, LogLevel, NodeName, Path as IceoryxPath, SemanticString, SignalHandlingMode, ipc,
+    set_log_level,
 };
 use nix::errno::Errno;
 use nix::fcntl::{Flock, FlockArg};
 
 use super::error::{DomainError, explain};
 use super::identity::{Fnv128, SHARED_MEMORY_DIRECTORY, fingerprint};
+use super::members;
 use super::sequence::OPEN_WITHIN;
 use crate::clock::MonotonicClock;
 
@@ -107,7 +108,7 @@ pub struct Domain {
 /// What [`Domain::remove`] found and left.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Removal {
-    /// Processes that were still members; their channels are gone under their hands.
+    /// Processes of the run that were still members; their channels are gone under their hands.
     pub live_member_count: u64,
     /// Files that could not be deleted.
     pub remained: Vec<PathBuf>,
@@ -155,7 +156,7 @@ impl Domain {
         }
         let prefix = fresh_prefix(&root_path)?;
         fs::write(&marker, &prefix).map_err(DomainError::io("write", &marker))?;
-        let mut domain = Self::join(DomainAddress { root_path, prefix })?;
+        let mut domain = Self::join(DomainAddress { root_path, prefix }, None)?;
         domain.lock = Some(lock);
         Ok(domain)
     }
@@ -172,15 +173,26 @@ impl Domain {
     pub fn open(address: &DomainAddress) -> Result<Self, DomainError> {
         let marker = address.root_path.join(MARKER);
         fs::metadata(&marker).map_err(DomainError::io("find the run's", &marker))?;
-        Self::join(address.clone())
+        Self::join(address.clone(), None)
     }
 
-    fn join(address: DomainAddress) -> Result<Self, DomainError> {
+    /// As [`Domain::open`], for a program that only looks on: the run ends without regard to it.
+    ///
+    /// # Errors
+    /// As [`Domain::open`].
+    pub fn observe(address: &DomainAddress) -> Result<Self, DomainError> {
+        let marker = address.root_path.join(MARKER);
+        fs::metadata(&marker).map_err(DomainError::io("find the run's", &marker))?;
+        Self::join(address.clone(), Some(members::observer_name()))
+    }
+
+    fn join(address: DomainAddress, name: Option<NodeName>) -> Result<Self, DomainError> {
         // Below this level iceoryx2 prints nothing we do not report ourselves; at it, some
         // failures would be visible nowhere else.
         set_log_level(LogLevel::Warn);
         let config = configuration(&address)?;
-        let node = NodeBuilder::new()
+        let builder = name.map_or_else(NodeBuilder::new, |name| NodeBuilder::new().name(&name));
+        let node = builder
             .config(&config)
             .signal_handling_mode(SignalHandlingMode::Disabled)
             .create::<ipc::Service>()
@@ -250,6 +262,11 @@ impl Domain {
         }
     }
 
+    /// Observers that have not left yet.
+    pub fn observer_count(&self) -> u64 {
+        members::living(&self.config).observer_count
+    }
+
     /// Leaves the domain and, in the launcher, deletes its files. Drop all ports and
     /// [`ChannelHolder`](super::ChannelHolder)s and end all workers before.
     pub fn remove(mut self) -> Removal {
@@ -262,7 +279,7 @@ impl Domain {
         let Some(lock) = self.lock.take() else {
             return Removal::default();
         };
-        let live_member_count = live_members(&self.config);
+        let live_member_count = members::living(&self.config).process_count;
         delete_files(&self.address);
         let root_path = &self.address.root_path;
         // The directory goes while the lock is held, so that the next launcher starts clean.
@@ -469,14 +486,4 @@ fn delete_below(root_path: &Path) {
         };
     }
     let _is_gone = fs::remove_file(root_path.join(MARKER)).is_ok();
-}
-
-fn live_members(config: &Config) -> u64 {
-    let mut live_count = 0;
-    let listed = Node::<ipc::Service>::list(config, |state| {
-        live_count += u64::from(matches!(state, NodeState::Alive(_)));
-        CallbackProgression::Continue
-    });
-    // An unreadable list means a deleted directory, hence no members.
-    listed.map_or(0, |()| live_count)
 }

@@ -20,11 +20,13 @@
 //! Ports are not [`Send`]: open each in the thread that uses it. A [`Domain`] can be shared.
 
 mod ahead;
+mod census;
 mod degradation;
 mod domain;
 mod error;
 mod holder;
 mod identity;
+mod members;
 mod raw;
 mod sequence;
 mod shm;
@@ -34,13 +36,14 @@ mod wake;
 #[cfg(test)]
 mod tests;
 
+pub use census::Census;
 pub use domain::{Cleanup, Domain, DomainAddress, ROOT_PATH_LENGTH_MAX, Removal};
 pub use error::{ChannelError, DomainError};
 pub use holder::{ChannelHolder, ChannelSettings};
 pub use identity::clock_id;
 pub use raw::{ENVELOPE_TYPE_NAME, RawInput, RawOutput};
-pub(crate) use sequence::Sequencer;
 pub use sequence::{InputCounters, OutputSettings, Stamp};
+pub(crate) use sequence::{SequenceTracker, Sequencer};
 pub use shm::{ShmInput, ShmOutput, TypedInput, TypedOutput};
 pub use type_info::TypeInfo;
 pub use wake::{WAITER_CHANNELS_MAX, Waiter, Wake};

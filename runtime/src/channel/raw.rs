@@ -76,7 +76,7 @@ fn detail_of(message: &TypeInfo, channel: &str) -> Result<TypeDetail, ChannelErr
 
 pub(crate) type ByteService =
     publish_subscribe::PortFactory<ipc::Service, [CustomPayloadMarker], CustomHeaderMarker>;
-type ReadService =
+pub(super) type ReadService =
     publish_subscribe::PortFactory<ipc::Service, [CustomPayloadMarker], SharedEnvelope>;
 
 pub(crate) fn service_name(channel: &str) -> Result<ServiceName, ChannelError> {
@@ -152,7 +152,7 @@ fn open_for_writing(
         .map_err(|error| open_error(domain, channel, message, error))
 }
 
-fn open_for_reading(
+pub(super) fn open_for_reading(
     domain: &Domain,
     channel: &str,
     message: &TypeInfo,
@@ -184,7 +184,7 @@ pub(crate) fn open_error(
 }
 
 /// Reads the message type from the channel itself.
-fn discover(domain: &Domain, channel: &str) -> Result<TypeInfo, ChannelError> {
+pub(super) fn discover(domain: &Domain, channel: &str) -> Result<TypeInfo, ChannelError> {
     const OPERATION: &str = "read its message type";
     let name = service_name(channel)?;
     let details = ipc::Service::details(&name, domain.config(), MessagingPattern::PublishSubscribe)

@@ -6,6 +6,7 @@ use std::path::Path;
 
 use crate::cli::{BatchArgs, CalibrateArgs};
 use crate::console::Console;
+use crate::progress::Progress;
 use crate::registry::Registry;
 use crate::replay;
 use crate::run_folder::RunFolder;
@@ -34,9 +35,14 @@ pub(super) fn simulate(
     let Some(topology) = load(path, overrides, registry, console) else {
         return exit::USAGE;
     };
+    let progress = Progress::begin();
     let outcome = output
         .map_or(Ok(()), simulate::check_output)
-        .and_then(|()| simulate::simulate(&topology, registry));
+        .and_then(|()| {
+            simulate::simulate(&topology, registry, &mut |share| {
+                progress.show(console, Some(share), "in virtual time");
+            })
+        });
     let simulated = match outcome {
         Ok(simulated) => simulated,
         Err(error) => {

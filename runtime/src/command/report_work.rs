@@ -149,6 +149,25 @@ fn figures(
     Ok(())
 }
 
+/// A folder of `simulate` or `tables` has its report as it was printed, and every figure as JSON.
+fn show_virtual(folder: &RunFolder, json: bool, console: &mut Console) -> u8 {
+    let path = if json {
+        folder.virtual_report()
+    } else {
+        folder.report()
+    };
+    match fs::read_to_string(&path) {
+        Ok(text) => {
+            console.result(text.trim_end());
+            exit::RAN
+        }
+        Err(error) => {
+            console.error(&format!("{}: {error}", path.display()));
+            exit::USAGE
+        }
+    }
+}
+
 /// The report as the run printed it.
 fn show(run: &Path, json: bool, console: &mut Console) -> u8 {
     let folder = RunFolder::existing(run);
@@ -159,9 +178,7 @@ fn show(run: &Path, json: bool, console: &mut Console) -> u8 {
             let text = if folder.manifest().is_file() {
                 "this run never began or was killed outright, so it left no summary".to_owned()
             } else if folder.virtual_report().is_file() {
-                "this is a folder of `simulate` or `tables`, not of a run; read its report.txt, or \
-                 report.json for every figure, or make a page with -o report.html"
-                    .to_owned()
+                return show_virtual(&folder, json, console);
             } else {
                 format!("not a run's folder: {error}")
             };

@@ -189,6 +189,7 @@ mod tests {
             "realtime_throttle",
             "fifo",
             "memory_lock",
+            "probe_tap",
             "wakeup_latency",
             "shared_memory",
             "shared_memory_leftovers",

@@ -1,9 +1,10 @@
-//! What this process may ask of the kernel: real-time priority and locked memory, tried and not
-//! just read from limits. The tries leave no trace: the priority is taken by a thread that ends,
-//! the lock is released again.
+//! What this process may ask of the kernel: real-time priority, locked memory and eBPF programs, tried
+//! and not just read from limits. The tries leave no trace: the priority is taken by a thread that
+//! ends, the lock is released again, and a program is attached nowhere.
 
 use std::thread;
 
+use hil_gateways::transport::bpf_tap;
 use nix::sys::mman::{MlockAllFlags, mlockall, munlockall};
 use nix::sys::resource::Resource;
 
@@ -15,7 +16,7 @@ use crate::realtime::{GrantOutcome, RealtimeRequest, SchedulingPolicy, apply};
 const TRIED_PRIORITY: u8 = 80;
 
 pub(crate) fn examine(files: &HostFiles) -> Vec<Finding> {
-    vec![throttle(files), fifo(files), memory_lock(files)]
+    vec![throttle(files), fifo(files), memory_lock(files), tap()]
 }
 
 fn throttle(files: &HostFiles) -> Finding {
@@ -105,6 +106,17 @@ fn memory_lock(files: &HostFiles) -> Finding {
         Err(errno) => Finding::problem(id, title, format!("refused ({errno}); {rights}"))
             .because("a page fault in the loop costs microseconds to milliseconds")
             .fixed_by("needs CAP_IPC_LOCK or LimitMEMLOCK=infinity in the unit"),
+    }
+}
+
+/// What `hil-runtime probe` can tap an interface with.
+fn tap() -> Finding {
+    let (id, title) = ("probe_tap", "Tap of the passive probe");
+    match bpf_tap::is_granted() {
+        Ok(()) => Finding::good(id, title, "eBPF programs granted"),
+        Err(error) => Finding::note(id, title, format!("packet ring at most: {error}"))
+            .because("a packet ring costs the watched hop more")
+            .fixed_by("Linux 6.6 or newer, with CAP_BPF and CAP_NET_ADMIN (run as root)"),
     }
 }
 

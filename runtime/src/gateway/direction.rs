@@ -16,6 +16,7 @@ use super::egress::{Attention, Egress};
 use super::ingress::{Ingress, Notes};
 use super::kernel_clock::KernelClock;
 use super::line::Line;
+use super::link_switch::SwitchHandle;
 use super::socket::{Ends, OpenSocket, stamps_of};
 use super::stamp_plan::StampPlan;
 use super::{GatewayError, Surroundings};
@@ -125,6 +126,11 @@ impl Opened {
     /// Messages carried so far.
     pub fn count(&self) -> Arc<AtomicU64> {
         Arc::clone(&self.count)
+    }
+
+    /// Where the emulated link of this direction is changed, if it has one; once.
+    pub(super) fn take_switch(&mut self) -> Option<SwitchHandle> {
+        self.socket.switch.take()
     }
 
     /// How often its connections come and go, if it is one that connects.

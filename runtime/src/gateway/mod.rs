@@ -14,6 +14,8 @@ pub(crate) mod egress;
 pub(crate) mod ingress;
 pub(crate) mod kernel_clock;
 mod line;
+pub(crate) mod link_control;
+mod link_switch;
 pub(crate) mod process;
 pub(crate) mod socket;
 pub mod stamp_plan;

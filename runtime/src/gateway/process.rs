@@ -12,6 +12,7 @@ use std::time::Duration;
 
 use super::connection::Connection;
 use super::direction::{self, Opened};
+use super::link_control::LinkControl;
 use super::{GatewayError, Surroundings, arming};
 use hil_models::time::Instant;
 
@@ -63,6 +64,9 @@ fn prepare_and_live(path: &Path) -> Result<(), GatewayError> {
         )?);
     }
     let sampler = armed.prepare_sampler(&launch.process, &mut recorder);
+    let switches = opened.iter_mut().filter_map(|(_, one)| one.take_switch());
+    let switches = switches.collect();
+    let mut control = LinkControl::open(&surroundings.domain, &launch, switches)?;
     recorder.start().map_err(GatewayError::Thread)?;
     let stop = Arc::clone(&surroundings.stop);
     let sampler = sampler.map(|one| one.start(stop)).transpose()?;
@@ -93,7 +97,8 @@ fn prepare_and_live(path: &Path) -> Result<(), GatewayError> {
             launch: &launch,
         });
         let hops = (counters.as_slice(), established.as_slice());
-        watch(&orders, &threads, hops, (&mut watched, patience));
+        let beside = (watched.as_mut_slice(), &mut control);
+        watch(&orders, &threads, hops, (beside, patience));
     }
     surroundings.stop.store(true, Ordering::Release);
     armed.facts.extend(sampler.map(Sampler::finish));
@@ -126,7 +131,10 @@ fn watch(
     orders: &Orders,
     threads: &[JoinHandle<Lived>],
     (counters, established): (&[Counter], &[Arc<AtomicBool>]),
-    (connections, patience): (&mut [Connection], Option<Patience<'_>>),
+    ((connections, control), patience): (
+        (&mut [Connection], &mut LinkControl),
+        Option<Patience<'_>>,
+    ),
 ) {
     let mut is_ready = false;
     let mut told = MonotonicClock::now();
@@ -153,6 +161,7 @@ fn watch(
                 connection.tell(now);
             }
         }
+        control.attend();
         thread::sleep(WATCH_PERIOD);
     }
 }

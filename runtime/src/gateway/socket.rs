@@ -17,9 +17,10 @@ use hil_gateways::transport::udp::{GrantedOptions, PathMtu, UdpReceiver, UdpSend
 use hil_gateways::transport::{DatagramReceiver, DatagramSender};
 use hil_models::link::trace::ReplayTally;
 use hil_models::link::{Fate, LinkModel, LossCauses, MessageNumber};
-use hil_models::time::Instant;
+use hil_models::time::{Instant, RemoteInstant};
 
 use super::GatewayError;
+use super::link_switch::{SwitchHandle, switch};
 use super::stamp_plan::StampPlan;
 use crate::clock::MonotonicClock;
 use crate::process::emulation_room::EmulationRoom;
@@ -43,6 +44,8 @@ pub(super) struct OpenSocket {
     pub(super) tally: Option<Arc<ConnectionTally>>,
     /// What its link model met of the trace that it replays, where it replays one.
     pub(super) replay: Option<ReplayTally>,
+    /// Where its link model can be changed, where it has one.
+    pub(super) switch: Option<SwitchHandle>,
 }
 
 /// Which end of the hop it is.
@@ -72,7 +75,7 @@ impl OpenSocket {
         (launch, plan): (&DirectionLaunch, StampPlan),
         start: &RunStart,
     ) -> Result<Self, GatewayError> {
-        let (ends, mut facts, replay) = match launch.side {
+        let (ends, mut facts, (replay, switch)) = match launch.side {
             Side::Egress => {
                 let sender = UdpSender::open(settings)?;
                 let mut facts = socket_facts(settings, sender.granted());
@@ -84,13 +87,13 @@ impl OpenSocket {
                 let text = format!("{} bytes, {configured} configured", mtu.packet_bytes);
                 facts.push(("path MTU".to_owned(), text));
                 let longest = datagram_bytes_max(launch, mtu);
-                (Ends::Sender(Box::new(sender), longest), facts, None)
+                (Ends::Sender(Box::new(sender), longest), facts, (None, None))
             }
             Side::Ingress => {
                 let receiver = UdpReceiver::open(settings)?;
                 let facts = socket_facts(settings, receiver.granted());
-                let (receiver, replay) = emulate(receiver, launch, start)?;
-                (Ends::Receiver(receiver), facts, replay)
+                let (receiver, replay, switch) = emulate(receiver, launch, start)?;
+                (Ends::Receiver(receiver), facts, (replay, switch))
             }
         };
         if let Some(emulation) = &launch.emulation {
@@ -108,6 +111,7 @@ impl OpenSocket {
             facts,
             tally: None,
             replay,
+            switch,
         })
     }
 
@@ -148,6 +152,7 @@ impl OpenSocket {
             facts,
             tally,
             replay: None,
+            switch: None,
         })
     }
 }
@@ -231,8 +236,12 @@ fn held_bytes_max(launch: &DirectionLaunch) -> usize {
     message.max(512).min(launch.socket.path_mtu_bytes)
 }
 
-/// A receiver, and what its link model met of the trace that it replays.
-type Emulated = (Box<dyn DatagramReceiver>, Option<ReplayTally>);
+/// A receiver, what its link model met of the trace that it replays, and where the model is changed.
+type Emulated = (
+    Box<dyn DatagramReceiver>,
+    Option<ReplayTally>,
+    Option<SwitchHandle>,
+);
 
 /// Puts the receiver behind the launch's link model, if it has one. Greetings and clock exchanges
 /// pass freely: the model stands for what happens to the robot's messages.
@@ -242,23 +251,25 @@ fn emulate(
     start: &RunStart,
 ) -> Result<Emulated, GatewayError> {
     let Some(emulation) = &launch.emulation else {
-        return Ok((Box::new(receiver), None));
+        return Ok((Box::new(receiver), None, None));
     };
     let link = SinceStart {
         link: emulation.model(&launch.channel)?,
         start: start.clone(),
     };
+    let room = room(emulation, launch)?;
+    let replay = link.replay_tally();
+    let (link, switch) = switch(link, &launch.channel, (emulation, room));
     let settings = EmulatedSettings {
-        capacity_count: room(emulation, launch)?.capacity_count,
+        capacity_count: room.capacity_count,
         datagram_bytes_max: held_bytes_max(launch),
         clock: Some(MonotonicClock::now),
         number_of: Some(message_number),
     };
     let is_exempt =
         |bytes: &[u8]| wire::decode(bytes).is_ok_and(|datagram| datagram.header.kind != Kind::Data);
-    let replay = link.replay_tally();
     let receiver = EmulatedReceiver::new(receiver, Box::new(link), is_exempt, settings);
-    Ok((Box::new(receiver), replay))
+    Ok((Box::new(receiver), replay, Some(switch)))
 }
 
 /// Which message of its channel a datagram carries, or a part of.
@@ -267,6 +278,9 @@ fn message_number(bytes: &[u8]) -> Option<MessageNumber> {
     (header.kind == Kind::Data).then_some(MessageNumber {
         start: header.epoch,
         sequence: header.sequence,
+        // The smallest integer stands for a message without a stamp.
+        published: (header.published_ns != i64::MIN)
+            .then(|| RemoteInstant::from_ns(header.published_ns)),
     })
 }
 

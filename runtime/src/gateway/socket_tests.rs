@@ -71,11 +71,12 @@ fn outages_count_from_the_start_of_the_run_on_every_channel_alike() {
     assert!(lost_count > 1_000, "{lost_count}");
 }
 
-/// A piece of three of a message of 300 bytes.
+/// A piece of three of a message of 300 bytes, published every 10 ms.
 fn piece(sequence: u64, index: u16) -> Vec<u8> {
     let mut bytes = vec![0; wire::HEADER_BYTES + 100];
     Header {
         sequence,
+        published_ns: i64::try_from(sequence).unwrap() * 10_000_000,
         total_len: 300,
         fragment_index: index,
         fragment_count: 3,

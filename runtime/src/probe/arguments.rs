@@ -6,6 +6,8 @@ use std::time::Duration;
 use clap::{Args, Subcommand, ValueEnum};
 use hil_gateways::capture::flow::FlowFilter;
 
+use super::tap::TapChoice;
+
 const EXAMPLES: &str = "\
 Examples:
   hil-runtime probe --interface eth0 --output here.pcapng
@@ -14,6 +16,8 @@ Examples:
       RTP through a bridge with two ports, known again by its sequence number
   hil-runtime probe -i eth0 -o card.pcapng --stamps card
       with the network card's own stamps of what arrives beside the kernel's
+  hil-runtime probe -i eth0 -o queued.pcapng --tap packet
+      by a packet ring: what leaves is stamped behind the queueing discipline instead of before it
   ip netns exec robot hil-runtime probe -i eth0 -o robot.pcapng
       the same in another network namespace
   hil-runtime probe analyse here.pcapng there.pcapng
@@ -27,7 +31,7 @@ Flows: hil (our datagrams), egm:port=6510, udp:CONDITIONS; conditions with comma
 
 Exit codes: 0 done; 1 packets were dropped, an interface failed, a file has a fault, or the figures
 differ; 2 wrong arguments, nothing to read, or a capture without anything of the run; 69 no such interface; 78 the right to capture is missing (root or
-CAP_NET_RAW) or the card gives no stamps; 130 interrupted before --duration was over, the file is complete";
+CAP_NET_RAW), --tap bpf cannot be had, or the card gives no stamps; 130 interrupted before --duration was over, the file is complete";
 
 /// Look at the wire without taking part: capture, analyse, compare with a run.
 #[derive(Debug, Args)]
@@ -74,6 +78,9 @@ pub(crate) struct LiveArgs {
     /// sets the card up (`CAP_NET_ADMIN`) and puts it back.
     #[arg(long, value_enum, default_value = "kernel")]
     pub(crate) stamps: Stamps,
+    /// What takes the packets.
+    #[arg(long, value_enum, default_value = "auto")]
+    pub(crate) tap: TapChoice,
     /// Print no progress.
     #[arg(long, short)]
     pub(crate) quiet: bool,

@@ -10,7 +10,7 @@ use hil_gateways::transport::packet_ring::{PacketRing, RingCounters, RingSetting
 use hil_gateways::transport::ring_frame::StampSource;
 use hil_gateways::transport::timestamping::TimestampCapabilities;
 
-use super::live::{LiveError, Output, append, counters_of, flow_list};
+use super::live::{LiveError, Output, append, flow_list, told};
 use crate::card_clock::guard::GuardedCard;
 
 /// Reads of the card's clock of which the narrowest counts.
@@ -134,7 +134,7 @@ impl CardTap {
         buffer: &mut Vec<u8>,
     ) -> Result<CardResult, LiveError> {
         let end = self.clock.as_ref().ok().and_then(|(_, clock)| read(clock));
-        let counters = counters_of(&mut self.ring, &self.name)?;
+        let counters = told(self.ring.counters(), &self.name)?;
         let span = (on_card(from_ns, self.start), on_card(to_ns, end));
         let counts = (counters.matched_count, counters.dropped_count);
         let comment = format!(

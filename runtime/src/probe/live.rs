@@ -10,12 +10,12 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use hil_gateways::capture::flow::FlowFilter;
 use hil_gateways::capture::writer::{self, PacketToWrite};
 use hil_gateways::capture::{CaptureInterface, Direction, link_type as link};
-use hil_gateways::transport::packet_ring::{
-    PacketRing, RingCounters, RingError, RingSettings, RingStamps,
-};
+use hil_gateways::transport::live_tap::{LiveTap, TapEngine};
+use hil_gateways::transport::packet_ring::{RingCounters, RingError, RingSettings, RingStamps};
 use hil_gateways::transport::ring_frame::{RingPacket, StampSource};
 
 use super::card_tap::{CardResult, CardTap};
+use super::tap::{self, TapChoice};
 use crate::console::Console;
 use crate::signals::Signals;
 
@@ -39,6 +39,7 @@ pub(super) struct Request {
     pub(super) ring_bytes: usize,
     /// Whose stamps the file is to have, besides the kernel's.
     pub(super) stamps: RingStamps,
+    pub(super) tap: TapChoice,
 }
 
 /// Why a capture failed. What was written until then is a file of whole blocks.
@@ -63,10 +64,15 @@ pub(super) enum LiveError {
 #[derive(Debug, Clone, Default)]
 pub(super) struct InterfaceResult {
     pub(super) name: String,
+    /// What took the packets, in words.
+    pub(super) tapped: String,
     pub(super) inbound_count: u64,
     pub(super) outbound_count: u64,
-    /// Stamped by the tap itself, because the kernel had not yet.
+    /// Stamped by the tap itself, because the kernel had not yet; departures by eBPF, which are
+    /// always, are not counted.
     pub(super) late_stamp_count: u64,
+    /// How often the clock of the tap's own stamps was set anew.
+    pub(super) step_count: u64,
     pub(super) counters: RingCounters,
     /// The interface was taken down or has gone.
     pub(super) has_failed: bool,
@@ -85,8 +91,10 @@ pub(super) struct LiveResult {
 }
 
 struct Tap {
-    ring: PacketRing,
+    ring: LiveTap,
     card: Option<CardTap>,
+    /// Number of the interface when it was opened: names are given anew.
+    index: Option<u32>,
     /// When the interface had gone, nanoseconds since 1970.
     gone_ns: Option<u64>,
     result: InterfaceResult,
@@ -139,7 +147,8 @@ pub(super) fn capture(
         } = tap.result.counters;
         let span = (start_ns, tap.gone_ns.unwrap_or(end_ns).max(start_ns));
         let counts = (matched_count, dropped_count);
-        writer::statistics(&mut file.buffer, index, span, counts, None);
+        let comment = Some(tap.result.tapped.as_str());
+        writer::statistics(&mut file.buffer, index, span, counts, comment);
         if let Some(card) = tap.card.take() {
             let index = tap_count + index;
             tap.result.card = Some(card.finish(index, span, &mut file.buffer)?);
@@ -162,7 +171,11 @@ fn open_taps(request: &Request, console: &mut Console) -> Result<Vec<Tap>, LiveE
     };
     let mut taps: Vec<Tap> = Vec::with_capacity(request.interfaces.len());
     for name in &request.interfaces {
-        let ring = PacketRing::open(name, &request.flows, &settings)?;
+        let index = nix::net::if_::if_nametoindex(name.as_str()).ok();
+        let (ring, tapped, is_news) = tap::open(request.tap, name, &request.flows, &settings)?;
+        if is_news {
+            console.say(&format!("{name}: {tapped}"));
+        }
         let card = match request.stamps {
             RingStamps::Kernel => None,
             RingStamps::Card => {
@@ -180,9 +193,11 @@ fn open_taps(request: &Request, console: &mut Console) -> Result<Vec<Tap>, LiveE
         taps.push(Tap {
             ring,
             card,
+            index,
             gone_ns: None,
             result: InterfaceResult {
                 name: name.clone(),
+                tapped,
                 ..InterfaceResult::default()
             },
         });
@@ -199,6 +214,7 @@ fn describe(buffer: &mut Vec<u8>, request: &Request, taps: &[Tap]) {
     for tap in taps {
         let interface = CaptureInterface {
             name: Some(tap.result.name.clone()),
+            description: Some(tap.result.tapped.clone()),
             link_type: tap.ring.link_type(),
             snap_bytes: request.snap_bytes,
             ..CaptureInterface::default()
@@ -226,15 +242,16 @@ fn drain(
     }
     let link_type = tap.ring.link_type();
     let Tap { ring, result, .. } = tap;
+    let stamps_departures = ring.engine() == TapEngine::Bpf;
     // A ring that fills as fast as it is emptied must not keep the others waiting.
     for _ in 0..ring.frame_count() {
         let buffer = &mut file.buffer;
         let is_there = ring.next_packet(|packet| {
-            match packet.direction {
-                Direction::Outbound => result.outbound_count += 1,
-                _ => result.inbound_count += 1,
-            }
-            result.late_stamp_count += u64::from(packet.source == StampSource::Tap);
+            let is_outbound = packet.direction == Direction::Outbound;
+            result.outbound_count += u64::from(is_outbound);
+            result.inbound_count += u64::from(!is_outbound);
+            let is_late = packet.source == StampSource::Tap && !(is_outbound && stamps_departures);
+            result.late_stamp_count += u64::from(is_late);
             append(buffer, index, packet, link_type);
         });
         if !is_there {
@@ -245,20 +262,33 @@ fn drain(
     Ok(())
 }
 
-/// Says what has happened to the interface of a tap. One that is down may come up again; one that has
-/// gone does not come back under its number.
+/// Says what has happened to the interface of a tap, once. One that is down may come up again, under
+/// another name too; one that has gone does not come back under its number.
 fn watch(tap: &mut Tap, now_ns: u64, console: &mut Console) {
-    let Err(error) = tap.ring.check() else {
+    if tap.gone_ns.is_some() {
         return;
-    };
+    }
+    let told = tap.ring.check().err();
+    // Of an interface that was down before, the kernel does not tell a packet ring that it has gone.
+    let is_gone = (told.is_some() || tap.result.has_failed) && !is_there(tap.index);
+    if told.is_none() && !is_gone {
+        return;
+    }
     tap.result.has_failed = true;
-    let what = if nix::net::if_::if_nametoindex(tap.result.name.as_str()).is_ok() {
-        "nothing is captured until it is up again"
-    } else {
-        tap.gone_ns.get_or_insert(now_ns);
+    let what = if is_gone {
+        tap.gone_ns = Some(now_ns);
         "it has gone, and its part of the capture ends here"
+    } else {
+        "nothing is captured until it is up again"
     };
-    console.warn(&format!("{}: {error}: {what}", tap.result.name));
+    let why = told.map_or_else(String::new, |error| format!("{error}: "));
+    console.warn(&format!("{}: {why}{what}", tap.result.name));
+}
+
+/// Whether there is an interface of this number. For one that is missing `nix` gives an empty name.
+fn is_there(index: Option<u32>) -> bool {
+    let name = index.map(nix::net::if_::if_indextoname);
+    name.is_some_and(|name| name.is_ok_and(|name| !name.is_empty()))
 }
 
 /// Puts a packet into the file as it was on the wire, with the VLAN tag the kernel took out.
@@ -293,13 +323,18 @@ pub(super) fn append(
 }
 
 fn count(tap: &mut Tap) -> Result<(), LiveError> {
-    tap.result.counters = counters_of(&mut tap.ring, &tap.result.name)?;
+    tap.result.counters = told(tap.ring.counters(), &tap.result.name)?;
+    tap.result.step_count = tap.ring.step_count();
     Ok(())
 }
 
-pub(super) fn counters_of(ring: &mut PacketRing, name: &str) -> Result<RingCounters, LiveError> {
-    ring.counters().map_err(|source| LiveError::Counters {
-        interface: name.to_owned(),
+/// What the kernel counted, if it told.
+pub(super) fn told(
+    counters: io::Result<RingCounters>,
+    interface: &str,
+) -> Result<RingCounters, LiveError> {
+    counters.map_err(|source| LiveError::Counters {
+        interface: interface.to_owned(),
         source,
     })
 }
@@ -428,6 +463,14 @@ fn whole_blocks(buffer: &[u8], there_bytes: u64) -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_interface_is_known_by_its_number() {
+        let loopback = nix::net::if_::if_nametoindex("lo").ok();
+        assert!(loopback.is_some() && is_there(loopback));
+        assert!(!is_there(Some(0x7fff_fff0)), "nothing has that number");
+        assert!(!is_there(None));
+    }
 
     #[test]
     fn a_file_that_could_not_grow_is_cut_behind_its_last_whole_block() {

@@ -8,6 +8,7 @@ mod compare;
 mod files;
 mod live;
 mod point_clocks;
+mod tap;
 
 use core::fmt::Write as _;
 use std::path::Path;
@@ -18,7 +19,7 @@ use hil_gateways::transport::packet_ring::{RingError, RingStamps};
 
 use self::analyse::{Reading, Report};
 use self::arguments::{LiveArgs, ProbeArgs, ProbeWork, ReadingArgs, Stamps};
-use self::live::{LiveError, LiveResult, Request};
+use self::live::{InterfaceResult, LiveError, LiveResult, Request};
 use crate::console::Console;
 use crate::signals::{EXIT_INTERRUPTED, Signals};
 
@@ -184,6 +185,7 @@ fn capture(args: &LiveArgs) -> u8 {
             Stamps::Kernel => RingStamps::Kernel,
             Stamps::Card => RingStamps::Card,
         },
+        tap: args.tap,
         flows,
     };
     let signals = match Signals::install() {
@@ -202,9 +204,8 @@ fn capture(args: &LiveArgs) -> u8 {
                 LiveError::Ring(RingError::Size { .. } | RingError::LinkLayer { .. })
                 | LiveError::File { .. }
                 | LiveError::Exists { .. } => exit::USAGE,
-                LiveError::Ring(RingError::Rights { .. }) | LiveError::Card { .. } => {
-                    exit::HOST_UNFIT
-                }
+                LiveError::Ring(RingError::Rights { .. } | RingError::Program { .. })
+                | LiveError::Card { .. } => exit::HOST_UNFIT,
                 LiveError::Ring(RingError::Refused { .. }) | LiveError::Counters { .. } => {
                     exit::INTERNAL
                 }
@@ -213,38 +214,52 @@ fn capture(args: &LiveArgs) -> u8 {
     }
 }
 
+/// What came of one interface.
+fn tell(text: &mut String, one: &InterfaceResult) {
+    let _infallible = write!(
+        text,
+        "{}: {} in, {} out, {} dropped by the kernel, {}",
+        one.name, one.inbound_count, one.outbound_count, one.counters.dropped_count, one.tapped
+    );
+    if one.late_stamp_count > 0 {
+        let late = one.late_stamp_count;
+        let _infallible = write!(text, ", {late} stamped by the tap instead of in the stack");
+    }
+    if one.step_count > 0 {
+        let steps = one.step_count;
+        let _infallible = write!(
+            text,
+            ", {steps} changes of atomic time against the system clock: what left just before \
+             is stamped wrong by them"
+        );
+    }
+    if one.has_failed {
+        text.push_str(", interrupted");
+    }
+    text.push('\n');
+    if let Some(card) = &one.card {
+        let _infallible = writeln!(
+            text,
+            "{}: {} of {} arrivals have the card's stamp, the others the kernel's alone; {} \
+             dropped by the kernel; {}; the card {}",
+            one.name,
+            card.stamped_count,
+            card.stamped_count + card.unstamped_count,
+            card.counters.dropped_count,
+            card.granted,
+            card.restoring
+        );
+    }
+}
+
 fn conclude(request: &Request, result: &LiveResult, console: &mut Console) -> u8 {
     let mut text = String::new();
     let mut dropped_count = 0;
     for one in &result.interfaces {
+        tell(&mut text, one);
+        let of_card = one.card.as_ref();
         dropped_count += one.counters.dropped_count;
-        let _infallible = write!(
-            text,
-            "{}: {} in, {} out, {} dropped by the kernel",
-            one.name, one.inbound_count, one.outbound_count, one.counters.dropped_count
-        );
-        if one.late_stamp_count > 0 {
-            let late = one.late_stamp_count;
-            let _infallible = write!(text, ", {late} stamped by the tap instead of in the stack");
-        }
-        if one.has_failed {
-            text.push_str(", interrupted");
-        }
-        text.push('\n');
-        if let Some(card) = &one.card {
-            dropped_count += card.counters.dropped_count;
-            let _infallible = writeln!(
-                text,
-                "{}: {} of {} arrivals have the card's stamp, the others the kernel's alone; {} \
-                 dropped by the kernel; {}; the card {}",
-                one.name,
-                card.stamped_count,
-                card.stamped_count + card.unstamped_count,
-                card.counters.dropped_count,
-                card.granted,
-                card.restoring
-            );
-        }
+        dropped_count += of_card.map_or(0, |card| card.counters.dropped_count);
     }
     let _infallible = writeln!(
         text,

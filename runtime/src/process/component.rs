@@ -29,6 +29,8 @@ use crate::wait::{Pause, WaitMode, WaitStrategy};
 /// Records a ring holds: 4 s at 4 kHz, far more than the writer's period needs.
 const RING_RECORDS: usize = 16_384;
 const PROGRESS_PERIOD: Duration = Duration::from_millis(250);
+/// Stands for the skipped ticks of a role that never ticks.
+const NO_TIMER: u64 = u64::MAX;
 
 /// Why a component cannot run.
 #[derive(Debug, thiserror::Error)]
@@ -94,7 +96,8 @@ fn prepare_and_live(path: &Path, registry: &Registry) -> Result<(), ComponentErr
     };
     let mut lived = Ok(());
     if orders.wait_for_start() {
-        lived = live(endpoint, waiter.as_mut(), &orders, launch.wait, &mut report);
+        let how = (launch.wait, counts.skipped.as_ref());
+        lived = live(endpoint, waiter.as_mut(), &orders, how, &mut report);
         progress.store(false, Ordering::Release);
     }
     drop(waiter);
@@ -124,6 +127,8 @@ fn make_role(card: &ProcessCard, registry: &Registry) -> Result<Box<dyn Role>, C
 struct Counts {
     taken: Vec<Count>,
     given: Vec<Count>,
+    /// Ticks that passed without the role; [`NO_TIMER`] for one that has none.
+    skipped: Arc<AtomicU64>,
 }
 
 /// How many messages of a channel went which way.
@@ -154,6 +159,7 @@ impl Counts {
         Self {
             taken: card.inputs.iter().map(|one| count(one, "taken")).collect(),
             given: card.outputs.iter().map(given).collect(),
+            skipped: Arc::new(AtomicU64::new(NO_TIMER)),
         }
     }
 
@@ -172,6 +178,7 @@ impl Counts {
                 (progress, Arc::clone(&one.so_far))
             })
             .collect();
+        let skipped = Arc::clone(&self.skipped);
         let is_running = Arc::new(AtomicBool::new(true));
         let running = Arc::clone(&is_running);
         thread::Builder::new()
@@ -184,6 +191,10 @@ impl Counts {
                         ..progress.clone()
                     });
                     say(&FromProcess::Progress(counts.collect()));
+                    let skipped = skipped.load(Ordering::Relaxed);
+                    if skipped != NO_TIMER {
+                        say(&FromProcess::SkippedTicks(skipped));
+                    }
                 }
             })?;
         Ok(is_running)
@@ -316,14 +327,18 @@ fn live(
     mut endpoint: ComponentEndpoint,
     mut waiter: Option<&mut Waiter>,
     orders: &Orders,
-    mode: WaitMode,
+    (mode, skipped): (WaitMode, &AtomicU64),
     report: &mut ProcessReport,
 ) -> Result<(), ChannelError> {
     let own_wait = WaitStrategy::new(mode);
     endpoint.start(MonotonicClock::now());
     let mut outcome = Ok(());
     while outcome.is_ok() && !orders.is_stopping() {
+        let ticks = report.ticks;
         outcome = turn(&mut endpoint, &mut waiter, &own_wait, report);
+        if report.ticks != ticks {
+            skipped.store(endpoint.role().skipped_ticks(), Ordering::Relaxed);
+        }
     }
     report.skipped_ticks = endpoint.role().skipped_ticks();
     report.outbox_dropped = endpoint.role().outbox_dropped();

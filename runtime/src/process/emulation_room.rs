@@ -96,6 +96,13 @@ impl EmulationRoom {
     }
 }
 
+impl EmulationRoom {
+    /// The longest fixed delay that this much room holds at 100 messages per second.
+    pub fn longest_delay(&self) -> Duration {
+        Duration::from_secs_f64(self.capacity_count as f64 / LEAST_RATE_HZ)
+    }
+}
+
 /// Whether gateways can hold what every emulated link of `topology` leaves under way.
 ///
 /// # Errors

@@ -35,6 +35,8 @@ pub enum FromProcess {
     Ready,
     /// Counts so far, a few times a second.
     Progress(Vec<ChannelProgress>),
+    /// Grid points of the role's timer that passed without a tick so far; not of a role without one.
+    SkippedTicks(u64),
     /// A condition the user should hear about now.
     Warning(String),
     /// The last word of an orderly end.

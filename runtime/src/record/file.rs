@@ -15,6 +15,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use bytemuck::Pod;
+use hil_models::link::condition::LinkConditionRecord;
 use hil_models::measure::card_clock::CardClockRecord;
 use hil_models::measure::record::{
     EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
@@ -56,11 +57,14 @@ pub enum RecordKind {
     CardClock,
     /// [`RadioRecord`]s of a gateway on a wireless hop; the channel is `<process>/<interface>`.
     Radio,
+    /// [`LinkConditionRecord`]s of a gateway that emulates a link; the channel is that of the orders,
+    /// `hil/link/<link>/<direction>`.
+    LinkCondition,
 }
 
 impl RecordKind {
     /// Every kind, with the number that stands for it in the header and its name in file names.
-    const ALL: [(Self, u32, &'static str); 11] = [
+    const ALL: [(Self, u32, &'static str); 12] = [
         (Self::Published, 1, "published"),
         (Self::Taken, 2, "taken"),
         (Self::Egress, 3, "egress"),
@@ -72,6 +76,7 @@ impl RecordKind {
         (Self::FaceReceived, 9, "face-received"),
         (Self::CardClock, 10, "card-clock"),
         (Self::Radio, 15, "radio"),
+        (Self::LinkCondition, 16, "link-condition"),
     ];
 
     fn row(self) -> (Self, u32, &'static str) {
@@ -101,6 +106,7 @@ impl RecordKind {
             Self::FaceReceived => Some(size_of::<FaceReceivedRecord>()),
             Self::CardClock => Some(size_of::<CardClockRecord>()),
             Self::Radio => Some(size_of::<RadioRecord>()),
+            Self::LinkCondition => Some(size_of::<LinkConditionRecord>()),
             Self::Message => None,
         }
     }
@@ -187,7 +193,16 @@ impl RecordHeader {
         Ok(bytes)
     }
 
-    fn decode(path: &Path, bytes: &[u8]) -> Result<Self, RecordFileError> {
+    /// The name of the process that wrote the file called `name`, which has this header; `None`
+    /// when the name is not made as [`RecordHeader::file_name`] makes it.
+    pub fn writer<'a>(&self, name: &'a str) -> Option<&'a str> {
+        let start = format!("{}.{}.", self.channel.replace('/', "."), self.kind.row().2);
+        let end = format!(".{}.rec", self.instance);
+        name.strip_prefix(&start)?.strip_suffix(&end)
+    }
+
+    /// Reads a header off the beginning of a file.
+    pub(crate) fn decode(path: &Path, bytes: &[u8]) -> Result<Self, RecordFileError> {
         let Some(header) = bytes.first_chunk::<HEADER_BYTES>() else {
             return Err(malformed(
                 path,

@@ -7,6 +7,7 @@ pub mod emulation;
 pub(crate) mod event_log;
 pub mod face;
 mod face_warnings;
+pub mod link_change;
 pub mod network;
 pub(crate) mod page;
 pub mod radio;

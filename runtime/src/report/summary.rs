@@ -11,13 +11,14 @@ use std::path::{Path, PathBuf};
 
 use hil_models::case_study::{Metric, Score};
 use hil_models::link::trace::ReplayCounts;
-use hil_models::measure::account::{ChannelAccount, OutageFigures};
+use hil_models::measure::account::{ChannelAccount, MessageFate, OutageFigures};
 use serde::{Deserialize, Serialize};
 
 use super::assessment::Assessment;
 use super::clock_summary::ClockSection;
 use super::emulation::EmulationFigures;
 use super::face::FaceSummary;
+use super::link_change::LinkChange;
 use super::network::NetworkReport;
 use super::radio::RadioReport;
 use super::score_event::ScoreEvents;
@@ -44,6 +45,9 @@ pub struct RunSummary {
     pub processes: Vec<ProcessSummary>,
     /// What happened, in order of time.
     pub events: Vec<RunEvent>,
+    /// Changes of emulated links while the run went on, by hand or by a program, in order of time.
+    #[serde(default)]
+    pub link_changes: Vec<LinkChange>,
     /// The channels, in the order of the case study.
     pub channels: Vec<ChannelSummary>,
     /// Arms that went through a face to a foreign program.
@@ -79,6 +83,7 @@ impl RunSummary {
             clocks: None,
             processes: Vec::new(),
             events: Vec::new(),
+            link_changes: Vec::new(),
             channels: Vec::new(),
             faces: Vec::new(),
             hardware_stamps: None,
@@ -315,6 +320,16 @@ impl LinkKind {
             Self::Tcp => "TCP",
             Self::Emulated => "emulated link",
             Self::RecordOnly => "recorded only",
+        }
+    }
+}
+
+impl LinkKind {
+    /// The words for a fate of a message on it: what an emulated link lost, no wire did.
+    pub const fn fate_label(self, fate: MessageFate) -> &'static str {
+        match (self, fate) {
+            (Self::Emulated, MessageFate::LostOnWire) => "lost by the emulated link",
+            (_, fate) => fate.label(),
         }
     }
 }

@@ -11,6 +11,7 @@ use nix::sys::resource::{UsageWho, getrusage};
 use nix::sys::time::TimeVal;
 
 use crate::console::Console;
+use crate::progress::line;
 use crate::signals::Signals;
 use crate::study::Cost;
 
@@ -125,22 +126,7 @@ impl<'a> Pool<'a> {
             labels.push(self.batch.label(task));
         }
         let share = (done / self.batch.task_count().max(1) as f64).min(1.0);
-        let elapsed_s = elapsed.as_secs_f64();
-        // Before the first hundredth an estimate would only be noise.
-        let left = if share >= 0.01 {
-            format!(
-                ", about {} left",
-                clock_text(elapsed_s * (1.0 - share) / share)
-            )
-        } else {
-            String::new()
-        };
-        let labels = labels.join(" | ");
-        format!(
-            "{:3.0} %  {}{left}  {labels}",
-            100.0 * share,
-            clock_text(elapsed_s)
-        )
+        line(Some(share), elapsed, &labels.join(" | "))
     }
 }
 
@@ -151,15 +137,6 @@ impl<'a> Pool<'a> {
 )]
 fn parts(share: f64) -> u64 {
     (share.clamp(0.0, 1.0) * SHARE_UNIT) as u64
-}
-
-/// Seconds as `m:ss`.
-fn clock_text(seconds: f64) -> String {
-    format!(
-        "{:.0}:{:02.0}",
-        (seconds / 60.0).floor(),
-        (seconds % 60.0).floor()
-    )
 }
 
 /// Processor time this process has used so far, in user and in kernel mode.
@@ -246,12 +223,5 @@ mod tests {
         let (outcomes, cost) = pool.run(&signals, &mut Console::new(true));
         assert_eq!(cost.ended_count, 0);
         assert!(outcomes.iter().all(Option::is_none));
-    }
-
-    #[test]
-    fn times_read_like_a_clock() {
-        assert_eq!(clock_text(0.0), "0:00");
-        assert_eq!(clock_text(59.9), "0:59");
-        assert_eq!(clock_text(754.0), "12:34");
     }
 }

@@ -30,6 +30,11 @@ pub(crate) struct Child {
 }
 
 impl Child {
+    /// Its process id.
+    pub(crate) fn id(&self) -> u32 {
+        self.process.id()
+    }
+
     /// Starts a process that speaks the pipe protocol; its words arrive at `words` marked with
     /// `index` and `instance`. Standard error goes to `log`.
     ///

@@ -66,8 +66,10 @@ pub(crate) struct Member {
     pub(crate) report: Option<ProcessReport>,
     pub(crate) end: Option<String>,
     pub(crate) progress: Vec<ChannelProgress>,
-    child: Option<Child>,
-    is_ready: bool,
+    /// Ticks of its timer that passed without it, as it last said.
+    pub(crate) skipped_tick_count: Option<u64>,
+    pub(super) child: Option<Child>,
+    pub(super) is_ready: bool,
     seen_alive: Instant,
     complaint: Option<String>,
 }
@@ -82,7 +84,7 @@ pub(crate) struct Crew {
     sender: SyncSender<Word>,
     words: Receiver<Word>,
     /// When the run began.
-    started: Option<Instant>,
+    pub(super) started: Option<Instant>,
     events: Vec<Event>,
 }
 
@@ -100,6 +102,7 @@ impl Crew {
             report: None,
             end: None,
             progress: Vec::new(),
+            skipped_tick_count: None,
             child: None,
             is_ready: false,
             seen_alive: Instant::ZERO,
@@ -313,6 +316,7 @@ impl Crew {
                     }
                 }
                 FromProcess::Progress(progress) => member.progress = progress,
+                FromProcess::SkippedTicks(count) => member.skipped_tick_count = Some(count),
                 FromProcess::Warning(text) => self.note(now, index, text, None),
                 FromProcess::Finished(report) => member.report = Some(*report),
                 FromProcess::Failed(text) => member.complaint = Some(text),
@@ -390,6 +394,12 @@ impl Crew {
             self.members[index].end = Some(end);
         }
         self.listen();
+    }
+
+    /// Names of the processes.
+    pub(crate) fn names(&self) -> Vec<String> {
+        let members = self.members.iter();
+        members.map(|member| member.plan.name.clone()).collect()
     }
 
     /// The processes with their history.

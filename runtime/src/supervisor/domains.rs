@@ -1,17 +1,28 @@
 //! The shared-memory domains a supervisor owns: one per host that runs here, with every channel
 //! created and held, so that the processes it starts only ever open.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::thread;
+use std::time::{Duration, Instant as WallInstant};
+
+use hil_models::link::condition::{LinkOrder, ORDER_TYPE_NAME};
 
 use super::plan::{HostPlan, domain_base, domain_root};
 use crate::channel::{ChannelError, ChannelHolder, ChannelSettings, Domain, DomainError, TypeInfo};
+use crate::gateway::link_control::ORDERS_MAX;
+use crate::topology::Channel;
+use crate::watch::{observer_depth, withdraw_abandoned};
 
 /// Writers at a time: one, and its successor while the dead one is not cleaned up yet.
 const WRITERS_MAX: usize = 2;
 /// Readers at a time: consumer or gateway, its successor, and room for four observers.
 const READERS_MAX: usize = 6;
+/// Observers look about fifty times a second and leave when they see that the run is over; one that
+/// does not has its memory taken from under it.
+const OBSERVERS_LEAVE_WITHIN: Duration = Duration::from_millis(500);
+const OBSERVERS_PAUSE: Duration = Duration::from_millis(5);
 
 /// Why a domain could not be made.
 #[derive(Debug, thiserror::Error)]
@@ -87,6 +98,20 @@ impl Domains {
         }
     }
 
+    /// Waits until all observers have left, a little while at most: what leaves in order leaves
+    /// nothing behind.
+    pub(crate) fn let_observers_leave(&self) {
+        let deadline = WallInstant::now() + OBSERVERS_LEAVE_WITHIN;
+        let is_observed = || {
+            self.hosts
+                .iter()
+                .any(|host| host.domain.observer_count() > 0)
+        };
+        while is_observed() && WallInstant::now() < deadline {
+            thread::sleep(OBSERVERS_PAUSE);
+        }
+    }
+
     /// Deletes everything; says what could not be deleted.
     pub(crate) fn remove(self) -> Vec<String> {
         let mut left = Vec::new();
@@ -123,13 +148,32 @@ fn sweep(base: &Path) {
     let Ok(entries) = fs::read_dir(base) else {
         return;
     };
-    for entry in entries.flatten() {
+    let paths = entries.flatten().map(|entry| entry.path());
+    let roots: Vec<PathBuf> = paths.filter(|path| Domain::is_at(path)).collect();
+    // All of them first: a run is announced in the domain of each of its hosts, and goes on for
+    // observers while any of these is locked.
+    for root in &roots {
+        withdraw_abandoned(root);
+    }
+    for root in &roots {
         // A domain in use is locked and refuses; anything else there is not a domain's folder.
-        if Domain::is_at(&entry.path())
-            && let Ok(domain) = Domain::create(&entry.path())
+        if Domain::is_at(root)
+            && let Ok(domain) = Domain::create(root)
         {
             domain.remove();
         }
+    }
+}
+
+/// What the channel allows, not what its consumer asks for: observers of messages that nobody
+/// records come by less often than a consumer.
+fn depth_max(channel: &Channel, observed: &BTreeSet<String>) -> usize {
+    if observed.contains(&channel.name) {
+        channel
+            .depth
+            .max(observer_depth(channel.message.size_bytes))
+    } else {
+        channel.depth
     }
 }
 
@@ -145,18 +189,19 @@ fn create_host(
         source,
     })?;
     let mut holders = Vec::new();
-    for channel in &plan.channels {
-        let settings = ChannelSettings {
-            name: channel.name.clone(),
-            message: TypeInfo {
-                name: channel.message.name.clone(),
-                size_bytes: channel.message.size_bytes,
-                alignment_bytes: channel.message.alignment_bytes,
-            },
-            depth_max: channel.depth,
-            writers_max: WRITERS_MAX,
-            readers_max: READERS_MAX,
-        };
+    let of_messages = plan.channels.iter().map(|channel| ChannelSettings {
+        name: channel.name.clone(),
+        message: TypeInfo {
+            name: channel.message.name.clone(),
+            size_bytes: channel.message.size_bytes,
+            alignment_bytes: channel.message.alignment_bytes,
+        },
+        depth_max: depth_max(channel, &plan.observed),
+        writers_max: WRITERS_MAX,
+        readers_max: READERS_MAX,
+    });
+    let of_orders = plan.orders.iter().map(|name| order_settings(name));
+    for settings in of_messages.chain(of_orders) {
         let holder =
             ChannelHolder::create(&domain, &settings).map_err(|source| DomainsError::Channel {
                 host: host.clone(),
@@ -169,4 +214,19 @@ fn create_host(
         holders,
         domain,
     })
+}
+
+/// A channel for orders to an emulated link: one gives them at a time, the gateway takes them.
+fn order_settings(name: &str) -> ChannelSettings {
+    ChannelSettings {
+        name: name.to_owned(),
+        message: TypeInfo {
+            name: ORDER_TYPE_NAME.to_owned(),
+            size_bytes: size_of::<LinkOrder>(),
+            alignment_bytes: align_of::<LinkOrder>(),
+        },
+        depth_max: ORDERS_MAX,
+        writers_max: WRITERS_MAX,
+        readers_max: WRITERS_MAX,
+    }
 }

@@ -14,8 +14,10 @@ pub(crate) mod peer;
 pub(crate) mod plan;
 mod progress_line;
 mod session;
+mod teller;
 
 pub use domains::DomainsError;
 pub use meet::PeerError;
 pub use outcome::{Outcome, RunError, RunOptions, RunResult};
+pub(crate) use plan::domain_base_candidates;
 pub use session::run;

@@ -1,13 +1,14 @@
 //! From a checked topology to what this supervisor starts: domains, channels, processes. It
 //! starts nothing itself.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use hil_models::egm::messages::Side as ArmSide;
 use hil_models::egm::parameters::{ControllerSettings, EgmParameters};
+use hil_models::link::condition::order_channel;
 use nix::unistd::{AccessFlags, Uid, access};
 
 use super::clock_path;
@@ -19,6 +20,7 @@ use crate::topology::{
     ProcessCard, Program, Scheduling, Topology, Via, Wait, command_channel, feedback_channel,
 };
 use crate::wait::WaitMode;
+use crate::watch::{self, Source};
 
 /// Everything one supervisor is responsible for.
 #[derive(Debug)]
@@ -36,6 +38,11 @@ pub(crate) struct HostPlan {
     pub(crate) name: String,
     /// Channels in shared memory with an end on this host.
     pub(crate) channels: Vec<Channel>,
+    /// Channels for orders to the directions of emulated links that are emulated here.
+    pub(crate) orders: BTreeSet<String>,
+    /// Names of those whose messages no process here records: who wants to see them looks into
+    /// the shared memory of this host.
+    pub(crate) observed: BTreeSet<String>,
 }
 
 /// A process to start here.
@@ -116,9 +123,15 @@ pub(crate) fn plan(topology: &Topology, hosts: &[&Host]) -> Plan {
                     .filter_map(|name| topology.process(name))
                     .any(|process| process.host == host.name)
         });
+        let observed = topology.channels().iter().filter(|channel| {
+            let source = watch::source(topology, channel, &is_here);
+            matches!(source, Some(Source::SharedMemory { host: at, .. }) if at == host.name)
+        });
         HostPlan {
             name: host.name.clone(),
+            observed: observed.map(|channel| channel.name.clone()).collect(),
             channels: channels.cloned().collect(),
+            orders: order_channels(topology, host),
         }
     });
     let clock_paths = hosts.iter().flat_map(|host| clock_path::on(topology, host));
@@ -135,6 +148,17 @@ pub(crate) fn plan(topology: &Topology, hosts: &[&Host]) -> Plan {
         hosts: host_plans.collect(),
         processes,
     }
+}
+
+/// The channels for orders to what is emulated on `host`: it receives.
+fn order_channels(topology: &Topology, host: &Host) -> BTreeSet<String> {
+    let seed = topology.run().seed;
+    topology
+        .crossings()
+        .filter(|crossing| crossing.to_host.name == host.name)
+        .filter_map(|crossing| EmulationLaunch::of(&crossing, seed))
+        .map(|emulation| order_channel(&emulation.link, emulation.way))
+        .collect()
 }
 
 /// What the gateway process of `link` on `host` is called, in reports and in record files.
@@ -364,19 +388,24 @@ pub(crate) fn domain_base(base: Option<&PathBuf>) -> PathBuf {
     base.cloned().unwrap_or_else(default_domain_base)
 }
 
-/// `/run/hil` where this user may use it, else the user's own runtime folder, else a folder of the
-/// user's own among the temporary ones.
+/// The first candidate that this user may use; the last one is the user's own.
 fn default_domain_base() -> PathBuf {
     let is_usable = |folder: &PathBuf| {
         std::fs::create_dir_all(folder).is_ok() && access(folder, AccessFlags::W_OK).is_ok()
     };
+    let mut candidates = domain_base_candidates();
+    let last = candidates.pop().unwrap_or_default();
+    candidates.into_iter().find(is_usable).unwrap_or(last)
+}
+
+/// Where domains lie by default: `/run/hil`, else the user's own runtime folder, else a folder of
+/// the user's own among the temporary ones.
+pub(crate) fn domain_base_candidates() -> Vec<PathBuf> {
     let runtime_folder =
         std::env::var_os("XDG_RUNTIME_DIR").map(|path| PathBuf::from(path).join("hil"));
-    [Some(PathBuf::from("/run/hil")), runtime_folder]
-        .into_iter()
-        .flatten()
-        .find(is_usable)
-        .unwrap_or_else(|| std::env::temp_dir().join(format!("hil-{}", Uid::current())))
+    let own = std::env::temp_dir().join(format!("hil-{}", Uid::current()));
+    let candidates = [Some(PathBuf::from("/run/hil")), runtime_folder, Some(own)];
+    candidates.into_iter().flatten().collect()
 }
 
 #[cfg(test)]

@@ -16,18 +16,20 @@ use super::meet::{Meeting, meet};
 use super::outcome::{Heard, Outcome, RunError, RunOptions, RunResult};
 use super::peer::{Peer, PeerEvent};
 use super::plan::{ProcessPlan, plan};
-use super::progress_line;
+use super::teller::Teller;
 use crate::card_clock::CardWatch;
 use crate::channel::clock_id;
 use crate::clock::MonotonicClock;
 use crate::clock_discipline::HostDiscipline;
 use crate::console::Console;
 use crate::host_facts::HostFacts;
+use crate::live::status::Phase;
 use crate::manifest;
 use crate::process::emulation_room::check_emulation;
 use crate::run_folder::{RunFolder, utc_text};
 use crate::signals::Signals;
 use crate::topology::{Host, Topology};
+use crate::watch::Announcement;
 
 /// How often the supervisor looks after everything.
 const WATCH_PERIOD: Duration = Duration::from_millis(5);
@@ -35,7 +37,6 @@ const WATCH_PERIOD: Duration = Duration::from_millis(5);
 /// restarted process is to be back.
 const CLEANUP_PERIOD: Duration = Duration::from_millis(100);
 const ALIVE_PERIOD: Duration = Duration::from_millis(500);
-const PROGRESS_PERIOD: Duration = Duration::from_millis(500);
 /// How long components and gateways may take to end in order.
 const STOP_PATIENCE: Duration = Duration::from_secs(3);
 /// How long the other hosts wait for the first host's word that the time is up.
@@ -64,20 +65,31 @@ pub fn run(
     let folder = make_folder(topology, &hosts)?;
     let facts = HostFacts::gather();
     let discipline = HostDiscipline::gather().ok();
-    manifest::write(topology, options, &folder, &facts).map_err(|source| RunError::Folder {
+    let unwritable = |source| RunError::Folder {
         folder: folder.root().to_owned(),
         source,
-    })?;
+    };
+    manifest::write(topology, options, &folder, &facts).map_err(unwritable)?;
     let run = folder.root().to_string_lossy();
     let domains = Domains::create(&plan.hosts, options.domain_root.as_ref(), &run)?;
     console.say(&format!("run folder {}", folder.root().display()));
     let peers = gather_peers(topology, &hosts, &domains, (signals, console))?;
     let here = clock_id()?;
     let crew = Crew::new(plan.processes, domains.addresses(), &folder)?;
+    let announcement = Announcement::make(
+        topology,
+        &folder,
+        domains.addresses(),
+        crew.names(),
+        clocks_known(topology, &hosts, &peers, here),
+    );
+    let announcement = announcement.map_err(unwritable)?;
     // Before the gateways: they find out by sending what the cards deliver.
     let cards = CardWatch::start(topology, &hosts, &folder.records());
+    let teller = Teller::new(folder.root());
     let mut session = Session {
         topology,
+        announcement,
         cards,
         is_first_host: topology
             .hosts()
@@ -92,7 +104,7 @@ pub fn run(
         discipline,
         cleaned: WallInstant::now(),
         greeted: WallInstant::now(),
-        told: WallInstant::now(),
+        teller,
     };
     let begun = session.begin(topology.run().start_timeout);
     let start = MonotonicClock::now();
@@ -108,6 +120,12 @@ pub fn run(
 
 fn is_here(host: &Host, hosts: &[&Host]) -> bool {
     hosts.iter().any(|here| here.name == host.name)
+}
+
+/// Whether all hosts read one clock, where this host has met them all.
+fn clocks_known(topology: &Topology, hosts: &[&Host], peers: &[Peer], here: u64) -> Option<bool> {
+    let has_met_all = peers.len() + hosts.len() == topology.hosts().len();
+    has_met_all.then(|| peers.iter().all(|peer| peer.hello.clock_id == here))
 }
 
 fn make_folder(topology: &Topology, hosts: &[&Host]) -> Result<RunFolder, RunError> {
@@ -171,6 +189,8 @@ fn gather_peers(
 
 struct Session<'a> {
     topology: &'a Topology,
+    // Before the domains: its files lie beside theirs.
+    announcement: Announcement,
     cards: CardWatch,
     is_first_host: bool,
     /// All hosts of the run read one clock.
@@ -185,7 +205,7 @@ struct Session<'a> {
     discipline: Option<HostDiscipline>,
     cleaned: WallInstant,
     greeted: WallInstant,
-    told: WallInstant,
+    teller: Teller,
 }
 
 impl Session<'_> {
@@ -208,6 +228,7 @@ impl Session<'_> {
                 Some(Outcome::EndedEarly(text)) => return Err(Outcome::Failed(text)),
                 Some(outcome) => return Err(outcome),
             }
+            self.tell(Phase::Starting);
             let is_ready = self.crew.is_ready();
             if is_ready && !has_told && !self.is_first_host {
                 self.say_to_all(&PeerMessage::Ready);
@@ -234,6 +255,8 @@ impl Session<'_> {
             if is_ready && may_begin {
                 let has_one_clock = self.has_one_clock;
                 self.say_to_all(&PeerMessage::Start { has_one_clock });
+                // Only observers read it; they do without.
+                let _is_said = self.announcement.say_clock(has_one_clock).is_ok();
                 self.crew.begin();
                 return Ok(());
             }
@@ -271,7 +294,7 @@ impl Session<'_> {
             if elapsed >= duration + grace {
                 return Outcome::Completed;
             }
-            self.show_progress(elapsed, duration);
+            self.tell(Phase::Running);
             thread::sleep(WATCH_PERIOD);
         }
     }
@@ -341,22 +364,15 @@ impl Session<'_> {
         heard
     }
 
-    fn show_progress(&mut self, elapsed: Duration, duration: Duration) {
-        if self.told.elapsed() < PROGRESS_PERIOD {
-            return;
-        }
-        self.told = WallInstant::now();
-        let members = self.crew.members().iter();
-        let progress = members.flat_map(|member| &member.progress);
-        let channels = progress_line::of_channels(self.topology, progress);
-        let (elapsed_s, total_s) = (elapsed.as_secs_f64(), duration.as_secs_f64());
-        self.console
-            .progress(&format!("{elapsed_s:6.1} / {total_s:.0} s  {channels}"));
+    fn tell(&mut self, phase: Phase) {
+        let run = (self.topology, &self.crew);
+        self.teller.tell(phase, run, self.console);
     }
 
     /// Ends components everywhere first, then gateways, so that what is under way arrives, and last
     /// the clock paths, so that an exchange follows the last message.
     fn stop(&mut self, outcome: &Outcome) {
+        self.tell(Phase::Ending);
         let reason = outcome.text();
         let meaning = outcome.meaning();
         self.say_to_all(&PeerMessage::Stop { reason, meaning });
@@ -417,6 +433,9 @@ impl Session<'_> {
         }
         let has_one_clock = self.has_one_clock;
         drop(self.crew);
+        drop(self.teller);
+        self.announcement.withdraw();
+        self.domains.let_observers_leave();
         let left = self.domains.remove();
         problems.extend(
             left.into_iter()

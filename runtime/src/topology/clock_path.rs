@@ -155,6 +155,8 @@ fn end_of(host: &Host, before: &[(&Host, &Host)]) -> Option<SocketAddr> {
 pub(super) struct ClockEntry {
     pub path: String,
     pub place: Place,
+    /// Of the port, or of the address where the port is the default.
+    pub port_place: Place,
 }
 
 /// Reads the keys of a host's clock path.
@@ -181,6 +183,7 @@ pub(super) fn read(reader: &mut Reader<'_>) -> (Option<ClockEnd>, Option<ClockEn
     let entry = place.map(|place| ClockEntry {
         path: reader.path.clone(),
         place,
+        port_place: reader.place_of("clock_port").unwrap_or(place),
     });
     (end, entry)
 }
@@ -352,7 +355,7 @@ fn check_ports(
 ) {
     let add = |fault: String| {
         let key = join(&entry.path, "clock_port");
-        faults.add(key, Some(entry.place), Fault::Inconsistent(fault));
+        faults.add(key, Some(entry.port_place), Fault::Inconsistent(fault));
     };
     let pairs = topology.clock_pairs();
     let is_own = |(one, other): &&(&Host, &Host)| one.name == host.name || other.name == host.name;

@@ -53,9 +53,16 @@ pub use model::{
 };
 pub use model_links::{Emulation, Gateway, Hop, Link, Timestamps, Via};
 
+pub(crate) use units::parse_duration;
+
 use check::Needs;
 use errors::Place;
 use layers::Layers;
+
+/// A duration as topology files write it, such as `40 s`; `None` when it is none.
+pub fn read_duration(text: &str) -> Option<std::time::Duration> {
+    parse_duration(text).ok()
+}
 
 /// Reads the topology file at `path` and all it extends, lays the `overrides` (each
 /// `key.path=value`) over it, and checks the result against the cases the program knows.

@@ -56,6 +56,11 @@ impl<'t> Reader<'t> {
         self.table.contains_key(key)
     }
 
+    /// Where the value of `key` stands; does not make the key known.
+    pub(super) fn place_of(&self, key: &str) -> Option<Place> {
+        self.table.get(key).map(|node| node.place)
+    }
+
     /// True when `key` is a table; does not make the key known.
     pub(super) fn is_table(&self, key: &str) -> bool {
         let node = self.table.get(key);

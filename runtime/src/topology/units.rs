@@ -14,7 +14,7 @@ const UNITS: &[(&str, u128)] = &[
 
 /// Why a text is no duration.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub(super) enum DurationError {
+pub(crate) enum DurationError {
     #[error("has no number before its unit")]
     NoNumber,
     #[error("has no unit")]
@@ -28,7 +28,7 @@ pub(super) enum DurationError {
 }
 
 /// Reads `20 s`, `4ms`, `1.5 us`.
-pub(super) fn parse_duration(text: &str) -> Result<Duration, DurationError> {
+pub(crate) fn parse_duration(text: &str) -> Result<Duration, DurationError> {
     let text = text.trim();
     let end = text
         .find(|letter: char| !letter.is_ascii_digit() && letter != '.')

@@ -10,6 +10,7 @@ use hil_models::trace::{
     Trace, TraceArrival, TraceDirection, TraceHeader, TraceRecord, UNAVAILABLE_NS,
 };
 
+use crate::analysis::link_changes;
 use crate::analysis::records::RunRecords;
 use crate::report::summary::{Fact, RunSummary};
 use crate::supervisor::RunResult;
@@ -17,6 +18,8 @@ use crate::topology::{Crossing, Direction, Topology, Via};
 
 /// What a trace of clocks without a relation says of them.
 pub(crate) const NOT_ALIGNED: &str = "clocks not aligned";
+/// What follows the name of a link that was changed while the run went on, before how often.
+pub(super) const CHANGED_BY_HAND: &str = " (changed by hand";
 
 /// The file of `channel` in a folder of traces.
 pub(crate) fn file_name(channel: &str) -> String {
@@ -67,7 +70,10 @@ fn write_one(
         return Ok(false);
     }
     let trace = Trace {
-        header: header(run.1, crossing, &found),
+        header: TraceHeader {
+            link: link_words(run.0, crossing, records),
+            ..header(run.1, crossing, &found)
+        },
         records: found,
     };
     let bytes = wire::encode(&trace).map_err(|error| error.to_string())?;
@@ -99,6 +105,20 @@ fn header(result: &RunResult, crossing: &Crossing<'_>, records: &[TraceRecord]) 
         origin_ns: span.map_or(UNAVAILABLE_NS, |(start, _)| start.as_ns()),
         duration_ns: span.map_or(UNAVAILABLE_NS, |(start, end)| end.ns_since(*start)),
     }
+}
+
+/// The link, and how often it was changed while the run went on: its model alone does not explain the
+/// trace then.
+fn link_words(topology: &Topology, crossing: &Crossing<'_>, records: &RunRecords) -> String {
+    let name = &crossing.link.name;
+    let count = link_changes::in_force_on(topology, records, crossing).count();
+    let words = match count {
+        0 => return cut(name, TraceHeader::LINK_BYTES),
+        1 => format!("{CHANGED_BY_HAND} once)"),
+        count => format!("{CHANGED_BY_HAND} {count} times)"),
+    };
+    let room = TraceHeader::LINK_BYTES - words.len();
+    cut(name, room) + &words
 }
 
 /// As much of a name as fits, at the border of a character.

@@ -18,6 +18,8 @@ const FIT_EXAMPLES: &str = "\
 Examples:
   hil-runtime trace fit runs/NAME/traces/shuttle.command.trace
       loss and delay laws, ranked, with what speaks against each
+  hil-runtime trace fit runs/NAME
+      every trace of a run, as [links.NAME.forward] and .backward; a second channel's as a remark
   hil-runtime trace fit FILE --link wlan >> my-topology.toml
       the best laws as [links.wlan]; the table goes to standard error
 
@@ -58,9 +60,9 @@ pub enum TraceCommand {
         /// Seed of the resampling behind the probabilities.
         #[arg(long, default_value_t = 1)]
         seed: u64,
-        /// Name of the link in the lines that are printed.
-        #[arg(long, default_value = "hop")]
-        link: String,
+        /// Name of the link in the lines that are printed; else what the trace calls it, or `hop`.
+        #[arg(long)]
+        link: Option<String>,
     },
     /// Plot traces in the terminal, and as CSV.
     #[command(after_help = PLOT_EXAMPLES)]

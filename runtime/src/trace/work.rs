@@ -1,15 +1,19 @@
 //! What `hil-runtime trace` does: reads, computes, prints and writes. The figures are
 //! `hil_models::trace`'s, the page is `report::terminal`'s.
 
+use core::fmt::Write as _;
+use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
 
 use hil_models::plot::PlotSeries;
 use hil_models::trace::figures::TraceFigures;
 use hil_models::trace::fit::TraceFit;
-use hil_models::trace::{Trace, csv, netem, opportunities, wire};
+use hil_models::trace::netem::NetemTable;
+use hil_models::trace::{Trace, TraceDirection, csv, netem, opportunities, wire};
 use serde_json::{Value, json};
 
+use super::capture::CHANGED_BY_HAND;
 use super::cli::{TraceCommand, TraceFiles, TraceForm};
 use super::open::{Opened, files, open};
 use super::plots;
@@ -43,11 +47,18 @@ pub(crate) fn work(command: TraceCommand, columns: usize, console: &mut Console)
             console.result(&page);
             Ok(Value::Null)
         }),
-        TraceCommand::Fit { files, seed, link } => {
-            each(&files, console, &mut |opened, is_json, console| {
+        TraceCommand::Fit {
+            files: asked,
+            seed,
+            link,
+        } => {
+            let is_one = files(&asked.files).is_ok_and(|all| all.len() == 1);
+            let mut written = FittedLinks::new(link, is_one);
+            each(&asked, console, &mut |opened, is_json, console| {
                 let fit = TraceFit::of(&opened.trace, seed);
+                let toml = written.toml(opened, &fit);
                 if is_json {
-                    return Ok(json!({ "file": opened.path, "fit": fit, "toml": fit.toml(&link) }));
+                    return Ok(json!({ "file": opened.path, "fit": fit, "toml": toml }));
                 }
                 let header = &opened.trace.header;
                 console.rendered(&terminal::render_fit(
@@ -56,7 +67,7 @@ pub(crate) fn work(command: TraceCommand, columns: usize, console: &mut Console)
                     columns,
                     Style::Coloured,
                 ));
-                console.result(&fit.toml(&link));
+                console.result(&toml);
                 Ok(Value::Null)
             })
         }
@@ -72,6 +83,89 @@ pub(crate) fn work(command: TraceCommand, columns: usize, console: &mut Console)
             force,
         } => convert(&from, (&into, to, force), console),
     }
+}
+
+/// The links that were printed so far, so that what several traces come to is one topology.
+struct FittedLinks {
+    /// What the user calls the link; else each trace's own name of it.
+    named: Option<String>,
+    /// One trace speaks for both directions.
+    is_one: bool,
+    tables: BTreeSet<String>,
+}
+
+impl FittedLinks {
+    const fn new(named: Option<String>, is_one: bool) -> Self {
+        Self {
+            named,
+            is_one,
+            tables: BTreeSet::new(),
+        }
+    }
+
+    /// The lines for one trace, and above them where they come from.
+    fn toml(&mut self, opened: &Opened, fit: &TraceFit) -> String {
+        let header = &opened.trace.header;
+        let (own, is_changed) = match header.link.split_once(CHANGED_BY_HAND) {
+            Some((name, _)) => (name, true),
+            None => (header.link.as_str(), false),
+        };
+        let own = Some(own).filter(|name| !name.is_empty());
+        let link = key(self.named.as_deref().or(own).unwrap_or("hop"));
+        let changed = if is_changed {
+            "# the link was changed by hand: the fit mixes its conditions\n"
+        } else {
+            ""
+        };
+        let source = format!(
+            "# {} of {}, direction {}\n{changed}",
+            header.channel,
+            opened.path.display(),
+            header.direction.word()
+        );
+        if self.is_one {
+            return format!("{source}{}", fit.toml(&link));
+        }
+        let toml = fit.toml_of_direction(&link, header.direction);
+        let is_first = self.tables.insert(link.clone());
+        let opening = if is_first && header.direction != TraceDirection::Unknown {
+            format!("[links.{link}]\nvia = \"emulated\"\n\n")
+        } else {
+            String::new()
+        };
+        if self
+            .tables
+            .insert(format!("{link}.{}", header.direction.word()))
+        {
+            return format!("{opening}{source}{toml}\n");
+        }
+        // A second table of one name would make the file invalid.
+        let lines: Vec<String> = toml.lines().map(|line| format!("# {line}")).collect();
+        format!(
+            "{source}# another channel's fit of this direction stands above; to take this one instead:\n{}\n\n",
+            lines.join("\n")
+        )
+    }
+}
+
+/// `name` as a key of TOML: quoted where a bare key cannot say it.
+fn key(name: &str) -> String {
+    let is_bare = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_');
+    if !name.is_empty() && name.chars().all(is_bare) {
+        return name.to_owned();
+    }
+    let mut quoted = String::from("\"");
+    for c in name.chars() {
+        match c {
+            '"' | '\\' => quoted.extend(['\\', c]),
+            c if c.is_control() => {
+                write!(quoted, "\\u{:04X}", u32::from(c)).expect("writing to a string cannot fail");
+            }
+            c => quoted.push(c),
+        }
+    }
+    quoted.push('"');
+    quoted
 }
 
 /// Opens every file and hands it on; what is wrong with one is said and does not keep the others.
@@ -241,14 +335,29 @@ fn converted(trace: &Trace, form: TraceForm) -> Result<(Vec<u8>, String), String
             let table = netem::table(trace).ok_or("fewer than two delays, or all are equal")?;
             let remark = format!(
                 "; use it as: netem delay {:.0}us {:.0}us distribution FILE. Not kept: losses, and \
-                 the order of the delays; {}",
+                 the order of the delays{}; {}",
                 table.mean_ns / 1e3,
                 table.deviation_ns / 1e3,
+                cut_words(&table),
                 bound_words(trace)
             );
             Ok((table.text.into_bytes(), remark))
         }
     }
+}
+
+/// What of the delays no table of netem's can say.
+fn cut_words(table: &NetemTable) -> String {
+    if table.cut_count == 0 {
+        return String::new();
+    }
+    let share = 100.0 * table.cut_count as f64 / netem::TABLE_COUNT as f64;
+    let most_ns = table.mean_ns + 4.0 * table.deviation_ns;
+    format!(
+        ". Cut: {share:.2} % of the delays, more than four deviations from the mean, where the table \
+         ends ({:.3} ms)",
+        most_ns / 1e6
+    )
 }
 
 /// How far the clocks may have led the delays of `trace` astray.
@@ -273,6 +382,26 @@ fn form_of(path: &Path) -> Option<TraceForm> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_link_of_any_name_is_one_key() {
+        for name in [
+            "hop",
+            "a-b_9",
+            "a.b",
+            "",
+            "two words",
+            "say \"x\\\"",
+            "tab\t",
+            "µ",
+        ] {
+            let text = format!("[links.{}]\nvia = \"emulated\"\n", key(name));
+            let table: toml::Table = toml::from_str(&text).unwrap();
+            assert_eq!(table["links"][name]["via"].as_str(), Some("emulated"));
+        }
+        assert_eq!(key("hop"), "hop");
+        assert_eq!(key("a.b"), "\"a.b\"");
+    }
 
     #[test]
     fn a_form_is_told_by_the_ending() {

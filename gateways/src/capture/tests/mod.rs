@@ -5,7 +5,7 @@ mod containers;
 mod frames;
 mod joins;
 mod mutations;
-mod programs;
+pub(crate) mod programs;
 
 use super::reader::{CaptureReader, Step};
 use super::{CaptureFault, CaptureInterface, Direction};

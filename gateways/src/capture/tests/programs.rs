@@ -10,7 +10,7 @@ use super::super::program::{Instruction, code, compile};
 use super::{message, udp_frame};
 
 /// Bytes the program keeps of `packet`.
-fn run(program: &[Instruction], packet: &[u8]) -> u32 {
+pub(crate) fn run(program: &[Instruction], packet: &[u8]) -> u32 {
     let load = |at: u32, count: usize| -> Option<u32> {
         let bytes = packet.get(at as usize..at as usize + count)?;
         Some(
@@ -54,7 +54,8 @@ fn run(program: &[Instruction], packet: &[u8]) -> u32 {
     }
 }
 
-fn is_of(flows: &[FlowFilter], link: u16, packet: &[u8]) -> bool {
+/// Whether the analyser finds a packet to be of the flows.
+pub(crate) fn is_of(flows: &[FlowFilter], link: u16, packet: &[u8]) -> bool {
     let Ok(datagram) = udp_datagram(link, packet) else {
         return false;
     };
@@ -65,57 +66,65 @@ fn is_of(flows: &[FlowFilter], link: u16, packet: &[u8]) -> bool {
     })
 }
 
+/// Flows to try, so that every condition and every mixture is there.
+pub(crate) const FLOW_SETS: [&[&str]; 4] = [
+    &["hil"],
+    &["hil:dst=10.77.0.2", "udp:port=7000"],
+    &[
+        "udp:sport=7000,src=10.77.0.1",
+        "egm:dport=6510",
+        "hil:port=9",
+    ],
+    &["udp:src=fd00::1,dst=fd00::2", "udp:dst=10.77.0.9"],
+];
+
+/// A packet with or without what the flows ask for: tags, fragments, IPv6, other protocols.
+pub(crate) fn made_up_frame(random: &mut RandomStream, case: u64, link: u16) -> Vec<u8> {
+    let ports = [9, 6510, 7000, 7001];
+    let mut pick = || ports[usize::try_from(random.next_u64() % 4).unwrap()];
+    let payload = if case.is_multiple_of(3) {
+        vec![7; 30]
+    } else {
+        message(case)
+    };
+    let mut frame = udp_frame((pick(), pick()), &payload);
+    if random.chance(0.2) {
+        frame[33] = 9;
+    }
+    if random.chance(0.1) {
+        frame[20 + usize::from(random.chance(0.5))] = 0x21;
+    }
+    if random.chance(0.1) {
+        frame[23] = 6;
+    }
+    if random.chance(0.3) {
+        let mut six = frame[..12].to_vec();
+        six.extend([0x86, 0xdd, 0x60, 0, 0, 0, 0, frame[39], 17, 64]);
+        for last in [1, 2] {
+            six.extend([0xfd, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, last]);
+        }
+        six.extend(&frame[34..]);
+        frame = six;
+    }
+    if link == link_type::RAW {
+        frame.drain(..14);
+    } else if random.chance(0.3) {
+        frame.splice(12..12, [0x81, 0, 0, 5]);
+    }
+    frame
+}
+
 #[test]
 fn the_kernels_filter_and_the_analyser_agree_on_every_packet() {
-    let sets = [
-        vec!["hil"],
-        vec!["hil:dst=10.77.0.2", "udp:port=7000"],
-        vec![
-            "udp:sport=7000,src=10.77.0.1",
-            "egm:dport=6510",
-            "hil:port=9",
-        ],
-        vec!["udp:src=fd00::1,dst=fd00::2", "udp:dst=10.77.0.9"],
-    ];
-    let ports = [9, 6510, 7000, 7001];
     let mut random = RandomStream::new(5, "filters");
     let mut pass_count = 0;
-    for set in sets {
+    for set in FLOW_SETS {
         let flows: Vec<FlowFilter> = set.iter().map(|text| text.parse().unwrap()).collect();
         for link in [link_type::ETHERNET, link_type::RAW] {
             let program = compile(link, &flows, 99).unwrap();
             assert!(program.len() < 256);
             for case in 0..25_000_u64 {
-                let mut pick = || ports[usize::try_from(random.next_u64() % 4).unwrap()];
-                let payload = if case % 3 == 0 {
-                    vec![7; 30]
-                } else {
-                    message(case)
-                };
-                let mut frame = udp_frame((pick(), pick()), &payload);
-                if random.chance(0.2) {
-                    frame[33] = 9;
-                }
-                if random.chance(0.1) {
-                    frame[20 + usize::from(random.chance(0.5))] = 0x21;
-                }
-                if random.chance(0.1) {
-                    frame[23] = 6;
-                }
-                if random.chance(0.3) {
-                    let mut six = frame[..12].to_vec();
-                    six.extend([0x86, 0xdd, 0x60, 0, 0, 0, 0, frame[39], 17, 64]);
-                    for last in [1, 2] {
-                        six.extend([0xfd, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, last]);
-                    }
-                    six.extend(&frame[34..]);
-                    frame = six;
-                }
-                if link == link_type::RAW {
-                    frame.drain(..14);
-                } else if random.chance(0.3) {
-                    frame.splice(12..12, [0x81, 0, 0, 5]);
-                }
+                let frame = made_up_frame(&mut random, case, link);
                 let is_kept = run(&program, &frame) == 99;
                 assert_eq!(
                     is_kept,

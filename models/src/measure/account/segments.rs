@@ -392,7 +392,7 @@ impl<'a> SegmentBook<'a> {
         let bound = BoundFigures::of(self.end_to_end_bounds_ns.clone());
         let exact = self.path.has_one_clock().then_some(0);
         EndToEnd {
-            distribution: self.end_to_end.distribution(reason),
+            distribution: Distribution::of_samples(samples, reason),
             bins: self.end_to_end.bins(),
             p50_interval: block_bootstrap_quantile(samples, 0.5, CONFIDENCE, random),
             p99_interval: block_bootstrap_quantile(samples, 0.99, CONFIDENCE, random),

@@ -3,7 +3,7 @@
 use core::time::Duration;
 
 use super::goodness::ks_distance;
-use super::{Fit, REFUSED_BELOW, Ranking, duration_text};
+use super::{Fit, NEARLY_FIXED, REFUSED_BELOW, Ranking, duration_text};
 use crate::case_study::ParameterError;
 use crate::link::delay::{
     DELAY_MAX, DelayLaw, Exponential, Histogram, LogNormal, Normal, Pareto, Uniform,
@@ -374,6 +374,12 @@ fn fixed(ascending: &[f64]) -> Result<Fit, String> {
         (median - smallest) * 1e3,
         (largest - median) * 1e3
     );
+    let hundredth = ascending.len() / 100;
+    let (early, late) = (
+        ascending[hundredth],
+        ascending[ascending.len() - 1 - hundredth],
+    );
+    fit.is_nearly_fixed = (median - early).max(late - median) <= NEARLY_FIXED * median;
     fit.toml = format!(
         "\n[links.LINK.delay]\nlaw = \"fixed\"\ndelay = {}\n",
         duration_text(median)

@@ -9,14 +9,17 @@ mod loss;
 
 use serde::{Deserialize, Serialize};
 
-use super::Trace;
 use super::figures::{TraceFigures, known_losses};
+use super::{Trace, TraceDirection};
 use crate::measure::histogram::Distribution;
 
 pub use goodness::ChiSquare;
 
 /// Below this probability of its own data a model is not taken.
 pub const REFUSED_BELOW: f64 = 0.05;
+
+/// Delays so near their middle, relative to it, may be those of a fixed delay on busy hosts.
+const NEARLY_FIXED: f64 = 0.05;
 
 /// One model of one property.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -41,6 +44,9 @@ pub struct Fit {
     pub ks_probability: Option<f64>,
     /// What to write into `[links.<name>]`.
     pub toml: String,
+    /// A fixed delay from which few delays differ by much.
+    #[serde(default)]
+    pub is_nearly_fixed: bool,
 }
 
 impl Fit {
@@ -56,6 +62,7 @@ impl Fit {
             ks_distance: None,
             ks_probability: None,
             toml: String::new(),
+            is_nearly_fixed: false,
         }
     }
 
@@ -85,6 +92,25 @@ impl Ranking {
             best: None,
             why: why.to_owned(),
         }
+    }
+
+    /// A remark with a fixed delay in place of a fitted distribution, where nearly all delays are
+    /// within [`NEARLY_FIXED`] of their middle: that much may well be the hosts and not the link.
+    fn fixed_instead(&self, table: &str) -> String {
+        let fixed = self.fits.iter().enumerate().find_map(|(index, fit)| {
+            let wanted = fit.is_nearly_fixed && self.best != Some(index);
+            wanted.then_some(fit)
+        });
+        fixed.map_or_else(String::new, |fit| {
+            let lines = fit.toml.replace("LINK", table);
+            let lines = lines.lines().filter(|line| !line.is_empty());
+            let lines: Vec<String> = lines.map(|line| format!("#   {line}")).collect();
+            let lines = lines.join("\n");
+            format!(
+                "\n# 98 % of the delays are within {} % of their middle. If such a spread is the hosts' own:\n{lines}\n",
+                NEARLY_FIXED * 100.0
+            )
+        })
     }
 
     fn sort(fits: &mut [Fit]) {
@@ -167,7 +193,8 @@ impl TraceFit {
         }
         if losses.len() > loss::ASCENT_MAX {
             remarks.push(format!(
-                "the law of Gilbert and Elliott was sought in {} of {} messages, in stretches spread                  over the run; its likelihood, and all of the other loss laws, is of all.",
+                "the law of Gilbert and Elliott was sought in {} of {} messages, in stretches spread \
+                 over the run; its likelihood, and all of the other loss laws, is of all.",
                 loss::ASCENT_MAX,
                 losses.len()
             ));
@@ -183,13 +210,30 @@ impl TraceFit {
         }
     }
 
-    /// `[links.<name>]` with the best laws.
+    /// `[links.<name>]` with the best laws, for both directions.
     pub fn toml(&self, link: &str) -> String {
-        let best = |ranking: &Ranking| {
+        self.toml_of(link, "via = \"emulated\"\n")
+    }
+
+    /// The same as `[links.<name>.<direction>]`, for a file in which `[links.<name>]` stands already;
+    /// as [`TraceFit::toml`] where the direction is not known.
+    pub fn toml_of_direction(&self, link: &str, direction: TraceDirection) -> String {
+        match direction {
+            TraceDirection::Unknown => self.toml(link),
+            known => self.toml_of(&format!("{link}.{}", known.word()), ""),
+        }
+    }
+
+    fn toml_of(&self, table: &str, via: &str) -> String {
+        let best = |what: &str, ranking: &Ranking| {
             let fit = ranking.best.map(|index| &ranking.fits[index]);
-            fit.map(|fit| fit.toml.replace("LINK", link))
-                .unwrap_or_default()
+            // What is missing is said: without its key a link loses nothing and takes no time.
+            fit.map_or_else(
+                || format!("# no {what}: {}\n", ranking.why),
+                |fit| fit.toml.replace("LINK", table),
+            )
         };
+        let (loss, delay) = (best("loss", &self.loss), best("delay", &self.delay));
         let bound = match (self.tested_delay_count, self.delay_bound_ns) {
             (0, _) | (_, Some(0)) => String::new(),
             (_, Some(ns)) => format!(
@@ -201,10 +245,9 @@ impl TraceFit {
             }
         };
         format!(
-            "{bound}[links.{link}]\nvia = \"emulated\"\n{}{}",
             // A ratio of losses is a key of the link and no table: it goes before them.
-            best(&self.loss),
-            best(&self.delay)
+            "{bound}[links.{table}]\n{via}{loss}{}{delay}",
+            self.delay.fixed_instead(table)
         )
     }
 }

@@ -174,8 +174,26 @@ fn what_has_no_formula_falls_to_the_histogram_and_what_is_constant_to_fixed() {
     let same = TraceFit::of(&trace(&[false; 100], || 0.005), 1);
     assert_eq!(best(&same.delay).law, "fixed");
     assert!(same.toml("hop").contains("delay = \"5 ms\""));
+    assert!(!same.toml("hop").contains("# 98 %"));
+    // A host's jitter on a fixed delay is fitted as it is, and the fixed delay said beside it.
+    let mut jitter = RandomStream::new(4, "jitter");
+    let host = TraceFit::of(
+        &trace(&[false; 500], || 0.02 + 3e-4 * jitter.uniform().powi(3)),
+        1,
+    );
+    assert_ne!(best(&host.delay).law, "fixed");
+    assert!(
+        host.toml("hop").contains("#   law = \"fixed\""),
+        "{}",
+        host.toml("hop")
+    );
     let few = TraceFit::of(&trace(&[true; 100], || 0.005), 1);
     assert_eq!(few.delay.best, None);
+    assert!(
+        few.toml("hop").contains("# no delay: "),
+        "{}",
+        few.toml("hop")
+    );
     assert_eq!(best(&few.loss).law, "bernoulli");
 }
 

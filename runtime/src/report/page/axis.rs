@@ -20,6 +20,9 @@ enum Scale {
     Nines,
 }
 
+/// Fewer values beside an axis do not show its scale.
+const TICKS_MIN: usize = 3;
+
 impl Axis {
     /// From `low` to `high`; a span of nothing is widened so that there is something to draw in.
     pub(super) fn linear((low, high): (f64, f64), (from_px, until_px): (f64, f64)) -> Self {
@@ -97,6 +100,19 @@ impl Axis {
         let steps = [1.0, 2.0, 5.0, 10.0].map(|factor| factor * base);
         let step = steps.into_iter().find(|step| *step >= rough);
         let step = step.unwrap_or(10.0 * base);
+        let mut ticks = self.stepped(unit, step);
+        // Few round values lie between neighbouring ones: one tick alone gives no scale.
+        for finer in [2.0, 5.0, 10.0, 20.0] {
+            if ticks.len() >= TICKS_MIN {
+                break;
+            }
+            ticks = self.stepped(unit, step / finer);
+        }
+        ticks
+    }
+
+    /// Every multiple of `step` on the axis, with words that tell neighbours apart.
+    fn stepped(&self, unit: Unit, step: f64) -> Vec<(f64, String)> {
         let step = if unit == Unit::Count {
             step.max(1.0)
         } else {
@@ -106,14 +122,27 @@ impl Axis {
         let mut index = (self.low / step - 1e-9).ceil();
         while index * step <= self.high + step * 1e-9 && ticks.len() < 16 {
             let value = index * step;
-            ticks.push((value, unit.words(value, step)));
+            ticks.push((value, unit.words_apart(value, step)));
             index += 1.0;
         }
         ticks
     }
 
     fn decades(&self, unit: Unit) -> Vec<(f64, String)> {
+        let ticks = self.within_decades(unit, &[]);
+        if ticks.len() >= TICKS_MIN {
+            return ticks;
+        }
+        let ticks = self.within_decades(unit, &[1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0]);
+        if ticks.len() >= TICKS_MIN {
+            return ticks;
+        }
+        self.linear_ticks(unit)
+    }
+
+    fn within_decades(&self, unit: Unit, wanted: &[f64]) -> Vec<(f64, String)> {
         let factors: &[f64] = match (self.high / self.low).log10() {
+            _ if !wanted.is_empty() => wanted,
             ..2.0 => &[1.0, 2.0, 5.0],
             2.0..4.0 if (self.until_px - self.from_px).abs() > 400.0 => &[1.0, 3.0],
             _ => &[1.0],
@@ -185,6 +214,30 @@ impl Unit {
             Self::Seconds | Self::Number | Self::Count => number(value, step),
             Self::Share => format!("{}{JOINT}%", number(value * 100.0, step * 100.0)),
         }
+    }
+}
+
+impl Unit {
+    /// As [`Self::words`], but with as many digits as tell values apart that differ by `step`.
+    fn words_apart(self, value: f64, step: f64) -> String {
+        let ns = match self {
+            Self::Nanoseconds => 1.0,
+            Self::Length => 1e9,
+            Self::Seconds | Self::Number | Self::Count | Self::Share => {
+                return self.words(value, step);
+            }
+        };
+        let units = [(1e9, "s"), (1e6, "ms"), (1e3, "µs"), (1.0, "ns")];
+        let fits = |unit: &&(f64, &str)| value.abs() * ns >= unit.0 * 0.999_999;
+        let (scale, word) = units.iter().find(fits).unwrap_or(&units[3]);
+        // Three digits are what the words have by themselves.
+        if step * ns / scale * 1e3 > value.abs() * ns / scale {
+            return self.words(value, step);
+        }
+        format!(
+            "{}{JOINT}{word}",
+            number(value * ns / scale, step * ns / scale)
+        )
     }
 }
 
@@ -269,5 +322,26 @@ mod tests {
         }
         assert!((Axis::nines(2.0, (100.0, 0.0)).at(0.99) - 0.0).abs() < 1e-6);
         assert!((Axis::nines(2.0, (100.0, 0.0)).at(0.0) - 100.0).abs() < 1e-6);
+    }
+    #[test]
+    fn values_near_each_other_still_have_a_scale() {
+        for (low, high) in [
+            (4.9e-3, 5.05e-3),
+            (5.001e-3, 5.003e-3),
+            (0.9e-3, 1.1e-3),
+            (7.0, 7.9),
+        ] {
+            let axes = [
+                Axis::linear((low, high), (100.0, 20.0)),
+                Axis::logarithmic((low, high), (100.0, 20.0)),
+            ];
+            for axis in axes {
+                let ticks = axis.ticks(Unit::Length);
+                assert!(ticks.len() >= TICKS_MIN, "{low} to {high}: {ticks:?}");
+                let mut words: Vec<&String> = ticks.iter().map(|tick| &tick.1).collect();
+                words.dedup();
+                assert_eq!(words.len(), ticks.len(), "{ticks:?}");
+            }
+        }
     }
 }

@@ -11,7 +11,8 @@ use hil_models::measure::statistics::{CONFIDENCE, IntervalNs, wilson};
 use super::data::{Channel, Figure, Table};
 use super::figures::waterfall::Bar;
 use super::words::{UNAVAILABLE, count, ns_s};
-use crate::report::terminal::{JOINT, duration, grouped, percent};
+use crate::report::summary::LinkKind;
+use crate::report::terminal::{JOINT, counted, duration, grouped, percent};
 
 /// What there is of one channel.
 #[derive(Debug, Clone, Copy, Default)]
@@ -19,6 +20,8 @@ pub(super) struct Sources<'a> {
     /// True for a channel that goes over a network or the model of one.
     pub(super) crosses: bool,
     pub(super) account: Option<&'a ChannelAccount>,
+    /// How a live run carried it.
+    pub(super) link: Option<LinkKind>,
     pub(super) network: Option<&'a NetworkFigures>,
     pub(super) outages: Option<&'a OutageFigures>,
     /// Of virtual time: published, taken, in flight.
@@ -56,7 +59,7 @@ pub(super) fn fill(channel: &mut Channel, sources: &Sources<'_>) {
     }
     if let Some(account) = sources.account {
         channel.tables.push(segment_table(account));
-        channel.tables.extend(fate_table(account));
+        channel.tables.extend(fate_table(account, sources.link));
         channel.tables.extend(stamp_table(account));
     }
 }
@@ -311,11 +314,8 @@ fn outage_figures(outages: &OutageFigures) -> Vec<Figure> {
         } else {
             ""
         };
-        let lost = grouped(one.lost_count);
-        format!(
-            "from {:.3}{JOINT}s, {lost} messages lost{open}",
-            ns_s(one.start_ns)
-        )
+        let lost = counted(one.lost_count, "message");
+        format!("from {:.3}{JOINT}s, {lost} lost{open}", ns_s(one.start_ns))
     });
     let longest = longest.map(|one| ns_s(one.length_ns));
     vec![
@@ -411,7 +411,7 @@ pub(super) fn segment_name(segment: &SegmentFigures) -> String {
     format!("{}{combined}", segment.name())
 }
 
-fn fate_table(account: &ChannelAccount) -> Option<Table> {
+fn fate_table(account: &ChannelAccount, link: Option<LinkKind>) -> Option<Table> {
     let total = account.published_count;
     if total == 0 {
         return None;
@@ -427,9 +427,10 @@ fn fate_table(account: &ChannelAccount) -> Option<Table> {
         } else {
             UNAVAILABLE.to_owned()
         };
+        let label = link.map_or(fate.label(), |link| link.fate_label(fate));
         table
             .rows
-            .push(vec![fate.label().to_owned(), grouped(count), share]);
+            .push(vec![label.to_owned(), grouped(count), share]);
     }
     Some(table)
 }

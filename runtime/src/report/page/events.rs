@@ -2,16 +2,19 @@
 //! and what follows what.
 
 use hil_models::case_study::Severity;
+use hil_models::measure::network::NetworkEventKind;
 
 use super::data::{Event, EventList};
 use super::drawings;
 use super::words::UNAVAILABLE;
-use crate::report::network::{Correlation, NetworkReport};
+use crate::report::network::{Correlation, NetworkReport, TimedEvent};
 use crate::report::score_event::{ExplainedEvent, ScoreEvents};
 use crate::report::terminal::{self, grouped, percent, seconds};
 
-/// Events of the score and of the network that a page lists.
+/// Events of the score that a page lists.
 const EVENTS_MAX: usize = 200;
+/// Events of the network that a page lists: under independent losses there are hundreds alike.
+const NETWORK_EVENTS_MAX: usize = 40;
 
 pub(super) fn score_events(events: &ScoreEvents) -> EventList {
     let total = events.events.len();
@@ -102,14 +105,15 @@ fn score_event(event: &ExplainedEvent, clocks_differ: bool) -> Event {
 }
 
 pub(super) fn network_events(report: &NetworkReport) -> EventList {
-    let listed = report.events.iter().take(EVENTS_MAX).map(|event| Event {
+    let chosen = longest(&report.events);
+    let shown = chosen.len() as u64;
+    let listed = chosen.into_iter().map(|event| Event {
         at: seconds(event.from_s),
         severity: "network",
         what: event.words(),
         beside: Vec::new(),
     });
     let total = report.events.len() as u64 + report.events_dropped_count;
-    let shown = report.events.len().min(EVENTS_MAX) as u64;
     let chance = percent(report.foregoing_chance_ratio);
     let window = terminal::duration_s(report.foregoing_s);
     let mut note = format!(
@@ -118,13 +122,62 @@ pub(super) fn network_events(report: &NetworkReport) -> EventList {
     );
     if total > shown {
         let (shown, total) = (grouped(shown), grouped(total));
-        note.push_str(&[" The first ", &shown, " of ", &total, "."].concat());
+        note.push_str(&[" The ", &shown, " longest of ", &total, " events"].concat());
+        note.push_str(&[": ", &kinds(&report.events), ". All are in summary.json"].concat());
+        if report.events_dropped_count > 0 {
+            let dropped = grouped(report.events_dropped_count);
+            note.push_str(&[", but for ", &dropped, " that found no room"].concat());
+        }
+        note.push('.');
     }
     EventList {
         grave_count: 0,
         events: listed.collect(),
         note,
     }
+}
+
+/// The longest events, in order of time; what lasts to the end is the longest.
+fn longest(events: &[TimedEvent]) -> Vec<&TimedEvent> {
+    let mut chosen: Vec<&TimedEvent> = events.iter().collect();
+    if chosen.len() > NETWORK_EVENTS_MAX {
+        let length = |event: &TimedEvent| {
+            event
+                .until_s
+                .map_or(f64::MAX, |until_s| until_s - event.from_s)
+        };
+        chosen.sort_by(|a, b| length(b).total_cmp(&length(a)));
+        chosen.truncate(NETWORK_EVENTS_MAX);
+        chosen.sort_by(|a, b| a.from_s.total_cmp(&b.from_s));
+    }
+    chosen
+}
+
+/// How many there are of each kind.
+fn kinds(events: &[TimedEvent]) -> String {
+    let words = [
+        "outage",
+        "burst of losses",
+        "delay",
+        "reordering",
+        "process down",
+        "clock step",
+    ];
+    let mut counts = [0_u64; 6];
+    for event in events {
+        let index = match event.kind {
+            NetworkEventKind::Outage { .. } => 0,
+            NetworkEventKind::LossBurst { .. } => 1,
+            NetworkEventKind::Delay { .. } => 2,
+            NetworkEventKind::Reordering { .. } => 3,
+            NetworkEventKind::ProcessDown { .. } => 4,
+            NetworkEventKind::ClockStep { .. } => 5,
+        };
+        counts[index] += 1;
+    }
+    let of = words.iter().zip(counts).filter(|(_, count)| *count > 0);
+    let of = of.map(|(word, count)| format!("{word} {}", grouped(count)));
+    of.collect::<Vec<_>>().join(", ")
 }
 
 pub(super) fn correlation(report: &NetworkReport) -> Vec<String> {

@@ -43,11 +43,15 @@ pub(super) fn of(material: &Material, index: usize, steps: usize) -> Run {
         Found::Virtual(report) => (report.network.as_ref(), &report.score_events),
         Found::Unfinished(_) => (None, &ScoreEvents::default()),
     };
+    let changes = match &material.found {
+        Found::Live(summary) => summary.link_changes.as_slice(),
+        Found::Virtual(_) | Found::Unfinished(_) => &[],
+    };
     if let Some(report) = network {
         run.drawings.push(timeline::over_run(
             &key,
             report,
-            events,
+            (events, changes),
             (&material.series, steps),
         ));
         run.network_events = network_events(report);
@@ -184,7 +188,12 @@ fn live_facts(summary: &RunSummary) -> Vec<FactGroup> {
             facts.to_vec()
         }
     };
-    vec![
+    let changes = summary.link_changes.iter();
+    let changes: Vec<Fact> = changes
+        .map(|change| Fact::new(change.time(), change.what()))
+        .collect();
+    let by_hand = (!changes.is_empty()).then(|| group("Links changed by hand", changes));
+    let groups = vec![
         group("Run", facts),
         group(
             "Granted by the kernel",
@@ -198,7 +207,8 @@ fn live_facts(summary: &RunSummary) -> Vec<FactGroup> {
             "Host that wrote this",
             or_none(&summary.host_facts, UNAVAILABLE),
         ),
-    ]
+    ];
+    groups.into_iter().chain(by_hand).collect()
 }
 
 fn live_channel(key: &str, one: &ChannelSummary, summary: &RunSummary) -> Channel {
@@ -230,6 +240,7 @@ fn live_channel(key: &str, one: &ChannelSummary, summary: &RunSummary) -> Channe
     let sources = Sources {
         crosses: network.is_some() || !is_local,
         account: one.account.as_ref(),
+        link: Some(one.link),
         network: network.map(|network| &network.figures),
         outages: one.outages.as_ref(),
         ..Sources::default()

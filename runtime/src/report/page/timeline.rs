@@ -7,6 +7,7 @@ use super::data::Drawing;
 use super::drawings::{name_of, severity_word};
 use super::figures::time::{Mark, over_time};
 use super::series::{Plot, PlotPanel, Series, Thinned, thinned};
+use crate::report::link_change::LinkChange;
 use crate::report::network::{NetworkReport, TimelineRow};
 use crate::report::score_event::{ExplainedEvent, ScoreEvents};
 use crate::report::terminal::duration_s;
@@ -22,7 +23,7 @@ const BANDS_MAX: usize = 300;
 pub(super) fn over_run(
     key: &str,
     report: &NetworkReport,
-    events: &ScoreEvents,
+    (events, changes): (&ScoreEvents, &[LinkChange]),
     (series, point_count): (&[Series], usize),
 ) -> Drawing {
     let rows = &report.timeline.rows;
@@ -44,7 +45,9 @@ pub(super) fn over_run(
         });
     }
     let bands = bands(report);
-    let moments: Vec<Mark> = events.events.iter().filter_map(moment).collect();
+    let by_hand = changes.iter().filter_map(changed_at);
+    let moments = events.events.iter().filter_map(moment);
+    let moments: Vec<Mark> = moments.chain(by_hand).collect();
     let caption = run_caption(report, (step_s, width_s), bands.len() == BANDS_MAX);
     let plot = Plot {
         axis: format!("{key}-run"),
@@ -118,6 +121,17 @@ fn moment(event: &ExplainedEvent) -> Option<Mark> {
         class: severity_word(event.severity),
         channel: String::new(),
         words: event.what.clone(),
+    })
+}
+
+/// Refused changes changed nothing.
+fn changed_at(change: &LinkChange) -> Option<Mark> {
+    Some(Mark {
+        from_s: change.at_s.filter(|_| change.is_in_force())?,
+        until_s: None,
+        class: "change",
+        channel: String::new(),
+        words: change.what(),
     })
 }
 

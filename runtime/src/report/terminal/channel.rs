@@ -9,8 +9,9 @@ use hil_models::measure::statistics::IntervalNs;
 
 use super::canvas::{Canvas, INDENT, Tone, bar, left, right};
 use super::clocks;
+use super::events::counted;
 use super::units::{duration, grouped, percent};
-use crate::report::summary::{ChannelSummary, CountByName, RecordedFigures};
+use crate::report::summary::{ChannelSummary, CountByName, LinkKind, RecordedFigures};
 
 /// Columns of a stage's name, of each of the four figures, and between figures and bar.
 const NAME_WIDTH: usize = 22;
@@ -37,7 +38,7 @@ pub(super) fn channel(canvas: &mut Canvas, channel: &ChannelSummary) {
         );
         return;
     };
-    fates(canvas, account);
+    fates(canvas, account, channel.link);
     if account.published_count > 0 {
         waterfall(canvas, account);
         closing(canvas, &account.closing);
@@ -105,7 +106,7 @@ fn recorded(canvas: &mut Canvas, figures: Option<RecordedFigures>) {
     canvas.paragraph(INDENT, tone, &text);
 }
 
-fn fates(canvas: &mut Canvas, account: &ChannelAccount) {
+fn fates(canvas: &mut Canvas, account: &ChannelAccount, kind: LinkKind) {
     let total = account.published_count;
     if total == 0 {
         canvas.paragraph(INDENT, Tone::Caution, "no message was published");
@@ -115,8 +116,9 @@ fn fates(canvas: &mut Canvas, account: &ChannelAccount) {
     let is_total_known = account.published_unrecorded_count.is_some();
     let title = if is_total_known {
         format!(
-            "{} messages published, and what became of them",
-            grouped(total)
+            "{} published, and what became of {}",
+            counted(total, "message"),
+            if total == 1 { "it" } else { "them" }
         )
     } else {
         format!(
@@ -138,7 +140,7 @@ fn fates(canvas: &mut Canvas, account: &ChannelAccount) {
         let line = format!(
             "{:INDENT$}{}{}{}{:BAR_GAP$}{}",
             "",
-            canvas.paint(tone, &left(fate.label(), 38)),
+            canvas.paint(tone, &left(kind.fate_label(fate), 38)),
             right(&grouped(count), 12),
             right(
                 &if is_total_known {
@@ -399,7 +401,7 @@ fn round_trip(canvas: &mut Canvas, round_trip: &Distribution) {
 }
 
 fn losses(canvas: &mut Canvas, account: &ChannelAccount) {
-    let counted = [
+    let counts = [
         ("reordered", account.reordered_count),
         ("duplicated", account.duplicated_count),
         ("late", account.late_count),
@@ -409,7 +411,7 @@ fn losses(canvas: &mut Canvas, account: &ChannelAccount) {
             account.published_unrecorded_count.filter(|c| *c > 0),
         ),
     ];
-    let words: Vec<String> = counted
+    let words: Vec<String> = counts
         .into_iter()
         .filter_map(|(name, count)| Some(format!("{name} {}", grouped(count?))))
         .collect();
@@ -429,11 +431,11 @@ fn losses(canvas: &mut Canvas, account: &ChannelAccount) {
     }
     for interruption in &account.interruptions {
         let text = format!(
-            "{} down for {} ({}): {} messages lost",
+            "{} down for {} ({}): {} lost",
             interruption.process,
             duration(interruption.length_ns),
             interruption.cause,
-            grouped(interruption.lost_count)
+            counted(interruption.lost_count, "message")
         );
         canvas.field("interruption", Tone::Caution, &text);
     }

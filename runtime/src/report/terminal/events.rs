@@ -64,7 +64,7 @@ pub(super) fn score_events(canvas: &mut Canvas, all: &ScoreEvents) {
     }
 }
 
-fn counted(count: u64, what: &str) -> String {
+pub(crate) fn counted(count: u64, what: &str) -> String {
     let plural = if count == 1 { "" } else { "s" };
     format!("{} {what}{plural}", grouped(count))
 }

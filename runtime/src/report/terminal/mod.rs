@@ -2,6 +2,7 @@
 
 mod canvas;
 mod cards;
+mod changes;
 mod channel;
 mod clocks;
 mod emulation;
@@ -18,6 +19,7 @@ mod units;
 pub use canvas::Style;
 pub(crate) use canvas::{Tone, shortened, wrapped};
 pub(crate) use channel::closing_text;
+pub(crate) use events::counted;
 pub(crate) use trace::{render_fit, render_trace, render_trace_plots};
 pub(crate) use units::{JOINT, duration, duration_s, figure, grouped, percent, seconds};
 
@@ -26,6 +28,7 @@ use hil_models::measure::account::OutageFigures;
 use canvas::{Canvas, INDENT};
 
 use super::assessment::{Assessment, NetworkVerdict, SKIPPED_TICK_RATIO_MAX};
+use super::link_change::LinkChange;
 use super::network::NetworkReport;
 use super::score_event::ScoreEvents;
 use super::summary::{Outcome, RunSummary, ScoreMetric};
@@ -36,10 +39,12 @@ pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> Strin
     let mut canvas = Canvas::new(width_columns, style);
     title(&mut canvas, summary);
     verdict(&mut canvas, summary, &assessment);
+    changes::changes(&mut canvas, &summary.link_changes);
     tables::score(&mut canvas, &summary.score);
     events::score_events(&mut canvas, &summary.score_events);
     if let Some(report) = &summary.network {
-        network_sections(&mut canvas, report, &summary.score_events);
+        let changes = &summary.link_changes;
+        network_sections(&mut canvas, report, (&summary.score_events, changes));
     }
     for channel in &summary.channels {
         channel::channel(&mut canvas, channel);
@@ -79,8 +84,12 @@ pub fn render_score(
 }
 
 /// The network of a run and how the robot stood to it.
-fn network_sections(canvas: &mut Canvas, report: &NetworkReport, events: &ScoreEvents) {
-    timeline::timeline(canvas, &report.timeline);
+fn network_sections(
+    canvas: &mut Canvas,
+    report: &NetworkReport,
+    (events, changes): (&ScoreEvents, &[LinkChange]),
+) {
+    timeline::timeline(canvas, &report.timeline, changes);
     network::what_preceded_what(canvas, report, events);
     network::network(canvas, report);
 }
@@ -93,7 +102,7 @@ pub fn render_network(
     style: Style,
 ) -> String {
     let mut canvas = Canvas::new(width_columns, style);
-    network_sections(&mut canvas, report, events);
+    network_sections(&mut canvas, report, (events, &[]));
     canvas.finish()
 }
 

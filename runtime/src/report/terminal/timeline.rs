@@ -3,6 +3,7 @@
 
 use super::canvas::{Canvas, INDENT, Tone, left, right};
 use super::units::{duration_s, figure, percent, seconds};
+use crate::report::link_change::LinkChange;
 use crate::report::network::{Timeline, TimelineRow};
 
 /// Columns of the row's name, of what it shows, and of its scale behind it.
@@ -12,7 +13,7 @@ const SCALE_WIDTH: usize = 18;
 /// Eighths of a block, lowest first.
 const LEVELS: [char; 8] = ['▁', '▂', '▃', '▄', '▅', '▆', '▇', '█'];
 
-pub(super) fn timeline(canvas: &mut Canvas, all: &Timeline) {
+pub(super) fn timeline(canvas: &mut Canvas, all: &Timeline, changes: &[LinkChange]) {
     let Some(step_count) = all.rows.first().map(|row| row.values.len()) else {
         return;
     };
@@ -51,6 +52,16 @@ pub(super) fn timeline(canvas: &mut Canvas, all: &Timeline) {
         canvas.line(&line);
     }
     let axis_margin = INDENT + name_width + WHAT_WIDTH;
+    if let Some(marks) = change_marks(changes, (whole_s, room)) {
+        let label = left("link changed by hand", name_width + WHAT_WIDTH);
+        let line = format!(
+            "{:INDENT$}{}{}",
+            "",
+            canvas.paint(Tone::Faint, &label),
+            canvas.paint(Tone::Caution, &marks)
+        );
+        canvas.line(&line);
+    }
     let [begin, middle, end] = [0.0, 0.5, 1.0].map(|share| seconds(share * whole_s));
     let half = room / 2;
     let axis = format!(
@@ -62,6 +73,27 @@ pub(super) fn timeline(canvas: &mut Canvas, all: &Timeline) {
     );
     let axis = canvas.paint(Tone::Faint, &axis);
     canvas.line(&axis);
+}
+
+/// A mark in each column in which a link was changed; `None` when none was.
+fn change_marks(changes: &[LinkChange], (whole_s, room): (f64, usize)) -> Option<String> {
+    let in_force = changes.iter().filter(|change| change.is_in_force());
+    let times: Vec<f64> = in_force.filter_map(|change| change.at_s).collect();
+    let column_s = whole_s / room as f64;
+    let mark = |index: usize| {
+        let from_s = index as f64 * column_s;
+        // What happened just before the start or after the end stands at the border.
+        let is_within = |at_s: &f64| {
+            let at_s = at_s.clamp(0.0, whole_s - column_s / 2.0);
+            (from_s..from_s + column_s).contains(&at_s)
+        };
+        if times.iter().any(is_within) {
+            '^'
+        } else {
+            ' '
+        }
+    };
+    (!times.is_empty()).then(|| (0..room).map(mark).collect())
 }
 
 fn pad(text: &str, width: usize) -> String {
@@ -119,7 +151,9 @@ fn scale(row: &TimelineRow) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::report::link_change::ChangedTo;
     use crate::report::terminal::Style;
+    use hil_models::link::spec::Way;
 
     #[test]
     fn a_strip_keeps_the_highest_value_of_each_column() {
@@ -151,7 +185,16 @@ mod tests {
         };
         for width in [80, 100] {
             let mut canvas = Canvas::new(width, Style::Plain);
-            timeline(&mut canvas, &all);
+            let change = LinkChange {
+                link: "hop".to_owned(),
+                way: Way::Forward,
+                number: 1,
+                at_s: Some(3.0),
+                unsure_s: 0.0,
+                to: ChangedTo::Cut,
+                refused: None,
+            };
+            timeline(&mut canvas, &all, &[change]);
             let page = canvas.finish();
             let rows: Vec<&str> = page.lines().collect();
             assert!(
@@ -164,8 +207,10 @@ mod tests {
                 "{page}"
             );
             assert!(rows[4].contains("error of the cart's speed"), "{page}");
+            let changed = rows[5].chars().position(|c| c == '^').unwrap();
+            assert!(changed.abs_diff(place(rows[2])) <= 1, "{page}");
             assert!(
-                rows[3].ends_with("812 ms ±15.0 µs") && rows[5].contains("6.000 s"),
+                rows[3].ends_with("812 ms ±15.0 µs") && rows[6].contains("6.000 s"),
                 "{page}"
             );
         }

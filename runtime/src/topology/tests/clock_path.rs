@@ -189,6 +189,11 @@ fn no_port_of_a_clock_path_is_one_of_a_link() {
         let text = fault_of(&with_port(port), key);
         let words = format!("{port}..={port} overlaps with the ports of link `hop`");
         assert!(text.contains(&words), "{text}");
+        let line = with_port(port)
+            .lines()
+            .position(|line| line.starts_with("clock_port"));
+        let place = format!("clock.toml:{}:", line.unwrap() + 1);
+        assert!(text.contains(&place), "{text}");
     }
     for port in [7399, 7404, 65_535] {
         assert_eq!(parse_good(&with_port(port)).clock_paths().count(), 1);

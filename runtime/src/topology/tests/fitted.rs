@@ -4,7 +4,7 @@
 use hil_models::link::delay::DelayLaw;
 use hil_models::random::RandomStream;
 use hil_models::trace::fit::{Fit, TraceFit};
-use hil_models::trace::{Trace, TraceFate, TraceHeader, TraceRecord};
+use hil_models::trace::{Trace, TraceDirection, TraceFate, TraceHeader, TraceRecord};
 
 use super::faulty::GOOD;
 use super::*;
@@ -117,6 +117,10 @@ fn every_fit_of_a_trace_is_a_valid_link() {
             fit.toml("hop")
         );
         assert_eq!(fit.delay.best.is_some(), !trace.delays_ns().is_empty());
+        // And as one direction of a link that stands already.
+        let backward = fit.toml_of_direction("hop", TraceDirection::Backward);
+        let topology = with_link(&format!("[links.hop]\nvia = \"emulated\"\n{backward}"));
+        assert_eq!(&topology.links()[0].emulation().unwrap().backward, spec);
     }
     assert!(checked_count > 60, "{checked_count}");
 }

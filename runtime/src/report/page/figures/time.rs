@@ -87,16 +87,20 @@ pub(in crate::report::page) fn over_time(
 }
 
 fn draw_moments(svg: &mut Svg, moments: &[Mark], top: f64, (axis, url): (&Axis, &str)) {
-    svg.text(
-        "strong",
-        (8.0, top + 15.0),
-        Anchor::Start,
-        "What happened to the robot",
-    );
+    let is_change = |mark: &Mark| mark.class == "change";
+    let title = if moments.iter().all(is_change) {
+        "Links changed by hand (dashed)"
+    } else if moments.iter().any(is_change) {
+        "What happened to the robot, and links changed by hand (dashed)"
+    } else {
+        "What happened to the robot"
+    };
+    svg.text("strong", (8.0, top + 15.0), Anchor::Start, title);
     let rows = [
         ("incident", top + 22.0),
         ("hazard", top + 22.0),
         ("notice", top + 30.0),
+        ("change", top + 18.0),
     ];
     svg.open(&[("clip-path", url)]);
     svg.open(&[("class", "zoom")]);

@@ -1,0 +1,398 @@
+//! Recording a run while it goes: events of the run become topics, topics go to files, files are flushed
+//! by the clock. What a topic holds is decided in [`crate::live`], what a file is in
+//! [`crate::split`].
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use hil_runtime::watch::{Event, Feed, FeedError, LiveRun, Poll, SelectError, select};
+
+use crate::facts::{self, Words};
+use crate::live::LiveTopics;
+use crate::run::Run;
+use crate::split::{Files, Split};
+use crate::writer::WriteError;
+
+/// How long a recorder with nothing to do sleeps.
+const PAUSE: Duration = Duration::from_millis(10);
+/// How often it looks whether a run has begun.
+const WAIT_PAUSE: Duration = Duration::from_millis(50);
+/// How often it says how far it is.
+const PROGRESS_PERIOD: Duration = Duration::from_millis(500);
+/// What the processes of a run have in their rings is in their files after this time.
+const RINGS_EMPTY_WITHIN: Duration = Duration::from_millis(60);
+/// Problems that the file tells in words; further ones are counted.
+const PROBLEMS_MAX: usize = 1000;
+
+/// How a recording went wrong.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum RecordError {
+    /// No run, or several.
+    #[error(transparent)]
+    Select(#[from] SelectError),
+    /// The run cannot be watched.
+    #[error(transparent)]
+    Feed(#[from] FeedError),
+    /// Nowhere to put it.
+    #[error(transparent)]
+    Write(#[from] WriteError),
+    /// A signal came before a run did.
+    #[error("ended by {0}; no run had begun and no file was written")]
+    Interrupted(&'static str),
+}
+
+/// What is asked for.
+#[derive(Debug, Clone)]
+pub(crate) struct Request {
+    /// Which run; the only one if left out.
+    pub(crate) run: Option<String>,
+    /// File to write, or folder to write it into.
+    pub(crate) output: PathBuf,
+    /// Wait for a run to begin.
+    pub(crate) waits: bool,
+    /// Leave out what is recorded already.
+    pub(crate) from_now: bool,
+    /// When to begin another file.
+    pub(crate) split: Split,
+    /// What a kill may lose at most.
+    pub(crate) flush: Duration,
+    /// Replace files that exist.
+    pub(crate) force: bool,
+}
+
+/// What a recording came to.
+#[derive(Debug)]
+pub(crate) struct Recorded {
+    /// The files, in order.
+    pub(crate) paths: Vec<PathBuf>,
+    /// Messages in them, of all topics.
+    pub(crate) written_count: u64,
+    /// Messages of the run's own channels among them.
+    pub(crate) message_count: u64,
+    /// Topics.
+    pub(crate) topic_count: usize,
+    /// Messages that should be in them and are not, by channel.
+    pub(crate) missed: BTreeMap<String, u64>,
+    /// What a reader must know.
+    pub(crate) words: Vec<String>,
+    /// Something of the run is not in them.
+    pub(crate) has_gaps: bool,
+    /// The signal that ended the recording before its run.
+    pub(crate) signal: Option<&'static str>,
+}
+
+/// How far a recording is.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Progress<'a> {
+    /// The run; empty while none has begun.
+    pub(crate) run: &'a str,
+    /// Messages per second of late.
+    pub(crate) rate_hz: f64,
+    /// Size so far, bytes.
+    pub(crate) size_bytes: u64,
+    /// Files so far.
+    pub(crate) file_count: usize,
+    /// Messages missed so far.
+    pub(crate) missed_count: u64,
+}
+
+/// Hears how far the recording is and gives the signal that came.
+pub(crate) type Look<'a> = &'a mut dyn FnMut(&Progress<'_>) -> Option<&'static str>;
+
+/// Records a run until it ends, or `look` gives a signal.
+///
+/// # Errors
+/// When there is no run to record or no file can be written; what was written is beside its place
+/// then.
+pub(crate) fn record(request: &Request, look: Look<'_>) -> Result<Recorded, RecordError> {
+    let run = find(request, look)?;
+    let target = target(&request.output, &run.name);
+    let mut feed = Feed::open(run)?;
+    if request.from_now {
+        feed.skip_to_now();
+    }
+    let files = Files::begin(&target, request.split, request.force)?;
+    let mut recording = LiveRecording::begin(feed, files)?;
+    let signal = recording.run(request, look)?;
+    recording.finish(signal)
+}
+
+/// The file for a run: the one named, or one with the run's name in the folder named.
+fn target(output: &Path, run: &str) -> PathBuf {
+    if output.is_dir() {
+        output.join(format!("{run}.mcap"))
+    } else {
+        output.to_owned()
+    }
+}
+
+fn find(request: &Request, look: Look<'_>) -> Result<LiveRun, RecordError> {
+    let nothing = Progress {
+        run: "",
+        rate_hz: 0.0,
+        size_bytes: 0,
+        file_count: 0,
+        missed_count: 0,
+    };
+    loop {
+        match select(request.run.as_deref()) {
+            Ok(run) => return Ok(run),
+            Err(SelectError::NoneRuns | SelectError::NoSuch { .. }) if request.waits => {}
+            Err(error) => return Err(error.into()),
+        }
+        if let Some(signal) = look(&nothing) {
+            return Err(RecordError::Interrupted(signal));
+        }
+        thread::sleep(WAIT_PAUSE);
+    }
+}
+
+struct LiveRecording {
+    feed: Feed,
+    topics: LiveTopics,
+    files: Files,
+    /// All records of the run have come.
+    is_silent: bool,
+    has_summary: bool,
+    problems: Vec<String>,
+    problem_count: u64,
+    /// What the open file says of the clocks.
+    told_clocks: Words,
+}
+
+impl LiveRecording {
+    fn begin(feed: Feed, files: Files) -> Result<Self, WriteError> {
+        let mut recording = Self {
+            topics: LiveTopics::of(&feed),
+            feed,
+            files,
+            is_silent: false,
+            has_summary: false,
+            problems: Vec::new(),
+            problem_count: 0,
+            told_clocks: Words::new(),
+        };
+        recording.describe_run()?;
+        recording.files.flush()?;
+        Ok(recording)
+    }
+
+    /// Records until the run ends or a signal comes, which it gives back.
+    fn run(
+        &mut self,
+        request: &Request,
+        look: Look<'_>,
+    ) -> Result<Option<&'static str>, WriteError> {
+        // A message waits for the ring of its process, for the next look, and for the flush.
+        let flush_period = request.flush / 2;
+        let (mut flushed, mut told) = (Instant::now(), Instant::now());
+        let (mut told_count, mut has_caught_up) = (0, false);
+        loop {
+            let polled = self.poll()?;
+            let now = Instant::now();
+            self.topics.settle(now, &mut self.files)?;
+            // What was there before the recorder is not to wait for its first period.
+            let is_abreast = polled == Poll::Idle && !has_caught_up;
+            has_caught_up |= is_abreast;
+            if is_abreast || now.duration_since(flushed) >= flush_period {
+                flushed = now;
+                if self.files.flush()? {
+                    self.next_file()?;
+                }
+            }
+            // Before a signal is asked for: a run that is over was not interrupted.
+            if polled == Poll::Over {
+                return Ok(None);
+            }
+            let since_told = now.duration_since(told);
+            if since_told >= PROGRESS_PERIOD {
+                let count = self.topics.counts().message_count;
+                let rate_hz = (count - told_count) as f64 / since_told.as_secs_f64();
+                (told, told_count) = (now, count);
+                if let Some(signal) = look(&self.progress(rate_hz)) {
+                    let is_over = self.catch_up()? == Poll::Over;
+                    return Ok((!is_over).then_some(signal));
+                }
+            }
+            if polled == Poll::Idle {
+                thread::sleep(PAUSE);
+            }
+        }
+    }
+
+    fn progress(&self, rate_hz: f64) -> Progress<'_> {
+        let missed = self.topics.missed(&self.feed, false);
+        Progress {
+            run: &self.feed.run().name,
+            rate_hz,
+            size_bytes: self.files.size_bytes(),
+            file_count: self.files.number(),
+            missed_count: missed.values().sum(),
+        }
+    }
+
+    fn poll(&mut self) -> Result<Poll, WriteError> {
+        let Self {
+            feed,
+            topics,
+            files,
+            is_silent,
+            has_summary,
+            problems,
+            problem_count,
+            ..
+        } = self;
+        topics.clocks().learn(feed.has_one_clock());
+        let mut failed = None;
+        let polled = feed.poll(&mut |event| {
+            match &event {
+                Event::Problem(text) => {
+                    *problem_count += 1;
+                    if problems.len() < PROBLEMS_MAX {
+                        problems.push((*text).to_owned());
+                    }
+                }
+                Event::Silent => *is_silent = true,
+                Event::Ended { has_summary: has } => *has_summary = *has,
+                Event::Message { .. } | Event::Record { .. } => {}
+            }
+            if failed.is_none() {
+                failed = topics.take(&event, files).err();
+            }
+        });
+        failed.map_or(Ok(polled), Err)
+    }
+
+    /// What was published before the signal is to be in the file; what the last poll came to.
+    fn catch_up(&mut self) -> Result<Poll, WriteError> {
+        thread::sleep(RINGS_EMPTY_WITHIN);
+        let mut polled = self.poll()?;
+        while polled == Poll::Busy {
+            polled = self.poll()?;
+        }
+        self.topics.flush_joins(&mut self.files)?;
+        Ok(polled)
+    }
+
+    fn next_file(&mut self) -> Result<(), WriteError> {
+        self.describe_recording("goes on in the next file")?;
+        self.files.next()?;
+        self.describe_run()?;
+        self.files.flush()?;
+        Ok(())
+    }
+
+    fn finish(mut self, signal: Option<&'static str>) -> Result<Recorded, RecordError> {
+        let mut run = Run::without_records(self.feed.run().run_folder());
+        if self.has_summary {
+            // A folder that cannot be listed is one more thing to say, and no reason to lose the rest.
+            if let Err(error) = run.read_traces() {
+                run.gaps.words.push(error.to_string());
+                run.gaps.unreadable_file_count += 1;
+            }
+            let section = run.summary.as_ref().and_then(|one| one.clocks.as_ref());
+            let has_one_clock = section.map(|section| section.has_one_clock);
+            let clocks = self.topics.clocks();
+            let mut time_ns = |host: &str, at_ns| clocks.time_ns(host, at_ns);
+            let events = facts::event_times(&run, has_one_clock, &mut time_ns);
+            self.topics.conclude(&run, &events, &mut self.files)?;
+        }
+        let how = match signal {
+            Some(signal) => format!("the recorder was ended by {signal}, the run went on"),
+            None if self.has_summary => "the run ended".to_owned(),
+            None => "the run was killed".to_owned(),
+        };
+        self.describe_recording(&how)?;
+        let mut end = facts::run_words(&run);
+        if signal.is_some() {
+            end.insert("exit_reason".to_owned(), how);
+        }
+        self.files.open().describe("hil.end", end)?;
+        facts::attach(self.files.open(), &run.folder)?;
+        let counts = self.topics.counts();
+        let missed = self.topics.missed(&self.feed, self.is_silent);
+        let mut words = self.problems.clone();
+        if self.has_summary {
+            words.extend(run.gaps.words.iter().cloned());
+        }
+        let has_gaps = !missed.is_empty()
+            || counts.misfit_count + counts.timeless_count + self.problem_count > 0
+            || (self.has_summary && run.gaps.is_any());
+        let topic_count = self.files.topic_count();
+        let (paths, written_count) = self.files.finish()?;
+        Ok(Recorded {
+            paths,
+            written_count,
+            message_count: counts.message_count,
+            topic_count,
+            missed,
+            words,
+            has_gaps,
+            signal,
+        })
+    }
+
+    /// What ran, at the beginning of each file, so that one that is cut short has it too.
+    fn describe_run(&mut self) -> Result<(), WriteError> {
+        let run = Run::without_records(self.feed.run().run_folder());
+        let mut words = facts::run_words(&run);
+        words.insert(
+            "exit_reason".to_owned(),
+            "recorded while it went".to_owned(),
+        );
+        let manifest = self.feed.manifest();
+        let json =
+            |value: &serde_json::Value| Words::from([("json".to_owned(), value.to_string())]);
+        let (topology, host) = (json(&manifest.topology), json(&manifest.host_facts));
+        self.told_clocks = self.topics.clocks().words();
+        let file = self.files.open();
+        file.describe("hil.clocks", self.told_clocks.clone())?;
+        file.describe("hil.run", words)?;
+        file.describe("hil.topology", topology)?;
+        file.describe("hil.host_facts", host)
+    }
+
+    /// What was recorded so far, at the end of each file.
+    fn describe_recording(&mut self, how: &str) -> Result<(), WriteError> {
+        let counts = self.topics.counts();
+        let numbers = [
+            ("file_number", self.files.number() as u64),
+            ("message_count", counts.message_count),
+            ("misfit_message_count", counts.misfit_count),
+            ("timeless_record_count", counts.timeless_count),
+            ("late_record_count", self.topics.late_count()),
+            ("problem_count", self.problem_count),
+        ];
+        let mut words: Words = numbers
+            .iter()
+            .map(|(key, count)| ((*key).to_owned(), count.to_string()))
+            .collect();
+        let version = env!("CARGO_PKG_VERSION").to_owned();
+        words.insert("recorder_version".to_owned(), version);
+        words.insert("mode".to_owned(), "live".to_owned());
+        words.insert("ended".to_owned(), how.to_owned());
+        for (channel, count) in self.topics.missed(&self.feed, self.is_silent) {
+            words.insert(format!("missed {channel}"), count.to_string());
+        }
+        for (channel, count) in self.topics.earlier(&self.feed) {
+            words.insert(format!("before {channel}"), count.to_string());
+        }
+        for (problem, number) in self.problems.iter().zip(1..) {
+            words.insert(format!("gap_{number:04}"), problem.clone());
+        }
+        for (given, wanted) in &self.topics.names().changed {
+            words.insert(format!("renamed {given}"), format!("{wanted} was taken"));
+        }
+        let clocks = self.topics.clocks().words();
+        let channels = self.topics.channel_words();
+        let file = self.files.open();
+        // Offsets of other clocks come with the last records.
+        if clocks != self.told_clocks {
+            file.describe("hil.clocks", clocks)?;
+        }
+        file.describe("hil.channels", channels)?;
+        file.describe("hil.recording", words)
+    }
+}

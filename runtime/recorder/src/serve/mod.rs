@@ -1,0 +1,293 @@
+//! `hil-recorder serve`: a run as it goes on, or as it went, to browsers and viewers. One thread reads
+//! records, works out the state and hands it to the socket; the socket and the page have a runtime of
+//! their own.
+
+mod engine;
+mod page;
+mod parameters;
+mod playback;
+mod recording;
+mod running;
+mod source;
+mod viewers;
+
+use std::fs;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use hil_runtime::console::Console;
+use hil_runtime::run_folder::RunFolder;
+use hil_runtime::signals::{EXIT_INTERRUPTED, Signals};
+use hil_runtime::watch::{FeedError, LiveRun, SelectError, select};
+use tokio::runtime::Runtime;
+
+use crate::cli::ServeOptions;
+use engine::{Engine, Showing, Shown};
+use parameters::Links;
+use playback::Playback;
+use running::Running;
+use viewers::Viewers;
+
+/// Between two looks at the records.
+const LOOK_PERIOD: Duration = Duration::from_millis(10);
+/// Between two looks for a run that begins.
+const WAIT_PERIOD: Duration = Duration::from_millis(300);
+
+/// Why nothing is served.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum ServeError {
+    /// Nothing to play back.
+    #[error(transparent)]
+    Run(#[from] crate::run::RunError),
+    /// A run's folder in which nothing is yet.
+    #[error("the run in {folder} has not begun yet; --wait waits for it")]
+    NotBegun {
+        /// The folder.
+        folder: PathBuf,
+    },
+    /// No run goes on, or it is not clear which is meant.
+    #[error("{0}; --wait waits for one, and the folder of a finished run is played back")]
+    Select(#[from] SelectError),
+    /// A run that goes on cannot be watched.
+    #[error(transparent)]
+    Feed(#[from] FeedError),
+    /// The socket.
+    #[error(
+        "cannot listen for viewers at {address}: {why}; --port takes another, 0 any that is free"
+    )]
+    Socket {
+        /// Where.
+        address: SocketAddr,
+        /// What the library said.
+        why: String,
+    },
+    /// The page.
+    #[error(
+        "cannot serve the page at {address}: {why}; --http-port takes another, 0 any that is free"
+    )]
+    Page {
+        /// Where.
+        address: SocketAddr,
+        /// What the system said.
+        why: std::io::Error,
+    },
+    /// Threads, mostly.
+    #[error("cannot begin: {0}")]
+    Runtime(#[from] std::io::Error),
+}
+
+/// Serves until a signal comes; the exit code.
+///
+/// # Errors
+/// When there is nothing to show or nowhere to show it.
+pub(crate) fn serve(
+    options: &ServeOptions,
+    signals: &Signals,
+    console: &mut Console,
+) -> Result<i32, ServeError> {
+    let shown = first(options, signals, console)?;
+    if signals.received().is_some() {
+        return Ok(EXIT_INTERRUPTED);
+    }
+    let links = Links::begin();
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(2)
+        .thread_name("viewers")
+        .enable_all()
+        .build()?;
+    let viewers = open(options, &runtime, &links, console)?;
+    let mut engine = Engine::new(viewers, links, options.record.clone());
+    match shown {
+        Some(shown) => engine.show(shown, console),
+        None => console.say("no run goes on here; waiting for one"),
+    }
+    let mut looked = Instant::now();
+    let mut said = None;
+    while signals.received().is_none() {
+        if options.wait && looked.elapsed() >= WAIT_PERIOD {
+            looked = Instant::now();
+            show_next(options, &mut engine, &mut said, console);
+        }
+        engine.round(console);
+        thread::sleep(LOOK_PERIOD);
+    }
+    engine.into_viewers(console).end(runtime.handle());
+    runtime.shutdown_timeout(Duration::from_secs(1));
+    console.say("ended");
+    Ok(0)
+}
+
+/// What is shown first; `None` when it has to be waited for.
+fn first(
+    options: &ServeOptions,
+    signals: &Signals,
+    console: &mut Console,
+) -> Result<Option<Shown>, ServeError> {
+    let wanted = options.run.as_deref();
+    let folder = wanted.map(Path::new).filter(|path| path.is_dir());
+    // Asked before whether it goes on, so that one that begins in between is not played back.
+    if let Some(folder) = folder.filter(|folder| has_not_begun(folder)) {
+        let folder = folder.to_owned();
+        return if options.wait {
+            Ok(None)
+        } else {
+            Err(ServeError::NotBegun { folder })
+        };
+    }
+    if let Some(folder) = folder.filter(|folder| !goes_on(folder)) {
+        let how = (options.speed, options.repeats);
+        let read = Playback::read(folder, how, &mut |_| signals.received().is_none());
+        let (playback, facts) = read?;
+        for words in playback.words() {
+            console.warn(words);
+        }
+        let source = Box::new(playback);
+        return Ok(Some(Shown::new(facts, source, Some(options.speed), None)));
+    }
+    match select(wanted) {
+        Ok(run) => Ok(Some(watch(run)?)),
+        Err(error) if options.wait && is_none_yet(&error) => Ok(None),
+        Err(error) => Err(error.into()),
+    }
+}
+
+fn goes_on(folder: &Path) -> bool {
+    LiveRun::read(folder).is_ok_and(|run| run.is_held())
+}
+
+/// True for the folder of a run whose supervisor has only just made it: nothing is announced or
+/// recorded. A finished run has records.
+fn has_not_begun(folder: &Path) -> bool {
+    let run = RunFolder::existing(folder);
+    let is_told = folder.join(LiveRun::FILE_NAME).exists() || run.summary().exists();
+    let records = fs::read_dir(run.records());
+    !is_told && records.is_ok_and(|mut records| records.next().is_none())
+}
+
+const fn is_none_yet(error: &SelectError) -> bool {
+    matches!(error, SelectError::NoneRuns | SelectError::NoSuch { .. })
+}
+
+fn watch(run: LiveRun) -> Result<Shown, ServeError> {
+    let folder = run.folder.clone();
+    let (running, facts) = Running::open(run)?;
+    let topology = running.topology().clone();
+    let links = Some((folder, topology));
+    Ok(Shown::new(facts, Box::new(running), None, links))
+}
+
+/// Shows a run that has begun, where none is shown or the one shown gives way to it. `said` is what
+/// was said last of why none can be chosen.
+fn show_next(
+    options: &ServeOptions,
+    engine: &mut Engine,
+    said: &mut Option<String>,
+    console: &mut Console,
+) {
+    let showing = engine.showing();
+    if showing.is_some_and(|showing| !showing.is_over && !showing.is_playback) {
+        return;
+    }
+    let run = match select(options.run.as_deref()) {
+        Ok(run) => run,
+        Err(error @ SelectError::Several { .. }) => {
+            // Asked three times a second: once for each choice of runs.
+            let words = error.to_string();
+            if said.as_ref() != Some(&words) {
+                console.warn(&words);
+                *said = Some(words);
+            }
+            return;
+        }
+        // None has begun, which is what is waited for.
+        Err(_) => return,
+    };
+    if showing.is_some_and(|showing| !gives_way(showing, &run.name)) {
+        return;
+    }
+    let name = run.name.clone();
+    match watch(run) {
+        Ok(shown) => {
+            console.say(&format!("showing {name}"));
+            engine.show(shown, console);
+        }
+        // It may be over already, or not quite there: the next look tells.
+        Err(error) => console.warn(&error.to_string()),
+    }
+}
+
+/// True when what is shown makes room for the run called `name`, which goes on. What is played back
+/// under that name was looked at before the run began.
+fn gives_way(showing: Showing<'_>, name: &str) -> bool {
+    if showing.name == name {
+        showing.is_playback
+    } else {
+        showing.is_over
+    }
+}
+
+/// Opens socket and page and says where they are.
+fn open(
+    options: &ServeOptions,
+    runtime: &Runtime,
+    links: &Links,
+    console: &mut Console,
+) -> Result<Viewers, ServeError> {
+    let address = SocketAddr::new(options.host, options.port);
+    let handler = Arc::new(links.clone());
+    let viewers = Viewers::begin(runtime.handle(), address, handler).map_err(|error| {
+        let why = error.to_string();
+        ServeError::Socket { address, why }
+    })?;
+    let socket = SocketAddr::new(options.host, viewers.port());
+    let address = SocketAddr::new(options.host, options.http_port);
+    let page = page::serve(runtime.handle(), address, viewers.port())
+        .map_err(|why| ServeError::Page { address, why })?;
+    if !options.host.is_loopback() {
+        console.warn(
+            "anybody who can reach this address sees the run and may change its emulated links; \
+             without --host only this machine can",
+        );
+    }
+    console.result(&format!("page    http://{page}/\nviewers ws://{socket}\n"));
+    Ok(viewers)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_folder_with_nothing_in_it_yet_is_not_that_of_a_finished_run() {
+        let name = format!("hil-recorder-not-begun-{}", std::process::id());
+        let folder = std::env::temp_dir().join(name);
+        let run = RunFolder::existing(&folder);
+        // One of a program that keeps no records.
+        fs::create_dir_all(&folder).unwrap();
+        assert!(!has_not_begun(&folder));
+        fs::create_dir(run.records()).unwrap();
+        assert!(has_not_begun(&folder));
+        fs::write(run.summary(), "{}").unwrap();
+        assert!(!has_not_begun(&folder));
+        fs::remove_file(run.summary()).unwrap();
+        fs::write(run.records().join("x.rec"), "").unwrap();
+        assert!(!has_not_begun(&folder));
+        fs::remove_dir_all(&folder).unwrap();
+    }
+
+    #[test]
+    fn a_run_that_goes_on_takes_the_place_of_its_own_playback_and_of_what_is_over() {
+        let showing = |is_over, is_playback| Showing {
+            name: "x-1",
+            is_over,
+            is_playback,
+        };
+        assert!(gives_way(showing(false, true), "x-1"));
+        assert!(!gives_way(showing(true, false), "x-1"));
+        assert!(gives_way(showing(true, false), "x-2"));
+        assert!(!gives_way(showing(false, true), "x-2"));
+    }
+}

@@ -1,0 +1,178 @@
+//! The page over HTTP: files that are part of the program, and where the socket is. It reads no file
+//! and knows no other path, so there is nothing outside to reach.
+
+use std::convert::Infallible;
+use std::io;
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use http_body_util::Full;
+use hyper::body::{Bytes, Incoming};
+use hyper::header::{self, HeaderValue};
+use hyper::server::conn::http1;
+use hyper::service::service_fn;
+use hyper::{Method, Request, Response, StatusCode};
+use hyper_util::rt::{TokioIo, TokioTimer};
+use serde_json::json;
+use tokio::net::TcpListener;
+use tokio::runtime::Handle;
+
+// `PAGE_FILES`: name and content of each file of the folder `page`, written by the build script.
+include!(concat!(env!("OUT_DIR"), "/page_files.rs"));
+
+/// Nothing from elsewhere is loaded or run; the socket may be on any port that a tunnel gives it.
+const POLICY: &str = "default-src 'self'; connect-src 'self' ws:; img-src 'self' data:; object-src 'none'; \
+                      base-uri 'none'; frame-ancestors 'none'; form-action 'none'";
+
+/// Connections at once; more wait.
+const CONNECTIONS_MAX: usize = 64;
+/// How long a browser may take to say what it wants; one that says nothing would keep its place
+/// from the others.
+const REQUEST_WITHIN: Duration = Duration::from_secs(5);
+
+/// Serves the page at `address` from now on; where it really is. The page will look for the socket
+/// at `ws_port` of the same host.
+///
+/// # Errors
+/// When the address cannot be had.
+pub(crate) fn serve(runtime: &Handle, address: SocketAddr, ws_port: u16) -> io::Result<SocketAddr> {
+    let listener = runtime.block_on(TcpListener::bind(address))?;
+    let at = listener.local_addr()?;
+    let config = json!({ "ws_port": ws_port, "version": env!("CARGO_PKG_VERSION") });
+    let config = Bytes::from(config.to_string());
+    runtime.spawn(async move {
+        let room = std::sync::Arc::new(tokio::sync::Semaphore::new(CONNECTIONS_MAX));
+        loop {
+            let Ok(place) = std::sync::Arc::clone(&room).acquire_owned().await else {
+                return;
+            };
+            let Ok((stream, _)) = listener.accept().await else {
+                // Out of file descriptors, mostly: others must close first.
+                tokio::time::sleep(Duration::from_millis(50)).await;
+                continue;
+            };
+            let config = config.clone();
+            tokio::spawn(async move {
+                let service = service_fn(move |request: Request<Incoming>| {
+                    let answer = answer(request.method(), request.uri().path(), &config);
+                    async move { Ok::<_, Infallible>(answer) }
+                });
+                let connection = http1::Builder::new()
+                    .timer(TokioTimer::new())
+                    .header_read_timeout(REQUEST_WITHIN)
+                    .keep_alive(false)
+                    .serve_connection(TokioIo::new(stream), service);
+                // A browser that goes away in the middle is nobody's fault.
+                let _is_served = connection.await.is_ok();
+                drop(place);
+            });
+        }
+    });
+    Ok(at)
+}
+
+fn answer(method: &Method, path: &str, config: &Bytes) -> Response<Full<Bytes>> {
+    if !matches!(*method, Method::GET | Method::HEAD) {
+        let mut response = plain(StatusCode::METHOD_NOT_ALLOWED, "only GET and HEAD\n");
+        let allowed = HeaderValue::from_static("GET, HEAD");
+        response.headers_mut().insert(header::ALLOW, allowed);
+        return response;
+    }
+    let name = match path {
+        "/" => "index.html",
+        path => path.strip_prefix('/').unwrap_or(path),
+    };
+    if name == "config.json" {
+        return found("application/json", config.clone());
+    }
+    let mut files = PAGE_FILES.iter();
+    match files.find(|(known, _)| *known == name) {
+        Some((name, content)) => found(content_type(name), Bytes::from_static(content)),
+        None => plain(StatusCode::NOT_FOUND, "no such file\n"),
+    }
+}
+
+fn found(kind: &'static str, content: Bytes) -> Response<Full<Bytes>> {
+    with_headers(StatusCode::OK, kind, content)
+}
+
+fn plain(status: StatusCode, words: &'static str) -> Response<Full<Bytes>> {
+    with_headers(
+        status,
+        "text/plain; charset=utf-8",
+        Bytes::from_static(words.as_bytes()),
+    )
+}
+
+fn with_headers(status: StatusCode, kind: &'static str, content: Bytes) -> Response<Full<Bytes>> {
+    let mut response = Response::new(Full::new(content));
+    *response.status_mut() = status;
+    let headers = response.headers_mut();
+    for (name, value) in [
+        (header::CONTENT_TYPE, kind),
+        (header::CONTENT_SECURITY_POLICY, POLICY),
+        (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
+        (header::REFERRER_POLICY, "no-referrer"),
+        // Another version of the program may be there at the next look.
+        (header::CACHE_CONTROL, "no-cache"),
+    ] {
+        headers.insert(name, HeaderValue::from_static(value));
+    }
+    response
+}
+
+fn content_type(name: &str) -> &'static str {
+    match name.rsplit_once('.').map(|(_, extension)| extension) {
+        Some("html") => "text/html; charset=utf-8",
+        Some("js" | "mjs") => "text/javascript; charset=utf-8",
+        Some("css") => "text/css; charset=utf-8",
+        Some("svg") => "image/svg+xml",
+        Some("png") => "image/png",
+        Some("json") => "application/json",
+        Some("woff2") => "font/woff2",
+        Some("txt") => "text/plain; charset=utf-8",
+        _ => "application/octet-stream",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn get(path: &str) -> Response<Full<Bytes>> {
+        answer(&Method::GET, path, &Bytes::from_static(b"{}"))
+    }
+
+    #[test]
+    fn the_page_is_served_and_nothing_else() {
+        let page = get("/");
+        assert_eq!(page.status(), StatusCode::OK);
+        assert_eq!(
+            page.headers()[header::CONTENT_TYPE],
+            "text/html; charset=utf-8"
+        );
+        assert_eq!(page.headers()[header::CONTENT_SECURITY_POLICY], POLICY);
+        assert_eq!(
+            get("/config.json").headers()[header::CONTENT_TYPE],
+            "application/json"
+        );
+        for path in [
+            "/../Cargo.toml",
+            "/etc/passwd",
+            "//index.html",
+            "/%2e%2e/Cargo.toml",
+            "",
+        ] {
+            assert_eq!(get(path).status(), StatusCode::NOT_FOUND, "{path}");
+        }
+        let put = answer(&Method::PUT, "/", &Bytes::new());
+        assert_eq!(put.status(), StatusCode::METHOD_NOT_ALLOWED);
+    }
+
+    #[test]
+    fn every_file_of_the_page_has_a_type() {
+        for (name, _) in PAGE_FILES {
+            assert_ne!(content_type(name), "application/octet-stream", "{name}");
+        }
+    }
+}

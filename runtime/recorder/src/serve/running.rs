@@ -1,0 +1,236 @@
+//! A run that goes on on this host, as its feed tells of it.
+
+use std::fs::{self, File};
+use std::io::{self, Read, Seek, SeekFrom};
+use std::path::Path;
+
+use hil_runtime::clock::MonotonicClock;
+use hil_runtime::report::summary::RunSummary;
+use hil_runtime::watch::{self, Event, Feed, FeedError, LiveRun, Origin, Poll, Record};
+
+use super::playback::how_ended;
+use super::source::{Progress, Source, Warning};
+use crate::clocks::Clocks;
+use crate::view::facts::RunFacts;
+use crate::view::{Body, LiveRecord};
+
+/// Polls per look, so that a long past does not keep signals and pictures waiting.
+const POLLS_MAX: usize = 16;
+/// Lines shown of what a process said.
+const LINES_MAX: usize = 3;
+/// As much of the end of a log is read: it is looked at every second, and may become long.
+const LOG_END_BYTES: u64 = 64 * 1024;
+
+/// A run that goes on.
+#[derive(Debug)]
+pub(crate) struct Running {
+    feed: Feed,
+    facts: Names,
+    /// From this host's monotonic clock to the axis, nanoseconds.
+    offset_ns: i64,
+    is_silent: bool,
+    ended: Option<String>,
+    problems: Vec<String>,
+}
+
+/// The channels in the order of the facts.
+type Names = Vec<String>;
+
+impl Running {
+    /// Begins to watch `run`.
+    ///
+    /// # Errors
+    /// When its manifest or its shared memory cannot be had.
+    pub(crate) fn open(run: LiveRun) -> Result<(Self, RunFacts), FeedError> {
+        let name = run.name.clone();
+        let feed = Feed::open(run)?;
+        let manifest = feed.manifest();
+        let mut facts = RunFacts::new(&name, Some(manifest), &[], &Clocks::default());
+        let offset_ns = manifest.realtime_minus_monotonic_ns.unwrap_or(0);
+        for channel in &mut facts.channels {
+            channel.offsets_ns = [offset_ns; 2];
+            let watched = feed.channel(&channel.name);
+            let source = watched.and_then(|watched| watched.source.as_ref());
+            // A foreign program keeps no records of what it publishes.
+            channel.is_by_message |= matches!(
+                source,
+                Some(watch::Source::SharedMemory {
+                    is_forwarded: false,
+                    ..
+                })
+            );
+        }
+        let is_here = |host: &String| facts.hosts_here.contains(host);
+        facts.has_one_clock = facts.hosts.iter().all(is_here) || feed.has_one_clock() == Some(true);
+        let names = facts.channels.iter().map(|channel| channel.name.clone());
+        let running = Self {
+            facts: names.collect(),
+            feed,
+            offset_ns,
+            is_silent: false,
+            ended: None,
+            problems: Vec::new(),
+        };
+        Ok((running, facts))
+    }
+
+    /// The topology with every default spelled out.
+    pub(crate) const fn topology(&self) -> &serde_json::Value {
+        &self.feed.manifest().topology
+    }
+
+    /// What the account at the end says of how it ended.
+    fn how(&self, has_summary: bool) -> String {
+        let path = self.feed.run().run_folder().summary();
+        let text = fs::read_to_string(path).ok().filter(|_| has_summary);
+        let summary = text.and_then(|text| RunSummary::from_json(&text).ok());
+        summary.map_or_else(
+            || "its supervisor was killed".to_owned(),
+            |summary| how_ended(&summary),
+        )
+    }
+}
+
+impl Source for Running {
+    fn now_ns(&self) -> i64 {
+        MonotonicClock::now().as_ns().saturating_add(self.offset_ns)
+    }
+
+    fn poll(&mut self, take: &mut dyn FnMut(&LiveRecord)) -> Progress {
+        let Self {
+            feed,
+            facts,
+            offset_ns,
+            is_silent,
+            problems,
+            ..
+        } = self;
+        let (offset_ns, mut has_summary) = (*offset_ns, None);
+        let now_ns = MonotonicClock::now().as_ns();
+        let place = |name: &str| facts.iter().position(|known| known == name);
+        let mut give = |channel: &str, own_ns: Option<i64>, body: Body| {
+            if let Some(channel) = place(channel) {
+                // Of another host's clock nothing is known but that it was before now.
+                let at_ns = own_ns.unwrap_or(now_ns).saturating_add(offset_ns);
+                take(&LiveRecord {
+                    at_ns,
+                    channel,
+                    body,
+                });
+            }
+        };
+        for _ in 0..POLLS_MAX {
+            let poll = feed.poll(&mut |event| match event {
+                Event::Message {
+                    channel,
+                    origin,
+                    envelope,
+                    payload,
+                } => {
+                    let own_ns = match origin {
+                        Origin::Records => Some(envelope.published_ns),
+                        Origin::SharedMemory => None,
+                        // What another host sends at the end has been, and is not shown as new.
+                        Origin::OtherHost => return,
+                    };
+                    let body = Body::Message(payload.to_vec());
+                    give(&channel.description.name, own_ns, body);
+                }
+                Event::Record {
+                    channel,
+                    is_of_this_host: true,
+                    record,
+                    ..
+                } => {
+                    if let Some((own_ns, body)) = body_of(record) {
+                        give(channel, Some(own_ns), body);
+                    }
+                }
+                Event::Record { .. } => {}
+                Event::Problem(text) => problems.push(text.to_owned()),
+                Event::Silent => *is_silent = true,
+                Event::Ended { has_summary: has } => has_summary = Some(has),
+            });
+            if poll != Poll::Busy {
+                break;
+            }
+        }
+        if let Some(has_summary) = has_summary {
+            self.ended = Some(self.how(has_summary));
+        }
+        match (&self.ended, self.is_silent) {
+            (Some(how), _) => Progress::Ended(how.clone()),
+            (None, true) => Progress::Ended(
+                "all processes have ended; the account is being drawn up".to_owned(),
+            ),
+            (None, false) => Progress::Going,
+        }
+    }
+
+    fn missed_count(&self) -> Option<u64> {
+        let missed = self.facts.iter().map(|name| {
+            let is_shared = self.feed.counters(name).is_some();
+            is_shared.then(|| self.feed.missed_count(name))
+        });
+        missed.flatten().reduce(u64::saturating_add)
+    }
+
+    fn take_problems(&mut self) -> Vec<String> {
+        core::mem::take(&mut self.problems)
+    }
+
+    fn has_one_clock(&self) -> bool {
+        self.feed.has_one_clock() == Some(true)
+    }
+
+    /// What the processes said on their standard error so far.
+    fn warnings(&self) -> Vec<Warning> {
+        let folder = self.feed.run().folder.join("logs");
+        let Ok(entries) = fs::read_dir(folder) else {
+            return Vec::new();
+        };
+        let mut paths: Vec<_> = entries.flatten().map(|entry| entry.path()).collect();
+        paths.sort();
+        let mut warnings = Vec::new();
+        for path in paths {
+            let Ok(text) = end_of(&path) else {
+                continue;
+            };
+            let process = path
+                .file_stem()
+                .map(|name| name.to_string_lossy().into_owned());
+            let lines: Vec<&str> = text
+                .lines()
+                .filter(|line| !line.trim().is_empty())
+                .collect();
+            let last = lines.len().saturating_sub(LINES_MAX);
+            for line in &lines[last..] {
+                warnings.push((process.clone(), (*line).to_owned()));
+            }
+        }
+        warnings
+    }
+}
+
+/// The last lines of the log at `path`, whatever bytes a program wrote there.
+fn end_of(path: &Path) -> io::Result<String> {
+    let mut file = File::open(path)?;
+    let begin = file.metadata()?.len().saturating_sub(LOG_END_BYTES);
+    file.seek(SeekFrom::Start(begin))?;
+    let mut bytes = Vec::new();
+    file.take(LOG_END_BYTES).read_to_end(&mut bytes)?;
+    let text = String::from_utf8_lossy(&bytes);
+    let whole_lines = text.split_once('\n').filter(|_| begin > 0);
+    Ok(whole_lines.map_or(&*text, |(_, rest)| rest).to_owned())
+}
+
+/// What of a record is shown, and when it was on the clock of its process.
+fn body_of(record: Record) -> Option<(i64, Body)> {
+    Some(match record {
+        Record::Published(one) => (one.published_ns, Body::Published(one)),
+        Record::Taken(one) => (one.taken_ns, Body::Taken(one)),
+        Record::Egress(one) => (one.taken_ns, Body::Egress(one)),
+        Record::Ingress(one) => (one.received_ns, Body::Ingress(one)),
+        _ => return None,
+    })
+}

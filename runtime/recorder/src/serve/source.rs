@@ -1,0 +1,42 @@
+//! Where the records of a served run come from: a finished run's folder, or one that goes on.
+
+use crate::view::LiveRecord;
+
+/// How it goes on after a look.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Progress {
+    /// More will come.
+    Going,
+    /// It begins again.
+    Rewound,
+    /// No more will come, and how the run ended.
+    Ended(String),
+}
+
+/// What is amiss: with which process, where that is known, and what.
+pub(crate) type Warning = (Option<String>, String);
+
+/// A run's records as they come.
+pub(crate) trait Source {
+    /// Now, on the axis of the records' times.
+    fn now_ns(&self) -> i64;
+
+    /// Gives out what came since the last look.
+    fn poll(&mut self, take: &mut dyn FnMut(&LiveRecord)) -> Progress;
+
+    /// Numbers that were never seen on channels read from shared memory; `None` where none is.
+    fn missed_count(&self) -> Option<u64> {
+        None
+    }
+
+    /// True when the stamps of all hosts compare; may become true while a run goes on.
+    fn has_one_clock(&self) -> bool;
+
+    /// What is amiss with the run or its host, as far as it is known by now.
+    fn warnings(&self) -> Vec<Warning>;
+
+    /// What could not be read since the last call.
+    fn take_problems(&mut self) -> Vec<String> {
+        Vec::new()
+    }
+}

@@ -1,0 +1,74 @@
+//! Where topics and their messages go. What becomes of a run is decided by those who make topics; a
+//! file, or a viewer, only has to take them.
+
+use std::collections::BTreeMap;
+
+use crate::schema::Schema;
+use crate::writer::Stamp;
+
+/// Takes topics and messages.
+pub(crate) trait Sink {
+    /// Why it could not.
+    type Error;
+
+    /// A new topic; its number.
+    ///
+    /// # Errors
+    /// When there is no room for it.
+    fn add_topic(
+        &mut self,
+        topic: &str,
+        schema: &Schema,
+        metadata: &BTreeMap<String, String>,
+    ) -> Result<u16, Self::Error>;
+
+    /// A message of a topic.
+    ///
+    /// # Errors
+    /// When it cannot be taken.
+    fn write(&mut self, topic: u16, at: Stamp, data: &[u8]) -> Result<(), Self::Error>;
+}
+
+/// A topic that appears with its first message.
+#[derive(Debug)]
+pub(crate) struct Topic {
+    name: String,
+    schema: Schema,
+    metadata: BTreeMap<String, String>,
+    number: Option<u16>,
+}
+
+impl Topic {
+    /// A topic of this name, of which nobody has heard yet.
+    pub(crate) fn new(name: String, schema: Schema, metadata: &[(&str, &str)]) -> Self {
+        let pairs = metadata.iter();
+        let pairs = pairs.map(|(key, value)| ((*key).to_owned(), (*value).to_owned()));
+        Self {
+            name,
+            schema,
+            metadata: pairs.collect(),
+            number: None,
+        }
+    }
+
+    /// Its number in `sink`, which hears of it now if it has not before.
+    pub(crate) fn declare<S: Sink>(&mut self, sink: &mut S) -> Result<u16, S::Error> {
+        if let Some(number) = self.number {
+            return Ok(number);
+        }
+        let number = sink.add_topic(&self.name, &self.schema, &self.metadata)?;
+        self.number = Some(number);
+        Ok(number)
+    }
+
+    /// A message of it.
+    pub(crate) fn write<S: Sink>(
+        &mut self,
+        sink: &mut S,
+        at: Stamp,
+        data: &[u8],
+    ) -> Result<(), S::Error> {
+        let number = self.declare(sink)?;
+        sink.write(number, at, data)
+    }
+}

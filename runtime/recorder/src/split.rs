@@ -1,0 +1,319 @@
+//! A live recording as one file or several, each whole by itself: topics and schemas are repeated in
+//! each, and what a kill leaves can be recovered up to the last flush.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::panic::resume_unwind;
+use std::path::{Path, PathBuf};
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+use crate::schema::Schema;
+use crate::sink::Sink;
+use crate::writer::{Recording, Stamp, WriteError, check_target};
+
+/// Files that may be on their way to the disk beside the open one: each has a queue of its own in
+/// memory.
+const CLOSING_MAX: usize = 2;
+
+/// When to begin another file.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(crate) struct Split {
+    /// Larger than this, bytes.
+    pub(crate) size_bytes: Option<u64>,
+    /// Written for longer than this.
+    pub(crate) time: Option<Duration>,
+}
+
+impl Split {
+    const fn is_any(&self) -> bool {
+        self.size_bytes.is_some() || self.time.is_some()
+    }
+}
+
+#[derive(Debug)]
+struct KnownTopic {
+    name: String,
+    schema: Schema,
+    metadata: BTreeMap<String, String>,
+    /// In the file that is open; `None` until a message of it comes.
+    number: Option<u16>,
+}
+
+/// Files on their way to the disk, which takes its time; oldest first. None of them is left alone:
+/// when the process ended before them, they would not be whole.
+#[derive(Debug, Default)]
+struct Closing {
+    files: VecDeque<JoinHandle<Result<u64, WriteError>>>,
+    /// Messages in those that have arrived.
+    written_count: u64,
+}
+
+impl Closing {
+    /// Waits until one more may be on its way.
+    fn make_room(&mut self) -> Result<(), WriteError> {
+        while self.files.len() >= CLOSING_MAX {
+            self.join_oldest()?;
+        }
+        Ok(())
+    }
+
+    /// Waits for all, whatever became of one; how many messages they hold, or the first failure.
+    fn join_all(&mut self) -> Result<u64, WriteError> {
+        let mut first = Ok(());
+        while !self.files.is_empty() {
+            let joined = self.join_oldest();
+            first = first.and(joined);
+        }
+        first.map(|()| self.written_count)
+    }
+
+    fn join_oldest(&mut self) -> Result<(), WriteError> {
+        if let Some(file) = self.files.pop_front() {
+            let closed = file.join();
+            self.written_count += closed.unwrap_or_else(|panic| resume_unwind(panic))?;
+        }
+        Ok(())
+    }
+}
+
+impl Drop for Closing {
+    /// After a failure elsewhere, which is what is said then.
+    fn drop(&mut self) {
+        for file in self.files.drain(..) {
+            let _is_joined = file.join().is_ok();
+        }
+    }
+}
+
+/// Files of one recording, one open at a time.
+pub(crate) struct Files {
+    target: PathBuf,
+    split: Split,
+    may_replace: bool,
+    open: Recording,
+    begun: Instant,
+    topics: Vec<KnownTopic>,
+    done: Vec<PathBuf>,
+    done_bytes: u64,
+    closing: Closing,
+}
+
+/// Where the `number`th file of a recording that is split goes: before the extension.
+fn numbered(target: &Path, number: usize) -> PathBuf {
+    let stem = target.file_stem().unwrap_or_default().to_string_lossy();
+    let extension = target
+        .extension()
+        .map(|one| format!(".{}", one.to_string_lossy()));
+    let extension = extension.unwrap_or_default();
+    target.with_file_name(format!("{stem}_{number:04}{extension}"))
+}
+
+impl Files {
+    /// Begins the first file; `target` is its name, or what the names of several begin with.
+    ///
+    /// # Errors
+    /// When it exists and may not be replaced, or cannot be written.
+    pub(crate) fn begin(
+        target: &Path,
+        split: Split,
+        may_replace: bool,
+    ) -> Result<Self, WriteError> {
+        let first = if split.is_any() {
+            numbered(target, 1)
+        } else {
+            target.to_owned()
+        };
+        check_target(&first, Path::new(""), may_replace)?;
+        Ok(Self {
+            target: target.to_owned(),
+            split,
+            may_replace,
+            open: Recording::create_live(&first)?,
+            begun: Instant::now(),
+            topics: Vec::new(),
+            done: Vec::new(),
+            done_bytes: 0,
+            closing: Closing::default(),
+        })
+    }
+
+    /// The file that is open, for metadata.
+    pub(crate) fn open(&mut self) -> &mut Recording {
+        &mut self.open
+    }
+
+    /// Puts everything so far within reach of `recover`; true when it is time for another file.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub(crate) fn flush(&mut self) -> Result<bool, WriteError> {
+        self.open.flush()?;
+        let size_bytes = self.open.size_bytes();
+        let is_large = self.split.size_bytes.is_some_and(|most| size_bytes >= most);
+        let is_old = self
+            .split
+            .time
+            .is_some_and(|most| self.begun.elapsed() >= most);
+        // A file without a message would say nothing that the next one does not.
+        Ok((is_large || is_old) && self.open.message_count() > 0)
+    }
+
+    /// Begins the next file and completes the one that was open meanwhile; waits when the disk is
+    /// more than so many files behind.
+    ///
+    /// # Errors
+    /// When the next cannot be begun, or one of those before was not completed; how the others
+    /// ended is said by [`Self::finish`].
+    pub(crate) fn next(&mut self) -> Result<(), WriteError> {
+        self.closing.make_room()?;
+        let path = numbered(&self.target, self.done.len() + 2);
+        check_target(&path, Path::new(""), self.may_replace)?;
+        let next = Recording::create_live(&path)?;
+        let finished = core::mem::replace(&mut self.open, next);
+        self.done_bytes += finished.size_bytes();
+        self.done.push(finished.path().to_owned());
+        let closing = thread::spawn(move || finished.finish());
+        self.closing.files.push_back(closing);
+        self.begun = Instant::now();
+        for topic in &mut self.topics {
+            topic.number = None;
+        }
+        Ok(())
+    }
+
+    /// Completes the open file and waits for those before; the paths of all, and how many messages
+    /// they hold.
+    ///
+    /// # Errors
+    /// When one cannot be written; the others are complete then.
+    pub(crate) fn finish(mut self) -> Result<(Vec<PathBuf>, u64), WriteError> {
+        let last = self.open.path().to_owned();
+        // Both before either failure is said.
+        let last_count = self.open.finish();
+        let earlier_count = self.closing.join_all();
+        let written_count = earlier_count? + last_count?;
+        self.done.push(last);
+        Ok((self.done, written_count))
+    }
+
+    /// Bytes of all files so far, as of the last flush.
+    pub(crate) fn size_bytes(&self) -> u64 {
+        self.done_bytes + self.open.size_bytes()
+    }
+
+    /// Topics of all files.
+    pub(crate) fn topic_count(&self) -> usize {
+        self.topics.len()
+    }
+
+    /// Number of the open file, from 1.
+    pub(crate) fn number(&self) -> usize {
+        self.done.len() + 1
+    }
+}
+
+impl Sink for Files {
+    type Error = WriteError;
+
+    /// The number stays the same for all files of the recording.
+    fn add_topic(
+        &mut self,
+        topic: &str,
+        schema: &Schema,
+        metadata: &BTreeMap<String, String>,
+    ) -> Result<u16, WriteError> {
+        let number = u16::try_from(self.topics.len()).map_err(|_many| self.open.full())?;
+        self.topics.push(KnownTopic {
+            name: topic.to_owned(),
+            schema: schema.clone(),
+            metadata: metadata.clone(),
+            number: None,
+        });
+        Ok(number)
+    }
+
+    fn write(&mut self, topic: u16, at: Stamp, data: &[u8]) -> Result<(), WriteError> {
+        let known = &mut self.topics[usize::from(topic)];
+        let number = match known.number {
+            Some(number) => number,
+            None => self
+                .open
+                .add_topic(&known.name, &known.schema, &known.metadata)?,
+        };
+        known.number = Some(number);
+        self.open.write(number, at, data)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::schema;
+    use std::fs;
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicBool, Ordering};
+
+    #[test]
+    fn every_file_of_a_split_recording_is_whole_by_itself() {
+        let folder = std::env::temp_dir().join(format!("hil-split-{}", std::process::id()));
+        fs::create_dir_all(&folder).unwrap();
+        let split = Split {
+            size_bytes: Some(1),
+            time: None,
+        };
+        let mut files = Files::begin(&folder.join("a.mcap"), split, false).unwrap();
+        let nothing = BTreeMap::new();
+        let topic = files.add_topic("/a", &schema::opaque(), &nothing).unwrap();
+        for number in 0..5 {
+            if number > 0 {
+                assert!(files.flush().unwrap());
+                files.next().unwrap();
+                assert!(files.closing.files.len() <= CLOSING_MAX);
+            }
+            files.write(topic, Stamp::new(5, number), b"x").unwrap();
+        }
+        let (paths, count) = files.finish().unwrap();
+        let names: Vec<_> = paths.iter().filter_map(|path| path.file_name()).collect();
+        let expected = [1, 2, 3, 4, 5].map(|number| format!("a_000{number}.mcap"));
+        assert_eq!(names, expected.each_ref().map(String::as_str));
+        assert_eq!((fs::read_dir(&folder).unwrap().count(), count), (5, 5));
+        for path in &paths {
+            let bytes = fs::read(path).unwrap();
+            let mut messages = mcap::MessageStream::new(&bytes).unwrap();
+            assert_eq!(messages.next().unwrap().unwrap().channel.topic, "/a");
+            assert!(messages.next().is_none());
+        }
+        // A name that is taken ends it, and what is open is kept beside it.
+        assert!(matches!(
+            Files::begin(&folder.join("a.mcap"), split, false).map(|_| ()),
+            Err(WriteError::Exists { .. })
+        ));
+        fs::remove_dir_all(folder).unwrap();
+    }
+
+    /// A file that takes a while to close, and then says so.
+    fn slow(is_closed: &Arc<AtomicBool>) -> JoinHandle<Result<u64, WriteError>> {
+        let is_closed = Arc::clone(is_closed);
+        thread::spawn(move || {
+            thread::sleep(Duration::from_millis(50));
+            is_closed.store(true, Ordering::Relaxed);
+            Ok(1)
+        })
+    }
+
+    #[test]
+    fn every_file_is_waited_for_whatever_became_of_another() {
+        let is_closed = Arc::new(AtomicBool::new(false));
+        let mut closing = Closing::default();
+        let path = PathBuf::from("a.mcap");
+        let failed = thread::spawn(move || Err(WriteError::Exists { path }));
+        closing.files.extend([failed, slow(&is_closed)]);
+        assert!(matches!(closing.join_all(), Err(WriteError::Exists { .. })));
+        assert!(is_closed.load(Ordering::Relaxed));
+        let is_closed = Arc::new(AtomicBool::new(false));
+        let mut closing = Closing::default();
+        closing.files.push_back(slow(&is_closed));
+        drop(closing);
+        assert!(is_closed.load(Ordering::Relaxed));
+    }
+}

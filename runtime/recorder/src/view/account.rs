@@ -1,0 +1,333 @@
+//! The account of one channel while its run goes on: how often, how long, how many lost. It says
+//! less than the account of a finished run: what is not known yet is no loss.
+
+use std::collections::BTreeMap;
+
+use serde_json::{Value, json};
+
+use super::facts::ChannelFacts;
+use super::join::{Joined, LINK_SEGMENTS, LOCAL_SEGMENTS};
+use super::window::{Recent, Samples, WINDOW_NS};
+use super::{Body, LiveRecord, seconds};
+use crate::net::MessageLatency;
+
+/// A message that has not arrived so long after it was handed over counts as lost.
+const LOST_AFTER_NS: i64 = 1_000_000_000;
+/// A message that arrives all the same within this time is taken back from the lost.
+const REMEMBERED_NS: i64 = 30_000_000_000;
+/// Messages under way, and lost ones remembered, at most; beyond, the oldest are forgotten.
+const UNDER_WAY_MAX: usize = 50_000;
+/// Periods of silence after which a link is called silent, and the least time.
+const SILENT_PERIODS: i64 = 5;
+const SILENT_NS: i64 = 500_000_000;
+/// Numbers listed of one loss event.
+const LISTED_MAX: usize = 64;
+/// Single messages shown each time that messages are settled, ten times a second.
+const SHOWN_MAX: usize = 5;
+
+/// A producer's start and the number of a message.
+type Key = (u32, u64);
+
+/// One channel.
+#[derive(Debug)]
+pub(crate) struct Account {
+    has_link: bool,
+    has_one_clock: bool,
+    is_by_message: bool,
+    under_way: BTreeMap<Key, Joined>,
+    lost: BTreeMap<Key, i64>,
+    /// Per start of the producer, the highest number that arrived.
+    newest: BTreeMap<u32, u64>,
+    /// Lost since they were last told, with their publication.
+    untold: Vec<(u64, Option<i64>)>,
+    /// Complete messages to show.
+    shown: Vec<MessageLatency>,
+    counts: Counts,
+    rate: Recent,
+    window_lost: Recent,
+    segments: Vec<Samples>,
+    whole: Samples,
+    left_ns: Option<i64>,
+    arrived_ns: Option<i64>,
+    period_ns: i64,
+}
+
+/// Of a stage that has no record here, nothing is known.
+#[derive(Debug, Default)]
+struct Counts {
+    published: Option<u64>,
+    sent: Option<u64>,
+    received: Option<u64>,
+    taken: Option<u64>,
+    lost: u64,
+    forgotten: u64,
+}
+
+impl Counts {
+    /// Records of a stage are written by a process of its own and may be read before those of the
+    /// stage before: what was received or taken was published.
+    fn published(&self) -> Option<u64> {
+        let later = self.received.max(self.taken).unwrap_or(0);
+        self.published.map(|count| count.max(later))
+    }
+}
+
+fn count(of: &mut Option<u64>) {
+    *of = Some(of.unwrap_or(0) + 1);
+}
+
+impl Account {
+    /// The account of `channel`; `has_one_clock` says that stamps of both ends compare.
+    pub(crate) fn new(channel: &ChannelFacts, has_one_clock: bool) -> Self {
+        let has_link = channel.link.is_some();
+        let count = if has_link {
+            LINK_SEGMENTS.len()
+        } else {
+            LOCAL_SEGMENTS.len()
+        };
+        Self {
+            has_link,
+            has_one_clock,
+            is_by_message: channel.is_by_message,
+            under_way: BTreeMap::new(),
+            lost: BTreeMap::new(),
+            newest: BTreeMap::new(),
+            untold: Vec::new(),
+            shown: Vec::new(),
+            counts: Counts::default(),
+            rate: Recent::default(),
+            window_lost: Recent::default(),
+            segments: (0..count).map(|_| Samples::default()).collect(),
+            whole: Samples::default(),
+            left_ns: None,
+            arrived_ns: None,
+            period_ns: 0,
+        }
+    }
+
+    /// Stamps of both ends compare from now on.
+    pub(crate) const fn compare_clocks(&mut self) {
+        self.has_one_clock = true;
+    }
+
+    /// Takes a record of the channel.
+    pub(crate) fn take(&mut self, record: &LiveRecord) {
+        let at_ns = record.at_ns;
+        match &record.body {
+            Body::Message(_) => {
+                if self.is_by_message {
+                    count(&mut self.counts.published);
+                    self.rate.add(at_ns, 1);
+                }
+            }
+            Body::Published(one) => {
+                count(&mut self.counts.published);
+                self.rate.add(at_ns, 1);
+                self.update((one.epoch, one.sequence), at_ns, &|joined| {
+                    joined.published(one);
+                });
+            }
+            Body::Taken(one) => {
+                count(&mut self.counts.taken);
+                self.update((one.epoch, one.sequence), at_ns, &|joined| {
+                    joined.taken(one);
+                });
+            }
+            Body::Egress(one) => {
+                count(&mut self.counts.sent);
+                self.left_ns = Some(at_ns);
+                self.update((one.epoch, one.sequence), at_ns, &|joined| joined.sent(one));
+            }
+            Body::Ingress(one) => {
+                if one.flags & hil_models::measure::record::IngressRecord::DUPLICATE != 0 {
+                    return;
+                }
+                let key = (one.epoch, one.sequence);
+                self.arrive(key, at_ns);
+                self.update(key, at_ns, &|joined| joined.received(one));
+            }
+        }
+    }
+
+    fn arrive(&mut self, (epoch, sequence): Key, at_ns: i64) {
+        count(&mut self.counts.received);
+        if self.counts.published.is_none() {
+            self.rate.add(at_ns, 1);
+        }
+        if let Some(before_ns) = self.arrived_ns {
+            let gap_ns = at_ns.saturating_sub(before_ns).clamp(0, SILENT_NS);
+            self.period_ns += (gap_ns - self.period_ns) / 8;
+        }
+        self.arrived_ns = Some(at_ns);
+        if self.lost.remove(&(epoch, sequence)).is_some() {
+            self.counts.lost = self.counts.lost.saturating_sub(1);
+            self.untold.retain(|(number, _)| *number != sequence);
+        }
+        let newest = self.newest.insert(epoch, sequence).unwrap_or(sequence);
+        if newest > sequence {
+            self.newest.insert(epoch, newest);
+        }
+        // Where nobody here saw them leave, the numbers passed over are all that tells of them.
+        if self.counts.sent.is_none() {
+            let from = newest.saturating_add(1).max(sequence.saturating_sub(1000));
+            for number in from..sequence {
+                let key = (epoch, number);
+                self.under_way
+                    .entry(key)
+                    .or_insert_with(|| Joined::new(key, at_ns));
+            }
+        }
+    }
+
+    fn update(&mut self, key: Key, at_ns: i64, change: &dyn Fn(&mut Joined)) {
+        let joined = self.under_way.entry(key);
+        let joined = joined.or_insert_with(|| Joined::new(key, at_ns));
+        change(joined);
+        let (segments, whole) = (&mut self.segments, &mut self.whole);
+        joined.news(
+            (self.has_link, self.has_one_clock),
+            &mut |segment, length_ns| {
+                let samples = segment.and_then(|index| segments.get_mut(index));
+                samples.unwrap_or(whole).add(at_ns, length_ns);
+            },
+        );
+        if self.under_way.len() > UNDER_WAY_MAX {
+            self.under_way.pop_first();
+            self.counts.forgotten += 1;
+        }
+    }
+
+    /// Decides about messages that have been under way for long enough.
+    pub(crate) fn settle(&mut self, now_ns: i64) {
+        let due_ns = now_ns - LOST_AFTER_NS;
+        let old = self.under_way.iter();
+        let old: Vec<Key> = old
+            .filter(|(_, joined)| joined.first_ns <= due_ns)
+            .map(|(key, _)| *key)
+            .collect();
+        for key in old {
+            let Some(joined) = self.under_way.remove(&key) else {
+                continue;
+            };
+            if self.is_lost(key, &joined) {
+                self.counts.lost += 1;
+                self.window_lost.add(now_ns, 1);
+                self.lost.insert(key, now_ns);
+                self.untold.push((key.1, joined.stamps.published_ns));
+            }
+            if self.shown.len() < SHOWN_MAX {
+                self.shown.push(joined.stamps);
+            }
+        }
+        self.lost.retain(|_, at_ns| now_ns - *at_ns < REMEMBERED_NS);
+        while self.lost.len() > UNDER_WAY_MAX {
+            self.lost.pop_first();
+        }
+    }
+
+    fn is_lost(&self, key: Key, joined: &Joined) -> bool {
+        if !self.has_link || joined.has_arrived() || self.counts.received.is_none() {
+            return false;
+        }
+        let newest = self.newest.get(&key.0);
+        joined.has_left()
+            || newest.is_some_and(|newest| *newest > key.1 && self.counts.sent.is_none())
+    }
+
+    /// Stamps of some messages whose way is over, since the last call.
+    pub(crate) fn take_shown(&mut self) -> Vec<MessageLatency> {
+        core::mem::take(&mut self.shown)
+    }
+
+    /// What was found lost since the last call, as `/live/losses` has it; `origin_ns` is the run's
+    /// beginning on the producer's clock, where that is known, `at_s` now.
+    pub(crate) fn take_losses(
+        &mut self,
+        name: &str,
+        at_s: f64,
+        origin_ns: Option<i64>,
+    ) -> Option<Value> {
+        let mut lost = core::mem::take(&mut self.untold);
+        lost.sort_unstable();
+        let first_ns = lost.iter().filter_map(|(_, published)| *published).min();
+        let sequences: Vec<u64> = lost
+            .iter()
+            .map(|(number, _)| *number)
+            .take(LISTED_MAX)
+            .collect();
+        (!lost.is_empty()).then(|| {
+            json!({
+                "at_s": at_s, "channel": name, "sequences": sequences, "count": lost.len(),
+                "first_at_s": first_ns
+                    .zip(origin_ns)
+                    .map(|(ns, origin_ns)| seconds(ns.saturating_sub(origin_ns))),
+            })
+        })
+    }
+
+    /// The channel's entry in `/live/channels`.
+    pub(crate) fn figures(&mut self, name: &str, now_ns: i64) -> Value {
+        let names: &[&str] = if self.has_link {
+            &LINK_SEGMENTS
+        } else {
+            &LOCAL_SEGMENTS
+        };
+        let segments: Vec<Value> = names
+            .iter()
+            .zip(&mut self.segments)
+            .map(|(name, samples)| {
+                let mut figures = samples.figures(now_ns);
+                figures["name"] = json!(name);
+                figures
+            })
+            .collect();
+        let one_way = self.whole.is_available.then(|| {
+            let mut figures = self.whole.figures(now_ns);
+            figures["name"] = json!("published-taken");
+            figures
+        });
+        let can_tell = self.has_link && self.counts.received.is_some();
+        let window_lost = self.window_lost.count(now_ns);
+        let silent_ns = self
+            .arrived_ns
+            .filter(|_| self.has_link)
+            .map(|ns| now_ns - ns);
+        let rate_hz = self.rate.count(now_ns) as f64 * 1e9 / WINDOW_NS as f64;
+        let counts = &self.counts;
+        json!({
+            "name": name,
+            "rate_hz": rate_hz,
+            "published_count": counts.published(),
+            "received_count": counts.received,
+            "taken_count": counts.taken,
+            "lost_count": can_tell.then_some(counts.lost),
+            "window_lost_count": can_tell.then_some(window_lost),
+            "segments": segments,
+            "one_way": one_way,
+            "clock_bound_us": self.has_one_clock.then_some(0.0),
+            "link_state": self.link_state(now_ns),
+            "silent_s": silent_ns.map(|ns| seconds(ns.max(0))),
+        })
+    }
+
+    fn link_state(&self, now_ns: i64) -> &'static str {
+        let Some(arrived_ns) = self.arrived_ns.filter(|_| self.has_link) else {
+            let waits = self.left_ns.is_some() && self.counts.received.is_some();
+            return if waits { "silent" } else { "none" };
+        };
+        let patience_ns = (SILENT_PERIODS * self.period_ns).max(SILENT_NS);
+        // A channel on which nobody spoke is not silent because of its link.
+        let was_offered = self
+            .left_ns
+            .is_none_or(|left_ns| left_ns > arrived_ns + patience_ns / 2);
+        if now_ns - arrived_ns > patience_ns && was_offered {
+            "silent"
+        } else {
+            "up"
+        }
+    }
+}
+
+#[cfg(test)]
+#[path = "account_tests.rs"]
+mod tests;

@@ -1,0 +1,217 @@
+//! The arms as their messages tell of them: commanded and measured joints, and where these put the
+//! links. Kinematics is that of the models; shapes are thick lines from joint to joint.
+
+use hil_models::egm::messages::{EgmCommand, EgmFeedback, Side};
+use hil_models::message::Message;
+use hil_models::yumi::arm::Arm;
+use hil_models::yumi::{JOINT_COUNT, Joints, Pose};
+use serde_json::{Value, json};
+
+use super::{rounded, seconds};
+
+/// Radius of the line from frame to frame, metres: about the arm's own thickness.
+const RADII_M: [f64; JOINT_COUNT] = [0.065, 0.06, 0.055, 0.05, 0.045, 0.04, 0.035];
+
+/// Both arms.
+#[derive(Debug)]
+pub(crate) struct ArmsView {
+    arms: [OneArm; 2],
+}
+
+#[derive(Debug)]
+struct OneArm {
+    side: Side,
+    arm: Arm,
+    command: Option<(EgmCommand, i64)>,
+    feedback: Option<(EgmFeedback, i64)>,
+}
+
+impl ArmsView {
+    /// Arms of which nothing is known yet.
+    pub(crate) fn new() -> Self {
+        let arm = |side| OneArm {
+            side,
+            arm: match side {
+                Side::Right => Arm::right(),
+                Side::Left => Arm::left(),
+            },
+            command: None,
+            feedback: None,
+        };
+        Self {
+            arms: Side::BOTH.map(arm),
+        }
+    }
+
+    /// Takes a message of `channel` at `at_ns`; which arm it is about, the channel's name tells.
+    pub(crate) fn take(&mut self, channel: &str, message: &str, payload: &[u8], at_ns: i64) {
+        let mut parts = channel.split('/');
+        let side = parts.find_map(|part| Side::BOTH.into_iter().find(|side| side.word() == part));
+        let Some(side) = side else { return };
+        let arm = &mut self.arms[side.index()];
+        match message {
+            EgmCommand::NAME => {
+                if let Ok(command) = bytemuck::try_pod_read_unaligned(payload) {
+                    arm.command = Some((command, at_ns));
+                }
+            }
+            EgmFeedback::NAME => {
+                if let Ok(feedback) = bytemuck::try_pod_read_unaligned(payload) {
+                    arm.feedback = Some((feedback, at_ns));
+                }
+            }
+            _ => {}
+        }
+    }
+
+    /// True once there is anything to show.
+    pub(crate) fn is_known(&self) -> bool {
+        self.arms
+            .iter()
+            .any(|arm| arm.command.is_some() || arm.feedback.is_some())
+    }
+
+    /// `/live/arms` at `now_ns`; `origin_ns` is the run's beginning.
+    pub(crate) fn picture(&self, now_ns: i64, origin_ns: i64) -> Value {
+        let shapes = RADII_M.iter().enumerate();
+        let shapes: Vec<Value> = shapes
+            .map(|(from, radius_m)| json!({ "from": from, "to": from + 1, "radius_m": radius_m }))
+            .collect();
+        let arms: Vec<Value> = self.arms.iter().map(|arm| arm.picture(now_ns)).collect();
+        json!({ "at_s": seconds(now_ns - origin_ns), "shapes": shapes, "arms": arms })
+    }
+}
+
+impl OneArm {
+    fn picture(&self, now_ns: i64) -> Value {
+        let desired = self.command.map(|(command, _)| command.position_rad);
+        let measured = self.feedback.map(|(feedback, _)| feedback.measured_rad);
+        let [desired, measured] = [desired, measured].map(|joints| joints.filter(is_finite));
+        let age = |at_ns: Option<i64>| at_ns.map(|at_ns| seconds((now_ns - at_ns).max(0)));
+        let feedback = self.feedback.as_ref().map(|(feedback, _)| feedback);
+        let state = feedback.and_then(EgmFeedback::session_state);
+        json!({
+            "side": self.side.word(),
+            "state": state.map(hil_models::egm::messages::SessionState::word),
+            "session": feedback.map(|one| one.session),
+            "queue_count": feedback.map(|one| one.queue_count),
+            "flags": self.flags(),
+            "desired_rad": desired, "measured_rad": measured,
+            "desired_age_s": age(self.command.map(|(_, at_ns)| at_ns)),
+            "measured_age_s": age(self.feedback.map(|(_, at_ns)| at_ns)),
+            "tool_error_mm": desired.zip(measured).map(|both| self.tool_error_mm(&both)),
+            "desired_frames": desired.map(|joints| self.frames(&joints)),
+            "measured_frames": measured.map(|joints| self.frames(&joints)),
+        })
+    }
+
+    fn flags(&self) -> Vec<&'static str> {
+        let of_feedback = [
+            (EgmFeedback::HOLDING, "holding"),
+            (EgmFeedback::AT_POSITION_LIMIT, "at-position-limit"),
+            (EgmFeedback::SPEED_LIMITED, "speed-limited"),
+            (
+                EgmFeedback::SPEED_DEVIATION_LIMITED,
+                "speed-deviation-limited",
+            ),
+            (EgmFeedback::CONVERGED, "converged"),
+        ];
+        let of_command = [
+            (EgmCommand::UNREACHABLE, "unreachable"),
+            (EgmCommand::LIMITED, "limited"),
+            (EgmCommand::JUMP_LIMITED, "jump-limited"),
+            (EgmCommand::PARKED, "parked"),
+        ];
+        let feedback = self.feedback.map_or(0, |(one, _)| one.flags);
+        let command = self.command.map_or(0, |(one, _)| one.flags);
+        let set = |flags: u32| move |(bit, _): &&(u32, &str)| flags & *bit != 0;
+        let words = of_feedback.iter().filter(set(feedback));
+        let words = words.chain(of_command.iter().filter(set(command)));
+        words.map(|(_, word)| *word).collect()
+    }
+
+    fn tool_error_mm(&self, (desired, measured): &(Joints, Joints)) -> f64 {
+        let position = |joints| Pose::from(self.arm.tool(joints)).position_m;
+        let (one, other) = (position(desired), position(measured));
+        let squares = one.iter().zip(&other).map(|(a, b)| (a - b) * (a - b));
+        rounded(1000.0 * squares.sum::<f64>().sqrt())
+    }
+
+    fn frames(&self, joints: &Joints) -> Vec<Vec<f64>> {
+        let frames = self.arm.frames(joints).map(Pose::from);
+        let numbers = frames.iter().map(|frame| {
+            let numbers = frame.position_m.iter().chain(&frame.quaternion_wxyz);
+            numbers.map(|number| (number * 1e4).round() / 1e4).collect()
+        });
+        numbers.collect()
+    }
+}
+
+fn is_finite(joints: &Joints) -> bool {
+    joints.iter().all(|angle| angle.is_finite())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use bytemuck::Zeroable;
+    use hil_models::yumi::arm::RIGHT_START_RAD;
+
+    #[test]
+    fn an_arm_that_is_where_it_shall_be_has_no_error_and_its_tool_at_its_last_frame() {
+        let mut view = ArmsView::new();
+        let (mut command, mut feedback) = (EgmCommand::zeroed(), EgmFeedback::zeroed());
+        command.position_rad = RIGHT_START_RAD;
+        (feedback.measured_rad, feedback.state) = (RIGHT_START_RAD, 4);
+        feedback.flags = EgmFeedback::HOLDING;
+        assert!(!view.is_known());
+        let bytes = bytemuck::bytes_of(&command);
+        view.take("egm/right/command", EgmCommand::NAME, bytes, 0);
+        let bytes = bytemuck::bytes_of(&feedback);
+        view.take("egm/right/feedback", EgmFeedback::NAME, bytes, 500_000_000);
+        let picture = view.picture(1_000_000_000, 0);
+        let [right, left] = [0, 1].map(|arm| &picture["arms"][arm]);
+        assert_eq!(
+            (&right["state"], &right["flags"]),
+            (&json!("running"), &json!(["holding"]))
+        );
+        assert_eq!(
+            (&right["desired_age_s"], &right["measured_age_s"]),
+            (&json!(1.0), &json!(0.5))
+        );
+        assert_eq!(right["tool_error_mm"], 0.0);
+        let tool = Pose::from(Arm::right().tool(&RIGHT_START_RAD)).position_m;
+        let frame = &right["measured_frames"][7];
+        for axis in 0..3 {
+            assert!((frame[axis].as_f64().unwrap() - tool[axis]).abs() < 1e-4);
+        }
+        assert_eq!(left["measured_rad"], Value::Null);
+        assert_eq!(left["desired_frames"], Value::Null);
+    }
+
+    #[test]
+    fn the_error_is_the_way_between_the_tools() {
+        let mut view = ArmsView::new();
+        let (mut command, mut feedback) = (EgmCommand::zeroed(), EgmFeedback::zeroed());
+        command.position_rad = RIGHT_START_RAD;
+        feedback.measured_rad = RIGHT_START_RAD;
+        feedback.measured_rad[0] += 0.01;
+        view.take(
+            "egm/right/command",
+            EgmCommand::NAME,
+            bytemuck::bytes_of(&command),
+            0,
+        );
+        view.take(
+            "egm/right/feedback",
+            EgmFeedback::NAME,
+            bytemuck::bytes_of(&feedback),
+            0,
+        );
+        let error_mm = view.picture(0, 0)["arms"][0]["tool_error_mm"]
+            .as_f64()
+            .unwrap();
+        // The tool is some tenths of a metre off the first joint's axis.
+        assert!((1.0..8.0).contains(&error_mm), "{error_mm}");
+    }
+}

@@ -1,0 +1,157 @@
+//! Collisions of a fleet while it drives: by the referee that scores the run, where the robots'
+//! true motion is recorded on this host; else by the states that they report, which says less.
+
+use std::collections::{BTreeSet, VecDeque};
+
+use hil_models::fleet::geometry::{Footprint, Pose};
+use hil_models::fleet::messages::Truth;
+use hil_models::fleet::referee::{Referee, SCAN_PERIOD};
+use hil_models::time::Instant;
+use serde_json::{Value, json};
+
+use super::ground::Ground;
+use super::{rounded, seconds};
+
+/// The referee looks at what was so long ago: by then, all that was recorded has been read.
+const BEHIND_NS: i64 = 150_000_000;
+/// Records kept until the ground is known.
+const WAITING_MAX: usize = 200_000;
+/// Collisions listed.
+const LISTED_MAX: usize = 100;
+
+/// Finds collisions.
+#[derive(Debug, Default)]
+pub(crate) struct Collisions {
+    referee: Option<Box<Referee>>,
+    waiting: VecDeque<Truth>,
+    forgotten_count: u64,
+    /// Time of the next look, on the robots' clock.
+    next: Option<Instant>,
+    known_count: usize,
+    overlapping: BTreeSet<(u32, u32, u32)>,
+    listed: VecDeque<Value>,
+    count: u64,
+    has_truth: bool,
+}
+
+impl Collisions {
+    /// The ground is known.
+    pub(crate) fn begin(&mut self, ground: &Ground) {
+        let referee = Referee::new(&ground.scene, ground.parameters.fleets);
+        self.referee = Some(Box::new(referee));
+    }
+
+    /// Takes what a robot truly did.
+    pub(crate) fn on_truth(&mut self, truth: Truth) {
+        self.has_truth = true;
+        if self.waiting.len() == WAITING_MAX {
+            self.waiting.pop_front();
+            self.forgotten_count += 1;
+        }
+        self.waiting.push_back(truth);
+    }
+
+    /// True when collisions are those of the robots' true motion.
+    pub(crate) const fn is_by_truth(&self) -> bool {
+        self.has_truth
+    }
+
+    /// Looks at all that was until shortly before `now_ns`; `origin_ns` is the run's beginning,
+    /// both on the robots' clock.
+    pub(crate) fn look(&mut self, now_ns: i64, origin_ns: i64) {
+        let Some(referee) = &mut self.referee else {
+            return;
+        };
+        let first = self
+            .waiting
+            .front()
+            .map(|truth| Instant::from_ns(truth.at_ns));
+        let Some(begin) = self.next.or(first) else {
+            return;
+        };
+        self.next = Some(scan(referee, &mut self.waiting, (begin, now_ns)));
+        let incidents = referee.incidents();
+        let listed: Vec<Value> = incidents[self.known_count..]
+            .iter()
+            .map(|one| {
+                json!({
+                    "at_s": seconds(one.at.as_ns() - origin_ns),
+                    "fleet": one.fleet_id, "robots": one.robots,
+                    "x_m": rounded(one.position_m[0]), "y_m": rounded(one.position_m[1]),
+                    "basis": "truth", "kind": one.kind,
+                })
+            })
+            .collect();
+        self.known_count = incidents.len();
+        for one in listed {
+            self.list(one);
+        }
+    }
+
+    /// Looks at reported poses instead: `robots` of one fleet, with the footprint of all.
+    pub(crate) fn look_at_states(
+        &mut self,
+        fleet: u32,
+        robots: &[(u32, Pose)],
+        vehicle: &Footprint,
+        at_s: f64,
+    ) {
+        if self.has_truth {
+            return;
+        }
+        for (index, (one, pose)) in robots.iter().enumerate() {
+            let covered = vehicle.at(pose);
+            for (other, there) in &robots[index + 1..] {
+                let key = (fleet, *one, *other);
+                let is_overlap = pose.distance_m(there) < 2.0 * vehicle.radius_m()
+                    && covered.overlaps(&vehicle.at(there));
+                if !is_overlap {
+                    self.overlapping.remove(&key);
+                } else if self.overlapping.insert(key) {
+                    self.list(json!({
+                        "at_s": at_s, "fleet": fleet, "robots": [one, other],
+                        "x_m": rounded(0.5 * (pose.x_m + there.x_m)),
+                        "y_m": rounded(0.5 * (pose.y_m + there.y_m)),
+                        "basis": "states", "kind": "overlap",
+                    }));
+                }
+            }
+        }
+    }
+
+    fn list(&mut self, one: Value) {
+        self.count += 1;
+        if self.listed.len() == LISTED_MAX {
+            self.listed.pop_front();
+        }
+        self.listed.push_back(one);
+    }
+
+    /// The last of them, and how many there were; a count that lacks something is not known.
+    pub(crate) fn listed(&self) -> (Vec<Value>, Option<u64>) {
+        let count = (self.forgotten_count == 0).then_some(self.count);
+        (self.listed.iter().cloned().collect(), count)
+    }
+}
+
+/// Gives the referee all records up to each look, from `begin` on; the time of the next look.
+fn scan(
+    referee: &mut Referee,
+    waiting: &mut VecDeque<Truth>,
+    (begin, now_ns): (Instant, i64),
+) -> Instant {
+    let mut at = begin;
+    while at.as_ns() + BEHIND_NS <= now_ns {
+        while waiting
+            .front()
+            .is_some_and(|truth| truth.at_ns <= at.as_ns())
+        {
+            if let Some(truth) = waiting.pop_front() {
+                referee.on_truth(&truth);
+            }
+        }
+        referee.scan(at);
+        at = at + SCAN_PERIOD;
+    }
+    at
+}

@@ -1,0 +1,214 @@
+//! What is known of a run before its first record: channels, links, hosts, the case. Taken from the
+//! manifest; what only the case knows, its roles, from the shipped cases.
+
+use std::time::Duration;
+
+use hil_models::fleet::Fleet;
+use hil_models::shuttle::Shuttle;
+use hil_models::teleoperation::Teleoperation;
+use hil_runtime::manifest::{ChannelDescription, FieldDescription, Manifest};
+use hil_runtime::registry::Registry;
+use serde_json::{Value, json};
+
+use crate::clocks::Clocks;
+
+/// A run, as far as it is known beforehand.
+#[derive(Debug, Default)]
+pub(crate) struct RunFacts {
+    /// Name of its folder.
+    pub(crate) name: String,
+    /// Its case.
+    pub(crate) case: Option<String>,
+    /// `[case.parameters]`, every default spelled out.
+    pub(crate) parameters: Value,
+    /// As planned.
+    pub(crate) duration: Option<Duration>,
+    /// Hosts of the topology on this machine.
+    pub(crate) hosts_here: Vec<String>,
+    /// All of them.
+    pub(crate) hosts: Vec<String>,
+    /// Hash of the topology, and the seed.
+    pub(crate) identity: Option<(String, u64)>,
+    /// The channels.
+    pub(crate) channels: Vec<ChannelFacts>,
+    /// The links.
+    pub(crate) links: Vec<LinkFacts>,
+    /// Stamps of all hosts compare.
+    pub(crate) has_one_clock: bool,
+}
+
+/// A channel.
+#[derive(Debug, Default, Clone)]
+pub(crate) struct ChannelFacts {
+    /// Name.
+    pub(crate) name: String,
+    /// Its message.
+    pub(crate) message: Option<String>,
+    /// Size of one.
+    pub(crate) size_bytes: usize,
+    /// How a message lies in memory.
+    pub(crate) fields: Vec<FieldDescription>,
+    /// Process that publishes, and the one that takes.
+    pub(crate) ends: [Option<String>; 2],
+    /// Their hosts.
+    pub(crate) hosts: [Option<String>; 2],
+    /// How it travels.
+    pub(crate) via: String,
+    /// The link that it crosses.
+    pub(crate) link: Option<String>,
+    /// No producer's record tells when its messages were published; the messages themselves do.
+    pub(crate) is_by_message: bool,
+    /// From the monotonic clocks of the two hosts to the recording's axis, nanoseconds.
+    pub(crate) offsets_ns: [i64; 2],
+}
+
+/// A link.
+#[derive(Debug, Default, Clone)]
+pub(crate) struct LinkFacts {
+    /// Name.
+    pub(crate) name: String,
+    /// `udp`, `tcp`, `emulated`, `shared-memory`.
+    pub(crate) via: String,
+    /// Hosts at its ends.
+    pub(crate) between: [Option<String>; 2],
+}
+
+impl RunFacts {
+    /// What `manifest` says of the run called `name`; `recorded` are the channels with records.
+    pub(crate) fn new(
+        name: &str,
+        manifest: Option<&Manifest>,
+        recorded: &[String],
+        clocks: &Clocks,
+    ) -> Self {
+        let mut facts = Self {
+            name: name.to_owned(),
+            has_one_clock: clocks.has_one_clock == Some(true),
+            ..Self::default()
+        };
+        if let Some(manifest) = manifest {
+            facts.describe(manifest);
+        }
+        for name in recorded {
+            if facts.channel(name).is_none() {
+                let name = name.clone();
+                facts.channels.push(ChannelFacts {
+                    name,
+                    via: "unknown".to_owned(),
+                    ..ChannelFacts::default()
+                });
+            }
+        }
+        for channel in &mut facts.channels {
+            let [from, to] = &channel.hosts;
+            let from_ns = clocks.offset_ns(from.as_deref());
+            let to_ns = to
+                .as_deref()
+                .map_or(from_ns, |to| clocks.offset_ns(Some(to)));
+            channel.offsets_ns = [from_ns, to_ns];
+        }
+        facts
+    }
+
+    fn describe(&mut self, manifest: &Manifest) {
+        let topology = &manifest.topology;
+        let text = |value: &Value| value.as_str().map(str::to_owned);
+        self.case = text(&topology["case"]["name"]);
+        self.parameters = topology["case"]["parameters"].clone();
+        let duration = topology["run"]["duration"].as_str();
+        self.duration = duration.and_then(hil_runtime::topology::read_duration);
+        self.hosts_here.clone_from(&manifest.hosts_here);
+        self.hosts = names(&topology["hosts"]);
+        self.identity = Some((manifest.topology_hash.clone(), manifest.seed));
+        for name in names(&topology["links"]) {
+            let link = &topology["links"][&name];
+            let ends = [0, 1].map(|end| text(&link["between"][end]));
+            self.links.push(LinkFacts {
+                via: text(&link["via"]).unwrap_or_default(),
+                between: ends,
+                name,
+            });
+        }
+        let channels = manifest.channels.iter();
+        self.channels = channels.map(|one| self.described(one, topology)).collect();
+    }
+
+    fn described(&self, one: &ChannelDescription, topology: &Value) -> ChannelFacts {
+        let own = &topology["channels"][&one.name];
+        let crosses = one.to_host.is_some() && one.to_host != one.from_host;
+        let link = own["link"].as_str().filter(|_| crosses);
+        let via = match (&one.to_host, link) {
+            (None, _) => "record",
+            (_, Some(link)) => topology["links"][link]["via"].as_str().unwrap_or("unknown"),
+            _ => "shared-memory",
+        };
+        ChannelFacts {
+            name: one.name.clone(),
+            message: Some(one.message.clone()),
+            size_bytes: one.size_bytes,
+            fields: one.fields.clone(),
+            ends: self.ends(&one.name, topology),
+            hosts: [one.from_host.clone(), one.to_host.clone()],
+            via: via.to_owned(),
+            link: link.map(str::to_owned),
+            is_by_message: one.to_host.is_none(),
+            offsets_ns: [0; 2],
+        }
+    }
+
+    /// Processes at the ends of a channel: as the file says, or those with the case's roles.
+    fn ends(&self, channel: &str, topology: &Value) -> [Option<String>; 2] {
+        let own = &topology["channels"][channel];
+        if let Some(from) = own["from"].as_str() {
+            return [Some(from.to_owned()), own["to"].as_str().map(str::to_owned)];
+        }
+        let registry = shipped();
+        let case = self.case.as_deref().and_then(|name| registry.find(name));
+        let spec = case.and_then(|case| case.channels.iter().find(|one| one.name == channel));
+        let Some(spec) = spec else {
+            return [None, None];
+        };
+        let with_role = |role: &str| {
+            let processes = names(&topology["processes"]);
+            let mut processes = processes.into_iter();
+            processes.find(|name| topology["processes"][name]["role"] == role)
+        };
+        [with_role(spec.from), spec.to.and_then(with_role)]
+    }
+
+    /// The channel called `name`, with its place.
+    pub(crate) fn channel(&self, name: &str) -> Option<(usize, &ChannelFacts)> {
+        let mut channels = self.channels.iter().enumerate();
+        channels.find(|(_, channel)| channel.name == name)
+    }
+
+    /// Its channels as `/live/run` lists them.
+    pub(crate) fn channels_json(&self) -> Vec<Value> {
+        let channels = self.channels.iter();
+        let listed = channels.map(|one| {
+            json!({
+                "name": one.name, "message": one.message,
+                "size_bytes": one.message.as_ref().map(|_| one.size_bytes),
+                "from": one.ends[0], "to": one.ends[1],
+                "from_host": one.hosts[0], "to_host": one.hosts[1],
+                "via": one.via, "link": one.link,
+            })
+        });
+        listed.collect()
+    }
+}
+
+/// Keys of a table, in order.
+fn names(table: &Value) -> Vec<String> {
+    let table = table.as_object();
+    table.map_or_else(Vec::new, |table| table.keys().cloned().collect())
+}
+
+/// The cases that are shipped.
+fn shipped() -> Registry {
+    let mut registry = Registry::default();
+    registry.add::<Fleet>();
+    registry.add::<Teleoperation>();
+    registry.add::<Shuttle>();
+    registry
+}

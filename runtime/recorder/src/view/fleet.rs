@@ -1,0 +1,318 @@
+//! The fleet as its messages tell of it: where each robot last was, how far it may go, who waits.
+
+use std::collections::BTreeMap;
+
+use hil_models::fleet::geometry::{Footprint, Pose};
+use hil_models::fleet::messages::{Mission, NO_AUTHORITY, Phase, State, TO_GOAL, Truth};
+use hil_models::fleet::path::{Path, PathId};
+use hil_models::fleet::scenario::Scene;
+use hil_models::message::Message;
+use serde_json::{Value, json};
+
+use super::collisions::Collisions;
+use super::ground::{Ground, Made, Making, points};
+use super::sections::{Areas, OnPath, of_pair};
+use super::{rounded, seconds};
+
+/// A state older than this is shown as stale.
+const STALE_NS: i64 = 1_000_000_000;
+/// Points of a way ahead.
+const AHEAD_MAX: usize = 24;
+/// Robots of a fleet beyond which sections, a matter of pairs, are not worked out.
+const PAIRED_MAX: usize = 64;
+/// Sections listed.
+const SECTIONS_MAX: usize = 400;
+/// Robots shown at all: a damaged record must not fill the memory.
+const ROBOTS_MAX: usize = 64 * 448;
+
+/// A robot's fleet and number.
+type Id = (u32, u32);
+
+/// The fleets of a run.
+#[derive(Debug)]
+pub(crate) struct FleetView {
+    robots: BTreeMap<Id, Robot>,
+    collisions: Collisions,
+    vehicle: Option<Footprint>,
+    making: Option<Making>,
+    ground: Option<Box<Ground>>,
+    areas: Option<Areas>,
+    /// From the robots' monotonic clock to the axis.
+    offset_ns: i64,
+    /// Why there is no map.
+    pub(crate) problem: Option<String>,
+}
+
+#[derive(Debug, Default)]
+struct Robot {
+    state: Option<(State, i64)>,
+    /// Mission and path, the newest two: a state may still tell of the one before.
+    missions: [(u32, u32); 2],
+}
+
+impl Robot {
+    fn learn(&mut self, mission: u32, path: u32) {
+        if mission != 0 && self.missions[0].0 != mission {
+            self.missions = [(mission, path), self.missions[0]];
+        }
+    }
+
+    fn path_of(&self, mission: u32) -> Option<PathId> {
+        let known = self.missions.iter().find(|(known, _)| *known == mission);
+        known
+            .filter(|_| mission != 0)
+            .map(|(_, path)| PathId(*path))
+    }
+}
+
+impl FleetView {
+    /// A fleet with these `[case.parameters]`; its ground is made from now on.
+    pub(crate) fn new(parameters: &Value) -> Self {
+        let world =
+            serde_json::from_value::<hil_models::fleet::FleetParameters>(parameters.clone());
+        let vehicle = world.as_ref().ok().map(|one| one.world.vehicle().footprint);
+        Self {
+            robots: BTreeMap::new(),
+            collisions: Collisions::default(),
+            vehicle,
+            making: Some(Making::begin(parameters.clone())),
+            ground: None,
+            areas: None,
+            offset_ns: 0,
+            problem: None,
+        }
+    }
+
+    /// Begins again on the same ground.
+    pub(crate) fn rewind(&mut self) {
+        self.robots.clear();
+        self.collisions = Collisions::default();
+        if let Some(ground) = &self.ground {
+            self.collisions.begin(ground);
+        }
+    }
+
+    /// Takes a message; `offset_ns` leads from its producer's clock to the axis.
+    pub(crate) fn take(&mut self, message: &str, payload: &[u8], (at_ns, offset_ns): (i64, i64)) {
+        match message {
+            State::NAME => {
+                if let Some(state) = read::<State>(payload).filter(State::is_sound) {
+                    self.offset_ns = offset_ns;
+                    let header = state.header;
+                    if let Some(robot) = self.robot((header.fleet_id, header.robot_id)) {
+                        robot.state = Some((state, at_ns));
+                    }
+                }
+            }
+            Mission::NAME => {
+                if let Some(mission) = read::<Mission>(payload) {
+                    let header = mission.header;
+                    if let Some(robot) = self.robot((header.fleet_id, header.robot_id)) {
+                        robot.learn(header.mission_id, mission.path_id);
+                    }
+                }
+            }
+            Truth::NAME => {
+                if let Some(truth) = read::<Truth>(payload) {
+                    self.offset_ns = offset_ns;
+                    if let Some(robot) = self.robot((truth.fleet_id, truth.robot_id)) {
+                        robot.learn(truth.mission_id, truth.path_id);
+                    }
+                    self.collisions.on_truth(truth);
+                }
+            }
+            _ => {}
+        }
+    }
+
+    fn robot(&mut self, id: Id) -> Option<&mut Robot> {
+        if self.robots.len() >= ROBOTS_MAX && !self.robots.contains_key(&id) {
+            return None;
+        }
+        Some(self.robots.entry(id).or_default())
+    }
+
+    /// Looks whether the ground has been made; the map, the first time.
+    pub(crate) fn new_map(&mut self) -> Option<Value> {
+        match self.making.as_ref()?.look() {
+            Made::NotYet => return None,
+            Made::Not(why) => self.problem = Some(format!("no map of the fleet: {why}")),
+            Made::Ground(ground) => {
+                self.collisions.begin(&ground);
+                self.areas = Some(Areas::new(ground.scene.world.vehicle.footprint));
+                self.ground = Some(ground);
+            }
+        }
+        self.making = None;
+        self.ground.as_ref().map(|ground| ground.map.clone())
+    }
+
+    /// How many robots there are.
+    pub(crate) fn robot_count(&self) -> usize {
+        self.robots.len()
+    }
+
+    /// `/live/fleet` at `now_ns`; `origin_ns` is the run's beginning, both on the axis.
+    pub(crate) fn picture(&mut self, now_ns: i64, origin_ns: i64) -> Value {
+        let at_s = seconds(now_ns - origin_ns);
+        let offset_ns = self.offset_ns;
+        self.collisions
+            .look(now_ns - offset_ns, origin_ns - offset_ns);
+        self.look_at_states(now_ns, at_s);
+        let scene = self.ground.as_ref().map(|ground| &ground.scene);
+        let robots: Vec<Value> = self
+            .robots
+            .iter()
+            .filter_map(|(id, robot)| picture_of(*id, robot, scene, now_ns))
+            .collect();
+        let sections = self.sections();
+        let (collisions, count) = self.collisions.listed();
+        let basis = if self.collisions.is_by_truth() {
+            "truth"
+        } else {
+            "states"
+        };
+        json!({
+            "at_s": at_s, "robots": robots, "sections": sections,
+            "collisions": collisions, "collision_count": count, "basis": basis,
+        })
+    }
+
+    fn look_at_states(&mut self, now_ns: i64, at_s: f64) {
+        let Some(vehicle) = self.vehicle.filter(|_| !self.collisions.is_by_truth()) else {
+            return;
+        };
+        let mut fleets: BTreeMap<u32, Vec<(u32, Pose)>> = BTreeMap::new();
+        for ((fleet, id), robot) in &self.robots {
+            if let Some((state, at_ns)) = robot.state
+                && now_ns - at_ns < STALE_NS
+            {
+                let pose = Pose::new(state.x_m, state.y_m, state.heading_rad);
+                fleets.entry(*fleet).or_default().push((*id, pose));
+            }
+        }
+        for (fleet, robots) in fleets {
+            let known = robots.len() <= PAIRED_MAX;
+            if known {
+                self.collisions
+                    .look_at_states(fleet, &robots, &vehicle, at_s);
+            }
+        }
+    }
+
+    /// `None` where the ground is not known, or a fleet is too large to look at its pairs.
+    fn sections(&mut self) -> Option<Vec<Value>> {
+        let world = &self.ground.as_ref()?.scene.world;
+        let areas = self.areas.as_mut()?;
+        let mut fleets: BTreeMap<u32, Vec<OnPath>> = BTreeMap::new();
+        for ((fleet, id), robot) in &self.robots {
+            fleets
+                .entry(*fleet)
+                .or_default()
+                .extend(on_path(*id, robot, world));
+        }
+        let mut list = Vec::new();
+        for (fleet, robots) in &fleets {
+            if robots.len() > PAIRED_MAX {
+                return None;
+            }
+            for (index, one) in robots.iter().enumerate() {
+                for other in &robots[index + 1..] {
+                    if list.len() < SECTIONS_MAX {
+                        of_pair(world, areas, *fleet, (one, other), &mut list);
+                    }
+                }
+            }
+        }
+        list.truncate(SECTIONS_MAX);
+        Some(list)
+    }
+}
+
+fn on_path(id: u32, robot: &Robot, world: &hil_models::fleet::world::World) -> Option<OnPath> {
+    let (state, _) = robot.state?;
+    let is_under_way = matches!(
+        Phase::of(state.phase),
+        Some(Phase::Driving | Phase::AtPoint)
+    );
+    let path = robot
+        .path_of(state.header.mission_id)
+        .filter(|_| is_under_way)?;
+    let index = usize::try_from(state.path_index).ok()?;
+    let granted = granted(&state, world.paths.get(path)?).unwrap_or(index);
+    Some(OnPath {
+        robot: id,
+        path,
+        index,
+        granted,
+    })
+}
+
+/// The last pose that the robot may reach; `None` before it was told.
+fn granted(state: &State, path: &Path) -> Option<usize> {
+    match state.authority_index {
+        TO_GOAL => Some(path.last_index()),
+        NO_AUTHORITY => None,
+        index => usize::try_from(index)
+            .ok()
+            .map(|index| index.min(path.last_index())),
+    }
+}
+
+fn picture_of((fleet, id): Id, robot: &Robot, scene: Option<&Scene>, now_ns: i64) -> Option<Value> {
+    let (state, at_ns) = robot.state?;
+    let phase = Phase::of(state.phase)?;
+    let word = match phase {
+        Phase::Parked => "parked",
+        Phase::Driving => "driving",
+        Phase::AtPoint => "at-point",
+        Phase::Done => "done",
+    };
+    let is_standing = state.speed_mps.abs() < 1e-3;
+    let mission = state.header.mission_id;
+    let mut picture = json!({
+        "fleet": fleet, "id": id,
+        "x_m": rounded(state.x_m), "y_m": rounded(state.y_m),
+        "heading_rad": rounded(state.heading_rad), "speed_mps": rounded(state.speed_mps.into()),
+        "age_s": seconds((now_ns - at_ns).max(0)), "is_stale": now_ns - at_ns > STALE_NS,
+        "phase": word,
+        "is_waiting": phase == Phase::AtPoint || (phase == Phase::Driving && is_standing),
+        "mission": (mission != 0).then_some(mission),
+        "path": null, "goal": null, "path_index": null, "granted_index": null,
+        "last_index": null, "granted_m": null, "ahead": [], "granted": [],
+    });
+    let id = robot.path_of(mission);
+    let path = id.and_then(|id| scene?.world.paths.get(id));
+    if let (Some(id), Some(path)) = (id, path) {
+        let here = usize::try_from(state.path_index)
+            .unwrap_or(0)
+            .min(path.last_index());
+        let granted = granted(&state, path);
+        let route = scene.and_then(|scene| scene.world.routes.iter().find(|one| one.path == id));
+        picture["path"] = json!(id.0);
+        picture["goal"] = json!(route.map(|route| route.to));
+        picture["path_index"] = json!(here);
+        picture["last_index"] = json!(path.last_index());
+        picture["granted_index"] = json!(granted);
+        if matches!(phase, Phase::Driving | Phase::AtPoint) {
+            let ahead = points(path, (here, path.last_index()), AHEAD_MAX);
+            picture["ahead"] = json!(ahead);
+        }
+        if let Some(granted) = granted {
+            let way_m = path.way_to_m(granted) - state.travelled_m;
+            picture["granted_m"] = json!(rounded(way_m.max(0.0)));
+            if granted > here {
+                picture["granted"] = json!(points(path, (here, granted), AHEAD_MAX));
+            }
+        }
+    }
+    Some(picture)
+}
+
+fn read<M: Message>(payload: &[u8]) -> Option<M> {
+    bytemuck::try_pod_read_unaligned(payload).ok()
+}
+
+#[cfg(test)]
+#[path = "fleet_tests.rs"]
+mod tests;

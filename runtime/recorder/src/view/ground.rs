@@ -1,0 +1,190 @@
+//! The ground of a fleet, made from the run's parameters as its own processes make it: map, paths,
+//! vehicle. Planning the paths takes seconds, so it is done beside everything else.
+
+use std::sync::mpsc::{Receiver, TryRecvError, channel};
+use std::thread;
+
+use hil_models::fleet::FleetParameters;
+use hil_models::fleet::geometry::{Bounds, Footprint, Pose};
+use hil_models::fleet::path::{Path, PathId};
+use hil_models::fleet::scenario::Scene;
+use serde_json::{Value, json};
+
+use super::rounded;
+use super::sections::Areas;
+
+/// Points of all paths that are shown: more would be a picture of megabytes.
+const POINTS_MAX: usize = 20_000;
+/// Conflict areas that are shown.
+const AREAS_MAX: usize = 400;
+
+/// The ground, once it is known.
+#[derive(Debug)]
+pub(crate) struct Ground {
+    /// World, starts, partners.
+    pub(crate) scene: Scene,
+    /// What was set.
+    pub(crate) parameters: FleetParameters,
+    /// `/live/map`.
+    pub(crate) map: Value,
+}
+
+/// A ground that is being made.
+#[derive(Debug)]
+pub(crate) struct Making {
+    result: Receiver<Result<Box<Ground>, String>>,
+}
+
+/// What became of it.
+pub(crate) enum Made {
+    /// Not yet.
+    NotYet,
+    /// Here.
+    Ground(Box<Ground>),
+    /// It cannot be made, and why.
+    Not(String),
+}
+
+impl Making {
+    /// Begins to make the ground of the fleet with these `[case.parameters]`.
+    pub(crate) fn begin(parameters: Value) -> Self {
+        let (give, result) = channel();
+        thread::spawn(move || {
+            // Nobody may be there any more to take it.
+            let _is_wanted = give.send(make(parameters)).is_ok();
+        });
+        Self { result }
+    }
+
+    /// Looks whether it is done.
+    pub(crate) fn look(&self) -> Made {
+        match self.result.try_recv() {
+            Ok(Ok(ground)) => Made::Ground(ground),
+            Ok(Err(why)) => Made::Not(why),
+            Err(TryRecvError::Empty) => Made::NotYet,
+            Err(TryRecvError::Disconnected) => Made::Not("making the map failed".to_owned()),
+        }
+    }
+}
+
+fn make(parameters: Value) -> Result<Box<Ground>, String> {
+    let parameters: FleetParameters =
+        serde_json::from_value(parameters).map_err(|error| error.to_string())?;
+    let scene = parameters
+        .world
+        .build()
+        .map_err(|error| error.to_string())?;
+    let map = map(&parameters, &scene).map_err(|error| error.to_string())?;
+    Ok(Box::new(Ground {
+        scene,
+        parameters,
+        map,
+    }))
+}
+
+fn map(
+    parameters: &FleetParameters,
+    scene: &Scene,
+) -> Result<Value, hil_models::case_study::ParameterError> {
+    let known = parameters.world.map()?;
+    let world = &scene.world;
+    let vehicle = &world.vehicle.footprint;
+    let bounds = known
+        .as_ref()
+        .map_or_else(|| around(scene), |map| map.bounds);
+    let bays = world.bays.iter().enumerate();
+    let bays: Vec<_> = bays
+        .map(|(id, bay)| {
+            let Pose {
+                x_m,
+                y_m,
+                heading_rad,
+            } = bay.pose;
+            json!({ "id": id, "x_m": rounded(x_m), "y_m": rounded(y_m),
+                    "heading_rad": rounded(heading_rad) })
+        })
+        .collect();
+    let forward = world.routes.iter().filter(|route| route.path.0 % 2 == 0);
+    let each = POINTS_MAX / forward.clone().count().max(1);
+    let paths: Vec<_> = forward
+        .map(|route| {
+            let path = world.path(route.path);
+            let points = points(path, (0, path.last_index()), each.clamp(2, 200));
+            json!({ "id": route.path.0, "from": route.from, "to": route.to, "points": points })
+        })
+        .collect();
+    let scenario = serde_json::to_value(parameters.world.scenario).unwrap_or(Value::Null);
+    Ok(json!({
+        "case": "fleet",
+        "scenario": scenario,
+        "bounds": bounds,
+        "obstacles": known.map_or_else(Vec::new, |map| map.obstacles),
+        "bays": bays,
+        "footprint": { "length_m": vehicle.length_m, "width_m": vehicle.width_m },
+        "paths": paths,
+        "conflict_areas": conflict_areas(scene, vehicle),
+        "fleet_count": parameters.fleets,
+        "robot_count": scene.starts.len(),
+    }))
+}
+
+/// The ground on which vehicles of two shuttle lines can meet.
+fn conflict_areas(scene: &Scene, vehicle: &Footprint) -> Vec<Value> {
+    let world = &scene.world;
+    let line = |start: &usize| -> Option<PathId> {
+        let partner = scene.partners[*start]?;
+        let routes = world.routes_from(*start).iter();
+        let mut routes = routes.filter(|route| route.to == partner);
+        routes.next().map(|route| route.path)
+    };
+    let lines: Vec<_> = scene.starts.iter().filter_map(line).collect();
+    let mut areas = Areas::new(*vehicle);
+    let mut shown = Vec::new();
+    for (index, one) in lines.iter().enumerate() {
+        for other in &lines[index + 1..] {
+            for section in 0..world.sections.between(*one, *other).len() {
+                if shown.len() == AREAS_MAX {
+                    return shown;
+                }
+                let area = areas.of(world, (*one, *other), section);
+                if !area.is_empty() {
+                    shown.push(json!(area));
+                }
+            }
+        }
+    }
+    shown
+}
+
+/// A rectangle around all paths, where the ground has no edge.
+fn around(scene: &Scene) -> Bounds {
+    let world = &scene.world;
+    let radius_m = 2.0 * world.vehicle.footprint.radius_m();
+    let poses = world.paths.ids().filter_map(|id| world.paths.get(id));
+    let poses = poses.flat_map(|path| path.poses());
+    let each = poses.map(|pose| Bounds {
+        x_min_m: pose.x_m - radius_m,
+        x_max_m: pose.x_m + radius_m,
+        y_min_m: pose.y_m - radius_m,
+        y_max_m: pose.y_m + radius_m,
+    });
+    let joined = each.reduce(|one, other| one.joined(&other));
+    joined.unwrap_or(Bounds {
+        x_min_m: 0.0,
+        x_max_m: 1.0,
+        y_min_m: 0.0,
+        y_max_m: 1.0,
+    })
+}
+
+/// At most about `count_max` points of `path` from one pose to another, both ends among them.
+pub(crate) fn points(path: &Path, (from, to): (usize, usize), count_max: usize) -> Vec<[f64; 2]> {
+    let to = to.min(path.last_index());
+    let from = from.min(to);
+    let step = (to - from).div_ceil(count_max.max(1)).max(1);
+    let poses = path.poses();
+    let at = |index: usize| [rounded(poses[index].x_m), rounded(poses[index].y_m)];
+    let mut points: Vec<_> = (from..to).step_by(step).map(at).collect();
+    points.push(at(to));
+    points
+}

@@ -1,0 +1,200 @@
+//! Everything of a run at once: takes its records and gives the JSON of each topic of
+//! docs/live-view.md.
+
+use serde_json::{Value, json};
+
+use super::account::Account;
+use super::arms::ArmsView;
+use super::facts::RunFacts;
+use super::fleet::FleetView;
+use super::{Body, LiveRecord, seconds};
+use crate::net::MessageLatency;
+
+/// Robots from which on the fleet's picture is drawn more seldom.
+const MANY_ROBOTS: usize = 64;
+
+/// How a run stands.
+#[derive(Debug, Clone, PartialEq, Eq)]
+enum Standing {
+    /// Records come.
+    Running,
+    /// None comes any more, and how it ended.
+    Ended(String),
+}
+
+/// A run while it goes on.
+#[derive(Debug)]
+pub(crate) struct RunState {
+    /// What was known before.
+    pub(crate) facts: RunFacts,
+    /// How it stands.
+    standing: Standing,
+    accounts: Vec<Account>,
+    fleet: Option<FleetView>,
+    arms: ArmsView,
+    /// The first record's time.
+    origin_ns: Option<i64>,
+    ended_ns: Option<i64>,
+    read_count: u64,
+}
+
+impl RunState {
+    /// A run without a record yet.
+    pub(crate) fn new(facts: RunFacts) -> Self {
+        let channels = facts.channels.iter();
+        let accounts = channels.map(|channel| Account::new(channel, facts.has_one_clock));
+        let is_fleet = facts.case.as_deref() == Some("fleet");
+        Self {
+            accounts: accounts.collect(),
+            fleet: is_fleet.then(|| FleetView::new(&facts.parameters)),
+            arms: ArmsView::new(),
+            standing: Standing::Running,
+            origin_ns: None,
+            ended_ns: None,
+            read_count: 0,
+            facts,
+        }
+    }
+
+    /// Begins again with the same run; what takes long to work out is kept.
+    pub(crate) fn rewind(&mut self) {
+        let channels = self.facts.channels.iter();
+        let accounts = channels.map(|channel| Account::new(channel, self.facts.has_one_clock));
+        self.accounts = accounts.collect();
+        self.arms = ArmsView::new();
+        if let Some(fleet) = &mut self.fleet {
+            fleet.rewind();
+        }
+        self.origin_ns = None;
+        self.ended_ns = None;
+        self.standing = Standing::Running;
+        self.read_count = 0;
+    }
+
+    /// Stamps of all hosts compare from now on.
+    pub(crate) fn compare_clocks(&mut self) {
+        self.facts.has_one_clock = true;
+        for account in &mut self.accounts {
+            account.compare_clocks();
+        }
+    }
+
+    /// Takes a record.
+    pub(crate) fn take(&mut self, record: &LiveRecord) {
+        let Some(channel) = self.facts.channels.get(record.channel) else {
+            return;
+        };
+        if self
+            .origin_ns
+            .is_none_or(|origin_ns| record.at_ns < origin_ns)
+        {
+            self.origin_ns = Some(record.at_ns);
+        }
+        self.accounts[record.channel].take(record);
+        if let Body::Message(payload) = &record.body {
+            self.read_count += 1;
+            let message = channel.message.as_deref().unwrap_or_default();
+            self.arms
+                .take(&channel.name, message, payload, record.at_ns);
+            if let Some(fleet) = &mut self.fleet {
+                fleet.take(message, payload, (record.at_ns, channel.offsets_ns[0]));
+            }
+        }
+    }
+
+    /// It ended, and how; true when that is news.
+    pub(crate) fn end(&mut self, how: String, now_ns: i64) -> bool {
+        let standing = Standing::Ended(how);
+        let is_news = self.standing != standing;
+        self.ended_ns.get_or_insert(now_ns);
+        self.standing = standing;
+        is_news
+    }
+
+    /// Seconds from the first record to now or to the end.
+    pub(crate) fn elapsed_s(&self, now_ns: i64) -> Option<f64> {
+        let now_ns = self.ended_ns.unwrap_or(now_ns);
+        self.origin_ns
+            .map(|origin_ns| seconds((now_ns - origin_ns).max(0)))
+    }
+
+    /// `/live/run`, without what only the server knows.
+    pub(crate) fn run(&self, now_ns: i64) -> Value {
+        let facts = &self.facts;
+        let (state, how) = match &self.standing {
+            Standing::Running => ("running", None),
+            Standing::Ended(how) => ("ended", Some(how)),
+        };
+        json!({
+            "name": facts.name, "case": facts.case, "state": state, "how": how,
+            "elapsed_s": self.elapsed_s(now_ns),
+            "duration_s": facts.duration.map(|one| one.as_secs_f64()),
+            "hosts_here": facts.hosts_here, "hosts": facts.hosts,
+            "topology_hash": facts.identity.as_ref().map(|(hash, _)| hash),
+            "seed": facts.identity.as_ref().map(|(_, seed)| seed),
+            "channels": facts.channels_json(),
+            "recorder": { "read_count": self.read_count },
+        })
+    }
+
+    /// True when no more records come.
+    pub(crate) fn is_over(&self) -> bool {
+        self.standing != Standing::Running
+    }
+
+    /// What went wrong in here.
+    pub(crate) fn problem(&self) -> Option<&str> {
+        self.fleet.as_ref()?.problem.as_deref()
+    }
+
+    /// `/live/channels`, and each `/live/losses` since the last call.
+    pub(crate) fn channels(&mut self, now_ns: i64) -> (Value, Vec<Value>) {
+        let at_s = self.elapsed_s(now_ns);
+        let (mut channels, mut losses) = (Vec::new(), Vec::new());
+        for (account, facts) in self.accounts.iter_mut().zip(&self.facts.channels) {
+            account.settle(now_ns);
+            channels.push(account.figures(&facts.name, now_ns));
+            // Another host's clock may be anything.
+            let from_host = facts.hosts[0].as_ref();
+            let is_here = from_host.is_some_and(|host| self.facts.hosts_here.contains(host));
+            let origin_ns = self
+                .origin_ns
+                .filter(|_| is_here || self.facts.has_one_clock);
+            let origin_ns = origin_ns.map(|origin_ns| origin_ns - facts.offsets_ns[0]);
+            losses.extend(account.take_losses(&facts.name, at_s.unwrap_or(0.0), origin_ns));
+        }
+        let channels = json!({ "at_s": at_s, "window_s": 1, "channels": channels });
+        (channels, losses)
+    }
+
+    /// Stamps of single messages of the channel with this place, some of those whose way is over.
+    pub(crate) fn shown(&mut self, channel: usize) -> Vec<MessageLatency> {
+        self.accounts[channel].take_shown()
+    }
+
+    /// `/live/map` when it is new.
+    pub(crate) fn new_map(&mut self) -> Option<Value> {
+        self.fleet.as_mut()?.new_map()
+    }
+
+    /// True when the fleet's picture is worth drawing in every round.
+    pub(crate) fn is_small(&self) -> bool {
+        let robots = self.fleet.as_ref().map(FleetView::robot_count);
+        robots.is_none_or(|count| count <= MANY_ROBOTS)
+    }
+
+    /// `/live/fleet`.
+    pub(crate) fn fleet(&mut self, now_ns: i64) -> Option<Value> {
+        let origin_ns = self.origin_ns?;
+        let fleet = self.fleet.as_mut()?;
+        Some(fleet.picture(now_ns, origin_ns))
+    }
+
+    /// `/live/arms`.
+    pub(crate) fn arms(&self, now_ns: i64) -> Option<Value> {
+        let origin_ns = self.origin_ns?;
+        self.arms
+            .is_known()
+            .then(|| self.arms.picture(now_ns, origin_ns))
+    }
+}

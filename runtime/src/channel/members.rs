@@ -1,0 +1,45 @@
+//! Who is a member of a domain: the processes of its run, and observers, which only look on and
+//! whose leaving nobody has to wait for.
+
+use iceoryx2::config::Config;
+use iceoryx2::node::{Node, NodeState, NodeView};
+use iceoryx2::prelude::{CallbackProgression, NodeName, ipc};
+
+/// What the nodes of observers are called.
+const OBSERVER: &str = "hil-observer";
+
+/// Living members of a domain.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(super) struct Members {
+    /// Processes of the run.
+    pub(super) process_count: u64,
+    /// Observers.
+    pub(super) observer_count: u64,
+}
+
+/// The name under which an observer joins.
+pub(super) fn observer_name() -> NodeName {
+    NodeName::new(OBSERVER).expect("a short plain name is a node's name")
+}
+
+/// Counts the living members of the domain that `config` describes.
+pub(super) fn living(config: &Config) -> Members {
+    let mut members = Members::default();
+    let listed = Node::<ipc::Service>::list(config, |state| {
+        if let NodeState::Alive(view) = state {
+            let name = view
+                .details()
+                .as_ref()
+                .map(|details| details.name().as_str() == OBSERVER);
+            let count = if name == Some(true) {
+                &mut members.observer_count
+            } else {
+                &mut members.process_count
+            };
+            *count += 1;
+        }
+        CallbackProgression::Continue
+    });
+    // An unreadable list means a deleted directory, hence no members.
+    listed.map_or_else(|_unreadable| Members::default(), |()| members)
+}

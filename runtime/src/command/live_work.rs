@@ -1,0 +1,48 @@
+//! The commands that look at a run while it goes: `channel` and `top`.
+
+use super::{columns, exit, interrupted, signals};
+use crate::console::Console;
+use crate::live::channel::{self, End};
+use crate::live::cli::{ChannelArgs, TopArgs};
+use crate::live::top::{self, TopEnd, TopError};
+use crate::registry::Registry;
+
+/// `channel`.
+pub(super) fn channel(args: ChannelArgs, registry: &Registry, console: &mut Console) -> u8 {
+    let signals = match signals(console) {
+        Ok(signals) => signals,
+        Err(code) => return code,
+    };
+    match channel::run(args, registry, &signals, console) {
+        Ok(End::Done) => exit::RAN,
+        Ok(End::Interrupted) => interrupted(),
+        Err(error) => {
+            console.error(&error.to_string());
+            if error.is_usage() {
+                exit::USAGE
+            } else {
+                exit::FAILED
+            }
+        }
+    }
+}
+
+/// `top`.
+pub(super) fn top(args: &TopArgs, registry: &Registry, console: &mut Console) -> u8 {
+    let signals = match signals(console) {
+        Ok(signals) => signals,
+        Err(code) => return code,
+    };
+    match top::run(args, columns(), registry, (&signals, console)) {
+        Ok(TopEnd::Done) => exit::RAN,
+        Ok(TopEnd::Interrupted) => interrupted(),
+        Err(error) => {
+            console.error(&error.to_string());
+            match error {
+                TopError::Observe(_) => exit::USAGE,
+                TopError::Terminal(_) => exit::FAILED,
+                TopError::Json(_) => exit::INTERNAL,
+            }
+        }
+    }
+}

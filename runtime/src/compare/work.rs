@@ -1,0 +1,96 @@
+//! What `hil-runtime compare` does: reads, compares, judges, prints.
+
+use std::path::PathBuf;
+
+use serde::Serialize;
+
+use super::cli::{CompareArgs, CompareFormat};
+use super::conditions::{Condition, Judged};
+use super::{ComparedRun, Comparison, render};
+use crate::console::Console;
+
+/// How it ended; the caller knows the exit codes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum End {
+    /// No condition holds.
+    Passed,
+    /// One does.
+    Failed,
+    /// Nothing could be compared or judged.
+    Refused,
+}
+
+/// Does what the command line says.
+pub(crate) fn work(args: &CompareArgs, console: &mut Console) -> End {
+    match compared(args) {
+        Ok((text, has_failed)) => {
+            console.result(&format!("{text}\n"));
+            if has_failed {
+                console.error("a condition of --fail-if holds");
+                return End::Failed;
+            }
+            End::Passed
+        }
+        Err(text) => {
+            console.error(&text);
+            End::Refused
+        }
+    }
+}
+
+fn compared(args: &CompareArgs) -> Result<(String, bool), String> {
+    let (base, new) = sides(args);
+    // Wrong words are told before folders are read.
+    let conditions = args.fail_if.iter().map(|text| Condition::parse(text));
+    let conditions = conditions
+        .collect::<Result<Vec<_>, _>>()
+        .map_err(|error| error.to_string())?;
+    let read = |folders: &[PathBuf]| {
+        let runs = folders.iter().map(|folder| ComparedRun::read(folder));
+        runs.collect::<Result<Vec<_>, _>>()
+            .map_err(|error| error.to_string())
+    };
+    let comparison = Comparison::of(&read(&base)?, &read(&new)?);
+    let mut judged = Vec::new();
+    for condition in &conditions {
+        let found = condition
+            .judge(&comparison, args.strict)
+            .map_err(|error| error.to_string())?;
+        judged.extend(found);
+    }
+    let has_failed = judged.iter().any(|one| one.holds);
+    let format = if args.json {
+        CompareFormat::Json
+    } else {
+        args.format
+    };
+    let text = match format {
+        CompareFormat::Text => render::text(&comparison, &judged),
+        CompareFormat::Md => render::markdown(&comparison, &judged),
+        CompareFormat::Json => json(&comparison, &judged)?,
+    };
+    Ok((text, has_failed))
+}
+
+fn sides(args: &CompareArgs) -> (Vec<PathBuf>, Vec<PathBuf>) {
+    match args.runs.as_slice() {
+        [base, new] => (vec![base.clone()], vec![new.clone()]),
+        _ => (args.base.clone(), args.new.clone()),
+    }
+}
+
+fn json(comparison: &Comparison, conditions: &[Judged]) -> Result<String, String> {
+    #[derive(Serialize)]
+    struct Document<'a> {
+        schema_version: u32,
+        #[serde(flatten)]
+        comparison: &'a Comparison,
+        conditions: &'a [Judged],
+    }
+    let document = Document {
+        schema_version: 1,
+        comparison,
+        conditions,
+    };
+    serde_json::to_string_pretty(&document).map_err(|error| error.to_string())
+}

@@ -1,0 +1,177 @@
+//! Which runs go on this host, and which of them is meant.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use super::live::LiveRun;
+use crate::supervisor::domain_base_candidates;
+
+/// Why no run could be chosen.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum SelectError {
+    /// Nothing runs.
+    #[error("no run goes on this host")]
+    NoneRuns,
+    /// Nothing of that name runs.
+    #[error("no run {wanted:?} goes on this host; {}", list(.running))]
+    NoSuch {
+        /// What was asked for.
+        wanted: String,
+        /// What runs.
+        running: Vec<String>,
+    },
+    /// A folder of a run that is over.
+    #[error("the run in {folder} does not go any more")]
+    Over {
+        /// The folder.
+        folder: PathBuf,
+    },
+    /// More than one could be meant.
+    #[error("{} runs could be meant: {}; give the name of one, or its folder", .running.len(), .running.join(", "))]
+    Several {
+        /// Their names.
+        running: Vec<String>,
+    },
+}
+
+fn list(running: &[String]) -> String {
+    if running.is_empty() {
+        "none does".to_owned()
+    } else {
+        format!("these do: {}", running.join(", "))
+    }
+}
+
+/// The runs that go on this host, by name.
+pub fn running_runs() -> Vec<LiveRun> {
+    let bases = domain_base_candidates();
+    let mut found: BTreeMap<PathBuf, LiveRun> = BTreeMap::new();
+    for base in &bases {
+        for run in running_runs_below(base) {
+            found.insert(run.folder.clone(), run);
+        }
+    }
+    let mut runs: Vec<LiveRun> = found.into_values().collect();
+    runs.sort_by(|one, other| one.name.cmp(&other.name));
+    runs
+}
+
+/// The runs whose shared-memory domains lie below `base`. Those of killed supervisors are left
+/// out.
+pub fn running_runs_below(base: &Path) -> Vec<LiveRun> {
+    let mut found: BTreeMap<PathBuf, LiveRun> = BTreeMap::new();
+    let entries = fs::read_dir(base).into_iter().flatten().flatten();
+    for entry in entries {
+        // Anything else there is not a domain's folder, or not one of a run that began.
+        if let Ok(run) = LiveRun::read(&entry.path())
+            && run.is_held()
+        {
+            found.insert(run.folder.clone(), run);
+        }
+    }
+    found.into_values().collect()
+}
+
+/// The run that `wanted` means: a run's folder, its name, the beginning of its name (its topology,
+/// for one), or without a word the only one.
+///
+/// # Errors
+/// When none or several could be meant; the error names those that run.
+pub fn select(wanted: Option<&str>) -> Result<LiveRun, SelectError> {
+    choose(wanted, running_runs())
+}
+
+fn choose(wanted: Option<&str>, mut running: Vec<LiveRun>) -> Result<LiveRun, SelectError> {
+    if let Some(wanted) = wanted {
+        let folder = Path::new(wanted);
+        if folder.is_dir() {
+            return in_folder(folder);
+        }
+        if let Some(index) = running.iter().position(|run| run.name == wanted) {
+            return Ok(running.swap_remove(index));
+        }
+        let all = names(&running);
+        running.retain(|run| run.name.starts_with(wanted));
+        if running.is_empty() {
+            return Err(SelectError::NoSuch {
+                wanted: wanted.to_owned(),
+                running: all,
+            });
+        }
+    }
+    if running.len() > 1 {
+        let running = names(&running);
+        return Err(SelectError::Several { running });
+    }
+    running.pop().ok_or(SelectError::NoneRuns)
+}
+
+/// A run's folder says itself where its domains are, wherever these lie.
+fn in_folder(folder: &Path) -> Result<LiveRun, SelectError> {
+    let over = || SelectError::Over {
+        folder: folder.to_owned(),
+    };
+    let run = LiveRun::read(folder).map_err(|_absent| over())?;
+    if run.is_held() { Ok(run) } else { Err(over()) }
+}
+
+fn names(runs: &[LiveRun]) -> Vec<String> {
+    runs.iter().map(|run| run.name.clone()).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn run(name: &str) -> LiveRun {
+        let text = format!(
+            r#"{{"schema_version": 1, "name": "{name}", "topology": "t", "folder": "/r/{name}",
+               "pid": 1, "since": "", "domains": {{}}}}"#
+        );
+        serde_json::from_str(&text).unwrap()
+    }
+
+    fn chosen(wanted: Option<&str>, names: &[&str]) -> Result<String, String> {
+        let running = names.iter().map(|name| run(name)).collect();
+        let chosen = choose(wanted, running);
+        chosen
+            .map(|run| run.name)
+            .map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn a_run_is_meant_by_name_by_beginning_or_by_being_the_only_one() {
+        let two = ["teleop-1", "teleop-12"];
+        assert_eq!(chosen(None, &["a-1"]), Ok("a-1".to_owned()));
+        assert_eq!(chosen(Some("teleop-1"), &two), Ok("teleop-1".to_owned()));
+        assert_eq!(chosen(Some("teleop-12"), &two), Ok("teleop-12".to_owned()));
+        assert_eq!(
+            chosen(Some("fleet"), &["teleop-1", "fleet-1"]),
+            Ok("fleet-1".to_owned())
+        );
+    }
+
+    #[test]
+    fn errors_name_what_runs() {
+        let two = ["teleop-1", "teleop-2"];
+        for wanted in [None, Some("teleop")] {
+            let error = chosen(wanted, &two).unwrap_err();
+            assert!(error.contains("teleop-1, teleop-2"), "{error}");
+        }
+        let error = chosen(Some("fleet"), &two).unwrap_err();
+        assert!(
+            error.contains("\"fleet\"") && error.contains("teleop-2"),
+            "{error}"
+        );
+        assert!(
+            chosen(Some("fleet"), &[])
+                .unwrap_err()
+                .contains("none does")
+        );
+        assert_eq!(chosen(None, &[]).unwrap_err(), "no run goes on this host");
+        let folder = std::env::temp_dir();
+        let error = chosen(folder.to_str(), &two).unwrap_err();
+        assert!(error.contains("does not go any more"), "{error}");
+    }
+}

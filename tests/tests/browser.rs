@@ -1,0 +1,374 @@
+//! Our pages in a browser: the live page of `hil-recorder serve` beside a run that goes on, and the pages of
+//! `hil-runtime report`. Clicks and keys go through the browser's own input, figures are read off the page.
+//!
+//! Needs Chromium; without one the tests say so and are skipped, and in CI they fail. `HIL_BROWSER` names
+//! another one, and empty leaves them out. Pictures go to `HIL_SCREENSHOTS`, else to the target folder.
+#![allow(clippy::unwrap_used, clippy::print_stderr, reason = "tests")]
+
+use std::path::Path;
+use std::process::Command;
+use std::time::Duration;
+
+use hil_tests::binary::{hil_recorder_binary, hil_runtime_binary};
+use hil_tests::browser::{Browser, Page, screenshot_folder};
+use hil_tests::child::{ChildGuard, run};
+use hil_tests::lab::{Lab, LabHost};
+use hil_tests::run_folder::RunFolder;
+use hil_tests::trial::Trial;
+use nix::sys::signal::Signal;
+use serde_json::Value;
+
+const LIMIT: Duration = Duration::from_mins(2);
+const DESKTOP: (u32, u32) = (1440, 900);
+const PHONE: (u32, u32) = (390, 844);
+/// All that a page may bring over the network, in bytes.
+const WEIGHT_MAX: u64 = 1_000_000;
+
+/// A run that goes on, a recorder that shows it, and the address of its page.
+struct Shown {
+    run: ChildGuard,
+    recorder: ChildGuard,
+    address: String,
+    folder: RunFolder,
+}
+
+impl Shown {
+    fn start(trial: &Trial, folder: RunFolder, host: Option<&LabHost>) -> Self {
+        let run = host.map_or_else(|| trial.start_here(), |host| trial.start_on(host));
+        let root = trial.folder("", LIMIT).root().to_owned();
+        let ports = ["--port", "0", "--http-port", "0"];
+        let (recorder, address) = serve(&root, host, &ports);
+        Self {
+            run,
+            recorder,
+            address,
+            folder,
+        }
+    }
+
+    /// Ends both as a user does, and waits for them.
+    fn end(mut self) {
+        for child in [&mut self.recorder, &mut self.run] {
+            child.signal(Signal::SIGINT).unwrap();
+            child.wait_within(LIMIT).unwrap();
+        }
+        drop(self.folder);
+    }
+}
+
+/// Shows the run of this folder as soon as it goes on.
+fn serve(root: &Path, host: Option<&LabHost>, options: &[&str]) -> (ChildGuard, String) {
+    let name = root.file_name().unwrap();
+    let binary = hil_recorder_binary();
+    let mut command = host.map_or_else(|| Command::new(binary), |host| host.command(binary));
+    let mut recorder =
+        ChildGuard::spawn(command.args(["serve", "--wait"]).arg(name).args(options)).unwrap();
+    let printed = recorder.wait_for_output("http://", LIMIT);
+    assert!(printed.is_ok(), "{}", printed.unwrap_err());
+    let words = recorder.stdout_so_far() + &recorder.stderr_so_far();
+    let mut addresses = words.split_whitespace();
+    let address = addresses.find(|word| word.starts_with("http://")).unwrap();
+    let address = address.trim_end_matches([',', '.']).to_owned();
+    (recorder, address)
+}
+
+/// Nothing on the console, nothing from elsewhere, and no more than a page may weigh.
+fn assert_clean(page: &mut Page<'_>, name: &str) {
+    let complaints = page.complaints();
+    assert!(complaints.is_empty(), "{name}: {complaints:#?}");
+    for address in page.addresses() {
+        let is_own = ["http://127.0.0.1:", "ws://127.0.0.1:", "file:///"]
+            .iter()
+            .any(|own| address.starts_with(own));
+        assert!(is_own, "{name} asked for {address}");
+    }
+    let bytes = page.received_bytes();
+    eprintln!("{name}: {bytes} bytes over the network");
+    assert!(bytes <= WEIGHT_MAX, "{name}: {bytes} bytes");
+}
+
+/// Pictures as on a desk, in the dark and on a phone, where nothing may stick out sideways.
+fn take_pictures(page: &mut Page<'_>, name: &str) {
+    let folder = screenshot_folder();
+    page.value("scrollTo(0, 0)");
+    settle(page);
+    page.screenshot(&folder.join(format!("{name}-desktop.png")));
+    page.set_dark(true);
+    settle(page);
+    page.screenshot(&folder.join(format!("{name}-dark.png")));
+    page.set_dark(false);
+    page.set_size(PHONE.0, PHONE.1);
+    settle(page);
+    page.screenshot(&folder.join(format!("{name}-phone.png")));
+    let width = page.value("document.documentElement.scrollWidth");
+    assert_eq!(width, PHONE.0, "{name} on a phone");
+    page.set_size(DESKTOP.0, DESKTOP.1);
+    settle(page);
+}
+
+/// Waits until the page has been drawn a few times since whatever was done to it.
+fn settle(page: &mut Page<'_>) {
+    let frames = "new Promise(done => { let left = 30; const next = () => --left ? \
+                  requestAnimationFrame(next) : done(true); next(); })";
+    page.value(frames);
+}
+
+/// Keeps an expression's value on the page under a name, to compare with later.
+fn keep(page: &mut Page<'_>, name: &str, expression: &str) {
+    page.value(&format!("void (window.{name} = {expression})"));
+}
+
+fn number(page: &mut Page<'_>, expression: &str) -> f64 {
+    let value = page.value(expression);
+    value
+        .as_f64()
+        .unwrap_or_else(|| panic!("{expression} is {value}"))
+}
+
+/// Pauses with the mouse, goes back with keys and slider, and returns to what is now.
+fn check_past(page: &mut Page<'_>, scene: &str) {
+    page.wait_until("hil.snapshot().kept_s > 4");
+    page.click("#pause");
+    page.wait_until("document.body.dataset.paused === 'true'");
+    settle(page);
+    let drawn = format!("JSON.stringify([hil.snapshot().moment, hil.snapshot().{scene}])");
+    keep(page, "drawnThen", &drawn);
+    keep(page, "keptThen", "hil.snapshot().kept_s");
+    page.wait_until("hil.snapshot().kept_s > keptThen + 1.5");
+    assert_eq!(
+        page.value(&format!("{drawn} === drawnThen")),
+        true,
+        "a pause holds"
+    );
+    let paused_at = number(page, "hil.snapshot().moment");
+    // Off the button, where keys mean the page.
+    page.value("document.activeElement.blur()");
+    for _press in 0..4 {
+        page.press("ArrowLeft");
+    }
+    settle(page);
+    let earlier = number(page, "hil.snapshot().moment");
+    assert!(
+        (paused_at - earlier - 2.0).abs() < 0.01,
+        "{paused_at} {earlier}"
+    );
+    assert_eq!(page.value(&format!("{drawn} === drawnThen")), false);
+    page.value("(() => { scrub.value = scrub.min; scrub.dispatchEvent(new Event('input')); })()");
+    settle(page);
+    assert!(number(page, "hil.snapshot().moment") < earlier);
+    page.press(" ");
+    page.wait_until("document.body.dataset.paused === 'false'");
+    assert!(
+        number(page, "hil.snapshot().moment") > paused_at + 1.0,
+        "now is now"
+    );
+    page.press(" ");
+    page.wait_until("document.body.dataset.paused === 'true'");
+    page.click("#live");
+    page.wait_until("document.body.dataset.paused === 'false'");
+}
+
+/// Rates, counts and delays are numbers with units, and they grow or change.
+fn check_numbers(page: &mut Page<'_>, channel: &str) {
+    let cell = |label: &str| format!("tr[data-channel='{channel}'] [data-label='{label}']");
+    let published = format!(
+        "Number((document.querySelector({:?})?.textContent ?? '').replaceAll(',', ''))",
+        cell("published")
+    );
+    page.wait_until(&format!("{published} > 0"));
+    let before = number(page, &published);
+    page.wait_until(&format!("{published} > {before}"));
+    for (label, unit) in [("rate", "Hz"), ("p50", "s"), ("p99", "s"), ("max", "s")] {
+        let text = page.text(&cell(label));
+        let (figure, found) = text.split_once(' ').unwrap_or((&text, ""));
+        assert!(
+            figure.parse::<f64>().is_ok() && found.ends_with(unit),
+            "{label}: {text}"
+        );
+    }
+}
+
+/// Types a delay of a link's way; the server says that it is set, and the run feels it.
+fn check_condition(page: &mut Page<'_>, way: &str, channel: &str) {
+    let parameter = format!("link.{way}.delay_ms");
+    let field = format!("[id='set-{parameter}']");
+    page.wait_until(&format!(
+        "document.querySelector(\"{field}\") && hil.snapshot().conditions['{parameter}'] !== undefined"
+    ));
+    assert_eq!(
+        page.value(&format!(
+            "document.querySelector(\"{field}\").matches(':disabled')"
+        )),
+        false
+    );
+    page.click(&field);
+    page.value("document.activeElement.select()");
+    for key in ["8", "0", "Enter"] {
+        page.press(key);
+    }
+    page.wait_until(&format!(
+        "document.querySelector(\"[data-parameter='{parameter}']\").textContent === '80 ms, confirmed'"
+    ));
+    let (link, direction) = way.split_once('.').unwrap();
+    page.wait_until(&format!(
+        "hil.snapshot().run.links.find(one => one.name === '{link}').directions\
+         .find(one => one.way === '{direction}').condition.delay_ms === 80"
+    ));
+    page.wait_until(&format!(
+        "hil.snapshot().channels.channels.find(one => one.name === '{channel}').one_way?.p50_us > 79000"
+    ));
+}
+
+/// The recorder goes and comes back: the page says so, and goes on by itself.
+fn check_return(page: &mut Page<'_>, shown: &mut Shown, root: &Path) {
+    let socket = page
+        .addresses()
+        .into_iter()
+        .find(|one| one.starts_with("ws://"))
+        .unwrap();
+    let port = |address: &str| {
+        address
+            .trim_end_matches('/')
+            .rsplit(':')
+            .next()
+            .unwrap()
+            .to_owned()
+    };
+    let (socket, http) = (port(&socket), port(&shown.address));
+    shown.recorder.signal(Signal::SIGINT).unwrap();
+    shown.recorder.wait_within(LIMIT).unwrap();
+    page.wait_until("document.body.dataset.state === 'lost' && !lost.hidden");
+    let (recorder, _) = serve(root, None, &["--port", &socket, "--http-port", &http]);
+    shown.recorder = recorder;
+    page.wait_until("document.body.dataset.state === 'live' && lost.hidden");
+    keep(page, "movedSince", "hil.snapshot().moment");
+    page.wait_until("hil.snapshot().moment > movedSince + 1");
+}
+
+#[test]
+fn the_live_page_shows_a_fleet_and_changes_its_links() {
+    let Some(mut browser) = Browser::start_or_skip() else {
+        return;
+    };
+    let folder = RunFolder::new("browser-fleet");
+    let trial = Trial::shipped("fleet-emulated.toml", folder.path())
+        .set("case.parameters.fleets=2")
+        .set("run.duration=\"10 min\"")
+        .set("links.commands.port=48700")
+        .set("links.states.port=48710");
+    let mut shown = Shown::start(&trial, folder, None);
+    let root = trial.folder("", LIMIT).root().to_owned();
+    let mut page = browser.page(DESKTOP.0, DESKTOP.1);
+    page.go(&shown.address);
+    page.wait_until("document.body.dataset.state === 'live' && hil.snapshot().robots.length === 7");
+    keep(&mut page, "robotsThen", "hil.snapshot().robots");
+    page.wait_until(
+        "hil.snapshot().robots.some((one, index) => \
+         Math.hypot(one.x_px - robotsThen[index].x_px, one.y_px - robotsThen[index].y_px) > 4)",
+    );
+    assert_eq!(
+        page.value("document.querySelectorAll('[data-robot]').length"),
+        7
+    );
+    page.wait_until("document.querySelectorAll('#event-list li').length > 0");
+    check_numbers(&mut page, "fleet/state");
+    check_past(&mut page, "robots");
+    page.click("#fleet-choice button:nth-child(2)");
+    page.wait_until("hil.snapshot().robots.length === 7 && hil.snapshot().robots[0].fleet === 1");
+    take_pictures(&mut page, "live-fleet");
+    check_condition(&mut page, "commands.forward", "fleet/authority");
+    assert_clean(&mut page, "the live page of a fleet");
+    // From here on the browser itself complains of the lost connection.
+    check_return(&mut page, &mut shown, &root);
+    drop(page);
+    shown.end();
+}
+
+#[test]
+fn the_live_page_shows_arms_where_there_is_no_network() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let host = lab.host(0);
+    let Some(mut browser) = Browser::start_on_or_skip(host) else {
+        return;
+    };
+    let folder = RunFolder::new("browser-arms");
+    let trial = Trial::shipped("emulated.toml", folder.path()).set("run.duration=\"10 min\"");
+    let shown = Shown::start(&trial, folder, Some(host));
+    let mut page = browser.page(DESKTOP.0, DESKTOP.1);
+    page.go(&shown.address);
+    page.wait_until("document.body.dataset.state === 'live' && hil.snapshot().tools.length === 2");
+    keep(&mut page, "toolsThen", "hil.snapshot().tools");
+    page.wait_until(
+        "hil.snapshot().tools.some((one, index) => \
+         Math.hypot(one.x_px - toolsThen[index].x_px, one.y_px - toolsThen[index].y_px) > 2)",
+    );
+    let points =
+        "Number(document.querySelector(\"[data-strip^='egm/right/command']\")?.dataset.points)";
+    page.wait_until(&format!("{points} > 3"));
+    let before = number(&mut page, points);
+    page.wait_until(&format!("{points} > {before} + 10"));
+    check_numbers(&mut page, "egm/right/command");
+    check_past(&mut page, "tools");
+    page.click("tr[data-channel='egm/right/command'] button");
+    page.wait_until("document.querySelectorAll('.strip').length >= 7");
+    take_pictures(&mut page, "live-arms");
+    assert_clean(&mut page, "the live page of arms");
+    drop(page);
+    shown.end();
+}
+
+fn made_report(trial: &Trial, output: &Path) {
+    let finished = trial.start_here().wait_within(LIMIT).unwrap();
+    finished.assert_success();
+    let root = trial.folder("", LIMIT).root().to_owned();
+    let mut command = Command::new(hil_runtime_binary());
+    command.arg("report").arg(root).arg("-o").arg(output);
+    run(&mut command, LIMIT).unwrap();
+}
+
+fn look_at_report(browser: &mut Browser, report: &Path, name: &str) {
+    let mut page = browser.page(DESKTOP.0, DESKTOP.1);
+    page.go(&format!("file://{}", report.display()));
+    let timing = "performance.getEntriesByType('navigation')[0].loadEventEnd";
+    page.wait_until(&format!("{timing} > 0"));
+    let loaded_ms = number(&mut page, timing);
+    eprintln!("{name}: loaded after {loaded_ms:.0} ms");
+    let figures = "[...document.querySelectorAll('table.figures td.n')]\
+                   .filter(cell => /[0-9]/.test(cell.textContent)).length";
+    assert!(
+        number(&mut page, figures) >= 10.0,
+        "{name}: tables have numbers"
+    );
+    let drawings: Value = page.value("document.querySelectorAll('svg.figure path').length");
+    assert!(
+        drawings.as_u64().unwrap() > 5,
+        "{name}: {drawings} lines drawn"
+    );
+    take_pictures(&mut page, name);
+    assert_clean(&mut page, name);
+}
+
+#[test]
+fn reports_of_fleet_and_arms_open_without_a_complaint() {
+    let Some(mut browser) = Browser::start_or_skip() else {
+        return;
+    };
+    let fleet = RunFolder::new("browser-report-fleet");
+    let trial = Trial::shipped("fleet-emulated.toml", fleet.path())
+        .set("case.parameters.fleets=1")
+        .set("run.duration=\"6 s\"")
+        .set("links.commands.port=48720")
+        .set("links.states.port=48730");
+    let page = fleet.join("report.html");
+    made_report(&trial, &page);
+    look_at_report(&mut browser, &page, "report-fleet");
+    let arms = RunFolder::new("browser-report-arms");
+    let trial = Trial::shipped("emulated.toml", arms.path())
+        .set("run.duration=\"6 s\"")
+        .set("links.hop.port=48740");
+    let page = arms.join("report.html");
+    made_report(&trial, &page);
+    look_at_report(&mut browser, &page, "report-arms");
+}
