@@ -229,26 +229,17 @@ fn entry(joined: &mut Latencies, epoch: u32, sequence: u64) -> &mut MessageLaten
 
 /// Puts a record beside the others of its message.
 pub(crate) fn published(joined: &mut Latencies, record: &PublishedRecord) {
-    let one = entry(joined, record.epoch, record.sequence);
-    one.published_ns = stamp(record.published_ns);
+    entry(joined, record.epoch, record.sequence).note_published(record);
 }
 
 /// Puts a record beside the others of its message.
 pub(crate) fn taken(joined: &mut Latencies, record: &TakenRecord) {
-    let one = entry(joined, record.epoch, record.sequence);
-    one.published_ns = one.published_ns.or(stamp(record.published_ns));
-    one.taken_ns = stamp(record.taken_ns);
+    entry(joined, record.epoch, record.sequence).note_taken(record);
 }
 
 /// Puts a record beside the others of its message.
 pub(crate) fn sent(joined: &mut Latencies, record: &EgressRecord) {
-    let one = entry(joined, record.epoch, record.sequence);
-    one.published_ns = one.published_ns.or(stamp(record.published_ns));
-    one.gateway_taken_ns = stamp(record.taken_ns);
-    one.handed_ns = stamp(record.handed_ns);
-    one.tx_realtime_ns = stamp(record.tx_software_ns);
-    one.tx_card_ns = stamp(record.tx_hardware_ns);
-    one.sender_realtime_offset_ns = stamp(record.realtime_offset_ns);
+    entry(joined, record.epoch, record.sequence).note_sent(record);
 }
 
 /// Puts a record beside the others of its message.
@@ -257,14 +248,42 @@ pub(crate) fn received(joined: &mut Latencies, record: &IngressRecord) {
     if record.flags & IngressRecord::DUPLICATE != 0 {
         return;
     }
-    let one = entry(joined, record.epoch, record.sequence);
-    one.published_ns = one.published_ns.or(stamp(record.published_ns));
-    one.handed_ns = one.handed_ns.or(stamp(record.handed_ns));
-    one.rx_card_ns = stamp(record.rx_hardware_ns);
-    one.rx_realtime_ns = stamp(record.rx_software_ns);
-    one.received_ns = stamp(record.received_ns);
-    one.forwarded_ns = stamp(record.forwarded_ns);
-    one.receiver_realtime_offset_ns = stamp(record.realtime_offset_ns);
+    entry(joined, record.epoch, record.sequence).note_received(record);
+}
+
+/// What each record says of its message, in whatever order they come.
+impl MessageLatency {
+    /// The producer's.
+    pub(crate) fn note_published(&mut self, record: &PublishedRecord) {
+        self.published_ns = stamp(record.published_ns);
+    }
+
+    /// The consumer's.
+    pub(crate) fn note_taken(&mut self, record: &TakenRecord) {
+        self.published_ns = self.published_ns.or(stamp(record.published_ns));
+        self.taken_ns = stamp(record.taken_ns);
+    }
+
+    /// The sending gateway's.
+    pub(crate) fn note_sent(&mut self, record: &EgressRecord) {
+        self.published_ns = self.published_ns.or(stamp(record.published_ns));
+        self.gateway_taken_ns = stamp(record.taken_ns);
+        self.handed_ns = stamp(record.handed_ns);
+        self.tx_realtime_ns = stamp(record.tx_software_ns);
+        self.tx_card_ns = stamp(record.tx_hardware_ns);
+        self.sender_realtime_offset_ns = stamp(record.realtime_offset_ns);
+    }
+
+    /// The receiving gateway's, of the first copy.
+    pub(crate) fn note_received(&mut self, record: &IngressRecord) {
+        self.published_ns = self.published_ns.or(stamp(record.published_ns));
+        self.handed_ns = self.handed_ns.or(stamp(record.handed_ns));
+        self.rx_card_ns = stamp(record.rx_hardware_ns);
+        self.rx_realtime_ns = stamp(record.rx_software_ns);
+        self.received_ns = stamp(record.received_ns);
+        self.forwarded_ns = stamp(record.forwarded_ns);
+        self.receiver_realtime_offset_ns = stamp(record.realtime_offset_ns);
+    }
 }
 
 /// Transmit stamps that came in later datagrams, for messages whose sender left no records. They

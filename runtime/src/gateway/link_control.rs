@@ -246,15 +246,7 @@ impl ConditionBook {
             return Ok(());
         }
         let header = self.header(self.instance);
-        let path = self.folder.join(header.file_name(&self.process));
-        let bytes = header.encode(&path)?;
-        let file = File::create_new(&path)
-            .and_then(|mut file| file.write_all(&bytes).map(|()| file))
-            .map_err(|source| RecordFileError::Io {
-                path: path.clone(),
-                source,
-            })?;
-        self.file = Some((path, file));
+        self.file = Some(header.create(&self.folder, &self.process)?);
         Ok(())
     }
 

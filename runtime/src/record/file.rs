@@ -10,8 +10,8 @@
 //! | 20 | 12 | zero |
 //! | 32 | 96 | channel name, UTF-8, padded with zeros |
 
-use std::fs;
-use std::io;
+use std::fs::{self, File};
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use bytemuck::Pod;
@@ -191,6 +191,25 @@ impl RecordHeader {
         bytes[16..20].copy_from_slice(&self.instance.to_le_bytes());
         bytes[32..32 + name.len()].copy_from_slice(name);
         Ok(bytes)
+    }
+
+    /// Makes the file of `writer` in `folder`, with the header in it; its path as well.
+    ///
+    /// # Errors
+    /// When it exists or cannot be written, or the channel name is too long.
+    pub(crate) fn create(
+        &self,
+        folder: &Path,
+        writer: &str,
+    ) -> Result<(PathBuf, File), RecordFileError> {
+        let path = folder.join(self.file_name(writer));
+        let bytes = self.encode(&path)?;
+        let made =
+            File::create_new(&path).and_then(|mut file| file.write_all(&bytes).map(|()| file));
+        match made {
+            Ok(file) => Ok((path, file)),
+            Err(source) => Err(RecordFileError::Io { path, source }),
+        }
     }
 
     /// The name of the process that wrote the file called `name`, which has this header; `None`

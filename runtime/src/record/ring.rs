@@ -129,14 +129,7 @@ impl Recorder {
             record_bytes: record_bytes_header,
             instance: self.instance,
         };
-        let path = self.folder.join(header.file_name(&self.writer));
-        let bytes = header.encode(&path)?;
-        let file = File::create_new(&path)
-            .and_then(|mut file| file.write_all(&bytes).map(|()| file))
-            .map_err(|source| RecordFileError::Io {
-                path: path.clone(),
-                source,
-            })?;
+        let (path, file) = header.create(&self.folder, &self.writer)?;
         let capacity_records = capacity_records
             .min(RING_BYTES_MAX / record_bytes)
             .max(RING_RECORDS_MIN);

@@ -1,9 +1,7 @@
 //! The stages of one message as its records come in, in any order, and which of the way's segments
 //! they complete. The stages are those of the account of a finished run.
 
-use hil_models::measure::record::{
-    EgressRecord, IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE,
-};
+use hil_models::measure::record::{EgressRecord, IngressRecord, PublishedRecord, TakenRecord};
 
 use crate::net::MessageLatency;
 
@@ -54,38 +52,23 @@ impl Joined {
 
     /// It was published.
     pub(crate) fn published(&mut self, record: &PublishedRecord) {
-        self.stamps.published_ns = stamp(record.published_ns);
+        self.stamps.note_published(record);
     }
 
     /// It was taken.
     pub(crate) fn taken(&mut self, record: &TakenRecord) {
-        let one = &mut self.stamps;
-        one.published_ns = one.published_ns.or(stamp(record.published_ns));
-        one.taken_ns = stamp(record.taken_ns);
+        self.stamps.note_taken(record);
     }
 
     /// It was sent.
     pub(crate) fn sent(&mut self, record: &EgressRecord) {
-        let one = &mut self.stamps;
-        one.published_ns = one.published_ns.or(stamp(record.published_ns));
-        one.gateway_taken_ns = stamp(record.taken_ns);
-        one.handed_ns = stamp(record.handed_ns);
-        one.tx_realtime_ns = stamp(record.tx_software_ns);
-        one.tx_card_ns = stamp(record.tx_hardware_ns);
-        one.sender_realtime_offset_ns = stamp(record.realtime_offset_ns);
+        self.stamps.note_sent(record);
         self.is_refused = record.flags & EgressRecord::REFUSED_BY_KERNEL != 0;
     }
 
     /// It arrived, for the first time.
     pub(crate) fn received(&mut self, record: &IngressRecord) {
-        let one = &mut self.stamps;
-        one.published_ns = one.published_ns.or(stamp(record.published_ns));
-        one.handed_ns = one.handed_ns.or(stamp(record.handed_ns));
-        one.rx_card_ns = stamp(record.rx_hardware_ns);
-        one.rx_realtime_ns = stamp(record.rx_software_ns);
-        one.received_ns = stamp(record.received_ns);
-        one.forwarded_ns = stamp(record.forwarded_ns);
-        one.receiver_realtime_offset_ns = stamp(record.realtime_offset_ns);
+        self.stamps.note_received(record);
         self.has_ingress = true;
     }
 
@@ -140,10 +123,6 @@ impl Joined {
         self.counted = counted;
         self.stamps.delay_ns = whole;
     }
-}
-
-fn stamp(ns: i64) -> Option<i64> {
-    (ns != UNAVAILABLE).then_some(ns)
 }
 
 fn minus(ns: Option<i64>, offset_ns: Option<i64>) -> Option<i64> {
