@@ -1,4 +1,4 @@
-//! The page over HTTP: files that are part of the program, and where the socket is. It reads no file
+//! The page over HTTP: one file that is part of the program, and where the socket is. It reads no file
 //! and knows no other path, so there is nothing outside to reach.
 
 use std::convert::Infallible;
@@ -17,12 +17,19 @@ use serde_json::json;
 use tokio::net::TcpListener;
 use tokio::runtime::Handle;
 
-// `PAGE_FILES`: name and content of each file of the folder `page`, written by the build script.
-include!(concat!(env!("OUT_DIR"), "/page_files.rs"));
+/// The page with its style and scripts, made of the folder `page` by the build script.
+const PAGE: &str = include_str!(concat!(env!("OUT_DIR"), "/page.html"));
 
-/// Nothing from elsewhere is loaded or run; the socket may be on any port that a tunnel gives it.
-const POLICY: &str = "default-src 'self'; connect-src 'self' ws:; img-src 'self' data:; object-src 'none'; \
-                      base-uri 'none'; frame-ancestors 'none'; form-action 'none'";
+/// Nothing but the page's own script and style is run or drawn; the socket may be on any port that a
+/// tunnel gives it.
+const POLICY: &str = concat!(
+    "default-src 'none'; script-src 'sha256-",
+    include_str!(concat!(env!("OUT_DIR"), "/script.digest")),
+    "'; style-src 'sha256-",
+    include_str!(concat!(env!("OUT_DIR"), "/style.digest")),
+    "'; connect-src 'self' ws:; img-src data:; base-uri 'none'; frame-ancestors 'none'; \
+     form-action 'none'"
+);
 
 /// Connections at once; more wait.
 const CONNECTIONS_MAX: usize = 64;
@@ -78,17 +85,13 @@ fn answer(method: &Method, path: &str, config: &Bytes) -> Response<Full<Bytes>> 
         response.headers_mut().insert(header::ALLOW, allowed);
         return response;
     }
-    let name = match path {
-        "/" => "index.html",
-        path => path.strip_prefix('/').unwrap_or(path),
-    };
-    if name == "config.json" {
-        return found("application/json", config.clone());
-    }
-    let mut files = PAGE_FILES.iter();
-    match files.find(|(known, _)| *known == name) {
-        Some((name, content)) => found(content_type(name), Bytes::from_static(content)),
-        None => plain(StatusCode::NOT_FOUND, "no such file\n"),
+    match path {
+        "/" => found(
+            "text/html; charset=utf-8",
+            Bytes::from_static(PAGE.as_bytes()),
+        ),
+        "/config.json" => found("application/json", config.clone()),
+        _ => plain(StatusCode::NOT_FOUND, "no such file\n"),
     }
 }
 
@@ -119,20 +122,6 @@ fn with_headers(status: StatusCode, kind: &'static str, content: Bytes) -> Respo
         headers.insert(name, HeaderValue::from_static(value));
     }
     response
-}
-
-fn content_type(name: &str) -> &'static str {
-    match name.rsplit_once('.').map(|(_, extension)| extension) {
-        Some("html") => "text/html; charset=utf-8",
-        Some("js" | "mjs") => "text/javascript; charset=utf-8",
-        Some("css") => "text/css; charset=utf-8",
-        Some("svg") => "image/svg+xml",
-        Some("png") => "image/png",
-        Some("json") => "application/json",
-        Some("woff2") => "font/woff2",
-        Some("txt") => "text/plain; charset=utf-8",
-        _ => "application/octet-stream",
-    }
 }
 
 #[cfg(test)]
@@ -170,9 +159,21 @@ mod tests {
     }
 
     #[test]
-    fn every_file_of_the_page_has_a_type() {
-        for (name, _) in PAGE_FILES {
-            assert_ne!(content_type(name), "application/octet-stream", "{name}");
+    fn the_page_is_one_file_with_all_that_its_parts_have() {
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/page");
+        for entry in std::fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            let text = std::fs::read_to_string(&path).unwrap();
+            // Imports and exports are rewritten, links are replaced by what they name.
+            let is_kept = |line: &&str| {
+                !["import ", "export ", "<link rel=\"stylesheet", "<script"]
+                    .iter()
+                    .any(|start| line.starts_with(start))
+            };
+            for line in text.lines().filter(is_kept) {
+                assert!(PAGE.contains(line), "{}: {line}", path.display());
+            }
         }
+        assert!(!PAGE.contains("src=") && !PAGE.contains("rel=\"stylesheet"));
     }
 }
