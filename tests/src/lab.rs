@@ -233,6 +233,17 @@ impl LabHost {
         command
     }
 
+    /// Plugs a cable in (`up`) or pulls it (`down`).
+    ///
+    /// # Panics
+    /// When it cannot be done.
+    pub fn set_link(&self, interface: &str, what: &str) {
+        let words = ["-n", &self.namespace, "link", "set", interface, what];
+        if let Err(reason) = namespace::ip(&words) {
+            panic!("{interface} {what}: {reason}");
+        }
+    }
+
     /// Runs `work` in a thread whose new sockets belong to this host's network. The sockets stay
     /// there when they are handed out; the file system is this machine's.
     ///

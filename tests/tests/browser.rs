@@ -1,5 +1,5 @@
 //! Our pages in a browser: the live page of `hil-recorder serve` beside a run that goes on, and the pages of
-//! `hil-runtime report`. Clicks and keys go through the browser's own input, figures are read off the page.
+//! `hil-runtime report`, with the network cable pulled. Clicks and keys go through the browser's own input, figures are read off the page.
 //!
 //! Needs Chromium; without one the tests say so and are skipped, and in CI they fail. `HIL_BROWSER` names
 //! another one, and empty leaves them out. Pictures go to `HIL_SCREENSHOTS`, else to the target folder.
@@ -12,7 +12,7 @@ use std::time::Duration;
 use hil_tests::binary::{hil_recorder_binary, hil_runtime_binary};
 use hil_tests::browser::{Browser, Page, screenshot_folder};
 use hil_tests::child::{ChildGuard, run};
-use hil_tests::lab::{Lab, LabHost};
+use hil_tests::lab::{INTERFACE, Lab, LabHost};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::Trial;
 use nix::sys::signal::Signal;
@@ -33,8 +33,8 @@ struct Shown {
 }
 
 impl Shown {
-    fn start(trial: &Trial, folder: RunFolder, host: Option<&LabHost>) -> Self {
-        let run = host.map_or_else(|| trial.start_here(), |host| trial.start_on(host));
+    fn start(trial: &Trial, folder: RunFolder, host: &LabHost) -> Self {
+        let run = trial.start_on(host);
         let root = trial.folder("", LIMIT).root().to_owned();
         let ports = ["--port", "0", "--http-port", "0"];
         let (recorder, address) = serve(&root, host, &ports);
@@ -56,11 +56,18 @@ impl Shown {
     }
 }
 
+/// A network on which nothing can be reached and nothing changes: browsers drop what they are loading
+/// when an interface comes or goes, as those of other tests do all the time.
+fn with_the_cable_pulled() -> Option<Lab> {
+    let lab = Lab::two_hosts_or_skip()?;
+    lab.host(0).set_link(INTERFACE, "down");
+    Some(lab)
+}
+
 /// Shows the run of this folder as soon as it goes on.
-fn serve(root: &Path, host: Option<&LabHost>, options: &[&str]) -> (ChildGuard, String) {
+fn serve(root: &Path, host: &LabHost, options: &[&str]) -> (ChildGuard, String) {
     let name = root.file_name().unwrap();
-    let binary = hil_recorder_binary();
-    let mut command = host.map_or_else(|| Command::new(binary), |host| host.command(binary));
+    let mut command = host.command(hil_recorder_binary());
     let mut recorder =
         ChildGuard::spawn(command.args(["serve", "--wait"]).arg(name).args(options)).unwrap();
     let printed = recorder.wait_for_output("http://", LIMIT);
@@ -220,7 +227,7 @@ fn check_condition(page: &mut Page<'_>, way: &str, channel: &str) {
 }
 
 /// The recorder goes and comes back: the page says so, and goes on by itself.
-fn check_return(page: &mut Page<'_>, shown: &mut Shown, root: &Path) {
+fn check_return(page: &mut Page<'_>, shown: &mut Shown, (root, host): (&Path, &LabHost)) {
     let socket = page
         .addresses()
         .into_iter()
@@ -238,7 +245,7 @@ fn check_return(page: &mut Page<'_>, shown: &mut Shown, root: &Path) {
     shown.recorder.signal(Signal::SIGINT).unwrap();
     shown.recorder.wait_within(LIMIT).unwrap();
     page.wait_until("document.body.dataset.state === 'lost' && !lost.hidden");
-    let (recorder, _) = serve(root, None, &["--port", &socket, "--http-port", &http]);
+    let (recorder, _) = serve(root, host, &["--port", &socket, "--http-port", &http]);
     shown.recorder = recorder;
     page.wait_until("document.body.dataset.state === 'live' && lost.hidden");
     keep(page, "movedSince", "hil.snapshot().moment");
@@ -247,16 +254,22 @@ fn check_return(page: &mut Page<'_>, shown: &mut Shown, root: &Path) {
 
 #[test]
 fn the_live_page_shows_a_fleet_and_changes_its_links() {
-    let Some(mut browser) = Browser::start_or_skip() else {
+    let Some(lab) = with_the_cable_pulled() else {
+        return;
+    };
+    let host = lab.host(0);
+    let Some(mut browser) = Browser::start_on_or_skip(host) else {
         return;
     };
     let folder = RunFolder::new("browser-fleet");
+    // Another test may begin a run of that topology in the same second.
     let trial = Trial::shipped("fleet-emulated.toml", folder.path())
+        .set("name=\"shown-fleet\"")
         .set("case.parameters.fleets=2")
         .set("run.duration=\"10 min\"")
         .set("links.commands.port=48700")
         .set("links.states.port=48710");
-    let mut shown = Shown::start(&trial, folder, None);
+    let mut shown = Shown::start(&trial, folder, host);
     let root = trial.folder("", LIMIT).root().to_owned();
     let mut page = browser.page(DESKTOP.0, DESKTOP.1);
     page.go(&shown.address);
@@ -279,14 +292,14 @@ fn the_live_page_shows_a_fleet_and_changes_its_links() {
     check_condition(&mut page, "commands.forward", "fleet/authority");
     assert_clean(&mut page, "the live page of a fleet");
     // From here on the browser itself complains of the lost connection.
-    check_return(&mut page, &mut shown, &root);
+    check_return(&mut page, &mut shown, (&root, host));
     drop(page);
     shown.end();
 }
 
 #[test]
-fn the_live_page_shows_arms_where_there_is_no_network() {
-    let Some(lab) = Lab::two_hosts_or_skip() else {
+fn the_live_page_shows_arms() {
+    let Some(lab) = with_the_cable_pulled() else {
         return;
     };
     let host = lab.host(0);
@@ -294,8 +307,10 @@ fn the_live_page_shows_arms_where_there_is_no_network() {
         return;
     };
     let folder = RunFolder::new("browser-arms");
-    let trial = Trial::shipped("emulated.toml", folder.path()).set("run.duration=\"10 min\"");
-    let shown = Shown::start(&trial, folder, Some(host));
+    let trial = Trial::shipped("emulated.toml", folder.path())
+        .set("name=\"shown-arms\"")
+        .set("run.duration=\"10 min\"");
+    let shown = Shown::start(&trial, folder, host);
     let mut page = browser.page(DESKTOP.0, DESKTOP.1);
     page.go(&shown.address);
     page.wait_until("document.body.dataset.state === 'live' && hil.snapshot().tools.length === 2");

@@ -221,7 +221,7 @@ fn a_cable_that_is_never_plugged_in_delays_the_run_and_does_not_stop_it() {
     };
     let record = RunFolder::new("clock-unplugged");
     lab.lay_second_cable();
-    link(&lab, 1, "down");
+    lab.host(1).set_link(SECOND_INTERFACE, "down");
     for summary in &Split::start(lab, &record, "2 s").finish() {
         let pair = pair(summary);
         assert!(!path(pair).has_exchanges(), "{pair:?}");
@@ -232,12 +232,6 @@ fn a_cable_that_is_never_plugged_in_delays_the_run_and_does_not_stop_it() {
         });
         assert_eq!(waited.count(), 1, "{:?}", summary.events);
     }
-}
-
-fn link(lab: &Lab, index: usize, what: &str) {
-    let mut command: Command = lab.host(index).command("ip");
-    let words = ["link", "set", SECOND_INTERFACE, what];
-    assert!(command.args(words).status().unwrap().success());
 }
 
 #[test]
@@ -261,7 +255,7 @@ fn a_killed_end_comes_back_and_a_cable_pulled_in_the_run_leaves_a_gap_that_is_to
     wait_until(LIMIT, "exchanges after the restarts", || {
         exchanged() > before + 48 * 20
     });
-    link(&split.lab, 0, "down");
+    split.lab.host(0).set_link(SECOND_INTERFACE, "down");
     let files = split.files[0].root().join("records");
     for summary in &split.finish() {
         let pair = pair(summary);

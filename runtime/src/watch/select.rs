@@ -88,11 +88,12 @@ fn choose(wanted: Option<&str>, mut running: Vec<LiveRun>) -> Result<LiveRun, Se
         if folder.is_dir() {
             return in_folder(folder);
         }
-        if let Some(index) = running.iter().position(|run| run.name == wanted) {
-            return Ok(running.swap_remove(index));
-        }
         let all = names(&running);
-        running.retain(|run| run.name.starts_with(wanted));
+        if running.iter().any(|run| run.name == wanted) {
+            running.retain(|run| run.name == wanted);
+        } else {
+            running.retain(|run| run.name.starts_with(wanted));
+        }
         if running.is_empty() {
             return Err(SelectError::NoSuch {
                 wanted: wanted.to_owned(),
@@ -101,7 +102,7 @@ fn choose(wanted: Option<&str>, mut running: Vec<LiveRun>) -> Result<LiveRun, Se
         }
     }
     if running.len() > 1 {
-        let running = names(&running);
+        let running = places(&running);
         return Err(SelectError::Several { running });
     }
     running.pop().ok_or(SelectError::NoneRuns)
@@ -118,6 +119,19 @@ fn in_folder(folder: &Path) -> Result<LiveRun, SelectError> {
 
 fn names(runs: &[LiveRun]) -> Vec<String> {
     runs.iter().map(|run| run.name.clone()).collect()
+}
+
+/// Names, and folders of those that began in the same second in different places.
+fn places(runs: &[LiveRun]) -> Vec<String> {
+    let place = |run: &LiveRun| {
+        let is_alone = runs.iter().filter(|one| one.name == run.name).count() == 1;
+        if is_alone {
+            run.name.clone()
+        } else {
+            run.folder.display().to_string()
+        }
+    };
+    runs.iter().map(place).collect()
 }
 
 #[cfg(test)]
@@ -150,6 +164,14 @@ mod tests {
             chosen(Some("fleet"), &["teleop-1", "fleet-1"]),
             Ok("fleet-1".to_owned())
         );
+    }
+
+    #[test]
+    fn runs_of_one_name_are_told_apart_by_their_folders() {
+        let mut running = vec![run("fleet-1"), run("fleet-1")];
+        running[1].folder = PathBuf::from("/elsewhere/fleet-1");
+        let error = choose(Some("fleet-1"), running).unwrap_err().to_string();
+        assert!(error.contains("/r/fleet-1, /elsewhere/fleet-1"), "{error}");
     }
 
     #[test]
