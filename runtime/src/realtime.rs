@@ -27,6 +27,9 @@ pub enum SchedulingPolicy {
         /// 1 (lowest) to 99. Kernel threads for interrupts run at 50 on `PREEMPT_RT`.
         priority: u8,
     },
+    /// `SCHED_IDLE`: runs when no normal task of its control group wants the CPU, and never
+    /// interrupts one by waking up. For what must not be felt by what it looks at.
+    Idle,
 }
 
 /// What a thread asks of the kernel.
@@ -174,6 +177,7 @@ pub fn apply(request: &RealtimeRequest) -> RealtimeGrant {
             let flags = libc::SCHED_FIFO | libc::SCHED_RESET_ON_FORK;
             (format!("SCHED_FIFO {priority}"), schedule(flags, priority))
         }
+        SchedulingPolicy::Idle => ("SCHED_IDLE".to_owned(), schedule(libc::SCHED_IDLE, 0)),
     };
     grant.add(RealtimeItem::Scheduling, asked, result);
     grant
@@ -234,13 +238,26 @@ fn set_timer_slack(slack: Duration) -> Result<(), Refusal> {
 
 fn schedule(policy: libc::c_int, priority: u8) -> Result<(), Refusal> {
     let set = set_scheduler(policy, priority);
-    set.map_err(|errno| explain_scheduling(errno, priority, &HostFiles::of_this_host()))?;
+    set.map_err(|errno| match policy {
+        libc::SCHED_OTHER | libc::SCHED_IDLE => explain_raising(errno),
+        _ => explain_scheduling(errno, priority, &HostFiles::of_this_host()),
+    })?;
     let actual = current_policy();
     if actual & !libc::SCHED_RESET_ON_FORK == policy & !libc::SCHED_RESET_ON_FORK {
         return Ok(());
     }
     let reason = format!("the kernel accepted the call but reports policy {actual}");
     Err(Refusal::new(Errno::EAGAIN, reason, "report this kernel"))
+}
+
+/// `SCHED_IDLE` counts as nice 20, which a task without rights may enter and not leave.
+fn explain_raising(errno: Errno) -> Refusal {
+    let nice = limit(Resource::RLIMIT_NICE, "").to_text();
+    Refusal::new(
+        errno,
+        format!("RLIMIT_NICE is {nice}"),
+        "needs CAP_SYS_NICE or LimitNICE=0 in the unit",
+    )
 }
 
 fn explain_scheduling(errno: Errno, priority: u8, files: &HostFiles) -> Refusal {

@@ -6,6 +6,8 @@ use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand};
 
+use crate::priority::Priority;
+
 const EXAMPLES: &str = "\
 Examples:
   hil-recorder convert runs/teleop-local-20261121-101500 -o run.mcap
@@ -137,6 +139,9 @@ pub(crate) enum Command {
         /// What a kill of the recorder may lose at most, 100ms to 60s.
         #[arg(long, value_name = "TIME", value_parser = flush, default_value = "1s")]
         flush: Duration,
+        /// How it stands against what it records.
+        #[arg(long, value_enum, default_value_t = Priority::Idle)]
+        priority: Priority,
         /// Replace files that exist.
         #[arg(long)]
         force: bool,

@@ -53,6 +53,7 @@ pub(crate) fn run() -> ExitCode {
             split_size,
             split_time,
             flush,
+            priority,
             force,
         } => {
             let request = Request {
@@ -66,6 +67,7 @@ pub(crate) fn run() -> ExitCode {
                 },
                 flush,
                 force,
+                priority,
             };
             record_run(&request, &signals, &mut console)
         }

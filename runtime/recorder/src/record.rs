@@ -7,16 +7,22 @@ use std::path::{Path, PathBuf};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use hil_runtime::watch::{Event, Feed, FeedError, LiveRun, Poll, SelectError, select};
+use hil_runtime::watch::{
+    Event, Feed, FeedError, LiveRun, Poll, SelectError, Source, WatchedChannel, select,
+};
 
 use crate::facts::{self, Words};
 use crate::live::LiveTopics;
+use crate::priority::{Precedence, Priority};
 use crate::run::Run;
 use crate::split::{Files, Split};
 use crate::writer::WriteError;
 
-/// How long a recorder with nothing to do sleeps.
+/// How long a recorder with nothing to do sleeps when it reads shared memory, whose buffers are short.
 const PAUSE: Duration = Duration::from_millis(10);
+/// The same when all it reads are files. Every wake-up empties the caches of a processor that carries
+/// messages in the next moment: two a second are felt less than a hundred.
+const LONG_PAUSE: Duration = Duration::from_millis(500);
 /// How often it looks whether a run has begun.
 const WAIT_PAUSE: Duration = Duration::from_millis(50);
 /// How often it says how far it is.
@@ -60,6 +66,8 @@ pub(crate) struct Request {
     pub(crate) flush: Duration,
     /// Replace files that exist.
     pub(crate) force: bool,
+    /// How it stands against what it records.
+    pub(crate) priority: Priority,
 }
 
 /// What a recording came to.
@@ -114,7 +122,8 @@ pub(crate) fn record(request: &Request, look: Look<'_>) -> Result<Recorded, Reco
         feed.skip_to_now();
     }
     let files = Files::begin(&target, request.split, request.force)?;
-    let mut recording = LiveRecording::begin(feed, files)?;
+    let precedence = Precedence::take(request.priority);
+    let mut recording = LiveRecording::begin(feed, files, precedence)?;
     let signal = recording.run(request, look)?;
     recording.finish(signal)
 }
@@ -149,6 +158,11 @@ fn find(request: &Request, look: Look<'_>) -> Result<LiveRun, RecordError> {
     }
 }
 
+/// Records wait in their files for as long as it takes; shared memory does not.
+const fn is_in_shared_memory(channel: &WatchedChannel) -> bool {
+    matches!(channel.source, Some(Source::SharedMemory { .. }))
+}
+
 struct LiveRecording {
     feed: Feed,
     topics: LiveTopics,
@@ -160,10 +174,11 @@ struct LiveRecording {
     problem_count: u64,
     /// What the open file says of the clocks.
     told_clocks: Words,
+    precedence: Precedence,
 }
 
 impl LiveRecording {
-    fn begin(feed: Feed, files: Files) -> Result<Self, WriteError> {
+    fn begin(feed: Feed, files: Files, precedence: Precedence) -> Result<Self, WriteError> {
         let mut recording = Self {
             topics: LiveTopics::of(&feed),
             feed,
@@ -173,6 +188,7 @@ impl LiveRecording {
             problems: Vec::new(),
             problem_count: 0,
             told_clocks: Words::new(),
+            precedence,
         };
         recording.describe_run()?;
         recording.files.flush()?;
@@ -187,6 +203,11 @@ impl LiveRecording {
     ) -> Result<Option<&'static str>, WriteError> {
         // A message waits for the ring of its process, for the next look, and for the flush.
         let flush_period = request.flush / 2;
+        let pause = if self.feed.channels().any(is_in_shared_memory) {
+            PAUSE
+        } else {
+            LONG_PAUSE.min(flush_period)
+        };
         let (mut flushed, mut told) = (Instant::now(), Instant::now());
         let (mut told_count, mut has_caught_up) = (0, false);
         loop {
@@ -211,14 +232,21 @@ impl LiveRecording {
                 let count = self.topics.counts().message_count;
                 let rate_hz = (count - told_count) as f64 / since_told.as_secs_f64();
                 (told, told_count) = (now, count);
-                if let Some(signal) = look(&self.progress(rate_hz)) {
+                let progress = self.progress(rate_hz);
+                let missed_count = progress.missed_count;
+                let signal = look(&progress);
+                self.precedence.judge_missed(missed_count);
+                if let Some(signal) = signal {
                     let is_over = self.catch_up()? == Poll::Over;
                     return Ok((!is_over).then_some(signal));
                 }
             }
-            if polled == Poll::Idle {
-                thread::sleep(PAUSE);
-            }
+            let planned = match polled {
+                Poll::Idle => pause,
+                Poll::Busy | Poll::Over => Duration::ZERO,
+            };
+            thread::sleep(planned);
+            self.precedence.judge_look(planned);
         }
     }
 
@@ -314,6 +342,7 @@ impl LiveRecording {
         let counts = self.topics.counts();
         let missed = self.topics.missed(&self.feed, self.is_silent);
         let mut words = self.problems.clone();
+        words.extend(self.precedence.warning());
         if self.has_summary {
             words.extend(run.gaps.words.iter().cloned());
         }
@@ -373,6 +402,7 @@ impl LiveRecording {
         words.insert("recorder_version".to_owned(), version);
         words.insert("mode".to_owned(), "live".to_owned());
         words.insert("ended".to_owned(), how.to_owned());
+        words.insert("priority".to_owned(), self.precedence.to_string());
         for (channel, count) in self.topics.missed(&self.feed, self.is_silent) {
             words.insert(format!("missed {channel}"), count.to_string());
         }

@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use hil_runtime::console::Console;
 
+use crate::priority::Priority;
 use crate::record::{RecordError, Recorded, Request, record};
 use crate::split::Split;
 
@@ -35,6 +36,7 @@ impl Recording {
             split: Split::default(),
             flush: FLUSH,
             force: false,
+            priority: Priority::Idle,
         };
         let stop = Arc::new(AtomicBool::new(false));
         let is_stopped = Arc::clone(&stop);
