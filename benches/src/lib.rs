@@ -13,6 +13,7 @@ mod host;
 mod quantiles;
 mod report;
 mod rounds;
+pub mod turns;
 
 pub use host::{HostFacts, pin_to_cpu};
 pub use quantiles::{MedianInterval, PairedRatio, Quantiles};
