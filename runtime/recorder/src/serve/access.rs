@@ -43,8 +43,8 @@ pub(crate) enum Refusal {
     ForeignOrigin(String),
     /// As many look on as may.
     Full(usize),
-    /// What shows the run does not answer.
-    NoServer,
+    /// What shows the run cannot be reached, and why.
+    NoServer(String),
 }
 
 impl Refusal {
@@ -55,7 +55,7 @@ impl Refusal {
             Self::TooSlow => (408, "Request Timeout"),
             Self::TooLong => (431, "Request Header Fields Too Large"),
             Self::ForeignHost(_) | Self::ForeignOrigin(_) => (403, "Forbidden"),
-            Self::Full(_) | Self::NoServer => (503, "Service Unavailable"),
+            Self::Full(_) | Self::NoServer(_) => (503, "Service Unavailable"),
         }
     }
 
@@ -71,7 +71,6 @@ impl Refusal {
             Self::ForeignOrigin(origin) => format!(
                 "; --allow-origin {origin} lets its pages see the run and change emulated links"
             ),
-            Self::NoServer => "; start this server again".to_owned(),
             _ => String::new(),
         };
         format!("refused {self}{advice}")
@@ -92,7 +91,12 @@ impl fmt::Display for Refusal {
             }
             Self::ForeignOrigin(origin) => write!(f, "a page of {origin}"),
             Self::Full(seats) => write!(f, "a viewer, as {seats} look on already"),
-            Self::NoServer => f.write_str("a viewer, as what shows the run does not answer"),
+            Self::NoServer(why) => {
+                write!(
+                    f,
+                    "a viewer, as what shows the run cannot be reached: {why}"
+                )
+            }
         }
     }
 }

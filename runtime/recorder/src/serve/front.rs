@@ -240,15 +240,18 @@ async fn read_head(
 
 async fn connect(server: SocketAddr) -> Result<TcpStream, Refusal> {
     let connect = async {
+        // The library stops listening for good when it has no descriptor for a connection.
+        let spare = TcpSocket::new_v4()?;
         let socket = TcpSocket::new_v4()?;
+        drop(spare);
         socket.set_recv_buffer_size(KERNEL_BYTES)?;
         let stream = socket.connect(server).await?;
         stream.set_nodelay(true)?;
         Ok::<_, io::Error>(stream)
     };
     let connected = timeout(SERVER_WITHIN, connect).await;
-    let connected = connected.ok().and_then(Result::ok);
-    connected.ok_or(Refusal::NoServer)
+    let connected = connected.unwrap_or_else(|late| Err(late.into()));
+    connected.map_err(|why| Refusal::NoServer(why.to_string()))
 }
 
 /// Says no, and why.
@@ -300,7 +303,97 @@ async fn pass(from: ReadHalf<'_>, mut to: WriteHalf<'_>) -> io::Result<()> {
 
 #[cfg(test)]
 mod tests {
+    use std::io::Write as _;
+    use std::net::{TcpListener as StdListener, TcpStream as StdStream};
+    use std::thread;
+
+    use tokio::runtime::{Builder, Runtime};
+
     use super::*;
+
+    const REQUEST: &[u8] = b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n";
+
+    /// A door before what listens at `server`: its address, and what keeps it open.
+    fn door(server: SocketAddr) -> (SocketAddr, Front, Runtime) {
+        let mut builder = Builder::new_multi_thread();
+        let runtime = builder.worker_threads(2).enable_all().build().unwrap();
+        let loopback = SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 0);
+        let door = Door::take(runtime.handle(), loopback).unwrap();
+        let address = SocketAddr::new(loopback.ip(), door.port());
+        let access = Arc::new(Access::new(&[], &[], None));
+        let front = door.open(runtime.handle(), server, access, 80);
+        (address, front, runtime)
+    }
+
+    fn listener() -> (StdListener, SocketAddr) {
+        let listener = StdListener::bind((hidden_address().unwrap(), 0)).unwrap();
+        let address = listener.local_addr().unwrap();
+        (listener, address)
+    }
+
+    #[test]
+    fn all_bytes_and_their_end_get_through_both_ways() {
+        const BYTES: usize = 3_000_000;
+        let (listener, server) = listener();
+        let answering = thread::spawn(move || {
+            let (mut stream, _) = listener.accept().unwrap();
+            let mut bytes = Vec::new();
+            stream.read_to_end(&mut bytes).unwrap();
+            // Only now, when the other way is closed already.
+            stream.write_all(&bytes).unwrap();
+        });
+        let (address, front, runtime) = door(server);
+        let mut stream = StdStream::connect(address).unwrap();
+        let body: Vec<u8> = (0..=250).cycle().take(BYTES).collect();
+        let sent = [REQUEST, &body].concat();
+        stream.write_all(&sent).unwrap();
+        stream.shutdown(std::net::Shutdown::Write).unwrap();
+        let mut received = Vec::new();
+        stream.read_to_end(&mut received).unwrap();
+        assert!(
+            received == sent,
+            "{} of {} bytes",
+            received.len(),
+            sent.len()
+        );
+        answering.join().unwrap();
+        front.end(runtime.handle());
+    }
+
+    #[test]
+    fn a_viewer_hears_that_there_is_nothing_to_see() {
+        let (listener, server) = listener();
+        drop(listener);
+        let (address, front, runtime) = door(server);
+        let mut stream = StdStream::connect(address).unwrap();
+        stream.write_all(REQUEST).unwrap();
+        let mut answer = String::new();
+        stream.read_to_string(&mut answer).unwrap();
+        assert!(answer.starts_with("HTTP/1.1 503 "), "{answer}");
+        assert!(
+            answer.contains("cannot be reached: Connection refused"),
+            "{answer}"
+        );
+        front.end(runtime.handle());
+        assert!(StdStream::connect(address).is_err());
+    }
+
+    #[test]
+    fn one_that_neither_reads_nor_goes_does_not_keep_the_door_open() {
+        let (listener, server) = listener();
+        let (address, front, runtime) = door(server);
+        let mut stream = StdStream::connect(address).unwrap();
+        stream.write_all(REQUEST).unwrap();
+        let (mut inside, _) = listener.accept().unwrap();
+        let writing = thread::spawn(move || inside.write_all(&vec![0; 50_000_000]));
+        let mut first = [0; 1];
+        stream.read_exact(&mut first).unwrap();
+        front.end(runtime.handle());
+        assert!(
+            writing.join().unwrap().is_err(),
+            "the connection was closed"
+        );
+    }
 
     #[test]
     fn the_hidden_address_is_on_loopback_and_not_the_one_everybody_tries() {

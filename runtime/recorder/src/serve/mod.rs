@@ -1,6 +1,6 @@
 //! `hil-recorder serve`: a run as it goes on, or as it went, to browsers and viewers. One thread reads
 //! records, works out the state and hands it to the socket; the socket and the page have a runtime of
-//! their own.
+//! their own. Before the socket is a door, [`front`], that knows whose page asks.
 
 mod access;
 mod engine;
