@@ -155,7 +155,8 @@ fn programs_our_own_page_and_allowed_pages_look_on() {
     let server = Server::start(&["--allow-origin", "https://app.foxglove.dev"]);
     server.ask_as_program().is_let_in();
     let own = format!("http://{}", server.page);
-    for origin in [&*own, "https://app.foxglove.dev", "file://"] {
+    let claimed = format!("http://{}", server.socket);
+    for origin in [&*own, &*claimed, "https://app.foxglove.dev", "file://"] {
         server.ask(&server.socket, Some(origin)).is_let_in();
     }
     // Through a tunnel from another machine, by whatever port.

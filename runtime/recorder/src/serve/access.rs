@@ -139,7 +139,8 @@ impl Access {
     /// # Errors
     /// Why not.
     pub(super) fn judge(&self, head: &Head, page_port: u16) -> Result<(), Refusal> {
-        let host = self.judge_host(head.host.as_deref())?;
+        let named = head.host.as_deref();
+        let host = self.judge_host(named)?;
         let Some(origin) = &head.origin else {
             return Ok(());
         };
@@ -150,7 +151,9 @@ impl Access {
             80 => format!("http://{host}"),
             port => format!("http://{host}:{port}"),
         };
-        if known == own || self.origins.contains(&known) {
+        // Some libraries for programs say that they are a page of the socket's. There is none.
+        let socket = named.map(|named| format!("http://{}", named.to_ascii_lowercase()));
+        if known == own || Some(&known) == socket.as_ref() || self.origins.contains(&known) {
             return Ok(());
         }
         Err(Refusal::ForeignOrigin(word(origin)))
@@ -344,6 +347,8 @@ mod tests {
             ("localhost:8765", Some("https://app.foxglove.dev")),
             ("localhost:8765", Some("file://")),
             ("localhost", None),
+            // As Python's websocket-client does.
+            ("127.0.0.1:8765", Some("http://127.0.0.1:8765")),
         ] {
             assert_eq!(judged(host, origin), Ok(()), "{host} {origin:?}");
         }

@@ -108,7 +108,7 @@ pub(crate) fn serve(
         .thread_name("viewers")
         .enable_all()
         .build()?;
-    let access = Arc::new(access(options));
+    let access = Arc::new(admitted(options));
     let (viewers, front) = open(options, &runtime, (&links, &access), console)?;
     let mut engine = Engine::new(viewers, links, options.record.clone());
     match shown {
@@ -283,7 +283,7 @@ fn open(
 }
 
 /// Who may look on. A machine that does not know its name has none.
-fn access(options: &ServeOptions) -> Access {
+fn admitted(options: &ServeOptions) -> Access {
     let machine = nix::unistd::gethostname().ok();
     let machine = machine.and_then(|name| name.into_string().ok());
     let machine = machine.filter(|name| !name.is_empty());
