@@ -1,5 +1,6 @@
-//! Our pages in a browser: the live page of `hil-recorder serve` beside a run that goes on, and the pages of
-//! `hil-runtime report`, with the network cable pulled. Clicks and keys go through the browser's own input, figures are read off the page.
+//! Our pages in a browser, with the network cable pulled: the live page of `hil-recorder serve` beside a run
+//! that goes on, pages of others that may not look on, and the pages of `hil-runtime report`. Clicks
+//! and keys go through the browser's own input, figures are read off the page.
 //!
 //! Needs Chromium; without one the tests say so and are skipped, and in CI they fail. `HIL_BROWSER` names
 //! another one, and empty leaves them out. Pictures go to `HIL_SCREENSHOTS`, else to the target folder.
@@ -64,12 +65,11 @@ fn with_the_cable_pulled() -> Option<Lab> {
     Some(lab)
 }
 
-/// Shows the run of this folder as soon as it goes on.
+/// Shows the run of this folder as soon as it goes on. Two that begin within a second have one name.
 fn serve(root: &Path, host: &LabHost, options: &[&str]) -> (ChildGuard, String) {
-    let name = root.file_name().unwrap();
     let mut command = host.command(hil_recorder_binary());
     let mut recorder =
-        ChildGuard::spawn(command.args(["serve", "--wait"]).arg(name).args(options)).unwrap();
+        ChildGuard::spawn(command.args(["serve", "--wait"]).arg(root).args(options)).unwrap();
     let printed = recorder.wait_for_output("http://", LIMIT);
     assert!(printed.is_ok(), "{}", printed.unwrap_err());
     let words = recorder.stdout_so_far() + &recorder.stderr_so_far();
@@ -332,6 +332,48 @@ fn the_live_page_shows_arms() {
     assert_clean(&mut page, "the live page of arms");
     drop(page);
     shown.end();
+}
+
+/// What comes of opening the socket from the page that is shown.
+fn looked_on(page: &mut Page<'_>, port: &str) -> Value {
+    page.value(&format!(
+        "new Promise(done => {{ const socket = new WebSocket('ws://127.0.0.1:{port}', 'foxglove.sdk.v1'); \
+         socket.onmessage = () => done('looks on'); socket.onerror = () => done('refused'); }})"
+    ))
+}
+
+#[test]
+fn a_browser_gets_our_page_to_the_socket_and_no_other() {
+    let Some(lab) = with_the_cable_pulled() else {
+        return;
+    };
+    let host = lab.host(0);
+    let Some(mut browser) = Browser::start_on_or_skip(host) else {
+        return;
+    };
+    let folder = RunFolder::new("browser-foreign");
+    let unknown = folder.join("no-run-is-called-so");
+    let free = ["--port", "0", "--http-port", "0"];
+    let (mut recorder, own) = serve(&unknown, host, &free);
+    let said = recorder.stdout_so_far();
+    let port = said.trim_end().rsplit(':').next().unwrap().to_owned();
+    let (_other, foreign) = serve(&unknown, host, &free);
+    let file = folder.join("foreign.html");
+    std::fs::write(&file, "<!doctype html><title>foreign</title>").unwrap();
+    let mut page = browser.page(DESKTOP.0, DESKTOP.1);
+    page.go(&own);
+    assert_eq!(looked_on(&mut page, &port), "looks on");
+    let by_name = own.replace("127.0.0.1", "localhost");
+    for other in [foreign, by_name, format!("file://{}", file.display())] {
+        page.go(&other);
+        assert_eq!(looked_on(&mut page, &port), "refused", "{other}");
+    }
+    recorder.signal(Signal::SIGINT).unwrap();
+    let finished = recorder.wait_within(LIMIT).unwrap();
+    assert!(
+        finished.stderr.contains("a page without an origin"),
+        "{finished:?}"
+    );
 }
 
 fn made_report(trial: &Trial, output: &Path) {

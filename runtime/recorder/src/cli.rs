@@ -41,7 +41,10 @@ Examples:
       a finished run again and again
   ssh -L 8765:localhost:8765 -L 8766:localhost:8766 control-pc
       from another PC, then the same address; nothing is open to the network
+  hil-recorder serve --allow-origin https://app.foxglove.dev
+      pages of Foxglove's own web site may look on and change links as well
 
+Web pages of others are refused, and named here once. Programs and our own page need no option.
 Lichtblick and Foxglove connect to ws://127.0.0.1:8765. Topics and fields are in docs/live-view.md.
 It ends with Ctrl-C; the exit code is 0 then.";
 
@@ -211,6 +214,14 @@ pub(crate) struct ServeOptions {
     /// Port of the page; 0 takes one that is free.
     #[arg(long, value_name = "PORT", default_value_t = 8766)]
     pub(crate) http_port: u16,
+    /// Let web pages of this origin look on and change emulated links, e.g.
+    /// `https://app.foxglove.dev`; may be repeated.
+    #[arg(long, value_name = "ORIGIN", value_parser = crate::serve::origin)]
+    pub(crate) allow_origin: Vec<String>,
+    /// A further name of this machine, as in the browser's address bar; addresses, localhost and
+    /// the machine's own name need none; may be repeated.
+    #[arg(long, value_name = "NAME", value_parser = crate::serve::host)]
+    pub(crate) allow_host: Vec<String>,
     /// Record what is shown while it goes on, as `record` does: a file, or a folder for one file
     /// per run.
     #[arg(long, value_name = "FILE")]

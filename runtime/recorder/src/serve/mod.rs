@@ -1,8 +1,11 @@
 //! `hil-recorder serve`: a run as it goes on, or as it went, to browsers and viewers. One thread reads
 //! records, works out the state and hands it to the socket; the socket and the page have a runtime of
-//! their own.
+//! their own. Before the socket is a door, [`front`], that knows whose page asks.
 
+mod access;
 mod engine;
+mod front;
+mod head;
 mod page;
 mod parameters;
 mod playback;
@@ -10,6 +13,8 @@ mod recording;
 mod running;
 mod source;
 mod viewers;
+
+pub(crate) use access::{host, origin};
 
 use std::fs;
 use std::net::SocketAddr;
@@ -25,7 +30,9 @@ use hil_runtime::watch::{FeedError, LiveRun, SelectError, select};
 use tokio::runtime::Runtime;
 
 use crate::cli::ServeOptions;
+use access::{Access, NO_ORIGIN};
 use engine::{Engine, Showing, Shown};
+use front::{Door, Front};
 use parameters::Links;
 use playback::Playback;
 use running::Running;
@@ -61,9 +68,12 @@ pub(crate) enum ServeError {
     Socket {
         /// Where.
         address: SocketAddr,
-        /// What the library said.
-        why: String,
+        /// What the system said.
+        why: std::io::Error,
     },
+    /// What is behind the socket.
+    #[error("cannot listen behind the socket on loopback: {0}")]
+    Hidden(String),
     /// The page.
     #[error(
         "cannot serve the page at {address}: {why}; --http-port takes another, 0 any that is free"
@@ -98,7 +108,8 @@ pub(crate) fn serve(
         .thread_name("viewers")
         .enable_all()
         .build()?;
-    let viewers = open(options, &runtime, &links, console)?;
+    let access = Arc::new(admitted(options));
+    let (viewers, front) = open(options, &runtime, (&links, &access), console)?;
     let mut engine = Engine::new(viewers, links, options.record.clone());
     match shown {
         Some(shown) => engine.show(shown, console),
@@ -112,10 +123,17 @@ pub(crate) fn serve(
             show_next(options, &mut engine, &mut said, console);
         }
         engine.round(console);
+        for words in access.take_unsaid() {
+            console.warn(&words);
+        }
         thread::sleep(LOOK_PERIOD);
     }
     engine.into_viewers(console).end(runtime.handle());
+    front.end(runtime.handle());
     runtime.shutdown_timeout(Duration::from_secs(1));
+    if let Some(account) = access.account() {
+        console.say(&account);
+    }
     console.say("ended");
     Ok(0)
 }
@@ -233,27 +251,47 @@ fn gives_way(showing: Showing<'_>, name: &str) -> bool {
 fn open(
     options: &ServeOptions,
     runtime: &Runtime,
-    links: &Links,
+    (links, access): (&Links, &Arc<Access>),
     console: &mut Console,
-) -> Result<Viewers, ServeError> {
+) -> Result<(Viewers, Front), ServeError> {
+    let runtime = runtime.handle();
     let address = SocketAddr::new(options.host, options.port);
-    let handler = Arc::new(links.clone());
-    let viewers = Viewers::begin(runtime.handle(), address, handler).map_err(|error| {
-        let why = error.to_string();
-        ServeError::Socket { address, why }
-    })?;
-    let socket = SocketAddr::new(options.host, viewers.port());
+    let door = Door::take(runtime, address).map_err(|why| ServeError::Socket { address, why })?;
+    let socket = SocketAddr::new(options.host, door.port());
+    let viewers = Viewers::begin(runtime, Arc::new(links.clone()))
+        .map_err(|error| ServeError::Hidden(error.to_string()))?;
     let address = SocketAddr::new(options.host, options.http_port);
-    let page = page::serve(runtime.handle(), address, viewers.port())
+    let page = page::serve(runtime, address, door.port(), Arc::clone(access))
         .map_err(|why| ServeError::Page { address, why })?;
+    let front = door.open(runtime, viewers.address(), Arc::clone(access), page.port());
     if !options.host.is_loopback() {
         console.warn(
             "anybody who can reach this address sees the run and may change its emulated links; \
              without --host only this machine can",
         );
     }
+    if options
+        .allow_origin
+        .iter()
+        .any(|origin| origin == NO_ORIGIN)
+    {
+        console
+            .warn("--allow-origin null lets any page in: every page can show one of that origin");
+    }
     console.result(&format!("page    http://{page}/\nviewers ws://{socket}\n"));
-    Ok(viewers)
+    Ok((viewers, front))
+}
+
+/// Who may look on. A machine that does not know its name has none.
+fn admitted(options: &ServeOptions) -> Access {
+    let machine = nix::unistd::gethostname().ok();
+    let machine = machine.and_then(|name| name.into_string().ok());
+    let machine = machine.filter(|name| !name.is_empty());
+    Access::new(
+        &options.allow_host,
+        &options.allow_origin,
+        machine.as_deref(),
+    )
 }
 
 #[cfg(test)]

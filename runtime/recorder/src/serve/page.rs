@@ -4,6 +4,7 @@
 use std::convert::Infallible;
 use std::io;
 use std::net::SocketAddr;
+use std::sync::Arc;
 use std::time::Duration;
 
 use http_body_util::Full;
@@ -16,6 +17,8 @@ use hyper_util::rt::{TokioIo, TokioTimer};
 use serde_json::json;
 use tokio::net::TcpListener;
 use tokio::runtime::Handle;
+
+use super::access::{Access, Refusal};
 
 /// The page with its style and scripts, made of the folder `page` by the build script.
 const PAGE: &str = include_str!(concat!(env!("OUT_DIR"), "/page.html"));
@@ -38,19 +41,24 @@ const CONNECTIONS_MAX: usize = 64;
 const REQUEST_WITHIN: Duration = Duration::from_secs(5);
 
 /// Serves the page at `address` from now on; where it really is. The page will look for the socket
-/// at `ws_port` of the same host.
+/// at `ws_port` of the same host. Requests to names that `access` does not know are refused.
 ///
 /// # Errors
 /// When the address cannot be had.
-pub(crate) fn serve(runtime: &Handle, address: SocketAddr, ws_port: u16) -> io::Result<SocketAddr> {
+pub(crate) fn serve(
+    runtime: &Handle,
+    address: SocketAddr,
+    ws_port: u16,
+    access: Arc<Access>,
+) -> io::Result<SocketAddr> {
     let listener = runtime.block_on(TcpListener::bind(address))?;
     let at = listener.local_addr()?;
     let config = json!({ "ws_port": ws_port, "version": env!("CARGO_PKG_VERSION") });
     let config = Bytes::from(config.to_string());
     runtime.spawn(async move {
-        let room = std::sync::Arc::new(tokio::sync::Semaphore::new(CONNECTIONS_MAX));
+        let room = Arc::new(tokio::sync::Semaphore::new(CONNECTIONS_MAX));
         loop {
-            let Ok(place) = std::sync::Arc::clone(&room).acquire_owned().await else {
+            let Ok(place) = Arc::clone(&room).acquire_owned().await else {
                 return;
             };
             let Ok((stream, _)) = listener.accept().await else {
@@ -58,10 +66,14 @@ pub(crate) fn serve(runtime: &Handle, address: SocketAddr, ws_port: u16) -> io::
                 tokio::time::sleep(Duration::from_millis(50)).await;
                 continue;
             };
-            let config = config.clone();
+            let (config, access) = (config.clone(), Arc::clone(&access));
             tokio::spawn(async move {
                 let service = service_fn(move |request: Request<Incoming>| {
-                    let answer = answer(request.method(), request.uri().path(), &config);
+                    let hosts = request.headers().get_all(header::HOST).iter();
+                    let answer = match access.judge_page(hosts.map(HeaderValue::as_bytes)) {
+                        Ok(()) => answer(request.method(), request.uri().path(), &config),
+                        Err(refusal) => refused(&refusal),
+                    };
                     async move { Ok::<_, Infallible>(answer) }
                 });
                 let connection = http1::Builder::new()
@@ -105,6 +117,13 @@ fn plain(status: StatusCode, words: &'static str) -> Response<Full<Bytes>> {
         "text/plain; charset=utf-8",
         Bytes::from_static(words.as_bytes()),
     )
+}
+
+fn refused(refusal: &Refusal) -> Response<Full<Bytes>> {
+    let (code, _) = refusal.status();
+    let status = StatusCode::from_u16(code).unwrap_or(StatusCode::FORBIDDEN);
+    let words = format!("{}\n", refusal.words());
+    with_headers(status, "text/plain; charset=utf-8", Bytes::from(words))
 }
 
 fn with_headers(status: StatusCode, kind: &'static str, content: Bytes) -> Response<Full<Bytes>> {

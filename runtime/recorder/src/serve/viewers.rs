@@ -3,7 +3,7 @@
 //! [`crate::view`].
 
 use std::collections::BTreeMap;
-use std::net::{IpAddr, SocketAddr};
+use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::Duration;
@@ -17,6 +17,7 @@ use prost::Message as _;
 use serde_json::{Value, json};
 use tokio::runtime::Handle;
 
+use super::front::hidden_address;
 use crate::encode::Encoder;
 use crate::net::{self, MessageLatency};
 use crate::schema::{self, Schema};
@@ -47,14 +48,6 @@ const KEPT: [&str; 5] = [
     "/live/fleet",
     "/live/arms",
 ];
-
-/// As the library joins it with a port.
-fn bracketed(ip: IpAddr) -> String {
-    match ip {
-        IpAddr::V4(ip) => ip.to_string(),
-        IpAddr::V6(ip) => format!("[{ip}]"),
-    }
-}
 
 /// Subscriptions, as they happen.
 struct Listener {
@@ -88,6 +81,8 @@ struct Topics {
 pub(crate) struct Viewers {
     context: Arc<Context>,
     server: WebSocketServerHandle,
+    /// Where the library listens.
+    address: SocketAddr,
     live: BTreeMap<&'static str, Live>,
     channels: Vec<Topics>,
     subscribed: Receiver<(SinkId, String)>,
@@ -95,13 +90,13 @@ pub(crate) struct Viewers {
 }
 
 impl Viewers {
-    /// Offers the live topics at `address`; links are changed through `parameters`.
+    /// Offers the live topics at an address that nobody knows; links are changed through
+    /// `parameters`.
     ///
     /// # Errors
-    /// When the address cannot be had.
+    /// When no address can be had.
     pub(crate) fn begin(
         runtime: &Handle,
-        address: SocketAddr,
         parameters: Arc<dyn ParameterHandler>,
     ) -> Result<Self, FoxgloveError> {
         let context = Context::new();
@@ -119,9 +114,10 @@ impl Viewers {
             live.insert(topic, one);
         }
         let (tell, subscribed) = channel();
+        let ip = hidden_address().map_err(FoxgloveError::Bind)?;
         let server = WebSocketServer::new()
             .name(concat!("hil-recorder ", env!("CARGO_PKG_VERSION")))
-            .bind(bracketed(address.ip()), address.port())
+            .bind(ip.to_string(), 0)
             .message_backlog_size(WAITING_MAX)
             .listener(Arc::new(Listener { tell }))
             .parameter_handler(parameters)
@@ -130,6 +126,7 @@ impl Viewers {
         let server = runtime.block_on(server.start())?;
         Ok(Self {
             context,
+            address: SocketAddr::new(ip.into(), server.port()),
             server,
             live,
             channels: Vec::new(),
@@ -138,9 +135,9 @@ impl Viewers {
         })
     }
 
-    /// The socket's port.
-    pub(crate) fn port(&self) -> u16 {
-        self.server.port()
+    /// Where the library listens, to nobody but the door.
+    pub(crate) const fn address(&self) -> SocketAddr {
+        self.address
     }
 
     /// Viewers that are connected.

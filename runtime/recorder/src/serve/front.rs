@@ -1,0 +1,408 @@
+//! The door of the socket: reads the head of each request, lets pass who may look on, and hands
+//! bytes on both ways between viewers and the library's server.
+//!
+//! That server can only be had on a TCP port and asks nobody who they are. It listens on loopback, at
+//! an address that is drawn by lot out of the sixteen million there, and at any free port: a page that
+//! would go around this door has to guess both.
+
+use std::fs::File;
+use std::io::{self, Read as _};
+use std::net::{Ipv4Addr, SocketAddr};
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _, BufReader};
+use tokio::net::tcp::{ReadHalf, WriteHalf};
+use tokio::net::{TcpListener, TcpSocket, TcpStream};
+use tokio::runtime::Handle;
+use tokio::sync::{Semaphore, oneshot};
+use tokio::task::{JoinHandle, JoinSet};
+use tokio::time::{sleep, timeout};
+
+use super::access::{Access, Refusal};
+use super::head::{Head, Parsed, parse};
+
+/// Viewers at once.
+const SEATS: usize = 32;
+/// Connections at once that have not said yet what they want; more wait.
+const ENTERING_MAX: usize = 64;
+/// A browser's head has a few hundred bytes, and what it adds of its own.
+const HEAD_BYTES_MAX: usize = 16 * 1024;
+/// How long it may take to come.
+const HEAD_WITHIN: Duration = Duration::from_secs(5);
+/// How long the library's server, on this machine, may take to answer.
+const SERVER_WITHIN: Duration = Duration::from_secs(5);
+/// How long one side may take to close after the other has.
+const CLOSE_WITHIN: Duration = Duration::from_secs(1);
+/// As much of what a refused viewer sends on is read away: a connection that is closed with unread
+/// bytes in it is reset, and the answer lost.
+const UNREAD_BYTES_MAX: u64 = 64 * 1024;
+/// Bytes on their way in this process, per viewer and way.
+const BUFFER_BYTES: usize = 32 * 1024;
+/// Bytes that the kernel keeps for a slow viewer, at either end of our part of the way. Without a
+/// bound it would keep megabytes, and what a viewer sees would be as old as they are.
+const KERNEL_BYTES: u32 = 128 * 1024;
+/// Out of file descriptors, mostly: others must close first.
+const PAUSE: Duration = Duration::from_millis(50);
+
+/// An address of this machine's own that nobody knows.
+///
+/// # Errors
+/// When the kernel has no random numbers.
+pub(super) fn hidden_address() -> io::Result<Ipv4Addr> {
+    let mut random = [0; 3];
+    File::open("/dev/urandom")?.read_exact(&mut random)?;
+    Ok(hidden(random))
+}
+
+fn hidden([a, b, c]: [u8; 3]) -> Ipv4Addr {
+    // The first is everybody's first guess, and those of the network and of all hosts are none.
+    match (a, b, c) {
+        (0, 0, 0 | 1) => Ipv4Addr::new(127, 0, 0, 2),
+        (255, 255, 255) => Ipv4Addr::new(127, 255, 255, 254),
+        _ => Ipv4Addr::new(127, a, b, c),
+    }
+}
+
+/// The port that viewers connect to, before anybody is let in.
+#[derive(Debug)]
+pub(super) struct Door {
+    listener: TcpListener,
+    port: u16,
+}
+
+impl Door {
+    /// Takes `address`; connections wait.
+    ///
+    /// # Errors
+    /// When it cannot be had.
+    pub(super) fn take(runtime: &Handle, address: SocketAddr) -> io::Result<Self> {
+        let _entered = runtime.enter();
+        let socket = match address {
+            SocketAddr::V4(_) => TcpSocket::new_v4()?,
+            SocketAddr::V6(_) => TcpSocket::new_v6()?,
+        };
+        socket.set_reuseaddr(true)?;
+        socket.set_keepalive(true)?;
+        // Handed down to the connections.
+        socket.set_send_buffer_size(KERNEL_BYTES)?;
+        socket.bind(address)?;
+        let listener = socket.listen(1024)?;
+        let port = listener.local_addr()?.port();
+        Ok(Self { listener, port })
+    }
+
+    /// The port.
+    pub(super) const fn port(&self) -> u16 {
+        self.port
+    }
+
+    /// Lets in who `access` lets in, to the library's server at `server`. `page_port` is that of our
+    /// own page.
+    pub(super) fn open(
+        self,
+        runtime: &Handle,
+        server: SocketAddr,
+        access: Arc<Access>,
+        page_port: u16,
+    ) -> Front {
+        let house = Arc::new(House {
+            access,
+            page_port,
+            server,
+            seats: Arc::new(Semaphore::new(SEATS)),
+        });
+        let (close, closed) = oneshot::channel();
+        let task = runtime.spawn(attend(self.listener, house, closed));
+        Front { close, task }
+    }
+}
+
+/// The open door.
+#[derive(Debug)]
+pub(super) struct Front {
+    close: oneshot::Sender<()>,
+    task: JoinHandle<()>,
+}
+
+impl Front {
+    /// Lets nobody in any more, and closes all connections: those of polite viewers, who have heard
+    /// the server's goodbye, are at their end already.
+    pub(super) fn end(self, runtime: &Handle) {
+        // It fails where there is nobody to hear it, which is as well.
+        let _is_heard = self.close.send(()).is_ok();
+        let mut task = self.task;
+        let ended = runtime.block_on(async { timeout(CLOSE_WITHIN, &mut task).await });
+        if ended.is_err() {
+            task.abort();
+        }
+    }
+}
+
+/// What all connections need.
+#[derive(Debug)]
+struct House {
+    access: Arc<Access>,
+    page_port: u16,
+    server: SocketAddr,
+    seats: Arc<Semaphore>,
+}
+
+/// Takes connections until it is told to end, then waits for those that are there.
+async fn attend(listener: TcpListener, house: Arc<House>, mut closed: oneshot::Receiver<()>) {
+    // Dropped with this, and all connections with it.
+    let mut connections = JoinSet::new();
+    let entering = Arc::new(Semaphore::new(ENTERING_MAX));
+    loop {
+        let next = async {
+            let place = Arc::clone(&entering).acquire_owned().await;
+            (place, listener.accept().await)
+        };
+        tokio::select! {
+            _ = &mut closed => break,
+            Some(_) = connections.join_next() => {}
+            (place, accepted) = next => match accepted {
+                Ok((viewer, _)) => {
+                    let house = Arc::clone(&house);
+                    connections.spawn(async move {
+                        // Whoever goes away in the middle is nobody's fault.
+                        let _is_served = serve(viewer, &house, place).await.is_ok();
+                    });
+                }
+                Err(_) => sleep(PAUSE).await,
+            },
+        }
+    }
+    drop(listener);
+    while connections.join_next().await.is_some() {}
+}
+
+/// One connection; `place` is its place among those that enter.
+async fn serve<P>(mut viewer: TcpStream, house: &House, place: P) -> io::Result<()> {
+    viewer.set_nodelay(true)?;
+    let mut bytes = Vec::new();
+    let head = match timeout(HEAD_WITHIN, read_head(&mut viewer, &mut bytes)).await {
+        // Browsers open connections that they may need, and say nothing.
+        Err(_) if bytes.is_empty() => return Ok(()),
+        Err(_) => Err(Refusal::TooSlow),
+        Ok(head) => match head? {
+            Some(head) => head,
+            None => return Ok(()),
+        },
+    };
+    let judged = head.and_then(|head| house.access.judge(&head, house.page_port));
+    let seat = judged.and_then(|()| {
+        let seat = Arc::clone(&house.seats).try_acquire_owned();
+        seat.map_err(|_none| Refusal::Full(SEATS))
+    });
+    let server = match seat {
+        Ok(seat) => connect(house.server).await.map(|server| (server, seat)),
+        Err(refusal) => Err(refusal),
+    };
+    match server {
+        Ok((mut server, _seat)) => {
+            drop(place);
+            server.write_all(&bytes).await?;
+            drop(bytes);
+            hand_on(&mut viewer, &mut server).await
+        }
+        Err(refusal) => {
+            house.access.count(&refusal);
+            refuse(&mut viewer, &refusal).await
+        }
+    }
+}
+
+/// Reads the head of a request, and whatever came with it, into `bytes`; `None` when the other side
+/// ends before its head does.
+async fn read_head(
+    viewer: &mut TcpStream,
+    bytes: &mut Vec<u8>,
+) -> io::Result<Option<Result<Head, Refusal>>> {
+    loop {
+        let read = bytes.len();
+        if (&mut *viewer).take(4096).read_buf(bytes).await? == 0 {
+            return Ok(None);
+        }
+        // A head can only end where a line does.
+        if bytes[read..].contains(&b'\n') {
+            match parse(bytes) {
+                Parsed::Whole(head) => return Ok(Some(Ok(head))),
+                Parsed::Broken => return Ok(Some(Err(Refusal::Malformed))),
+                Parsed::Partial => {}
+            }
+        }
+        if bytes.len() >= HEAD_BYTES_MAX {
+            return Ok(Some(Err(Refusal::TooLong)));
+        }
+    }
+}
+
+async fn connect(server: SocketAddr) -> Result<TcpStream, Refusal> {
+    let connect = async {
+        // The library stops listening for good when it has no descriptor for a connection.
+        let spare = TcpSocket::new_v4()?;
+        let socket = TcpSocket::new_v4()?;
+        drop(spare);
+        socket.set_recv_buffer_size(KERNEL_BYTES)?;
+        let stream = socket.connect(server).await?;
+        stream.set_nodelay(true)?;
+        Ok::<_, io::Error>(stream)
+    };
+    let connected = timeout(SERVER_WITHIN, connect).await;
+    let connected = connected.unwrap_or_else(|late| Err(late.into()));
+    connected.map_err(|why| Refusal::NoServer(why.to_string()))
+}
+
+/// Says no, and why.
+async fn refuse(viewer: &mut TcpStream, refusal: &Refusal) -> io::Result<()> {
+    let (code, word) = refusal.status();
+    let words = refusal.words();
+    let answer = format!(
+        "HTTP/1.1 {code} {word}\r\nContent-Type: text/plain; charset=utf-8\r\n\
+         X-Content-Type-Options: nosniff\r\nContent-Length: {}\r\nConnection: close\r\n\r\n{words}\n",
+        words.len() + 1
+    );
+    let goodbye = async {
+        viewer.write_all(answer.as_bytes()).await?;
+        viewer.shutdown().await?;
+        tokio::io::copy(&mut viewer.take(UNREAD_BYTES_MAX), &mut tokio::io::sink()).await
+    };
+    timeout(CLOSE_WITHIN, goodbye)
+        .await
+        .map_or(Ok(()), |done| done.map(drop))
+}
+
+/// Hands bytes on both ways until both sides have ended, or one has failed.
+async fn hand_on(viewer: &mut TcpStream, server: &mut TcpStream) -> io::Result<()> {
+    let (from_viewer, to_viewer) = viewer.split();
+    let (from_server, to_server) = server.split();
+    let up = pass(from_viewer, to_server);
+    let down = pass(from_server, to_viewer);
+    tokio::pin!(up, down);
+    tokio::select! {
+        // The server ends when it hears the end, and what it still says is the viewer's.
+        done = &mut up => {
+            done?;
+            down.await
+        }
+        // A viewer that hangs would keep its place for ever.
+        done = &mut down => {
+            done?;
+            timeout(CLOSE_WITHIN, up).await.unwrap_or(Ok(()))
+        }
+    }
+}
+
+/// Hands bytes on one way, and their end.
+async fn pass(from: ReadHalf<'_>, mut to: WriteHalf<'_>) -> io::Result<()> {
+    let mut from = BufReader::with_capacity(BUFFER_BYTES, from);
+    tokio::io::copy_buf(&mut from, &mut to).await?;
+    to.shutdown().await
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write as _;
+    use std::net::{TcpListener as StdListener, TcpStream as StdStream};
+    use std::thread;
+
+    use tokio::runtime::{Builder, Runtime};
+
+    use super::*;
+
+    const REQUEST: &[u8] = b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n";
+
+    /// A door before what listens at `server`: its address, and what keeps it open.
+    fn door(server: SocketAddr) -> (SocketAddr, Front, Runtime) {
+        let mut builder = Builder::new_multi_thread();
+        let runtime = builder.worker_threads(2).enable_all().build().unwrap();
+        let loopback = SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 0);
+        let door = Door::take(runtime.handle(), loopback).unwrap();
+        let address = SocketAddr::new(loopback.ip(), door.port());
+        let access = Arc::new(Access::new(&[], &[], None));
+        let front = door.open(runtime.handle(), server, access, 80);
+        (address, front, runtime)
+    }
+
+    fn listener() -> (StdListener, SocketAddr) {
+        let listener = StdListener::bind((hidden_address().unwrap(), 0)).unwrap();
+        let address = listener.local_addr().unwrap();
+        (listener, address)
+    }
+
+    #[test]
+    fn all_bytes_and_their_end_get_through_both_ways() {
+        const BYTES: usize = 3_000_000;
+        let (listener, server) = listener();
+        let answering = thread::spawn(move || {
+            let (mut stream, _) = listener.accept().unwrap();
+            let mut bytes = Vec::new();
+            stream.read_to_end(&mut bytes).unwrap();
+            // Only now, when the other way is closed already.
+            stream.write_all(&bytes).unwrap();
+        });
+        let (address, front, runtime) = door(server);
+        let mut stream = StdStream::connect(address).unwrap();
+        let body: Vec<u8> = (0..=250).cycle().take(BYTES).collect();
+        let sent = [REQUEST, &body].concat();
+        stream.write_all(&sent).unwrap();
+        stream.shutdown(std::net::Shutdown::Write).unwrap();
+        let mut received = Vec::new();
+        stream.read_to_end(&mut received).unwrap();
+        assert!(
+            received == sent,
+            "{} of {} bytes",
+            received.len(),
+            sent.len()
+        );
+        answering.join().unwrap();
+        front.end(runtime.handle());
+    }
+
+    #[test]
+    fn a_viewer_hears_that_there_is_nothing_to_see() {
+        let (listener, server) = listener();
+        drop(listener);
+        let (address, front, runtime) = door(server);
+        let mut stream = StdStream::connect(address).unwrap();
+        stream.write_all(REQUEST).unwrap();
+        let mut answer = String::new();
+        stream.read_to_string(&mut answer).unwrap();
+        assert!(answer.starts_with("HTTP/1.1 503 "), "{answer}");
+        assert!(
+            answer.contains("cannot be reached: Connection refused"),
+            "{answer}"
+        );
+        front.end(runtime.handle());
+        assert!(StdStream::connect(address).is_err());
+    }
+
+    #[test]
+    fn one_that_neither_reads_nor_goes_does_not_keep_the_door_open() {
+        let (listener, server) = listener();
+        let (address, front, runtime) = door(server);
+        let mut stream = StdStream::connect(address).unwrap();
+        stream.write_all(REQUEST).unwrap();
+        let (mut inside, _) = listener.accept().unwrap();
+        let writing = thread::spawn(move || inside.write_all(&vec![0; 50_000_000]));
+        let mut first = [0; 1];
+        stream.read_exact(&mut first).unwrap();
+        front.end(runtime.handle());
+        assert!(
+            writing.join().unwrap().is_err(),
+            "the connection was closed"
+        );
+    }
+
+    #[test]
+    fn the_hidden_address_is_on_loopback_and_not_the_one_everybody_tries() {
+        assert_eq!(hidden([0, 0, 0]), Ipv4Addr::new(127, 0, 0, 2));
+        assert_eq!(hidden([0, 0, 1]), Ipv4Addr::new(127, 0, 0, 2));
+        assert_eq!(hidden([255, 255, 255]), Ipv4Addr::new(127, 255, 255, 254));
+        assert_eq!(hidden([1, 2, 3]), Ipv4Addr::new(127, 1, 2, 3));
+        let drawn: Vec<_> = (0..4).map(|_| hidden_address().unwrap()).collect();
+        assert!(drawn.iter().all(Ipv4Addr::is_loopback));
+        assert!(drawn[1..].iter().any(|one| *one != drawn[0]), "{drawn:?}");
+    }
+}
