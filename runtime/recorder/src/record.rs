@@ -12,6 +12,7 @@ use hil_runtime::watch::{Event, Feed, FeedError, LiveRun, Poll, SelectError, sel
 use crate::facts::{self, Words};
 use crate::live::LiveTopics;
 use crate::run::Run;
+use crate::scene::Scenery;
 use crate::split::{Files, Split};
 use crate::writer::WriteError;
 
@@ -60,6 +61,8 @@ pub(crate) struct Request {
     pub(crate) flush: Duration,
     /// Replace files that exist.
     pub(crate) force: bool,
+    /// Draw the scene.
+    pub(crate) scenery: Scenery,
 }
 
 /// What a recording came to.
@@ -114,7 +117,7 @@ pub(crate) fn record(request: &Request, look: Look<'_>) -> Result<Recorded, Reco
         feed.skip_to_now();
     }
     let files = Files::begin(&target, request.split, request.force)?;
-    let mut recording = LiveRecording::begin(feed, files)?;
+    let mut recording = LiveRecording::begin(feed, files, request.scenery)?;
     let signal = recording.run(request, look)?;
     recording.finish(signal)
 }
@@ -163,9 +166,9 @@ struct LiveRecording {
 }
 
 impl LiveRecording {
-    fn begin(feed: Feed, files: Files) -> Result<Self, WriteError> {
+    fn begin(feed: Feed, files: Files, scenery: Scenery) -> Result<Self, WriteError> {
         let mut recording = Self {
-            topics: LiveTopics::of(&feed),
+            topics: LiveTopics::of(&feed, scenery),
             feed,
             files,
             is_silent: false,
@@ -191,6 +194,9 @@ impl LiveRecording {
         let (mut told_count, mut has_caught_up) = (0, false);
         loop {
             let polled = self.poll()?;
+            if polled != Poll::Busy {
+                self.topics.draw(&mut self.files)?;
+            }
             let now = Instant::now();
             self.topics.settle(now, &mut self.files)?;
             // What was there before the recorder is not to wait for its first period.
@@ -285,6 +291,9 @@ impl LiveRecording {
     }
 
     fn finish(mut self, signal: Option<&'static str>) -> Result<Recorded, RecordError> {
+        if let Some(problem) = self.topics.finish_scene(&mut self.files)? {
+            self.problems.push(problem.to_owned());
+        }
         let mut run = Run::without_records(self.feed.run().run_folder());
         if self.has_summary {
             // A folder that cannot be listed is one more thing to say, and no reason to lose the rest.

@@ -10,6 +10,7 @@ use std::time::Duration;
 use hil_runtime::console::Console;
 
 use crate::record::{RecordError, Recorded, Request, record};
+use crate::scene::Scenery;
 use crate::split::Split;
 
 /// What a kill may lose at most.
@@ -35,6 +36,7 @@ impl Recording {
             split: Split::default(),
             flush: FLUSH,
             force: false,
+            scenery: Scenery::Drawn,
         };
         let stop = Arc::new(AtomicBool::new(false));
         let is_stopped = Arc::clone(&stop);
