@@ -31,6 +31,7 @@ use crate::link::{self, cli::LinkCommand};
 use crate::probe;
 use crate::process::emulation_room::check_emulation;
 use crate::process::{component, own_program};
+use crate::progress::Progress;
 use crate::registry::Registry;
 use crate::report::terminal::{self, Style};
 use crate::signals::{EXIT_INTERRUPTED, Signals};
@@ -216,9 +217,11 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
                 exit::RAN if is_incomplete => exit::FAILED,
                 code => code,
             };
-            console.progress("drawing up the account");
             let origin = (path.as_path(), options.command_line.as_slice());
-            match analysis::conclude(&topology, &result, registry, origin) {
+            let summary = Progress::begin().during(console, "drawing up the account", |_| {
+                analysis::conclude(&topology, &result, registry, origin)
+            });
+            match summary {
                 Ok(summary) => {
                     console.result(&terminal::render(&summary, columns(), Style::Coloured));
                     if code != exit::RAN {

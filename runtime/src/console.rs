@@ -77,6 +77,14 @@ impl Console {
         }
     }
 
+    /// Takes the progress line away: the work is done.
+    pub(crate) fn end_progress(&mut self) {
+        if self.has_open_line {
+            write_to(&mut io::stderr(), "\r\x1b[K");
+            self.has_open_line = false;
+        }
+    }
+
     /// Gives a result; colours are dropped where the output cannot show them. False when nobody
     /// reads it any more, which ends what would go on for ever.
     pub fn result(&mut self, text: &str) -> bool {

@@ -1,12 +1,16 @@
 //! One line that says how far a long piece of work is: share, time passed, time left. Every command
 //! that can take more than a moment says it in this form.
 
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread;
 use std::time::{Duration, Instant};
 
 use crate::console::Console;
 
 /// Work that is done within this time needs no word on how far it is.
 const SILENCE: Duration = Duration::from_secs(1);
+/// How often the line of work in one piece is drawn.
+const PERIOD: Duration = Duration::from_millis(250);
 /// Below this share an estimate of the time left would only be noise.
 const SHARE_MIN: f64 = 0.01;
 
@@ -30,6 +34,100 @@ impl Progress {
         if elapsed >= SILENCE {
             console.progress(&line(share, elapsed, words));
         }
+    }
+
+    /// Does `work` and shows meanwhile how far it is, however seldom it says so itself. The line goes
+    /// when the work is done.
+    pub fn during<T>(
+        &self,
+        console: &mut Console,
+        words: &str,
+        work: impl FnOnce(&Stage) -> T,
+    ) -> T {
+        let stage = Stage::new(words);
+        thread::scope(|scope| {
+            // It only draws lines; where no thread can be had, the work is done without them.
+            let drawn = thread::Builder::new()
+                .name("progress".to_owned())
+                .spawn_scoped(scope, || self.show_until_over(&stage, console));
+            let done = {
+                let _over = OverOnDrop(&stage);
+                work(&stage)
+            };
+            drop(drawn);
+            done
+        })
+    }
+
+    fn show_until_over(&self, stage: &Stage, console: &mut Console) {
+        while let Some((share, words)) = stage.after(PERIOD) {
+            self.show(console, share, &words);
+        }
+        console.end_progress();
+    }
+}
+
+/// How far a piece of work is, as it says itself.
+#[derive(Debug)]
+pub struct Stage {
+    standing: Mutex<Standing>,
+    ended: Condvar,
+}
+
+#[derive(Debug)]
+struct Standing {
+    share: Option<f64>,
+    words: String,
+    is_over: bool,
+}
+
+impl Stage {
+    fn new(words: &str) -> Self {
+        let standing = Standing {
+            share: None,
+            words: words.to_owned(),
+            is_over: false,
+        };
+        Self {
+            standing: Mutex::new(standing),
+            ended: Condvar::new(),
+        }
+    }
+
+    /// `share` of the work is done, 0 to 1.
+    pub fn reach(&self, share: f64) {
+        self.standing().share = Some(share);
+    }
+
+    /// What is being done from now on, and the share that is done, where it is known.
+    pub fn tell(&self, share: Option<f64>, words: &str) {
+        let mut standing = self.standing();
+        standing.share = share;
+        words.clone_into(&mut standing.words);
+    }
+
+    /// How it stands in `period`; `None` as soon as the work is over.
+    fn after(&self, period: Duration) -> Option<(Option<f64>, String)> {
+        let is_going = |standing: &mut Standing| !standing.is_over;
+        let waited = self
+            .ended
+            .wait_timeout_while(self.standing(), period, is_going);
+        let standing = waited.unwrap_or_else(PoisonError::into_inner).0;
+        (!standing.is_over).then(|| (standing.share, standing.words.clone()))
+    }
+
+    fn standing(&self) -> MutexGuard<'_, Standing> {
+        self.standing.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Ends the line even where the work panics: its thread is waited for.
+struct OverOnDrop<'a>(&'a Stage);
+
+impl Drop for OverOnDrop<'_> {
+    fn drop(&mut self) {
+        self.0.standing().is_over = true;
+        self.0.ended.notify_all();
     }
 }
 
@@ -67,6 +165,35 @@ mod tests {
         assert_eq!(clock_text(0.0), "0:00");
         assert_eq!(clock_text(59.9), "0:59");
         assert_eq!(clock_text(754.0), "12:34");
+    }
+
+    #[test]
+    fn work_in_one_piece_says_how_far_it_is_and_gives_its_result() {
+        let mut console = Console::new(true);
+        let progress = Progress::begin();
+        let done = progress.during(&mut console, "reading", |stage| {
+            stage.reach(0.5);
+            let standing = stage.standing();
+            assert_eq!(
+                (standing.share, standing.words.as_str()),
+                (Some(0.5), "reading")
+            );
+            drop(standing);
+            stage.tell(None, "drawing");
+            assert_eq!(stage.standing().words, "drawing");
+            assert_eq!(stage.standing().share, None);
+            7
+        });
+        assert_eq!(done, 7);
+    }
+
+    #[test]
+    fn work_that_panics_leaves_no_thread_waiting() {
+        let mut console = Console::new(true);
+        let outcome = std::panic::catch_unwind(core::panic::AssertUnwindSafe(|| {
+            Progress::begin().during(&mut console, "reading", |_| panic!("wanted by this test"));
+        }));
+        assert!(outcome.is_err());
     }
 
     #[test]

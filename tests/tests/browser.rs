@@ -8,6 +8,7 @@
 
 use std::path::Path;
 use std::process::Command;
+use std::thread;
 use std::time::Duration;
 
 use hil_tests::binary::{hil_recorder_binary, hil_runtime_binary};
@@ -16,7 +17,7 @@ use hil_tests::child::{ChildGuard, run};
 use hil_tests::lab::{INTERFACE, Lab, LabHost};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::Trial;
-use nix::sys::signal::Signal;
+use nix::sys::signal::{Signal, kill};
 use serde_json::Value;
 
 const LIMIT: Duration = Duration::from_mins(2);
@@ -24,6 +25,8 @@ const DESKTOP: (u32, u32) = (1440, 900);
 const PHONE: (u32, u32) = (390, 844);
 /// All that a page may bring over the network, in bytes.
 const WEIGHT_MAX: u64 = 1_000_000;
+/// All that a report may have to lay out: with its size, what makes it open fast on any machine.
+const ELEMENT_COUNT_MAX: f64 = 8_000.0;
 
 /// A run that goes on, a recorder that shows it, and the address of its page.
 struct Shown {
@@ -298,6 +301,31 @@ fn the_live_page_shows_a_fleet_and_changes_its_links() {
 }
 
 #[test]
+fn a_host_that_overran_is_said_at_the_head_of_the_page() {
+    let Some(lab) = with_the_cable_pulled() else {
+        return;
+    };
+    let host = lab.host(0);
+    let Some(mut browser) = Browser::start_on_or_skip(host) else {
+        return;
+    };
+    let folder = RunFolder::new("page-overrun");
+    let trial = Trial::shipped("shuttle-local.toml", folder.path()).set("run.duration=\"2 min\"");
+    let shown = Shown::start(&trial, folder, host);
+    let mut page = browser.page(DESKTOP.0, DESKTOP.1);
+    page.go(&shown.address);
+    page.wait_until("document.getElementById('run-state').textContent === 'running'");
+    let files = trial.folder("", LIMIT);
+    let robot = files.process("robot", 0).unwrap();
+    // Its ticks pass without it, as on a host that has no time for it.
+    kill(robot, Signal::SIGSTOP).unwrap();
+    thread::sleep(Duration::from_millis(500));
+    kill(robot, Signal::SIGCONT).unwrap();
+    page.wait_until("/overran.*robot [1-9]/.test(document.getElementById('warnings').innerText)");
+    shown.end();
+}
+
+#[test]
 fn the_live_page_shows_arms() {
     let Some(lab) = with_the_cable_pulled() else {
         return;
@@ -391,7 +419,9 @@ fn look_at_report(browser: &mut Browser, report: &Path, name: &str) {
     let timing = "performance.getEntriesByType('navigation')[0].loadEventEnd";
     page.wait_until(&format!("{timing} > 0"));
     let loaded_ms = number(&mut page, timing);
-    eprintln!("{name}: loaded after {loaded_ms:.0} ms");
+    let elements = number(&mut page, "document.getElementsByTagName('*').length");
+    eprintln!("{name}: loaded after {loaded_ms:.0} ms, {elements} elements");
+    assert!(elements < ELEMENT_COUNT_MAX, "{name}: {elements} elements");
     let figures = "[...document.querySelectorAll('table.figures td.n')]\
                    .filter(cell => /[0-9]/.test(cell.textContent)).length";
     assert!(

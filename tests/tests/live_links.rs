@@ -18,12 +18,14 @@ use hil_models::measure::statistics::clopper_pearson;
 use hil_runtime::report::link_change::ChangedTo;
 use hil_runtime::report::summary::Outcome;
 use hil_tests::account::assert_every_message_is_accounted_for;
-use hil_tests::binary::hil_runtime_binary;
+use hil_tests::binary::{hil_recorder_binary, hil_runtime_binary};
 use hil_tests::child::ChildGuard;
+use hil_tests::mcap_file::{assert_code, read_back, recorder};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::shuttle::{emulated_shuttle, records, trace_of};
 use hil_tests::trial::{RunFiles, Trial, wait_until};
 use nix::sys::signal::Signal;
+use prost::Message;
 use serde_json::Value;
 
 const LIMIT: Duration = Duration::from_mins(1);
@@ -90,9 +92,20 @@ fn requested(files: &RunFiles, channel: &str, (from_ns, until_ns): (i64, i64)) -
 #[test]
 fn a_change_holds_for_messages_received_from_then_on_and_the_report_names_it() {
     let record = RunFolder::new("live-link");
+    // It may have to be built first, and the run would not wait.
+    let recorder_binary = hil_recorder_binary();
     let (trial, mut child) = started(&record, ("live-link", 7811), "");
     let files = trial.folder("", LIMIT);
     wait_for_messages(&files);
+    let live = record.join("live.mcap");
+    let mut recorder = ChildGuard::spawn(
+        Command::new(recorder_binary)
+            .arg("record")
+            .arg(files.root())
+            .arg("-o")
+            .arg(&live),
+    )
+    .unwrap();
     let run = files.root();
     let text = done(&["show"], run);
     assert!(
@@ -122,6 +135,71 @@ fn a_change_holds_for_messages_received_from_then_on_and_the_report_names_it() {
     );
     check_messages(&files);
     check_report(&files);
+    recorder.wait_within(LIMIT).unwrap().assert_success();
+    check_recordings(&files, (&live, &record.join("converted.mcap")));
+}
+
+/// What we look at of an `hil.LinkCondition.v1`.
+#[derive(Clone, PartialEq, Message)]
+struct Condition {
+    #[prost(uint64, tag = "1")]
+    number: u64,
+    #[prost(string, tag = "3")]
+    link: String,
+    #[prost(string, tag = "4")]
+    direction: String,
+    #[prost(string, tag = "5")]
+    kind: String,
+    #[prost(uint64, optional, tag = "6")]
+    delay_ns: Option<u64>,
+    #[prost(double, optional, tag = "7")]
+    loss_ratio: Option<f64>,
+    #[prost(bool, tag = "8")]
+    is_in_force: bool,
+    #[prost(int64, tag = "10")]
+    from_ns: i64,
+}
+
+/// The changes are in a recording beside the messages that met them, live and converted alike.
+fn check_recordings(files: &RunFiles, (live, converted): (&Path, &Path)) {
+    let output = recorder(&["convert", "--output"], &[converted, files.root()]);
+    assert_code(&output, 0);
+    for way in ["forward", "backward"] {
+        let topic = format!("/net/hop/{way}/condition");
+        let orders = orders(files, way);
+        let read = [live, converted].map(|file| {
+            let messages = read_back(file).remove(&topic).unwrap();
+            let read = messages.iter().map(|one| {
+                assert_eq!(one.channel.metadata["link"], "hop");
+                let condition = Condition::decode(&*one.data).unwrap();
+                // On the axis of the recording, whose offset is its own.
+                let since_first = one.log_time - messages[0].log_time;
+                (since_first, condition)
+            });
+            read.collect::<Vec<_>>()
+        });
+        assert_eq!(read[0], read[1], "{topic}");
+        assert_eq!(read[0].len(), orders.len(), "{topic}");
+        for ((since_first, found), order) in read[0].iter().zip(&orders) {
+            assert_eq!((found.number, found.from_ns), (order.number, order.from_ns));
+            assert_eq!(
+                (found.link.as_str(), found.direction.as_str()),
+                ("hop", way)
+            );
+            let since_ns = order.from_ns - orders[0].from_ns;
+            assert_eq!(since_first.cast_signed(), since_ns);
+            assert!(found.is_in_force);
+        }
+        let words: Vec<&str> = read[0].iter().map(|(_, one)| one.kind.as_str()).collect();
+        if way == "backward" {
+            assert_eq!(words, ["fixed", "cut", "topology"]);
+            let first = &read[0][0].1;
+            assert_eq!(first.delay_ns.map(u64::cast_signed), Some(BY_HAND_NS));
+            assert_eq!(first.loss_ratio, Some(LOSS_RATIO));
+        } else {
+            assert_eq!(words, ["topology"]);
+        }
+    }
 }
 
 /// What cannot be done is refused with its reason, and with the exit code of wrong usage.

@@ -4,7 +4,7 @@
 //! packages `mcap` and `mcap-protobuf-support` as well.
 #![allow(clippy::unwrap_used, reason = "tests")]
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::Path;
 use std::process::Output;
@@ -173,9 +173,10 @@ fn check_in_python(
     recorded: &[(Envelope, EgmFeedback)],
 ) {
     let feedback = format!("/{FEEDBACK}");
-    let Some(read) = python(file, &[&feedback]) else {
+    let Some(read) = python(file, &[&feedback, "/scene", "/tf"]) else {
         return;
     };
+    check_arms_in_python(&read);
     let found = read["topics"].as_object().unwrap();
     assert_eq!(found.len(), topics.len());
     for (topic, messages) in topics {
@@ -203,6 +204,112 @@ fn check_in_python(
     assert_eq!(read["metadata"]["hil.clocks"]["has_one_clock"], "true");
     let attachments = read["attachments"].as_array().unwrap();
     assert!(attachments.contains(&Value::from("summary.json")));
+}
+
+/// Frames move, and the shapes of the arms with them.
+fn check_arms_in_python(read: &Value) {
+    let topics = &read["topics"];
+    assert_eq!(topics["/scene"]["schema"], "foxglove.SceneUpdate");
+    assert_eq!(topics["/tf"]["schema"], "foxglove.FrameTransforms");
+    let tools = |motion: &str| {
+        let name = format!("right/{motion}/tool");
+        let messages = topics["/tf"]["messages"].as_array().unwrap().iter();
+        let places = messages.filter_map(|one| {
+            let all = one["fields"]["transforms"].as_array()?;
+            let frame = all
+                .iter()
+                .find(|one| one["child_frame_id"] == name.as_str())?;
+            assert_eq!(frame["parent_frame_id"], "body");
+            Some(frame["translation"].to_string())
+        });
+        places.collect::<BTreeSet<_>>()
+    };
+    for motion in ["desired", "measured"] {
+        assert!(tools(motion).len() > 10, "{:?}", tools(motion));
+    }
+    let last = topics["/scene"]["messages"].as_array().unwrap().last();
+    let entities = last.unwrap()["fields"]["entities"].as_array().unwrap();
+    let measured = entities.iter().find(|one| one["id"] == "left arm measured");
+    assert!(measured.unwrap()["cylinders"].as_array().unwrap().len() >= 5);
+}
+
+/// What we look at of a `foxglove.SceneUpdate`.
+#[derive(Message)]
+struct Scene {
+    #[prost(message, repeated, tag = "2")]
+    entities: Vec<Entity>,
+}
+
+#[derive(Message)]
+struct Entity {
+    #[prost(string, tag = "2")]
+    frame_id: String,
+    #[prost(string, tag = "3")]
+    id: String,
+}
+
+#[test]
+fn a_fleets_file_has_a_scene_whose_robots_move() {
+    let folder = RunFolder::new("mcap-fleet");
+    let trial = Trial::shipped("fleet-emulated.toml", folder.path())
+        .set("run.duration=\"8 s\"")
+        .set("case.parameters.fleets=2")
+        .set("links.commands.port=48631")
+        .set("links.states.port=48641");
+    let run = run(&trial);
+    let (file, bare) = (folder.join("run.mcap"), folder.join("bare.mcap"));
+    assert_code(&convert(run.root(), &file), 0);
+    assert_code(
+        &recorder(&["convert", "--no-scene", "--output"], &[&bare, run.root()]),
+        0,
+    );
+    let (topics, without) = (read_back(&file), read_back(&bare));
+    for (topic, count) in counts(&run.summary()) {
+        assert_eq!(topics[&topic].len() as u64, count, "{topic}");
+        assert_eq!(without[&topic].len() as u64, count, "{topic}");
+    }
+    assert!(!without.contains_key("/scene") && !without.contains_key("/scene/ground"));
+    let scenes = &topics["/scene"];
+    let apart = scenes
+        .windows(2)
+        .map(|two| two[1].log_time - two[0].log_time);
+    assert!(
+        apart.clone().all(|apart_ns| apart_ns == 50_000_000),
+        "{:?}",
+        apart.max()
+    );
+    let last = Scene::decode(&*scenes.last().unwrap().data).unwrap();
+    let robot = last.entities.iter().find(|one| one.id == "fleet 1 robot 0");
+    assert_eq!(robot.unwrap().frame_id, "map_1");
+    assert!(!topics["/scene/ground"].is_empty());
+    check_scene_in_python(&file);
+}
+
+/// Robots go somewhere, and sections say who may pass.
+fn check_scene_in_python(file: &Path) {
+    let Some(read) = python(file, &["/scene"]) else {
+        return;
+    };
+    let scenes = read["topics"]["/scene"]["messages"].as_array().unwrap();
+    let mut places: BTreeMap<&str, BTreeSet<String>> = BTreeMap::new();
+    let mut section_count = 0;
+    for entity in scenes
+        .iter()
+        .flat_map(|one| one["fields"]["entities"].as_array().unwrap())
+    {
+        let id = entity["id"].as_str().unwrap();
+        if id.contains("section") {
+            section_count += 1;
+            assert_eq!(entity["metadata"][1]["key"], "may_pass");
+            assert!(entity["lines"][0]["points"].as_array().unwrap().len() > 2);
+        } else if id.contains("robot") {
+            let place = entity["cubes"][0]["pose"]["position"].to_string();
+            places.entry(id).or_default().insert(place);
+        }
+    }
+    let moved = places.values().filter(|places| places.len() > 10).count();
+    assert!(moved >= 4, "{moved} of {} robots move", places.len());
+    assert!(section_count > 0);
 }
 
 #[test]

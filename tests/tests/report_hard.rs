@@ -11,6 +11,7 @@ use std::time::{Duration, Instant};
 use hil_models::measure::account::{MessageFate, Stage};
 use hil_tests::account::{account, assert_every_message_is_accounted_for};
 use hil_tests::binary::hil_runtime_binary;
+use hil_tests::browser::Browser;
 use hil_tests::child::{ChildGuard, Finished};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::shuttle::{CHANNELS, emulated_shuttle};
@@ -19,6 +20,10 @@ use hil_tests::trial::{RunFiles, Trial};
 const LIMIT: Duration = Duration::from_mins(5);
 /// A page of one run, without a series of its own that would fill it.
 const PAGE_BYTES_MAX: usize = 3_000_000;
+/// What makes the page of a million messages open fast on any machine: how much there is to read, and to
+/// lay out.
+const MILLION_BYTES_MAX: usize = 500_000;
+const MILLION_ELEMENT_COUNT_MAX: u64 = 2_000;
 
 fn run(arguments: &[&Path]) -> Finished {
     let mut command = Command::new(hil_runtime_binary());
@@ -128,6 +133,26 @@ fn a_run_of_a_million_messages_has_a_page_of_bounded_size() {
     };
     let count: u64 = CHANNELS.iter().map(|name| published(name)).sum();
     assert!(count >= 990_000, "{count}");
-    let page = page(&folder, &record.join("page.html"));
+    let output = record.join("page.html");
+    let page = page(&folder, &output);
     assert!(page.contains("million"));
+    assert!(page.len() < MILLION_BYTES_MAX, "{} bytes", page.len());
+    check_opened(&output);
+}
+
+/// How many elements the page has once a browser has read it, and, said only, how long that took.
+fn check_opened(file: &Path) {
+    let Some(mut browser) = Browser::start_or_skip() else {
+        return;
+    };
+    let mut page = browser.page(1440, 900);
+    page.go(&format!("file://{}", file.display()));
+    page.wait_until("performance.getEntriesByType('navigation')[0]?.loadEventEnd > 0");
+    let load_ms = page.value("performance.getEntriesByType('navigation')[0].loadEventEnd");
+    let elements = page.value("document.getElementsByTagName('*').length");
+    let elements = elements.as_u64().unwrap();
+    println!("opened in {load_ms} ms, {elements} elements");
+    assert!(elements > 100, "{elements} elements");
+    assert!(elements < MILLION_ELEMENT_COUNT_MAX, "{elements} elements");
+    assert!(page.complaints().is_empty(), "{:?}", page.complaints());
 }

@@ -165,7 +165,7 @@ function drawPanels(moment) {
   const samples = shelves.channels.between(moment - stretch_s - 1, moment);
   const newest = samples.at(-1)?.value ?? at("channels", moment);
   showFacts(run, newest);
-  showWarnings(run.warnings);
+  showWarnings(run);
   // A loss is drawn when the message was published, not when it was found missing.
   const losses = shelves.losses.between(moment - KEPT_S, moment).map(({ time, value }) => ({
     ...value, time: time - (value.first_at_s === null ? 0 : value.at_s - value.first_at_s) }));

@@ -50,7 +50,8 @@ export function showFacts(run, channels) {
   list.replaceChildren(...shown.map(([name, value]) => make("div", {}, make("dt", {}, name), make("dd", {}, value))));
 }
 
-export function showWarnings(warnings) {
+export function showWarnings(run) {
+  const warnings = [...overran(run.overruns ?? []), ...run.warnings];
   const section = byId("warnings");
   const key = JSON.stringify(warnings);
   if (section.dataset.key === key) return;
@@ -60,6 +61,15 @@ export function showWarnings(warnings) {
   const items = lines.slice(0, MOST_WARNINGS).map((line) => make("li", {}, line));
   if (lines.length > MOST_WARNINGS) items.push(make("li", { class: "faint" }, `and ${lines.length - MOST_WARNINGS} more`));
   section.firstElementChild.replaceChildren(...items);
+}
+
+// Ticks that went by without their process, by host: no delay of these is the network's.
+function overran(overruns) {
+  const some = overruns.filter((one) => one.skipped_tick_count > 0);
+  return [...new Set(some.map((one) => one.host))].map((host) => {
+    const each = some.filter((one) => one.host === host).map((one) => `${one.process} ${count(one.skipped_tick_count)}`);
+    return { what: `host ${host} overran, ticks skipped so far: ${each.join(", ")}` };
+  });
 }
 
 // One row per channel; cells are kept and rewritten, so that focus and selection stay.

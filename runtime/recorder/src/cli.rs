@@ -117,6 +117,9 @@ pub(crate) enum Command {
         /// Replace the file if it exists.
         #[arg(long)]
         force: bool,
+        /// Leave out /scene and /tf, and the work that drawing them takes.
+        #[arg(long)]
+        no_scene: bool,
     },
     /// Record a run while it goes.
     #[command(after_help = RECORD_EXAMPLES)]
@@ -148,6 +151,9 @@ pub(crate) enum Command {
         /// Replace files that exist.
         #[arg(long)]
         force: bool,
+        /// Leave out /scene and /tf, and the work that drawing them takes.
+        #[arg(long)]
+        no_scene: bool,
     },
     /// Make a whole MCAP file of what is left of a broken one.
     #[command(after_help = RECOVER_EXAMPLES)]

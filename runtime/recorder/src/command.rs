@@ -16,6 +16,7 @@ use crate::play::{PlayEnd, PlayError, PlayOptions, SourceError, TargetError, pla
 use crate::record::{Progress as RecordProgress, RecordError, Request, record};
 use crate::recover::{RecoverError, loss_words, recover};
 use crate::scan::ScanError;
+use crate::scene::Scenery;
 use crate::serve::{ServeError, serve};
 use crate::split::Split;
 use crate::writer::{WriteError, check_target};
@@ -39,11 +40,21 @@ pub(crate) fn run() -> ExitCode {
             return ExitCode::from(exit::INTERNAL);
         }
     };
-    let code = match cli.command {
-        Command::Convert { run, output, force } => {
+    ExitCode::from(work(cli.command, &signals, &mut console))
+}
+
+fn work(command: Command, signals: &Signals, console: &mut Console) -> u8 {
+    match command {
+        Command::Convert {
+            run,
+            output,
+            force,
+            no_scene,
+        } => {
             let checked = check_target(&output, &run, force);
-            unless_refused(checked, &mut console)
-                .unwrap_or_else(|console| convert_run((&run, &output), &signals, console))
+            let work = (run.as_path(), output.as_path(), Scenery::of(no_scene));
+            unless_refused(checked, console)
+                .unwrap_or_else(|console| convert_run(work, signals, console))
         }
         Command::Record {
             run,
@@ -55,6 +66,7 @@ pub(crate) fn run() -> ExitCode {
             flush,
             priority,
             force,
+            no_scene,
         } => {
             let request = Request {
                 run,
@@ -68,8 +80,9 @@ pub(crate) fn run() -> ExitCode {
                 flush,
                 force,
                 priority,
+                scenery: Scenery::of(no_scene),
             };
-            record_run(&request, &signals, &mut console)
+            record_run(&request, signals, console)
         }
         Command::Recover {
             broken,
@@ -77,11 +90,11 @@ pub(crate) fn run() -> ExitCode {
             force,
         } => {
             let checked = check_target(&output, &broken, force);
-            unless_refused(checked, &mut console)
-                .unwrap_or_else(|console| recover_file((&broken, &output), &signals, console))
+            unless_refused(checked, console)
+                .unwrap_or_else(|console| recover_file((&broken, &output), signals, console))
         }
-        Command::Info { file, json } => show(&file, json, &signals, &mut console),
-        Command::Serve(options) => serve_run(&options, &signals, &mut console),
+        Command::Info { file, json } => show(&file, json, signals, console),
+        Command::Serve(options) => serve_run(&options, signals, console),
         Command::Play {
             file,
             only,
@@ -96,10 +109,9 @@ pub(crate) fn run() -> ExitCode {
                 is_looped,
                 into,
             };
-            play_file(&options, &signals, &mut console)
+            play_file(&options, signals, console)
         }
-    };
-    ExitCode::from(code)
+    }
 }
 
 /// The exit code of a refusal; the console again when there was none.
@@ -140,9 +152,13 @@ fn interrupted() -> u8 {
     u8::try_from(EXIT_INTERRUPTED).unwrap_or(exit::FAILED)
 }
 
-fn convert_run((run, output): (&Path, &Path), signals: &Signals, console: &mut Console) -> u8 {
+fn convert_run(
+    (run, output, scenery): (&Path, &Path, Scenery),
+    signals: &Signals,
+    console: &mut Console,
+) -> u8 {
     let progress = Progress::begin();
-    let converted = convert(run, output, &mut |share, words| {
+    let converted = convert(run, output, scenery, &mut |share, words| {
         progress.show(console, share, words);
         signals.received()
     });

@@ -1,21 +1,31 @@
 //! A finished run's folder as one recording. Everything is put on one axis of time, the instants of
 //! publication; what each topic looks like is decided in the modules it calls.
 
-use std::path::Path;
+mod beside;
 
+use std::path::Path;
+use std::thread;
+use std::time::Duration;
+
+use hil_models::link::condition::LinkConditionRecord;
 use hil_models::message::Envelope;
 use hil_models::trace::Trace;
 use hil_runtime::record::{RecordFile, RecordKind};
 use prost::Message as _;
 
 use crate::clocks::Clocks;
+use crate::conditions::Conditions;
 use crate::encode::Encoder;
 use crate::facts;
 use crate::net::{self, Latencies, LinkDecision, MessageLatency};
 use crate::run::{Run, RunError};
+use crate::scene::{Heard, Scene, Scenery};
 use crate::schema::{self, Schema};
 use crate::topics::{self, Names, View, topic_of};
 use crate::writer::{Recording, Stamp, WriteError};
+
+/// How often it looks whether something that takes its time is done.
+const PAUSE: Duration = Duration::from_millis(20);
 
 /// How a conversion went wrong.
 #[derive(Debug, thiserror::Error)]
@@ -67,13 +77,14 @@ enum What {
     Message { file: usize, index: usize },
     Latency { key: (u32, u64) },
     Link { trace: usize, index: usize },
+    Condition { file: usize, index: usize },
     Event { index: usize },
 }
 
 /// Its place: time, then the channel, so that the order is the same each time.
 type Item = (u64, usize, What);
 
-/// Converts the run at `from` to the file `to`; `look` hears how far it is, in words, and gives the
+/// Converts the run at `from` to the file `to`, with its scene if that is wanted; `look` hears how far it is, in words, and gives the
 /// signal that came.
 ///
 /// # Errors
@@ -81,6 +92,7 @@ type Item = (u64, usize, What);
 pub(crate) fn convert(
     from: &Path,
     to: &Path,
+    scenery: Scenery,
     look: &mut dyn FnMut(Option<f64>, &str) -> Option<&'static str>,
 ) -> Result<Converted, ConvertError> {
     let mut stopped = None;
@@ -93,7 +105,13 @@ pub(crate) fn convert(
     }
     run.count_missing();
     let clocks = Clocks::of(&run);
-    let mut conversion = Conversion::begin(to, &run, &clocks)?;
+    let mut conversion = Conversion::begin(to, &run, &clocks, scenery)?;
+    while !conversion.is_ready() {
+        if let Some(signal) = look(None, "making the fleet's ground") {
+            return Err(ConvertError::Interrupted(signal));
+        }
+        thread::sleep(PAUSE);
+    }
     let items = conversion.plan(&run, &clocks);
     run.gaps.timeless_count = conversion.timeless_count;
     if conversion.timeless_count > 0 {
@@ -113,6 +131,7 @@ pub(crate) fn convert(
         }
         conversion.write(&mut run, *item)?;
     }
+    conversion.finish_scene(&mut run)?;
     let Conversion {
         mut recording,
         channels,
@@ -143,6 +162,8 @@ struct Conversion {
     channels: Vec<ChannelTopics>,
     names: Names,
     events: Option<u16>,
+    scene: Option<Scene>,
+    conditions: Conditions,
     latencies: Vec<Latencies>,
     topic_count: usize,
     message_count: u64,
@@ -152,12 +173,14 @@ struct Conversion {
 
 impl Conversion {
     /// Opens the file and declares every topic in it.
-    fn begin(to: &Path, run: &Run, clocks: &Clocks) -> Result<Self, WriteError> {
+    fn begin(to: &Path, run: &Run, clocks: &Clocks, scenery: Scenery) -> Result<Self, WriteError> {
         let mut conversion = Self {
             recording: Recording::create(to)?,
             channels: Vec::new(),
             names: Names::default(),
             events: None,
+            scene: None,
+            conditions: Conditions::default(),
             latencies: Vec::new(),
             topic_count: 0,
             message_count: 0,
@@ -177,6 +200,10 @@ impl Conversion {
         if events.is_some_and(|events| !events.is_empty()) {
             let schema = topics::event_schema();
             conversion.events = Some(conversion.topic("/score/events".to_owned(), &schema, &[])?);
+        }
+        conversion.begin_conditions(run)?;
+        if scenery.is_drawn() {
+            conversion.begin_scene(run)?;
         }
         // Descriptions of topics in a chunk of their own: damage to a message cannot take them along.
         conversion.recording.flush()?;
@@ -307,6 +334,16 @@ impl Conversion {
             }
         }
         let after_all = self.channels.len();
+        for (file, records) in run.files.iter().enumerate() {
+            if !is_order_file(records) {
+                continue;
+            }
+            let host = self.conditions.host_of(&records.header.channel);
+            for (index, one) in records.records::<LinkConditionRecord>().enumerate() {
+                let at_ns = host.and_then(|host| clocks.host_time_ns(host, one.from_ns));
+                put(at_ns, after_all, What::Condition { file, index });
+            }
+        }
         let mut time_ns = |host: &str, at_ns| clocks.host_time_ns(host, at_ns);
         let events = facts::event_times(run, clocks.has_one_clock, &mut time_ns);
         for (index, at_ns) in events.into_iter().enumerate() {
@@ -337,6 +374,14 @@ impl Conversion {
                     LinkDecision::of(record).encode_raw(&mut self.buffer);
                     let at = Stamp::new(at_ns, record.sequence);
                     self.recording.write(topic, at, &self.buffer)?;
+                }
+            }
+            What::Condition { file, index } => {
+                let file = &run.files[file];
+                if let Some(record) = file.records::<LinkConditionRecord>().nth(index) {
+                    let one = (at_ns, &record);
+                    self.conditions
+                        .write(&file.header.channel, one, &mut self.recording)?;
                 }
             }
             What::Event { index } => {
@@ -375,7 +420,11 @@ impl Conversion {
                 self.recording.write(*topic, at, &shown)?;
             }
         }
-        Ok(())
+        let Some((scene, message)) = self.scene.as_mut().zip(topics.message.as_deref()) else {
+            return Ok(());
+        };
+        let heard = Heard::of((&topics.name, message), at_ns, (&envelope, payload));
+        scene.take(&heard, &mut self.recording)
     }
 }
 
@@ -400,6 +449,10 @@ fn typed_encoder(run: &Run, channel: &str) -> Result<(Encoder, Schema), String> 
 
 fn is_of(file: &RecordFile, channel: &str, kind: RecordKind) -> bool {
     file.header.kind == kind && file.header.channel == channel
+}
+
+fn is_order_file(file: &RecordFile) -> bool {
+    file.header.kind == RecordKind::LinkCondition
 }
 
 /// The trace of a channel, and its number among all.

@@ -1,6 +1,8 @@
 //! What becomes of a run's events while it goes: topics and their messages, the same as
 //! [`crate::convert`] makes of the folder afterwards. Where they go is the [`Sink`]'s.
 
+mod beside;
+
 use std::collections::BTreeMap;
 use std::time::Instant;
 
@@ -9,11 +11,14 @@ use hil_models::message::Envelope;
 use hil_runtime::watch::{Event, Feed, Origin, Record, Seen, Source, WatchedChannel};
 use prost::Message as _;
 
+use crate::conditions::Conditions;
 use crate::encode::Encoder;
 use crate::joining::Joining;
 use crate::live_clocks::LiveClocks;
 use crate::net::{self, LinkDecision, MessageLatency};
 use crate::run::Run;
+use crate::scene::waiting::LiveScene;
+use crate::scene::{Heard, Scene, Scenery};
 use crate::schema;
 use crate::sink::{Sink, Topic};
 use crate::topics::{self, Names, View, topic_of};
@@ -48,6 +53,8 @@ pub(crate) struct LiveTopics {
     channels: BTreeMap<String, ChannelTopics>,
     names: Names,
     events: Topic,
+    conditions: Conditions,
+    scene: Option<LiveScene>,
     clocks: LiveClocks,
     buffer: Vec<u8>,
     counts: Counts,
@@ -67,8 +74,9 @@ pub(crate) struct Counts {
 }
 
 impl LiveTopics {
-    /// Names the topics of a run; they appear with their first message.
-    pub(crate) fn of(feed: &Feed) -> Self {
+    /// Names the topics of a run; they appear with their first message. Without a scene, what it takes
+    /// to draw one is not worked out.
+    pub(crate) fn of(feed: &Feed, scenery: Scenery) -> Self {
         let mut names = Names::default();
         let mut channels: BTreeMap<String, ChannelTopics> = BTreeMap::new();
         // Before the derived names, so that the run's own keep theirs.
@@ -81,10 +89,19 @@ impl LiveTopics {
             channels.insert(name, ChannelTopics::of(feed, channel, topic, &mut names));
         }
         let events = names.claim("/score/events".to_owned());
+        let topology = &feed.manifest().topology;
+        let conditions = Conditions::of(topology, &mut names);
+        let case = &topology["case"];
+        let scene = scenery.is_drawn().then(|| {
+            let scene = Scene::new(case["name"].as_str(), &case["parameters"], &mut names);
+            LiveScene::new(scene)
+        });
         Self {
             channels,
             names,
             events: Topic::new(events, topics::event_schema(), &[]),
+            conditions,
+            scene,
             clocks: LiveClocks::of(feed),
             buffer: Vec::new(),
             counts: Counts::default(),
@@ -167,6 +184,12 @@ impl LiveTopics {
                 topic.write(sink, at, &shown)?;
             }
         }
+        // What another host sends at the end was long ago: the pictures of that time are drawn.
+        let is_news = origin != Origin::OtherHost;
+        if let Some(scene) = self.scene.as_mut().filter(|_| is_news) {
+            let channel = (name, channel.message.as_str());
+            scene.take(&Heard::of(channel, at_ns, (envelope, payload)), sink)?;
+        }
         Ok(())
     }
 
@@ -177,6 +200,9 @@ impl LiveTopics {
         record: &Record,
         sink: &mut S,
     ) -> Result<(), S::Error> {
+        if let Record::LinkCondition(one) = record {
+            return self.condition(name, one, sink);
+        }
         let Some(channel) = self.channels.get_mut(name) else {
             return Ok(());
         };

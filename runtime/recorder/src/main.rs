@@ -11,6 +11,7 @@
 mod cli;
 mod clocks;
 mod command;
+mod conditions;
 mod convert;
 mod decode;
 mod disk;
@@ -27,6 +28,7 @@ mod record;
 mod recover;
 mod run;
 mod scan;
+mod scene;
 mod schema;
 mod serve;
 mod sink;

@@ -15,6 +15,7 @@ use crate::facts::{self, Words};
 use crate::live::LiveTopics;
 use crate::priority::{Precedence, Priority};
 use crate::run::Run;
+use crate::scene::Scenery;
 use crate::split::{Files, Split};
 use crate::writer::WriteError;
 
@@ -68,6 +69,8 @@ pub(crate) struct Request {
     pub(crate) force: bool,
     /// How it stands against what it records.
     pub(crate) priority: Priority,
+    /// Draw the scene.
+    pub(crate) scenery: Scenery,
 }
 
 /// What a recording came to.
@@ -123,7 +126,8 @@ pub(crate) fn record(request: &Request, look: Look<'_>) -> Result<Recorded, Reco
     }
     let files = Files::begin(&target, request.split, request.force)?;
     let precedence = Precedence::take(request.priority);
-    let mut recording = LiveRecording::begin(feed, files, precedence)?;
+    let topics = LiveTopics::of(&feed, request.scenery);
+    let mut recording = LiveRecording::begin((feed, topics), files, precedence)?;
     let signal = recording.run(request, look)?;
     recording.finish(signal)
 }
@@ -178,9 +182,13 @@ struct LiveRecording {
 }
 
 impl LiveRecording {
-    fn begin(feed: Feed, files: Files, precedence: Precedence) -> Result<Self, WriteError> {
+    fn begin(
+        (feed, topics): (Feed, LiveTopics),
+        files: Files,
+        precedence: Precedence,
+    ) -> Result<Self, WriteError> {
         let mut recording = Self {
-            topics: LiveTopics::of(&feed),
+            topics,
             feed,
             files,
             is_silent: false,
@@ -212,6 +220,9 @@ impl LiveRecording {
         let (mut told_count, mut has_caught_up) = (0, false);
         loop {
             let polled = self.poll()?;
+            if polled != Poll::Busy {
+                self.topics.draw(&mut self.files)?;
+            }
             let now = Instant::now();
             self.topics.settle(now, &mut self.files)?;
             // What was there before the recorder is not to wait for its first period.
@@ -313,6 +324,9 @@ impl LiveRecording {
     }
 
     fn finish(mut self, signal: Option<&'static str>) -> Result<Recorded, RecordError> {
+        if let Some(problem) = self.topics.finish_scene(&mut self.files)? {
+            self.problems.push(problem.to_owned());
+        }
         let mut run = Run::without_records(self.feed.run().run_folder());
         if self.has_summary {
             // A folder that cannot be listed is one more thing to say, and no reason to lose the rest.

@@ -11,15 +11,17 @@ use hil_runtime::manifest::{ChannelDescription, Manifest};
 use hil_runtime::record::{RecordFile, RecordKind};
 use hil_runtime::report::summary::RunSummary;
 use hil_runtime::run_folder::RunFolder;
+use serde_json::Value;
 
 /// The kinds of records that end in a recording.
-const KINDS: [RecordKind; 6] = [
+const KINDS: [RecordKind; 7] = [
     RecordKind::Published,
     RecordKind::Taken,
     RecordKind::Egress,
     RecordKind::Ingress,
     RecordKind::FollowUp,
     RecordKind::Message,
+    RecordKind::LinkCondition,
 ];
 
 /// Why a folder cannot be turned into a recording at all.
@@ -197,6 +199,12 @@ impl Run {
         }
     }
 
+    /// The topology with every default spelled out; null when there is no manifest.
+    pub(crate) fn topology(&self) -> &Value {
+        const NOTHING: &Value = &Value::Null;
+        self.manifest.as_ref().map_or(NOTHING, |one| &one.topology)
+    }
+
     /// What the manifest says of `channel`.
     pub(crate) fn described(&self, channel: &str) -> Option<&ChannelDescription> {
         let manifest = self.manifest.as_ref()?;
@@ -229,9 +237,11 @@ impl Run {
         }
     }
 
-    /// Names of all channels with records, in order.
+    /// Names of all channels with records, in order; where orders to links are kept is none.
     pub(crate) fn channels(&self) -> Vec<String> {
-        let names = self.files.iter().map(|file| file.header.channel.clone());
+        let files = self.files.iter();
+        let files = files.filter(|file| file.header.kind != RecordKind::LinkCondition);
+        let names = files.map(|file| file.header.channel.clone());
         let mut names: Vec<String> = names.collect();
         names.sort();
         names.dedup();

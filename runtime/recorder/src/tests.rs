@@ -19,6 +19,7 @@ use crate::info::{Info, info};
 use crate::recover::{Recovered, recover};
 use crate::run::RunError;
 use crate::scan::ScanError;
+use crate::scene::Scenery;
 
 /// Messages of each made-up channel: enough for several chunks.
 const MESSAGE_COUNT: u64 = 60_000;
@@ -78,7 +79,12 @@ impl Folder {
     }
 
     fn convert(&self) -> Result<Converted, ConvertError> {
-        convert(&self.at("run"), &self.at("run.mcap"), &mut |_, _| None)
+        convert(
+            &self.at("run"),
+            &self.at("run.mcap"),
+            Scenery::Drawn,
+            &mut |_, _| None,
+        )
     }
 
     fn recover(&self, bytes: &[u8]) -> Result<Recovered, String> {
@@ -206,7 +212,12 @@ fn a_signal_leaves_no_file() {
     folder.record("a", 0..9000);
     for wanted in ["reading", "writing"] {
         let mut stop = |_: Option<f64>, words: &str| words.starts_with(wanted).then_some("Ctrl-C");
-        let stopped = convert(&folder.at("run"), &folder.at("run.mcap"), &mut stop);
+        let stopped = convert(
+            &folder.at("run"),
+            &folder.at("run.mcap"),
+            Scenery::Drawn,
+            &mut stop,
+        );
         assert!(matches!(stopped, Err(ConvertError::Interrupted("Ctrl-C"))));
         assert_eq!(fs::read_dir(&folder.0).unwrap().count(), 1);
     }

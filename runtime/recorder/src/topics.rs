@@ -137,7 +137,7 @@ fn read<M: Message>(payload: &[u8]) -> Option<M> {
     bytemuck::try_pod_read_unaligned(payload).ok()
 }
 
-fn well_known<M: Encode>() -> Schema {
+pub(crate) fn well_known<M: Encode>() -> Schema {
     let schema = M::get_schema().expect("every message of the SDK states its schema");
     Schema {
         name: schema.name,
@@ -146,7 +146,7 @@ fn well_known<M: Encode>() -> Schema {
 }
 
 /// `None` after the year 2106, where the viewers' clock ends.
-fn timestamp(at_ns: u64) -> Option<Timestamp> {
+pub(crate) fn timestamp(at_ns: u64) -> Option<Timestamp> {
     let seconds = u32::try_from(at_ns / 1_000_000_000).ok()?;
     Timestamp::new_checked(seconds, (at_ns % 1_000_000_000) as u32)
 }
@@ -177,7 +177,8 @@ fn joints(
     }
 }
 
-fn pose((x, y, z): (f64, f64, f64), (i, j, k, w): (f64, f64, f64, f64)) -> Pose {
+/// A place, and the quaternion x, y, z, w.
+pub(crate) fn pose((x, y, z): (f64, f64, f64), (i, j, k, w): (f64, f64, f64, f64)) -> Pose {
     Pose {
         position: Some(Vector3 { x, y, z }),
         orientation: Some(Quaternion {

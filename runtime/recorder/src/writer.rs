@@ -14,6 +14,7 @@ use mcap::{Attachment, Compression, McapError, WriteOptions, Writer};
 
 use crate::disk::QueuedFile;
 use crate::schema::Schema;
+use crate::sink::Sink;
 
 /// Messages of about this size are compressed together. The smaller, the less is lost when a file
 /// is damaged; the larger, the better they compress.
@@ -312,6 +313,23 @@ impl Recording {
         }
         fs::rename(&self.partial, &self.path).map_err(|error| failed(&self.path, error))?;
         Ok(self.message_count)
+    }
+}
+
+impl Sink for Recording {
+    type Error = WriteError;
+
+    fn add_topic(
+        &mut self,
+        topic: &str,
+        schema: &Schema,
+        metadata: &BTreeMap<String, String>,
+    ) -> Result<u16, WriteError> {
+        Self::add_topic(self, topic, schema, metadata)
+    }
+
+    fn write(&mut self, topic: u16, at: Stamp, data: &[u8]) -> Result<(), WriteError> {
+        Self::write(self, topic, at, data)
     }
 }
 

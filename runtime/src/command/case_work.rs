@@ -221,7 +221,10 @@ fn compute(
 /// `replay`.
 pub(super) fn replay(run: &Path, json: bool, registry: &Registry, console: &mut Console) -> u8 {
     let folder = RunFolder::existing(run);
-    let replayed = match replay::replay(&folder, registry) {
+    let replayed = Progress::begin().during(console, "running the robot again", |_| {
+        replay::replay(&folder, registry)
+    });
+    let replayed = match replayed {
         Ok(replayed) => replayed,
         Err(error) => {
             console.error(&error.to_string());

@@ -5,9 +5,10 @@ use std::path::{Path, PathBuf};
 
 use crate::cli::ReportArgs;
 use crate::console::Console;
+use crate::progress::Progress;
 use crate::report::page::material::Material;
 use crate::report::page::{self, Format, read, write};
-use crate::report::summary::RunSummary;
+use crate::report::summary::{RunSummary, SummaryError};
 use crate::report::terminal::{self, Style};
 use crate::run_folder::RunFolder;
 
@@ -53,15 +54,27 @@ fn to_files(args: &ReportArgs, console: &mut Console) -> Result<(), Refusal> {
     if let Some(output) = args.output.as_deref().filter(|_| !is_folder) {
         write::check(output, args.force).map_err(usage)?;
     }
-    let materials = args.runs.iter().map(|run| read::read(run));
-    let materials = materials.collect::<Result<Vec<_>, _>>().map_err(usage)?;
+    let materials = Progress::begin().during(console, "reading runs", |stage| {
+        let runs = args.runs.iter().enumerate();
+        let materials = runs.map(|(index, run)| {
+            // Of the first, nothing says yet how long one takes.
+            let share = (index > 0).then(|| index as f64 / args.runs.len() as f64);
+            stage.tell(share, &format!("reading {}", run.display()));
+            read::read(run)
+        });
+        materials.collect::<Result<Vec<_>, _>>()
+    });
+    let materials = materials.map_err(usage)?;
     if format == Format::Svg && template.is_none() {
         return figures(args, &materials, console);
     }
     let own = template
         .as_ref()
         .map(|(name, text)| (name.as_str(), text.as_str()));
-    let text = page::render(&materials, format, own).map_err(usage)?;
+    let text = Progress::begin().during(console, "drawing", |_| {
+        page::render(&materials, format, own)
+    });
+    let text = text.map_err(usage)?;
     match &args.output {
         None => {
             console.result(&text);
@@ -111,7 +124,10 @@ fn figures(
     materials: &[Material],
     console: &mut Console,
 ) -> Result<(), Refusal> {
-    let files = page::figure_files(materials, args.figure.as_deref()).map_err(usage)?;
+    let files = Progress::begin().during(console, "drawing", |_| {
+        page::figure_files(materials, args.figure.as_deref())
+    });
+    let files = files.map_err(usage)?;
     let Some(output) = &args.output else {
         if args.figure.is_none() {
             return Err(usage(
@@ -171,7 +187,11 @@ fn show_virtual(folder: &RunFolder, json: bool, console: &mut Console) -> u8 {
 /// The report as the run printed it.
 fn show(run: &Path, json: bool, console: &mut Console) -> u8 {
     let folder = RunFolder::existing(run);
-    let text = match fs::read_to_string(folder.summary()) {
+    let progress = Progress::begin();
+    let text = progress.during(console, "reading the summary", |_| {
+        fs::read_to_string(folder.summary())
+    });
+    let text = match text {
         Ok(text) => text,
         Err(error) => {
             let path = folder.summary();
@@ -190,9 +210,13 @@ fn show(run: &Path, json: bool, console: &mut Console) -> u8 {
         console.result(&text);
         return exit::RAN;
     }
-    match RunSummary::from_json(&text) {
-        Ok(summary) => {
-            console.result(&terminal::render(&summary, columns(), Style::Coloured));
+    let page = progress.during(console, "laying out the report", |_| {
+        let summary = RunSummary::from_json(&text)?;
+        Ok::<_, SummaryError>(terminal::render(&summary, columns(), Style::Coloured))
+    });
+    match page {
+        Ok(page) => {
+            console.result(&page);
             exit::RAN
         }
         Err(error) => {

@@ -8,6 +8,7 @@ use super::cli::{CompareArgs, CompareFormat};
 use super::conditions::{Condition, Judged};
 use super::{ComparedRun, Comparison, render};
 use crate::console::Console;
+use crate::progress::{Progress, Stage};
 
 /// How it ended; the caller knows the exit codes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -22,7 +23,8 @@ pub(crate) enum End {
 
 /// Does what the command line says.
 pub(crate) fn work(args: &CompareArgs, console: &mut Console) -> End {
-    match compared(args) {
+    let compared = Progress::begin().during(console, "reading runs", |stage| compared(args, stage));
+    match compared {
         Ok((text, has_failed)) => {
             console.result(&format!("{text}\n"));
             if has_failed {
@@ -38,19 +40,27 @@ pub(crate) fn work(args: &CompareArgs, console: &mut Console) -> End {
     }
 }
 
-fn compared(args: &CompareArgs) -> Result<(String, bool), String> {
+fn compared(args: &CompareArgs, stage: &Stage) -> Result<(String, bool), String> {
     let (base, new) = sides(args);
     // Wrong words are told before folders are read.
     let conditions = args.fail_if.iter().map(|text| Condition::parse(text));
     let conditions = conditions
         .collect::<Result<Vec<_>, _>>()
         .map_err(|error| error.to_string())?;
-    let read = |folders: &[PathBuf]| {
-        let runs = folders.iter().map(|folder| ComparedRun::read(folder));
+    let (run_count, mut read_count) = (base.len() + new.len(), 0_usize);
+    let mut read = |folders: &[PathBuf]| {
+        let runs = folders.iter().map(|folder| {
+            let run = ComparedRun::read(folder);
+            read_count += 1;
+            stage.reach(read_count as f64 / run_count as f64);
+            run
+        });
         runs.collect::<Result<Vec<_>, _>>()
             .map_err(|error| error.to_string())
     };
-    let comparison = Comparison::of(&read(&base)?, &read(&new)?);
+    let (base, new) = (read(&base)?, read(&new)?);
+    stage.tell(None, "comparing");
+    let comparison = Comparison::of(&base, &new);
     let mut judged = Vec::new();
     for condition in &conditions {
         let found = condition

@@ -1,11 +1,12 @@
 //! One running run as the commands of a terminal need it: its topology, the newest records of each
 //! channel, and how the clocks of its hosts stand to each other. It draws nothing.
 
+mod exchanges;
+
 use std::collections::BTreeMap;
 use std::thread;
 use std::time::{Duration, Instant as WallInstant};
 
-use hil_models::clock::{ClockMap, ClockSettings, Exchange, Requester};
 use hil_models::link::condition::{LinkCondition, LinkConditionRecord};
 use hil_models::link::spec::Way;
 use hil_models::measure::account::{
@@ -392,14 +393,6 @@ impl Observer {
         Some(tail.account(span, &context))
     }
 
-    /// How the clock of `from` relates to that of `to` by the exchanges of the last half minute;
-    /// `None` without any.
-    pub(crate) fn clock_map(&self, from: &str, to: &str) -> Option<ClockMap> {
-        let exchanges = self.exchanges(from, to);
-        let map = ClockMap::new(&exchanges, ClockSettings::default());
-        map.figures().offset.is_some().then_some(map)
-    }
-
     /// True when all hosts of the run read one clock.
     pub(crate) fn has_one_clock(&self) -> bool {
         let is_whole = self
@@ -447,43 +440,6 @@ impl Observer {
         found.map_or((None, None), |one| {
             (one.from_host.as_ref(), one.to_host.as_ref())
         })
-    }
-
-    fn exchanges(&self, from: &str, to: &str) -> Vec<Exchange> {
-        let mut found = Vec::new();
-        for (name, round_trips) in &self.round_trips {
-            let Some((asks, answers)) = self.exchanging_hosts(name) else {
-                continue;
-            };
-            // The host that is converted to is the local one.
-            let requester = match (asks.as_str(), answers.as_str()) {
-                pair if pair == (to, from) => Requester::Local,
-                pair if pair == (from, to) => Requester::Remote,
-                _ => continue,
-            };
-            // An exchange whose stamps were bettered later is there twice; the last one counts.
-            let last: BTreeMap<(u32, u64), &RoundTripRecord> = round_trips
-                .iter()
-                .map(|one| ((one.session, one.sequence), one))
-                .collect();
-            found.extend(
-                last.into_values()
-                    .filter_map(|one| Exchange::of(one, requester)),
-            );
-        }
-        found
-    }
-
-    /// The host that asks and the host that answers in the exchanges recorded as `name`: of a
-    /// channel, whose sending gateway asks, or of a clock path.
-    fn exchanging_hosts(&self, name: &str) -> Option<(String, String)> {
-        if let Some(topology) = &self.topology {
-            let clock_path = topology.clock_paths().find(|path| path.name() == name);
-            if let Some(path) = clock_path {
-                return Some((path.from.name.clone(), path.to.name.clone()));
-            }
-        }
-        self.hosts_of(name)
     }
 }
 

@@ -100,6 +100,31 @@ pub fn has_begun(folder: &Path) -> bool {
     status.is_ok_and(|status| status.phase == Phase::Running)
 }
 
+/// Ticks of a process that passed without it: its host overran.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct ProcessOverruns {
+    /// Its name in the topology.
+    pub process: String,
+    /// Its host.
+    pub host: String,
+    /// How many so far; `None` for what has no timer, or has not said.
+    pub skipped_tick_count: Option<u64>,
+}
+
+/// The overruns of every process here of the run in `folder`, while it goes on.
+///
+/// # Errors
+/// When there is no `status.json`, as before and after a run, or none that this program can read.
+pub fn overruns(folder: &Path) -> io::Result<Vec<ProcessOverruns>> {
+    let processes = RunStatus::read(folder)?.processes.into_iter();
+    let overruns = processes.map(|one| ProcessOverruns {
+        process: one.name,
+        host: one.host,
+        skipped_tick_count: one.skipped_tick_count,
+    });
+    Ok(overruns.collect())
+}
+
 /// The file for as long as the run goes; it is removed when this is dropped.
 #[derive(Debug)]
 pub(crate) struct StatusFile {
@@ -166,6 +191,11 @@ mod tests {
         let mut file = StatusFile::of(&folder);
         assert_eq!(file.write(&status), None);
         assert_eq!(RunStatus::read(&folder).unwrap(), status);
+        let overruns = overruns(&folder).unwrap();
+        assert_eq!(
+            (overruns[0].process.as_str(), overruns[0].skipped_tick_count),
+            ("robot", None)
+        );
         drop(file);
         assert!(RunStatus::read(&folder).is_err());
         fs::remove_dir_all(&folder).unwrap();

@@ -26,13 +26,17 @@ pub(super) struct Reading {
 }
 
 impl Reading {
-    /// Reads up to two files.
-    pub(super) fn of(paths: &[&Path], flows: &[FlowFilter]) -> Result<Self, FileError> {
+    /// Reads up to two files; `look` hears of each piece how many bytes it was.
+    pub(super) fn of(
+        paths: &[&Path],
+        flows: &[FlowFilter],
+        look: &mut dyn FnMut(usize),
+    ) -> Result<Self, FileError> {
         let mut observer = Observer::new(flows);
         let mut of_cards = Observer::new(flows);
         let mut files = Vec::with_capacity(paths.len());
         for (index, path) in paths.iter().enumerate() {
-            files.push(read(path, index, (&mut observer, &mut of_cards))?);
+            files.push(read(path, index, (&mut observer, &mut of_cards), look)?);
         }
         Ok(Self {
             files,
@@ -287,10 +291,8 @@ impl Report {
         }
         for point in &self.points {
             line(&mut text, "");
-            line(
-                &mut text,
-                &format!("{}  at {}", stream_line(&point.stream), point.point),
-            );
+            let head = format!("{}  at {}", stream_line(&point.stream), point.point);
+            line(&mut text, &head);
             if let Some(all) = point.kernel_stamped_count {
                 line(&mut text, &format!("  {all} arrived, of which"));
             }

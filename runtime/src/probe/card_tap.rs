@@ -245,7 +245,7 @@ mod tests {
         }
         std::fs::write(&path, file).unwrap();
         let flow = "udp:port=5004,id=0+2".parse().unwrap();
-        let reading = Reading::of(&[path.as_path()], &[flow]).unwrap();
+        let reading = Reading::of(&[path.as_path()], &[flow], &mut |_| {}).unwrap();
         let report = serde_json::to_value(Report::of(&reading, 1_000_000, false)).unwrap();
         std::fs::remove_file(path).unwrap();
         assert_eq!(report["packets"]["packet_count"], 3, "{report:#}");

@@ -42,11 +42,13 @@ pub(super) struct FileError {
 }
 
 /// Reads a whole file; faults of the format are part of the result. Packets go to `observer`, and
-/// once more to `of_cards` where the file has them with a card's stamp as well.
+/// once more to `of_cards` where the file has them with a card's stamp as well. `look` hears of each
+/// piece how many bytes it was.
 pub(super) fn read(
     path: &Path,
     file_index: usize,
     (observer, of_cards): (&mut Observer, &mut Observer),
+    look: &mut dyn FnMut(usize),
 ) -> Result<CaptureFile, FileError> {
     let failed = |source| FileError {
         path: path.to_owned(),
@@ -72,7 +74,10 @@ pub(super) fn read(
             }
             Step::NeedsMore => match input.read(&mut chunk) {
                 Ok(0) => reader.end(),
-                Ok(length) => reader.feed(&chunk[..length]),
+                Ok(length) => {
+                    look(length);
+                    reader.feed(&chunk[..length]);
+                }
                 Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
                 Err(error) => return Err(failed(error)),
             },

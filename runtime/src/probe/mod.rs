@@ -11,6 +11,7 @@ mod point_clocks;
 mod tap;
 
 use core::fmt::Write as _;
+use std::fs;
 use std::path::Path;
 use std::time::Duration;
 
@@ -21,6 +22,7 @@ use self::analyse::{Reading, Report};
 use self::arguments::{LiveArgs, ProbeArgs, ProbeWork, ReadingArgs, Stamps};
 use self::live::{InterfaceResult, LiveError, LiveResult, Request};
 use crate::console::Console;
+use crate::progress::Progress;
 use crate::signals::{EXIT_INTERRUPTED, Signals};
 
 /// Exit codes; the command's help lists them.
@@ -60,7 +62,10 @@ pub(crate) fn run(args: &ProbeArgs, console: &mut Console) -> u8 {
             for complaint in captures.complaints() {
                 console.warn(&complaint);
             }
-            match compare::compare(run, &captures, window_ns(reading)) {
+            let compared = Progress::begin().during(console, "joining with the run", |_| {
+                compare::compare(run, &captures, window_ns(reading))
+            });
+            match compared {
                 Ok(comparison) => {
                     console.result(&if reading.json {
                         json(&comparison)
@@ -105,7 +110,20 @@ fn flows(asked: &[FlowFilter]) -> Vec<FlowFilter> {
 }
 
 fn read(paths: &[&Path], reading: &ReadingArgs, console: &mut Console) -> Option<Reading> {
-    match Reading::of(paths, &flows(&reading.flow)) {
+    let flows = flows(&reading.flow);
+    let sizes = paths.iter().filter_map(|path| fs::metadata(path).ok());
+    let all_bytes: u64 = sizes.map(|one| one.len()).sum();
+    let captures = Progress::begin().during(console, "reading packets", |stage| {
+        let mut read_bytes = 0;
+        Reading::of(paths, &flows, &mut |bytes| {
+            read_bytes += bytes;
+            // A pipe does not tell how much will come.
+            if all_bytes > 0 {
+                stage.reach(read_bytes as f64 / all_bytes as f64);
+            }
+        })
+    });
+    match captures {
         Ok(captures) => Some(captures),
         Err(error) => {
             console.error(&error.to_string());
@@ -123,7 +141,9 @@ fn analyse(
     let Some(captures) = read(paths, reading, console) else {
         return exit::USAGE;
     };
-    let report = Report::of(&captures, window_ns(reading), is_one_clock);
+    let report = Progress::begin().during(console, "drawing up the figures", |_| {
+        Report::of(&captures, window_ns(reading), is_one_clock)
+    });
     let complaints = captures.complaints();
     for complaint in &complaints {
         console.warn(complaint);

@@ -44,6 +44,16 @@ impl ClockRung {
             Self::None => "not aligned",
         }
     }
+
+    /// The same, where some of the exchanges may have come over a clock path.
+    pub(crate) const fn words(self, has_path_exchanges: bool) -> &'static str {
+        match self {
+            Self::Exchanges if has_path_exchanges => {
+                "exchanges over the clock path, and beside the data"
+            }
+            other => other.label(),
+        }
+    }
 }
 
 /// Two hosts' clocks.
@@ -74,10 +84,8 @@ impl HostPairClock {
     /// What was used, in the words of a report.
     pub fn rung_words(&self) -> &'static str {
         let path = self.clock_path.as_ref();
-        if self.rung == ClockRung::Exchanges && path.is_some_and(ClockPathSummary::has_exchanges) {
-            return "exchanges over the clock path, and beside the data";
-        }
-        self.rung.label()
+        let has_exchanges = path.is_some_and(ClockPathSummary::has_exchanges);
+        self.rung.words(has_exchanges)
     }
 }
 

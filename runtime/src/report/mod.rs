@@ -1,6 +1,7 @@
 //! What a run leaves behind for people: the summary that goes into `summary.json` and its
 //! rendering for a terminal. It measures nothing and prints nothing; the caller writes the text.
 
+pub(crate) mod alike;
 pub mod assessment;
 pub mod clock_summary;
 pub mod emulation;

@@ -17,7 +17,9 @@ use super::capture::CHANGED_BY_HAND;
 use super::cli::{TraceCommand, TraceFiles, TraceForm};
 use super::open::{Opened, files, open};
 use super::plots;
+use super::source::TraceFileError;
 use crate::console::Console;
+use crate::progress::Progress;
 use crate::report::terminal::{self, Style};
 use crate::series;
 
@@ -38,13 +40,13 @@ pub(crate) enum End {
 /// Does what the command line says, on a page of `columns`.
 pub(crate) fn work(command: TraceCommand, columns: usize, console: &mut Console) -> End {
     match command {
-        TraceCommand::Info(asked) => each(&asked, console, &mut |opened, is_json, console| {
-            let figures = TraceFigures::of(&opened.trace, SEED);
+        TraceCommand::Info(asked) => each(&asked, console, &mut |opened, is_json, talk| {
+            let figures = talk.figures_of(opened);
             if is_json {
                 return Ok(info_json(opened, &figures));
             }
             let page = terminal::render_trace(&opened.trace, &figures, columns, Style::Coloured);
-            console.result(&page);
+            talk.console.result(&page);
             Ok(Value::Null)
         }),
         TraceCommand::Fit {
@@ -54,26 +56,27 @@ pub(crate) fn work(command: TraceCommand, columns: usize, console: &mut Console)
         } => {
             let is_one = files(&asked.files).is_ok_and(|all| all.len() == 1);
             let mut written = FittedLinks::new(link, is_one);
-            each(&asked, console, &mut |opened, is_json, console| {
-                let fit = TraceFit::of(&opened.trace, seed);
+            each(&asked, console, &mut |opened, is_json, talk| {
+                let words = format!("fitting {}", opened.path.display());
+                let fit = talk.during(&words, || TraceFit::of(&opened.trace, seed));
                 let toml = written.toml(opened, &fit);
                 if is_json {
                     return Ok(json!({ "file": opened.path, "fit": fit, "toml": toml }));
                 }
                 let header = &opened.trace.header;
-                console.rendered(&terminal::render_fit(
+                talk.console.rendered(&terminal::render_fit(
                     header,
                     &fit,
                     columns,
                     Style::Coloured,
                 ));
-                console.result(&toml);
+                talk.console.result(&toml);
                 Ok(Value::Null)
             })
         }
         TraceCommand::Plot { files, output } => {
-            each(&files, console, &mut |opened, is_json, console| {
-                plot(opened, is_json, (output.as_deref(), columns), console)
+            each(&files, console, &mut |opened, is_json, talk| {
+                plot(opened, is_json, (output.as_deref(), columns), talk)
             })
         }
         TraceCommand::Convert {
@@ -172,7 +175,7 @@ fn key(name: &str) -> String {
 fn each(
     asked: &TraceFiles,
     console: &mut Console,
-    show: &mut dyn FnMut(&Opened, bool, &mut Console) -> Result<Value, String>,
+    show: &mut dyn FnMut(&Opened, bool, &mut Talk<'_>) -> Result<Value, String>,
 ) -> End {
     let paths = match files(&asked.files) {
         Ok(paths) => paths,
@@ -182,35 +185,76 @@ fn each(
         }
     };
     let (mut end, mut documents) = (End::Done, Vec::new());
-    for path in paths {
-        let opened = match open(&path) {
+    let mut talk = Talk::begin(console);
+    for (index, path) in paths.iter().enumerate() {
+        // Of the first, nothing says yet how long one takes.
+        talk.share = (index > 0).then(|| index as f64 / paths.len() as f64);
+        let opened = match talk.open(path) {
             Ok(opened) => opened,
             Err(error) => {
-                console.error(&error.to_string());
+                talk.console.error(&error.to_string());
                 end = End::Refused;
                 continue;
             }
         };
         if let Some(fault) = &opened.fault {
             let kept = opened.trace.records.len();
-            console.error(&format!("{fault}; the {kept} records before it are shown"));
+            talk.console
+                .error(&format!("{fault}; the {kept} records before it are shown"));
             end = if end == End::Done { End::Failed } else { end };
         }
         if let Some(remark) = opened.remark {
-            console.warn(&format!("{}: {remark}", path.display()));
+            let name = path.display();
+            talk.console.warn(&format!("{name}: {remark}"));
         }
-        match show(&opened, asked.json, console) {
+        match show(&opened, asked.json, &mut talk) {
             Ok(document) => documents.push(document),
             Err(text) => {
-                console.error(&text);
+                talk.console.error(&text);
                 end = End::Failed;
             }
         }
     }
     if asked.json {
-        console.result(&format!("{:#}\n", Value::Array(documents)));
+        talk.console
+            .result(&format!("{:#}\n", Value::Array(documents)));
     }
     end
+}
+
+/// Says how far the work on all files is while there is nothing else to say.
+struct Talk<'a> {
+    console: &'a mut Console,
+    progress: Progress,
+    /// Files that are done.
+    share: Option<f64>,
+}
+
+impl<'a> Talk<'a> {
+    fn begin(console: &'a mut Console) -> Self {
+        Self {
+            console,
+            progress: Progress::begin(),
+            share: None,
+        }
+    }
+
+    fn during<T>(&mut self, words: &str, work: impl FnOnce() -> T) -> T {
+        let share = self.share;
+        self.progress.during(self.console, words, |stage| {
+            stage.tell(share, words);
+            work()
+        })
+    }
+
+    fn open(&mut self, path: &Path) -> Result<Opened, TraceFileError> {
+        self.during(&format!("reading {}", path.display()), || open(path))
+    }
+
+    fn figures_of(&mut self, opened: &Opened) -> TraceFigures {
+        let words = format!("computing the figures of {}", opened.path.display());
+        self.during(&words, || TraceFigures::of(&opened.trace, SEED))
+    }
 }
 
 fn info_json(opened: &Opened, figures: &TraceFigures) -> Value {
@@ -232,15 +276,15 @@ fn plot(
     opened: &Opened,
     is_json: bool,
     (output, columns): (Option<&Path>, usize),
-    console: &mut Console,
+    talk: &mut Talk<'_>,
 ) -> Result<Value, String> {
-    let figures = TraceFigures::of(&opened.trace, SEED);
+    let figures = talk.figures_of(opened);
     let made = plots::series(&opened.trace, &figures);
     let document = if is_json {
         plots_json(opened, &made)
     } else {
         let page = terminal::render_trace_plots(&opened.trace, &figures, columns, Style::Coloured);
-        console.result(&page);
+        talk.console.result(&page);
         Value::Null
     };
     if let Some(folder) = output {
@@ -248,7 +292,8 @@ fn plot(
         let folder = folder.join(channel);
         let names = series::write(&folder, made).map_err(|error| error.to_string())?;
         let folder = folder.display();
-        console.say(&format!("wrote to {folder}: {}", names.join(", ")));
+        let names = names.join(", ");
+        talk.console.say(&format!("wrote to {folder}: {names}"));
     }
     Ok(document)
 }
@@ -284,34 +329,38 @@ fn convert(
         console.error(&format!("{}: exists; say --force", into.display()));
         return End::Refused;
     }
-    let opened = match open(from) {
+    let mut talk = Talk::begin(console);
+    let opened = match talk.open(from) {
         Ok(opened) => opened,
         Err(error) => {
-            console.error(&error.to_string());
+            talk.console.error(&error.to_string());
             return End::Refused;
         }
     };
     if let Some(remark) = opened.remark {
-        console.warn(remark);
+        talk.console.warn(remark);
     }
-    let (bytes, remark) = match converted(&opened.trace, form) {
+    let words = format!("making {}", into.display());
+    let converted = talk.during(&words, || converted(&opened.trace, form));
+    let (bytes, remark) = match converted {
         Ok(converted) => converted,
         Err(text) => {
-            console.error(&format!("{}: {text}", from.display()));
+            talk.console.error(&format!("{}: {text}", from.display()));
             return End::Failed;
         }
     };
     if let Err(error) = fs::write(into, bytes) {
-        console.error(&format!("{}: {error}", into.display()));
+        talk.console.error(&format!("{}: {error}", into.display()));
         return End::Failed;
     }
     let count = opened.trace.records.len();
-    console.say(&format!(
+    talk.console.say(&format!(
         "wrote {count} records to {}{remark}",
         into.display()
     ));
     if let Some(fault) = &opened.fault {
-        console.error(&format!("{fault}; what stands before it was converted"));
+        talk.console
+            .error(&format!("{fault}; what stands before it was converted"));
         return End::Failed;
     }
     End::Done

@@ -1,5 +1,6 @@
 //! What an observer hears of a run, one thing at a time.
 
+use hil_models::link::condition::LinkConditionRecord;
 use hil_models::measure::card_clock::CardClockRecord;
 use hil_models::measure::record::{
     EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
@@ -85,6 +86,8 @@ pub enum Record {
     CardClock(CardClockRecord),
     /// A radio was asked, or said something.
     Radio(RadioRecord),
+    /// An emulated link was given an order; the channel is `hil/link/<link>/<direction>`.
+    LinkCondition(LinkConditionRecord),
 }
 
 impl Record {
@@ -105,8 +108,12 @@ impl Record {
             }
             RecordKind::CardClock => batch.records().for_each(|one| take(Self::CardClock(one))),
             RecordKind::Radio => batch.records().for_each(|one| take(Self::Radio(one))),
-            // Changes of links are asked of `crate::link`, which knows what is in force.
-            RecordKind::Message | RecordKind::LinkCondition => {}
+            RecordKind::LinkCondition => {
+                batch
+                    .records()
+                    .for_each(|one| take(Self::LinkCondition(one)));
+            }
+            RecordKind::Message => {}
         }
     }
 }

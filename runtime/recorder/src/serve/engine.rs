@@ -55,6 +55,8 @@ pub(crate) struct Shown {
     pub(crate) links: Option<(PathBuf, Value)>,
     /// What became known of what is amiss, once a second.
     warnings: Vec<Value>,
+    /// Ticks skipped here, by process, as often.
+    overruns: Value,
 }
 
 impl Shown {
@@ -71,6 +73,7 @@ impl Shown {
             playback_speed,
             links,
             warnings: Vec::new(),
+            overruns: Value::Null,
         }
     }
 
@@ -79,6 +82,7 @@ impl Shown {
         let warnings = self.source.warnings().into_iter().chain(own);
         let warnings = warnings.map(|(process, what)| json!({ "process": process, "what": what }));
         self.warnings = warnings.collect();
+        self.overruns = json!(self.source.overruns());
     }
 }
 
@@ -282,6 +286,7 @@ fn words(shown: &Shown, links: &Links, viewer_count: usize, now_ns: i64) -> Valu
     run["is_playback"] = json!(shown.playback_speed.is_some());
     run["speed"] = json!(shown.playback_speed.unwrap_or(1.0));
     run["warnings"] = json!(shown.warnings);
+    run["overruns"] = shown.overruns.clone();
     run["recorder"]["missed_count"] = json!(shown.source.missed_count());
     run["recorder"]["viewer_count"] = json!(viewer_count);
     run
@@ -293,7 +298,7 @@ fn waiting(viewer_count: usize) -> Value {
         "name": null, "case": null, "state": "waiting", "how": null,
         "is_playback": false, "speed": 1.0, "elapsed_s": null, "duration_s": null,
         "hosts_here": [], "hosts": [], "topology_hash": null, "seed": null,
-        "channels": [], "links": [], "warnings": [],
+        "channels": [], "links": [], "warnings": [], "overruns": null,
         "recorder": {
             "file": null, "read_count": 0, "missed_count": null, "viewer_count": viewer_count,
         },

@@ -11,6 +11,7 @@ use hil_runtime::console::Console;
 
 use crate::priority::Priority;
 use crate::record::{RecordError, Recorded, Request, record};
+use crate::scene::Scenery;
 use crate::split::Split;
 
 /// What a kill may lose at most.
@@ -37,6 +38,7 @@ impl Recording {
             flush: FLUSH,
             force: false,
             priority: Priority::Idle,
+            scenery: Scenery::Drawn,
         };
         let stop = Arc::new(AtomicBool::new(false));
         let is_stopped = Arc::clone(&stop);

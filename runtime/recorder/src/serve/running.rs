@@ -5,6 +5,7 @@ use std::io::{self, Read, Seek, SeekFrom};
 use std::path::Path;
 
 use hil_runtime::clock::MonotonicClock;
+use hil_runtime::live::status::{self, ProcessOverruns};
 use hil_runtime::report::summary::RunSummary;
 use hil_runtime::watch::{self, Event, Feed, FeedError, LiveRun, Origin, Poll, Record};
 
@@ -31,6 +32,8 @@ pub(crate) struct Running {
     is_silent: bool,
     ended: Option<String>,
     problems: Vec<String>,
+    /// As they were told last: the supervisor takes them away with the run's end.
+    overruns: Option<Vec<ProcessOverruns>>,
 }
 
 /// The channels in the order of the facts.
@@ -70,6 +73,7 @@ impl Running {
             is_silent: false,
             ended: None,
             problems: Vec::new(),
+            overruns: None,
         };
         Ok((running, facts))
     }
@@ -181,6 +185,13 @@ impl Source for Running {
 
     fn has_one_clock(&self) -> bool {
         self.feed.has_one_clock() == Some(true)
+    }
+
+    fn overruns(&mut self) -> Option<Vec<ProcessOverruns>> {
+        if let Ok(told) = status::overruns(&self.feed.run().folder) {
+            self.overruns = Some(told);
+        }
+        self.overruns.clone()
     }
 
     /// What the processes said on their standard error so far.

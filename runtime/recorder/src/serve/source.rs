@@ -1,5 +1,7 @@
 //! Where the records of a served run come from: a finished run's folder, or one that goes on.
 
+use hil_runtime::live::status::ProcessOverruns;
+
 use crate::view::LiveRecord;
 
 /// How it goes on after a look.
@@ -34,6 +36,12 @@ pub(crate) trait Source {
 
     /// What is amiss with the run or its host, as far as it is known by now.
     fn warnings(&self) -> Vec<Warning>;
+
+    /// Ticks that the processes here skipped so far; `None` where nobody tells, as of a finished run,
+    /// whose report has them among its warnings.
+    fn overruns(&mut self) -> Option<Vec<ProcessOverruns>> {
+        None
+    }
 
     /// What could not be read since the last call.
     fn take_problems(&mut self) -> Vec<String> {

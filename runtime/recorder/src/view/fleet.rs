@@ -147,6 +147,12 @@ impl FleetView {
         self.ground.as_ref().map(|ground| ground.map.clone())
     }
 
+    /// Length and width of a vehicle, metres.
+    pub(crate) fn vehicle_size_m(&self) -> Option<[f64; 2]> {
+        self.vehicle
+            .map(|vehicle| [vehicle.length_m, vehicle.width_m])
+    }
+
     /// How many robots there are.
     pub(crate) fn robot_count(&self) -> usize {
         self.robots.len()

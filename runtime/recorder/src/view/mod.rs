@@ -6,10 +6,10 @@
 //! offset (see [`crate::clocks`]).
 
 mod account;
-mod arms;
+pub(crate) mod arms;
 mod collisions;
 pub(crate) mod facts;
-mod fleet;
+pub(crate) mod fleet;
 mod ground;
 mod join;
 mod polygon;

@@ -318,8 +318,11 @@ fn clocks(view: &View, lines: &mut Vec<Line>) {
         lines,
     );
     for (one, pair) in view.clocks.iter().zip(pairs) {
+        let count = one
+            .exchange_count
+            .map_or_else(String::new, |count| format!(", {count} in half a minute"));
         let text = format!(
-            "{:name_columns$} {:>12} {:>9}  {}",
+            "{:name_columns$} {:>12} {:>9}  {}{count}",
             shortened(&pair, name_columns),
             known(one.offset_ns.map(duration)),
             known(one.bound_ns.map(bound)),

@@ -87,7 +87,8 @@ fn view() -> View {
         clocks: vec![ClockRow {
             from: "control-pc".to_owned(),
             to: "robot-pc".to_owned(),
-            rung: "204 exchanges of half a minute".to_owned(),
+            rung: "exchanges beside the data".to_owned(),
+            exchange_count: Some(204),
             offset_ns: Some(-1_500_000),
             bound_ns: Some(12_000),
         }],

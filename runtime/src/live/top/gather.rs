@@ -341,11 +341,13 @@ fn clocks(observer: &Observer) -> Vec<ClockRow> {
 }
 
 fn clock_row(observer: &Observer, from: String, to: String) -> ClockRow {
+    let rung = observer.clock_rung(&from, &to).to_owned();
     if observer.has_one_clock() {
         return ClockRow {
             from,
             to,
-            rung: "one clock".to_owned(),
+            rung,
+            exchange_count: None,
             offset_ns: Some(0),
             bound_ns: Some(0),
         };
@@ -353,10 +355,8 @@ fn clock_row(observer: &Observer, from: String, to: String) -> ClockRow {
     let map = observer.clock_map(&from, &to);
     let figures = map.as_ref().map(ClockMap::figures);
     ClockRow {
-        rung: match figures {
-            Some(figures) => format!("{} exchanges of half a minute", figures.exchange_count),
-            None => "not related: this host recorded no exchange".to_owned(),
-        },
+        rung,
+        exchange_count: figures.map(|figures| figures.exchange_count),
         offset_ns: figures.and_then(|one| Some(one.offset?.estimate_ns)),
         bound_ns: figures.and_then(|one| Some(one.bound?.median_ns)),
         from,

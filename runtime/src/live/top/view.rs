@@ -130,8 +130,10 @@ pub(crate) struct ClockRow {
     pub(crate) from: String,
     /// The other.
     pub(crate) to: String,
-    /// `one clock`, `exchanges`, or why they are not related.
+    /// What figures between the two rest on, in the words of a report.
     pub(crate) rung: String,
+    /// Exchanges of the last half minute; `None` where none is needed or there was none.
+    pub(crate) exchange_count: Option<u64>,
     /// What to add to the first one's monotonic clock to have the second one's, nanoseconds.
     pub(crate) offset_ns: Option<i64>,
     /// Largest error of that, nanoseconds.

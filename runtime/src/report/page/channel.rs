@@ -383,9 +383,14 @@ fn segment_table(account: &ChannelAccount) -> Table {
     for segment in &account.segments {
         let bound = segment.bound.map(|bound| bound.largest_ns);
         let name = segment_name(segment);
-        table
-            .rows
-            .push(segment_row(&name, &segment.distribution, bound));
+        let row = segment_row(&name, &segment.distribution, bound);
+        // A reason is said once: rows of two cells have nothing but one.
+        match table.rows.last_mut() {
+            Some(last) if row.len() == 2 && last.len() == 2 && last[1] == row[1] => {
+                last[0] = format!("{}; {name}", last[0]);
+            }
+            _ => table.rows.push(row),
+        }
     }
     if let Some(hardware) = &account.hardware_wire {
         table.rows.push(segment_row("card to card", hardware, None));

@@ -6,6 +6,7 @@ use serde_json::json;
 
 use super::data::Page;
 use super::svg::{STYLE, escaped};
+use crate::report::alike::joined_labels;
 use crate::report::terminal::JOINT;
 
 /// Why a template gave no text.
@@ -114,6 +115,7 @@ fn rendered(
     });
     environment.add_filter("md", |text: String| markdown_escaped(&text));
     environment.add_filter("tex", |text: String| tex_escaped(&text));
+    environment.add_filter("alike", alike);
     environment.add_filter("xml", |text: String| {
         Value::from_safe_string(escaped(&text))
     });
@@ -123,6 +125,33 @@ fn rendered(
     template
         .render(context! { ..extra, ..page })
         .map_err(failed)
+}
+
+/// Figures for a table: those that there are none of for one reason make one row, where the first of
+/// them stands.
+fn alike(figures: Vec<Value>) -> Result<Vec<Value>, minijinja::Error> {
+    let mut rows: Vec<(String, Vec<Value>)> = Vec::new();
+    for figure in figures {
+        let reason = if figure.get_attr("value")?.is_none() {
+            figure.get_attr("method")?.to_string()
+        } else {
+            String::new()
+        };
+        let known = rows.iter_mut().find(|(known, _)| *known == reason);
+        match known.filter(|_| !reason.is_empty()) {
+            Some((_, row)) => row.push(figure),
+            None => rows.push((reason, vec![figure])),
+        }
+    }
+    let row = |(_, row): (String, Vec<Value>)| {
+        let label = |one: &Value| Ok(one.get_attr("label")?.to_string());
+        let labels = row.iter().map(label);
+        let labels = labels.collect::<Result<Vec<String>, minijinja::Error>>()?;
+        let labels: Vec<&str> = labels.iter().map(String::as_str).collect();
+        let label = joined_labels(&labels);
+        Ok(context! { label, ..row[0].clone() })
+    };
+    rows.into_iter().map(row).collect()
 }
 
 /// For a cell of a GitHub table or a line of prose.

@@ -7,7 +7,7 @@ use super::series::{Series, parse};
 use super::{Format, PAGE_BYTES_MAX, figure_files, page_of, render};
 use crate::report::sample::{awkward, empty, full};
 use crate::report::summary::RunSummary;
-use crate::report::terminal::JOINT;
+use crate::report::terminal::{JOINT, Style};
 
 const HOSTILE: &str = "</script><script>alert(1)</script>\"'><img src=x onerror=alert(1)>&amp;]]>";
 
@@ -300,4 +300,66 @@ fn the_other_formats_have_the_same_figures() {
     );
     assert!(error.contains("timeline"), "{error}");
     assert_eq!(figure_files(&one, Some("timeline")).unwrap().len(), 1);
+}
+
+/// Ten figures that there are none of, for one reason, around one that there is.
+fn for_one_reason() -> RunSummary {
+    let mut summary = full();
+    let mut given = summary.score[0].clone();
+    given.value = None;
+    given.interval = None;
+    given.method = "no whole motion loop".to_owned();
+    let kept = summary.score[0].clone();
+    summary.score = (0..10)
+        .map(|number| {
+            let mut one = given.clone();
+            one.name = format!("figure_{number}");
+            one.label = format!("motion loops, number {number}");
+            one
+        })
+        .collect();
+    summary.score.insert(5, kept);
+    summary
+}
+
+#[test]
+fn a_reason_is_said_once_with_all_that_it_is_for() {
+    let summary = for_one_reason();
+    let page = html(&material(summary.clone()));
+    assert_well_formed(&page);
+    // The tile of the first figure says it by itself.
+    let reason = "<td class=\"how\">no whole motion loop";
+    assert_eq!(page.matches(reason).count(), 1);
+    assert!(page.contains("motion loops, number 0, number 1, number 2"));
+    assert!(page.contains(&summary.score[5].label));
+    let terminal = crate::report::terminal::render(&summary, 120, Style::Plain);
+    assert_eq!(
+        terminal.matches("no whole motion loop").count(),
+        1,
+        "{terminal}"
+    );
+    assert!(terminal.contains("unavailable, 10: no whole motion loop"));
+    let markdown = render(&[material(summary.clone())], Format::Md, None).unwrap();
+    assert_eq!(markdown.matches("no whole motion loop").count(), 1);
+    // For programs each figure stands by itself.
+    let csv = render(&[material(summary)], Format::Csv, None).unwrap();
+    assert_eq!(csv.matches("no whole motion loop").count(), 10);
+}
+
+#[test]
+fn long_lists_show_their_beginning_and_how_much_is_folded() {
+    let mut summary = full();
+    let event = summary.score_events.events[0].clone();
+    summary.score_events.events = vec![event; 40];
+    summary.warnings = (0..30)
+        .map(|number| format!("odd thing {number}"))
+        .collect();
+    let page = html(&material(summary));
+    assert_well_formed(&page);
+    assert!(page.contains("32 later ones of 40"));
+    let warnings = page.split("<h3>Warnings</h3>").nth(1).unwrap();
+    let (shown, rest) = warnings.split_once("<details>").unwrap();
+    assert!(shown.matches("<li>").count() == 8, "{shown}");
+    let folded = rest.split("</details>").next().unwrap();
+    assert!(folded.contains("odd thing 29") && folded.contains("more of"));
 }

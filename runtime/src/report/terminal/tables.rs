@@ -2,6 +2,7 @@
 
 use super::canvas::{Canvas, INDENT, Tone, columns, left, right};
 use super::units::{duration_s, figure, grouped, seconds};
+use crate::report::alike::joined_labels;
 use crate::report::summary::{Fact, ProcessSummary, RealtimeFacts, RunEvent, ScoreMetric};
 
 /// Shorter preparations concern nobody.
@@ -20,7 +21,19 @@ pub(super) fn score(canvas: &mut Canvas, metrics: &[ScoreMetric]) {
     let label_width = widest
         .unwrap_or(0)
         .clamp(20, canvas.width() - FIGURES_WIDTH);
+    let mut told: Vec<&str> = Vec::new();
     for metric in metrics {
+        let alike = without_value(metrics, metric);
+        if alike.len() > 1 {
+            // A reason is said once, where the first of those stands that it is for.
+            if !told.contains(&metric.method.as_str()) {
+                told.push(&metric.method);
+                let reason = format!("unavailable, {}: {}", alike.len(), metric.method);
+                canvas.paragraph(INDENT, Tone::Faint, &reason);
+                canvas.paragraph(INDENT + 2, Tone::Plain, &joined_labels(&alike));
+            }
+            continue;
+        }
         let unit = if metric.unit == "1" {
             ""
         } else {
@@ -43,6 +56,15 @@ pub(super) fn score(canvas: &mut Canvas, metrics: &[ScoreMetric]) {
         canvas.line(&line);
         canvas.paragraph(INDENT + 2, Tone::Faint, &metric.method);
     }
+}
+
+/// Labels of the figures that there are none of for the reason of `one`; empty when it has a value.
+fn without_value<'a>(metrics: &'a [ScoreMetric], one: &ScoreMetric) -> Vec<&'a str> {
+    let alike = metrics.iter().filter(|other| {
+        let is_none = one.value.is_none() && other.value.is_none();
+        is_none && !one.method.is_empty() && other.method == one.method
+    });
+    alike.map(|other| other.label.as_str()).collect()
 }
 
 pub(super) fn processes(canvas: &mut Canvas, processes: &[ProcessSummary]) {

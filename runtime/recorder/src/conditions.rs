@@ -1,0 +1,224 @@
+//! Conditions of emulated links that were changed by hand while a run went on, as topics. What an
+//! order means is the models'; here it is put beside the messages that met it.
+
+use std::collections::BTreeMap;
+
+use hil_models::link::condition::{LinkCondition, LinkConditionRecord, OrderOutcome};
+use prost::Message as _;
+use prost_types::field_descriptor_proto::Type;
+use serde_json::Value;
+
+use crate::schema::{self, OwnField, Schema};
+use crate::sink::{Sink, Topic};
+use crate::topics::Names;
+use crate::writer::Stamp;
+
+/// Before the link and the direction in the name under which orders are recorded.
+const RECORDED_AS: &str = "hil/link/";
+
+/// An order to one direction of a link and what became of it.
+#[derive(Clone, PartialEq, prost::Message)]
+pub(crate) struct OrderedCondition {
+    /// The gateway's count of orders, from 1 at each of its starts.
+    #[prost(uint64, tag = "1")]
+    number: u64,
+    /// What the order was called by whoever gave it.
+    #[prost(uint64, tag = "2")]
+    request: u64,
+    #[prost(string, tag = "3")]
+    link: String,
+    /// `forward` or `backward`.
+    #[prost(string, tag = "4")]
+    direction: String,
+    /// `topology`, `fixed`, `cut`, or `unknown` to this version.
+    #[prost(string, tag = "5")]
+    condition: String,
+    /// Of a fixed condition, nanoseconds.
+    #[prost(uint64, optional, tag = "6")]
+    delay_ns: Option<u64>,
+    /// Of a fixed condition, 0 to 1; of a cut 1.
+    #[prost(double, optional, tag = "7")]
+    loss_ratio: Option<f64>,
+    /// It took effect.
+    #[prost(bool, tag = "8")]
+    is_in_force: bool,
+    /// Why it did not; empty where it did.
+    #[prost(string, tag = "9")]
+    refusal: String,
+    /// Messages that the gateway received from here on met it, on its host's monotonic clock.
+    #[prost(int64, tag = "10")]
+    from_ns: i64,
+    /// Messages received between `from_ns` and this may have met the one before.
+    #[prost(int64, tag = "11")]
+    certain_ns: i64,
+}
+
+/// The schema of these.
+fn condition_schema() -> Schema {
+    const FIELDS: [OwnField; 11] = [
+        ("number", Type::Uint64, false),
+        ("request", Type::Uint64, false),
+        ("link", Type::String, false),
+        ("direction", Type::String, false),
+        ("condition", Type::String, false),
+        ("delay_ns", Type::Uint64, true),
+        ("loss_ratio", Type::Double, true),
+        ("is_in_force", Type::Bool, false),
+        ("refusal", Type::String, false),
+        ("from_ns", Type::Int64, false),
+        ("certain_ns", Type::Int64, false),
+    ];
+    schema::own("LinkCondition", &FIELDS)
+}
+
+impl OrderedCondition {
+    fn of((link, direction): (&str, &str), record: &LinkConditionRecord) -> Self {
+        let (condition, delay_ns, loss_ratio) = match record.condition() {
+            Some(LinkCondition::Topology) => ("topology", None, None),
+            Some(LinkCondition::Fixed { loss_ratio, .. }) => {
+                ("fixed", Some(record.delay_ns), Some(loss_ratio))
+            }
+            Some(LinkCondition::Cut) => ("cut", None, Some(1.0)),
+            None => ("unknown", None, None),
+        };
+        let outcome = record.outcome();
+        let refusal = outcome.map_or("an outcome unknown to this version", OrderOutcome::words);
+        Self {
+            number: record.number,
+            request: record.request,
+            link: link.to_owned(),
+            direction: direction.to_owned(),
+            condition: condition.to_owned(),
+            delay_ns,
+            loss_ratio,
+            is_in_force: outcome == Some(OrderOutcome::InForce),
+            refusal: refusal.to_owned(),
+            from_ns: record.from_ns,
+            certain_ns: record.certain_ns,
+        }
+    }
+}
+
+/// The topics of all links, one per direction that was given an order.
+#[derive(Debug, Default)]
+pub(crate) struct Conditions {
+    /// By the name under which orders are recorded.
+    directions: BTreeMap<String, Direction>,
+}
+
+#[derive(Debug)]
+struct Direction {
+    link: String,
+    way: String,
+    /// Of the gateway that emulates it.
+    host: String,
+    topic: Topic,
+}
+
+impl Conditions {
+    /// Of the links of `topology`, as a manifest has it.
+    pub(crate) fn of(topology: &Value, names: &mut Names) -> Self {
+        let mut directions = BTreeMap::new();
+        let links = topology["links"].as_object().into_iter().flatten();
+        for (link, described) in links.filter(|(_, one)| one["via"] == "emulated") {
+            // A gateway emulates the direction that ends at its host.
+            for (way, end) in [("forward", 1), ("backward", 0)] {
+                let host = described["between"][end].as_str().unwrap_or_default();
+                let name = names.claim(format!("/net/{link}/{way}/condition"));
+                let metadata = [("link", link.as_str()), ("direction", way)];
+                let direction = Direction {
+                    link: link.clone(),
+                    way: way.to_owned(),
+                    host: host.to_owned(),
+                    topic: Topic::new(name, condition_schema(), &metadata),
+                };
+                directions.insert(format!("{RECORDED_AS}{link}/{way}"), direction);
+            }
+        }
+        Self { directions }
+    }
+
+    /// The host of the gateway that wrote the orders recorded under `channel`.
+    pub(crate) fn host_of(&self, channel: &str) -> Option<&str> {
+        Some(&self.directions.get(channel)?.host)
+    }
+
+    /// Lets `sink` hear now of the topic of orders recorded under `channel`; how many topics that is.
+    ///
+    /// # Errors
+    /// When it has no room for it.
+    pub(crate) fn declare<S: Sink>(
+        &mut self,
+        channel: &str,
+        sink: &mut S,
+    ) -> Result<usize, S::Error> {
+        let Some(direction) = self.directions.get_mut(channel) else {
+            return Ok(0);
+        };
+        direction.topic.declare(sink)?;
+        Ok(1)
+    }
+
+    /// Writes an order recorded under `channel`, in force from `at_ns` of the recording's axis.
+    ///
+    /// # Errors
+    /// When the sink cannot take it.
+    pub(crate) fn write<S: Sink>(
+        &mut self,
+        channel: &str,
+        (at_ns, record): (u64, &LinkConditionRecord),
+        sink: &mut S,
+    ) -> Result<(), S::Error> {
+        let Some(direction) = self.directions.get_mut(channel) else {
+            return Ok(());
+        };
+        let ordered = OrderedCondition::of((&direction.link, &direction.way), record);
+        let at = Stamp::new(at_ns, record.number);
+        direction.topic.write(sink, at, &ordered.encode_to_vec())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use bytemuck::Zeroable;
+    use serde_json::json;
+
+    #[test]
+    fn an_order_says_what_it_asked_for_and_why_it_was_refused() {
+        let mut record = LinkConditionRecord::zeroed();
+        (record.kind, record.delay_ns, record.loss_ratio) = (1, 40_000_000, 0.2);
+        let ordered = OrderedCondition::of(("hop", "forward"), &record);
+        assert_eq!(
+            (ordered.condition.as_str(), ordered.is_in_force),
+            ("fixed", true)
+        );
+        assert_eq!(
+            (ordered.delay_ns, ordered.loss_ratio),
+            (Some(40_000_000), Some(0.2))
+        );
+        (record.kind, record.outcome) = (2, 2);
+        let ordered = OrderedCondition::of(("hop", "forward"), &record);
+        assert_eq!(
+            (ordered.condition.as_str(), ordered.loss_ratio),
+            ("cut", Some(1.0))
+        );
+        assert!(!ordered.is_in_force && ordered.refusal.contains("too little room"));
+        (record.kind, record.outcome) = (9, 9);
+        let ordered = OrderedCondition::of(("hop", "forward"), &record);
+        assert_eq!(ordered.condition, "unknown");
+        assert!(!ordered.is_in_force && !ordered.refusal.is_empty());
+    }
+
+    #[test]
+    fn the_gateway_of_a_direction_is_at_its_end() {
+        let topology = json!({ "links": {
+            "hop": { "via": "emulated", "between": ["a", "b"] },
+            "wire": { "via": "udp", "between": ["a", "b"] },
+        } });
+        let conditions = Conditions::of(&topology, &mut Names::default());
+        assert_eq!(conditions.host_of("hil/link/hop/forward"), Some("b"));
+        assert_eq!(conditions.host_of("hil/link/hop/backward"), Some("a"));
+        assert_eq!(conditions.host_of("hil/link/wire/forward"), None);
+    }
+}
