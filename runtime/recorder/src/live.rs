@@ -215,10 +215,9 @@ impl LiveTopics {
             _ => {}
         }
         channel.note_due(record, is_of_this_host);
-        match channel.joining.take(record, Instant::now()) {
-            Some(whole) => self.latency(name, whole, sink),
-            None => Ok(()),
-        }
+        let now = Instant::now();
+        channel.joining.take(record, now);
+        self.give_out_of(name, &mut |joining| joining.next(now), sink)
     }
 
     fn latency<S: Sink>(
@@ -250,7 +249,7 @@ impl LiveTopics {
     /// # Errors
     /// When the sink cannot take them.
     pub(crate) fn settle<S: Sink>(&mut self, now: Instant, sink: &mut S) -> Result<(), S::Error> {
-        self.give_out(&mut |joining| joining.overdue(now), sink)
+        self.give_out(&mut |joining| joining.next(now), sink)
     }
 
     /// Gives out the stamps of all messages that are still waited for.
@@ -258,7 +257,7 @@ impl LiveTopics {
     /// # Errors
     /// When the sink cannot take them.
     pub(crate) fn flush_joins<S: Sink>(&mut self, sink: &mut S) -> Result<(), S::Error> {
-        self.give_out(&mut Joining::oldest, sink)
+        self.give_out(&mut Joining::earliest, sink)
     }
 
     fn give_out<S: Sink>(
@@ -268,13 +267,23 @@ impl LiveTopics {
     ) -> Result<(), S::Error> {
         let names: Vec<String> = self.channels.keys().cloned().collect();
         for name in names {
-            while let Some(one) = self
-                .channels
-                .get_mut(&name)
-                .and_then(|one| next(&mut one.joining))
-            {
-                self.latency(&name, one, sink)?;
-            }
+            self.give_out_of(&name, next, sink)?;
+        }
+        Ok(())
+    }
+
+    fn give_out_of<S: Sink>(
+        &mut self,
+        name: &str,
+        next: &mut dyn FnMut(&mut Joining) -> Option<MessageLatency>,
+        sink: &mut S,
+    ) -> Result<(), S::Error> {
+        while let Some(one) = self
+            .channels
+            .get_mut(name)
+            .and_then(|one| next(&mut one.joining))
+        {
+            self.latency(name, one, sink)?;
         }
         Ok(())
     }
