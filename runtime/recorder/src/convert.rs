@@ -96,8 +96,8 @@ pub(crate) fn convert(
     look: &mut dyn FnMut(Option<f64>, &str) -> Option<&'static str>,
 ) -> Result<Converted, ConvertError> {
     let mut stopped = None;
-    let mut run = Run::read(from, &mut |path| {
-        stopped = look(None, &format!("reading {path}"));
+    let mut run = Run::read(from, &mut |(share, path)| {
+        stopped = look(Some(share), &format!("reading {path}"));
         stopped.is_none()
     })?;
     if let Some(signal) = stopped {
@@ -378,7 +378,7 @@ impl Conversion {
             }
             What::Condition { file, index } => {
                 let file = &run.files[file];
-                if let Some(record) = file.records::<LinkConditionRecord>().nth(index) {
+                if let Some(record) = file.record::<LinkConditionRecord>(index) {
                     let one = (at_ns, &record);
                     self.conditions
                         .write(&file.header.channel, one, &mut self.recording)?;

@@ -320,6 +320,13 @@ impl RecordFile {
             .filter_map(|bytes| bytemuck::try_pod_read_unaligned(bytes).ok())
     }
 
+    /// The record with `index` in the order of the file; `None` beyond the last, and when records are of
+    /// another size than `T`.
+    pub fn record<T: Pod>(&self, index: usize) -> Option<T> {
+        let bytes = self.raw().nth(index)?;
+        bytemuck::try_pod_read_unaligned(bytes).ok()
+    }
+
     /// How many whole records there are.
     pub fn record_count(&self) -> usize {
         self.raw().len()
@@ -386,6 +393,9 @@ mod tests {
     fn a_file_gives_back_its_header_and_records() {
         let file = RecordFile::parse(Path::new("x"), sample()).unwrap();
         assert_eq!(file.header.channel, "arm/command");
+        let sequence = |index| Some(file.record::<PublishedRecord>(index)?.sequence);
+        assert_eq!([0, 2, 3].map(sequence), [Some(0), Some(2), None]);
+        assert!(file.record::<u64>(0).is_none(), "another size");
         assert_eq!(
             file.header.file_name("robot"),
             "arm.command.published.robot.2.rec"
