@@ -1,4 +1,5 @@
-//! The command line as a person uses it: help, checks, mistakes, Ctrl-C, and every command.
+//! The command line as a person uses it: checks, mistakes, Ctrl-C, and what commands do. Their help is in
+//! `help.rs`.
 #![allow(clippy::unwrap_used, clippy::print_stdout, reason = "tests")]
 
 use std::fs;
@@ -44,41 +45,6 @@ fn assert_says(finished: &Finished, words: &[&str]) {
             "no `{word}` in {finished:?}"
         );
     }
-}
-
-/// The commands that `--help` lists.
-fn listed_commands() -> Vec<String> {
-    let help = run(&["--help"]);
-    assert_code(&help, 0);
-    let after = help.stdout.split("Commands:\n").nth(1).unwrap();
-    let list = after.split("\n\n").next().unwrap();
-    let names = list.lines().filter_map(|line| {
-        let is_name = line.starts_with("  ") && !line.starts_with("   ");
-        is_name.then(|| line.split_whitespace().next()).flatten()
-    });
-    let names = names.filter(|name| *name != "help").map(str::to_owned);
-    names.collect()
-}
-
-#[test]
-fn the_help_of_every_command_has_an_example() {
-    let commands = listed_commands();
-    assert!(commands.len() >= 5, "{commands:?}");
-    for command in commands {
-        let help = run(&[&command, "--help"]);
-        assert_code(&help, 0);
-        let example = help.stdout.split("Example").nth(1).unwrap_or_default();
-        let usage = format!("hil-runtime {command}");
-        assert!(example.contains(&usage), "{command}: {}", help.stdout);
-    }
-    let help = run(&["--help"]).stdout;
-    assert!(
-        help.contains("Examples:") && help.contains("Exit codes:"),
-        "{help}"
-    );
-    let nothing = run(&[]);
-    assert_code(&nothing, 2);
-    assert_says(&nothing, &["Usage:", "Examples:"]);
 }
 
 #[test]

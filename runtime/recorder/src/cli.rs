@@ -77,6 +77,14 @@ Every chunk whose check sum is right is copied, the last one as far as it goes. 
 with the byte at which it begins, here and in the new file under `hil.recovery`. The exit code is
 0 when there is a new file, whatever was lost.";
 
+const INFO_EXAMPLES: &str = "\
+Examples:
+  hil-recorder info run.mcap
+  hil-recorder info run.mcap --json | jq '.metadata[\"hil.run\"].seed'
+
+A broken file is shown as far as it goes, with where the damage begins; what `recover` makes of it
+is whole. The metadata are described in docs/recordings.md.";
+
 const PLAY_EXAMPLES: &str = "\
 Examples:
   hil-recorder play run.mcap --only human/frame --loop
@@ -169,6 +177,7 @@ pub(crate) enum Command {
         force: bool,
     },
     /// Print topics, counts, times and metadata of an MCAP file, whole or broken.
+    #[command(after_help = INFO_EXAMPLES)]
     Info {
         /// The file.
         #[arg(value_name = "FILE")]
