@@ -18,6 +18,7 @@ use hil_tests::account::{assert_accounts_close, assert_every_message_is_accounte
 use hil_tests::binary::hil_recorder_binary;
 use hil_tests::child::ChildGuard;
 use hil_tests::lab::Lab;
+use hil_tests::latency::assert_undisturbed;
 use hil_tests::mcap_file::{assert_code, counts, info, python, read_back, recorder, words};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::{RunFiles, Trial, wait_until};
@@ -344,6 +345,8 @@ fn ten_killed_recorders_lose_a_second_each_and_the_run_nothing() {
     assert_eq!(summary.run.outcome, Outcome::Completed);
     assert_every_message_is_accounted_for(&summary);
     assert_accounts_close(&summary);
+    let kills_ns: Vec<i64> = killed.iter().map(|one| one.at_ns).collect();
+    assert_undisturbed(files.root(), &kills_ns);
     for one in &killed {
         let lost_ns = lost_ns(one, &files);
         println!("seed {seed}: {} lost {lost_ns} ns", one.file.display());
