@@ -43,6 +43,8 @@ Examples:
       from another PC, then the same address; nothing is open to the network
   hil-recorder serve --allow-origin https://app.foxglove.dev
       pages of Foxglove's own web site may look on and change links as well
+  hil-recorder serve --allow-origin file://
+      for Lichtblick as an application; so may any saved page then
 
 Web pages of others are refused, and named here once. Programs and our own page need no option.
 Lichtblick and Foxglove connect to ws://127.0.0.1:8765. Topics and fields are in docs/live-view.md.
