@@ -320,8 +320,8 @@ impl RecordFile {
             .filter_map(|bytes| bytemuck::try_pod_read_unaligned(bytes).ok())
     }
 
-    /// The record with `index` in the order of the file; `None` beyond the last, and when records are of
-    /// another size than `T`.
+    /// The record with `index` in the order of the file as `T`; `None` beyond the last, and when
+    /// `T` has another size.
     pub fn record<T: Pod>(&self, index: usize) -> Option<T> {
         let bytes = self.raw().nth(index)?;
         bytemuck::try_pod_read_unaligned(bytes).ok()
