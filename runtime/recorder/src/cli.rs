@@ -48,7 +48,7 @@ Examples:
 
 Web pages of others are refused, and named here once. Programs and our own page need no option.
 Lichtblick and Foxglove connect to ws://127.0.0.1:8765. Topics and fields are in docs/live-view.md.
-It ends with Ctrl-C; the exit code is 0 then.";
+It ends with Ctrl-C; the exit code is 0 then, or 1 when --record could not write a file.";
 
 const CONVERT_EXAMPLES: &str = "\
 Examples:
@@ -63,7 +63,7 @@ Examples:
   hil-recorder record -o run.mcap
       the only run that goes on this host, until it ends or Ctrl-C
   hil-recorder record --wait -o recordings/ &
-      started before the run: waits for it; the file gets the run's name
+      started before the run: waits for it; the file gets the run's name, the folder is made
   hil-recorder record teleop-split -o long.mcap --split-size 1GiB --split-time 10min
       long_0001.mcap, long_0002.mcap and so on, each whole by itself
 
@@ -137,7 +137,8 @@ pub(crate) enum Command {
         /// Name of the run, the beginning of it, or its folder; the only one if left out.
         #[arg(value_name = "RUN")]
         run: Option<String>,
-        /// The file to write, or the folder to write it into.
+        /// The file to write, or a folder for a file with the run's name; one that is not there is
+        /// made if the name ends in `/`.
         #[arg(long, short, value_name = "FILE")]
         output: PathBuf,
         /// Wait for a run to begin.
@@ -240,7 +241,7 @@ pub(crate) struct ServeOptions {
     #[arg(long, value_name = "NAME", value_parser = crate::serve::host)]
     pub(crate) allow_host: Vec<String>,
     /// Record what is shown while it goes on, as `record` does: a file, or a folder for one file
-    /// per run.
+    /// per run, which is made if it is not there and the name ends in `/`.
     #[arg(long, value_name = "FILE")]
     pub(crate) record: Option<PathBuf>,
     /// How fast a finished run is played back, 0.01 to 100.

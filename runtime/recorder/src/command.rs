@@ -141,7 +141,12 @@ fn serve_run(options: &ServeOptions, signals: &Signals, console: &mut Console) -
         Err(error) => {
             console.error(&error.to_string());
             match error {
-                ServeError::Run(_) | ServeError::Select(_) => exit::USAGE,
+                ServeError::Run(_)
+                | ServeError::Select(_)
+                | ServeError::Over { .. }
+                | ServeError::Record(WriteError::Exists { .. } | WriteError::Unfinished { .. }) => {
+                    exit::USAGE
+                }
                 _ => exit::FAILED,
             }
         }

@@ -3,7 +3,7 @@
 //! [`crate::split`].
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -16,7 +16,7 @@ use crate::live::LiveTopics;
 use crate::priority::{Precedence, Priority};
 use crate::run::Run;
 use crate::scene::Scenery;
-use crate::split::{Files, Split};
+use crate::split::{Files, Split, prepare, target};
 use crate::writer::WriteError;
 
 /// How long a recorder with nothing to do sleeps when it reads shared memory, whose buffers are short.
@@ -118,6 +118,7 @@ pub(crate) type Look<'a> = &'a mut dyn FnMut(&Progress<'_>) -> Option<&'static s
 /// When there is no run to record or no file can be written; what was written is beside its place
 /// then.
 pub(crate) fn record(request: &Request, look: Look<'_>) -> Result<Recorded, RecordError> {
+    prepare(&request.output, request.split, request.force)?;
     let run = find(request, look)?;
     let target = target(&request.output, &run.name);
     let mut feed = Feed::open(run)?;
@@ -130,15 +131,6 @@ pub(crate) fn record(request: &Request, look: Look<'_>) -> Result<Recorded, Reco
     let mut recording = LiveRecording::begin((feed, topics), files, precedence)?;
     let signal = recording.run(request, look)?;
     recording.finish(signal)
-}
-
-/// The file for a run: the one named, or one with the run's name in the folder named.
-fn target(output: &Path, run: &str) -> PathBuf {
-    if output.is_dir() {
-        output.join(format!("{run}.mcap"))
-    } else {
-        output.to_owned()
-    }
 }
 
 fn find(request: &Request, look: Look<'_>) -> Result<LiveRun, RecordError> {

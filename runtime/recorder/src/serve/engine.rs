@@ -107,6 +107,8 @@ pub(crate) struct Engine {
     /// Where what is shown is recorded, and the recording.
     target: Option<PathBuf>,
     recording: Option<Recording>,
+    /// A recording before this one came to nothing.
+    has_failed: bool,
     due: Due,
 }
 
@@ -120,6 +122,7 @@ impl Engine {
             told: Vec::new(),
             target,
             recording: None,
+            has_failed: false,
             due: Due::default(),
         }
     }
@@ -134,6 +137,7 @@ impl Engine {
         self.links.show(shown.links.clone());
         if let Some(mut before) = self.recording.take() {
             before.end(console);
+            self.has_failed |= before.has_failed;
         }
         // What is played back is on record already.
         let target = self.target.as_ref().filter(|_| shown.links.is_some());
@@ -152,13 +156,15 @@ impl Engine {
         })
     }
 
-    /// The viewers, at the end.
-    pub(crate) fn into_viewers(self, console: &mut Console) -> Viewers {
+    /// The viewers, at the end, and whether all that was to be recorded is.
+    pub(crate) fn into_viewers(self, console: &mut Console) -> (Viewers, bool) {
         self.links.show(None);
+        let mut has_failed = self.has_failed;
         if let Some(mut recording) = self.recording {
             recording.end(console);
+            has_failed |= recording.has_failed;
         }
-        self.viewers
+        (self.viewers, !has_failed)
     }
 
     /// Reads what came and shows what is due.

@@ -30,6 +30,8 @@ use hil_runtime::watch::{FeedError, LiveRun, SelectError, select};
 use tokio::runtime::Runtime;
 
 use crate::cli::ServeOptions;
+use crate::split::{Split, prepare};
+use crate::writer::WriteError;
 use access::{Access, NO_ORIGIN};
 use engine::{Engine, Showing, Shown};
 use front::{Door, Front};
@@ -61,6 +63,18 @@ pub(crate) enum ServeError {
     /// A run that goes on cannot be watched.
     #[error(transparent)]
     Feed(#[from] FeedError),
+    /// Nowhere to record it.
+    #[error("--record: {0}")]
+    Record(#[from] WriteError),
+    /// To be recorded, but over.
+    #[error(
+        "--record: the run in {folder} is over and would only be played back; `hil-recorder convert \
+         {folder} -o FILE` makes a file of it"
+    )]
+    Over {
+        /// The run's folder.
+        folder: PathBuf,
+    },
     /// The socket.
     #[error(
         "cannot listen for viewers at {address}: {why}; --port takes another, 0 any that is free"
@@ -89,7 +103,7 @@ pub(crate) enum ServeError {
     Runtime(#[from] std::io::Error),
 }
 
-/// Serves until a signal comes; the exit code.
+/// Serves until a signal comes; the exit code, which says whether what was to be recorded is.
 ///
 /// # Errors
 /// When there is nothing to show or nowhere to show it.
@@ -98,6 +112,9 @@ pub(crate) fn serve(
     signals: &Signals,
     console: &mut Console,
 ) -> Result<i32, ServeError> {
+    if let Some(output) = &options.record {
+        prepare(output, Split::default(), false)?;
+    }
     let shown = first(options, signals, console)?;
     if signals.received().is_some() {
         return Ok(EXIT_INTERRUPTED);
@@ -128,14 +145,15 @@ pub(crate) fn serve(
         }
         thread::sleep(LOOK_PERIOD);
     }
-    engine.into_viewers(console).end(runtime.handle());
+    let (viewers, is_recorded) = engine.into_viewers(console);
+    viewers.end(runtime.handle());
     front.end(runtime.handle());
     runtime.shutdown_timeout(Duration::from_secs(1));
     if let Some(account) = access.account() {
         console.say(&account);
     }
     console.say("ended");
-    Ok(0)
+    Ok(i32::from(!is_recorded))
 }
 
 /// What is shown first; `None` when it has to be waited for.
@@ -156,6 +174,10 @@ fn first(
         };
     }
     if let Some(folder) = folder.filter(|folder| !goes_on(folder)) {
+        if options.record.is_some() {
+            let folder = folder.to_owned();
+            return Err(ServeError::Over { folder });
+        }
         let how = (options.speed, options.repeats);
         let read = Playback::read(folder, how, &mut |_| signals.received().is_none());
         let (playback, facts) = read?;

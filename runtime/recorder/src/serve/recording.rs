@@ -22,6 +22,8 @@ const FLUSH: Duration = Duration::from_secs(1);
 pub(super) struct Recording {
     /// The file, or the folder that it is written into.
     pub(super) path: PathBuf,
+    /// No file came of it.
+    pub(super) has_failed: bool,
     thread: Option<JoinHandle<Result<Recorded, RecordError>>>,
     stop: Arc<AtomicBool>,
 }
@@ -49,6 +51,7 @@ impl Recording {
         });
         Self {
             path: path.to_owned(),
+            has_failed: false,
             thread: Some(thread),
             stop,
         }
@@ -72,7 +75,9 @@ impl Recording {
             return;
         };
         let path = self.path.display();
-        match thread.join() {
+        let joined = thread.join();
+        self.has_failed = !matches!(joined, Ok(Ok(_)));
+        match joined {
             Err(_) => console.error(&format!(
                 "{path}: the recorder failed; its file is not whole"
             )),
