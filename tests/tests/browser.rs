@@ -45,6 +45,16 @@ fn take_pictures(page: &mut Page<'_>, name: &str) {
     settle(page);
 }
 
+/// A stage without an area, as before the first layout, is drawn on without a complaint.
+fn vanish(page: &mut Page<'_>) {
+    let stage = "document.getElementById('stage')";
+    page.value(&format!("void ({stage}.style.display = 'none')"));
+    page.wait_until(&format!("{stage}.width === 0"));
+    settle(page);
+    page.value(&format!("void ({stage}.style.display = '')"));
+    page.wait_until(&format!("{stage}.width > 0"));
+}
+
 /// Keeps an expression's value on the page under a name, to compare with later.
 fn keep(page: &mut Page<'_>, name: &str, expression: &str) {
     page.value(&format!("void (window.{name} = {expression})"));
@@ -215,6 +225,7 @@ fn the_live_page_shows_a_fleet_and_changes_its_links() {
     page.wait_until("hil.snapshot().robots.length === 7 && hil.snapshot().robots[0].fleet === 1");
     take_pictures(&mut page, "live-fleet");
     check_condition(&mut page, "commands.forward", "fleet/authority");
+    vanish(&mut page);
     assert_clean(&mut page, "the live page of a fleet");
     // From here on the browser itself complains of the lost connection.
     check_return(&mut page, &mut shown, (&root, host));
@@ -279,6 +290,7 @@ fn the_live_page_shows_arms() {
     page.click("tr[data-channel='egm/right/command'] button");
     page.wait_until("document.querySelectorAll('.strip').length >= 7");
     take_pictures(&mut page, "live-arms");
+    vanish(&mut page);
     assert_clean(&mut page, "the live page of arms");
     drop(page);
     shown.end();
