@@ -18,7 +18,7 @@ use hil_models::case_study::ParameterError;
 use hil_models::layout::Field;
 use hil_models::teleoperation::swing::swing_bvh;
 
-use crate::analysis;
+use crate::analysis::{self, Concluded};
 use crate::card_clock::guard;
 use crate::cases;
 use crate::cli::{Cli, Command, RunArgs};
@@ -218,16 +218,18 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
                 code => code,
             };
             let origin = (path.as_path(), options.command_line.as_slice());
-            let summary = Progress::begin().during(console, "drawing up the account", |_| {
+            let concluded = Progress::begin().during(console, "drawing up the account", |_| {
                 analysis::conclude(&topology, &result, registry, origin)
             });
-            match summary {
-                Ok(summary) => {
+            match concluded {
+                Ok(Concluded { summary, unwritten }) => {
                     console.result(&terminal::render(&summary, columns(), Style::Coloured));
                     if code != exit::RAN {
                         console.error(&complaint(&result));
                     }
-                    code
+                    let Some(error) = unwritten else { return code };
+                    console.error(&format!("{error}; the report is only what is printed here"));
+                    code.max(exit::FAILED)
                 }
                 Err(error) => {
                     console.error(&format!("the run is over but its report failed: {error}"));

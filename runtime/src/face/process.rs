@@ -59,7 +59,10 @@ fn prepare_and_live(path: &Path) -> Result<(), FaceError> {
         opened.push((arm.clone(), OpenedArm::open(&launch, arm, &mut recorder)?));
     }
     let spare = Spare::open(&launch.face.spare, &mut recorder)?;
-    recorder.start().map_err(GatewayError::Thread)?;
+    let on_failure = orders.stopper();
+    recorder
+        .start_and_tell(on_failure)
+        .map_err(GatewayError::Thread)?;
     let counters: Vec<Counter> = opened
         .iter()
         .flat_map(|(arm, one)| counters(arm, one))
@@ -188,9 +191,10 @@ fn finish(
         }
     }
     let written = recorder.finish();
+    let problem = written.problem();
     report.recorder_dropped = written.dropped_count;
     report.recorder_failures = written.failures;
     add_usage(&mut report);
     say(&FromProcess::Finished(Box::new(report)));
-    outcome
+    outcome.and(problem.map_or(Ok(()), |text| Err(GatewayError::Unrecorded(text).into())))
 }

@@ -82,6 +82,9 @@ pub enum GatewayError {
     /// The other end does not want this channel.
     #[error("the gateway at the other end refused the channel: {}", .0.label())]
     Refused(HelloStatus),
+    /// A record file could not be written any more.
+    #[error("{0}")]
+    Unrecorded(String),
     /// A thread panicked.
     #[error("a gateway thread panicked")]
     Panicked,

@@ -67,7 +67,10 @@ fn prepare_and_live(path: &Path) -> Result<(), GatewayError> {
     let switches = opened.iter_mut().filter_map(|(_, one)| one.take_switch());
     let switches = switches.collect();
     let mut control = LinkControl::open(&surroundings.domain, &launch, switches)?;
-    recorder.start().map_err(GatewayError::Thread)?;
+    let on_failure = orders.stopper();
+    recorder
+        .start_and_tell(on_failure)
+        .map_err(GatewayError::Thread)?;
     let stop = Arc::clone(&surroundings.stop);
     let sampler = sampler.map(|one| one.start(stop)).transpose()?;
     let counters: Vec<Counter> = opened
@@ -260,11 +263,12 @@ fn finish(
         }
     }
     let written = recorder.finish();
+    let problem = written.problem();
     report.recorder_dropped = written.dropped_count;
     report.recorder_failures = written.failures;
     add_usage(&mut report);
     say(&FromProcess::Finished(Box::new(report)));
-    outcome
+    outcome.and(problem.map_or(Ok(()), |text| Err(GatewayError::Unrecorded(text))))
 }
 
 /// Says what a spinning thread, of the channel or arm `name`, will lose or take on its CPU.

@@ -53,6 +53,8 @@ pub(crate) enum ComponentError {
     Ports(#[from] PortCountError),
     #[error("cannot start a thread: {0}")]
     Thread(#[from] std::io::Error),
+    #[error("{0}")]
+    Unrecorded(String),
 }
 
 type ComponentEndpoint = Endpoint<RecordedInput, RecordedOutput>;
@@ -79,7 +81,7 @@ fn prepare_and_live(path: &Path, registry: &Registry) -> Result<(), ComponentErr
     let counts = Counts::of(&card);
     let mut recorder = Recorder::new(&launch.records, &launch.process, launch.instance);
     let sinks = Sinks::open(&card, &mut recorder)?;
-    recorder.start()?;
+    recorder.start_and_tell(orders.stopper())?;
     let progress = counts.report_progress()?;
 
     // Everything below runs on this thread, which from here on is the measured one.
@@ -102,11 +104,13 @@ fn prepare_and_live(path: &Path, registry: &Registry) -> Result<(), ComponentErr
     }
     drop(waiter);
     let outcome = recorder.finish();
+    let problem = outcome.problem();
     report.recorder_dropped = outcome.dropped_count;
     report.recorder_failures = outcome.failures;
     add_usage(&mut report);
     say(&FromProcess::Finished(Box::new(report)));
-    Ok(lived?)
+    lived?;
+    problem.map_or(Ok(()), |text| Err(ComponentError::Unrecorded(text)))
 }
 
 fn make_role(card: &ProcessCard, registry: &Registry) -> Result<Box<dyn Role>, ComponentError> {

@@ -200,6 +200,12 @@ impl Orders {
         self.start.clone()
     }
 
+    /// Ends the process as an order to stop would, from whichever thread calls it.
+    pub fn stopper(&self) -> impl Fn() + Send + use<> {
+        let state = Arc::clone(&self.state);
+        move || state.store(STOPPING, Ordering::Release)
+    }
+
     /// True once the process should end.
     pub fn is_stopping(&self) -> bool {
         self.state.load(Ordering::Acquire) == STOPPING

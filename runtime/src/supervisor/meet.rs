@@ -376,6 +376,20 @@ mod tests {
     }
 
     #[test]
+    fn another_version_is_refused_on_both_hosts_with_both_versions() {
+        let mut newer = hello("b", 1, 2);
+        newer.version = "2".to_owned();
+        for outcome in pair(&hello("a", 1, 1), &newer) {
+            let error = outcome.map(|_| ()).unwrap_err().to_string();
+            assert!(error.contains("version"), "{error}");
+            assert!(
+                error.contains("1 on a") && error.contains("2 on b"),
+                "{error}"
+            );
+        }
+    }
+
+    #[test]
     fn one_domain_at_both_ends_is_refused() {
         let [left, _] = pair(&hello("a", 1, 7), &hello("b", 1, 7));
         assert!(
