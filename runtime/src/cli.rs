@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use clap::{ArgGroup, Args, Parser, Subcommand};
 
 use crate::compare::cli::{self as compare_cli, CompareArgs};
+use crate::doctor::cli::DoctorArgs;
 use crate::link::cli::LinkCommand;
 use crate::live::cli::{ChannelArgs, TopArgs};
 use crate::probe::arguments::ProbeArgs;
@@ -315,23 +316,7 @@ pub enum Command {
     /// Look at a run while it goes: processes, channels, links, clocks.
     Top(TopArgs),
     /// Say what this host can measure and what to change.
-    #[command(
-        after_help = "Examples:\n  hil-runtime doctor --strict   # exit code 78 when something must be fixed\n  hil-runtime doctor --topology deploy/topologies/split.toml   # its clock path as well"
-    )]
-    Doctor {
-        /// A topology whose clock path is examined as well, as far as it ends on this host.
-        #[arg(long)]
-        topology: Option<PathBuf>,
-        /// Name of this host in the topology, if it is not found by itself.
-        #[arg(long, requires = "topology")]
-        host: Option<String>,
-        /// Exit with 78 when a problem was found.
-        #[arg(long)]
-        strict: bool,
-        /// Print JSON instead of a table.
-        #[arg(long)]
-        json: bool,
-    },
+    Doctor(DoctorArgs),
     /// Look at the wire without taking part: capture, analyse, compare with a run.
     Probe(ProbeArgs),
     /// List the case studies with their channels and parameters.

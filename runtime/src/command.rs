@@ -1,6 +1,7 @@
 //! What each command of the command line does, and the exit code it ends with.
 
 mod case_work;
+mod doctor_work;
 mod live_work;
 mod play_work;
 mod report_work;
@@ -9,11 +10,10 @@ use std::collections::BTreeMap;
 use std::env;
 use std::fs;
 use std::io::IsTerminal;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::ExitCode;
 
 use clap::Parser;
-use hil_gateways::transport::timestamping::TimestampCapabilities;
 use hil_models::case_study::ParameterError;
 use hil_models::layout::Field;
 use hil_models::teleoperation::swing::swing_bvh;
@@ -24,7 +24,6 @@ use crate::cases;
 use crate::cli::{Cli, Command, RunArgs};
 use crate::compare::{self, cli::CompareArgs};
 use crate::console::Console;
-use crate::doctor::{self, ClockQuestion, DoctorRequest, StampCapabilities};
 use crate::face;
 use crate::gateway;
 use crate::link::{self, cli::LinkCommand};
@@ -100,15 +99,7 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
             trace::work::End::Refused => exit::USAGE,
         },
         Command::Link { command } => change_link(&command, console),
-        Command::Doctor {
-            topology,
-            host,
-            strict,
-            json,
-        } => match doctor_request((topology, host), registry, console) {
-            Ok(request) => examine(&request, (strict, json), console),
-            Err(code) => code,
-        },
+        Command::Doctor(args) => doctor_work::doctor(&args, registry, console),
         Command::Channel(args) => live_work::channel(args, registry, console),
         Command::Top(args) => live_work::top(&args, registry, console),
         Command::Probe(args) => probe::run(&args, console),
@@ -333,75 +324,6 @@ fn hosts_here(topology: &Topology, requested: Option<&str>) -> Result<Vec<String
             .collect()),
         Err(error) => Err(error.to_string()),
     }
-}
-
-/// What a topology has the doctor look at beside the host itself.
-fn doctor_request(
-    (topology, host): (Option<PathBuf>, Option<String>),
-    registry: &Registry,
-    console: &mut Console,
-) -> Result<DoctorRequest, u8> {
-    let mut request = DoctorRequest::default();
-    let Some(path) = topology else {
-        return Ok(request);
-    };
-    let topology = load(&path, &[], registry, console).ok_or(exit::USAGE)?;
-    let here = hosts_here(&topology, host.as_deref()).map_err(|text| {
-        console.error(&text);
-        exit::USAGE
-    })?;
-    // Several hosts are here only when none has an address, and none of these has a clock path.
-    let mut ends = here
-        .iter()
-        .filter_map(|name| topology.host(name)?.clock.clone());
-    request.clock_end = ends
-        .next()
-        .map_or(ClockQuestion::NoneNamed, ClockQuestion::End);
-    Ok(request)
-}
-
-fn examine(request: &DoctorRequest, (is_strict, json): (bool, bool), console: &mut Console) -> u8 {
-    let signals = match signals(console) {
-        Ok(signals) => signals,
-        Err(code) => return code,
-    };
-    let watch = signals.end_program_unless_over(
-        "the doctor describes a host whole or not at all; a card it was trying is put back",
-    );
-    let report = doctor::examine(request, &stamp_capabilities);
-    drop(watch);
-    let text = if json {
-        report.to_json()
-    } else {
-        report.to_text(true)
-    };
-    console.result(&text);
-    if is_strict && report.worst_state() == doctor::State::Problem {
-        exit::HOST_UNFIT
-    } else {
-        exit::RAN
-    }
-}
-
-/// What an interface claims, in the bits of the kernel's answer.
-fn stamp_capabilities(interface: &str) -> Result<StampCapabilities, String> {
-    let claims = TimestampCapabilities::query(interface).map_err(|error| error.to_string())?;
-    let flag = |is_claimed: bool, bit: u32| if is_claimed { bit } else { 0 };
-    Ok(StampCapabilities {
-        so_timestamping: flag(claims.tx_hardware, libc::SOF_TIMESTAMPING_TX_HARDWARE)
-            | flag(claims.tx_software, libc::SOF_TIMESTAMPING_TX_SOFTWARE)
-            | flag(claims.rx_hardware, libc::SOF_TIMESTAMPING_RX_HARDWARE)
-            | flag(claims.rx_software, libc::SOF_TIMESTAMPING_RX_SOFTWARE)
-            | flag(
-                claims.tx_software || claims.rx_software,
-                libc::SOF_TIMESTAMPING_SOFTWARE,
-            )
-            | flag(
-                claims.tx_hardware || claims.rx_hardware,
-                libc::SOF_TIMESTAMPING_RAW_HARDWARE,
-            ),
-        hardware_clock_index: claims.phc_index,
-    })
 }
 
 /// Columns of the terminal; where there is none, a page's.

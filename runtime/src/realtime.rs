@@ -13,7 +13,11 @@ use nix::sys::resource::Resource;
 use nix::unistd::Pid;
 use serde::{Deserialize, Serialize};
 
-use crate::host_facts::{CAP_SYS_NICE, Fact, HostFiles, kernel_version, limit};
+pub use crate::host_facts::IsolatedCpus;
+use crate::host_facts::{
+    CAP_SYS_NICE, Fact, HostFiles, RealtimeThrottle, format_cpu_list, has_fair_server, limit,
+    online_cpus,
+};
 
 /// How the kernel schedules a thread.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -186,7 +190,9 @@ pub fn apply(request: &RealtimeRequest) -> RealtimeGrant {
 fn pin_to(cpu: usize) -> Result<(), Refusal> {
     let online = || {
         let files = HostFiles::of_this_host();
-        files.read("/sys/devices/system/cpu/online").to_text()
+        online_cpus(&files)
+            .map(|cpus| format_cpu_list(&cpus))
+            .to_text()
     };
     let refused = |errno| {
         let reason = format!("the CPUs online are {}", online());
@@ -326,25 +332,9 @@ pub(crate) fn clock_discipline() -> Result<ClockDiscipline, Errno> {
     })
 }
 
-/// CPUs the boot command line took out of the scheduler's hands.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct IsolatedCpus {
-    /// `isolcpus=`: no task is placed here unless pinned.
-    pub isolated: Fact<Vec<usize>>,
-    /// `nohz_full=`: no periodic tick while one task runs here.
-    pub nohz_full: Fact<Vec<usize>>,
-}
-
 /// The isolated CPUs of this host.
 pub fn isolated_cpus() -> IsolatedCpus {
-    isolated_cpus_in(&HostFiles::of_this_host())
-}
-
-pub(crate) fn isolated_cpus_in(files: &HostFiles) -> IsolatedCpus {
-    IsolatedCpus {
-        isolated: files.read_cpu_list("/sys/devices/system/cpu/isolated"),
-        nohz_full: files.read_cpu_list("/sys/devices/system/cpu/nohz_full"),
-    }
+    IsolatedCpus::read(&HostFiles::of_this_host())
 }
 
 /// Whether a busy-polling thread at real-time priority belongs on a CPU.
@@ -362,37 +352,28 @@ pub fn spin_advice(cpu: usize) -> SpinAdvice {
     spin_advice_in(cpu, &HostFiles::of_this_host())
 }
 
-/// The first kernel with the deadline server that lends normal tasks 50 ms per second.
-const FAIR_SERVER_SINCE: (u32, u32) = (6, 12);
-
 pub(crate) fn spin_advice_in(cpu: usize, files: &HostFiles) -> SpinAdvice {
-    let isolated = isolated_cpus_in(files).isolated;
+    let isolated = IsolatedCpus::read(files).isolated;
     let is_isolated = isolated.available().is_some_and(|cpus| cpus.contains(&cpu));
-    let has_fair_server = kernel_version(files)
-        .available()
-        .is_some_and(|version| *version >= FAIR_SERVER_SINCE);
-    let period_us = files.read_number("/proc/sys/kernel/sched_rt_period_us");
-    let period_us = period_us.available().copied().unwrap_or(1_000_000);
-    let runtime_us = match files.read_number("/proc/sys/kernel/sched_rt_runtime_us") {
-        Fact::Available(runtime_us) => runtime_us,
+    let has_fair_server = has_fair_server(files).available() == Some(&true);
+    let throttle = match RealtimeThrottle::read(files) {
+        Fact::Available(throttle) => throttle,
         Fact::Unavailable(reason) => {
             return SpinAdvice::Warn(format!("the real-time throttle is unknown: {reason}"));
         }
     };
-    let lost_ms = (period_us - runtime_us) / 1000;
-    let is_throttled = runtime_us >= 0 && runtime_us < period_us;
+    let (runtime_us, is_throttled) = (throttle.runtime_us, throttle.is_active());
+    let (lost_ms, period_ms) = (throttle.lost_ms(), throttle.period_ms());
     match (is_isolated, is_throttled) {
         (true, true) if !has_fair_server => SpinAdvice::Warn(format!(
             "cpu {cpu} is isolated, but sched_rt_runtime_us={runtime_us} stops a FIFO spinner for \
-             {lost_ms} ms of every {} ms all the same; set it to -1",
-            period_us / 1000
+             {lost_ms} ms of every {period_ms} ms all the same; set it to -1"
         )),
         (true, _) => SpinAdvice::Fine,
         (false, true) => SpinAdvice::Warn(format!(
             "cpu {cpu} is not isolated and sched_rt_runtime_us={runtime_us}: a FIFO spinner blacks \
-             out for about {lost_ms} ms of every {} ms when any normal task wants the CPU; boot \
-             with isolcpus={cpu} or use a waiting mode that blocks",
-            period_us / 1000
+             out for about {lost_ms} ms of every {period_ms} ms when any normal task wants the CPU; boot \
+             with isolcpus={cpu} or use a waiting mode that blocks"
         )),
         (false, false) if has_fair_server => SpinAdvice::Warn(format!(
             "cpu {cpu} is not isolated: since Linux 6.12 normal tasks are lent about 50 ms of every \

@@ -358,24 +358,6 @@ fn the_report_of_a_finished_run_can_be_printed_again() {
 }
 
 #[test]
-fn the_doctor_speaks_json_and_is_strict_when_told_to() {
-    let finished = run(&["doctor", "--json"]);
-    finished.assert_success();
-    let report: Value = serde_json::from_str(&finished.stdout).unwrap();
-    assert!(
-        report["host"]
-            .as_array()
-            .is_some_and(|facts| facts.len() > 5),
-        "{report}"
-    );
-    let text = run(&["doctor"]);
-    text.assert_success();
-    assert!(text.stdout.contains("kernel"), "{}", text.stdout);
-    let strict = run(&["doctor", "--strict"]);
-    assert!(matches!(strict.status.code(), Some(0 | 78)), "{strict:?}");
-}
-
-#[test]
 fn the_cases_are_listed_with_channels_and_parameters() {
     let finished = run(&["cases"]);
     finished.assert_success();

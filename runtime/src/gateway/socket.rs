@@ -1,7 +1,6 @@
 //! The socket of one channel direction: opened as its launch description says, behind a link model
 //! where it has one, with what the kernel granted. It moves no message.
 
-use std::fs;
 use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::Duration;
@@ -23,6 +22,7 @@ use super::GatewayError;
 use super::link_switch::{SwitchHandle, switch};
 use super::stamp_plan::StampPlan;
 use crate::clock::MonotonicClock;
+use crate::host_facts::{HostFiles, kernel_release};
 use crate::process::emulation_room::EmulationRoom;
 use crate::process::launch::{
     DirectionLaunch, EmulationError, EmulationLaunch, Side, SocketLaunch, Transport,
@@ -192,8 +192,8 @@ pub(crate) const fn timestamp_mode(asked: Timestamps) -> TimestampMode {
 
 /// Where this direction stands when stations contend for the air.
 fn access_category(granted: GrantedOptions) -> (String, String) {
-    let release = fs::read_to_string("/proc/sys/kernel/osrelease").unwrap_or_default();
-    let text = category::describe(granted.priority, granted.dscp, release.trim());
+    let release = kernel_release(&HostFiles::of_this_host());
+    let text = category::describe(granted.priority, granted.dscp, &release.to_text());
     ("access category".to_owned(), text)
 }
 
