@@ -48,11 +48,11 @@ pub(super) fn living(config: &Config) -> Members {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(crate) struct ForeignNodes {
     /// Living programs.
-    pub(crate) living_count: u64,
+    pub(crate) living: u64,
     /// Programs that ended without leaving.
-    pub(crate) dead_count: u64,
+    pub(crate) dead: u64,
     /// Those of other users, of which nothing can be said.
-    pub(crate) hidden_count: u64,
+    pub(crate) hidden: u64,
 }
 
 impl ForeignNodes {
@@ -65,9 +65,9 @@ impl ForeignNodes {
         let mut found = Self::default();
         let listed = Node::<ipc::Service>::list(&Config::default(), |state| {
             match state {
-                NodeState::Alive(_) => found.living_count += 1,
-                NodeState::Dead(_) => found.dead_count += 1,
-                NodeState::Inaccessible(_) | NodeState::Undefined(_) => found.hidden_count += 1,
+                NodeState::Alive(_) => found.living += 1,
+                NodeState::Dead(_) => found.dead += 1,
+                NodeState::Inaccessible(_) | NodeState::Undefined(_) => found.hidden += 1,
             }
             CallbackProgression::Continue
         });

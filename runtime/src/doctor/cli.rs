@@ -62,7 +62,7 @@ pub struct DoctorArgs {
     /// CPUs to measure on; without it those the topology pins, else the isolated ones, else all.
     #[arg(long, value_name = "N", value_delimiter = ',', requires = "latency")]
     pub cpu: Vec<usize>,
-    /// SCHED_FIFO priority of the measuring threads.
+    /// Real-time (FIFO) priority of the measuring threads.
     #[arg(long, value_name = "P", default_value_t = 80, requires = "latency",
           value_parser = clap::value_parser!(u8).range(1..=99))]
     pub priority: u8,

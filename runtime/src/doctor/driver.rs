@@ -145,11 +145,12 @@ fn coalescing(found: Result<&Coalescing, &String>) -> Finding {
     };
     let value = format!("receive {rx}, send {tx}{adaptive}");
     let longest = found.rx_us.max(found.tx_us).unwrap_or(0);
-    let severity = match longest {
-        _ if found.is_adaptive => Severity::Warning,
-        ..=COALESCING_US_OK => Severity::Ok,
-        ..=COALESCING_US_NOTE => Severity::Note,
-        _ => Severity::Warning,
+    let severity = if found.is_adaptive || longest > COALESCING_US_NOTE {
+        Severity::Warning
+    } else if longest > COALESCING_US_OK {
+        Severity::Note
+    } else {
+        Severity::Ok
     };
     Finding::new(id, severity, value)
 }

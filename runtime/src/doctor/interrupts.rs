@@ -50,15 +50,21 @@ fn judge(interface: &str, found: &Fact<Vec<Interrupt>>, plan: &Plan) -> Finding 
     let pinned = plan.cpus();
     let struck = |one: &&Interrupt| one.effective.iter().any(|cpu| pinned.contains(cpu));
     let may_strike = |one: &&Interrupt| one.allowed.iter().any(|cpu| pinned.contains(cpu));
-    if let Some(one) = found.iter().find(struck) {
-        let cpu = one.effective.iter().find(|cpu| pinned.contains(cpu));
-        let cpu = cpu.copied().unwrap_or_default();
-        let count = one.counts.get(cpu).copied().unwrap_or_default();
-        let of = plan.pins.iter().find(|pin| pin.cpu == cpu);
-        let of = of.map_or("the topology", |pin| pin.of.as_str());
-        let value =
-            format!("{value}; CPU {cpu} is pinned to by {of} ({count} struck there so far)");
-        return Finding::warning(id, value)
+    let hit: Vec<&Interrupt> = found.iter().filter(struck).collect();
+    if !hit.is_empty() {
+        let mut words = Vec::new();
+        for pin in &plan.pins {
+            let own = hit.iter().filter(|one| one.effective.contains(&pin.cpu));
+            let counts = own.map(|one| one.counts.get(pin.cpu).copied().unwrap_or_default());
+            let counts: Vec<u64> = counts.collect();
+            if !counts.is_empty() {
+                let (cpu, of, total) = (pin.cpu, &pin.of, counts.iter().sum::<u64>());
+                words.push(format!(
+                    "CPU {cpu} is pinned to by {of} ({total} struck there so far)"
+                ));
+            }
+        }
+        return Finding::warning(id, format!("{value}; {}", words.join(", ")))
             .of(interface)
             .fixed_by(cure(found, &pinned));
     }
@@ -82,11 +88,10 @@ fn cure(found: &[Interrupt], pinned: &[usize]) -> String {
         .collect();
     free.sort_unstable();
     free.dedup();
-    let cpus = if free.is_empty() {
-        "OTHERS".to_owned()
-    } else {
-        format_cpu_list(&free)
-    };
+    if free.is_empty() {
+        return "pin to fewer CPUs: the topology leaves none for interrupts".to_owned();
+    }
+    let cpus = format_cpu_list(&free);
     let numbers: Vec<String> = found.iter().map(|one| one.number.to_string()).collect();
     format!(
         "for i in {}; do echo {cpus} > /proc/irq/$i/smp_affinity_list; done",

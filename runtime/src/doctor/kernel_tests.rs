@@ -4,6 +4,8 @@ use super::*;
 use crate::doctor::plan::Pin;
 use crate::host_facts::FakeHost;
 
+type Look = fn(&HostFiles) -> Finding;
+
 const RELEASE: &str = "/proc/sys/kernel/osrelease";
 const VERSION: &str = "/proc/sys/kernel/version";
 const CMDLINE: &str = "/proc/cmdline";
@@ -157,7 +159,7 @@ fn group_scheduling_is_judged_with_the_trial() {
 fn settings_of_one_word_are_judged_by_it() {
     let huge = "/sys/kernel/mm/transparent_hugepage/enabled";
     let clock = "/sys/devices/system/clocksource/clocksource0/current_clocksource";
-    let cases: [(&str, &str, fn(&HostFiles) -> Finding, Severity); 6] = [
+    let cases: [(&str, &str, Look, Severity); 6] = [
         (huge, "always [madvise] never", huge_pages, Severity::Ok),
         (huge, "[always] madvise never", huge_pages, Severity::Note),
         (huge, "always madvise", huge_pages, Severity::CannotTell),

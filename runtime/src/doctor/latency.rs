@@ -287,7 +287,7 @@ pub fn measure(request: &LatencyRequest, files: &HostFiles, watch: &Watch<'_>) -
             Fact::Unavailable("interrupted before it".to_owned())
         } else {
             cyclictest::run(request, &|| (watch.is_stopped)(), &|words| {
-                steps.tell(words)
+                steps.tell(words);
             })
         };
     }

@@ -90,14 +90,12 @@ fn fifo(files: &HostFiles, tried: Option<&GrantOutcome>, rtprio: &str) -> Findin
             Finding::ok(id, format!("priority {TRIED_PRIORITY} granted; {rights}"))
         }
         Some(GrantOutcome::Refused { error, reason, fix }) => {
-            let finding = Finding::error(
-                id,
-                format!("priority {TRIED_PRIORITY} refused ({error}): {reason}; {rights}"),
-            );
+            let value = format!("priority {TRIED_PRIORITY} refused ({error}); {rights}");
             if held(files, CAP_SYS_NICE) == "held" {
-                finding.fixed_by(fix.clone())
+                // Then it is not for want of rights.
+                Finding::error(id, format!("{value}: {reason}")).fixed_by(fix.clone())
             } else {
-                finding.fixed_by(limit_line("rtprio", "90", "90-hil.conf"))
+                Finding::error(id, value).fixed_by(limit_line("rtprio", "90", "90-hil.conf"))
             }
         }
     }
@@ -131,8 +129,18 @@ fn memory_lock(
     }
     match trial() {
         Ok(()) => Finding::ok(id, format!("granted; {rights}")),
-        Err(errno) => Finding::error(id, format!("refused ({}); {rights}", errno.desc()))
-            .fixed_by(limit_line("memlock", "unlimited", "91-hil.conf")),
+        Err(errno) => {
+            // The kernel says "out of memory" for what is beyond the limit.
+            let why = match errno {
+                Errno::ENOMEM => "more than the limit",
+                _ => errno.desc(),
+            };
+            Finding::error(id, format!("refused ({why}); {rights}")).fixed_by(limit_line(
+                "memlock",
+                "unlimited",
+                "91-hil.conf",
+            ))
+        }
     }
 }
 

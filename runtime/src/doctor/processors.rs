@@ -6,7 +6,8 @@ use super::Finding;
 use super::finding::Severity;
 use super::plan::Plan;
 use crate::host_facts::{
-    CPU_FOLDER, Fact, HostFiles, IsolatedCpus, format_cpu_list, governors, online_cpus,
+    CPU_FOLDER, Fact, HostFiles, IsolatedCpus, KernelOptions, format_cpu_list, governors,
+    online_cpus,
 };
 
 /// An idle state that takes longer to leave shows up in every blocking receive.
@@ -16,12 +17,13 @@ const IDLE_EXIT_US_NOTE: i64 = 100;
 
 pub(super) fn examine(files: &HostFiles, plan: &Plan) -> Vec<Finding> {
     let isolation = IsolatedCpus::read(files);
-    let without_tick = match &isolation.nohz_full {
-        // A kernel without the option has no such file.
-        Fact::Unavailable(reason) => {
-            Fact::Unavailable(format!("{reason}: it was built without CONFIG_NO_HZ_FULL"))
+    let without_tick = isolation.nohz_full.clone();
+    let without_tick = match (without_tick, KernelOptions::read(files)) {
+        // A kernel without the option has no such file, and ticks everywhere.
+        (Fact::Unavailable(_), Fact::Available(options)) if !options.has("NO_HZ_FULL") => {
+            Fact::Available(Vec::new())
         }
-        known @ Fact::Available(_) => known.clone(),
+        (found, _) => found,
     };
     vec![
         covered("isolated_cpus", &isolation.isolated, plan),
@@ -56,18 +58,23 @@ fn covered(id: &str, apart: &Fact<Vec<usize>>, plan: &Plan) -> Finding {
     if outside.is_empty() {
         return Finding::ok(id, value);
     }
-    let mut cpus: Vec<usize> = outside.iter().map(|pin| pin.cpu).collect();
-    cpus.dedup();
-    let cpus = format_cpu_list(&cpus);
-    let spinner = outside.iter().find(|pin| pin.spins);
-    let severity = if spinner.is_some() {
+    let spins = outside.iter().any(|pin| pin.spins);
+    let severity = if spins {
         Severity::Warning
     } else {
         Severity::Note
     };
-    let of = spinner.unwrap_or(&outside[0]);
-    let what = if of.spins { ", which busy-polls" } else { "" };
-    let value = format!("{value}; not CPU {cpus}, pinned by {}{what}", of.of);
+    let words: Vec<String> = outside
+        .iter()
+        .map(|pin| {
+            let what = if pin.spins { ", which busy-polls" } else { "" };
+            format!("{} ({}{what})", pin.cpu, pin.of)
+        })
+        .collect();
+    let value = format!("{value}; pinned to outside: {}", words.join(", "));
+    let mut cpus: Vec<usize> = outside.iter().map(|pin| pin.cpu).collect();
+    cpus.dedup();
+    let cpus = format_cpu_list(&cpus);
     let parameter = if id == "isolated_cpus" {
         "isolcpus"
     } else {
@@ -167,10 +174,12 @@ fn idle_states(files: &HostFiles, plan: &Plan) -> Finding {
         Fact::Available(_) => (exit_us, "; nobody holds /dev/cpu_dma_latency".to_owned()),
         Fact::Unavailable(reason) => (exit_us, format!("; a bound on it is unknown ({reason})")),
     };
-    let severity = match bound {
-        ..=IDLE_EXIT_US_OK => Severity::Ok,
-        ..=IDLE_EXIT_US_NOTE => Severity::Note,
-        _ => Severity::Warning,
+    let severity = if bound > IDLE_EXIT_US_NOTE {
+        Severity::Warning
+    } else if bound > IDLE_EXIT_US_OK {
+        Severity::Note
+    } else {
+        Severity::Ok
     };
     Finding::new(id, severity, format!("{words}{also}"))
 }
@@ -280,11 +289,11 @@ mod tests {
         for (id, value) in [
             (
                 "isolated_cpus",
-                "none; not CPU 1, pinned by gateway of hop, which busy-polls",
+                "none; pinned to outside: 1 (gateway of hop, which busy-polls)",
             ),
             (
                 "rcu_nocbs",
-                "none; not CPU 1, pinned by gateway of hop, which busy-polls",
+                "none; pinned to outside: 1 (gateway of hop, which busy-polls)",
             ),
             ("governor", "powersave on CPU 1"),
             ("smt", "CPU 1 shares with CPU 0, open to all tasks"),
@@ -348,5 +357,24 @@ mod tests {
         let smt = found(&findings, "smt");
         assert_eq!(smt.severity, Severity::Warning);
         assert!(smt.value.contains("CPU 3, pinned too"), "{smt:?}");
+    }
+
+    #[test]
+    fn a_kernel_that_cannot_leave_the_tick_out_is_known_to_tick() {
+        let files = [
+            ("/proc/sys/kernel/osrelease".to_owned(), "6.1"),
+            ("/boot/config-6.1".to_owned(), "CONFIG_NO_HZ_IDLE=y"),
+        ];
+        let findings = with(&files, &pinned(&[1], true));
+        let tick = found(&findings, "nohz_full");
+        assert_eq!(tick.severity, Severity::Warning, "{tick:?}");
+        // One that can, and does not tell where, is not known to do anything.
+        let able = [
+            files[0].clone(),
+            (files[1].0.clone(), "CONFIG_NO_HZ_FULL=y"),
+        ];
+        let findings = with(&able, &pinned(&[1], true));
+        let tick = found(&findings, "nohz_full");
+        assert_eq!(tick.severity, Severity::CannotTell, "{tick:?}");
     }
 }

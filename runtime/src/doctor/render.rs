@@ -91,7 +91,7 @@ impl DoctorReport {
         let plural = |number: usize| if number == 1 { "" } else { "s" };
         let (errors, warnings) = (count(Severity::Error), count(Severity::Warning));
         format!(
-            "{errors} error{}, {warnings} warning{}, {} not to be told, {} to note, {} ok; docs/doctor.md \
+            "{errors} error{}, {warnings} warning{}, {} cannot be told, {} to note, {} ok; docs/doctor.md \
              explains each by its name",
             plural(errors),
             plural(warnings),
@@ -173,7 +173,7 @@ mod tests {
             \x20             fix  be early\n\
             \x20             from measured (wakeup_latency)\n\
             ok           Short           1 us\n\n\
-            1 error, 0 warnings, 0 not to be told, 0 to note, 1 ok; docs/doctor.md explains each by its \
+            1 error, 0 warnings, 0 cannot be told, 0 to note, 1 ok; docs/doctor.md explains each by its \
             name\n";
         let text = report().to_text(false);
         let (_, text) = text.split_once('\n').unwrap();

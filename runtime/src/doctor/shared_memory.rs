@@ -117,44 +117,53 @@ fn leftovers(files: &HostFiles, runtime_folders: &[PathBuf]) -> Finding {
         Some(_) => Standing::Ended,
         None => Standing::Unplaced,
     };
-    let of = |wanted: Standing| -> Vec<&str> {
-        let all = counts.keys().copied();
-        all.filter(|prefix| standing(prefix) == wanted).collect()
-    };
-    let (going, ended, unplaced) = (
-        of(Standing::GoesOn),
-        of(Standing::Ended),
-        of(Standing::Unplaced),
-    );
-    if ended.is_empty() && unplaced.is_empty() {
-        return Finding::ok(id, format!("none; {} runs go on", going.len()));
-    }
-    let stale: Vec<&str> = ended.iter().chain(&unplaced).copied().collect();
-    let file_count: usize = stale.iter().map(|prefix| counts[prefix]).sum();
-    let mut shown: Vec<String> = stale
+    let with_standing = counts
         .iter()
-        .take(SHOWN_MAX)
-        .map(|p| format!("{p}*"))
-        .collect();
+        .map(|(prefix, count)| (*prefix, *count, standing(prefix)));
+    judge_leftovers(&with_standing.collect::<Vec<_>>())
+}
+
+/// Of each run with segments: its prefix, how many, and its standing.
+fn judge_leftovers(runs: &[(&str, usize, Standing)]) -> Finding {
+    let id = "shared_memory_leftovers";
+    let of = |wanted: Standing| runs.iter().filter(move |(_, _, one)| *one == wanted);
+    let going = of(Standing::GoesOn).count();
+    let stale: Vec<_> = of(Standing::Ended).chain(of(Standing::Unplaced)).collect();
+    if stale.is_empty() {
+        return Finding::ok(id, format!("none; {going} runs go on"));
+    }
+    let file_count: usize = stale.iter().map(|(_, count, _)| count).sum();
+    let shown = stale.iter().take(SHOWN_MAX);
+    let mut shown: Vec<String> = shown.map(|(prefix, ..)| format!("{prefix}*")).collect();
     if stale.len() > SHOWN_MAX {
         shown.push("...".to_owned());
     }
+    let kinds = [
+        (of(Standing::Ended).count(), "ended"),
+        (
+            of(Standing::Unplaced).count(),
+            "of which no folder is found",
+        ),
+        (going, "go on, their files not counted"),
+    ];
+    let kinds: Vec<String> = kinds
+        .iter()
+        .filter(|(count, _)| *count > 0)
+        .map(|(count, words)| format!("{count} {words}"))
+        .collect();
     let value = format!(
-        "{file_count} files of {} ended runs and {} whose folder is not found: {}; {} runs go on",
-        ended.len(),
-        unplaced.len(),
+        "{file_count} files, {}; of runs: {}",
         shown.join(" "),
-        going.len()
+        kinds.join(", ")
     );
     let finding = Finding::note(id, value);
-    if unplaced.is_empty() {
-        return finding;
+    match of(Standing::Unplaced).next() {
+        None => finding,
+        Some((prefix, ..)) => finding.fixed_by(format!(
+            "if no other user's run goes on: rm /dev/shm/{prefix}*; any start of a run removes those \
+             of ended runs"
+        )),
     }
-    finding.fixed_by(format!(
-        "if no other user's run goes on: rm /dev/shm/{}*; any start of a run removes those of ended \
-         runs",
-        unplaced[0]
-    ))
 }
 
 /// The prefix and the root of every domain in `folders`.
@@ -190,8 +199,8 @@ fn foreign_nodes(found: Result<ForeignNodes, String>) -> Finding {
     let id = "iceoryx2_nodes";
     match found {
         Ok(nodes) => {
-            let (living, dead) = (nodes.living_count, nodes.dead_count);
-            let hidden = nodes.hidden_count;
+            let (living, dead) = (nodes.living, nodes.dead);
+            let hidden = nodes.hidden;
             let value = format!("{dead} dead, {living} alive, {hidden} of other users or damaged");
             if dead == 0 && hidden == 0 {
                 Finding::ok(id, value)
@@ -266,10 +275,7 @@ mod tests {
         let ended = FakeHost::with(&[(SEGMENT, ""), (MARK, "h1a2b3c4d_"), ("/proc/locks", "")]);
         let finding = judged(&ended);
         assert_eq!(finding.severity, Severity::Note);
-        assert!(
-            finding.value.starts_with("1 files of 1 ended runs"),
-            "{finding:?}"
-        );
+        assert!(finding.value.ends_with("of runs: 1 ended"), "{finding:?}");
         assert!(finding.value.contains("h1a2b3c4d_*"), "{finding:?}");
         // The kernel's line for whoever holds the folder's lock.
         let metadata = fs::metadata(ended.files().locate("/run/hil/abc")).unwrap();
@@ -328,11 +334,11 @@ mod tests {
 
     #[test]
     fn dead_nodes_are_a_note_and_an_unreadable_list_is_not_ok() {
-        let nodes = |living_count, dead_count| {
+        let nodes = |living, dead| {
             foreign_nodes(Ok(ForeignNodes {
-                living_count,
-                dead_count,
-                hidden_count: 0,
+                living,
+                dead,
+                hidden: 0,
             }))
         };
         assert_eq!(nodes(3, 0).severity, Severity::Ok);

@@ -199,11 +199,11 @@ fn dynamic(files: &HostFiles) -> Preemption {
 /// not there.
 pub(crate) fn boot_parameter(files: &HostFiles, name: &str) -> Fact<Option<String>> {
     files.read("/proc/cmdline").map(|line| {
-        let values = line.split_whitespace().filter_map(|word| {
+        let mut values = line.split_whitespace().filter_map(|word| {
             let (key, value) = word.split_once('=').unwrap_or((word, ""));
             (key == name).then(|| value.to_owned())
         });
-        values.last()
+        values.next_back()
     })
 }
 

@@ -187,13 +187,14 @@ fn deadline(rate_hz: i64, worst: &Worst) -> Claim {
         p999_ns, max_ns, ..
     } = worst.lateness;
     let (tail, max) = (us(p999_ns), us(max_ns));
-    let outcome = if worst.count < needed_count(999) {
+    // One miss is enough to know; that there is none takes many wake-ups.
+    let outcome = if max_ns >= period_ns {
+        let why = format!("the host alone missed one: a wake-up was {max} us late");
+        (Standing::NotSupportable, why)
+    } else if worst.count < needed_count(999) {
         let (count, needed) = (worst.count, needed_count(999));
         let why = format!("{count} wake-ups, and {needed} are needed: measure longer");
         (Standing::NotMeasured, why)
-    } else if max_ns >= period_ns {
-        let why = format!("the host alone missed one: a wake-up was {max} us late");
-        (Standing::NotSupportable, why)
     } else if p999_ns > tenth_ns {
         let why = format!("99.9 % wake-up is {tail} us, more than {} us", us(tenth_ns));
         (Standing::NotSupportable, why)
@@ -220,7 +221,8 @@ fn busy_polling(gaps: &Gaps, period_ns: i64) -> Claim {
     let longest_ns = gaps.length.map_or(0, |length| length.max_ns);
     let throttled = match gaps.throttle_like_count {
         Some(count) if count > 0 => {
-            format!("; {count} gaps as long as what sched_rt_runtime_us keeps back")
+            let gaps = if count == 1 { "gap" } else { "gaps" };
+            format!("; {count} {gaps} as long as what sched_rt_runtime_us keeps back")
         }
         _ => String::new(),
     };
@@ -249,7 +251,7 @@ fn busy_polling(gaps: &Gaps, period_ns: i64) -> Claim {
 fn below() -> Claim {
     Claim::new(
         "tail_cause",
-        "whose tail it is",
+        "tails as this system's own",
         "below a hypervisor the tail is not this system's alone, whatever steal time says",
         (
             Standing::NotSupportable,
@@ -260,7 +262,7 @@ fn below() -> Claim {
 }
 
 /// Microseconds, rounded up: a bound is not rounded in its own favour.
-fn us(ns: i64) -> i64 {
+pub(super) fn us(ns: i64) -> i64 {
     ns.max(0).unsigned_abs().div_ceil(1000).cast_signed()
 }
 

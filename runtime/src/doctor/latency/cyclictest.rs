@@ -254,7 +254,7 @@ mod tests {
                 .spawn()
                 .unwrap()
         };
-        let long = Duration::from_secs(60);
+        let long = Duration::from_mins(1);
         let failed = answer(child("echo no rights >&2; exit 3"), long, &|| false);
         let why = failed.unwrap_err();
         assert!(why.contains('3') && why.contains("no rights"), "{why}");

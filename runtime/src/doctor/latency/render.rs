@@ -3,6 +3,7 @@
 
 use core::fmt::Write as _;
 
+use super::claims;
 use super::{CyclictestThread, Gaps, LatencyReport, Standing, Wakeups};
 use crate::doctor::render::{Tone, mark, wrapped};
 use crate::host_facts::Fact;
@@ -53,19 +54,16 @@ impl LatencyReport {
             }
         }
         for line in self.scheduling() {
-            push(text, &format!("  {line}"));
+            push_hanging(text, "  ", &line);
         }
         match &self.cyclictest {
             Fact::Available(other) => {
                 // It differs in two things, and a reader of both rows must know.
-                push(text, &format!("  {}", other.command));
-                push(
-                    text,
-                    "  cyclictest keeps CPUs from sleeping (/dev/cpu_dma_latency) and counts no instant \
-                     that passed while it was late; ours does neither",
-                );
+                let differs = "it keeps CPUs from deep sleep (/dev/cpu_dma_latency) and counts no instant that \
+                               passed while it was late; ours does neither";
+                push_hanging(text, "  ", &format!("{}: {differs}", other.command));
             }
-            Fact::Unavailable(reason) => push(text, &format!("  cyclictest: {reason}")),
+            Fact::Unavailable(reason) => push_hanging(text, "  ", &format!("cyclictest: {reason}")),
         }
     }
 
@@ -174,10 +172,14 @@ impl LatencyReport {
                 Standing::NotMeasured => ("?  ", Tone::Unknown),
             };
             let word = mark(word, tone, has_colour);
-            push(
-                text,
-                &format!("  {word}  {:width$}  {}", claim.claim, claim.why),
-            );
+            let room = WIDTH.saturating_sub(7 + width + 2).max(30);
+            for (index, line) in wrapped(&claim.why, room).iter().enumerate() {
+                if index == 0 {
+                    push(text, &format!("  {word}  {:width$}  {line}", claim.claim));
+                } else {
+                    push(text, &format!("       {:width$}  {line}", ""));
+                }
+            }
         }
         let mut rules: Vec<&str> = Vec::new();
         for claim in &self.claims {
@@ -187,11 +189,20 @@ impl LatencyReport {
         }
         push(text, "  Rules, in the order of the lines:");
         for rule in rules {
-            for (index, line) in wrapped(rule, 90).iter().enumerate() {
-                let lead = if index == 0 { "  - " } else { "    " };
-                push(text, &format!("{lead}{line}"));
-            }
+            push_hanging(text, "  - ", rule);
         }
+    }
+}
+
+/// Columns of a page.
+const WIDTH: usize = 100;
+
+/// Wrapped words, all but the first line below the first word.
+fn push_hanging(text: &mut String, lead: &str, words: &str) {
+    let indent = lead.chars().count();
+    for (index, line) in wrapped(words, WIDTH - indent).iter().enumerate() {
+        let lead = if index == 0 { lead } else { "" };
+        push(text, &format!("{lead:indent$}{line}"));
     }
 }
 
@@ -211,8 +222,9 @@ fn place(cpu: Option<usize>) -> String {
     cpu.map_or("any CPU".to_owned(), |cpu| format!("CPU {cpu}"))
 }
 
+/// As the claims round, so that a figure is the same in both.
 fn us(ns: i64) -> String {
-    format!("{:.0}", ns as f64 / 1000.0)
+    claims::us(ns).to_string()
 }
 
 const NONE: &str = "-";
