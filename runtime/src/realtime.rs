@@ -2,6 +2,8 @@
 //! refused. It decides nothing: a refusal is listed with its reason and cure, and the caller (or
 //! the reader of the run's report) judges. Also here: the kernel calls `nix` lacks.
 
+use std::fs;
+use std::io;
 use std::time::Duration;
 
 use core_affinity::CoreId;
@@ -31,6 +33,32 @@ pub enum SchedulingPolicy {
     /// interrupts one by waking up. For what must not be felt by what it looks at.
     Idle,
 }
+
+impl SchedulingPolicy {
+    /// Policy with its flags, and priority, as the kernel numbers them.
+    const fn of_kernel(self) -> (libc::c_int, u8) {
+        match self {
+            Self::Other => (libc::SCHED_OTHER, 0),
+            Self::Fifo { priority } => (libc::SCHED_FIFO | libc::SCHED_RESET_ON_FORK, priority),
+            Self::Idle => (libc::SCHED_IDLE, 0),
+        }
+    }
+}
+
+impl std::fmt::Display for SchedulingPolicy {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Other => f.write_str("SCHED_OTHER"),
+            Self::Fifo { priority } => write!(f, "SCHED_FIFO {priority}"),
+            Self::Idle => f.write_str("SCHED_IDLE"),
+        }
+    }
+}
+
+/// The calling thread, in the kernel's numbers.
+const OWN_THREAD: libc::pid_t = 0;
+/// Rounds in which threads may still appear that are not moved yet.
+const MOVES_MAX: usize = 32;
 
 /// What a thread asks of the kernel.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -171,16 +199,55 @@ pub fn apply(request: &RealtimeRequest) -> RealtimeGrant {
         let asked = format!("timer slack {} ns", slack.as_nanos());
         grant.add(RealtimeItem::TimerSlack, asked, set_timer_slack(slack));
     }
-    let (asked, result) = match request.policy {
-        SchedulingPolicy::Other => ("SCHED_OTHER".to_owned(), schedule(libc::SCHED_OTHER, 0)),
-        SchedulingPolicy::Fifo { priority } => {
-            let flags = libc::SCHED_FIFO | libc::SCHED_RESET_ON_FORK;
-            (format!("SCHED_FIFO {priority}"), schedule(flags, priority))
-        }
-        SchedulingPolicy::Idle => ("SCHED_IDLE".to_owned(), schedule(libc::SCHED_IDLE, 0)),
-    };
-    grant.add(RealtimeItem::Scheduling, asked, result);
+    let (policy, priority) = request.policy.of_kernel();
+    let result = schedule(policy, priority);
+    grant.add(RealtimeItem::Scheduling, request.policy.to_string(), result);
     grant
+}
+
+/// Schedules every thread of this process that is under `from` by `to`, those included that are
+/// started meanwhile, and says what the kernel made of it. Threads under any other policy stay as
+/// they are.
+pub fn move_threads(from: SchedulingPolicy, to: SchedulingPolicy) -> RealtimeGrantItem {
+    let mut grant = RealtimeGrant::default();
+    let result = move_all(from.of_kernel().0, to.of_kernel());
+    grant.add(RealtimeItem::Scheduling, to.to_string(), result);
+    grant.items.remove(0)
+}
+
+fn move_all(from: libc::c_int, to: (libc::c_int, u8)) -> Result<(), Refusal> {
+    // A thread that was not moved yet may have started another one: until none is left.
+    for _ in 0..MOVES_MAX {
+        let threads = thread_numbers().map_err(|error| {
+            let errno = error.raw_os_error().map_or(Errno::EIO, Errno::from_raw);
+            Refusal::new(errno, "/proc/self/task cannot be read", "mount /proc")
+        })?;
+        let is_from = |thread: &libc::pid_t| {
+            let policy = current_policy(*thread);
+            policy >= 0 && policy & !libc::SCHED_RESET_ON_FORK == from & !libc::SCHED_RESET_ON_FORK
+        };
+        let mut is_moved = false;
+        for thread in threads.into_iter().filter(is_from) {
+            match set_scheduler(thread, to.0, to.1) {
+                Ok(()) => is_moved = true,
+                // It has ended.
+                Err(Errno::ESRCH) => {}
+                Err(errno) => return Err(explain(errno, to)),
+            }
+        }
+        if !is_moved {
+            return Ok(());
+        }
+    }
+    let fix = "try again when the process starts fewer threads";
+    Err(Refusal::new(Errno::EAGAIN, "new threads kept coming", fix))
+}
+
+fn thread_numbers() -> io::Result<Vec<libc::pid_t>> {
+    let entries = fs::read_dir("/proc/self/task")?;
+    let names = entries.map(|entry| Ok(entry?.file_name().to_string_lossy().parse().ok()));
+    let numbers: io::Result<Vec<Option<libc::pid_t>>> = names.collect();
+    Ok(numbers?.into_iter().flatten().collect())
 }
 
 fn pin_to(cpu: usize) -> Result<(), Refusal> {
@@ -237,17 +304,21 @@ fn set_timer_slack(slack: Duration) -> Result<(), Refusal> {
 }
 
 fn schedule(policy: libc::c_int, priority: u8) -> Result<(), Refusal> {
-    let set = set_scheduler(policy, priority);
-    set.map_err(|errno| match policy {
-        libc::SCHED_OTHER | libc::SCHED_IDLE => explain_raising(errno),
-        _ => explain_scheduling(errno, priority, &HostFiles::of_this_host()),
-    })?;
-    let actual = current_policy();
+    let set = set_scheduler(OWN_THREAD, policy, priority);
+    set.map_err(|errno| explain(errno, (policy, priority)))?;
+    let actual = current_policy(OWN_THREAD);
     if actual & !libc::SCHED_RESET_ON_FORK == policy & !libc::SCHED_RESET_ON_FORK {
         return Ok(());
     }
     let reason = format!("the kernel accepted the call but reports policy {actual}");
     Err(Refusal::new(Errno::EAGAIN, reason, "report this kernel"))
+}
+
+fn explain(errno: Errno, (policy, priority): (libc::c_int, u8)) -> Refusal {
+    match policy {
+        libc::SCHED_OTHER | libc::SCHED_IDLE => explain_raising(errno),
+        _ => explain_scheduling(errno, priority, &HostFiles::of_this_host()),
+    }
 }
 
 /// `SCHED_IDLE` counts as nice 20, which a task without rights may enter and not leave.
@@ -256,7 +327,8 @@ fn explain_raising(errno: Errno) -> Refusal {
     Refusal::new(
         errno,
         format!("RLIMIT_NICE is {nice}"),
-        "needs CAP_SYS_NICE or LimitNICE=0 in the unit",
+        // Without a sign systemd takes the raw limit, of which 0 allows nothing (systemd.exec(5)).
+        "needs CAP_SYS_NICE or LimitNICE=+0 in the unit",
     )
 }
 
@@ -282,19 +354,19 @@ fn explain_scheduling(errno: Errno, priority: u8, files: &HostFiles) -> Refusal 
 }
 
 #[allow(unsafe_code, reason = "nix has no sched_setscheduler")]
-fn set_scheduler(policy: libc::c_int, priority: u8) -> Result<(), Errno> {
+fn set_scheduler(thread: libc::pid_t, policy: libc::c_int, priority: u8) -> Result<(), Errno> {
     let parameters = libc::sched_param {
         sched_priority: i32::from(priority),
     };
     // SAFETY: the pointer is to a live, fully initialised `sched_param` that the call only reads.
-    let code = unsafe { libc::sched_setscheduler(0, policy, &raw const parameters) };
+    let code = unsafe { libc::sched_setscheduler(thread, policy, &raw const parameters) };
     Errno::result(code).map(drop)
 }
 
 #[allow(unsafe_code, reason = "nix has no sched_getscheduler")]
-fn current_policy() -> libc::c_int {
-    // SAFETY: the call takes no pointer; 0 is the calling thread, which exists.
-    unsafe { libc::sched_getscheduler(0) }
+fn current_policy(thread: libc::pid_t) -> libc::c_int {
+    // SAFETY: the call takes no pointer; of a thread that has ended it gives -1.
+    unsafe { libc::sched_getscheduler(thread) }
 }
 
 /// What the kernel knows about how `CLOCK_REALTIME` is steered.
