@@ -320,6 +320,13 @@ impl RecordFile {
             .filter_map(|bytes| bytemuck::try_pod_read_unaligned(bytes).ok())
     }
 
+    /// The record with `index` in the order of the file as `T`; `None` beyond the last, and when
+    /// `T` has another size.
+    pub fn record<T: Pod>(&self, index: usize) -> Option<T> {
+        let bytes = self.raw().nth(index)?;
+        bytemuck::try_pod_read_unaligned(bytes).ok()
+    }
+
     /// How many whole records there are.
     pub fn record_count(&self) -> usize {
         self.raw().len()
