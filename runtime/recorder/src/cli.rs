@@ -35,8 +35,8 @@ const SERVE_EXAMPLES: &str = "\
 Examples:
   hil-recorder serve
       the run that goes on here; the page is at http://127.0.0.1:8766/
-  hil-recorder serve --wait --record recordings/
-      the next one, and the one after it, each recorded as well
+  hil-recorder serve --wait --record recordings/ --no-scene
+      the next one, and the one after it, each recorded as well, without pictures
   hil-recorder serve runs/fleet-emulated-20261122-101806 --loop
       a finished run again and again
   ssh -L 8765:localhost:8765 -L 8766:localhost:8766 control-pc
@@ -232,6 +232,12 @@ pub(crate) struct ServeOptions {
     /// per run.
     #[arg(long, value_name = "FILE")]
     pub(crate) record: Option<PathBuf>,
+    /// How the server, and the recorder in it, stand against a run that goes on.
+    #[arg(long, value_enum, default_value_t = Priority::Idle)]
+    pub(crate) priority: Priority,
+    /// Leave out /scene and /tf of the file, and the work that drawing them takes.
+    #[arg(long, requires = "record")]
+    pub(crate) no_scene: bool,
     /// How fast a finished run is played back, 0.01 to 100.
     #[arg(long, value_name = "FACTOR", default_value_t = 1.0, value_parser = speed)]
     pub(crate) speed: f64,

@@ -13,7 +13,8 @@ use crate::cli::{Cli, Command, ServeOptions};
 use crate::convert::{ConvertError, convert};
 use crate::info::info;
 use crate::play::{PlayEnd, PlayError, PlayOptions, SourceError, TargetError, play};
-use crate::record::{Progress as RecordProgress, RecordError, Request, record};
+use crate::priority::Precedence;
+use crate::record::{Progress as RecordProgress, RecordError, Request, Which, record};
 use crate::recover::{RecoverError, loss_words, recover};
 use crate::scan::ScanError;
 use crate::scene::Scenery;
@@ -69,7 +70,7 @@ fn work(command: Command, signals: &Signals, console: &mut Console) -> u8 {
             no_scene,
         } => {
             let request = Request {
-                run,
+                run: Which::Named(run),
                 output,
                 waits: wait,
                 from_now,
@@ -79,7 +80,7 @@ fn work(command: Command, signals: &Signals, console: &mut Console) -> u8 {
                 },
                 flush,
                 force,
-                priority,
+                precedence: Precedence::new(priority),
                 scenery: Scenery::of(no_scene),
             };
             record_run(&request, signals, console)
@@ -206,7 +207,9 @@ fn record_run(request: &Request, signals: &Signals, console: &mut Console) -> u8
                     exit::USAGE
                 }
                 RecordError::Interrupted(_) => interrupted(),
-                RecordError::Feed(_) | RecordError::Write(_) => exit::FAILED,
+                RecordError::Feed(_) | RecordError::Gone { .. } | RecordError::Write(_) => {
+                    exit::FAILED
+                }
             };
         }
     };

@@ -9,7 +9,7 @@ use hil_runtime::console::Console;
 use serde_json::{Value, json};
 
 use super::parameters::Links;
-use super::recording::Recording;
+use super::recording::{Recording, Target};
 use super::source::{Progress, Source};
 use super::viewers::Viewers;
 use crate::view::facts::RunFacts;
@@ -24,6 +24,11 @@ const LARGE_PICTURE_PERIOD: Duration = Duration::from_millis(200);
 const CHANNELS_PERIOD: Duration = Duration::from_millis(100);
 /// Between two words on the run.
 const RUN_PERIOD: Duration = Duration::from_secs(1);
+
+/// Between two rounds, when something is read from shared memory.
+const MEMORY_REST: Duration = Duration::from_millis(10);
+/// The same when all that is read are files, which wait: half of what is between two pictures.
+const REST: Duration = Duration::from_millis(25);
 
 /// When the next of each is due.
 #[derive(Debug, Default)]
@@ -105,14 +110,14 @@ pub(crate) struct Engine {
     /// Parameters as they were told last.
     told: Vec<Parameter>,
     /// Where what is shown is recorded, and the recording.
-    target: Option<PathBuf>,
+    target: Option<Target>,
     recording: Option<Recording>,
     due: Due,
 }
 
 impl Engine {
     /// Nothing is shown yet.
-    pub(crate) fn new(viewers: Viewers, links: Links, target: Option<PathBuf>) -> Self {
+    pub(crate) fn new(viewers: Viewers, links: Links, target: Option<Target>) -> Self {
         Self {
             shown: None,
             viewers,
@@ -136,8 +141,8 @@ impl Engine {
             before.end(console);
         }
         // What is played back is on record already.
-        let target = self.target.as_ref().filter(|_| shown.links.is_some());
-        self.recording = target.map(|path| Recording::begin(&shown.state.facts.name, path));
+        let goes_on = self.target.as_ref().zip(shown.links.as_ref());
+        self.recording = goes_on.map(|(target, (folder, _))| Recording::begin(folder, target));
         self.shown = Some(shown);
         self.due = Due::default();
     }
@@ -150,6 +155,16 @@ impl Engine {
             is_over: shown.state.is_over(),
             is_playback: shown.playback_speed.is_some(),
         })
+    }
+
+    /// How long it may rest before the next round: shared memory has room for little.
+    pub(crate) fn rest(&self) -> Duration {
+        let shown = self.shown.as_ref();
+        if shown.is_some_and(|shown| shown.source.reads_memory()) {
+            MEMORY_REST
+        } else {
+            REST
+        }
     }
 
     /// The viewers, at the end.
