@@ -156,7 +156,7 @@ fn a_server_gives_way_as_a_whole_unless_told_otherwise() {
     let folder = RunFolder::new("serve-priority");
     let (mut run, name) = start(&folder, "serve-priority");
     let file = folder.join("served.mcap");
-    let mut serve = |more: &[&str]| {
+    let serve = |more: &[&str]| {
         let mut command = Command::new(hil_recorder_binary());
         command.args(["serve", &name, "--wait", "--port", "0", "--http-port", "0"]);
         let mut server = ChildGuard::spawn(command.args(more)).unwrap();
