@@ -138,7 +138,8 @@ fn every_thread_of_a_recorder_gives_way_and_none_is_left_behind_when_it_is_raise
         .as_str()
         .unwrap();
     println!("{said}");
-    if before == BTreeSet::from([IDLE]) {
+    // On a busy host it may have been kept waiting before anybody looked.
+    if before == BTreeSet::from([IDLE]) || said.starts_with("SCHED_IDLE") {
         assert!(
             said.starts_with("SCHED_IDLE until it had no processor time for "),
             "{said}"
