@@ -34,11 +34,13 @@ Examples:
       run its robot again in virtual time and compare every message
 
 Exit codes:
-  0  the run ended as planned         70  internal error
-  1  the run failed, its report has   78  doctor --strict: host not fit
-     gaps, or a replay differs        130 interrupted; the report is
-  2  wrong arguments or topology          complete
-  69 a peer host was not reachable    131 interrupted twice: no report";
+  0  the run ended as planned         75  an address or a port is not
+  1  the run failed, its report has       there yet: try again
+     gaps, or a replay differs        77  a folder is not this user's
+  2  wrong arguments or topology      78  doctor --strict: host not fit
+  69 a peer host was not reachable    130 interrupted; the report is
+  70 internal error                       complete
+                                      131 interrupted twice: no report";
 
 const CALIBRATE_EXAMPLES: &str = "\
 Examples:
@@ -370,6 +372,15 @@ pub enum Command {
         #[arg(last = true, required = true)]
         program: Vec<String>,
     },
+    /// Write manual pages and completions for a package to this folder.
+    #[command(hide = true)]
+    Documents {
+        /// Where to.
+        folder: PathBuf,
+    },
+    /// Remove what runs whose supervisor was killed left in shared memory; a unit does so at its end.
+    #[command(hide = true)]
+    Sweep,
     /// Wait for the end of the program that set a network card up; not for use by hand.
     #[command(hide = true)]
     CardGuard(CardGuardArgs),

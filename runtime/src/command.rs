@@ -8,11 +8,11 @@ mod report_work;
 use std::collections::BTreeMap;
 use std::env;
 use std::fs;
-use std::io::IsTerminal;
+use std::io::{self, ErrorKind, IsTerminal};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use clap::Parser;
+use clap::{CommandFactory as _, Parser};
 use hil_gateways::transport::timestamping::TimestampCapabilities;
 use hil_models::case_study::ParameterError;
 use hil_models::layout::Field;
@@ -25,6 +25,7 @@ use crate::cli::{Cli, Command, RunArgs};
 use crate::compare::{self, cli::CompareArgs};
 use crate::console::Console;
 use crate::doctor::{self, ClockQuestion, DoctorRequest, StampCapabilities};
+use crate::documents;
 use crate::face;
 use crate::gateway;
 use crate::link::{self, cli::LinkCommand};
@@ -46,6 +47,8 @@ mod exit {
     pub(super) const USAGE: u8 = 2;
     pub(super) const PEER_ABSENT: u8 = 69;
     pub(super) const INTERNAL: u8 = 70;
+    pub(super) const TRY_AGAIN: u8 = 75;
+    pub(super) const FORBIDDEN: u8 = 77;
     pub(super) const HOST_UNFIT: u8 = 78;
 }
 
@@ -112,6 +115,14 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
         Command::Channel(args) => live_work::channel(args, registry, console),
         Command::Top(args) => live_work::top(&args, registry, console),
         Command::Probe(args) => probe::run(&args, console),
+        Command::Documents { folder } => code_of(
+            documents::write(Cli::command(), &folder).map(|_| ()),
+            console,
+        ),
+        Command::Sweep => {
+            supervisor::sweep();
+            exit::RAN
+        }
         Command::Cases => {
             console.result(&cases::list(registry));
             exit::RAN
@@ -172,7 +183,7 @@ fn load(
     match topology::load(path, overrides, registry.known()) {
         Ok(topology) => Some(topology),
         Err(errors) => {
-            console.rendered(&errors.render(std::io::stderr().is_terminal()));
+            console.faults(&errors.render(io::stderr().is_terminal()));
             None
         }
     }
@@ -210,6 +221,7 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
         command_line: env::args().collect(),
         layouts: layouts(&topology, registry),
     };
+    console.serve();
     match supervisor::run(&topology, &options, &signals, console) {
         Ok(result) => {
             let is_incomplete = result.has_gaps();
@@ -292,6 +304,14 @@ fn exit_code_of_error(error: &RunError) -> u8 {
         RunError::Peer(PeerError::Absent { .. } | PeerError::Connection { .. }) => {
             exit::PEER_ABSENT
         }
+        RunError::Folder { source, .. } if source.kind() == ErrorKind::PermissionDenied => {
+            exit::FORBIDDEN
+        }
+        RunError::Peer(PeerError::Listen { source, .. } | PeerError::Own { source, .. })
+            if is_passing(source) =>
+        {
+            exit::TRY_AGAIN
+        }
         RunError::Folder { .. }
         | RunError::Emulation(_)
         | RunError::Peer(
@@ -301,6 +321,14 @@ fn exit_code_of_error(error: &RunError) -> u8 {
         RunError::Start(_) => exit::FAILED,
         RunError::Domains(_) | RunError::Identity(_) => exit::INTERNAL,
     }
+}
+
+/// An address may be given to an interface later, as when a host starts; a port becomes free.
+fn is_passing(error: &io::Error) -> bool {
+    matches!(
+        error.kind(),
+        ErrorKind::AddrNotAvailable | ErrorKind::AddrInUse
+    )
 }
 
 fn interrupted() -> u8 {

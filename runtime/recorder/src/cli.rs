@@ -133,6 +133,10 @@ pub(crate) enum Command {
         /// Wait for a run to begin.
         #[arg(long)]
         wait: bool,
+        /// Of the runs that go on, know only those whose folders lie below this one, as those of one
+        /// unit of systemd do.
+        #[arg(long, value_name = "DIR")]
+        below: Option<PathBuf>,
         /// Leave out what the run recorded before; otherwise a recorder that comes late catches up.
         #[arg(long)]
         from_now: bool,
@@ -176,6 +180,12 @@ pub(crate) enum Command {
         /// As JSON, with every value in full.
         #[arg(long)]
         json: bool,
+    },
+    /// Write manual pages and completions for a package to this folder.
+    #[command(hide = true)]
+    Documents {
+        /// Where to.
+        folder: PathBuf,
     },
     /// Show a run in the browser and in viewers that speak the Foxglove WebSocket.
     #[command(after_help = SERVE_EXAMPLES)]

@@ -4,8 +4,9 @@ use std::fs;
 use std::path::Path;
 use std::process::ExitCode;
 
-use clap::Parser;
+use clap::{CommandFactory as _, Parser};
 use hil_runtime::console::Console;
+use hil_runtime::documents;
 use hil_runtime::progress::Progress;
 use hil_runtime::signals::{EXIT_INTERRUPTED, Signals};
 
@@ -60,6 +61,7 @@ fn work(command: Command, signals: &Signals, console: &mut Console) -> u8 {
             run,
             output,
             wait,
+            below,
             from_now,
             split_size,
             split_time,
@@ -72,6 +74,7 @@ fn work(command: Command, signals: &Signals, console: &mut Console) -> u8 {
                 run,
                 output,
                 waits: wait,
+                below,
                 from_now,
                 split: Split {
                     size_bytes: split_size,
@@ -94,6 +97,7 @@ fn work(command: Command, signals: &Signals, console: &mut Console) -> u8 {
                 .unwrap_or_else(|console| recover_file((&broken, &output), signals, console))
         }
         Command::Info { file, json } => show(&file, json, signals, console),
+        Command::Documents { folder } => write_documents(&folder, console),
         Command::Serve(options) => serve_run(&options, signals, console),
         Command::Play {
             file,
@@ -110,6 +114,16 @@ fn work(command: Command, signals: &Signals, console: &mut Console) -> u8 {
                 into,
             };
             play_file(&options, signals, console)
+        }
+    }
+}
+
+fn write_documents(folder: &Path, console: &mut Console) -> u8 {
+    match documents::write(Cli::command(), folder) {
+        Ok(_) => exit::DONE,
+        Err(error) => {
+            console.error(&format!("{}: {error}", folder.display()));
+            exit::FAILED
         }
     }
 }

@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 
 use hil_runtime::watch::{
     Event, Feed, FeedError, LiveRun, Poll, SelectError, Source, WatchedChannel, select,
+    select_below,
 };
 
 use crate::facts::{self, Words};
@@ -59,6 +60,8 @@ pub(crate) struct Request {
     pub(crate) output: PathBuf,
     /// Wait for a run to begin.
     pub(crate) waits: bool,
+    /// Know only runs whose folders lie below this one.
+    pub(crate) below: Option<PathBuf>,
     /// Leave out what is recorded already.
     pub(crate) from_now: bool,
     /// When to begin another file.
@@ -150,7 +153,12 @@ fn find(request: &Request, look: Look<'_>) -> Result<LiveRun, RecordError> {
         missed_count: 0,
     };
     loop {
-        match select(request.run.as_deref()) {
+        let wanted = request.run.as_deref();
+        let selected = match &request.below {
+            Some(below) => select_below(below, wanted),
+            None => select(wanted),
+        };
+        match selected {
             Ok(run) => return Ok(run),
             Err(SelectError::NoneRuns | SelectError::NoSuch { .. }) if request.waits => {}
             Err(error) => return Err(error.into()),

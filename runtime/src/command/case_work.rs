@@ -180,7 +180,7 @@ fn loaded(topology: Result<Topology, TopologyErrors>, console: &mut Console) -> 
     match topology {
         Ok(topology) => Some(topology),
         Err(errors) => {
-            console.rendered(&errors.render(std::io::stderr().is_terminal()));
+            console.faults(&errors.render(std::io::stderr().is_terminal()));
             None
         }
     }

@@ -25,6 +25,7 @@ use crate::channel::{RawInput, RawOutput, Waiter};
 use crate::clock::MonotonicClock;
 use crate::process::launch::{DirectionLaunch, Side};
 use crate::process::pipe::{DirectionReport, RunStart};
+use crate::process::pulse::Pulse;
 use crate::record::{RecordKind, RecordSink, Recorder};
 use crate::wait::{WaitMode, WaitStrategy};
 
@@ -45,6 +46,7 @@ pub struct Opened {
     sinks: Sinks,
     count: Arc<AtomicU64>,
     is_established: Arc<AtomicBool>,
+    pulse: Pulse,
     plan: StampPlan,
 }
 
@@ -52,6 +54,7 @@ pub struct Opened {
 #[derive(Debug)]
 pub struct Direction {
     way: Way,
+    pulse: Pulse,
     facts: Vec<(String, String)>,
     replay: Option<ReplayTally>,
 }
@@ -95,6 +98,7 @@ pub fn open_with<'a>(
             sinks,
             plan,
             count: Arc::default(),
+            pulse: Pulse::default(),
             // A receiver has nobody to wait for: it takes what comes.
             is_established: Arc::new(AtomicBool::new(launch.side == Side::Ingress)),
         },
@@ -138,6 +142,11 @@ impl Opened {
         self.socket.tally.clone()
     }
 
+    /// The turns of the thread that will carry the messages.
+    pub(crate) fn pulse(&self) -> Pulse {
+        self.pulse.clone()
+    }
+
     /// True while the peer takes this direction's messages.
     pub fn is_established(&self) -> Arc<AtomicBool> {
         Arc::clone(&self.is_established)
@@ -172,7 +181,12 @@ impl Opened {
                 (launch, surroundings),
             )?)),
         };
-        Ok(Direction { way, facts, replay })
+        Ok(Direction {
+            way,
+            pulse: self.pulse,
+            facts,
+            replay,
+        })
     }
 }
 
@@ -258,8 +272,8 @@ impl Direction {
     /// When the channel or the socket itself breaks, or the peer refuses the channel for good.
     pub fn run(&mut self) -> Result<(), GatewayError> {
         match &mut self.way {
-            Way::Egress(egress) => egress.run(),
-            Way::Ingress(ingress) => ingress.run(),
+            Way::Egress(egress) => egress.run(&self.pulse),
+            Way::Ingress(ingress) => ingress.run(&self.pulse),
         }
     }
 

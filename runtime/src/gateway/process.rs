@@ -22,6 +22,7 @@ use crate::process::launch::{DirectionLaunch, GatewayLaunch, Side, read};
 use crate::process::pipe::{
     ChannelProgress, DirectionReport, FromProcess, Orders, ProcessReport, say,
 };
+use crate::process::pulse::Pulses;
 use crate::process::usage::add_usage;
 use crate::radio::sampler::Sampler;
 use crate::realtime::{self, RealtimeGrant, SpinAdvice};
@@ -75,6 +76,7 @@ fn prepare_and_live(path: &Path) -> Result<(), GatewayError> {
         .map(|(launch, one)| counter(launch, one))
         .collect();
     let established: Vec<_> = opened.iter().map(|(_, one)| one.is_established()).collect();
+    let mut pulses = Pulses::of(opened.iter().map(|(_, one)| one.pulse()));
     let mut watched: Vec<_> = opened
         .iter()
         .filter_map(|(launch, one)| Some(Connection::new(launch, one.tally()?)))
@@ -97,7 +99,7 @@ fn prepare_and_live(path: &Path) -> Result<(), GatewayError> {
             launch: &launch,
         });
         let hops = (counters.as_slice(), established.as_slice());
-        let beside = (watched.as_mut_slice(), &mut control);
+        let beside = (watched.as_mut_slice(), &mut control, &mut pulses);
         watch(&orders, &threads, hops, (beside, patience));
     }
     surroundings.stop.store(true, Ordering::Release);
@@ -131,8 +133,8 @@ fn watch(
     orders: &Orders,
     threads: &[JoinHandle<Lived>],
     (counters, established): (&[Counter], &[Arc<AtomicBool>]),
-    ((connections, control), patience): (
-        (&mut [Connection], &mut LinkControl),
+    ((connections, control, pulses), patience): (
+        (&mut [Connection], &mut LinkControl, &mut Pulses),
         Option<Patience<'_>>,
     ),
 ) {
@@ -155,6 +157,7 @@ fn watch(
         if now.saturating_duration_since(told) >= PROGRESS_PERIOD {
             told = now;
             report_progress(counters);
+            say_if_alive(pulses);
         }
         if is_ready {
             for connection in &mut *connections {
@@ -175,6 +178,13 @@ fn counter(launch: &DirectionLaunch, opened: &Opened) -> Counter {
         Side::Ingress => "received",
     };
     (launch.channel.clone(), what, opened.count())
+}
+
+/// Says that the threads of this process turn, if they do.
+pub(crate) fn say_if_alive(pulses: &mut Pulses) {
+    if pulses.have_all_beaten() {
+        say(&FromProcess::Alive);
+    }
 }
 
 pub(crate) fn report_progress(counters: &[Counter]) {

@@ -14,6 +14,7 @@ use hil_models::message::{Envelope, MessageType};
 
 use super::launch::{ComponentLaunch, LaunchError, read};
 use super::pipe::{ChannelProgress, FromProcess, Orders, ProcessReport, say};
+use super::pulse::{Pulse, Pulses};
 use super::recording::{Destination, RecordedInput, RecordedOutput};
 use super::usage::add_usage;
 use crate::channel::{
@@ -96,7 +97,7 @@ fn prepare_and_live(path: &Path, registry: &Registry) -> Result<(), ComponentErr
     };
     let mut lived = Ok(());
     if orders.wait_for_start() {
-        let how = (launch.wait, counts.skipped.as_ref());
+        let how = (launch.wait, &counts);
         lived = live(endpoint, waiter.as_mut(), &orders, how, &mut report);
         progress.store(false, Ordering::Release);
     }
@@ -129,6 +130,7 @@ struct Counts {
     given: Vec<Count>,
     /// Ticks that passed without the role; [`NO_TIMER`] for one that has none.
     skipped: Arc<AtomicU64>,
+    pulse: Pulse,
 }
 
 /// How many messages of a channel went which way.
@@ -160,6 +162,7 @@ impl Counts {
             taken: card.inputs.iter().map(|one| count(one, "taken")).collect(),
             given: card.outputs.iter().map(given).collect(),
             skipped: Arc::new(AtomicU64::new(NO_TIMER)),
+            pulse: Pulse::default(),
         }
     }
 
@@ -179,6 +182,7 @@ impl Counts {
             })
             .collect();
         let skipped = Arc::clone(&self.skipped);
+        let mut pulses = Pulses::of([self.pulse.clone()]);
         let is_running = Arc::new(AtomicBool::new(true));
         let running = Arc::clone(&is_running);
         thread::Builder::new()
@@ -186,6 +190,9 @@ impl Counts {
             .spawn(move || {
                 while running.load(Ordering::Acquire) {
                     thread::sleep(PROGRESS_PERIOD);
+                    if pulses.have_all_beaten() {
+                        say(&FromProcess::Alive);
+                    }
                     let counts = all.iter().map(|(progress, count)| ChannelProgress {
                         count: count.load(Ordering::Relaxed),
                         ..progress.clone()
@@ -327,7 +334,7 @@ fn live(
     mut endpoint: ComponentEndpoint,
     mut waiter: Option<&mut Waiter>,
     orders: &Orders,
-    (mode, skipped): (WaitMode, &AtomicU64),
+    (mode, counts): (WaitMode, &Counts),
     report: &mut ProcessReport,
 ) -> Result<(), ChannelError> {
     let own_wait = WaitStrategy::new(mode);
@@ -336,7 +343,9 @@ fn live(
     while outcome.is_ok() && !orders.is_stopping() {
         let ticks = report.ticks;
         outcome = turn(&mut endpoint, &mut waiter, &own_wait, report);
+        counts.pulse.beat();
         if report.ticks != ticks {
+            let skipped = &counts.skipped;
             skipped.store(endpoint.role().skipped_ticks(), Ordering::Relaxed);
         }
     }

@@ -33,6 +33,8 @@ pub enum ToProcess {
 pub enum FromProcess {
     /// Everything is open; waiting for the start.
     Ready,
+    /// Every loop of the process has turned since it last said so: a few times a second.
+    Alive,
     /// Counts so far, a few times a second.
     Progress(Vec<ChannelProgress>),
     /// Grid points of the role's timer that passed without a tick so far; not of a role without one.
@@ -244,6 +246,7 @@ mod tests {
         };
         for message in [
             FromProcess::Ready,
+            FromProcess::Alive,
             FromProcess::Warning("spin on a shared CPU".to_owned()),
             FromProcess::Finished(Box::new(report)),
         ] {

@@ -15,6 +15,7 @@ use nix::sys::wait::{Id, WaitPidFlag, WaitStatus, waitid};
 use nix::unistd::Pid;
 
 use crate::process::pipe::{FromProcess, ToProcess};
+use crate::systemd;
 
 /// A word from a process: which one (index and instance), and what.
 pub(crate) type Word = (usize, u32, FromProcess);
@@ -170,10 +171,13 @@ impl Drop for Child {
 }
 
 /// A group of its own keeps the terminal's Ctrl-C away from the child, so that the supervisor
-/// ends it in order.
+/// ends it in order. To systemd the supervisor speaks alone.
 fn prepared(mut command: Command, log: &Path) -> io::Result<Command> {
     let log = File::options().create(true).append(true).open(log)?;
     command.stderr(log).process_group(0);
+    for variable in systemd::VARIABLES {
+        command.env_remove(variable);
+    }
     Ok(command)
 }
 

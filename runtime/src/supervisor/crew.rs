@@ -70,6 +70,8 @@ pub(crate) struct Member {
     pub(crate) skipped_tick_count: Option<u64>,
     pub(super) child: Option<Child>,
     pub(super) is_ready: bool,
+    /// When it last said that its loops turn, or was asked to begin.
+    pub(super) heard: Instant,
     seen_alive: Instant,
     complaint: Option<String>,
 }
@@ -105,6 +107,7 @@ impl Crew {
             skipped_tick_count: None,
             child: None,
             is_ready: false,
+            heard: Instant::ZERO,
             seen_alive: Instant::ZERO,
             complaint: None,
         });
@@ -195,6 +198,7 @@ impl Crew {
         self.started = Some(started);
         let at_ns = started.as_ns();
         for member in &mut self.members {
+            member.heard = started;
             if let Some(child) = &mut member.child {
                 child.order(ToProcess::Start { at_ns });
             }
@@ -303,8 +307,10 @@ impl Crew {
             }
             let member = &mut self.members[index];
             match word {
+                FromProcess::Alive => member.heard = now,
                 FromProcess::Ready => {
                     member.is_ready = true;
+                    member.heard = now;
                     if let Some(started) = self.started
                         && instance > 0
                     {
@@ -338,7 +344,7 @@ impl Crew {
         }
     }
 
-    fn note(
+    pub(super) fn note(
         &mut self,
         at: Instant,
         index: usize,

@@ -8,6 +8,7 @@ pub(crate) mod domains;
 pub mod event;
 pub(crate) mod exchange;
 pub(crate) mod frame;
+mod heartbeat;
 pub(crate) mod meet;
 mod outcome;
 pub(crate) mod peer;
@@ -16,7 +17,7 @@ mod progress_line;
 mod session;
 mod teller;
 
-pub use domains::DomainsError;
+pub use domains::{DomainsError, sweep};
 pub use meet::PeerError;
 pub use outcome::{Outcome, RunError, RunOptions, RunResult};
 pub(crate) use plan::domain_base_candidates;

@@ -37,7 +37,7 @@ pub struct RunOptions {
 #[derive(Debug, thiserror::Error)]
 pub enum RunError {
     /// The run folder cannot be written.
-    #[error("run folder below {folder}: {source}")]
+    #[error("no run folder can be made below {folder}: {source}; run.record names another place")]
     Folder {
         /// Parent folder.
         folder: PathBuf,

@@ -180,6 +180,7 @@ fn gather_peers(
         console.progress(&format!(
             "waiting for {missing} {role} {address} ({waited_s} s)"
         ));
+        console.announce_up();
         signals.received().is_none()
     })?;
     let names: Vec<&str> = peers.iter().map(|peer| peer.hello.host.as_str()).collect();
@@ -365,7 +366,7 @@ impl Session<'_> {
     }
 
     fn tell(&mut self, phase: Phase) {
-        let run = (self.topology, &self.crew);
+        let run = (self.topology, &mut self.crew);
         self.teller.tell(phase, run, self.console);
     }
 

@@ -33,6 +33,7 @@ impl Recording {
             run: Some(run.to_owned()),
             output: path.to_owned(),
             waits: false,
+            below: None,
             from_now: false,
             split: Split::default(),
             flush: FLUSH,
