@@ -115,14 +115,8 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
         Command::Channel(args) => live_work::channel(args, registry, console),
         Command::Top(args) => live_work::top(&args, registry, console),
         Command::Probe(args) => probe::run(&args, console),
-        Command::Documents { folder } => code_of(
-            documents::write(Cli::command(), &folder).map(|_| ()),
-            console,
-        ),
-        Command::Sweep => {
-            supervisor::sweep();
-            exit::RAN
-        }
+        Command::Documents { folder } => write_documents(&folder, console),
+        Command::Sweep => sweep(),
         Command::Cases => {
             console.result(&cases::list(registry));
             exit::RAN
@@ -138,6 +132,15 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
             console,
         ),
     }
+}
+
+fn write_documents(folder: &Path, console: &mut Console) -> u8 {
+    code_of(documents::write(Cli::command(), folder).map(drop), console)
+}
+
+fn sweep() -> u8 {
+    supervisor::sweep();
+    exit::RAN
 }
 
 fn compare(args: &CompareArgs, console: &mut Console) -> u8 {

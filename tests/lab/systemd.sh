@@ -186,8 +186,9 @@ is_recorded() {
     lab_until 20 is "$1" hil-recorder@split ActiveState inactive || return 1
     is "$1" hil-recorder@split Result success || return 1
     file=$(pc "$1" sh -c "ls $STATE/split/recordings/*.mcap | tail -n 1")
-    pc "$1" hil-recorder info "$file" >"$PC_WORK/$1/recording.txt" || return 1
-    echo "$file, $(pc "$1" stat --format %s "$file") bytes"
+    pc "$1" hil-recorder info "$file" | sed -n 1,2p || return 1
+    pc "$1" journalctl --boot --output=cat --unit hil-recorder@split.service |
+        grep -o '[0-9]* messages of the run, .*'
 }
 
 # --- what it survives ------------------------------------------------------------------------------
@@ -265,6 +266,14 @@ foreign_folder_is_refused() {
         status=$?
     echo "exit code $status, ${words##*error: }"
     [[ $status -eq 77 && $words == *"$STATE"* ]]
+}
+
+upgrade_leaves_the_run_alone() {
+    local before
+    before=$(property "$1" hil-runtime@long MainPID)
+    pc "$1" apt-get --quiet --quiet --yes --reinstall install /root/hil-runtime.deb \
+        >"$PC_WORK/$1/upgrade.txt" 2>&1 || { tail -n 5 "$PC_WORK/$1/upgrade.txt"; return 1; }
+    [[ $before -gt 0 && $(property "$1" hil-runtime@long MainPID) == "$before" ]] && runs long "$1"
 }
 
 purge() {
@@ -350,6 +359,7 @@ ends() {
     check "control-pc: a folder of another user is refused" foreign_folder_is_refused control-pc
     for name in "${PCS[@]}"; do pc "$name" systemctl start hil-runtime@long.service; done
     check "a run goes on both" within 60 both runs long
+    check "control-pc: an upgrade leaves it alone" upgrade_leaves_the_run_alone control-pc
     for name in "${PCS[@]}"; do check "$name: purge in the middle of it leaves nothing" purge "$name"; done
 }
 

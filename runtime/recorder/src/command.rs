@@ -76,10 +76,7 @@ fn work(command: Command, signals: &Signals, console: &mut Console) -> u8 {
                 waits: wait,
                 below,
                 from_now,
-                split: Split {
-                    size_bytes: split_size,
-                    time: split_time,
-                },
+                split: Split::at(split_size, split_time),
                 flush,
                 force,
                 priority,

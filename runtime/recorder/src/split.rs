@@ -25,6 +25,11 @@ pub(crate) struct Split {
 }
 
 impl Split {
+    /// Above this size in bytes or after this time, whichever comes first.
+    pub(crate) const fn at(size_bytes: Option<u64>, time: Option<Duration>) -> Self {
+        Self { size_bytes, time }
+    }
+
     const fn is_any(&self) -> bool {
         self.size_bytes.is_some() || self.time.is_some()
     }
