@@ -87,9 +87,11 @@ fn systemd_hears_that_a_run_is_up_how_it_goes_and_that_it_ends() {
     assert_eq!(manager.count("READY=1"), 1, "{:?}", manager.words);
     assert_eq!(manager.count("STOPPING=1"), 1, "{:?}", manager.words);
     assert!(manager.count("WATCHDOG=1") > 2, "{:?}", manager.words);
-    let progress = manager.words.iter().find(|word| word.contains("/ 3 s"));
-    let progress = progress.unwrap_or_else(|| panic!("{:?}", manager.words));
-    assert!(progress.contains("shuttle/command"), "{progress}");
+    let has_progress = manager
+        .words
+        .iter()
+        .any(|word| word.contains("/ 3 s") && word.contains("shuttle/command"));
+    assert!(has_progress, "{:?}", manager.words);
     assert!(manager.place("READY=1") < manager.place("STOPPING=1"));
     assert!(manager.place("STOPPING=1") < manager.place("STATUS=ending"));
 }
