@@ -133,6 +133,7 @@ impl<const N: usize> Contest<N> {
         let one_round_s = TURN.as_secs_f64() * N as f64 + self.extra.as_secs_f64();
         let span_s = (one_round_s * arguments.round_count as f64 + 10.0).ceil();
         let mut trial = Trial::shipped("shuttle-split.toml", record.path())
+            .plain()
             .set(&format!("run.duration=\"{span_s} s\""))
             .set(&format!("case.parameters.rate_hz={:?}", arguments.rate_hz));
         for setting in &arguments.settings {

@@ -10,6 +10,7 @@ use crate::link::cli::LinkCommand;
 use crate::live::cli::{ChannelArgs, TopArgs};
 use crate::probe::arguments::ProbeArgs;
 use crate::report::page::Format;
+use crate::security::cli::KeyCommand;
 use crate::trace::cli::TraceCommand;
 
 const EXAMPLES: &str = "\
@@ -34,11 +35,12 @@ Examples:
       run its robot again in virtual time and compare every message
 
 Exit codes:
-  0  the run ended as planned         70  internal error
-  1  the run failed, its report has   78  doctor --strict: host not fit
-     gaps, or a replay differs        130 interrupted; the report is
-  2  wrong arguments or topology          complete
-  69 a peer host was not reachable    131 interrupted twice: no report";
+  0  the run ended as planned         77  the key cannot be used, or
+  1  the run failed, its report has       another host has another one
+     gaps, or a replay differs        78  doctor --strict: host not fit
+  2  wrong arguments or topology      130 interrupted; the report is
+  69 a peer host was not reachable        complete
+  70 internal error                   131 interrupted twice: no report";
 
 const CALIBRATE_EXAMPLES: &str = "\
 Examples:
@@ -314,6 +316,15 @@ pub enum Command {
     Channel(ChannelArgs),
     /// Look at a run while it goes: processes, channels, links, clocks.
     Top(TopArgs),
+    /// Make or check the key file that keeps strangers out of a run between two hosts.
+    #[command(
+        after_help = "Examples:\n  sudo hil-runtime key new /etc/hil-runtime/hop.key\n  sudo hil-runtime key check /etc/hil-runtime/hop.key   # the fingerprint, equal on all hosts"
+    )]
+    Key {
+        /// What to do with it.
+        #[command(subcommand)]
+        command: KeyCommand,
+    },
     /// Say what this host can measure and what to change.
     #[command(
         after_help = "Examples:\n  hil-runtime doctor --strict   # exit code 78 when something must be fixed\n  hil-runtime doctor --topology deploy/topologies/split.toml   # its clock path as well"

@@ -34,6 +34,7 @@ use crate::process::{component, own_program};
 use crate::progress::Progress;
 use crate::registry::Registry;
 use crate::report::terminal::{self, Style};
+use crate::security::cli::KeyCommand;
 use crate::signals::{EXIT_INTERRUPTED, Signals};
 use crate::supervisor::{self, Outcome, PeerError, RunError, RunOptions, RunResult};
 use crate::topology::{self, HOST_VARIABLE, HostChoice, MachineIdentity, Topology, which_host};
@@ -46,6 +47,7 @@ mod exit {
     pub(super) const USAGE: u8 = 2;
     pub(super) const PEER_ABSENT: u8 = 69;
     pub(super) const INTERNAL: u8 = 70;
+    pub(super) const NO_KEY: u8 = 77;
     pub(super) const HOST_UNFIT: u8 = 78;
 }
 
@@ -112,6 +114,7 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
         Command::Channel(args) => live_work::channel(args, registry, console),
         Command::Top(args) => live_work::top(&args, registry, console),
         Command::Probe(args) => probe::run(&args, console),
+        Command::Key { command } => key(&command, console),
         Command::Cases => {
             console.result(&cases::list(registry));
             exit::RAN
@@ -134,6 +137,19 @@ fn compare(args: &CompareArgs, console: &mut Console) -> u8 {
         compare::work::End::Passed => exit::RAN,
         compare::work::End::Failed => exit::FAILED,
         compare::work::End::Refused => exit::USAGE,
+    }
+}
+
+fn key(command: &KeyCommand, console: &mut Console) -> u8 {
+    match command.work() {
+        Ok(text) => {
+            console.result(&text);
+            exit::RAN
+        }
+        Err(error) => {
+            console.error(&error.to_string());
+            exit::USAGE
+        }
     }
 }
 
@@ -261,6 +277,10 @@ fn show_check(path: &Path, topology: &Topology, console: &mut Console) -> u8 {
         ));
         return exit::USAGE;
     }
+    if let Some(text) = topology.unsaid_security() {
+        console.error(&format!("{}: {text}", path.display()));
+        return exit::USAGE;
+    }
     // As comments, so that what is printed is a topology as a whole.
     let clock_paths = topology.clock_paths().map(|clock| {
         let (asking, answering) = (clock.asking.port(), clock.answering.port());
@@ -289,17 +309,18 @@ fn complaint(result: &RunResult) -> String {
 /// For a run that did not come about.
 fn exit_code_of_error(error: &RunError) -> u8 {
     match error {
-        RunError::Peer(PeerError::Absent { .. } | PeerError::Connection { .. }) => {
-            exit::PEER_ABSENT
-        }
+        RunError::Peer(PeerError::Absent { .. } | PeerError::Connection { .. })
+        | RunError::SecretMissing(_) => exit::PEER_ABSENT,
+        RunError::Peer(PeerError::Key { .. }) | RunError::Key(_) => exit::NO_KEY,
         RunError::Folder { .. }
+        | RunError::SecurityUnsaid(_)
         | RunError::Emulation(_)
         | RunError::Peer(
             PeerError::Mismatch { .. } | PeerError::Listen { .. } | PeerError::Own { .. },
         ) => exit::USAGE,
         RunError::Peer(PeerError::Interrupted { .. }) => interrupted(),
         RunError::Start(_) => exit::FAILED,
-        RunError::Domains(_) | RunError::Identity(_) => exit::INTERNAL,
+        RunError::Domains(_) | RunError::Identity(_) | RunError::Random(_) => exit::INTERNAL,
     }
 }
 

@@ -18,7 +18,8 @@
 //! 3. [`channel`]: shared memory between them; [`mod@record`]: the notes they keep.
 //! 4. [`report`]: from the notes to what a person reads.
 //! 5. [`watch`]: looking on while a run goes; [`link`]: changing its emulated links.
-//! 6. [`realtime`], [`clock`], [`wait`], [`host_facts`], [`doctor`]: the machine.
+//! 6. [`security`]: the key that keeps strangers out of a run between two hosts.
+//! 7. [`realtime`], [`clock`], [`wait`], [`host_facts`], [`doctor`]: the machine.
 
 mod analysis;
 pub mod card_clock;
@@ -48,6 +49,7 @@ pub mod registry;
 mod replay;
 pub mod report;
 pub mod run_folder;
+pub mod security;
 mod series;
 pub mod signals;
 mod simulate;

@@ -4,6 +4,7 @@
 
 pub mod account;
 pub mod arms;
+pub mod attacker;
 pub mod binary;
 pub mod browser;
 pub mod child;

@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 
 use hil_runtime::channel::DomainAddress;
 use hil_runtime::report::summary::RunSummary;
+use hil_runtime::security::PreSharedKey;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use serde_json::Value;
@@ -38,11 +39,18 @@ impl Trial {
     /// Any topology file.
     pub fn of(topology: &Path, record: &Path) -> Self {
         let record_setting = format!("run.record=\"{}\"", record.display());
+        let key_setting = format!("security.key=\"{}\"", hop_key(record).display());
         Self {
             topology: topology.to_owned(),
-            settings: vec![record_setting],
+            settings: vec![record_setting, key_setting],
             record: record.to_owned(),
         }
+    }
+
+    /// The same with hops that anyone on the wire can read.
+    #[must_use]
+    pub fn plain(self) -> Self {
+        self.set("security.hops=\"plain\"")
     }
 
     /// The same with one value changed, e.g. `run.duration="5 s"`.
@@ -105,6 +113,23 @@ impl Trial {
             root: found.remove(0),
         }
     }
+}
+
+/// The key of every run between two hosts that records into `record`.
+///
+/// # Panics
+/// When it cannot be made.
+pub fn hop_key(record: &Path) -> PathBuf {
+    let path = record.join(".hop.key");
+    if !path.exists() {
+        let made = fs::create_dir_all(record)
+            .map_err(|error| error.to_string())
+            .and_then(|()| PreSharedKey::create(&path).map_err(|error| error.to_string()));
+        if let Err(error) = made {
+            panic!("no key for the test's hops: {error}");
+        }
+    }
+    path
 }
 
 /// The path of a topology that ships with the workspace.

@@ -21,7 +21,7 @@ const BUFFER_BYTES: usize = u16::MAX as usize + TAG_BYTES;
 /// Refused datagrams that one call passes over at most, so that a flood of them cannot keep the
 /// thread from its other work.
 const RECEIVE_ATTEMPT_COUNT_MAX: usize = 16;
-/// Bytes of the longest greeting that waits for keys; a longer one is said again by its bridge.
+/// Bytes of the longest greeting there is: its header, 40 bytes and two names of 255.
 const GREETING_BYTES_MAX: usize = 1024;
 
 /// The sending end.
@@ -47,16 +47,17 @@ impl<S: DatagramSender> SealedSender<S> {
         }
     }
 
-    /// Keeps a greeting that has no keys yet; they come within a round trip.
-    fn keep_greeting(&mut self, datagram: &[u8]) {
-        self.greeting_bytes = 0;
-        if datagram.get(5) == Some(&(Kind::Hello as u8)) && datagram.len() <= GREETING_BYTES_MAX {
-            self.greeting[..datagram.len()].copy_from_slice(datagram);
-            self.greeting_bytes = datagram.len();
+    /// Keeps a greeting until keys are answered for, within a round trip; false for anything else.
+    fn keep_greeting(&mut self, datagram: &[u8]) -> bool {
+        if datagram[5] != Kind::Hello as u8 || datagram.len() > GREETING_BYTES_MAX {
+            return false;
         }
+        self.greeting[..datagram.len()].copy_from_slice(datagram);
+        self.greeting_bytes = datagram.len();
+        true
     }
 
-    /// Says the greeting that waited for keys. If it cannot leave, its bridge says it again.
+    /// Says the greeting that waited. If it cannot leave, its bridge says it again.
     fn send_greeting(&mut self) {
         let greeting = &self.greeting[..core::mem::take(&mut self.greeting_bytes)];
         if greeting.is_empty() {
@@ -72,8 +73,9 @@ impl<S: DatagramSender> DatagramSender for SealedSender<S> {
     fn send(&mut self, datagram: &[u8]) -> Result<TxToken, SendRefusal> {
         if let Some(request) = self.seal.request_before(datagram) {
             let sent = self.inner.send(&request);
-            self.keep_greeting(datagram);
-            if !self.seal.has_keys() {
+            // A greeting waits for the answer, so that it goes under keys that the peer has: one that
+            // started anew would refuse it.
+            if self.keep_greeting(datagram) {
                 return sent;
             }
         }
@@ -103,8 +105,8 @@ impl<S: DatagramSender> DatagramSender for SealedSender<S> {
                         ..received
                     }));
                 }
-                Ok(Heard::Keys) => self.send_greeting(),
-                Ok(Heard::Nothing) | Err(_) => {}
+                Ok(Heard::Keys | Heard::Nothing) => self.send_greeting(),
+                Err(_counted) => {}
             }
         }
         Ok(None)

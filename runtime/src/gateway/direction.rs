@@ -26,6 +26,7 @@ use crate::clock::MonotonicClock;
 use crate::process::launch::{DirectionLaunch, Side};
 use crate::process::pipe::{DirectionReport, RunStart};
 use crate::record::{RecordKind, RecordSink, Recorder};
+use crate::security::RunSeal;
 use crate::wait::{WaitMode, WaitStrategy};
 
 /// Records a ring holds.
@@ -73,10 +74,10 @@ pub fn open<'a>(
     start: &RunStart,
 ) -> Result<(&'a DirectionLaunch, Opened), GatewayError> {
     let plan = StampPlan::asked(stamps_of(&launch.socket));
-    open_with(launch, recorder, start, plan)
+    open_with(launch, recorder, start, (plan, None))
 }
 
-/// As [`open`], with what a probe found of the interface.
+/// As [`open`], with what a probe found of the interface, and sealed when the run's hops are.
 ///
 /// # Errors
 /// As [`open`].
@@ -84,10 +85,10 @@ pub fn open_with<'a>(
     launch: &'a DirectionLaunch,
     recorder: &mut Recorder,
     start: &RunStart,
-    plan: StampPlan,
+    (plan, seal): (StampPlan, Option<&RunSeal>),
 ) -> Result<(&'a DirectionLaunch, Opened), GatewayError> {
     let sinks = open_sinks(launch, recorder)?;
-    let socket = OpenSocket::open(launch, start, plan)?;
+    let socket = OpenSocket::open(launch, start, (plan, seal))?;
     Ok((
         launch,
         Opened {
@@ -288,18 +289,24 @@ impl Direction {
     /// Every counter of the direction.
     pub fn report(&self, launch: &DirectionLaunch) -> DirectionReport {
         let now = MonotonicClock::now();
-        let (direction, peer_state, mut counters, stream) = match &self.way {
+        let (direction, peer_state, mut counters, (stream, seal)) = match &self.way {
             Way::Egress(egress) => (
                 "egress",
                 counters::egress_state(egress),
                 counters::of_egress(egress),
-                egress.line.sender().stream_figures(now),
+                (
+                    egress.line.sender().stream_figures(now),
+                    egress.line.sender().seal_counts(),
+                ),
             ),
             Way::Ingress(ingress) => (
                 "ingress",
                 counters::ingress_state(ingress),
                 counters::of_ingress(ingress),
-                ingress.receiver.stream_figures(now),
+                (
+                    ingress.receiver.stream_figures(now),
+                    ingress.receiver.seal_counts(),
+                ),
             ),
         };
         let mut facts = self.facts.clone();
@@ -309,6 +316,7 @@ impl Direction {
             let counters = ingress.receiver.counters();
             facts.extend(counters::mark_fact(launch.socket.dscp, &counters));
         }
+        counters.extend(seal.iter().flat_map(counters::of_seal));
         if let Some(figures) = stream {
             counters.extend(stream::counters(&figures));
             facts.extend(stream::facts(&figures, launch.side));

@@ -76,6 +76,9 @@ pub enum GatewayError {
     /// No thread.
     #[error("cannot start a thread: {0}")]
     Thread(io::Error),
+    /// The run's secret, without which its hops are not opened.
+    #[error("the supervisor did not give the run's secret")]
+    SecretMissing,
     /// No random session number.
     #[error("cannot choose a session number: {0}")]
     Session(io::Error),

@@ -31,6 +31,8 @@ use crate::wait::WaitMode;
 const PROGRESS_PERIOD: Duration = Duration::from_millis(250);
 /// How often orders and threads are looked at.
 const WATCH_PERIOD: Duration = Duration::from_millis(5);
+/// How long the run's secret may take, which the supervisor writes as soon as the process is there.
+const SEAL_PATIENCE: Duration = Duration::from_secs(5);
 /// How long each half of the stamp probe may take; a restart must not wait long for it.
 pub(crate) const PROBE_BOUND: Duration = Duration::from_millis(300);
 
@@ -49,6 +51,13 @@ pub(crate) fn run(launch: &Path) -> Result<(), GatewayError> {
 fn prepare_and_live(path: &Path) -> Result<(), GatewayError> {
     let orders = Orders::listen().map_err(GatewayError::Thread)?;
     let launch: GatewayLaunch = read(path)?;
+    let seal = launch
+        .is_sealed
+        .then(|| orders.wait_for_seal(SEAL_PATIENCE));
+    if matches!(seal, Some(None)) {
+        return Err(GatewayError::SecretMissing);
+    }
+    let seal = seal.flatten();
     let domain = Domain::open(&launch.domain.parse()?)?;
     let surroundings = Arc::new(Surroundings::new(domain)?);
     let mut armed = arming::arm(&launch);
@@ -60,7 +69,7 @@ fn prepare_and_live(path: &Path) -> Result<(), GatewayError> {
             direction,
             &mut recorder,
             &orders.run_start(),
-            armed.plan(direction),
+            (armed.plan(direction), seal.as_ref()),
         )?);
     }
     let sampler = armed.prepare_sampler(&launch.process, &mut recorder);

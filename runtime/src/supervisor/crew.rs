@@ -21,6 +21,7 @@ use crate::process::launch::{ComponentLaunch, GatewayLaunch, LaunchError, write}
 use crate::process::own_program;
 use crate::process::pipe::{ChannelProgress, FromProcess, ProcessReport, ToProcess};
 use crate::run_folder::RunFolder;
+use crate::security::RunSeal;
 use crate::topology::OnExit;
 
 /// Words that may wait for the supervisor.
@@ -81,6 +82,8 @@ pub(crate) struct Crew {
     places: BTreeMap<String, String>,
     folder: RunFolder,
     own_program: PathBuf,
+    /// The run's secret, for its gateways; `None` when its hops are plain.
+    seal: Option<RunSeal>,
     sender: SyncSender<Word>,
     words: Receiver<Word>,
     /// When the run began.
@@ -94,6 +97,7 @@ impl Crew {
         plans: Vec<ProcessPlan>,
         places: BTreeMap<String, String>,
         folder: &RunFolder,
+        seal: Option<RunSeal>,
     ) -> Result<Self, CrewError> {
         let (sender, words) = sync_channel(WORDS_MAX);
         let members = plans.into_iter().map(|plan| Member {
@@ -112,6 +116,7 @@ impl Crew {
             members: members.collect(),
             places,
             folder: folder.clone(),
+            seal,
             own_program: env::current_exe().map_err(CrewError::OwnPath)?,
             sender,
             words,
@@ -153,18 +158,22 @@ impl Crew {
             Child::spawn_foreign(program, &log).map_err(|error| (command[0].clone(), error))
         } else {
             let launch = self.folder.launch(&name, instance);
-            let word = write_launch(member, &self.folder, &launch, domain)?;
+            let is_sealed = self.seal.is_some();
+            let word = write_launch(member, (&self.folder, is_sealed), &launch, domain)?;
             let mut program = Command::new(&self.own_program);
             program.arg(word).arg("--launch").arg(&launch);
             member.is_ready = false;
             Child::spawn_speaking(program, &log, (index, instance), self.sender.clone())
                 .map_err(|error| (self.own_program.display().to_string(), error))
         };
-        let child = spawned.map_err(|(program, source)| CrewError::Spawn {
+        let mut child = spawned.map_err(|(program, source)| CrewError::Spawn {
             process: name,
             program,
             source,
         })?;
+        if let Some(seal) = self.seal.as_ref().filter(|_| member.plan.is_gateway()) {
+            child.order(&ToProcess::Seal(seal.clone()));
+        }
         let now = MonotonicClock::now();
         member.child = Some(child);
         member.seen_alive = now;
@@ -196,7 +205,7 @@ impl Crew {
         let at_ns = started.as_ns();
         for member in &mut self.members {
             if let Some(child) = &mut member.child {
-                child.order(ToProcess::Start { at_ns });
+                child.order(&ToProcess::Start { at_ns });
             }
         }
     }
@@ -310,7 +319,7 @@ impl Crew {
                     {
                         let at_ns = started.as_ns();
                         if let Some(child) = &mut member.child {
-                            child.order(ToProcess::Start { at_ns });
+                            child.order(&ToProcess::Start { at_ns });
                         }
                         self.close_interruptions(index, now);
                     }
@@ -364,7 +373,7 @@ impl Crew {
         for index in &chosen {
             let member = &mut self.members[*index];
             if let Some(child) = &mut member.child {
-                child.order(ToProcess::Stop);
+                child.order(&ToProcess::Stop);
             }
         }
         let deadline = std::time::Instant::now() + patience;
@@ -432,7 +441,7 @@ pub(crate) fn find_programs(plans: &[ProcessPlan]) -> Result<(), CrewError> {
 
 fn write_launch(
     member: &Member,
-    folder: &RunFolder,
+    (folder, is_sealed): (&RunFolder, bool),
     path: &Path,
     domain: String,
 ) -> Result<&'static str, LaunchError> {
@@ -466,6 +475,7 @@ fn write_launch(
                 records: folder.records(),
                 directions: directions.clone(),
                 ready_within,
+                is_sealed,
             };
             write(path, &launch)?;
             Ok("gateway")

@@ -4,8 +4,10 @@
 use std::io::{self, Read, Write};
 
 use serde::{Deserialize, Serialize};
+use zeroize::Zeroizing;
 
 use super::event::HostStory;
+use crate::security::RunSeal;
 
 /// Largest frame either side accepts; a longer length field is an error, not an allocation.
 pub(crate) const FRAME_BYTES_MAX: usize = 1 << 20;
@@ -25,6 +27,8 @@ pub(crate) struct PeerHello {
     pub clock_id: u64,
     /// Fingerprint of the host's shared-memory domain; must differ.
     pub domain: [u8; 16],
+    /// Its processor has instructions for AES.
+    pub has_fast_aes: bool,
 }
 
 /// What supervisors tell each other.
@@ -35,6 +39,8 @@ pub(crate) enum PeerMessage {
     Hello(PeerHello),
     /// The other end does not fit, and why; the last frame.
     Refused(String),
+    /// The run's secret; from the first host, over a secured connection only.
+    Seal(RunSeal),
     /// Every process of this host is ready.
     Ready,
     /// Begin.
@@ -95,7 +101,9 @@ const KIND_CHUNK: u8 = 1;
 /// # Errors
 /// When the connection fails, or the message is longer than a frame may be.
 pub(crate) fn write_message(out: &mut impl Write, message: &PeerMessage) -> io::Result<()> {
-    write_frame(out, KIND_MESSAGE, &serde_json::to_vec(message)?)
+    // It may hold the run's secret.
+    let body = Zeroizing::new(serde_json::to_vec(message)?);
+    write_frame(out, KIND_MESSAGE, &body)
 }
 
 /// Writes one piece of a file.
@@ -124,19 +132,26 @@ fn write_frame(out: &mut impl Write, kind: u8, body: &[u8]) -> io::Result<()> {
 /// # Errors
 /// When the connection ends or says something that is not a frame.
 pub(crate) fn read_frame(input: &mut impl Read) -> io::Result<Frame> {
+    read_frame_within(input, FRAME_BYTES_MAX)
+}
+
+/// As [`read_frame`], of at most `bytes_max`: what a stranger may announce.
+///
+/// # Errors
+/// As [`read_frame`].
+pub(crate) fn read_frame_within(input: &mut impl Read, bytes_max: usize) -> io::Result<Frame> {
     let mut head = [0; 5];
     input.read_exact(&mut head)?;
     let length = u32::from_le_bytes([head[0], head[1], head[2], head[3]]) as usize;
-    if length > FRAME_BYTES_MAX {
-        let text =
-            format!("the peer announced a frame of {length} bytes, {FRAME_BYTES_MAX} is most");
+    if length > bytes_max {
+        let text = format!("the peer announced a frame of {length} bytes, {bytes_max} is most");
         return Err(io::Error::new(io::ErrorKind::InvalidData, text));
     }
-    let mut body = vec![0; length];
+    let mut body = Zeroizing::new(vec![0_u8; length]);
     input.read_exact(&mut body)?;
     match head[4] {
         KIND_MESSAGE => Ok(Frame::Message(serde_json::from_slice(&body)?)),
-        KIND_CHUNK => Ok(Frame::Chunk(body)),
+        KIND_CHUNK => Ok(Frame::Chunk(core::mem::take(&mut *body))),
         kind => {
             let text = format!("the peer sent a frame of unknown kind {kind}");
             Err(io::Error::new(io::ErrorKind::InvalidData, text))

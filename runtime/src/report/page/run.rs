@@ -158,7 +158,7 @@ fn live_facts(summary: &RunSummary) -> Vec<FactGroup> {
         .collect();
     hosts.sort_unstable();
     hosts.dedup();
-    let facts = vec![
+    let mut facts = vec![
         Fact::new("started", &run.started),
         Fact::new("length", seconds(run.duration_s)),
         Fact::new(
@@ -177,6 +177,8 @@ fn live_facts(summary: &RunSummary) -> Vec<FactGroup> {
         Fact::new("seed", run.seed.to_string()),
         Fact::new("folder", &run.folder),
     ];
+    let security = run.security.iter();
+    facts.extend(security.map(|text| Fact::new("hops between hosts", text)));
     let group = |title: &str, facts: Vec<Fact>| FactGroup {
         title: title.to_owned(),
         facts,
