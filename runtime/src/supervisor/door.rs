@@ -4,6 +4,8 @@
 
 use std::io::{self, BufReader, BufWriter, Read, Write};
 use std::net::{IpAddr, Shutdown, SocketAddr, TcpListener, TcpStream};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::thread;
 use std::time::{Duration, Instant};
@@ -58,6 +60,14 @@ struct HalfOpen {
     ip: IpAddr,
     stream: TcpStream,
     thread: thread::JoinHandle<()>,
+    /// It said who it is: from then on the connection is somebody else's to end.
+    is_known: Arc<AtomicBool>,
+}
+
+impl HalfOpen {
+    fn is_unknown(&self) -> bool {
+        !self.thread.is_finished() && !self.is_known.load(Ordering::Acquire)
+    }
 }
 
 /// The listener and the connections that have not said who they are.
@@ -96,7 +106,7 @@ impl Door {
                 Err(error) => return Err(error),
             }
         }
-        self.half_open.retain(|one| !one.thread.is_finished());
+        self.half_open.retain(HalfOpen::is_unknown);
         Ok(self.arrived.try_recv().ok())
     }
 
@@ -110,7 +120,7 @@ impl Door {
         let Some(handle) = stream.try_clone().ok().filter(|_| is_expected) else {
             return;
         };
-        self.half_open.retain(|one| !one.thread.is_finished());
+        self.half_open.retain(HalfOpen::is_unknown);
         let same = |one: &HalfOpen| one.ip == ip;
         if self.half_open.iter().filter(|one| same(one)).count() >= HALF_OPEN_MAX
             && let Some(oldest) = self.half_open.iter().position(same)
@@ -120,8 +130,11 @@ impl Door {
             let _gone = oldest.stream.shutdown(Shutdown::Both).is_err();
         }
         let (admission, sender) = (self.admission.clone(), self.sender.clone());
+        let is_known = Arc::new(AtomicBool::new(false));
+        let known = Arc::clone(&is_known);
         let greet = move || {
             let arrived = greet(stream, ip, &admission).unwrap_or(Arrived::Nobody);
+            known.store(matches!(arrived, Arrived::Peer(..)), Ordering::Release);
             // Nobody listens once all hosts are here.
             let _late = sender.send(arrived).is_err();
         };
@@ -131,6 +144,7 @@ impl Door {
                 ip,
                 stream: handle,
                 thread,
+                is_known,
             });
         }
     }
@@ -140,7 +154,7 @@ impl Drop for Door {
     /// Ends the connections that nobody waits for any more, so that their threads end.
     fn drop(&mut self) {
         for one in &self.half_open {
-            if !one.thread.is_finished() {
+            if one.is_unknown() {
                 let _gone = one.stream.shutdown(Shutdown::Both).is_err();
             }
         }

@@ -74,12 +74,8 @@ pub fn run(
     let run = folder.root().to_string_lossy();
     let domains = Domains::create(&plan.hosts, options.domain_root.as_ref(), &run)?;
     console.say(&format!("run folder {}", folder.root().display()));
-    let gathered = gather(
-        (topology, key.as_ref()),
-        &hosts,
-        &domains,
-        (signals, console),
-    )?;
+    let meant = (topology, key.as_ref());
+    let gathered = gather(meant, &hosts, &domains, (signals, console))?;
     let peers = gathered.peers;
     let here = clock_id()?;
     let crew = Crew::new(plan.processes, domains.addresses(), &folder, gathered.seal)?;
@@ -98,10 +94,7 @@ pub fn run(
         topology,
         announcement,
         cards,
-        is_first_host: topology
-            .hosts()
-            .first()
-            .is_some_and(|host| is_here(host, &hosts)),
+        is_first_host: is_here(&topology.hosts()[0], &hosts),
         has_one_clock: peers.iter().all(|peer| peer.hello.clock_id == here),
         crew,
         domains,
