@@ -232,7 +232,8 @@ impl Egress {
                     None => (false, is_announced),
                 };
                 self.attention.has_news |= has_socket_news;
-                self.attention.is_announced |= is_announced;
+                // After a quiet wait it is looked at as well: see `Waiter::drain`.
+                self.attention.is_announced |= is_announced || !has_socket_news;
             }
         }
         Ok(())
