@@ -15,6 +15,7 @@ mod radio;
 pub(crate) mod records;
 mod robot_series;
 mod score_clock;
+mod stalls;
 
 use std::fs;
 use std::io;

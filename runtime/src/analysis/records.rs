@@ -25,7 +25,7 @@ use hil_models::trace::TraceRecord;
 
 use super::AnalysisError;
 use super::clocks::HostClocks;
-use super::link_changes;
+use super::{link_changes, stalls};
 use crate::face::record::{FaceReceivedRecord, FaceSentRecord};
 use crate::process::launch::EmulationLaunch;
 use crate::radio::record::RadioRecord;
@@ -42,11 +42,11 @@ const FLIGHT_QUANTILE: f64 = 0.9999;
 /// All records of one channel.
 #[derive(Debug, Default)]
 pub(crate) struct ChannelFiles {
-    published: Option<Vec<PublishedRecord>>,
-    egress: Option<Vec<EgressRecord>>,
-    ingress: Option<Vec<IngressRecord>>,
+    pub(super) published: Option<Vec<PublishedRecord>>,
+    pub(super) egress: Option<Vec<EgressRecord>>,
+    pub(super) ingress: Option<Vec<IngressRecord>>,
     follow_up: Option<Vec<FollowUpRecord>>,
-    taken: Option<Vec<TakenRecord>>,
+    pub(super) taken: Option<Vec<TakenRecord>>,
     round_trips: BTreeMap<(u32, u64), RoundTripRecord>,
     face_sent: Vec<FaceSentRecord>,
     face_received: Vec<FaceReceivedRecord>,
@@ -55,7 +55,7 @@ pub(crate) struct ChannelFiles {
 /// Every record file of a run.
 #[derive(Debug, Default)]
 pub(crate) struct RunRecords {
-    channels: BTreeMap<String, ChannelFiles>,
+    pub(super) channels: BTreeMap<String, ChannelFiles>,
     cards: BTreeMap<String, Vec<CardClockRecord>>,
     log: RunLog,
     clocks: HostClocks,
@@ -309,7 +309,8 @@ impl RunRecords {
     ) -> T {
         let nothing = ChannelFiles::default();
         let files = self.channels.get(&channel.name).unwrap_or(&nothing);
-        let interruptions = interruptions(topology, result, channel);
+        let mut interruptions = interruptions(topology, result, channel);
+        interruptions.extend(stalls::at_end(self, (topology, result), channel));
         let span_of = |process: &str| {
             let (start, end) = *result.spans.get(&topology.process(process)?.host)?;
             Some(RunSpan { start, end })
