@@ -20,7 +20,7 @@ pub mod bpf_tap;
 pub mod card_arming;
 pub mod card_clock;
 pub mod clock_pair;
-mod control;
+pub mod control;
 mod counters;
 pub mod emulated;
 pub mod interface;

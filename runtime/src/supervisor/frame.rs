@@ -8,13 +8,13 @@ use serde::{Deserialize, Serialize};
 use super::event::HostStory;
 
 /// Largest frame either side accepts; a longer length field is an error, not an allocation.
-pub(crate) const FRAME_BYTES_MAX: usize = 1 << 20;
+pub const FRAME_BYTES_MAX: usize = 1 << 20;
 /// Piece in which record files travel.
-pub(crate) const CHUNK_BYTES: usize = 1 << 18;
+pub const CHUNK_BYTES: usize = 1 << 18;
 
 /// Who a supervisor is; the first frame each way.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub(crate) struct PeerHello {
+pub struct PeerHello {
     /// Version of this program; both ends must be equal.
     pub version: String,
     /// Hash of the resolved topology; both ends must be equal.
@@ -30,7 +30,7 @@ pub(crate) struct PeerHello {
 /// What supervisors tell each other.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub(crate) enum PeerMessage {
+pub enum PeerMessage {
     /// First frame each way.
     Hello(PeerHello),
     /// The other end does not fit, and why; the last frame.
@@ -69,7 +69,7 @@ pub(crate) enum PeerMessage {
 /// How the other hosts are to take the end of a run on one of them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub(crate) enum EndMeaning {
+pub enum EndMeaning {
     /// The planned time passed.
     Planned,
     /// A program ended by itself without a fault.
@@ -80,7 +80,7 @@ pub(crate) enum EndMeaning {
 
 /// One frame as read.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) enum Frame {
+pub enum Frame {
     /// A message.
     Message(PeerMessage),
     /// The next piece of the file announced last.
@@ -94,7 +94,7 @@ const KIND_CHUNK: u8 = 1;
 ///
 /// # Errors
 /// When the connection fails, or the message is longer than a frame may be.
-pub(crate) fn write_message(out: &mut impl Write, message: &PeerMessage) -> io::Result<()> {
+pub fn write_message(out: &mut impl Write, message: &PeerMessage) -> io::Result<()> {
     write_frame(out, KIND_MESSAGE, &serde_json::to_vec(message)?)
 }
 
@@ -102,7 +102,7 @@ pub(crate) fn write_message(out: &mut impl Write, message: &PeerMessage) -> io::
 ///
 /// # Errors
 /// When the connection fails.
-pub(crate) fn write_chunk(out: &mut impl Write, bytes: &[u8]) -> io::Result<()> {
+pub fn write_chunk(out: &mut impl Write, bytes: &[u8]) -> io::Result<()> {
     write_frame(out, KIND_CHUNK, bytes)
 }
 
@@ -123,7 +123,7 @@ fn write_frame(out: &mut impl Write, kind: u8, body: &[u8]) -> io::Result<()> {
 ///
 /// # Errors
 /// When the connection ends or says something that is not a frame.
-pub(crate) fn read_frame(input: &mut impl Read) -> io::Result<Frame> {
+pub fn read_frame(input: &mut impl Read) -> io::Result<Frame> {
     let mut head = [0; 5];
     input.read_exact(&mut head)?;
     let length = u32::from_le_bytes([head[0], head[1], head[2], head[3]]) as usize;
@@ -145,7 +145,7 @@ pub(crate) fn read_frame(input: &mut impl Read) -> io::Result<Frame> {
 }
 
 /// A record file's name as a peer may give it: nothing that could leave the records folder.
-pub(crate) fn is_plain_record_name(name: &str) -> bool {
+pub fn is_plain_record_name(name: &str) -> bool {
     let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || matches!(byte, b'.' | b'-' | b'_');
     name.len() <= 255
         && name.as_bytes().ends_with(b".rec")

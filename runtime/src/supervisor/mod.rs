@@ -7,7 +7,7 @@ pub(crate) mod crew;
 pub(crate) mod domains;
 pub mod event;
 pub(crate) mod exchange;
-pub(crate) mod frame;
+pub mod frame;
 pub(crate) mod meet;
 mod outcome;
 pub(crate) mod peer;
