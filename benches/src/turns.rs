@@ -95,10 +95,23 @@ pub struct Contest<const N: usize> {
 #[derive(Debug)]
 struct Outcome<const N: usize> {
     case: String,
+    /// Rounds with messages in all of their turns, and all rounds that were taken.
+    judged_count: usize,
+    round_count: usize,
     /// In the order of the kinds.
     quantiles: [Quantiles; N],
     /// Median and 99th percentile against the first kind; the others in their order.
     ratios: Vec<[MedianInterval; 2]>,
+}
+
+impl<const N: usize> Outcome<N> {
+    fn rounds_text(&self) -> String {
+        let (judged, all) = (self.judged_count, self.round_count);
+        match all - judged {
+            0 => format!("all {all} rounds judged"),
+            out => format!("{judged} of {all} rounds judged, {out} without messages left out"),
+        }
+    }
 }
 
 /// One latency of a message, nanoseconds; `None` where a stamp is missing.
@@ -133,6 +146,7 @@ impl<const N: usize> Contest<N> {
         let one_round_s = TURN.as_secs_f64() * N as f64 + self.extra.as_secs_f64();
         let span_s = (one_round_s * arguments.round_count as f64 + 10.0).ceil();
         let mut trial = Trial::shipped("shuttle-split.toml", record.path())
+            .plain()
             .set(&format!("run.duration=\"{span_s} s\""))
             .set(&format!("case.parameters.rate_hz={:?}", arguments.rate_hz));
         for setting in &arguments.settings {
@@ -156,7 +170,7 @@ impl<const N: usize> Contest<N> {
                 let case = format!("{channel}, {name}");
                 match judge(&case, &records, &rounds, latency) {
                     Some(outcome) => self.print(&outcome),
-                    None => println!("\n{case}: too few rounds with messages"),
+                    None => println!("\n{case}: too few of {} rounds with messages", rounds.len()),
                 }
             }
         }
@@ -166,7 +180,8 @@ impl<const N: usize> Contest<N> {
     fn heading(&self, facts: &HostFacts, arguments: &Arguments) -> String {
         format!(
             "{}\n{} rounds of {} s turns at {} Hz, order by lot of seed {SEED}; ratios of each \
-             round's quantiles, their median with its 95 % interval by order statistics",
+             round's quantiles, their median with its 95 % interval by order statistics; each interval \
+             holds by itself, not adjusted for how many there are",
             json!({"bench": self.bench, "host": facts.to_json(), "rounds": arguments.round_count,
                 "rate_hz": arguments.rate_hz, "seed": SEED}),
             arguments.round_count,
@@ -176,7 +191,7 @@ impl<const N: usize> Contest<N> {
     }
 
     fn print(&self, outcome: &Outcome<N>) {
-        println!("\n{}", outcome.case);
+        println!("\n{}: {}", outcome.case, outcome.rounds_text());
         for (kind, found) in self.kinds.iter().zip(&outcome.quantiles) {
             let us = |ns: u64| ns as f64 * 1e-3;
             println!(
@@ -202,6 +217,7 @@ impl<const N: usize> Contest<N> {
                     "{}",
                     json!({
                         "bench": self.bench, "case": outcome.case, "kind": kind, "figure": figure,
+                        "judged_rounds": outcome.judged_count, "rounds": outcome.round_count,
                         "ratio": median, "interval_95": [low, high], "aim_max": aim,
                         "verdict": verdict, "quantiles": quantiles,
                     })
@@ -271,6 +287,7 @@ fn judge<const N: usize>(
 ) -> Option<Outcome<N>> {
     let mut all: [Vec<u64>; N] = core::array::from_fn(|_| Vec::new());
     let mut ratios = vec![[Vec::new(), Vec::new()]; N - 1];
+    let mut judged_count = 0;
     for round in rounds {
         let mut during = round.each_ref().map(|turn| samples(records, turn, latency));
         let found: Option<Vec<Quantiles>> =
@@ -278,6 +295,7 @@ fn judge<const N: usize>(
         let Some([reference, others @ ..]) = found.as_deref() else {
             continue;
         };
+        judged_count += 1;
         for (ratios, other) in ratios.iter_mut().zip(others) {
             ratios[0].push(other.p50_ns as f64 / reference.p50_ns as f64);
             ratios[1].push(other.p99_ns as f64 / reference.p99_ns as f64);
@@ -294,6 +312,8 @@ fn judge<const N: usize>(
         .collect();
     Some(Outcome {
         case: case.to_owned(),
+        judged_count,
+        round_count: rounds.len(),
         quantiles: quantiles?.try_into().ok()?,
         ratios: ratios?,
     })
@@ -338,6 +358,12 @@ mod tests {
         let [p50, p99] = outcome.ratios[0];
         assert!((p50.median - 2.0).abs() < 1e-9 && (p99.high - 2.0).abs() < 1e-9);
         assert_eq!(outcome.quantiles.map(|found| found.count), [800, 800]);
+        assert_eq!(outcome.rounds_text(), "all 8 rounds judged");
+        records.retain(|record| !rounds[1][1].contains(&record.published_ns));
+        let fewer = judge("case", &records, &rounds, whole).unwrap();
+        assert_eq!(fewer.quantiles.map(|found| found.count), [700, 700]);
+        let said = "7 of 8 rounds judged, 1 without messages left out";
+        assert_eq!(fewer.rounds_text(), said);
         assert!(judge("case", &records, &rounds, hop).is_none());
         assert!(judge("case", &records, &rounds[..5], whole).is_none());
     }

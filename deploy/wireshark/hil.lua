@@ -12,6 +12,7 @@ local UNKNOWN_TIME = "-9223372036854775808"
 local kinds = {
     [1] = "DATA", [2] = "SYNC_REQ", [3] = "SYNC_RSP",
     [4] = "HELLO", [5] = "HELLO_ACK", [6] = "BYE",
+    [7] = "KEY_REQ", [8] = "KEY_ANS",
 }
 local statuses = {
     [0] = "accepted", [1] = "message types differ", [2] = "size or alignment differ",
@@ -25,7 +26,7 @@ local f = {
     version = ProtoField.uint8("hil.version", "Version"),
     kind = ProtoField.uint8("hil.kind", "Kind", base.DEC, kinds),
     flags = ProtoField.uint16("hil.flags", "Flags", base.HEX),
-    authenticated = ProtoField.bool("hil.flags.authenticated", "Authenticated", 16, nil, 0x0001),
+    authenticated = ProtoField.bool("hil.flags.authenticated", "Sealed", 16, nil, 0x0001),
     session = ProtoField.uint32("hil.session", "Session", base.HEX),
     channel = ProtoField.uint16("hil.channel", "Channel"),
     header_len = ProtoField.uint16("hil.header_len", "Header length"),
@@ -40,6 +41,11 @@ local f = {
     fragment_count = ProtoField.uint16("hil.fragment.count", "Fragments"),
     epoch = ProtoField.uint32("hil.epoch", "Epoch (producer's start)", base.HEX),
     reserved = ProtoField.bytes("hil.reserved", "Reserved"),
+    generation = ProtoField.uint8("hil.seal.generation", "Generation of the key, low 8 bits"),
+    number = ProtoField.uint32("hil.seal.number", "Number under the key"),
+    sealed = ProtoField.bytes("hil.seal.payload", "Sealed payload"),
+    salt = ProtoField.bytes("hil.seal.salt", "Salt"),
+    code = ProtoField.bytes("hil.seal.code", "Code (HMAC-SHA256)"),
     payload = ProtoField.bytes("hil.payload", "Payload"),
     tag = ProtoField.bytes("hil.tag", "Authentication tag"),
 
@@ -175,27 +181,45 @@ function hil.dissector(buffer, pinfo, root)
     tree:add_le(f.fragment_index, buffer(60, 2))
     tree:add_le(f.fragment_count, buffer(62, 2))
     tree:add_le(f.epoch, buffer(64, 4))
-    tree:add(f.reserved, buffer(68, 4))
+    local is_sealed = bit.band(buffer(6, 2):le_uint(), 1) == 1
+    if is_sealed then
+        tree:add(f.generation, buffer(7, 1))
+        tree:add_le(f.number, buffer(68, 4))
+    else
+        tree:add(f.reserved, buffer(68, 4))
+    end
 
     local body_end = buffer:len()
     -- A capture may hold less than the wire did: then the end of the buffer is no tag.
     local is_cut = buffer:len() < buffer:reported_len()
-    if bit.band(buffer(6, 2):le_uint(), 1) == 1 and not is_cut and body_end >= HEADER_BYTES + TAG_BYTES then
+    local is_key_exchange = kind == 7 or kind == 8
+    if is_sealed and not is_key_exchange and not is_cut and body_end >= HEADER_BYTES + TAG_BYTES then
         body_end = body_end - TAG_BYTES
         tree:add(f.tag, buffer(body_end, TAG_BYTES))
     end
     local is_sound = true
-    if body_end > HEADER_BYTES then
+    if is_key_exchange then
+        is_sound = is_sealed and buffer:len() == HEADER_BYTES + 48
+        if is_sound then
+            tree:add(f.salt, buffer(HEADER_BYTES, 16))
+            tree:add(f.code, buffer(HEADER_BYTES + 16, 32))
+        end
+    elseif is_sealed then
+        -- Without the key nobody can say what it is, so it is not dissected as what it is not.
+        if body_end > HEADER_BYTES then tree:add(f.sealed, buffer(HEADER_BYTES, body_end - HEADER_BYTES)) end
+    elseif body_end > HEADER_BYTES then
         is_sound = dissect_body(kind, buffer(HEADER_BYTES, body_end - HEADER_BYTES), tree)
     elseif kind ~= 1 and kind ~= 6 then
         is_sound = false
     end
-    if buffer(14, 2):le_uint() ~= HEADER_BYTES or buffer(68, 4):le_uint() ~= 0 then is_sound = false end
+    if buffer(14, 2):le_uint() ~= HEADER_BYTES then is_sound = false end
+    if not is_sealed and buffer(68, 4):le_uint() ~= 0 then is_sound = false end
     if not is_sound and not is_cut then tree:add_proto_expert_info(e.malformed) end
 
     local info = name .. " channel " .. channel .. " seq " .. tostring(sequence)
     local count = buffer(62, 2):le_uint()
     if count > 1 then info = info .. " piece " .. (buffer(60, 2):le_uint() + 1) .. "/" .. count end
+    if is_sealed then info = info .. ", sealed" end
     pinfo.cols.info = info
     return buffer:len()
 end

@@ -6,10 +6,12 @@ use std::path::PathBuf;
 use clap::{ArgGroup, Args, Parser, Subcommand};
 
 use crate::compare::cli::{self as compare_cli, CompareArgs};
+use crate::doctor::cli::DoctorArgs;
 use crate::link::cli::LinkCommand;
 use crate::live::cli::{ChannelArgs, TopArgs};
 use crate::probe::arguments::ProbeArgs;
 use crate::report::page::Format;
+use crate::security::cli::KeyCommand;
 use crate::trace::cli::TraceCommand;
 
 const EXAMPLES: &str = "\
@@ -34,11 +36,13 @@ Examples:
       run its robot again in virtual time and compare every message
 
 Exit codes:
-  0  the run ended as planned         70  internal error
-  1  the run failed, its report has   78  doctor --strict: host not fit
-     gaps, or a replay differs        130 interrupted; the report is
-  2  wrong arguments or topology          complete
-  69 a peer host was not reachable    131 interrupted twice: no report";
+  0  the run ended as planned         75  an address or a port is not
+  1  the run failed, its report has       there yet: try again
+     gaps, or a replay differs        77  a folder is not this user's,
+  2  wrong arguments or topology          or the key cannot be used
+  69 a peer host was not reachable    78  doctor --strict: host not fit
+  70 internal error                   130 interrupted; report complete
+                                      131 interrupted twice: no report";
 
 const CALIBRATE_EXAMPLES: &str = "\
 Examples:
@@ -314,24 +318,17 @@ pub enum Command {
     Channel(ChannelArgs),
     /// Look at a run while it goes: processes, channels, links, clocks.
     Top(TopArgs),
-    /// Say what this host can measure and what to change.
+    /// Make or check the key file that keeps strangers out of a run between two hosts.
     #[command(
-        after_help = "Examples:\n  hil-runtime doctor --strict   # exit code 78 when something must be fixed\n  hil-runtime doctor --topology deploy/topologies/split.toml   # its clock path as well"
+        after_help = "Examples:\n  sudo hil-runtime key new /etc/hil-runtime/hop.key\n  sudo hil-runtime key check /etc/hil-runtime/hop.key   # the fingerprint, equal on all hosts"
     )]
-    Doctor {
-        /// A topology whose clock path is examined as well, as far as it ends on this host.
-        #[arg(long)]
-        topology: Option<PathBuf>,
-        /// Name of this host in the topology, if it is not found by itself.
-        #[arg(long, requires = "topology")]
-        host: Option<String>,
-        /// Exit with 78 when a problem was found.
-        #[arg(long)]
-        strict: bool,
-        /// Print JSON instead of a table.
-        #[arg(long)]
-        json: bool,
+    Key {
+        /// What to do with it.
+        #[command(subcommand)]
+        command: KeyCommand,
     },
+    /// Say what this host can measure and what to change.
+    Doctor(DoctorArgs),
     /// Look at the wire without taking part: capture, analyse, compare with a run.
     Probe(ProbeArgs),
     /// List the case studies with their channels and parameters.
@@ -370,6 +367,15 @@ pub enum Command {
         #[arg(last = true, required = true)]
         program: Vec<String>,
     },
+    /// Write manual pages and completions for a package to this folder.
+    #[command(hide = true)]
+    Documents {
+        /// Where to.
+        folder: PathBuf,
+    },
+    /// Remove what runs whose supervisor was killed left in shared memory; a unit does so at its end.
+    #[command(hide = true)]
+    Sweep,
     /// Wait for the end of the program that set a network card up; not for use by hand.
     #[command(hide = true)]
     CardGuard(CardGuardArgs),

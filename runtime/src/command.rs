@@ -1,6 +1,7 @@
 //! What each command of the command line does, and the exit code it ends with.
 
 mod case_work;
+mod doctor_work;
 mod live_work;
 mod play_work;
 mod report_work;
@@ -8,23 +9,22 @@ mod report_work;
 use std::collections::BTreeMap;
 use std::env;
 use std::fs;
-use std::io::IsTerminal;
-use std::path::{Path, PathBuf};
+use std::io::{self, ErrorKind, IsTerminal};
+use std::path::Path;
 use std::process::ExitCode;
 
-use clap::Parser;
-use hil_gateways::transport::timestamping::TimestampCapabilities;
+use clap::{CommandFactory as _, Parser};
 use hil_models::case_study::ParameterError;
 use hil_models::layout::Field;
 use hil_models::teleoperation::swing::swing_bvh;
 
-use crate::analysis;
+use crate::analysis::{self, Concluded};
 use crate::card_clock::guard;
 use crate::cases;
 use crate::cli::{Cli, Command, RunArgs};
 use crate::compare::{self, cli::CompareArgs};
 use crate::console::Console;
-use crate::doctor::{self, ClockQuestion, DoctorRequest, StampCapabilities};
+use crate::documents;
 use crate::face;
 use crate::gateway;
 use crate::link::{self, cli::LinkCommand};
@@ -34,6 +34,7 @@ use crate::process::{component, own_program};
 use crate::progress::Progress;
 use crate::registry::Registry;
 use crate::report::terminal::{self, Style};
+use crate::security::cli::KeyCommand;
 use crate::signals::{EXIT_INTERRUPTED, Signals};
 use crate::supervisor::{self, Outcome, PeerError, RunError, RunOptions, RunResult};
 use crate::topology::{self, HOST_VARIABLE, HostChoice, MachineIdentity, Topology, which_host};
@@ -46,6 +47,8 @@ mod exit {
     pub(super) const USAGE: u8 = 2;
     pub(super) const PEER_ABSENT: u8 = 69;
     pub(super) const INTERNAL: u8 = 70;
+    pub(super) const TRY_AGAIN: u8 = 75;
+    pub(super) const FORBIDDEN: u8 = 77;
     pub(super) const HOST_UNFIT: u8 = 78;
 }
 
@@ -100,18 +103,13 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
             trace::work::End::Refused => exit::USAGE,
         },
         Command::Link { command } => change_link(&command, console),
-        Command::Doctor {
-            topology,
-            host,
-            strict,
-            json,
-        } => match doctor_request((topology, host), registry, console) {
-            Ok(request) => examine(&request, (strict, json), console),
-            Err(code) => code,
-        },
+        Command::Doctor(args) => doctor_work::doctor(&args, registry, console),
         Command::Channel(args) => live_work::channel(args, registry, console),
         Command::Top(args) => live_work::top(&args, registry, console),
         Command::Probe(args) => probe::run(&args, console),
+        Command::Documents { folder } => write_documents(&folder, console),
+        Command::Sweep => sweep(),
+        Command::Key { command } => key(&command, console),
         Command::Cases => {
             console.result(&cases::list(registry));
             exit::RAN
@@ -129,11 +127,33 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
     }
 }
 
+fn write_documents(folder: &Path, console: &mut Console) -> u8 {
+    code_of(documents::write(Cli::command(), folder).map(drop), console)
+}
+
+fn sweep() -> u8 {
+    supervisor::sweep();
+    exit::RAN
+}
+
 fn compare(args: &CompareArgs, console: &mut Console) -> u8 {
     match compare::work::work(args, console) {
         compare::work::End::Passed => exit::RAN,
         compare::work::End::Failed => exit::FAILED,
         compare::work::End::Refused => exit::USAGE,
+    }
+}
+
+fn key(command: &KeyCommand, console: &mut Console) -> u8 {
+    match command.work() {
+        Ok(text) => {
+            console.result(&text);
+            exit::RAN
+        }
+        Err(error) => {
+            console.error(&error.to_string());
+            exit::USAGE
+        }
     }
 }
 
@@ -172,7 +192,7 @@ fn load(
     match topology::load(path, overrides, registry.known()) {
         Ok(topology) => Some(topology),
         Err(errors) => {
-            console.rendered(&errors.render(std::io::stderr().is_terminal()));
+            console.faults(&errors.render(io::stderr().is_terminal()));
             None
         }
     }
@@ -210,6 +230,7 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
         command_line: env::args().collect(),
         layouts: layouts(&topology, registry),
     };
+    console.serve();
     match supervisor::run(&topology, &options, &signals, console) {
         Ok(result) => {
             let is_incomplete = result.has_gaps();
@@ -218,16 +239,18 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
                 code => code,
             };
             let origin = (path.as_path(), options.command_line.as_slice());
-            let summary = Progress::begin().during(console, "drawing up the account", |_| {
+            let concluded = Progress::begin().during(console, "drawing up the account", |_| {
                 analysis::conclude(&topology, &result, registry, origin)
             });
-            match summary {
-                Ok(summary) => {
+            match concluded {
+                Ok(Concluded { summary, unwritten }) => {
                     console.result(&terminal::render(&summary, columns(), Style::Coloured));
                     if code != exit::RAN {
                         console.error(&complaint(&result));
                     }
-                    code
+                    let Some(error) = unwritten else { return code };
+                    console.error(&format!("{error}; the report is only what is printed here"));
+                    code.max(exit::FAILED)
                 }
                 Err(error) => {
                     console.error(&format!("the run is over but its report failed: {error}"));
@@ -261,6 +284,10 @@ fn show_check(path: &Path, topology: &Topology, console: &mut Console) -> u8 {
         ));
         return exit::USAGE;
     }
+    if let Some(text) = topology.unsaid_security() {
+        console.error(&format!("{}: {text}", path.display()));
+        return exit::USAGE;
+    }
     // As comments, so that what is printed is a topology as a whole.
     let clock_paths = topology.clock_paths().map(|clock| {
         let (asking, answering) = (clock.asking.port(), clock.answering.port());
@@ -289,18 +316,35 @@ fn complaint(result: &RunResult) -> String {
 /// For a run that did not come about.
 fn exit_code_of_error(error: &RunError) -> u8 {
     match error {
-        RunError::Peer(PeerError::Absent { .. } | PeerError::Connection { .. }) => {
-            exit::PEER_ABSENT
+        RunError::Peer(PeerError::Absent { .. } | PeerError::Connection { .. })
+        | RunError::SecretMissing(_) => exit::PEER_ABSENT,
+        RunError::Folder { source, .. } if source.kind() == ErrorKind::PermissionDenied => {
+            exit::FORBIDDEN
+        }
+        RunError::Peer(PeerError::Key { .. }) | RunError::Key(_) => exit::FORBIDDEN,
+        RunError::Peer(PeerError::Listen { source, .. } | PeerError::Own { source, .. })
+            if is_passing(source) =>
+        {
+            exit::TRY_AGAIN
         }
         RunError::Folder { .. }
+        | RunError::SecurityUnsaid(_)
         | RunError::Emulation(_)
         | RunError::Peer(
             PeerError::Mismatch { .. } | PeerError::Listen { .. } | PeerError::Own { .. },
         ) => exit::USAGE,
         RunError::Peer(PeerError::Interrupted { .. }) => interrupted(),
         RunError::Start(_) => exit::FAILED,
-        RunError::Domains(_) | RunError::Identity(_) => exit::INTERNAL,
+        RunError::Domains(_) | RunError::Identity(_) | RunError::Random(_) => exit::INTERNAL,
     }
+}
+
+/// An address may be given to an interface later, as when a host starts; a port becomes free.
+fn is_passing(error: &io::Error) -> bool {
+    matches!(
+        error.kind(),
+        ErrorKind::AddrNotAvailable | ErrorKind::AddrInUse
+    )
 }
 
 fn interrupted() -> u8 {
@@ -333,75 +377,6 @@ fn hosts_here(topology: &Topology, requested: Option<&str>) -> Result<Vec<String
             .collect()),
         Err(error) => Err(error.to_string()),
     }
-}
-
-/// What a topology has the doctor look at beside the host itself.
-fn doctor_request(
-    (topology, host): (Option<PathBuf>, Option<String>),
-    registry: &Registry,
-    console: &mut Console,
-) -> Result<DoctorRequest, u8> {
-    let mut request = DoctorRequest::default();
-    let Some(path) = topology else {
-        return Ok(request);
-    };
-    let topology = load(&path, &[], registry, console).ok_or(exit::USAGE)?;
-    let here = hosts_here(&topology, host.as_deref()).map_err(|text| {
-        console.error(&text);
-        exit::USAGE
-    })?;
-    // Several hosts are here only when none has an address, and none of these has a clock path.
-    let mut ends = here
-        .iter()
-        .filter_map(|name| topology.host(name)?.clock.clone());
-    request.clock_end = ends
-        .next()
-        .map_or(ClockQuestion::NoneNamed, ClockQuestion::End);
-    Ok(request)
-}
-
-fn examine(request: &DoctorRequest, (is_strict, json): (bool, bool), console: &mut Console) -> u8 {
-    let signals = match signals(console) {
-        Ok(signals) => signals,
-        Err(code) => return code,
-    };
-    let watch = signals.end_program_unless_over(
-        "the doctor describes a host whole or not at all; a card it was trying is put back",
-    );
-    let report = doctor::examine(request, &stamp_capabilities);
-    drop(watch);
-    let text = if json {
-        report.to_json()
-    } else {
-        report.to_text(true)
-    };
-    console.result(&text);
-    if is_strict && report.worst_state() == doctor::State::Problem {
-        exit::HOST_UNFIT
-    } else {
-        exit::RAN
-    }
-}
-
-/// What an interface claims, in the bits of the kernel's answer.
-fn stamp_capabilities(interface: &str) -> Result<StampCapabilities, String> {
-    let claims = TimestampCapabilities::query(interface).map_err(|error| error.to_string())?;
-    let flag = |is_claimed: bool, bit: u32| if is_claimed { bit } else { 0 };
-    Ok(StampCapabilities {
-        so_timestamping: flag(claims.tx_hardware, libc::SOF_TIMESTAMPING_TX_HARDWARE)
-            | flag(claims.tx_software, libc::SOF_TIMESTAMPING_TX_SOFTWARE)
-            | flag(claims.rx_hardware, libc::SOF_TIMESTAMPING_RX_HARDWARE)
-            | flag(claims.rx_software, libc::SOF_TIMESTAMPING_RX_SOFTWARE)
-            | flag(
-                claims.tx_software || claims.rx_software,
-                libc::SOF_TIMESTAMPING_SOFTWARE,
-            )
-            | flag(
-                claims.tx_hardware || claims.rx_hardware,
-                libc::SOF_TIMESTAMPING_RAW_HARDWARE,
-            ),
-        hardware_clock_index: claims.phc_index,
-    })
 }
 
 /// Columns of the terminal; where there is none, a page's.

@@ -2,6 +2,8 @@
 //! description, not a judgement; [`crate::doctor`] judges.
 
 mod files;
+mod kernel;
+mod processors;
 
 use nix::sys::resource::{RLIM_INFINITY, Resource, getrlimit};
 use nix::sys::utsname::uname;
@@ -11,6 +13,14 @@ pub use self::files::HostFiles;
 #[cfg(test)]
 pub(crate) use self::files::fake::FakeHost;
 pub(crate) use self::files::{CAP_IPC_LOCK, CAP_SYS_NICE, format_cpu_list};
+pub(crate) use self::kernel::{
+    KernelOptions, PreemptionMode, RealtimeThrottle, boot_parameter, clocksource, has_fair_server,
+    kernel_release, preemption, virtual_machine,
+};
+pub(crate) use self::processors::{
+    CPU_FOLDER, governors, isolated_or_online, load_average, online_cpus, refuse_absent,
+};
+pub use self::processors::{IsolatedCpus, ProcessorTicks};
 
 /// Something the host was asked: an answer, or why there is none.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -82,33 +92,23 @@ impl HostFacts {
         let mut list = Self::default();
         list.add("hostname", hostname());
         list.add("kernel", kernel_name());
-        list.add("preemption", preemption(files));
-        list.add("boot_parameters", boot_parameters(files));
+        let isolation = IsolatedCpus::read(files);
+        let in_words = |cpus: Fact<Vec<usize>>| cpus.map(|cpus| format_cpu_list(&cpus));
+        list.add("preemption", preemption(files).map(|found| found.words));
+        list.add("boot_parameters", kernel::boot_parameters(files));
         list.add("cpu_model", files.read_field("/proc/cpuinfo", "model name"));
         list.add("cores", cores(files));
-        list.add(
-            "governor",
-            files.read("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor"),
-        );
-        list.add(
-            "isolated_cpus",
-            cpu_list(files, "/sys/devices/system/cpu/isolated"),
-        );
-        list.add(
-            "nohz_full_cpus",
-            cpu_list(files, "/sys/devices/system/cpu/nohz_full"),
-        );
-        list.add(
-            "clocksource",
-            files.read("/sys/devices/system/clocksource/clocksource0/current_clocksource"),
-        );
+        list.add("governor", governor(files));
+        list.add("isolated_cpus", in_words(isolation.isolated));
+        list.add("nohz_full_cpus", in_words(isolation.nohz_full));
+        list.add("clocksource", clocksource(files));
         list.add("boot_id", files.read("/proc/sys/kernel/random/boot_id"));
-        list.add("load_average", load_average(files));
+        list.add("load_average", load_average(files).map(|(_, words)| words));
         list.add("memory", memory(files));
         list.add("virtual_machine", virtual_machine(files));
         list.add(
             "sched_rt_runtime_us",
-            files.read("/proc/sys/kernel/sched_rt_runtime_us"),
+            RealtimeThrottle::read(files).map(|throttle| throttle.runtime_us.to_string()),
         );
         list.add("limit_rtprio", limit(Resource::RLIMIT_RTPRIO, ""));
         list.add("limit_memlock", limit(Resource::RLIMIT_MEMLOCK, " bytes"));
@@ -155,103 +155,18 @@ fn kernel_name() -> Fact<String> {
     }
 }
 
-/// The kernel's major and minor version.
-pub(crate) fn kernel_version(files: &HostFiles) -> Fact<(u32, u32)> {
-    files
-        .read("/proc/sys/kernel/osrelease")
-        .and_then(|release| {
-            let mut numbers = release
-                .split(|c: char| !c.is_ascii_digit())
-                .map(str::parse::<u32>);
-            match (numbers.next(), numbers.next()) {
-                (Some(Ok(major)), Some(Ok(minor))) => Fact::Available((major, minor)),
-                _ => Fact::Unavailable(format!("kernel release `{release}` has no version")),
-            }
-        })
-}
-
-/// `PREEMPT_RT`, or the preemption model and, where the kernel tells it, the mode chosen at boot.
-pub(crate) fn preemption(files: &HostFiles) -> Fact<String> {
-    let version = files.read("/proc/sys/kernel/version");
-    let realtime = files.read("/sys/kernel/realtime");
-    if realtime.available().is_some_and(|flag| flag == "1") {
-        return Fact::Available("PREEMPT_RT".to_owned());
-    }
-    version.map(|version| {
-        let words: Vec<&str> = version.split_whitespace().collect();
-        let model = words
-            .iter()
-            .find(|word| word.starts_with("PREEMPT"))
-            .copied();
-        match model {
-            None => "none (server)".to_owned(),
-            Some("PREEMPT_DYNAMIC") => format!("PREEMPT_DYNAMIC, {}", dynamic_mode(files)),
-            Some(model) => model.to_owned(),
-        }
-    })
-}
-
-/// The mode in brackets of `/sys/kernel/debug/sched/preempt`, for example `none (full) lazy`.
-fn dynamic_mode(files: &HostFiles) -> String {
-    let modes = files.read("/sys/kernel/debug/sched/preempt");
-    let chosen = modes.available().and_then(|modes| {
-        let (_, rest) = modes.split_once('(')?;
-        Some(rest.split_once(')')?.0.to_owned())
-    });
-    chosen.map_or_else(
-        || "mode unavailable (debugfs is not readable)".to_owned(),
-        |mode| format!("mode {mode}"),
-    )
-}
-
-/// Parameters of the kernel's command line that change how it schedules, ticks or idles. The others
-/// are left out: they say nothing about a measurement, and a manifest is meant to be shown around.
-const TIMING_PARAMETERS: [&str; 15] = [
-    "clocksource",
-    "cpuidle.off",
-    "idle",
-    "intel_idle.max_cstate",
-    "intel_pstate",
-    "irqaffinity",
-    "isolcpus",
-    "mitigations",
-    "nohz",
-    "nohz_full",
-    "nosmt",
-    "preempt",
-    "processor.max_cstate",
-    "rcu_nocbs",
-    "tsc",
-];
-
-fn boot_parameters(files: &HostFiles) -> Fact<String> {
-    files.read("/proc/cmdline").map(|line| {
-        let chosen: Vec<&str> = line
-            .split_whitespace()
-            .filter(|word| TIMING_PARAMETERS.contains(&word.split('=').next().unwrap_or(word)))
-            .collect();
-        if chosen.is_empty() {
-            "none that affect timing".to_owned()
-        } else {
-            chosen.join(" ")
-        }
-    })
-}
-
 fn cores(files: &HostFiles) -> Fact<String> {
-    files
-        .read_cpu_list("/sys/devices/system/cpu/online")
+    online_cpus(files)
         .map(|online| format!("{} online ({})", online.len(), format_cpu_list(&online)))
 }
 
-fn cpu_list(files: &HostFiles, path: &str) -> Fact<String> {
-    files.read_cpu_list(path).map(|cpus| format_cpu_list(&cpus))
-}
-
-fn load_average(files: &HostFiles) -> Fact<String> {
-    files.read("/proc/loadavg").map(|text| {
-        let words: Vec<&str> = text.split_whitespace().take(3).collect();
-        format!("{} over 1, 5 and 15 minutes", words.join(" "))
+/// That of every processor, said once where they agree.
+fn governor(files: &HostFiles) -> Fact<String> {
+    governors(files, &[]).map(|found| {
+        let mut names: Vec<String> = found.into_iter().map(|(_, governor)| governor).collect();
+        names.sort();
+        names.dedup();
+        names.join(", ")
     })
 }
 
@@ -262,19 +177,6 @@ fn memory(files: &HostFiles) -> Fact<String> {
             let available = files.read_field("/proc/meminfo", "MemAvailable");
             available.map(|available| format!("{total} in all, {available} available"))
         })
-}
-
-/// Whether a hypervisor runs below; the tail of every latency then belongs to it as well.
-pub(crate) fn virtual_machine(files: &HostFiles) -> Fact<String> {
-    files.read_field("/proc/cpuinfo", "flags").map(|flags| {
-        let is_virtual = flags.split_whitespace().any(|flag| flag == "hypervisor");
-        let product = files.read("/sys/class/dmi/id/product_name");
-        match (is_virtual, product) {
-            (false, _) => "no".to_owned(),
-            (true, Fact::Available(product)) => format!("yes ({product})"),
-            (true, Fact::Unavailable(_)) => "yes".to_owned(),
-        }
-    })
 }
 
 /// The soft limit of this process on `resource`.
@@ -379,17 +281,6 @@ mod tests {
         ] {
             assert_eq!(facts.find(label).unwrap().to_text(), expected);
         }
-    }
-
-    #[test]
-    fn a_realtime_kernel_is_recognised() {
-        let host = FakeHost::with(&[
-            ("/proc/sys/kernel/version", "#1 SMP PREEMPT_RT Debian 6.1"),
-            ("/sys/kernel/realtime", "1"),
-            ("/proc/sys/kernel/osrelease", "6.1.0-42-rt-amd64"),
-        ]);
-        assert_eq!(preemption(&host.files()).to_text(), "PREEMPT_RT");
-        assert_eq!(kernel_version(&host.files()), Fact::Available((6, 1)));
     }
 
     #[test]

@@ -18,7 +18,8 @@
 //! 3. [`channel`]: shared memory between them; [`mod@record`]: the notes they keep.
 //! 4. [`report`]: from the notes to what a person reads.
 //! 5. [`watch`]: looking on while a run goes; [`link`]: changing its emulated links.
-//! 6. [`realtime`], [`clock`], [`wait`], [`host_facts`], [`doctor`]: the machine.
+//! 6. [`security`]: the key that keeps strangers out of a run between two hosts.
+//! 7. [`realtime`], [`clock`], [`wait`], [`host_facts`], [`doctor`]: the machine.
 
 mod analysis;
 pub mod card_clock;
@@ -31,6 +32,7 @@ mod command;
 pub mod compare;
 pub mod console;
 pub mod doctor;
+pub mod documents;
 pub mod face;
 pub mod gateway;
 pub mod host_facts;
@@ -48,11 +50,13 @@ pub mod registry;
 mod replay;
 pub mod report;
 pub mod run_folder;
+pub mod security;
 mod series;
 pub mod signals;
 mod simulate;
 mod study;
 pub mod supervisor;
+pub mod systemd;
 pub mod topology;
 pub mod trace;
 pub mod wait;

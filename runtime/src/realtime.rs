@@ -2,6 +2,8 @@
 //! refused. It decides nothing: a refusal is listed with its reason and cure, and the caller (or
 //! the reader of the run's report) judges. Also here: the kernel calls `nix` lacks.
 
+use std::fs;
+use std::io;
 use std::time::Duration;
 
 use core_affinity::CoreId;
@@ -13,7 +15,11 @@ use nix::sys::resource::Resource;
 use nix::unistd::Pid;
 use serde::{Deserialize, Serialize};
 
-use crate::host_facts::{CAP_SYS_NICE, Fact, HostFiles, kernel_version, limit};
+pub use crate::host_facts::IsolatedCpus;
+use crate::host_facts::{
+    CAP_SYS_NICE, Fact, HostFiles, RealtimeThrottle, format_cpu_list, has_fair_server, limit,
+    online_cpus,
+};
 
 /// How the kernel schedules a thread.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -31,6 +37,32 @@ pub enum SchedulingPolicy {
     /// interrupts one by waking up. For what must not be felt by what it looks at.
     Idle,
 }
+
+impl SchedulingPolicy {
+    /// Policy with its flags, and priority, as the kernel numbers them.
+    const fn of_kernel(self) -> (libc::c_int, u8) {
+        match self {
+            Self::Other => (libc::SCHED_OTHER, 0),
+            Self::Fifo { priority } => (libc::SCHED_FIFO | libc::SCHED_RESET_ON_FORK, priority),
+            Self::Idle => (libc::SCHED_IDLE, 0),
+        }
+    }
+}
+
+impl std::fmt::Display for SchedulingPolicy {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Other => f.write_str("SCHED_OTHER"),
+            Self::Fifo { priority } => write!(f, "SCHED_FIFO {priority}"),
+            Self::Idle => f.write_str("SCHED_IDLE"),
+        }
+    }
+}
+
+/// The calling thread, in the kernel's numbers.
+const OWN_THREAD: libc::pid_t = 0;
+/// Rounds in which threads may still appear that are not moved yet.
+const MOVES_MAX: usize = 32;
 
 /// What a thread asks of the kernel.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -171,22 +203,63 @@ pub fn apply(request: &RealtimeRequest) -> RealtimeGrant {
         let asked = format!("timer slack {} ns", slack.as_nanos());
         grant.add(RealtimeItem::TimerSlack, asked, set_timer_slack(slack));
     }
-    let (asked, result) = match request.policy {
-        SchedulingPolicy::Other => ("SCHED_OTHER".to_owned(), schedule(libc::SCHED_OTHER, 0)),
-        SchedulingPolicy::Fifo { priority } => {
-            let flags = libc::SCHED_FIFO | libc::SCHED_RESET_ON_FORK;
-            (format!("SCHED_FIFO {priority}"), schedule(flags, priority))
-        }
-        SchedulingPolicy::Idle => ("SCHED_IDLE".to_owned(), schedule(libc::SCHED_IDLE, 0)),
-    };
-    grant.add(RealtimeItem::Scheduling, asked, result);
+    let (policy, priority) = request.policy.of_kernel();
+    let result = schedule(policy, priority);
+    grant.add(RealtimeItem::Scheduling, request.policy.to_string(), result);
     grant
+}
+
+/// Schedules every thread of this process that is under `from` by `to`, those included that are
+/// started meanwhile, and says what the kernel made of it. Threads under any other policy stay as
+/// they are.
+pub fn move_threads(from: SchedulingPolicy, to: SchedulingPolicy) -> RealtimeGrantItem {
+    let mut grant = RealtimeGrant::default();
+    let result = move_all(from.of_kernel().0, to.of_kernel());
+    grant.add(RealtimeItem::Scheduling, to.to_string(), result);
+    grant.items.remove(0)
+}
+
+fn move_all(from: libc::c_int, to: (libc::c_int, u8)) -> Result<(), Refusal> {
+    // A thread that was not moved yet may have started another one: until none is left.
+    for _ in 0..MOVES_MAX {
+        let threads = thread_numbers().map_err(|error| {
+            let errno = error.raw_os_error().map_or(Errno::EIO, Errno::from_raw);
+            Refusal::new(errno, "/proc/self/task cannot be read", "mount /proc")
+        })?;
+        let is_from = |thread: &libc::pid_t| {
+            let policy = current_policy(*thread);
+            policy >= 0 && policy & !libc::SCHED_RESET_ON_FORK == from & !libc::SCHED_RESET_ON_FORK
+        };
+        let mut is_moved = false;
+        for thread in threads.into_iter().filter(is_from) {
+            match set_scheduler(thread, to.0, to.1) {
+                Ok(()) => is_moved = true,
+                // It has ended.
+                Err(Errno::ESRCH) => {}
+                Err(errno) => return Err(explain(errno, to)),
+            }
+        }
+        if !is_moved {
+            return Ok(());
+        }
+    }
+    let fix = "try again when the process starts fewer threads";
+    Err(Refusal::new(Errno::EAGAIN, "new threads kept coming", fix))
+}
+
+fn thread_numbers() -> io::Result<Vec<libc::pid_t>> {
+    let entries = fs::read_dir("/proc/self/task")?;
+    let names = entries.map(|entry| Ok(entry?.file_name().to_string_lossy().parse().ok()));
+    let numbers: io::Result<Vec<Option<libc::pid_t>>> = names.collect();
+    Ok(numbers?.into_iter().flatten().collect())
 }
 
 fn pin_to(cpu: usize) -> Result<(), Refusal> {
     let online = || {
         let files = HostFiles::of_this_host();
-        files.read("/sys/devices/system/cpu/online").to_text()
+        online_cpus(&files)
+            .map(|cpus| format_cpu_list(&cpus))
+            .to_text()
     };
     let refused = |errno| {
         let reason = format!("the CPUs online are {}", online());
@@ -237,17 +310,21 @@ fn set_timer_slack(slack: Duration) -> Result<(), Refusal> {
 }
 
 fn schedule(policy: libc::c_int, priority: u8) -> Result<(), Refusal> {
-    let set = set_scheduler(policy, priority);
-    set.map_err(|errno| match policy {
-        libc::SCHED_OTHER | libc::SCHED_IDLE => explain_raising(errno),
-        _ => explain_scheduling(errno, priority, &HostFiles::of_this_host()),
-    })?;
-    let actual = current_policy();
+    let set = set_scheduler(OWN_THREAD, policy, priority);
+    set.map_err(|errno| explain(errno, (policy, priority)))?;
+    let actual = current_policy(OWN_THREAD);
     if actual & !libc::SCHED_RESET_ON_FORK == policy & !libc::SCHED_RESET_ON_FORK {
         return Ok(());
     }
     let reason = format!("the kernel accepted the call but reports policy {actual}");
     Err(Refusal::new(Errno::EAGAIN, reason, "report this kernel"))
+}
+
+fn explain(errno: Errno, (policy, priority): (libc::c_int, u8)) -> Refusal {
+    match policy {
+        libc::SCHED_OTHER | libc::SCHED_IDLE => explain_raising(errno),
+        _ => explain_scheduling(errno, priority, &HostFiles::of_this_host()),
+    }
 }
 
 /// `SCHED_IDLE` counts as nice 20, which a task without rights may enter and not leave.
@@ -256,7 +333,8 @@ fn explain_raising(errno: Errno) -> Refusal {
     Refusal::new(
         errno,
         format!("RLIMIT_NICE is {nice}"),
-        "needs CAP_SYS_NICE or LimitNICE=0 in the unit",
+        // Without a sign systemd takes the raw limit, of which 0 allows nothing (systemd.exec(5)).
+        "needs CAP_SYS_NICE or LimitNICE=+0 in the unit",
     )
 }
 
@@ -282,19 +360,19 @@ fn explain_scheduling(errno: Errno, priority: u8, files: &HostFiles) -> Refusal 
 }
 
 #[allow(unsafe_code, reason = "nix has no sched_setscheduler")]
-fn set_scheduler(policy: libc::c_int, priority: u8) -> Result<(), Errno> {
+fn set_scheduler(thread: libc::pid_t, policy: libc::c_int, priority: u8) -> Result<(), Errno> {
     let parameters = libc::sched_param {
         sched_priority: i32::from(priority),
     };
     // SAFETY: the pointer is to a live, fully initialised `sched_param` that the call only reads.
-    let code = unsafe { libc::sched_setscheduler(0, policy, &raw const parameters) };
+    let code = unsafe { libc::sched_setscheduler(thread, policy, &raw const parameters) };
     Errno::result(code).map(drop)
 }
 
 #[allow(unsafe_code, reason = "nix has no sched_getscheduler")]
-fn current_policy() -> libc::c_int {
-    // SAFETY: the call takes no pointer; 0 is the calling thread, which exists.
-    unsafe { libc::sched_getscheduler(0) }
+fn current_policy(thread: libc::pid_t) -> libc::c_int {
+    // SAFETY: the call takes no pointer; of a thread that has ended it gives -1.
+    unsafe { libc::sched_getscheduler(thread) }
 }
 
 /// What the kernel knows about how `CLOCK_REALTIME` is steered.
@@ -326,25 +404,9 @@ pub(crate) fn clock_discipline() -> Result<ClockDiscipline, Errno> {
     })
 }
 
-/// CPUs the boot command line took out of the scheduler's hands.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct IsolatedCpus {
-    /// `isolcpus=`: no task is placed here unless pinned.
-    pub isolated: Fact<Vec<usize>>,
-    /// `nohz_full=`: no periodic tick while one task runs here.
-    pub nohz_full: Fact<Vec<usize>>,
-}
-
 /// The isolated CPUs of this host.
 pub fn isolated_cpus() -> IsolatedCpus {
-    isolated_cpus_in(&HostFiles::of_this_host())
-}
-
-pub(crate) fn isolated_cpus_in(files: &HostFiles) -> IsolatedCpus {
-    IsolatedCpus {
-        isolated: files.read_cpu_list("/sys/devices/system/cpu/isolated"),
-        nohz_full: files.read_cpu_list("/sys/devices/system/cpu/nohz_full"),
-    }
+    IsolatedCpus::read(&HostFiles::of_this_host())
 }
 
 /// Whether a busy-polling thread at real-time priority belongs on a CPU.
@@ -362,37 +424,28 @@ pub fn spin_advice(cpu: usize) -> SpinAdvice {
     spin_advice_in(cpu, &HostFiles::of_this_host())
 }
 
-/// The first kernel with the deadline server that lends normal tasks 50 ms per second.
-const FAIR_SERVER_SINCE: (u32, u32) = (6, 12);
-
 pub(crate) fn spin_advice_in(cpu: usize, files: &HostFiles) -> SpinAdvice {
-    let isolated = isolated_cpus_in(files).isolated;
+    let isolated = IsolatedCpus::read(files).isolated;
     let is_isolated = isolated.available().is_some_and(|cpus| cpus.contains(&cpu));
-    let has_fair_server = kernel_version(files)
-        .available()
-        .is_some_and(|version| *version >= FAIR_SERVER_SINCE);
-    let period_us = files.read_number("/proc/sys/kernel/sched_rt_period_us");
-    let period_us = period_us.available().copied().unwrap_or(1_000_000);
-    let runtime_us = match files.read_number("/proc/sys/kernel/sched_rt_runtime_us") {
-        Fact::Available(runtime_us) => runtime_us,
+    let has_fair_server = has_fair_server(files).available() == Some(&true);
+    let throttle = match RealtimeThrottle::read(files) {
+        Fact::Available(throttle) => throttle,
         Fact::Unavailable(reason) => {
             return SpinAdvice::Warn(format!("the real-time throttle is unknown: {reason}"));
         }
     };
-    let lost_ms = (period_us - runtime_us) / 1000;
-    let is_throttled = runtime_us >= 0 && runtime_us < period_us;
+    let (runtime_us, is_throttled) = (throttle.runtime_us, throttle.is_active());
+    let (lost_ms, period_ms) = (throttle.lost_ms(), throttle.period_ms());
     match (is_isolated, is_throttled) {
         (true, true) if !has_fair_server => SpinAdvice::Warn(format!(
             "cpu {cpu} is isolated, but sched_rt_runtime_us={runtime_us} stops a FIFO spinner for \
-             {lost_ms} ms of every {} ms all the same; set it to -1",
-            period_us / 1000
+             {lost_ms} ms of every {period_ms} ms all the same; set it to -1"
         )),
         (true, _) => SpinAdvice::Fine,
         (false, true) => SpinAdvice::Warn(format!(
             "cpu {cpu} is not isolated and sched_rt_runtime_us={runtime_us}: a FIFO spinner blacks \
-             out for about {lost_ms} ms of every {} ms when any normal task wants the CPU; boot \
-             with isolcpus={cpu} or use a waiting mode that blocks",
-            period_us / 1000
+             out for about {lost_ms} ms of every {period_ms} ms when any normal task wants the CPU; boot \
+             with isolcpus={cpu} or use a waiting mode that blocks"
         )),
         (false, false) if has_fair_server => SpinAdvice::Warn(format!(
             "cpu {cpu} is not isolated: since Linux 6.12 normal tasks are lent about 50 ms of every \

@@ -96,11 +96,15 @@ struct ManifestRun {
     seed: u64,
 }
 
-/// Replays the run in `folder`.
+/// Replays the run in `folder`; `tell` hears what is done, and the share of it where that is known.
 ///
 /// # Errors
 /// When there is nothing to replay, or nobody who can.
-pub(crate) fn replay(folder: &RunFolder, registry: &Registry) -> Result<Replayed, ReplayError> {
+pub(crate) fn replay(
+    folder: &RunFolder,
+    registry: &Registry,
+    tell: &dyn Fn(Option<f64>, &str),
+) -> Result<Replayed, ReplayError> {
     let path = folder.manifest();
     let manifest = fs::read_to_string(&path)
         .map_err(|error| error.to_string())
@@ -118,7 +122,9 @@ pub(crate) fn replay(folder: &RunFolder, registry: &Registry) -> Result<Replayed
         Ok(case) => case,
         Err(source) => return Err(ReplayError::Case { name, source }),
     };
-    let mut records = MessageRecords::read(&folder.records())?;
+    let reach = |share| tell(Some(share), "reading messages");
+    let mut records = MessageRecords::read(&folder.records(), &reach)?;
+    tell(None, "running the robot again");
     if records.log.counts().next().is_none() {
         let folder = folder.records();
         return Err(ReplayError::NoRecords { folder });

@@ -87,6 +87,21 @@ impl RunFolder {
         self.root.join("records")
     }
 
+    /// The record files that are there, with their sizes in bytes, in no order.
+    ///
+    /// # Errors
+    /// When the folder cannot be read.
+    pub(crate) fn record_files(&self) -> io::Result<Vec<(PathBuf, u64)>> {
+        let mut files = Vec::new();
+        for entry in fs::read_dir(self.records())? {
+            let (entry, path) = entry.map(|entry| (entry.metadata(), entry.path()))?;
+            if path.extension().is_some_and(|ending| ending == "rec") {
+                files.push((path, entry?.len()));
+            }
+        }
+        Ok(files)
+    }
+
     /// Card of a component.
     pub fn card(&self, process: &str) -> PathBuf {
         self.root.join("cards").join(format!("{process}.json"))

@@ -25,7 +25,8 @@ unguarded() { ! guards; }
 shuttle() {
     exec "$hil" --topology /tmp/topologies/shuttle-split.toml --host "$host" \
         --set 'hosts.control-pc.interface="eth0"' --set 'hosts.robot-pc.interface="eth0"' \
-        --set 'links.hop.timestamps="hardware"' --set "run.duration=\"$1 s\"" \
+        --set 'links.hop.timestamps="hardware"' --set 'security.hops="plain"' \
+        --set "run.duration=\"$1 s\"" \
         --set "run.start_timeout=\"$boot_limit s\"" --set "run.record=\"$2\""
 }
 left() { echo "$1=$2" >>"$share/codes.txt"; }

@@ -49,6 +49,8 @@ start_timeout = "60 s"
 name = "shuttle"
 [case.parameters]
 rate_hz = 100.0
+[security]
+hops = "plain"
 [hosts.control-pc]
 address = "10.77.0.1"
 interface = "$2"

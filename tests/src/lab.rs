@@ -244,6 +244,44 @@ impl LabHost {
         }
     }
 
+    /// Takes the address of the first cable away from this host, as a lease that ran out does.
+    ///
+    /// # Panics
+    /// When it cannot be done.
+    pub fn take_address(&self) {
+        self.change(&["address", "del", &format!("{}/24", self.address)]);
+    }
+
+    /// Gives the address of the first cable back.
+    ///
+    /// # Panics
+    /// When it cannot be done.
+    pub fn give_address(&self) {
+        self.change(&["address", "add", &format!("{}/24", self.address)]);
+    }
+
+    /// Sets the longest packet of the first cable's interface, in bytes, and lets the host forget what it
+    /// learnt of the path: Linux keeps a small one for ten minutes (`net.ipv4.route.mtu_expires`).
+    ///
+    /// # Panics
+    /// When it cannot be done.
+    pub fn set_mtu(&self, bytes: u16) {
+        self.change(&["link", "set", "mtu", &bytes.to_string()]);
+        let forget = ["-n", self.namespace.as_str(), "route", "flush", "cache"];
+        if let Err(reason) = namespace::ip(&forget) {
+            panic!("{forget:?}: {reason}");
+        }
+    }
+
+    /// Runs `ip -n <this host> <words> dev <the first cable>`.
+    fn change(&self, words: &[&str]) {
+        let host = ["-n", self.namespace.as_str()];
+        let arguments: Vec<&str> = [&host, words, &["dev", INTERFACE]].concat();
+        if let Err(reason) = namespace::ip(&arguments) {
+            panic!("{words:?} on {}: {reason}", self.namespace);
+        }
+    }
+
     /// Runs `work` in a thread whose new sockets belong to this host's network. The sockets stay
     /// there when they are handed out; the file system is this machine's.
     ///

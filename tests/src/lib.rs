@@ -4,12 +4,17 @@
 
 pub mod account;
 pub mod arms;
+pub mod attacker;
 pub mod binary;
 pub mod browser;
+pub mod chaos;
 pub mod child;
 pub mod lab;
+pub mod latency;
 pub mod mcap_file;
 pub mod run_folder;
+pub mod shown;
 pub mod shuttle;
+pub mod soak;
 pub mod source_tree;
 pub mod trial;

@@ -1,13 +1,14 @@
 //! An MCAP file as the container's own reader has it, and the commands of `hil-recorder` that make one.
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::{env, fs};
 
 use serde_json::Value;
 
 use crate::binary::{hil_recorder_binary, workspace_folder};
+use crate::child::ChildGuard;
 
 /// Names the Python to read with.
 pub const PYTHON_VARIABLE: &str = "HIL_MCAP_PYTHON";
@@ -23,6 +24,26 @@ pub fn recorder(arguments: &[&str], paths: &[&Path]) -> Output {
         Ok(output) => output,
         Err(error) => panic!("hil-recorder cannot be started: {error}"),
     }
+}
+
+/// Starts `hil-recorder record`.
+///
+/// # Panics
+/// When it cannot be started.
+pub fn record(arguments: &[&str], output: &Path) -> ChildGuard {
+    let mut command = Command::new(hil_recorder_binary());
+    command.arg("record").args(arguments).arg("-o").arg(output);
+    match ChildGuard::spawn(&mut command) {
+        Ok(recorder) => recorder,
+        Err(error) => panic!("hil-recorder cannot be started: {error}"),
+    }
+}
+
+/// What the file at `path` is called until it is whole.
+pub fn partial(path: &Path) -> PathBuf {
+    let mut name = path.as_os_str().to_owned();
+    name.push(".partial");
+    PathBuf::from(name)
 }
 
 /// What a program said, on either stream.

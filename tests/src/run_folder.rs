@@ -17,10 +17,18 @@ impl RunFolder {
     /// # Panics
     /// When the folder cannot be created: no test can go on without it.
     pub fn new(label: &str) -> Self {
+        Self::below(&std::env::temp_dir(), label)
+    }
+
+    /// The same below `parent`.
+    ///
+    /// # Panics
+    /// As [`RunFolder::new`].
+    pub fn below(parent: &Path, label: &str) -> Self {
         static NEXT: AtomicUsize = AtomicUsize::new(0);
         let index = NEXT.fetch_add(1, Ordering::Relaxed);
         let name = format!("hil-test-{}-{index}-{label}", process::id());
-        let path = std::env::temp_dir().join(name);
+        let path = parent.join(name);
         // A folder of this name can only be left over from a process whose identifier came round.
         drop(fs::remove_dir_all(&path));
         let created = fs::create_dir(&path);

@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 
 use hil_runtime::channel::DomainAddress;
 use hil_runtime::report::summary::RunSummary;
+use hil_runtime::security::PreSharedKey;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use serde_json::Value;
@@ -38,11 +39,21 @@ impl Trial {
     /// Any topology file.
     pub fn of(topology: &Path, record: &Path) -> Self {
         let record_setting = format!("run.record=\"{}\"", record.display());
+        let mut settings = vec![record_setting];
+        if is_secured(topology) {
+            settings.push(format!("security.key=\"{}\"", hop_key(record).display()));
+        }
         Self {
             topology: topology.to_owned(),
-            settings: vec![record_setting],
+            settings,
             record: record.to_owned(),
         }
+    }
+
+    /// The same with hops that anyone on the wire can read.
+    #[must_use]
+    pub fn plain(self) -> Self {
+        self.set("security.hops=\"plain\"")
     }
 
     /// The same with one value changed, e.g. `run.duration="5 s"`.
@@ -95,6 +106,7 @@ impl Trial {
         wait_until(limit, &format!("a run folder {suffix}"), || {
             let entries = fs::read_dir(&self.record).into_iter().flatten().flatten();
             found = entries
+                .filter(|entry| entry.path().is_dir())
                 .filter(|entry| entry.file_name().to_string_lossy().ends_with(suffix))
                 .map(|entry| entry.path())
                 .collect();
@@ -105,6 +117,32 @@ impl Trial {
             root: found.remove(0),
         }
     }
+}
+
+/// Whether a topology, or one that it extends, has hops between hosts to be secured.
+fn is_secured(topology: &Path) -> bool {
+    let text = fs::read_to_string(topology).unwrap_or_default();
+    let mut lines = text.lines();
+    let base = lines.find_map(|line| line.strip_prefix("extends = \"")?.split('"').next());
+    let folder = topology.parent().unwrap_or(Path::new("."));
+    text.contains("[security]") || base.is_some_and(|base| is_secured(&folder.join(base)))
+}
+
+/// The key of every run between two hosts that records into `record`.
+///
+/// # Panics
+/// When it cannot be made.
+pub fn hop_key(record: &Path) -> PathBuf {
+    let path = record.join(".hop.key");
+    if !path.exists() {
+        let made = fs::create_dir_all(record)
+            .map_err(|error| error.to_string())
+            .and_then(|()| PreSharedKey::create(&path).map_err(|error| error.to_string()));
+        if let Err(error) = made {
+            panic!("no key for the test's hops: {error}");
+        }
+    }
+    path
 }
 
 /// The path of a topology that ships with the workspace.

@@ -1,6 +1,6 @@
 //! Our pages in a browser, with the network cable pulled: the live page of `hil-recorder serve` beside a run
-//! that goes on, pages of others that may not look on, and the pages of `hil-runtime report`. Clicks
-//! and keys go through the browser's own input, figures are read off the page.
+//! that goes on, pages of others that may not look on, and the pages of `hil-runtime report`, on the screen and
+//! on paper. Clicks and keys go through the browser's own input, figures are read off the page.
 //!
 //! Needs Chromium; without one the tests say so and are skipped, and in CI they fail. `HIL_BROWSER` names
 //! another one, and empty leaves them out. Pictures go to `HIL_SCREENSHOTS`, else to the target folder.
@@ -11,91 +11,20 @@ use std::process::Command;
 use std::thread;
 use std::time::Duration;
 
-use hil_tests::binary::{hil_recorder_binary, hil_runtime_binary};
+use hil_tests::binary::hil_runtime_binary;
 use hil_tests::browser::{Browser, Page, screenshot_folder};
-use hil_tests::child::{ChildGuard, run};
-use hil_tests::lab::{INTERFACE, Lab, LabHost};
+use hil_tests::child::run;
+use hil_tests::lab::LabHost;
 use hil_tests::run_folder::RunFolder;
+use hil_tests::shown::{DESKTOP, Shown, assert_clean, serve, settle, with_the_cable_pulled};
 use hil_tests::trial::Trial;
 use nix::sys::signal::{Signal, kill};
 use serde_json::Value;
 
 const LIMIT: Duration = Duration::from_mins(2);
-const DESKTOP: (u32, u32) = (1440, 900);
 const PHONE: (u32, u32) = (390, 844);
-/// All that a page may bring over the network, in bytes.
-const WEIGHT_MAX: u64 = 1_000_000;
 /// All that a report may have to lay out: with its size, what makes it open fast on any machine.
 const ELEMENT_COUNT_MAX: f64 = 8_000.0;
-
-/// A run that goes on, a recorder that shows it, and the address of its page.
-struct Shown {
-    run: ChildGuard,
-    recorder: ChildGuard,
-    address: String,
-    folder: RunFolder,
-}
-
-impl Shown {
-    fn start(trial: &Trial, folder: RunFolder, host: &LabHost) -> Self {
-        let run = trial.start_on(host);
-        let root = trial.folder("", LIMIT).root().to_owned();
-        let ports = ["--port", "0", "--http-port", "0"];
-        let (recorder, address) = serve(&root, host, &ports);
-        Self {
-            run,
-            recorder,
-            address,
-            folder,
-        }
-    }
-
-    /// Ends both as a user does, and waits for them.
-    fn end(mut self) {
-        for child in [&mut self.recorder, &mut self.run] {
-            child.signal(Signal::SIGINT).unwrap();
-            child.wait_within(LIMIT).unwrap();
-        }
-        drop(self.folder);
-    }
-}
-
-/// A network on which nothing can be reached and nothing changes: browsers drop what they are loading
-/// when an interface comes or goes, as those of other tests do all the time.
-fn with_the_cable_pulled() -> Option<Lab> {
-    let lab = Lab::two_hosts_or_skip()?;
-    lab.host(0).set_link(INTERFACE, "down");
-    Some(lab)
-}
-
-/// Shows the run of this folder as soon as it goes on. Two that begin within a second have one name.
-fn serve(root: &Path, host: &LabHost, options: &[&str]) -> (ChildGuard, String) {
-    let mut command = host.command(hil_recorder_binary());
-    let mut recorder =
-        ChildGuard::spawn(command.args(["serve", "--wait"]).arg(root).args(options)).unwrap();
-    let printed = recorder.wait_for_output("http://", LIMIT);
-    assert!(printed.is_ok(), "{}", printed.unwrap_err());
-    let words = recorder.stdout_so_far() + &recorder.stderr_so_far();
-    let mut addresses = words.split_whitespace();
-    let address = addresses.find(|word| word.starts_with("http://")).unwrap();
-    let address = address.trim_end_matches([',', '.']).to_owned();
-    (recorder, address)
-}
-
-/// Nothing on the console, nothing from elsewhere, and no more than a page may weigh.
-fn assert_clean(page: &mut Page<'_>, name: &str) {
-    let complaints = page.complaints();
-    assert!(complaints.is_empty(), "{name}: {complaints:#?}");
-    for address in page.addresses() {
-        let is_own = ["http://127.0.0.1:", "ws://127.0.0.1:", "file:///"]
-            .iter()
-            .any(|own| address.starts_with(own));
-        assert!(is_own, "{name} asked for {address}");
-    }
-    let bytes = page.received_bytes();
-    eprintln!("{name}: {bytes} bytes over the network");
-    assert!(bytes <= WEIGHT_MAX, "{name}: {bytes} bytes");
-}
 
 /// Pictures as on a desk, in the dark and on a phone, where nothing may stick out sideways.
 fn take_pictures(page: &mut Page<'_>, name: &str) {
@@ -116,11 +45,14 @@ fn take_pictures(page: &mut Page<'_>, name: &str) {
     settle(page);
 }
 
-/// Waits until the page has been drawn a few times since whatever was done to it.
-fn settle(page: &mut Page<'_>) {
-    let frames = "new Promise(done => { let left = 30; const next = () => --left ? \
-                  requestAnimationFrame(next) : done(true); next(); })";
-    page.value(frames);
+/// A stage without an area, as before the first layout, is drawn on without a complaint.
+fn vanish(page: &mut Page<'_>) {
+    let stage = "document.getElementById('stage')";
+    page.value(&format!("void ({stage}.style.display = 'none')"));
+    page.wait_until(&format!("{stage}.width === 0"));
+    settle(page);
+    page.value(&format!("void ({stage}.style.display = '')"));
+    page.wait_until(&format!("{stage}.width > 0"));
 }
 
 /// Keeps an expression's value on the page under a name, to compare with later.
@@ -293,6 +225,7 @@ fn the_live_page_shows_a_fleet_and_changes_its_links() {
     page.wait_until("hil.snapshot().robots.length === 7 && hil.snapshot().robots[0].fleet === 1");
     take_pictures(&mut page, "live-fleet");
     check_condition(&mut page, "commands.forward", "fleet/authority");
+    vanish(&mut page);
     assert_clean(&mut page, "the live page of a fleet");
     // From here on the browser itself complains of the lost connection.
     check_return(&mut page, &mut shown, (&root, host));
@@ -357,6 +290,7 @@ fn the_live_page_shows_arms() {
     page.click("tr[data-channel='egm/right/command'] button");
     page.wait_until("document.querySelectorAll('.strip').length >= 7");
     take_pictures(&mut page, "live-arms");
+    vanish(&mut page);
     assert_clean(&mut page, "the live page of arms");
     drop(page);
     shown.end();
@@ -435,11 +369,54 @@ fn look_at_report(browser: &mut Browser, report: &Path, name: &str) {
     );
     take_pictures(&mut page, name);
     assert_clean(&mut page, name);
+    check_on_paper(&mut page, name);
+}
+
+/// What is folded on the screen, but for the text as it was printed on the terminal.
+const FOLDED: &str = "details:not(.printed details)";
+
+/// Paper cannot be unfolded: what is folded is printed whole, by the style alone and by the script where a
+/// browser does not know that style, and is folded again afterwards.
+fn check_on_paper(page: &mut Page<'_>, name: &str) {
+    let parts = format!("[...document.querySelectorAll('{FOLDED} > :not(summary)')]");
+    let all = number(page, &format!("{parts}.length"));
+    if all == 0.0 {
+        // A run of few rows and warnings; `report::page` tests what is folded of longer ones.
+        eprintln!("{name}: nothing is folded");
+        return;
+    }
+    let visible = format!("{parts}.filter(one => one.checkVisibility()).length");
+    assert_eq!(number(page, &visible).to_bits(), 0.0_f64.to_bits());
+    page.set_paper(true);
+    settle(page);
+    assert_eq!(number(page, &visible).to_bits(), all.to_bits(), "{name}");
+    let open = "document.querySelectorAll('details[open]').length === 0";
+    assert_eq!(page.value(open), true, "{name}: by the style alone");
+    page.set_paper(false);
+    keep(page, "foldedOnPaper", "[]");
+    page.value(
+        "addEventListener('beforeprint', () => foldedOnPaper.push(\
+         document.querySelectorAll('details:not([open])').length))",
+    );
+    let whole = page.printed().len();
+    assert_eq!(
+        page.value("foldedOnPaper"),
+        serde_json::json!([0]),
+        "{name}"
+    );
+    page.wait_until(open);
+    page.value(&format!("{parts}.forEach(one => one.remove())"));
+    let without = page.printed().len();
+    eprintln!("{name}: {all} folded parts, {whole} bytes printed, {without} without them");
+    assert!(whole > without + 500, "{name}: {whole} and {without} bytes");
 }
 
 #[test]
 fn reports_of_fleet_and_arms_open_without_a_complaint() {
-    let Some(mut browser) = Browser::start_or_skip() else {
+    let Some(lab) = with_the_cable_pulled() else {
+        return;
+    };
+    let Some(mut browser) = Browser::start_on_or_skip(lab.host(0)) else {
         return;
     };
     let fleet = RunFolder::new("browser-report-fleet");

@@ -177,6 +177,7 @@ fn launch(folder: &RunFolder, name: &str, domain: &Domain, direction: DirectionL
         records,
         directions: vec![direction],
         ready_within: None,
+        is_sealed: false,
     };
     let path = folder.join(format!("{name}.json"));
     write(&path, &launch).unwrap();

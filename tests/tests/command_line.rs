@@ -1,4 +1,5 @@
-//! The command line as a person uses it: help, checks, mistakes, Ctrl-C, and every command.
+//! The command line as a person uses it: checks, mistakes, Ctrl-C, and what commands do. Their help is in
+//! `help.rs`.
 #![allow(clippy::unwrap_used, clippy::print_stdout, reason = "tests")]
 
 use std::fs;
@@ -46,41 +47,6 @@ fn assert_says(finished: &Finished, words: &[&str]) {
     }
 }
 
-/// The commands that `--help` lists.
-fn listed_commands() -> Vec<String> {
-    let help = run(&["--help"]);
-    assert_code(&help, 0);
-    let after = help.stdout.split("Commands:\n").nth(1).unwrap();
-    let list = after.split("\n\n").next().unwrap();
-    let names = list.lines().filter_map(|line| {
-        let is_name = line.starts_with("  ") && !line.starts_with("   ");
-        is_name.then(|| line.split_whitespace().next()).flatten()
-    });
-    let names = names.filter(|name| *name != "help").map(str::to_owned);
-    names.collect()
-}
-
-#[test]
-fn the_help_of_every_command_has_an_example() {
-    let commands = listed_commands();
-    assert!(commands.len() >= 5, "{commands:?}");
-    for command in commands {
-        let help = run(&[&command, "--help"]);
-        assert_code(&help, 0);
-        let example = help.stdout.split("Example").nth(1).unwrap_or_default();
-        let usage = format!("hil-runtime {command}");
-        assert!(example.contains(&usage), "{command}: {}", help.stdout);
-    }
-    let help = run(&["--help"]).stdout;
-    assert!(
-        help.contains("Examples:") && help.contains("Exit codes:"),
-        "{help}"
-    );
-    let nothing = run(&[]);
-    assert_code(&nothing, 2);
-    assert_says(&nothing, &["Usage:", "Examples:"]);
-}
-
 #[test]
 fn every_shipped_topology_is_fit_and_so_are_the_commands_it_tells_of() {
     let folder = workspace_folder().join("deploy/topologies");
@@ -101,7 +67,9 @@ fn every_shipped_topology_is_fit_and_so_are_the_commands_it_tells_of() {
         assert!(checked.stdout.contains("the file is valid"), "{checked:?}");
         let told = text.lines().filter_map(|line| {
             let (comment, command) = line.split_once("hil-runtime ")?;
-            comment.starts_with('#').then_some(command)
+            // What is told with sudo makes a file outside the test's folder: the key of a hop.
+            let is_tried = comment.starts_with('#') && !comment.ends_with("sudo ");
+            is_tried.then_some(command)
         });
         for command in told {
             command_count += 1;
@@ -193,7 +161,7 @@ fn a_host_whose_address_is_elsewhere_says_so() {
         ("robot-pc", "cannot connect from 203.0.113.2"),
     ] {
         let finished = start_as(&trial, host).wait_within(LIMIT).unwrap();
-        assert_code(&finished, 2);
+        assert_code(&finished, 75);
         assert_says(&finished, &[words, "is it this host's address"]);
     }
 }
@@ -355,24 +323,6 @@ fn the_report_of_a_finished_run_can_be_printed_again() {
     let missing = run(&["report", record.join("nothing").to_str().unwrap()]);
     assert_code(&missing, 2);
     assert_says(&missing, &["nothing"]);
-}
-
-#[test]
-fn the_doctor_speaks_json_and_is_strict_when_told_to() {
-    let finished = run(&["doctor", "--json"]);
-    finished.assert_success();
-    let report: Value = serde_json::from_str(&finished.stdout).unwrap();
-    assert!(
-        report["host"]
-            .as_array()
-            .is_some_and(|facts| facts.len() > 5),
-        "{report}"
-    );
-    let text = run(&["doctor"]);
-    text.assert_success();
-    assert!(text.stdout.contains("kernel"), "{}", text.stdout);
-    let strict = run(&["doctor", "--strict"]);
-    assert!(matches!(strict.status.code(), Some(0 | 78)), "{strict:?}");
 }
 
 #[test]

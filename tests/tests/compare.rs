@@ -99,6 +99,10 @@ fn a_worse_link_is_found_and_scripts_get_their_exit_code() {
     assert_eq!(code, Some(0));
     assert!(text.contains("| shuttle/command | loss |"), "{text}");
     assert!(text.contains("no difference shown"), "{text}");
+    let lines: Vec<&str> = text.lines().collect();
+    let care = lines.iter().position(|line| *line == "Read with care:");
+    let care = care.expect("one run on a side is read with care");
+    assert_eq!((lines[care - 1], lines[care + 1]), ("", ""), "{text}");
 }
 
 fn check_conditions((near, again, far): (&Path, &Path, &Path)) {
@@ -112,6 +116,7 @@ fn check_conditions((near, again, far): (&Path, &Path, &Path)) {
         ("p49 > 1.2x", [near, far], 2),
         ("nowhere:p50 > 1.2x", [near, far], 2),
         ("p50 > 3%", [near, far], 2),
+        ("p50 > 3", [near, far], 2),
         ("max > 1.5x", [near, far], 2),
     ] {
         let (code, text, error) = compare(&["--fail-if", condition], &folders);
@@ -119,6 +124,12 @@ fn check_conditions((near, again, far): (&Path, &Path, &Path)) {
     }
     let (code, ..) = compare(&["--fail-if", "max > 0.1x", "--strict"], &[near, far]);
     assert_eq!(code, Some(1), "strictly, a maximum can be judged");
+    let (_, text, _) = compare(&["--fail-if", "shuttle/command:p50 > 1 s"], &[near, far]);
+    let judged = text.lines().last().unwrap();
+    assert!(
+        judged.starts_with("passes: ") && judged.ends_with(" s)"),
+        "{judged}"
+    );
     let (code, _, error) = compare(&[], &[near, Path::new("/nowhere")]);
     assert_eq!(code, Some(2));
     assert!(error.contains("/nowhere/summary.json"), "{error}");

@@ -280,6 +280,37 @@ fn the_lua_dissector_shows_every_field_of_every_kind() {
 }
 
 #[test]
+fn a_sealed_payload_is_shown_as_sealed_and_not_misread() {
+    if !has_tshark() {
+        return;
+    }
+    let folder = RunFolder::new("dissector-sealed");
+    let mut sealed = datagram(&sample_header(Kind::SyncResponse), &[7; 96]);
+    sealed[56..60].copy_from_slice(&80_u32.to_le_bytes());
+    sealed[6..8].copy_from_slice(&[1, 3]);
+    sealed[68..72].copy_from_slice(&9_u32.to_le_bytes());
+    let mut request = datagram(&sample_header(Kind::KeyRequest), &[8; 48]);
+    request[6] = 1;
+    let frames: Vec<Vec<u8>> = [sealed, request].iter().map(|one| udp_frame(one)).collect();
+    let file = capture(&folder, &frames);
+    let fields = [
+        "hil.kind",
+        "hil.seal.generation",
+        "hil.seal.number",
+        "hil.seal.payload",
+        "hil.tag",
+        "hil.sync.t1_ns",
+        "hil.seal.salt",
+        "hil.expert.malformed",
+    ];
+    let packets = tshark(&file, &["-X", &dissector()], &fields);
+    let (payload, tag, salt) = ("07".repeat(80), "07".repeat(16), "08".repeat(16));
+    let shown = |index: usize| fields.map(|field| packets[index][field].as_str());
+    assert_eq!(shown(0), ["3", "3", "9", &payload, &tag, "", "", ""]);
+    assert_eq!(shown(1), ["7", "0", "0", "", "", "", &salt, ""]);
+}
+
+#[test]
 fn the_dissector_marks_what_is_not_as_it_must_be_and_leaves_others_alone() {
     if !has_tshark() {
         return;

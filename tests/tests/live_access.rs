@@ -1,18 +1,23 @@
 //! Who may look on: the socket and the page of `hil-recorder serve` against pages of others, names that
-//! may be anybody's, too many viewers and bytes that are no request. No run is needed for that.
+//! may be anybody's, too many viewers, viewers that vanish and bytes that are no request. No run is needed for
+//! that.
 #![allow(clippy::unwrap_used, reason = "tests")]
 
 use std::fs;
 use std::io::{Read, Write};
-use std::net::{Shutdown, TcpStream};
+use std::net::{Ipv4Addr, Shutdown, TcpStream};
 use std::process::Command;
+use std::thread;
 use std::time::{Duration, Instant};
 
 use hil_tests::binary::hil_recorder_binary;
 use hil_tests::child::{ChildGuard, Finished, run};
+use hil_tests::lab::{INTERFACE, Lab};
 use nix::sys::signal::Signal;
 
 const LIMIT: Duration = Duration::from_mins(1);
+/// Four times as long as a viewer that says nothing keeps its seat.
+const GONE_LIMIT: Duration = Duration::from_mins(2);
 /// Viewers at once, as docs/live-view.md says.
 const SEATS: usize = 32;
 const EVIL: &str = "https://evil.example";
@@ -25,7 +30,10 @@ struct Server {
 
 impl Server {
     fn start(options: &[&str]) -> Self {
-        let mut command = Command::new(hil_recorder_binary());
+        Self::start_by(Command::new(hil_recorder_binary()), options)
+    }
+
+    fn start_by(mut command: Command, options: &[&str]) -> Self {
         command.args(["serve", "--wait", "no-run-is-called-so"]);
         command.args(["--port", "0", "--http-port", "0"]);
         let mut child = ChildGuard::spawn(command.args(options)).unwrap();
@@ -45,14 +53,7 @@ impl Server {
 
     /// Asks to look on, as a browser or a program does.
     fn ask(&self, host: &str, origin: Option<&str>) -> Asked {
-        let origin = origin.map_or_else(String::new, |origin| format!("Origin: {origin}\r\n"));
-        let request = format!(
-            "GET / HTTP/1.1\r\nHost: {host}\r\n{origin}Upgrade: websocket\r\n\
-             Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\n\
-             Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\
-             Sec-WebSocket-Protocol: foxglove.sdk.v1\r\n\r\n"
-        );
-        Asked::send(&self.socket, request.as_bytes())
+        Asked::to_look_on(&self.socket, (host, origin))
     }
 
     fn ask_as_program(&self) -> Asked {
@@ -73,6 +74,17 @@ struct Asked {
 }
 
 impl Asked {
+    fn to_look_on(address: &str, (host, origin): (&str, Option<&str>)) -> Self {
+        let origin = origin.map_or_else(String::new, |origin| format!("Origin: {origin}\r\n"));
+        let request = format!(
+            "GET / HTTP/1.1\r\nHost: {host}\r\n{origin}Upgrade: websocket\r\n\
+             Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\n\
+             Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\
+             Sec-WebSocket-Protocol: foxglove.sdk.v1\r\n\r\n"
+        );
+        Self::send(address, request.as_bytes())
+    }
+
     fn send(address: &str, bytes: &[u8]) -> Self {
         let mut stream = TcpStream::connect(address).unwrap();
         stream.set_read_timeout(Some(LIMIT)).unwrap();
@@ -156,9 +168,15 @@ fn programs_our_own_page_and_allowed_pages_look_on() {
     server.ask_as_program().is_let_in();
     let own = format!("http://{}", server.page);
     let claimed = format!("http://{}", server.socket);
-    for origin in [&*own, &*claimed, "https://app.foxglove.dev", "file://"] {
+    for origin in [&*own, &*claimed, "https://app.foxglove.dev"] {
         server.ask(&server.socket, Some(origin)).is_let_in();
     }
+    let file = server.ask(&server.socket, Some("file://")).answer();
+    assert_refused(
+        &file,
+        "403",
+        "--allow-origin file:// lets them all see the run",
+    );
     // Through a tunnel from another machine, by whatever port.
     let page_port = server.page.rsplit(':').next().unwrap();
     let tunnelled = format!("http://localhost:{page_port}");
@@ -166,6 +184,20 @@ fn programs_our_own_page_and_allowed_pages_look_on() {
     let other = server.ask("localhost:18765", Some("http://localhost:3000"));
     assert_refused(&other.answer(), "403", "http://localhost:3000");
     server.end();
+    let server = Server::start(&["--allow-origin", "file://"]);
+    server.ask(&server.socket, Some("file://")).is_let_in();
+    server.end();
+}
+
+#[test]
+fn nobody_is_told_to_paste_what_a_shell_would_run() {
+    let server = Server::start(&[]);
+    let origin = "http://$(touch${IFS}pwned).example;`id`";
+    let answer = server.ask(&server.socket, Some(origin)).answer();
+    assert_refused(&answer, "403", "refused a page of http://$(touch");
+    assert!(!answer.contains("--allow-origin"), "{answer}");
+    let finished = server.end();
+    assert!(!finished.stderr.contains("--allow-origin"), "{finished:?}");
 }
 
 #[test]
@@ -216,6 +248,35 @@ fn a_viewer_too_many_is_told_so_and_comes_in_when_another_has_gone() {
         let mut rest = Vec::new();
         viewer.stream.read_to_end(&mut rest).unwrap();
     }
+}
+
+#[test]
+fn viewers_whose_cable_was_pulled_lose_their_seats() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let [here, there] = [0, 1].map(|index| lab.host(index));
+    let program = here.command(hil_recorder_binary());
+    let server = Server::start_by(program, &["--host", "0.0.0.0"]);
+    let port = server.socket.rsplit(':').next().unwrap();
+    let [local, remote] = [Ipv4Addr::LOCALHOST, here.address()].map(|one| format!("{one}:{port}"));
+    let look_on = || {
+        let mut asked = Asked::to_look_on(&remote, (&remote, None));
+        asked.is_let_in();
+        asked
+    };
+    let viewers: Vec<Asked> = there.on_network(|| (0..SEATS).map(|_| look_on()).collect());
+    let ask = || here.on_network(|| Asked::to_look_on(&local, (&local, None)));
+    let full = format!("{SEATS} look on already");
+    assert_refused(&ask().answer(), "503", &full);
+    there.set_link(INTERFACE, "down");
+    let deadline = Instant::now() + GONE_LIMIT;
+    while !ask().until("\r\n\r\n").starts_with("HTTP/1.1 101 ") {
+        assert!(Instant::now() < deadline, "the seats stay taken");
+        thread::sleep(Duration::from_millis(500));
+    }
+    drop(viewers);
+    server.end();
 }
 
 #[test]

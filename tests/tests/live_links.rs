@@ -209,7 +209,7 @@ fn check_refusals(run: &Path) {
             &["set", "hip", "--cut"][..],
             "no link `hip`; its links: hop (emulated)",
         ),
-        (&["set", "hop", "--loss", "1.5"], "1.5 is outside 0..=1"),
+        (&["set", "hop", "--loss", "1.5"], "1.5 is outside 0 to 1"),
         (&["set", "hop", "--delay", "50"], "has no unit"),
         (&["set", "hop", "--delay", "50s"], "room for 10."),
     ] {

@@ -3,22 +3,28 @@
 //! test does not depend on how fast the machine is.
 #![allow(clippy::unwrap_used, reason = "tests")]
 
-use std::fs::{self, OpenOptions};
+use std::fs::{self, File, OpenOptions};
 use std::io::Write;
+use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::Command;
 use std::thread;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use hil_models::trace::{
     Trace, TraceArrival, TraceDirection, TraceFate, TraceHeader, TraceRecord, UNAVAILABLE_NS, wire,
 };
 use hil_tests::binary::hil_runtime_binary;
+use hil_tests::child::{ChildGuard, Finished};
+use nix::errno::Errno;
+use nix::fcntl::OFlag;
 use nix::sys::stat::Mode;
 use nix::unistd::mkfifo;
 
 /// Longer than a command is silent, by more than two of its lines' periods.
 const KEPT_WAITING: Duration = Duration::from_millis(2500);
+/// No command here takes a tenth of this on an overloaded machine.
+const LIMIT: Duration = Duration::from_mins(1);
 
 struct Folder(PathBuf);
 
@@ -42,28 +48,38 @@ impl Drop for Folder {
 }
 
 /// Runs the command while `bytes` come through a pipe at `pipe`, the first of them late.
-fn kept_waiting(pipe: &Path, bytes: &[u8], arguments: &[&str]) -> Output {
+fn kept_waiting(pipe: &Path, bytes: &[u8], arguments: &[&str]) -> Finished {
     mkfifo(pipe, Mode::S_IRUSR | Mode::S_IWUSR).unwrap();
     let mut command = Command::new(hil_runtime_binary());
-    command.args(arguments);
-    thread::scope(|scope| {
-        scope.spawn(|| {
-            // Opens once the command reads.
-            let mut file = OpenOptions::new().write(true).open(pipe).unwrap();
-            thread::sleep(KEPT_WAITING);
-            file.write_all(bytes).unwrap();
-        });
-        command.output().unwrap()
-    })
+    let mut child = ChildGuard::spawn(command.args(arguments)).unwrap();
+    if let Some(mut writer) = opened(pipe, &mut child) {
+        thread::sleep(KEPT_WAITING);
+        // Fails when the command has ended meanwhile; what it said is looked at below.
+        let _is_taken = writer.write_all(bytes).is_ok();
+    }
+    child.wait_within(LIMIT).unwrap()
 }
 
-fn text(bytes: &[u8]) -> String {
-    String::from_utf8_lossy(bytes).into_owned()
+/// The writing end of `pipe` once the command reads; `None` when it ends without doing so. Opened in the
+/// usual way it would wait for a reader for ever.
+fn opened(pipe: &Path, child: &mut ChildGuard) -> Option<File> {
+    let deadline = Instant::now() + LIMIT;
+    let mut options = OpenOptions::new();
+    options.write(true).custom_flags(OFlag::O_NONBLOCK.bits());
+    while child.is_running() {
+        match options.open(pipe) {
+            Ok(file) => return Some(file),
+            Err(error) => assert_eq!(error.raw_os_error(), Some(Errno::ENXIO as i32)),
+        }
+        assert!(Instant::now() < deadline, "{}", child.stderr_so_far());
+        thread::sleep(Duration::from_millis(10));
+    }
+    None
 }
 
 /// The command said what it does and for how long on standard error, and only there.
-fn assert_shown(output: &Output, words: &str) {
-    let (stdout, stderr) = (text(&output.stdout), text(&output.stderr));
+fn assert_shown(output: &Finished, words: &str) {
+    let (stdout, stderr) = (&output.stdout, &output.stderr);
     let told = stderr.lines().find(|line| line.contains(words));
     let line = told.unwrap_or_else(|| panic!("no line says {words:?}\n{stderr}"));
     assert!(
@@ -117,8 +133,8 @@ fn a_trace_that_takes_long_to_read_says_so() {
     let pipe = folder.path("slow.trace");
     let output = kept_waiting(&pipe, &trace(), &["trace", "info", pipe.to_str().unwrap()]);
     assert_shown(&output, "reading ");
-    assert!(output.status.success(), "{}", text(&output.stderr));
-    assert!(text(&output.stdout).contains("shuttle/state"));
+    output.assert_success();
+    assert!(output.stdout.contains("shuttle/state"));
 }
 
 #[test]
@@ -133,7 +149,7 @@ fn a_conversion_that_takes_long_says_so_and_is_whole() {
     ];
     let output = kept_waiting(&pipe, &trace(), &arguments);
     assert_shown(&output, "reading ");
-    assert!(output.status.success(), "{}", text(&output.stderr));
+    output.assert_success();
     assert!(fs::read_to_string(into).unwrap().lines().count() > 100);
 }
 
@@ -146,11 +162,7 @@ fn packets_that_take_long_to_read_say_so() {
     let bytes: Vec<u8> = words.iter().flat_map(|word| word.to_le_bytes()).collect();
     let output = kept_waiting(&pipe, &bytes, &["probe", "analyse", pipe.to_str().unwrap()]);
     assert_shown(&output, "reading packets");
-    assert!(
-        text(&output.stdout).contains("0 packets"),
-        "{}",
-        text(&output.stdout)
-    );
+    assert!(output.stdout.contains("0 packets"), "{output:?}");
 }
 
 #[test]
@@ -171,7 +183,7 @@ fn runs_that_take_long_to_read_say_so() {
         // What comes is no summary: that it is refused is said as ever.
         let output = kept_waiting(&pipe, b"{}", &arguments);
         assert_shown(&output, words);
-        assert_eq!(output.status.code(), Some(2), "{}", text(&output.stderr));
-        assert!(text(&output.stderr).contains("summary.json"));
+        assert_eq!(output.status.code(), Some(2), "{output:?}");
+        assert!(output.stderr.contains("summary.json"));
     }
 }

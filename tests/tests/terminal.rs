@@ -200,6 +200,20 @@ fn messages_are_shown_by_their_fields_and_wrong_questions_say_what_there_is() {
     end(going);
 }
 
+/// A link that lets nothing through is silent and loses everything, also for who looks on only after
+/// the last message came.
+fn is_silent_when_cut(run_folder: &str) {
+    run(&["link", "set", "hop", "--cut", run_folder]).assert_success();
+    wait_until(LIMIT, "the silence", || {
+        let view = json(&["top", run_folder, "--once", "--json"]);
+        let link = &view["links"][0];
+        let channels = view["channels"].as_array().unwrap();
+        let channel = channels.iter().find(|one| one["name"] == COMMAND).unwrap();
+        let is_lost = link["loss_ratio"] == 1.0 && channel["lost_count"].as_u64() > Some(0);
+        link["state"] == "silent" && is_lost
+    });
+}
+
 #[test]
 fn top_shows_processes_channels_links_and_clocks_of_a_running_run() {
     let record = RunFolder::new("terminal-top");
@@ -255,6 +269,7 @@ fn top_shows_processes_channels_links_and_clocks_of_a_running_run() {
     );
     let loss_ratio = link["loss_ratio"].as_f64().unwrap();
     assert!(loss_ratio > 0.0 && loss_ratio < 0.5, "{link}");
+    is_silent_when_cut(&run_folder);
     end(going);
 }
 

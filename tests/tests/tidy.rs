@@ -66,12 +66,13 @@ const FORBIDDEN_MODULES: [(&str, &str); 2] = [
     ("models/src/egm", "teleoperation"),
     ("models/src/yumi", "teleoperation"),
 ];
-const MEMBERS: [&str; 6] = [
+const MEMBERS: [&str; 7] = [
     "models",
     "gateways",
     "runtime",
     "runtime/recorder",
     "tests",
+    "tests/decoders",
     "benches",
 ];
 

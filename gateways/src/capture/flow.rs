@@ -316,7 +316,8 @@ fn own(datagram: &UdpDatagram<'_>) -> Result<DatagramIdentity, Unidentified> {
             Unidentified::Foreign
         });
     };
-    let header = Header::decode(bytes).map_err(|_refusal| Unidentified::Foreign)?;
+    // A sealed header is as readable as a plain one.
+    let (header, _is_sealed) = Header::read(bytes).map_err(|_refusal| Unidentified::Foreign)?;
     let series = [
         header.session.to_le_bytes(),
         header.epoch.to_le_bytes(),

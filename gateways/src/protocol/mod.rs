@@ -8,6 +8,7 @@
 //! 2. [`sequence`]: lost, reordered, duplicate, late; [`fragment`]: messages above the path MTU.
 //! 3. [`egress`]: the sending host's half of a channel.
 //! 4. [`ingress`]: the receiving host's half.
+//! 5. [`seal`]: encryption and authentication, between a bridge and its transport.
 //!
 //! One channel carries messages one way. Replies (acknowledged greetings, clock exchanges) travel
 //! the other way on the same pair of addresses.
@@ -59,6 +60,7 @@ pub mod egress;
 pub mod fragment;
 pub mod ingress;
 pub mod refusal;
+pub mod seal;
 pub mod sequence;
 pub mod stamps;
 pub mod wire;

@@ -31,14 +31,14 @@ refusals! {
     /// Another version of the protocol.
     UnsupportedVersion => "unsupported_version", "protocol version is not 1";
     /// A kind this version does not know.
-    UnknownKind => "unknown_kind", "kind is outside 1..=6";
+    UnknownKind => "unknown_kind", "kind is outside 1..=8";
     /// The header claims another length than this version's.
     BadHeaderLength => "bad_header_length", "header length is not 72 bytes";
     /// A flag this version does not know.
     UnknownFlags => "unknown_flags", "an unknown flag is set";
-    /// Carries an authentication tag, and no key is configured here.
+    /// Sealed, and this hop is plain.
     AuthenticationNotConfigured => "authentication_not_configured",
-        "datagram is authenticated but no key is configured";
+        "datagram is sealed but this hop is plain";
     /// Bytes that must be zero are not.
     ReservedNotZero => "reserved_not_zero", "a reserved field is not zero";
     /// Fragment index, count and total length contradict each other or an earlier fragment.

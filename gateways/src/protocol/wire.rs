@@ -1,5 +1,5 @@
-//! The datagram: 72 bytes of header, then payload or body, then room for a 16-byte tag. Bodies
-//! are in [`super::body`]; nothing here knows sessions, windows or state.
+//! The datagram: 72 bytes of header, then payload or body, then a 16-byte tag or room for it. Bodies
+//! are in [`super::body`]; nothing here knows sessions, windows, keys or state.
 //!
 //! All numbers are little-endian and unaligned. Version 1:
 //!
@@ -7,8 +7,8 @@
 //! |-------:|------:|-------|---------|
 //! | 0 | 4 | magic | `48 49 4c 47`, the letters `HILG` |
 //! | 4 | 1 | version | 1 |
-//! | 5 | 1 | kind | 1 DATA, 2 `SYNC_REQ`, 3 `SYNC_RSP`, 4 HELLO, 5 `HELLO_ACK`, 6 BYE |
-//! | 6 | 2 | flags | bit 0: a 16-byte authentication tag follows the payload; others 0 |
+//! | 5 | 1 | kind | 1 DATA, 2 `SYNC_REQ`, 3 `SYNC_RSP`, 4 HELLO, 5 `HELLO_ACK`, 6 BYE; 7 `KEY_REQ`, 8 `KEY_ANS` of the seal |
+//! | 6 | 2 | flags | bit 0: sealed, what follows the header is encrypted and ends in a tag; then bits 8..16: low 8 bits of the key's generation; others 0 |
 //! | 8 | 4 | session | start of the *sending-side* gateway; replies repeat the request's |
 //! | 12 | 2 | channel | number of the channel between the two hosts |
 //! | 14 | 2 | `header_len` | 72 |
@@ -22,7 +22,7 @@
 //! | 60 | 2 | `fragment_index` | 0-based; 0 unless DATA |
 //! | 62 | 2 | `fragment_count` | 1..=1024; 1 unless DATA |
 //! | 64 | 4 | epoch | DATA, BYE: producer's start; otherwise 0 |
-//! | 68 | 4 | reserved | 0 |
+//! | 68 | 4 | number | sealed: of the datagram under its key; otherwise 0 |
 //! | 72 | n | payload or body | |
 //! | 72 + n | 0 or 16 | tag | only with flag bit 0 |
 //!
@@ -35,8 +35,11 @@
 //! DATA, its number is counted down from 65535, its type is `hil.ClockPath.v1` of 0 bytes, aligned to 1,
 //! and its name `clock/` with the names of both hosts. Nothing in a datagram tells it from another channel.
 //!
-//! Authentication is not configured in this version: a set bit 0 is refused, and the room for the
-//! tag is kept free so that switching it on will not change how messages fragment.
+//! Sealing a hop is the business of [`super::seal`], which lies between bridges and transport: a bridge
+//! refuses a set bit 0. The room for the tag is kept free on a plain hop too, so that both fragment
+//! alike. `KEY_REQ` and `KEY_ANS` are the seal's own: header, 16 bytes of salt, 32 of HMAC-SHA256 over
+//! both. Their sequence is the request's number, their epoch the generation of the sender's key, and of
+//! a request `published_ns` the first bytes of the salt that generation belongs to.
 
 use super::body::{Hello, HelloAck, SyncResponse, check_sync_request};
 use super::fragment::{FRAGMENT_COUNT_MAX, FragmentPlan};
@@ -50,8 +53,10 @@ pub const VERSION: u8 = 1;
 pub const HEADER_BYTES: usize = 72;
 /// Bytes kept free after the payload for an authentication tag.
 pub const TAG_BYTES: usize = 16;
-/// Flag bit: a tag follows the payload.
+/// Flag bit: sealed, and a tag follows the payload.
 pub const FLAG_AUTHENTICATED: u16 = 1;
+/// Flag bits: low 8 bits of the generation of the key.
+pub const FLAGS_GENERATION: u16 = 0xff00;
 /// Largest payload or body of one datagram on a path that carries `datagram_max_bytes`.
 pub const fn payload_budget_bytes(datagram_max_bytes: usize) -> usize {
     datagram_max_bytes.saturating_sub(HEADER_BYTES + TAG_BYTES)
@@ -73,10 +78,14 @@ pub enum Kind {
     HelloAck = 5,
     /// The session ends.
     Bye = 6,
+    /// The seal asks for keys.
+    KeyRequest = 7,
+    /// And gets them.
+    KeyAnswer = 8,
 }
 
 impl Kind {
-    const fn from_wire(code: u8) -> Option<Self> {
+    pub(crate) const fn from_wire(code: u8) -> Option<Self> {
         match code {
             1 => Some(Self::Data),
             2 => Some(Self::SyncRequest),
@@ -84,6 +93,8 @@ impl Kind {
             4 => Some(Self::Hello),
             5 => Some(Self::HelloAck),
             6 => Some(Self::Bye),
+            7 => Some(Self::KeyRequest),
+            8 => Some(Self::KeyAnswer),
             _ => None,
         }
     }
@@ -188,6 +199,18 @@ impl Header {
     }
 
     pub(crate) fn decode(bytes: &[u8]) -> Result<Self, Refusal> {
+        match Self::read(bytes)? {
+            (_, true) => Err(Refusal::AuthenticationNotConfigured),
+            (header, false) => Ok(header),
+        }
+    }
+
+    /// The header of a datagram as anyone on the wire can read it, and whether it is sealed: then only
+    /// the holder of the key can tell whether it is true.
+    ///
+    /// # Errors
+    /// The first [`Refusal`] that the header alone can show.
+    pub fn read(bytes: &[u8]) -> Result<(Self, bool), Refusal> {
         let Some(prefix) = Prefix::decode(bytes) else {
             let known = bytes.len() < 4 || u32_at(bytes, 0) == MAGIC;
             return Err(if known {
@@ -207,17 +230,20 @@ impl Header {
             return Err(Refusal::BadHeaderLength);
         }
         let flags = u16_at(bytes, 6);
-        if flags & !FLAG_AUTHENTICATED != 0 {
+        let is_sealed = flags & FLAG_AUTHENTICATED != 0;
+        let known = if is_sealed {
+            FLAG_AUTHENTICATED | FLAGS_GENERATION
+        } else {
+            0
+        };
+        if flags & !known != 0 {
             return Err(Refusal::UnknownFlags);
         }
-        if flags & FLAG_AUTHENTICATED != 0 {
-            return Err(Refusal::AuthenticationNotConfigured);
-        }
-        if u32_at(bytes, 68) != 0 {
+        if !is_sealed && u32_at(bytes, 68) != 0 {
             return Err(Refusal::ReservedNotZero);
         }
         let delta = u32_at(bytes, 52);
-        Ok(Self {
+        let header = Self {
             kind,
             session: prefix.session,
             channel: prefix.channel,
@@ -233,7 +259,8 @@ impl Header {
             fragment_index: u16_at(bytes, 60),
             fragment_count: u16_at(bytes, 62),
             epoch: u32_at(bytes, 64),
-        })
+        };
+        Ok((header, is_sealed))
     }
 
     /// Checks the length and fragment fields against the bytes after the header.
@@ -326,6 +353,8 @@ pub fn decode(bytes: &[u8]) -> Result<Datagram<'_>, Refusal> {
         Kind::HelloAck => Body::HelloAck(HelloAck::decode(payload)?),
         Kind::Bye if payload.is_empty() => Body::Bye,
         Kind::Bye => return Err(Refusal::MalformedBody),
+        // The seal takes its own out before a bridge sees them.
+        Kind::KeyRequest | Kind::KeyAnswer => return Err(Refusal::UnexpectedKind),
     };
     Ok(Datagram { header, body })
 }

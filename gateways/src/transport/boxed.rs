@@ -12,6 +12,7 @@ use super::{
     DatagramReceiver, DatagramSender, Received, ReceiverCounters, SendRefusal, SenderCounters,
     TransmitStamp, TxToken,
 };
+use crate::protocol::seal::SealCounts;
 
 impl<S: DatagramSender + ?Sized> DatagramSender for Box<S> {
     fn send(&mut self, datagram: &[u8]) -> Result<TxToken, SendRefusal> {
@@ -52,6 +53,10 @@ impl<S: DatagramSender + ?Sized> DatagramSender for Box<S> {
 
     fn stream_figures(&self, now: Instant) -> Option<StreamFigures> {
         (**self).stream_figures(now)
+    }
+
+    fn seal_counts(&self) -> Option<SealCounts> {
+        (**self).seal_counts()
     }
 }
 
@@ -95,5 +100,9 @@ impl<R: DatagramReceiver + ?Sized> DatagramReceiver for Box<R> {
 
     fn stream_figures(&self, now: Instant) -> Option<StreamFigures> {
         (**self).stream_figures(now)
+    }
+
+    fn seal_counts(&self) -> Option<SealCounts> {
+        (**self).seal_counts()
     }
 }

@@ -28,7 +28,7 @@ const STAMP_OF_SCHEDULING: u32 = 1;
 
 /// `struct sock_extended_err` without its padding.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct ExtendedError {
+pub struct ExtendedError {
     /// `ee_errno`.
     pub errno: u32,
     /// `ee_origin`.
@@ -41,20 +41,31 @@ pub(super) struct ExtendedError {
 
 /// What one entry of the error queue is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum QueueEntry {
+pub enum QueueEntry {
     /// A transmit stamp of the send with this identity.
-    Stamp { id: u32, stage: TransmitStage },
+    Stamp {
+        /// Counts the sends, as [`super::TxToken`] does.
+        id: u32,
+        /// Where on the way out it was taken.
+        stage: TransmitStage,
+    },
     /// The network reported an error about an earlier datagram.
-    NetworkReport { errno: i32 },
+    NetworkReport {
+        /// What it reported.
+        errno: i32,
+    },
     /// This host's stack reported one.
-    LocalReport { errno: i32 },
+    LocalReport {
+        /// What it reported.
+        errno: i32,
+    },
     /// None of these.
     Unknown,
 }
 
 impl ExtendedError {
     /// Sorts the entry by its origin.
-    pub(super) fn entry(&self) -> QueueEntry {
+    pub fn entry(&self) -> QueueEntry {
         let errno = i32::try_from(self.errno).unwrap_or(0);
         match self.origin {
             libc::SO_EE_ORIGIN_TIMESTAMPING => {
@@ -79,7 +90,7 @@ impl ExtendedError {
 
 /// Everything this crate reads from the control data of one datagram.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub(super) struct ControlData {
+pub struct ControlData {
     /// Software and hardware stamps.
     pub stamps: KernelStamps,
     /// Datagrams dropped so far because the receive buffer was full, modulo 2^32.
@@ -97,7 +108,7 @@ pub(super) struct ControlData {
 
 impl ControlData {
     /// Reads all control messages in `bytes`, of which the first starts at offset 0.
-    pub(super) fn decode(bytes: &[u8]) -> Self {
+    pub fn decode(bytes: &[u8]) -> Self {
         let mut data = Self::default();
         let mut messages = Messages { rest: bytes };
         for message in &mut messages {

@@ -15,6 +15,7 @@ use hil_models::time::Instant;
 
 use super::tcp::StreamFigures;
 use super::{DatagramReceiver, EmulatedDelay, Received, ReceiverCounters, SendRefusal};
+use crate::protocol::seal::SealCounts;
 
 /// How much an emulated link may hold.
 #[derive(Debug, Clone, Copy)]
@@ -242,6 +243,10 @@ impl<R: DatagramReceiver> DatagramReceiver for EmulatedReceiver<R> {
 
     fn stream_figures(&self, now: Instant) -> Option<StreamFigures> {
         self.inner.stream_figures(now)
+    }
+
+    fn seal_counts(&self) -> Option<SealCounts> {
+        self.inner.seal_counts()
     }
 
     /// Own counts of what was handed out, lost and dropped; the rest from below.

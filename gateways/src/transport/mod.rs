@@ -7,6 +7,7 @@
 //! - [`radio`]: whether the peer radio acknowledged each datagram.
 //! - [`queue`]: an in-process pair, for tests.
 //! - [`emulated`]: any receiver behind a link model.
+//! - [`sealed`]: any sender or receiver behind encryption and authentication.
 //! - [`timestamping`] and [`probe`]: what the kernel and the network card can stamp, and whether
 //!   they really do.
 //! - [`clock_pair`]: from the real-time clock of the stamps to the monotonic clock of the run.
@@ -20,7 +21,7 @@ pub mod bpf_tap;
 pub mod card_arming;
 pub mod card_clock;
 pub mod clock_pair;
-mod control;
+pub mod control;
 mod counters;
 pub mod emulated;
 pub mod interface;
@@ -32,6 +33,7 @@ pub mod queue;
 pub mod radio;
 mod reply_stamps;
 pub mod ring_frame;
+pub mod sealed;
 mod tap_ring;
 pub mod tcp;
 pub mod timestamping;
@@ -62,6 +64,8 @@ use thiserror::Error;
 pub use counters::{ReceiverCounters, SenderCounters};
 use radio::RadioReport;
 use tcp::StreamFigures;
+
+use crate::protocol::seal::SealCounts;
 
 /// The stamps the kernel attached to one datagram.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -251,6 +255,11 @@ pub trait DatagramSender: Debug + Send {
     fn stream_figures(&self, _now: Instant) -> Option<StreamFigures> {
         None
     }
+
+    /// What a transport behind the seal counted; `None` for a plain one.
+    fn seal_counts(&self) -> Option<SealCounts> {
+        None
+    }
 }
 
 /// The receiving end of a transport. Nothing here blocks. See [`DatagramSender`] for an example.
@@ -305,6 +314,11 @@ pub trait DatagramReceiver: Debug + Send {
 
     /// What a transport with connections saw until `now`; `None` for one without.
     fn stream_figures(&self, _now: Instant) -> Option<StreamFigures> {
+        None
+    }
+
+    /// What a transport behind the seal counted; `None` for a plain one.
+    fn seal_counts(&self) -> Option<SealCounts> {
         None
     }
 }

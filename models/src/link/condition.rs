@@ -48,8 +48,8 @@ impl LinkCondition {
         };
         let longest_s = DELAY_MAX.as_secs_f64();
         let (delay_s, range) = (delay.as_secs_f64(), 0.0..=longest_s);
-        ParameterError::check("delay", delay_s, range, "0..=60 s")?;
-        ParameterError::check("loss", loss_ratio, 0.0..=1.0, "0..=1")
+        ParameterError::check("delay", delay_s, range, "0 to 60 s")?;
+        ParameterError::check("loss", loss_ratio, 0.0..=1.0, "0 to 1")
     }
 
     /// The link that does this in place of the topology's; `None` for the topology's own. A cut loses

@@ -38,6 +38,22 @@ fn empty() -> Histogram<u64> {
 }
 
 impl LatencyHistogram {
+    /// An empty one that allocates nothing for values from zero to `max_ns` (at least 2), for a loop
+    /// that must not. Larger values are counted as well, and make it allocate.
+    #[allow(
+        clippy::missing_panics_doc,
+        reason = "bounds from 1 to at least 2 and three digits are what the histogram takes"
+    )]
+    pub fn with_room(max_ns: u64) -> Self {
+        let mut positive = Histogram::new_with_max(max_ns.max(2), SIGNIFICANT_DIGITS)
+            .expect("three digits and a maximum of at least 2 are valid");
+        positive.auto(true);
+        Self {
+            positive,
+            ..Self::default()
+        }
+    }
+
     /// Counts one value.
     #[allow(
         clippy::missing_panics_doc,
@@ -313,6 +329,19 @@ impl Distribution {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn room_changes_no_figure_and_bounds_nothing() {
+        let (mut roomy, mut plain) = (
+            LatencyHistogram::with_room(1_000_000),
+            LatencyHistogram::default(),
+        );
+        for value_ns in [0, 7, 999_999, 5_000_000_000, -3] {
+            roomy.record(value_ns);
+            plain.record(value_ns);
+        }
+        assert_eq!(roomy.summary(), plain.summary());
+    }
     use crate::random::RandomStream;
 
     #[test]

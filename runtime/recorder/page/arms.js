@@ -1,6 +1,6 @@
 // The robot's arms in space: measured solid, commanded as an outline; own projection, far parts first.
 
-import { FONT, age, make, quantity, surface, write } from "./format.js";
+import { FONT, age, isEmpty, make, quantity, surface, write } from "./format.js";
 
 const START = { turn: -0.62, tilt: 0.36, zoom: 1 };
 const CENTRE = [0.2, 0, 0.26];
@@ -51,6 +51,7 @@ export class ArmScene {
     this.size = Math.min(height * 2.3, width * 2.2);
     this.middle = [width / 2, height * 0.47];
     this.tools = [];
+    if (isEmpty(this.canvas)) return;
     this.floor(context);
     if (!arms) return;
     const parts = [...this.bodyParts(arms)];

@@ -1,6 +1,6 @@
 // The fleet from above: ground, ways, critical sections, vehicles to scale and where they met.
 
-import { FONT, age, make, quantity, surface, write } from "./format.js";
+import { FONT, age, isEmpty, make, quantity, surface, write } from "./format.js";
 
 const PADDING_PX = 14;
 const NUMBER_FITS_PX = 15;
@@ -56,6 +56,7 @@ export class FleetScene {
     this.labels = [];
     if (!map || !map.bounds) return;
     this.canvas.style.setProperty("--ground", aspect(map.bounds));
+    if (isEmpty(this.canvas)) return;
     this.fit(map.bounds, width, height);
     this.colours = colours;
     this.ground(context, map, width, height);

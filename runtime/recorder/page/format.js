@@ -92,3 +92,9 @@ export function surface(canvas) {
   context.clearRect(0, 0, box.width, box.height);
   return { context, width: box.width, height: box.height };
 }
+
+// A canvas without an area, as before the first layout: there is nothing to draw on, and a sheet of
+// its size may not be copied.
+export function isEmpty(canvas) {
+  return canvas.width === 0 || canvas.height === 0;
+}

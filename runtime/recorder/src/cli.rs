@@ -35,18 +35,20 @@ const SERVE_EXAMPLES: &str = "\
 Examples:
   hil-recorder serve
       the run that goes on here; the page is at http://127.0.0.1:8766/
-  hil-recorder serve --wait --record recordings/
-      the next one, and the one after it, each recorded as well
+  hil-recorder serve --wait --record recordings/ --no-scene
+      the next one, and the one after it, each recorded as well, without pictures
   hil-recorder serve runs/fleet-emulated-20261122-101806 --loop
       a finished run again and again
   ssh -L 8765:localhost:8765 -L 8766:localhost:8766 control-pc
       from another PC, then the same address; nothing is open to the network
   hil-recorder serve --allow-origin https://app.foxglove.dev
       pages of Foxglove's own web site may look on and change links as well
+  hil-recorder serve --allow-origin file://
+      for Lichtblick as an application; so may any saved page then
 
 Web pages of others are refused, and named here once. Programs and our own page need no option.
 Lichtblick and Foxglove connect to ws://127.0.0.1:8765. Topics and fields are in docs/live-view.md.
-It ends with Ctrl-C; the exit code is 0 then.";
+It ends with Ctrl-C; the exit code is 0 then, or 1 when --record could not write a file.";
 
 const CONVERT_EXAMPLES: &str = "\
 Examples:
@@ -61,7 +63,7 @@ Examples:
   hil-recorder record -o run.mcap
       the only run that goes on this host, until it ends or Ctrl-C
   hil-recorder record --wait -o recordings/ &
-      started before the run: waits for it; the file gets the run's name
+      started before the run: waits for it; the file gets the run's name, the folder is made
   hil-recorder record teleop-split -o long.mcap --split-size 1GiB --split-time 10min
       long_0001.mcap, long_0002.mcap and so on, each whole by itself
 
@@ -76,6 +78,14 @@ Example:
 Every chunk whose check sum is right is copied, the last one as far as it goes. Each loss is said
 with the byte at which it begins, here and in the new file under `hil.recovery`. The exit code is
 0 when there is a new file, whatever was lost.";
+
+const INFO_EXAMPLES: &str = "\
+Examples:
+  hil-recorder info run.mcap
+  hil-recorder info run.mcap --json | jq '.metadata[\"hil.run\"].seed'
+
+A broken file is shown as far as it goes, with where the damage begins; what `recover` makes of it
+is whole. The metadata are described in docs/recordings.md.";
 
 const PLAY_EXAMPLES: &str = "\
 Examples:
@@ -127,12 +137,17 @@ pub(crate) enum Command {
         /// Name of the run, the beginning of it, or its folder; the only one if left out.
         #[arg(value_name = "RUN")]
         run: Option<String>,
-        /// The file to write, or the folder to write it into.
+        /// The file to write, or a folder for a file with the run's name; one that is not there is
+        /// made if the name ends in `/`.
         #[arg(long, short, value_name = "FILE")]
         output: PathBuf,
         /// Wait for a run to begin.
         #[arg(long)]
         wait: bool,
+        /// Of the runs that go on, know only those whose folders lie below this one, as those of one
+        /// unit of systemd do.
+        #[arg(long, value_name = "DIR")]
+        below: Option<PathBuf>,
         /// Leave out what the run recorded before; otherwise a recorder that comes late catches up.
         #[arg(long)]
         from_now: bool,
@@ -169,6 +184,7 @@ pub(crate) enum Command {
         force: bool,
     },
     /// Print topics, counts, times and metadata of an MCAP file, whole or broken.
+    #[command(after_help = INFO_EXAMPLES)]
     Info {
         /// The file.
         #[arg(value_name = "FILE")]
@@ -176,6 +192,12 @@ pub(crate) enum Command {
         /// As JSON, with every value in full.
         #[arg(long)]
         json: bool,
+    },
+    /// Write manual pages and completions for a package to this folder.
+    #[command(hide = true)]
+    Documents {
+        /// Where to.
+        folder: PathBuf,
     },
     /// Show a run in the browser and in viewers that speak the Foxglove WebSocket.
     #[command(after_help = SERVE_EXAMPLES)]
@@ -229,9 +251,15 @@ pub(crate) struct ServeOptions {
     #[arg(long, value_name = "NAME", value_parser = crate::serve::host)]
     pub(crate) allow_host: Vec<String>,
     /// Record what is shown while it goes on, as `record` does: a file, or a folder for one file
-    /// per run.
+    /// per run, which is made if it is not there and the name ends in `/`.
     #[arg(long, value_name = "FILE")]
     pub(crate) record: Option<PathBuf>,
+    /// How the server, and the recorder in it, stand against a run that goes on.
+    #[arg(long, value_enum, default_value_t = Priority::Idle)]
+    pub(crate) priority: Priority,
+    /// Leave out /scene and /tf of the file, and the work that drawing them takes.
+    #[arg(long, requires = "record")]
+    pub(crate) no_scene: bool,
     /// How fast a finished run is played back, 0.01 to 100.
     #[arg(long, value_name = "FACTOR", default_value_t = 1.0, value_parser = speed)]
     pub(crate) speed: f64,

@@ -4,8 +4,9 @@ use std::fs;
 use std::path::Path;
 use std::process::ExitCode;
 
-use clap::Parser;
+use clap::{CommandFactory as _, Parser};
 use hil_runtime::console::Console;
+use hil_runtime::documents;
 use hil_runtime::progress::Progress;
 use hil_runtime::signals::{EXIT_INTERRUPTED, Signals};
 
@@ -13,7 +14,8 @@ use crate::cli::{Cli, Command, ServeOptions};
 use crate::convert::{ConvertError, convert};
 use crate::info::info;
 use crate::play::{PlayEnd, PlayError, PlayOptions, SourceError, TargetError, play};
-use crate::record::{Progress as RecordProgress, RecordError, Request, record};
+use crate::priority::Precedence;
+use crate::record::{Progress as RecordProgress, RecordError, Request, Which, record};
 use crate::recover::{RecoverError, loss_words, recover};
 use crate::scan::ScanError;
 use crate::scene::Scenery;
@@ -60,6 +62,7 @@ fn work(command: Command, signals: &Signals, console: &mut Console) -> u8 {
             run,
             output,
             wait,
+            below,
             from_now,
             split_size,
             split_time,
@@ -69,17 +72,15 @@ fn work(command: Command, signals: &Signals, console: &mut Console) -> u8 {
             no_scene,
         } => {
             let request = Request {
-                run,
+                run: Which::Named(run),
                 output,
                 waits: wait,
+                below,
                 from_now,
-                split: Split {
-                    size_bytes: split_size,
-                    time: split_time,
-                },
+                split: Split::at(split_size, split_time),
                 flush,
                 force,
-                priority,
+                precedence: Precedence::new(priority),
                 scenery: Scenery::of(no_scene),
             };
             record_run(&request, signals, console)
@@ -94,6 +95,7 @@ fn work(command: Command, signals: &Signals, console: &mut Console) -> u8 {
                 .unwrap_or_else(|console| recover_file((&broken, &output), signals, console))
         }
         Command::Info { file, json } => show(&file, json, signals, console),
+        Command::Documents { folder } => write_documents(&folder, console),
         Command::Serve(options) => serve_run(&options, signals, console),
         Command::Play {
             file,
@@ -110,6 +112,16 @@ fn work(command: Command, signals: &Signals, console: &mut Console) -> u8 {
                 into,
             };
             play_file(&options, signals, console)
+        }
+    }
+}
+
+fn write_documents(folder: &Path, console: &mut Console) -> u8 {
+    match documents::write(Cli::command(), folder) {
+        Ok(_) => exit::DONE,
+        Err(error) => {
+            console.error(&format!("{}: {error}", folder.display()));
+            exit::FAILED
         }
     }
 }
@@ -141,7 +153,12 @@ fn serve_run(options: &ServeOptions, signals: &Signals, console: &mut Console) -
         Err(error) => {
             console.error(&error.to_string());
             match error {
-                ServeError::Run(_) | ServeError::Select(_) => exit::USAGE,
+                ServeError::Run(_)
+                | ServeError::Select(_)
+                | ServeError::Over { .. }
+                | ServeError::Record(WriteError::Exists { .. } | WriteError::Unfinished { .. }) => {
+                    exit::USAGE
+                }
                 _ => exit::FAILED,
             }
         }
@@ -206,7 +223,9 @@ fn record_run(request: &Request, signals: &Signals, console: &mut Console) -> u8
                     exit::USAGE
                 }
                 RecordError::Interrupted(_) => interrupted(),
-                RecordError::Feed(_) | RecordError::Write(_) => exit::FAILED,
+                RecordError::Feed(_) | RecordError::Gone { .. } | RecordError::Write(_) => {
+                    exit::FAILED
+                }
             };
         }
     };

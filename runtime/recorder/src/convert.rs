@@ -84,8 +84,8 @@ enum What {
 /// Its place: time, then the channel, so that the order is the same each time.
 type Item = (u64, usize, What);
 
-/// Converts the run at `from` to the file `to`, with its scene if that is wanted; `look` hears how far it is, in words, and gives the
-/// signal that came.
+/// Converts the run at `from` to the file `to`, with its scene if that is wanted; `look` hears how
+/// far it is, in words, and gives the signal that came.
 ///
 /// # Errors
 /// When there is no run to read or no file can be written; there is no file then.
@@ -96,8 +96,8 @@ pub(crate) fn convert(
     look: &mut dyn FnMut(Option<f64>, &str) -> Option<&'static str>,
 ) -> Result<Converted, ConvertError> {
     let mut stopped = None;
-    let mut run = Run::read(from, &mut |path| {
-        stopped = look(None, &format!("reading {path}"));
+    let mut run = Run::read(from, &mut |(share, path)| {
+        stopped = look(Some(share), &format!("reading {path}"));
         stopped.is_none()
     })?;
     if let Some(signal) = stopped {
@@ -378,7 +378,7 @@ impl Conversion {
             }
             What::Condition { file, index } => {
                 let file = &run.files[file];
-                if let Some(record) = file.records::<LinkConditionRecord>().nth(index) {
+                if let Some(record) = file.record::<LinkConditionRecord>(index) {
                     let one = (at_ns, &record);
                     self.conditions
                         .write(&file.header.channel, one, &mut self.recording)?;

@@ -108,21 +108,6 @@ impl LiveTopics {
         }
     }
 
-    /// Lets `sink` hear of every topic of the channels' own messages and their views now.
-    #[allow(
-        dead_code,
-        reason = "viewers want to know topics before their first message"
-    )]
-    pub(crate) fn declare_all<S: Sink>(&mut self, sink: &mut S) -> Result<(), S::Error> {
-        for channel in self.channels.values_mut() {
-            channel.own.declare(sink)?;
-            for (_, topic) in &mut channel.views {
-                topic.declare(sink)?;
-            }
-        }
-        Ok(())
-    }
-
     /// Makes of an event what is to be made of it.
     ///
     /// # Errors
@@ -215,9 +200,10 @@ impl LiveTopics {
             _ => {}
         }
         channel.note_due(record, is_of_this_host);
-        let now = Instant::now();
-        channel.joining.take(record, now);
-        self.give_out_of(name, &mut |joining| joining.next(now), sink)
+        channel
+            .joining
+            .take(record, is_of_this_host, Instant::now());
+        self.give_out_of(name, &mut Joining::next, sink)
     }
 
     fn latency<S: Sink>(
@@ -244,12 +230,13 @@ impl LiveTopics {
             .write(sink, Stamp::new(at_ns, one.sequence), &self.buffer)
     }
 
-    /// Gives out the stamps of messages that have been waited for long enough.
+    /// Nothing more is to be read by `now`: gives out the stamps of messages that were held for long
+    /// enough.
     ///
     /// # Errors
     /// When the sink cannot take them.
     pub(crate) fn settle<S: Sink>(&mut self, now: Instant, sink: &mut S) -> Result<(), S::Error> {
-        self.give_out(&mut |joining| joining.next(now), sink)
+        self.give_out(&mut |joining| joining.next_held(now), sink)
     }
 
     /// Gives out the stamps of all messages that are still waited for.
@@ -383,6 +370,12 @@ impl LiveTopics {
             .values()
             .map(|one| one.joining.late_count)
             .sum()
+    }
+
+    /// Messages whose stamps were given out after those of a message published later.
+    pub(crate) fn unordered_count(&self) -> u64 {
+        let channels = self.channels.values();
+        channels.map(|one| one.joining.unordered_count).sum()
     }
 
     /// By channel: its message, and whether it is typed.

@@ -3,10 +3,10 @@
 //!
 //! Read in this order: [`run`] and [`clocks`], what there is and when it was; [`schema`] and
 //! [`encode`], what a message looks like; [`topics`] and [`net`], what is made of it; [`writer`],
-//! the file; [`convert`], all of them together. While a run goes, [`live`] makes the same topics of its
-//! events for any [`sink`], and [`record`] puts them into files; [`priority`] keeps it out of the run's way. [`scan`] reads files, for [`recover`] and [`info`];
-//! [`play`] feeds what [`decode`] makes of them into a run.
-//! [`view`] is the state of a run that goes on, [`serve`] shows it.
+//! the file; [`convert`], all of them together. While a run goes, [`live`] makes the same topics of
+//! its events for any [`sink`], and [`record`] puts them into files; [`priority`] keeps it out of the
+//! run's way. [`scan`] reads files, for [`recover`] and [`info`]; [`play`] feeds what [`decode`]
+//! makes of them into a run. [`view`] is the state of a run that goes on, [`serve`] shows it.
 
 mod cli;
 mod clocks;
@@ -22,6 +22,7 @@ mod joining;
 mod live;
 mod live_clocks;
 mod net;
+mod newest;
 mod play;
 mod priority;
 mod record;

@@ -1,227 +1,307 @@
-//! How the recorder stands against what it records: it gives way to everything, and stops giving way
-//! when it can no longer keep up.
+//! How the recorder stands against what it looks at: it gives way to everything where nothing is lost
+//! by that, and stops giving way when it can no longer keep up. All threads of the process stand
+//! alike, for what one of them is waited for all are late.
 
 use std::fmt;
-use std::time::{Duration, Instant};
+use std::fs;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::thread;
+use std::time::Duration;
 
 use clap::ValueEnum;
-use hil_runtime::realtime::{GrantOutcome, RealtimeItem, RealtimeRequest, SchedulingPolicy, apply};
-use nix::time::{ClockId, clock_gettime};
-
-/// A look that comes so much later than it should, beyond the processor time that was spent since
-/// the one before, shows that others left the recorder nothing.
-const LATE_MAX: Duration = Duration::from_secs(1);
+use hil_runtime::realtime::{
+    GrantOutcome, RealtimeGrantItem, RealtimeRequest, SchedulingPolicy, apply, move_threads,
+};
 
 /// What is asked for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum Priority {
-    /// Only when nothing else wants the processor; normal when it cannot keep up so.
+    /// Only when nothing else wants the processor, where that loses nothing; normal when it cannot
+    /// keep up so.
     Idle,
     /// As any other program.
     Normal,
 }
 
-/// Why the recorder no longer gives way.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Reason {
-    Late,
-    Missed,
-}
-
-impl Reason {
-    const fn words(self) -> &'static str {
-        match self {
-            Self::Late => "others left it no processor time for over a second",
-            Self::Missed => "it missed messages",
-        }
-    }
-}
-
 #[derive(Debug, Clone, PartialEq, Eq)]
 enum State {
+    /// As asked for.
     Normal,
+    /// It is asked to give way and has not yet.
+    Asked,
+    /// What it reads would not wait for it.
+    ReadsMemory,
     GivesWay,
-    Raised(Reason),
-    /// The kernel refused, for this reason.
-    Refused(Reason, String),
+    /// It was kept waiting for so long.
+    Raised(Duration),
+    /// The same, and the kernel refused, for this reason.
+    Refused(Duration, String),
     CannotGiveWay(String),
 }
 
-/// The scheduling of the calling thread. Use it in the thread that made it.
-#[derive(Debug)]
-pub(crate) struct Precedence {
-    state: State,
-    looked: Instant,
-    spent: Duration,
-}
+/// How all threads of this process stand.
+#[derive(Debug, Clone)]
+pub(crate) struct Precedence(Arc<Mutex<State>>);
 
 impl Precedence {
-    /// Takes the place that is asked for.
-    pub(crate) fn take(priority: Priority) -> Self {
+    /// As the command line asks; nothing is changed yet.
+    pub(crate) fn new(priority: Priority) -> Self {
         let state = match priority {
+            Priority::Idle => State::Asked,
             Priority::Normal => State::Normal,
-            Priority::Idle => match schedule(SchedulingPolicy::Idle) {
-                Ok(()) => State::GivesWay,
-                Err(refusal) => State::CannotGiveWay(refusal),
-            },
         };
-        Self {
-            state,
-            looked: Instant::now(),
-            spent: processor_time(),
+        Self(Arc::new(Mutex::new(state)))
+    }
+
+    /// Takes its place for a run that is read from files only, which wait for as long as it takes, or
+    /// also from shared memory, which does not wait.
+    pub(crate) fn settle(&self, reads_memory: bool) {
+        let mut state = self.lock();
+        match *state {
+            State::Asked | State::ReadsMemory if !reads_memory => *state = give_way(),
+            State::Asked => *state = State::ReadsMemory,
+            State::GivesWay if reads_memory => {
+                *state = match outcome(&move_threads(
+                    SchedulingPolicy::Idle,
+                    SchedulingPolicy::Other,
+                )) {
+                    Ok(()) => State::ReadsMemory,
+                    Err(refusal) => State::Refused(Duration::ZERO, refusal),
+                };
+            }
+            _ => {}
         }
     }
 
-    /// Judges a look that was to come `planned` after the one before.
-    pub(crate) fn judge_look(&mut self, planned: Duration) {
-        if self.state != State::GivesWay {
+    /// Gives way no longer: it was kept waiting for so long.
+    fn raise(&self, waited: Duration) {
+        let mut state = self.lock();
+        if *state != State::GivesWay {
             return;
         }
-        let (now, spent) = (Instant::now(), processor_time());
-        let due = planned + spent.saturating_sub(self.spent);
-        let is_late = now.duration_since(self.looked) > due + LATE_MAX;
-        (self.looked, self.spent) = (now, spent);
-        if is_late {
-            self.raise(Reason::Late);
-        }
-    }
-
-    /// Judges how many messages were missed so far.
-    pub(crate) fn judge_missed(&mut self, count: u64) {
-        if self.state == State::GivesWay && count > 0 {
-            self.raise(Reason::Missed);
-        }
-    }
-
-    fn raise(&mut self, reason: Reason) {
-        self.state = match schedule(SchedulingPolicy::Other) {
-            Ok(()) => State::Raised(reason),
-            Err(refusal) => State::Refused(reason, refusal),
+        let moved = move_threads(SchedulingPolicy::Idle, SchedulingPolicy::Other);
+        *state = match outcome(&moved) {
+            Ok(()) => State::Raised(waited),
+            Err(refusal) => State::Refused(waited, refusal),
         };
     }
 
     /// What a user must know of it.
     pub(crate) fn warning(&self) -> Option<String> {
-        match &self.state {
-            State::Raised(reason) => Some(format!(
-                "the recorder gave way to all else until {}; from then on it ran like any other \
-                 program, and the run may have felt it",
-                reason.words()
+        match &*self.lock() {
+            State::Raised(waited) => Some(format!(
+                "the recorder gave way to all else until others left it no processor time for {} ms; \
+                 from then on it ran like any other program, and the run may have felt it",
+                waited.as_millis()
             )),
-            State::Refused(reason, refusal) => Some(format!(
-                "the recorder gave way to all else, {}, and was not let up: {refusal}; or record \
-                 with --priority normal",
-                reason.words()
+            State::Refused(waited, refusal) => Some(format!(
+                "the recorder gave way to all else, which left it no processor time for {} ms, and \
+                 was not let up: {refusal}; or use --priority normal",
+                waited.as_millis()
             )),
             State::CannotGiveWay(refusal) => Some(format!(
-                "the recorder could not give way, so the run may have felt it: {refusal}"
+                "the recorder does not give way, so the run may feel it: {refusal}; with --priority \
+                 normal this is not said"
             )),
-            State::Normal | State::GivesWay => None,
+            State::Normal | State::Asked | State::ReadsMemory | State::GivesWay => None,
         }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
 impl fmt::Display for Precedence {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match &self.state {
-            State::Normal => f.write_str("SCHED_OTHER"),
+        match &*self.lock() {
+            State::Normal | State::Asked => f.write_str("SCHED_OTHER"),
+            State::ReadsMemory => f.write_str("SCHED_OTHER; shared memory does not wait for it"),
             State::GivesWay => f.write_str("SCHED_IDLE"),
-            State::Raised(reason) => {
-                write!(f, "SCHED_IDLE, then SCHED_OTHER: {}", reason.words())
-            }
-            State::Refused(reason, refusal) => {
-                write!(f, "SCHED_IDLE; {}; {refusal}", reason.words())
-            }
+            State::Raised(waited) => write!(
+                f,
+                "SCHED_IDLE until it had no processor time for {} ms, then SCHED_OTHER",
+                waited.as_millis()
+            ),
+            State::Refused(waited, refusal) => write!(
+                f,
+                "SCHED_IDLE; it had no processor time for {} ms; {refusal}",
+                waited.as_millis()
+            ),
             State::CannotGiveWay(refusal) => write!(f, "SCHED_OTHER; {refusal}"),
         }
     }
 }
 
-fn schedule(policy: SchedulingPolicy) -> Result<(), String> {
+/// Who gives way without the right to come back would stay there, however late it became.
+fn give_way() -> State {
+    let come_back = || {
+        if waited().is_none() {
+            return Err("/proc/thread-self/schedstat does not tell how long it waits".to_owned());
+        }
+        own(SchedulingPolicy::Idle)?;
+        own(SchedulingPolicy::Other)
+    };
+    // A thread that may not come back takes that with it.
+    let tried = thread::spawn(come_back).join();
+    let tried = tried.unwrap_or_else(|_panic| Err("its trial failed".to_owned()));
+    let moved = tried.and_then(|()| {
+        outcome(&move_threads(
+            SchedulingPolicy::Other,
+            SchedulingPolicy::Idle,
+        ))
+    });
+    moved.map_or_else(State::CannotGiveWay, |()| State::GivesWay)
+}
+
+/// Schedules the calling thread.
+fn own(policy: SchedulingPolicy) -> Result<(), String> {
     let request = RealtimeRequest {
         policy,
         ..RealtimeRequest::default()
     };
-    let grant = apply(&request);
-    let mut items = grant.items.iter();
-    match items.find(|one| one.item == RealtimeItem::Scheduling) {
-        Some(item) => match &item.outcome {
-            GrantOutcome::Granted => Ok(()),
-            GrantOutcome::Refused { error, reason, fix } => {
-                Err(format!("{error}; {reason}; {fix}"))
-            }
-        },
-        None => Err("the kernel was not asked".to_owned()),
+    apply(&request).items.iter().try_for_each(outcome)
+}
+
+fn outcome(item: &RealtimeGrantItem) -> Result<(), String> {
+    match &item.outcome {
+        GrantOutcome::Granted => Ok(()),
+        GrantOutcome::Refused { error, reason, fix } => Err(format!("{error}; {reason}; {fix}")),
     }
 }
 
-/// Processor time of the calling thread.
-fn processor_time() -> Duration {
-    clock_gettime(ClockId::CLOCK_THREAD_CPUTIME_ID).map_or(Duration::ZERO, Duration::from)
+/// The looks of one thread, each judged by how long it was kept waiting for a processor. Use it in
+/// the thread that looks.
+#[derive(Debug)]
+pub(crate) struct Looks {
+    late_max: Duration,
+    /// So far.
+    waited: Duration,
+}
+
+impl Looks {
+    /// Between two looks it may wait for `late_max`.
+    pub(crate) fn new(late_max: Duration) -> Self {
+        Self {
+            late_max,
+            waited: waited().unwrap_or_default(),
+        }
+    }
+
+    /// Judges the time since the look before: nothing but a lack of processor time counts, neither
+    /// a slow disk nor a stopped terminal.
+    pub(crate) fn judge(&mut self, precedence: &Precedence) {
+        self.judge_by(waited().unwrap_or(self.waited), precedence);
+    }
+
+    fn judge_by(&mut self, waited: Duration, precedence: &Precedence) {
+        let late = waited.saturating_sub(self.waited);
+        self.waited = waited;
+        if late > self.late_max {
+            precedence.raise(late);
+        }
+    }
+}
+
+/// How long the calling thread could have run and had no processor, since it began; `None` where the
+/// kernel does not count it.
+fn waited() -> Option<Duration> {
+    let text = fs::read_to_string("/proc/thread-self/schedstat").ok()?;
+    waited_in(&text)
+}
+
+/// The second number of `schedstat`: time spent waiting on a run queue, nanoseconds.
+fn waited_in(schedstat: &str) -> Option<Duration> {
+    let number = schedstat.split_whitespace().nth(1)?;
+    number.parse().ok().map(Duration::from_nanos)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::sync::mpsc::channel;
 
-    fn scheduling() -> i32 {
-        let text = std::fs::read_to_string("/proc/thread-self/sched").unwrap_or_default();
-        let line = text.lines().find(|line| line.starts_with("policy"));
-        let value = line.and_then(|line| line.rsplit(':').next());
-        value.and_then(|value| value.trim().parse().ok()).unwrap()
+    fn of(state: State) -> Precedence {
+        Precedence(Arc::new(Mutex::new(state)))
+    }
+
+    /// The policy of the calling thread, field 41 of its `stat`.
+    fn policy() -> u32 {
+        let text = fs::read_to_string("/proc/thread-self/stat").unwrap();
+        let (_, after_name) = text.rsplit_once(')').unwrap();
+        let field = after_name.split_whitespace().nth(38).unwrap();
+        field.parse().unwrap()
     }
 
     #[test]
-    fn it_gives_way_until_it_is_too_late() {
-        // Scheduling is of a thread; a test has one of its own.
-        let mut precedence = Precedence::take(Priority::Idle);
-        assert_eq!(
-            (precedence.state.clone(), scheduling()),
-            (State::GivesWay, 5)
-        );
-        precedence.judge_look(Duration::ZERO);
-        precedence.judge_missed(0);
-        assert_eq!(precedence.warning(), None);
-        precedence.looked = Instant::now().checked_sub(LATE_MAX * 2).unwrap();
-        precedence.judge_look(LATE_MAX * 3);
-        assert_eq!(
-            precedence.state,
-            State::GivesWay,
-            "it was to sleep for so long"
-        );
-        precedence.looked = Instant::now().checked_sub(LATE_MAX * 2).unwrap();
-        precedence.judge_look(Duration::ZERO);
-        match &precedence.state {
-            State::Raised(Reason::Late) => assert_eq!(scheduling(), 0),
+    fn the_kernel_tells_how_long_a_thread_waited() {
+        assert_eq!(waited_in("123 4567 89\n"), Some(Duration::from_nanos(4567)));
+        assert_eq!(waited_in("123"), None);
+        assert!(waited().is_some());
+    }
+
+    /// No other test of this program gives way, so no other is moved.
+    #[test]
+    fn every_thread_gives_way_until_one_is_too_late() {
+        let judged = thread::spawn(|| {
+            own(SchedulingPolicy::Idle).unwrap();
+            let (go, wait) = channel::<()>();
+            let child = thread::spawn(move || {
+                let _is_told = wait.recv().is_ok();
+                policy()
+            });
+            let precedence = of(State::GivesWay);
+            let late_max = Duration::from_millis(250);
+            let mut looks = Looks {
+                late_max,
+                waited: Duration::from_secs(7),
+            };
+            let look_after = |more_ms: u64| Duration::from_millis(7000 + more_ms);
+            looks.judge_by(look_after(250), &precedence);
+            assert_eq!(
+                (precedence.to_string().as_str(), policy()),
+                ("SCHED_IDLE", 5)
+            );
+            assert_eq!(precedence.warning(), None);
+            looks.judge_by(look_after(501), &precedence);
+            let state = precedence.lock().clone();
+            drop(go);
+            let policies = [policy(), child.join().unwrap()];
+            (state, policies, precedence.warning())
+        });
+        let (state, policies, warning) = judged.join().unwrap();
+        let late = Duration::from_millis(251);
+        match state {
+            State::Raised(waited) => assert_eq!((waited, policies), (late, [0, 0])),
             // Without the right to it.
-            State::Refused(Reason::Late, words) => {
+            State::Refused(waited, words) => {
+                assert_eq!(waited, late);
                 assert!(words.contains("RLIMIT_NICE"), "{words}");
             }
             other => panic!("{other:?}"),
         }
-        assert!(
-            precedence
-                .warning()
-                .is_some_and(|words| words.contains("over a second"))
-        );
+        assert!(warning.is_some_and(|words| words.contains("for 251 ms")));
     }
 
     #[test]
-    fn what_is_missed_raises_it_and_a_normal_one_stays() {
-        let mut precedence = Precedence::take(Priority::Idle);
-        precedence.judge_missed(3);
-        assert_ne!(precedence.state, State::GivesWay);
-        assert!(
-            precedence.to_string().contains("missed messages"),
-            "{precedence}"
+    fn it_stays_where_memory_does_not_wait_and_where_it_was_told_to() {
+        let asked = Precedence::new(Priority::Idle);
+        asked.settle(true);
+        assert_eq!(
+            asked.to_string(),
+            "SCHED_OTHER; shared memory does not wait for it"
         );
-        std::thread::spawn(|| {
-            let mut precedence = Precedence::take(Priority::Normal);
-            precedence.judge_missed(3);
-            assert_eq!(precedence.to_string(), "SCHED_OTHER");
-            assert_eq!(scheduling(), 0);
-        })
-        .join()
-        .unwrap();
+        let normal = Precedence::new(Priority::Normal);
+        normal.settle(false);
+        for precedence in [asked, normal] {
+            let mut looks = Looks::new(Duration::ZERO);
+            looks.judge_by(Duration::MAX, &precedence);
+            assert_eq!(precedence.warning(), None);
+            assert!(precedence.to_string().starts_with("SCHED_OTHER"));
+        }
+        let cannot = of(State::CannotGiveWay("EPERM".to_owned()));
+        cannot.settle(false);
+        assert_eq!(cannot.to_string(), "SCHED_OTHER; EPERM");
+        assert!(cannot.warning().is_some());
     }
 }

@@ -3,20 +3,22 @@
 //! [`crate::split`].
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::io;
+use std::path::PathBuf;
 use std::thread;
 use std::time::{Duration, Instant};
 
 use hil_runtime::watch::{
     Event, Feed, FeedError, LiveRun, Poll, SelectError, Source, WatchedChannel, select,
+    select_below,
 };
 
 use crate::facts::{self, Words};
 use crate::live::LiveTopics;
-use crate::priority::{Precedence, Priority};
+use crate::priority::{Looks, Precedence};
 use crate::run::Run;
 use crate::scene::Scenery;
-use crate::split::{Files, Split};
+use crate::split::{Files, Split, prepare, target};
 use crate::writer::WriteError;
 
 /// How long a recorder with nothing to do sleeps when it reads shared memory, whose buffers are short.
@@ -30,6 +32,9 @@ const WAIT_PAUSE: Duration = Duration::from_millis(50);
 const PROGRESS_PERIOD: Duration = Duration::from_millis(500);
 /// What the processes of a run have in their rings is in their files after this time.
 const RINGS_EMPTY_WITHIN: Duration = Duration::from_millis(60);
+/// How long the ground of a fleet is waited for at the end, and how often it is asked for.
+const GROUND_WITHIN: Duration = Duration::from_secs(30);
+const GROUND_PAUSE: Duration = Duration::from_millis(20);
 /// Problems that the file tells in words; further ones are counted.
 const PROBLEMS_MAX: usize = 1000;
 
@@ -42,6 +47,14 @@ pub(crate) enum RecordError {
     /// The run cannot be watched.
     #[error(transparent)]
     Feed(#[from] FeedError),
+    /// The run that was chosen is not there any more.
+    #[error("the run in {folder} does not go any more: {why}", folder = .folder.display())]
+    Gone {
+        /// Its folder.
+        folder: PathBuf,
+        /// What the system said.
+        why: io::Error,
+    },
     /// Nowhere to put it.
     #[error(transparent)]
     Write(#[from] WriteError),
@@ -50,15 +63,26 @@ pub(crate) enum RecordError {
     Interrupted(&'static str),
 }
 
+/// The run that is meant.
+#[derive(Debug, Clone)]
+pub(crate) enum Which {
+    /// By a word of the user's; the only one if left out.
+    Named(Option<String>),
+    /// The one in this folder.
+    In(PathBuf),
+}
+
 /// What is asked for.
 #[derive(Debug, Clone)]
 pub(crate) struct Request {
-    /// Which run; the only one if left out.
-    pub(crate) run: Option<String>,
+    /// Which run.
+    pub(crate) run: Which,
     /// File to write, or folder to write it into.
     pub(crate) output: PathBuf,
     /// Wait for a run to begin.
     pub(crate) waits: bool,
+    /// Know only runs whose folders lie below this one.
+    pub(crate) below: Option<PathBuf>,
     /// Leave out what is recorded already.
     pub(crate) from_now: bool,
     /// When to begin another file.
@@ -68,7 +92,7 @@ pub(crate) struct Request {
     /// Replace files that exist.
     pub(crate) force: bool,
     /// How it stands against what it records.
-    pub(crate) priority: Priority,
+    pub(crate) precedence: Precedence,
     /// Draw the scene.
     pub(crate) scenery: Scenery,
 }
@@ -118,27 +142,20 @@ pub(crate) type Look<'a> = &'a mut dyn FnMut(&Progress<'_>) -> Option<&'static s
 /// When there is no run to record or no file can be written; what was written is beside its place
 /// then.
 pub(crate) fn record(request: &Request, look: Look<'_>) -> Result<Recorded, RecordError> {
+    prepare(&request.output, request.split, request.force)?;
     let run = find(request, look)?;
     let target = target(&request.output, &run.name);
     let mut feed = Feed::open(run)?;
     if request.from_now {
         feed.skip_to_now();
     }
+    request.precedence.settle(reads_memory(&feed));
     let files = Files::begin(&target, request.split, request.force)?;
-    let precedence = Precedence::take(request.priority);
     let topics = LiveTopics::of(&feed, request.scenery);
+    let precedence = request.precedence.clone();
     let mut recording = LiveRecording::begin((feed, topics), files, precedence)?;
     let signal = recording.run(request, look)?;
     recording.finish(signal)
-}
-
-/// The file for a run: the one named, or one with the run's name in the folder named.
-fn target(output: &Path, run: &str) -> PathBuf {
-    if output.is_dir() {
-        output.join(format!("{run}.mcap"))
-    } else {
-        output.to_owned()
-    }
 }
 
 fn find(request: &Request, look: Look<'_>) -> Result<LiveRun, RecordError> {
@@ -149,8 +166,21 @@ fn find(request: &Request, look: Look<'_>) -> Result<LiveRun, RecordError> {
         file_count: 0,
         missed_count: 0,
     };
+    let wanted = match &request.run {
+        Which::Named(wanted) => wanted.as_deref(),
+        Which::In(folder) => {
+            return LiveRun::read(folder).map_err(|why| RecordError::Gone {
+                folder: folder.clone(),
+                why,
+            });
+        }
+    };
     loop {
-        match select(request.run.as_deref()) {
+        let selected = match &request.below {
+            Some(below) => select_below(below, wanted),
+            None => select(wanted),
+        };
+        match selected {
             Ok(run) => return Ok(run),
             Err(SelectError::NoneRuns | SelectError::NoSuch { .. }) if request.waits => {}
             Err(error) => return Err(error.into()),
@@ -163,8 +193,23 @@ fn find(request: &Request, look: Look<'_>) -> Result<LiveRun, RecordError> {
 }
 
 /// Records wait in their files for as long as it takes; shared memory does not.
-const fn is_in_shared_memory(channel: &WatchedChannel) -> bool {
-    matches!(channel.source, Some(Source::SharedMemory { .. }))
+pub(crate) fn reads_memory(feed: &Feed) -> bool {
+    let in_memory = |one: &WatchedChannel| matches!(one.source, Some(Source::SharedMemory { .. }));
+    feed.channels().any(in_memory)
+}
+
+/// For how long a look may be kept waiting, if what a kill loses is to stay below `flush`: half of that
+/// goes by between two looks, and up to another quarter in the rings of the run's processes.
+fn late_max(flush: Duration) -> Duration {
+    flush / 4
+}
+
+/// Keeps a problem, and counts it.
+fn note((problems, count): (&mut Vec<String>, &mut u64), text: &str) {
+    *count += 1;
+    if problems.len() < PROBLEMS_MAX {
+        problems.push(text.to_owned());
+    }
 }
 
 struct LiveRecording {
@@ -211,20 +256,21 @@ impl LiveRecording {
     ) -> Result<Option<&'static str>, WriteError> {
         // A message waits for the ring of its process, for the next look, and for the flush.
         let flush_period = request.flush / 2;
-        let pause = if self.feed.channels().any(is_in_shared_memory) {
+        let pause = if reads_memory(&self.feed) {
             PAUSE
         } else {
             LONG_PAUSE.min(flush_period)
         };
         let (mut flushed, mut told) = (Instant::now(), Instant::now());
         let (mut told_count, mut has_caught_up) = (0, false);
+        let mut looks = Looks::new(late_max(request.flush));
         loop {
             let polled = self.poll()?;
+            let now = Instant::now();
             if polled != Poll::Busy {
                 self.topics.draw(&mut self.files)?;
+                self.topics.settle(now, &mut self.files)?;
             }
-            let now = Instant::now();
-            self.topics.settle(now, &mut self.files)?;
             // What was there before the recorder is not to wait for its first period.
             let is_abreast = polled == Poll::Idle && !has_caught_up;
             has_caught_up |= is_abreast;
@@ -243,21 +289,15 @@ impl LiveRecording {
                 let count = self.topics.counts().message_count;
                 let rate_hz = (count - told_count) as f64 / since_told.as_secs_f64();
                 (told, told_count) = (now, count);
-                let progress = self.progress(rate_hz);
-                let missed_count = progress.missed_count;
-                let signal = look(&progress);
-                self.precedence.judge_missed(missed_count);
-                if let Some(signal) = signal {
+                if let Some(signal) = look(&self.progress(rate_hz)) {
                     let is_over = self.catch_up()? == Poll::Over;
                     return Ok((!is_over).then_some(signal));
                 }
             }
-            let planned = match polled {
-                Poll::Idle => pause,
-                Poll::Busy | Poll::Over => Duration::ZERO,
-            };
-            thread::sleep(planned);
-            self.precedence.judge_look(planned);
+            if polled == Poll::Idle {
+                thread::sleep(pause);
+            }
+            looks.judge(&self.precedence);
         }
     }
 
@@ -287,12 +327,7 @@ impl LiveRecording {
         let mut failed = None;
         let polled = feed.poll(&mut |event| {
             match &event {
-                Event::Problem(text) => {
-                    *problem_count += 1;
-                    if problems.len() < PROBLEMS_MAX {
-                        problems.push((*text).to_owned());
-                    }
-                }
+                Event::Problem(text) => note((problems, problem_count), text),
                 Event::Silent => *is_silent = true,
                 Event::Ended { has_summary: has } => *has_summary = *has,
                 Event::Message { .. } | Event::Record { .. } => {}
@@ -302,6 +337,14 @@ impl LiveRecording {
             }
         });
         failed.map_or(Ok(polled), Err)
+    }
+
+    /// A run may be over before the ground of its fleet was made.
+    fn await_scene(&mut self) {
+        let since = Instant::now();
+        while !self.topics.is_scene_ready() && since.elapsed() < GROUND_WITHIN {
+            thread::sleep(GROUND_PAUSE);
+        }
     }
 
     /// What was published before the signal is to be in the file; what the last poll came to.
@@ -324,8 +367,9 @@ impl LiveRecording {
     }
 
     fn finish(mut self, signal: Option<&'static str>) -> Result<Recorded, RecordError> {
-        if let Some(problem) = self.topics.finish_scene(&mut self.files)? {
-            self.problems.push(problem.to_owned());
+        self.await_scene();
+        for problem in self.topics.finish_scene(&mut self.files)? {
+            note((&mut self.problems, &mut self.problem_count), &problem);
         }
         let mut run = Run::without_records(self.feed.run().run_folder());
         if self.has_summary {
@@ -406,6 +450,7 @@ impl LiveRecording {
             ("misfit_message_count", counts.misfit_count),
             ("timeless_record_count", counts.timeless_count),
             ("late_record_count", self.topics.late_count()),
+            ("unordered_latency_count", self.topics.unordered_count()),
             ("problem_count", self.problem_count),
         ];
         let mut words: Words = numbers

@@ -94,13 +94,14 @@ impl Gaps {
 }
 
 impl Run {
-    /// Reads the folder at `path`; `goes_on` hears the name of each file, and ends it with false.
+    /// Reads the folder at `path`; `goes_on` hears the name of each file and the share of all bytes that
+    /// is read before it, and ends it with false.
     ///
     /// # Errors
     /// When it is no run's folder.
     pub(crate) fn read(
         path: &Path,
-        goes_on: &mut dyn FnMut(&str) -> bool,
+        goes_on: &mut dyn FnMut((f64, &str)) -> bool,
     ) -> Result<Self, RunError> {
         let folder = RunFolder::existing(path);
         if !folder.records().is_dir() && folder.virtual_report().is_file() {
@@ -109,10 +110,15 @@ impl Run {
         }
         let paths = listed(&folder.records())?;
         let mut run = Self::without_records(folder);
+        let size = |path: &PathBuf| fs::metadata(path).map_or(0, |file| file.len());
+        let all_bytes: u64 = paths.iter().map(size).sum();
+        let mut read_bytes = 0;
         for path in paths {
-            if !goes_on(&path.display().to_string()) {
+            let share = read_bytes as f64 / all_bytes.max(1) as f64;
+            if !goes_on((share, &path.display().to_string())) {
                 break;
             }
+            read_bytes += size(&path);
             run.read_records(&path);
         }
         run.read_traces()?;

@@ -2,6 +2,7 @@
 //! each, and what a kill leaves can be recovered up to the last flush.
 
 use std::collections::{BTreeMap, VecDeque};
+use std::fs;
 use std::panic::resume_unwind;
 use std::path::{Path, PathBuf};
 use std::thread::{self, JoinHandle};
@@ -9,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use crate::schema::Schema;
 use crate::sink::Sink;
-use crate::writer::{Recording, Stamp, WriteError, check_target};
+use crate::writer::{Recording, Stamp, WriteError, check_folder, check_live_target, check_target};
 
 /// Files that may be on their way to the disk beside the open one: each has a queue of its own in
 /// memory.
@@ -25,9 +26,54 @@ pub(crate) struct Split {
 }
 
 impl Split {
+    /// Above this size in bytes or after this time, whichever comes first.
+    pub(crate) const fn at(size_bytes: Option<u64>, time: Option<Duration>) -> Self {
+        Self { size_bytes, time }
+    }
+
     const fn is_any(&self) -> bool {
         self.size_bytes.is_some() || self.time.is_some()
     }
+
+    /// The first file of a recording called `target`.
+    fn first(&self, target: &Path) -> PathBuf {
+        if self.is_any() {
+            numbered(target, 1)
+        } else {
+            target.to_owned()
+        }
+    }
+}
+
+/// True when `output` means a folder, whose files get the names of their runs: it is one, or it ends
+/// in `/`.
+fn is_folder(output: &Path) -> bool {
+    output.is_dir() || output.as_os_str().as_encoded_bytes().ends_with(b"/")
+}
+
+/// The file for a run: the one named, or one with the run's name in the folder named.
+pub(crate) fn target(output: &Path, run: &str) -> PathBuf {
+    if is_folder(output) {
+        output.join(format!("{run}.mcap"))
+    } else {
+        output.to_owned()
+    }
+}
+
+/// Says that a recording may go to `output` before anything is waited for, and makes the folder that
+/// it names with `/` at its end.
+///
+/// # Errors
+/// When it may not, in the words that the recording itself would end with.
+pub(crate) fn prepare(output: &Path, split: Split, may_replace: bool) -> Result<(), WriteError> {
+    if !is_folder(output) {
+        return check_live_target(&split.first(output), may_replace);
+    }
+    fs::create_dir_all(output).map_err(|source| WriteError::Io {
+        path: output.to_owned(),
+        source,
+    })?;
+    check_folder(output, output)
 }
 
 #[derive(Debug)]
@@ -118,11 +164,7 @@ impl Files {
         split: Split,
         may_replace: bool,
     ) -> Result<Self, WriteError> {
-        let first = if split.is_any() {
-            numbered(target, 1)
-        } else {
-            target.to_owned()
-        };
+        let first = split.first(target);
         check_target(&first, Path::new(""), may_replace)?;
         Ok(Self {
             target: target.to_owned(),
@@ -283,11 +325,56 @@ mod tests {
             assert_eq!(messages.next().unwrap().unwrap().channel.topic, "/a");
             assert!(messages.next().is_none());
         }
+        let taken = prepare(&folder.join("a.mcap"), split, false);
+        assert!(matches!(taken, Err(WriteError::Exists { .. })));
+        prepare(&folder.join("a.mcap"), split, true).unwrap();
         // A name that is taken ends it, and what is open is kept beside it.
         assert!(matches!(
             Files::begin(&folder.join("a.mcap"), split, false).map(|_| ()),
             Err(WriteError::Exists { .. })
         ));
+        fs::remove_dir_all(folder).unwrap();
+    }
+
+    #[test]
+    fn where_a_recording_goes_is_looked_at_before_there_is_one() {
+        let folder = std::env::temp_dir().join(format!("hil-prepare-{}", std::process::id()));
+        fs::create_dir_all(&folder).unwrap();
+        let one = Split::default();
+        let named = |name: &str| folder.join(name);
+        // Only `/` at the end says that what is not there is to be a folder.
+        let absent = named("new/deep/");
+        prepare(&absent, one, false).unwrap();
+        assert!(absent.is_dir());
+        assert_eq!(target(&absent, "run-1"), named("new/deep/run-1.mcap"));
+        assert_eq!(
+            target(&named("new/deep"), "run-1"),
+            named("new/deep/run-1.mcap")
+        );
+        assert_eq!(target(&named("file"), "run-1"), named("file"));
+        prepare(&named("file"), one, false).unwrap();
+        assert!(!named("file").exists());
+        let nowhere = prepare(&named("none/a.mcap"), one, false).unwrap_err();
+        assert!(
+            nowhere.to_string().contains("none/a.mcap: No such file"),
+            "{nowhere}"
+        );
+        fs::write(named("a.mcap"), "").unwrap();
+        let words = |name: &str| prepare(&named(name), one, false).unwrap_err().to_string();
+        assert!(words("a.mcap").contains("exists already; --force"));
+        assert!(
+            words("a.mcap/").contains("cannot write"),
+            "{}",
+            words("a.mcap/")
+        );
+        assert!(
+            words("a.mcap/b").contains("cannot write"),
+            "{}",
+            words("a.mcap/b")
+        );
+        prepare(&named("a.mcap"), one, true).unwrap();
+        fs::write(named("b.mcap.partial"), "").unwrap();
+        assert!(words("b.mcap").contains("recover"), "{}", words("b.mcap"));
         fs::remove_dir_all(folder).unwrap();
     }
 

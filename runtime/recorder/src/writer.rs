@@ -11,6 +11,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{Attachment, Compression, McapError, WriteOptions, Writer};
+use nix::unistd::{AccessFlags, access};
 
 use crate::disk::QueuedFile;
 use crate::schema::Schema;
@@ -49,6 +50,16 @@ pub(crate) enum WriteError {
     Io {
         /// The file.
         path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// The file is whole, but its place is not to be had.
+    #[error("cannot write {path}: {source}; the recording is whole and in {partial}")]
+    Unplaced {
+        /// The file.
+        path: PathBuf,
+        /// Where it is.
+        partial: PathBuf,
         /// What the system said.
         source: io::Error,
     },
@@ -115,6 +126,42 @@ pub(crate) fn check_target(path: &Path, input: &Path, may_replace: bool) -> Resu
     Ok(())
 }
 
+/// Where a live recording that will be called `path` lies until it is whole.
+fn live_partial(path: &Path) -> PathBuf {
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    path.with_file_name(format!("{name}.partial"))
+}
+
+/// Says that a live recording may go to `path`, as [`check_target`] does.
+///
+/// # Errors
+/// As there, and when a recorder writes it or left it unfinished, or its folder is not there or not
+/// to be written into.
+pub(crate) fn check_live_target(path: &Path, may_replace: bool) -> Result<(), WriteError> {
+    check_target(path, Path::new(""), may_replace)?;
+    let partial = live_partial(path);
+    if fs::symlink_metadata(&partial).is_ok() {
+        return Err(WriteError::Unfinished { path: partial });
+    }
+    let folder = path.parent().filter(|one| !one.as_os_str().is_empty());
+    check_folder(folder.unwrap_or(Path::new(".")), path)
+}
+
+/// Says that `path` may be made in `folder`.
+///
+/// # Errors
+/// When the folder is none, or not to be written into.
+pub(crate) fn check_folder(folder: &Path, path: &Path) -> Result<(), WriteError> {
+    let failed = |source: io::Error| WriteError::Io {
+        path: path.to_owned(),
+        source,
+    };
+    if !fs::metadata(folder).map_err(failed)?.is_dir() {
+        return Err(failed(io::ErrorKind::NotADirectory.into()));
+    }
+    access(folder, AccessFlags::W_OK | AccessFlags::X_OK).map_err(|errno| failed(errno.into()))
+}
+
 impl Recording {
     /// Begins a file that will be called `path`.
     ///
@@ -133,9 +180,7 @@ impl Recording {
     /// When there is no room, no right or no folder for it, or such a file is there already: what a
     /// killed recorder left is not written over.
     pub(crate) fn create_live(path: &Path) -> Result<Self, WriteError> {
-        let name = path.file_name().unwrap_or_default().to_string_lossy();
-        let partial = path.with_file_name(format!("{name}.partial"));
-        Self::begin(path, partial, true)
+        Self::begin(path, live_partial(path), true)
     }
 
     fn begin(path: &Path, partial: PathBuf, is_live: bool) -> Result<Self, WriteError> {
@@ -311,7 +356,17 @@ impl Recording {
             let written = writer.into_inner().finish();
             written.map_err(|error| failed(&self.partial, error))?;
         }
-        fs::rename(&self.partial, &self.path).map_err(|error| failed(&self.path, error))?;
+        fs::rename(&self.partial, &self.path).map_err(|source| {
+            if self.is_live {
+                let (path, partial) = (self.path.clone(), self.partial.clone());
+                return WriteError::Unplaced {
+                    path,
+                    partial,
+                    source,
+                };
+            }
+            failed(&self.path, source)
+        })?;
         Ok(self.message_count)
     }
 }

@@ -59,6 +59,7 @@ pub(super) fn run_facts(
         topology_file: topology_file.display().to_string(),
         topology_hash: format!("{:016x}", topology.hash()),
         seed: topology.run().seed,
+        security: result.security.clone(),
         host: result.own_hosts.join(", "),
         started: result.started.clone(),
         starts_ns: result

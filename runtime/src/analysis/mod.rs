@@ -15,6 +15,7 @@ mod radio;
 pub(crate) mod records;
 mod robot_series;
 mod score_clock;
+mod stalls;
 
 use std::fs;
 use std::io;
@@ -52,16 +53,24 @@ pub(crate) enum AnalysisError {
     Write { path: PathBuf, source: io::Error },
 }
 
+/// The account of a finished run.
+#[derive(Debug)]
+pub(crate) struct Concluded {
+    pub(crate) summary: RunSummary,
+    /// Why the run folder lacks it, e.g. because its disk is full; it can be shown all the same.
+    pub(crate) unwritten: Option<AnalysisError>,
+}
+
 /// Draws up the summary of a finished run and writes it with its report into the run's folder.
 ///
 /// # Errors
-/// When the records cannot be read at all, or the run folder cannot be written.
+/// When the records cannot be read at all.
 pub(crate) fn conclude(
     topology: &Topology,
     result: &RunResult,
     registry: &Registry,
     (topology_file, command_line): (&Path, &[String]),
-) -> Result<RunSummary, AnalysisError> {
+) -> Result<Concluded, AnalysisError> {
     let mut records = RunRecords::read(&result.folder.records())?;
     let clocks = HostClocks::of(topology, result, &records);
     records.set_clocks(clocks);
@@ -123,8 +132,8 @@ pub(crate) fn conclude(
     let case = case.as_ref().map(|(_, case)| case.as_ref());
     let network_series = network_series.unwrap_or_default();
     write_series(&mut summary, result, (case, network_series), records);
-    write_texts(&summary, result)?;
-    Ok(summary)
+    let unwritten = write_texts(&summary, result).err();
+    Ok(Concluded { summary, unwritten })
 }
 
 /// Writes the summary, the events and the report into the run's folder.

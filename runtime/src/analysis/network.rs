@@ -170,7 +170,7 @@ impl NetworkBuilder {
             clock_bound_s: axis.bound_s,
             timeline: timeline(&self.bins, &robot, width_s),
             correlation: correlate(&self.bins, &robot, (width_s, seed)),
-            events: self.events.into_iter().take(EVENTS_MAX).collect(),
+            events: TimedEvent::kept(self.events, EVENTS_MAX),
             events_dropped_count: dropped as u64,
             channels: self.channels,
         };

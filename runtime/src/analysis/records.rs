@@ -25,7 +25,7 @@ use hil_models::trace::TraceRecord;
 
 use super::AnalysisError;
 use super::clocks::HostClocks;
-use super::link_changes;
+use super::{link_changes, stalls};
 use crate::face::record::{FaceReceivedRecord, FaceSentRecord};
 use crate::process::launch::EmulationLaunch;
 use crate::radio::record::RadioRecord;
@@ -42,11 +42,11 @@ const FLIGHT_QUANTILE: f64 = 0.9999;
 /// All records of one channel.
 #[derive(Debug, Default)]
 pub(crate) struct ChannelFiles {
-    published: Option<Vec<PublishedRecord>>,
-    egress: Option<Vec<EgressRecord>>,
-    ingress: Option<Vec<IngressRecord>>,
+    pub(super) published: Option<Vec<PublishedRecord>>,
+    pub(super) egress: Option<Vec<EgressRecord>>,
+    pub(super) ingress: Option<Vec<IngressRecord>>,
     follow_up: Option<Vec<FollowUpRecord>>,
-    taken: Option<Vec<TakenRecord>>,
+    pub(super) taken: Option<Vec<TakenRecord>>,
     round_trips: BTreeMap<(u32, u64), RoundTripRecord>,
     face_sent: Vec<FaceSentRecord>,
     face_received: Vec<FaceReceivedRecord>,
@@ -55,7 +55,7 @@ pub(crate) struct ChannelFiles {
 /// Every record file of a run.
 #[derive(Debug, Default)]
 pub(crate) struct RunRecords {
-    channels: BTreeMap<String, ChannelFiles>,
+    pub(super) channels: BTreeMap<String, ChannelFiles>,
     cards: BTreeMap<String, Vec<CardClockRecord>>,
     log: RunLog,
     clocks: HostClocks,
@@ -71,7 +71,8 @@ impl RunRecords {
     /// Reads the records folder.
     pub(crate) fn read(folder: &Path) -> Result<Self, AnalysisError> {
         let mut records = Self::default();
-        records.problems = read_files(folder, &|_| true, &mut |file| records.add(&file))?;
+        let mut add = |file| records.add(&file);
+        records.problems = read_files(folder, &|_| true, &|_| {}, &mut add)?;
         Ok(records)
     }
 
@@ -309,7 +310,8 @@ impl RunRecords {
     ) -> T {
         let nothing = ChannelFiles::default();
         let files = self.channels.get(&channel.name).unwrap_or(&nothing);
-        let interruptions = interruptions(topology, result, channel);
+        let mut interruptions = interruptions(topology, result, channel);
+        interruptions.extend(stalls::at_end(self, (topology, result), channel));
         let span_of = |process: &str| {
             let (start, end) = *result.spans.get(&topology.process(process)?.host)?;
             Some(RunSpan { start, end })
@@ -372,13 +374,14 @@ pub(crate) struct MessageRecords {
 }
 
 impl MessageRecords {
-    /// Reads them from a records folder.
+    /// Reads them from a records folder; `reach` hears the share that is read.
     ///
     /// # Errors
     /// When the folder cannot be read.
-    pub(crate) fn read(folder: &Path) -> Result<Self, AnalysisError> {
+    pub(crate) fn read(folder: &Path, reach: &dyn Fn(f64)) -> Result<Self, AnalysisError> {
         let mut records = Self::default();
-        let problems = read_files(folder, &|name| name.contains(".message."), &mut |file| {
+        let wanted = |name: &str| name.contains(".message.");
+        let problems = read_files(folder, &wanted, reach, &mut |file| {
             if file.header.kind != RecordKind::Message {
                 return;
             }
@@ -408,11 +411,12 @@ pub(crate) fn missing_count(messages: &[LoggedMessage]) -> u64 {
     given_count.saturating_sub(messages.len() as u64)
 }
 
-/// Hands every record file of `folder` with a `wanted` name to `take`; gives what could not be
-/// read.
+/// Hands every record file of `folder` with a `wanted` name to `take`, and before each the share of
+/// their bytes that is read to `reach`; gives what could not be read.
 fn read_files(
     folder: &Path,
     wanted: &dyn Fn(&str) -> bool,
+    reach: &dyn Fn(f64),
     take: &mut dyn FnMut(RecordFile),
 ) -> Result<Vec<String>, AnalysisError> {
     let failed = |source| AnalysisError::Folder {
@@ -428,8 +432,13 @@ fn read_files(
         let name = path.file_name().unwrap_or_default();
         wanted(&name.to_string_lossy())
     });
+    let size = |path: &PathBuf| fs::metadata(path).map_or(0, |file| file.len());
+    let all_bytes: u64 = paths.iter().map(size).sum();
+    let mut read_bytes = 0;
     let mut problems = Vec::new();
     for path in paths {
+        reach(read_bytes as f64 / all_bytes.max(1) as f64);
+        read_bytes += size(&path);
         match RecordFile::read(&path) {
             Ok(file) => take(file),
             // A process killed while it opened its files leaves one without a header.

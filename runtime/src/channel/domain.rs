@@ -166,6 +166,12 @@ impl Domain {
         root_path.join(MARKER).is_file()
     }
 
+    /// The prefix of the domain whose root is, or was, `root_path`; `None` where there is none.
+    pub(crate) fn prefix_at(root_path: &Path) -> Option<String> {
+        let prefix = fs::read_to_string(root_path.join(MARKER)).ok()?;
+        is_prefix(&prefix).then_some(prefix)
+    }
+
     /// Joins the domain a launcher created.
     ///
     /// # Errors

@@ -3,7 +3,7 @@
 
 use iceoryx2::config::Config;
 use iceoryx2::node::{Node, NodeState, NodeView};
-use iceoryx2::prelude::{CallbackProgression, NodeName, ipc};
+use iceoryx2::prelude::{CallbackProgression, LogLevel, NodeName, ipc, set_log_level};
 
 /// What the nodes of observers are called.
 const OBSERVER: &str = "hil-observer";
@@ -42,4 +42,38 @@ pub(super) fn living(config: &Config) -> Members {
     });
     // An unreadable list means a deleted directory, hence no members.
     listed.map_or_else(|_unreadable| Members::default(), |()| members)
+}
+
+/// Nodes of iceoryx2's default domain, which runs do not use: those of other programs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(crate) struct ForeignNodes {
+    /// Living programs.
+    pub(crate) living: u64,
+    /// Programs that ended without leaving.
+    pub(crate) dead: u64,
+    /// Those of other users, of which nothing can be said.
+    pub(crate) hidden: u64,
+}
+
+impl ForeignNodes {
+    /// Looks; cleans nothing up.
+    ///
+    /// # Errors
+    /// When the list cannot be read.
+    pub(crate) fn list() -> Result<Self, String> {
+        set_log_level(LogLevel::Warn);
+        let mut found = Self::default();
+        let listed = Node::<ipc::Service>::list(&Config::default(), |state| {
+            match state {
+                NodeState::Alive(_) => found.living += 1,
+                NodeState::Dead(_) => found.dead += 1,
+                NodeState::Inaccessible(_) | NodeState::Undefined(_) => found.hidden += 1,
+            }
+            CallbackProgression::Continue
+        });
+        match listed {
+            Ok(()) => Ok(found),
+            Err(error) => Err(format!("iceoryx2 cannot list its nodes: {error:?}")),
+        }
+    }
 }

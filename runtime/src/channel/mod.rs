@@ -41,6 +41,7 @@ pub use domain::{Cleanup, Domain, DomainAddress, ROOT_PATH_LENGTH_MAX, Removal};
 pub use error::{ChannelError, DomainError};
 pub use holder::{ChannelHolder, ChannelSettings};
 pub use identity::clock_id;
+pub(crate) use members::ForeignNodes;
 pub use raw::{ENVELOPE_TYPE_NAME, RawInput, RawOutput};
 pub use sequence::{InputCounters, OutputSettings, Stamp};
 pub(crate) use sequence::{SequenceTracker, Sequencer};

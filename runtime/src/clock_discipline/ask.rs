@@ -1,13 +1,13 @@
 //! Asks the daemons that steer the clock, by their own tools and for a bounded time. What the
 //! answers mean is read elsewhere.
 
-use std::fs;
 use std::io::Read;
 use std::process::{Command, Stdio};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use super::{ChronyTracking, NtpVariables, PtpStatus};
+use crate::host_facts::HostFiles;
 
 /// How long a tool may take; a daemon on this host answers within milliseconds, but `ntpq` of ntpsec
 /// alone takes a third of a second to start on a busy machine.
@@ -50,10 +50,8 @@ impl Daemons {
 
 /// Among the processes this one can see.
 pub(super) fn running_daemons() -> Daemons {
-    let entries = fs::read_dir("/proc").into_iter().flatten().flatten();
-    Daemons::named(
-        entries.map(|entry| fs::read_to_string(entry.path().join("comm")).unwrap_or_default()),
-    )
+    let names = HostFiles::of_this_host().process_names();
+    Daemons::named(names.available().into_iter().flatten().cloned())
 }
 
 pub(super) fn chrony() -> Result<ChronyTracking, String> {

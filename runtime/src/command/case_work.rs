@@ -180,7 +180,7 @@ fn loaded(topology: Result<Topology, TopologyErrors>, console: &mut Console) -> 
     match topology {
         Ok(topology) => Some(topology),
         Err(errors) => {
-            console.rendered(&errors.render(std::io::stderr().is_terminal()));
+            console.faults(&errors.render(std::io::stderr().is_terminal()));
             None
         }
     }
@@ -221,8 +221,10 @@ fn compute(
 /// `replay`.
 pub(super) fn replay(run: &Path, json: bool, registry: &Registry, console: &mut Console) -> u8 {
     let folder = RunFolder::existing(run);
-    let replayed = Progress::begin().during(console, "running the robot again", |_| {
-        replay::replay(&folder, registry)
+    let replayed = Progress::begin().during(console, "reading messages", |stage| {
+        replay::replay(&folder, registry, &|share, words| {
+            stage.tell(share, words);
+        })
     });
     let replayed = match replayed {
         Ok(replayed) => replayed,

@@ -14,7 +14,8 @@ Examples:
       for a script: exit code 1 when a condition holds beyond the figure's interval
   hil-runtime compare runs/before runs/after --format md > comparison.md
 
-A condition is [CHANNEL:]METRIC OP VALUE[UNIT]. Without a channel it is one on every channel.
+A condition is [CHANNEL:]METRIC OP VALUE[UNIT]. Without a channel it is one on every channel; those
+where it cannot be judged, as with too few messages, are named.
   METRIC  p50, p99, p99.9, max (end to end), loss, or a score by its name in summary.json
   OP      > >= < <=
   UNIT    of delays: x (new by base); s, ms, us, ns (of the new runs)
@@ -22,7 +23,7 @@ A condition is [CHANNEL:]METRIC OP VALUE[UNIT]. Without a channel it is one on e
           of scores: x, or none (of the new runs)
 
 Exit code 0 when no condition holds, 1 when one does, 2 for wrong arguments, folders that are no
-finished runs, and conditions that cannot be judged. docs/compare.md has the methods.";
+finished runs, and conditions that can be judged on no channel. docs/compare.md has the methods.";
 
 /// Arguments of a comparison.
 #[derive(Debug, Args)]

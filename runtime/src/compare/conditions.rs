@@ -34,20 +34,16 @@ pub(crate) enum ConditionError {
         allowed: String,
     },
     /// The figure is not measured that way.
-    #[error("--fail-if {text:?}: {metric} takes no `{unit}`; allowed: {allowed}")]
+    #[error("--fail-if {text:?}: {metric} {problem}; allowed: {allowed}")]
     Unit {
         text: String,
         metric: String,
-        unit: String,
+        problem: String,
         allowed: &'static str,
     },
     /// One side has no such figure, or nothing can be said of how sure it is.
-    #[error("--fail-if {text:?}: cannot be judged for {figure}: {why}")]
-    Unjudged {
-        text: String,
-        figure: String,
-        why: String,
-    },
+    #[error("--fail-if {0}")]
+    Unjudged(Unjudged),
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -103,12 +99,48 @@ pub(crate) struct Judged {
     pub(crate) condition: String,
     /// Channel and metric.
     pub(crate) figure: String,
-    /// The figure in the condition's unit.
+    /// The figure in the unit below.
     pub(crate) value: f64,
+    /// Unit of the condition, or of the score; empty for a number.
+    pub(crate) unit: String,
     /// Its interval in the same unit.
     pub(crate) interval: Option<Interval>,
     /// True when the comparison fails by it.
     pub(crate) holds: bool,
+}
+
+/// A figure that a condition means and that cannot be judged by it.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, thiserror::Error)]
+#[error("{condition:?}: cannot be judged for {figure}: {why}")]
+pub(crate) struct Unjudged {
+    /// As written.
+    pub(crate) condition: String,
+    /// Channel and metric.
+    pub(crate) figure: String,
+    /// What is missing.
+    pub(crate) why: String,
+}
+
+/// What became of all conditions.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(crate) struct Verdicts {
+    /// The figures that could be judged.
+    pub(crate) judged: Vec<Judged>,
+    /// Those that could not, beside others of the same condition that could.
+    pub(crate) unjudged: Vec<Unjudged>,
+}
+
+impl Verdicts {
+    /// In words, a line for each figure.
+    pub(super) fn lines(&self) -> Vec<String> {
+        let judged = self.judged.iter().map(ToString::to_string);
+        let unjudged = self.unjudged.iter();
+        let unjudged = unjudged.map(|one| {
+            let (condition, figure, why) = (&one.condition, &one.figure, &one.why);
+            format!("not judged: {condition}: {figure}: {why}")
+        });
+        judged.chain(unjudged).collect()
+    }
 }
 
 impl Condition {
@@ -150,15 +182,16 @@ impl Condition {
         })
     }
 
-    /// What it says of each figure that it means.
+    /// Adds to `verdicts` what it says of each figure that it means.
     ///
     /// # Errors
-    /// When it means none, its unit is not that figure's, or a figure cannot be judged.
+    /// When it means none, its unit is not that figure's, or none of its figures can be judged.
     pub(crate) fn judge(
         &self,
         comparison: &Comparison,
         is_strict: bool,
-    ) -> Result<Vec<Judged>, ConditionError> {
+        verdicts: &mut Verdicts,
+    ) -> Result<(), ConditionError> {
         let figures = &comparison.figures;
         let is_whole =
             |one: &&ComparedFigure| one.kind != FigureKind::Delay || one.part == END_TO_END;
@@ -185,11 +218,22 @@ impl Condition {
                 allowed: words(figures.iter().filter_map(|one| one.channel.as_deref())),
             });
         }
-        let mut judged = Vec::new();
+        let (mut judged, mut unjudged) = (Vec::new(), Vec::new());
         for one in meant {
-            judged.push(self.judge_one(one, is_strict)?);
+            match self.judge_one(one, is_strict) {
+                Ok(one) => judged.push(one),
+                Err(ConditionError::Unjudged(one)) => unjudged.push(one),
+                Err(error) => return Err(error),
+            }
         }
-        Ok(judged)
+        if judged.is_empty()
+            && let Some(first) = unjudged.first().cloned()
+        {
+            return Err(ConditionError::Unjudged(first));
+        }
+        verdicts.judged.extend(judged);
+        verdicts.unjudged.extend(unjudged);
+        Ok(())
     }
 
     fn judge_one(
@@ -198,18 +242,16 @@ impl Condition {
         is_strict: bool,
     ) -> Result<Judged, ConditionError> {
         let name = name_of(figure);
-        let unjudged = |why: String| ConditionError::Unjudged {
-            text: self.text.clone(),
-            figure: name.clone(),
-            why,
+        let unjudged = |why: String| {
+            ConditionError::Unjudged(Unjudged {
+                condition: self.text.clone(),
+                figure: name.clone(),
+                why,
+            })
         };
         let (value, interval) = self.quantity(figure)?;
         let value = value.ok_or_else(|| {
-            unjudged(
-                "the figure is unavailable on one side, or its \
-                                                   base is zero"
-                    .to_owned(),
-            )
+            unjudged("the figure is unavailable on one side, or its base is zero".to_owned())
         })?;
         let holds = match interval {
             _ if is_strict => self.operator.holds(value, self.value),
@@ -223,6 +265,10 @@ impl Condition {
             condition: self.text.clone(),
             figure: name,
             value,
+            unit: match self.unit.as_str() {
+                "" if figure.unit != "1" => figure.unit.clone(),
+                unit => unit.to_owned(),
+            },
             interval,
             holds,
         })
@@ -258,7 +304,10 @@ impl Condition {
                 return Err(ConditionError::Unit {
                     text: self.text.clone(),
                     metric: self.metric.clone(),
-                    unit: unit.to_owned(),
+                    problem: match unit {
+                        "" => "needs a unit".to_owned(),
+                        unit => format!("takes no `{unit}`"),
+                    },
                     allowed: match kind {
                         FigureKind::Delay => "x (new by base); s, ms, us, ns (of the new runs)",
                         FigureKind::Loss => {
@@ -295,118 +344,26 @@ fn words<'a>(all: impl Iterator<Item = &'a str>) -> String {
 impl fmt::Display for Judged {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         let word = if self.holds { "FAILS" } else { "passes" };
+        let with_unit = |value: f64| match self.unit.as_str() {
+            "" => format!("{value:.4}"),
+            "x" => format!("{value:.4}x"),
+            unit => format!("{value:.4} {unit}"),
+        };
         write!(
             formatter,
-            "{word}: {}: {} is {:.4}",
-            self.condition, self.figure, self.value
+            "{word}: {}: {} is {}",
+            self.condition,
+            self.figure,
+            with_unit(self.value)
         )?;
         if let Some(interval) = self.interval {
-            write!(formatter, " ({:.4} to {:.4})", interval.low, interval.high)?;
+            let (low, high) = (with_unit(interval.low), with_unit(interval.high));
+            write!(formatter, " ({low} to {high})")?;
         }
         Ok(())
     }
 }
 
 #[cfg(test)]
-mod tests {
-    use hil_models::measure::comparison::Estimate;
-
-    use super::*;
-    use crate::compare::Verdict;
-
-    fn figure(metric: &str, kind: FigureKind, ratio: (f64, f64, f64)) -> ComparedFigure {
-        let (low, value, high) = ratio;
-        let interval = Some(Interval { low, high });
-        let estimate = |value: f64| Some(Estimate { value, interval });
-        ComparedFigure {
-            channel: (kind != FigureKind::Score).then(|| "a/b".to_owned()),
-            part: match kind {
-                FigureKind::Delay => END_TO_END.to_owned(),
-                FigureKind::Loss | FigureKind::Score => String::new(),
-            },
-            metric: metric.to_owned(),
-            kind,
-            unit: String::new(),
-            base: estimate(1.0),
-            new: estimate(value),
-            base_count: 1,
-            new_count: 1,
-            ratio: Some(value),
-            ratio_interval: interval,
-            difference: Some(value),
-            difference_interval: interval,
-            verdict: Verdict::Slower,
-            method: "why not".to_owned(),
-        }
-    }
-
-    fn comparison() -> Comparison {
-        let mut maximum = figure("max", FigureKind::Delay, (1.0, 3.0, 4.0));
-        maximum.ratio_interval = None;
-        Comparison {
-            base: Vec::new(),
-            new: Vec::new(),
-            same: Vec::new(),
-            differences: Vec::new(),
-            cautions: Vec::new(),
-            figures: vec![
-                figure("p99", FigureKind::Delay, (1.1, 1.3, 1.5)),
-                maximum,
-                figure("loss", FigureKind::Loss, (0.001, 0.002, 0.004)),
-                figure("score_ratio", FigureKind::Score, (0.5, 0.7, 0.9)),
-            ],
-        }
-    }
-
-    fn holds(text: &str, is_strict: bool) -> Result<bool, ConditionError> {
-        let judged = Condition::parse(text)?.judge(&comparison(), is_strict)?;
-        Ok(judged.iter().any(|one| one.holds))
-    }
-
-    #[test]
-    fn a_condition_holds_beyond_the_interval_or_strictly_by_the_figure() {
-        for (text, beyond, strictly) in [
-            ("p99 > 1.2x", false, true),
-            ("p99 > 1.05x", true, true),
-            ("a/b:p99>=1.1x", true, true),
-            ("p99 < 1.4x", false, true),
-            ("loss > 0.15%", false, true),
-            ("loss > 0.05 pp", true, true),
-            ("score_ratio < 1", true, true),
-            ("score_ratio < 0.8", false, true),
-        ] {
-            assert_eq!(holds(text, false), Ok(beyond), "{text}");
-            assert_eq!(holds(text, true), Ok(strictly), "{text}, strictly");
-        }
-    }
-
-    #[test]
-    fn what_cannot_be_judged_says_what_could() {
-        for (text, words) in [
-            (
-                "p98 > 1x",
-                "unknown metric `p98`; these runs have: p99, max, loss, score_ratio",
-            ),
-            ("c:p99 > 1x", "unknown channel `c`; these runs have: a/b"),
-            (
-                "p99 > 1%",
-                "p99 takes no `%`; allowed: x (new by base); s, ms, us, ns",
-            ),
-            (
-                "loss > 1x",
-                "loss takes no `x`; allowed: % (of the new runs), pp",
-            ),
-            ("p99 1.2x", "no operator"),
-            ("> 2x", "no metric"),
-            ("p99 > fast", "no number"),
-            (
-                "max > 2x",
-                "cannot be judged for a/b:max: why not; --strict",
-            ),
-        ] {
-            let error = holds(text, false).unwrap_err().to_string();
-            assert!(error.contains(words), "{text}: {error}");
-        }
-        assert_eq!(holds("max > 2x", true), Ok(true));
-    }
-}
+#[path = "conditions_tests.rs"]
+mod tests;

@@ -3,7 +3,7 @@
 use hil_models::measure::comparison::Estimate;
 use hil_models::measure::statistics::Interval;
 
-use super::conditions::Judged;
+use super::conditions::Verdicts;
 use super::{ComparedFigure, Comparison, FigureKind};
 use crate::report::terminal::{duration, figure, percent};
 
@@ -89,7 +89,7 @@ fn value(one: &ComparedFigure, estimate: Option<Estimate>) -> String {
 }
 
 /// For a terminal.
-pub(super) fn text(comparison: &Comparison, judged: &[Judged]) -> String {
+pub(super) fn text(comparison: &Comparison, verdicts: &Verdicts) -> String {
     let rows = rows(comparison);
     let width = |column: usize| {
         let cells = rows.iter().map(|row| row.cells[column].chars().count());
@@ -121,9 +121,10 @@ pub(super) fn text(comparison: &Comparison, judged: &[Judged]) -> String {
             .into_iter()
             .map(|text| format!("  {text}")),
     );
-    if !judged.is_empty() {
+    let verdicts = verdicts.lines();
+    if !verdicts.is_empty() {
         lines.push(String::new());
-        lines.extend(judged.iter().map(ToString::to_string));
+        lines.extend(verdicts);
     }
     lines.join("\n")
 }
@@ -176,13 +177,22 @@ fn methods(comparison: &Comparison) -> Vec<String> {
 }
 
 /// As Markdown.
-pub(super) fn markdown(comparison: &Comparison, judged: &[Judged]) -> String {
+pub(super) fn markdown(comparison: &Comparison, verdicts: &Verdicts) -> String {
     let cell = |text: &str| text.replace('|', "\\|");
     let mut lines = vec!["# Comparison of runs".to_owned(), String::new()];
-    lines.extend(head(comparison, "- ").into_iter().flat_map(|line| {
+    // A blank line around everything but between the items of a list.
+    let mut was_item = false;
+    for line in head(comparison, "- ") {
         let is_item = line.starts_with("- ");
-        [line].into_iter().chain((!is_item).then(String::new))
-    }));
+        if was_item && !is_item {
+            lines.push(String::new());
+        }
+        lines.push(line);
+        if !is_item {
+            lines.push(String::new());
+        }
+        was_item = is_item;
+    }
     lines.push(String::new());
     lines.push(format!("| channel | {} |", COLUMNS.join(" | ")));
     lines.push("|---".repeat(COLUMNS.len() + 1) + "|");
@@ -199,9 +209,10 @@ pub(super) fn markdown(comparison: &Comparison, judged: &[Judged]) -> String {
             .into_iter()
             .map(|text| format!("- {text}")),
     );
-    if !judged.is_empty() {
+    let verdicts = verdicts.lines();
+    if !verdicts.is_empty() {
         lines.push(String::new());
-        lines.extend(judged.iter().map(|one| format!("- {one}")));
+        lines.extend(verdicts.iter().map(|one| format!("- {one}")));
     }
     lines.join("\n")
 }

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use serde::Serialize;
 
 use super::cli::{CompareArgs, CompareFormat};
-use super::conditions::{Condition, Judged};
+use super::conditions::{Condition, Judged, Unjudged, Verdicts};
 use super::{ComparedRun, Comparison, render};
 use crate::console::Console;
 use crate::progress::{Progress, Stage};
@@ -61,23 +61,22 @@ fn compared(args: &CompareArgs, stage: &Stage) -> Result<(String, bool), String>
     let (base, new) = (read(&base)?, read(&new)?);
     stage.tell(None, "comparing");
     let comparison = Comparison::of(&base, &new);
-    let mut judged = Vec::new();
+    let mut verdicts = Verdicts::default();
     for condition in &conditions {
-        let found = condition
-            .judge(&comparison, args.strict)
+        condition
+            .judge(&comparison, args.strict, &mut verdicts)
             .map_err(|error| error.to_string())?;
-        judged.extend(found);
     }
-    let has_failed = judged.iter().any(|one| one.holds);
+    let has_failed = verdicts.judged.iter().any(|one| one.holds);
     let format = if args.json {
         CompareFormat::Json
     } else {
         args.format
     };
     let text = match format {
-        CompareFormat::Text => render::text(&comparison, &judged),
-        CompareFormat::Md => render::markdown(&comparison, &judged),
-        CompareFormat::Json => json(&comparison, &judged)?,
+        CompareFormat::Text => render::text(&comparison, &verdicts),
+        CompareFormat::Md => render::markdown(&comparison, &verdicts),
+        CompareFormat::Json => json(&comparison, &verdicts)?,
     };
     Ok((text, has_failed))
 }
@@ -89,18 +88,20 @@ fn sides(args: &CompareArgs) -> (Vec<PathBuf>, Vec<PathBuf>) {
     }
 }
 
-fn json(comparison: &Comparison, conditions: &[Judged]) -> Result<String, String> {
+fn json(comparison: &Comparison, verdicts: &Verdicts) -> Result<String, String> {
     #[derive(Serialize)]
     struct Document<'a> {
         schema_version: u32,
         #[serde(flatten)]
         comparison: &'a Comparison,
         conditions: &'a [Judged],
+        unjudged: &'a [Unjudged],
     }
     let document = Document {
         schema_version: 1,
         comparison,
-        conditions,
+        conditions: &verdicts.judged,
+        unjudged: &verdicts.unjudged,
     };
     serde_json::to_string_pretty(&document).map_err(|error| error.to_string())
 }

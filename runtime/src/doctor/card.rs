@@ -2,9 +2,7 @@
 //! comes back when something is sent, and where their clock stands. Other interfaces have no
 //! finding here; what they claim is said beside.
 
-use nix::net::if_::InterfaceFlags;
-
-use super::network::interfaces;
+use super::network::Interfaces;
 use super::{Finding, StampCapabilityQuery};
 use crate::card_clock::probing::{CardProbe, Delivery};
 
@@ -12,27 +10,25 @@ use crate::card_clock::probing::{CardProbe, Delivery};
 const FOREIGN_OFFSET_NS: u64 = 1_000_000;
 
 pub(super) fn examine(
-    wanted: &[String],
+    present: &Interfaces,
+    names: &[String],
     query: &dyn StampCapabilityQuery,
     probe: &dyn Fn(&str, u32) -> CardProbe,
 ) -> Vec<Finding> {
-    // What keeps the interfaces from being listed is a finding of the network already.
-    let present = interfaces().unwrap_or_default();
-    let names = present
-        .iter()
-        .filter(|(name, _)| wanted.is_empty() || wanted.contains(name));
     names
-        .filter_map(|(name, flags)| {
+        .iter()
+        .filter_map(|name| {
+            // What is missing, or does not answer, is a finding of the network already.
+            let interface = present.get(name)?;
             let claims = query.stamp_capabilities(name).ok()?;
             let index = claims.hardware_clock_index?;
-            let is_up = flags.contains(InterfaceFlags::IFF_UP | InterfaceFlags::IFF_RUNNING);
-            Some(judge(name, index, is_up, &probe(name, index)))
+            Some(judge(name, index, interface.has_link, &probe(name, index)))
         })
         .collect()
 }
 
-fn judge(name: &str, index: u32, is_up: bool, probe: &CardProbe) -> Finding {
-    let (id, title) = (format!("card.{name}"), format!("Card of {name}"));
+fn judge(name: &str, index: u32, has_link: bool, probe: &CardProbe) -> Finding {
+    let id = "card";
     let setting = match &probe.setting {
         Ok(setting) => setting.clone(),
         Err(reason) => format!("setting unknown ({reason})"),
@@ -53,23 +49,27 @@ fn judge(name: &str, index: u32, is_up: bool, probe: &CardProbe) -> Finding {
         Err(reason) => format!("not probed ({reason})"),
     };
     let value = format!("{setting}; {delivery}; {clock}");
-    if !is_up {
-        return Finding::note(&id, &title, format!("{value}; link down"))
+    if !has_link {
+        return Finding::note(id, format!("{value}; link down"))
+            .of(name)
             .because("nothing leaves an interface without a link, so no stamp can come")
             .fixed_by("connect it and run the doctor again");
     }
     match &probe.tx_hardware {
-        Ok(Delivery::Delivered) => explain_clock(Finding::good(&id, &title, value), probe),
-        Ok(Delivery::AdvertisedOnly) => Finding::note(&id, &title, value)
+        Ok(Delivery::Delivered) => explain_clock(Finding::ok(id, value).of(name), probe),
+        Ok(Delivery::AdvertisedOnly) => Finding::note(id, value)
+            .of(name)
             .because(
                 "the driver advertises what its card does not do: a run that asks for hardware \
                  stamps gets software stamps and says so",
             )
             .fixed_by("leave timestamps = \"software\", or use another card"),
-        Ok(Delivery::NotOffered) => Finding::note(&id, &title, value)
+        Ok(Delivery::NotOffered) => Finding::note(id, value)
+            .of(name)
             .because("the card has a clock and does not stamp what it sends")
             .fixed_by("leave timestamps = \"software\""),
-        Err(_) => Finding::note(&id, &title, value)
+        Err(_) => Finding::cannot_tell(id, value)
+            .of(name)
             .because("whether the card delivers the stamps it advertises is not known")
             .fixed_by("run the doctor with CAP_NET_ADMIN and an address on the interface"),
     }
@@ -88,7 +88,9 @@ fn explain_clock(finding: Finding, probe: &CardProbe) -> Finding {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::doctor::{StampCapabilities, State};
+    use crate::doctor::StampCapabilities;
+    use crate::doctor::finding::Severity;
+    use crate::doctor::network::Interface;
     use hil_gateways::transport::card_clock::CardPair;
 
     fn probe(tx_hardware: Result<Delivery, String>) -> CardProbe {
@@ -106,7 +108,7 @@ mod tests {
     #[test]
     fn a_card_that_delivers_is_good_and_its_clock_is_told_with_its_bound() {
         let finding = judge("eth0", 2, true, &probe(Ok(Delivery::Delivered)));
-        assert_eq!(finding.state, State::Good);
+        assert_eq!(finding.severity, Severity::Ok);
         assert!(finding.value.contains("transmit off"), "{}", finding.value);
         let clock = "/dev/ptp2 is 37000000120 ns against the system clock, within 900 ns";
         assert!(finding.value.contains(clock), "{}", finding.value);
@@ -116,16 +118,16 @@ mod tests {
     #[test]
     fn a_card_that_only_advertises_is_called_that() {
         let finding = judge("eth0", 0, true, &probe(Ok(Delivery::AdvertisedOnly)));
-        assert_eq!(finding.state, State::Note);
+        assert_eq!(finding.severity, Severity::Note);
         let words = "advertised but never delivered";
         assert!(finding.value.contains(words), "{}", finding.value);
     }
 
     #[test]
-    fn what_could_not_be_found_out_is_a_note_with_the_reason() {
+    fn what_could_not_be_found_out_is_told_with_the_reason() {
         let refused = Err("switching the card's stamps on needs CAP_NET_ADMIN".to_owned());
         let finding = judge("eth0", 0, true, &probe(refused));
-        assert_eq!(finding.state, State::Note);
+        assert_eq!(finding.severity, Severity::CannotTell);
         assert!(finding.value.contains("CAP_NET_ADMIN"), "{}", finding.value);
         let finding = judge("eth0", 0, false, &probe(Ok(Delivery::AdvertisedOnly)));
         assert!(finding.value.ends_with("link down"), "{}", finding.value);
@@ -139,7 +141,11 @@ mod tests {
                 hardware_clock_index: None,
             })
         };
-        let findings = examine(&[], &query, &|name, _| panic!("{name} was probed"));
+        let present = Interfaces::from([("eth0".to_owned(), Interface::default())]);
+        let names = ["eth0".to_owned()];
+        let findings = examine(&present, &names, &query, &|name, _| {
+            panic!("{name} was probed")
+        });
         assert!(findings.is_empty());
     }
 }

@@ -3,32 +3,27 @@
 
 use std::net::IpAddr;
 
-use super::{ClockQuestion, Finding, StampCapabilityQuery};
+use super::{Finding, StampCapabilityQuery};
+use crate::topology::ClockEnd;
 
 const ID: &str = "clock_path";
-const TITLE: &str = "Clock path";
 /// What a run makes of a clock path that it cannot use.
 const GOES_ON: &str = "the run would go on with the clock exchanges of the data path, whose bound is as wide as that \
                        path is slow";
 
-const NONE_NAMED: &str = "clocks are exchanged over the data path alone, and the bound of one-way figures is as \
-                          wide as that path is slow";
-
 /// Which interface has an address, in words when the host does not tell.
 pub(super) type InterfaceOf<'a> = &'a dyn Fn(IpAddr) -> Result<Option<String>, String>;
 
+/// `end` is that of the topology on this host, if it has one.
 pub(super) fn examine(
-    question: &ClockQuestion,
+    end: Option<&ClockEnd>,
     interface_of: InterfaceOf<'_>,
     stamps: &dyn StampCapabilityQuery,
-) -> Option<Finding> {
-    let end = match question {
-        ClockQuestion::NotAsked => return None,
-        ClockQuestion::NoneNamed => {
-            let value = "the topology names no clock_address of this host".to_owned();
-            return Some(Finding::note(ID, TITLE, value).because(NONE_NAMED));
-        }
-        ClockQuestion::End(end) => end,
+) -> Finding {
+    let Some(end) = end else {
+        return Finding::note(ID, "the topology names no clock_address of this host").fixed_by(
+            "clock_address and clock_interface of both hosts in the topology (docs/clocks.md)",
+        );
     };
     let address = end.address;
     let interface = match interface_of(address) {
@@ -36,45 +31,41 @@ pub(super) fn examine(
         Ok(None) => {
             let value = format!("no interface has {address}, the clock_address");
             let fix = end.interface.as_deref().unwrap_or("<interface>");
-            return Some(
-                Finding::problem(ID, TITLE, value)
-                    .because(GOES_ON)
-                    .fixed_by(format!("ip address add {address}/24 dev {fix}")),
-            );
+            return Finding::error(ID, value)
+                .because(GOES_ON)
+                .fixed_by(format!("ip address add {address}/24 dev {fix}"));
         }
-        Err(reason) => return Some(Finding::unknown(ID, TITLE, &reason)),
+        Err(reason) => return Finding::cannot_tell(ID, reason),
     };
     if let Some(named) = end.interface.as_ref().filter(|named| **named != interface) {
         let value = format!("{address} is on {interface}, and clock_interface says {named}");
-        return Some(
-            Finding::problem(ID, TITLE, value)
-                .because(GOES_ON)
-                .fixed_by(format!("clock_interface = \"{interface}\"")),
-        );
+        return Finding::error(ID, value)
+            .because(GOES_ON)
+            .fixed_by(format!("clock_interface = \"{interface}\""));
     }
     let claims = match stamps.stamp_capabilities(&interface) {
         Ok(claims) => claims,
-        Err(reason) => return Some(Finding::unknown(ID, TITLE, &reason)),
+        Err(reason) => return Finding::cannot_tell(ID, reason),
     };
     let port = end.port;
     let claimed = claims.describe();
     let value = format!("{address} on {interface}, UDP from port {port}; {claimed}");
-    Some(if claims.has_software_both_ways() {
-        Finding::good(ID, TITLE, value)
-    } else {
-        Finding::note(ID, TITLE, value)
-            .because(
-                "without kernel stamps both ways the time to wake up counts as the path's, and the \
-                 bound is that much wider",
-            )
-            .fixed_by("use an interface whose driver has software stamps (ethtool -T shows them)")
-    })
+    if claims.has_software_both_ways() {
+        return Finding::ok(ID, value);
+    }
+    Finding::note(ID, value)
+        .because(
+            "without kernel stamps both ways the time to wake up counts as the path's, and the \
+             bound is that much wider",
+        )
+        .fixed_by("use an interface whose driver has software stamps (ethtool -T shows them)")
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::doctor::{StampCapabilities, State};
+    use crate::doctor::StampCapabilities;
+    use crate::doctor::finding::Severity;
     use crate::topology::ClockEnd;
 
     fn end(interface: Option<&str>) -> ClockEnd {
@@ -97,35 +88,36 @@ mod tests {
                 .map(|name| name.map(str::to_owned))
                 .map_err(str::to_owned)
         };
-        examine(&ClockQuestion::End(end(interface)), &of, &query).unwrap()
+        examine(Some(&end(interface)), &of, &query)
     }
 
     #[test]
     fn an_end_that_is_here_is_told_with_its_stamps() {
         for named in [None, Some("eth1")] {
             let finding = examined(named, Ok(Some("eth1")), 0x1a);
-            assert_eq!(finding.state, State::Good);
+            assert_eq!(finding.severity, Severity::Ok);
             let expected = "10.78.0.1 on eth1, UDP from port 7390; software tx+rx, hardware none";
             assert_eq!(finding.value, expected);
         }
         let deaf = examined(None, Ok(Some("wlan0")), 0x18);
-        assert_eq!(deaf.state, State::Note);
+        assert_eq!(deaf.severity, Severity::Note);
         assert!(deaf.value.contains("software rx only"), "{}", deaf.value);
     }
 
     #[test]
     fn an_address_that_is_not_here_or_elsewhere_is_a_problem_with_its_cure() {
         let missing = examined(Some("eth1"), Ok(None), 0x1a);
-        assert_eq!(missing.state, State::Problem);
+        assert_eq!(missing.severity, Severity::Error);
         assert_eq!(missing.fix, "ip address add 10.78.0.1/24 dev eth1");
         let elsewhere = examined(Some("eth2"), Ok(Some("eth1")), 0x1a);
-        assert_eq!(elsewhere.state, State::Problem);
+        assert_eq!(elsewhere.severity, Severity::Error);
         assert_eq!(elsewhere.fix, "clock_interface = \"eth1\"");
-        assert_eq!(examined(None, Err("no"), 0x1a).state, State::Note);
+        assert_eq!(
+            examined(None, Err("no"), 0x1a).severity,
+            Severity::CannotTell
+        );
         let query = |name: &str| panic!("{name} was asked");
-        let examine = |question| examine(&question, &|_| Ok(None), &query);
-        assert_eq!(examine(ClockQuestion::NotAsked), None);
-        let unnamed = examine(ClockQuestion::NoneNamed).unwrap();
-        assert_eq!(unnamed.state, State::Note, "looked at, and not there");
+        let unnamed = examine(None, &|_| Ok(None), &query);
+        assert_eq!(unnamed.severity, Severity::Note, "looked at, and not there");
     }
 }

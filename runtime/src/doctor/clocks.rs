@@ -3,46 +3,25 @@
 
 use std::hint::black_box;
 
-use super::{Finding, State};
+use super::Finding;
+use super::finding::Severity;
 use crate::clock::MonotonicClock;
-use crate::clock_discipline::HostDiscipline;
-use crate::host_facts::{Fact, HostFiles};
+use crate::clock_discipline::{HostDiscipline, common_bound_ns};
 
 /// A vDSO read stays below this on any PC of the last ten years.
-const READ_COST_NS_GOOD: f64 = 100.0;
+const READ_COST_NS_OK: f64 = 100.0;
 /// Above this the read is a system call, as long as a shared-memory hop.
 const READ_COST_NS_BAD: f64 = 1000.0;
 
-pub(crate) fn examine(files: &HostFiles) -> Vec<Finding> {
-    let (synchronisation, reference) = steering(HostDiscipline::gather());
-    vec![
-        clocksource(files),
-        read_cost(cheapest_read_ns()),
-        synchronisation,
-        reference,
-    ]
-}
-
-fn clocksource(files: &HostFiles) -> Finding {
-    let (id, title) = ("clocksource", "Clock source");
-    let path = "/sys/devices/system/clocksource/clocksource0/current_clocksource";
-    match files.read(path) {
-        Fact::Available(name) => {
-            // These are read in user space through the vDSO; any other is a system call.
-            let is_fast = [
-                "tsc",
-                "arch_sys_counter",
-                "kvm-clock",
-                "hyperv_clocksource_tsc_page",
-            ]
-            .contains(&name.as_str());
-            Finding::note_unless(is_fast, id, title, name)
-                .because("reads are system calls, and the kernel may have found the TSC unstable")
-                .fixed_by("look for `clocksource` in dmesg; boot with tsc=reliable if it is")
-                .quiet_when_good()
-        }
-        Fact::Unavailable(reason) => Finding::unknown(id, title, &reason),
-    }
+/// `found` is what kernel and daemons say; `other` the same of another host, with its name.
+pub(super) fn examine(
+    found: &Result<HostDiscipline, String>,
+    other: Option<(&str, Option<&HostDiscipline>)>,
+) -> Vec<Finding> {
+    let mut findings = vec![read_cost(cheapest_read_ns())];
+    findings.extend(steering(found));
+    findings.extend(other.map(|(name, other)| between(found.as_ref().ok(), (name, other))));
+    findings
 }
 
 /// The cheapest of 20 batches: the cost itself, with the scheduler's interruptions left out.
@@ -60,58 +39,60 @@ fn cheapest_read_ns() -> f64 {
 }
 
 fn read_cost(cost_ns: f64) -> Finding {
-    let state = if cost_ns < READ_COST_NS_GOOD {
-        State::Good
+    let severity = if cost_ns < READ_COST_NS_OK {
+        Severity::Ok
     } else if cost_ns < READ_COST_NS_BAD {
-        State::Note
+        Severity::Note
     } else {
-        State::Problem
+        Severity::Warning
     };
-    Finding::new(
-        "clock_read_cost",
-        "Cost of a clock read",
-        state,
-        format!("{cost_ns:.0} ns"),
-    )
-    .because("every stamp of a message pays it, several times per hop")
-    .fixed_by("use the tsc clocksource; build with optimisation")
-    .quiet_when_good()
+    Finding::new("clock_read_cost", severity, format!("{cost_ns:.0} ns"))
 }
 
-const SYNCHRONISATION: (&str, &str) = ("clock_synchronisation", "Time of day against a reference");
-const REFERENCE: (&str, &str) = ("clock_reference", "Reference of the time of day");
+const SYNCHRONISATION: &str = "clock_synchronisation";
+const REFERENCE: &str = "clock_reference";
 
 /// What the kernel says of the time of day, and what the daemon that keeps it does.
-fn steering(found: Result<HostDiscipline, String>) -> (Finding, Finding) {
+fn steering(found: &Result<HostDiscipline, String>) -> [Finding; 2] {
     match found {
-        Ok(found) => (judge_discipline(&found), judge_reference(&found)),
-        Err(why) => {
-            let unknown = |(id, title)| Finding::unknown(id, title, &why);
-            (unknown(SYNCHRONISATION), unknown(REFERENCE))
-        }
+        Ok(found) => [judge_discipline(found), judge_reference(found)],
+        Err(why) => [SYNCHRONISATION, REFERENCE].map(|id| Finding::cannot_tell(id, why)),
+    }
+}
+
+/// How far apart the clocks of this host and of another may be.
+fn between(
+    own: Option<&HostDiscipline>,
+    (name, other): (&str, Option<&HostDiscipline>),
+) -> Finding {
+    let id = "clock_between_hosts";
+    let (Some(own), Some(other)) = (own, other) else {
+        let whose = if own.is_none() { "this host" } else { name };
+        return Finding::cannot_tell(id, format!("the kernel of {whose} says nothing")).of(name);
+    };
+    match common_bound_ns(("this host", own), (name, other)) {
+        Ok(bound_ns) => Finding::ok(
+            id,
+            format!("apart by at most {} us", bound_ns.div_ceil(1_000)),
+        )
+        .of(name)
+        .because(format!("{}; {name}: {}", own.basis, other.basis)),
+        Err(why) => Finding::note(id, format!("no bound: {why}"))
+            .of(name)
+            .fixed_by("keep both on one reference with chronyd, or ptp4l and phc2sys"),
     }
 }
 
 /// What one-way figures to another host could rest on besides clock exchanges.
 fn judge_reference(found: &HostDiscipline) -> Finding {
-    let (id, title) = REFERENCE;
     if let Some((reference, bound_ns)) = found.reference.as_ref().zip(found.bound_ns) {
         let value = format!("{reference}, within ±{} us", bound_ns.div_ceil(1_000));
-        return Finding::good(id, title, value).because(found.basis.clone());
+        return Finding::ok(REFERENCE, value).because(found.basis.clone());
     }
-    Finding::note(id, title, found.basis.clone())
-        .because(
-            "the bound of one-way delays to another host is then half the smallest round trip of \
-             the gateways' clock exchanges, plus what the clocks may drift between them",
-        )
-        .fixed_by(
-            "keep both hosts on one reference with chronyd or ptp4l if that is not tight enough, \
-             best over a wired link",
-        )
+    Finding::note(REFERENCE, found.basis.clone())
 }
 
 fn judge_discipline(found: &HostDiscipline) -> Finding {
-    let (id, title) = SYNCHRONISATION;
     let value = format!(
         "{}, claimed error {} us, estimate {} us, rate {:+} ppb",
         if found.is_kernel_synchronised {
@@ -127,40 +108,22 @@ fn judge_discipline(found: &HostDiscipline) -> Finding {
         // ptp4l and phc2sys leave maxerror alone or write a constant into it.
         let why = "the claimed error is the daemon's word: chronyd and ntpd keep it, ptp4l and \
                    phc2sys do not, so it is no bound under PTP";
-        return Finding::good(id, title, value).because(why);
+        return Finding::ok(SYNCHRONISATION, value).because(why);
     }
-    Finding::note(id, title, value)
-        .because(
-            "one-way delays to another host then rest on the runtime's own probe exchange alone, \
-             and kernel receive stamps jump if a daemon steps the clock during a run",
-        )
-        .fixed_by(
-            "run chronyd, or ptp4l with phc2sys, on both hosts, and wait until it has settled",
-        )
+    Finding::note(SYNCHRONISATION, value)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::host_facts::FakeHost;
-
-    #[test]
-    fn a_slow_counter_is_noted() {
-        let path = "/sys/devices/system/clocksource/clocksource0/current_clocksource";
-        for (name, expected) in [("tsc", State::Good), ("hpet", State::Note)] {
-            let host = FakeHost::with(&[(path, name)]);
-            assert_eq!(clocksource(&host.files()).state, expected, "{name}");
-        }
-    }
-
     #[test]
     fn the_read_cost_is_judged_by_its_class() {
         for (cost_ns, expected) in [
-            (25.0, State::Good),
-            (400.0, State::Note),
-            (15_000.0, State::Problem),
+            (25.0, Severity::Ok),
+            (400.0, Severity::Note),
+            (15_000.0, Severity::Warning),
         ] {
-            assert_eq!(read_cost(cost_ns).state, expected);
+            assert_eq!(read_cost(cost_ns).severity, expected);
         }
         assert!(cheapest_read_ns() > 0.0);
     }
@@ -179,9 +142,8 @@ mod tests {
 
     #[test]
     fn what_the_kernel_does_not_say_is_unknown_in_both_findings() {
-        let (synchronisation, reference) = steering(Err("adjtimex: EPERM".to_owned()));
-        for finding in [synchronisation, reference] {
-            assert_ne!(finding.state, State::Good);
+        for finding in steering(&Err("adjtimex: EPERM".to_owned())) {
+            assert_eq!(finding.severity, Severity::CannotTell);
             assert!(finding.value.contains("EPERM"), "{}", finding.value);
         }
     }
@@ -190,12 +152,12 @@ mod tests {
     fn only_a_reference_with_a_bound_is_good() {
         let mut found = kept();
         let finding = judge_reference(&found);
-        assert_eq!(finding.state, State::Note);
+        assert_eq!(finding.severity, Severity::Note);
         assert_eq!(finding.value, found.basis);
         found.reference = Some("ptp 00a069.fffe.0b552d".to_owned());
         found.bound_ns = Some(9_620);
         let finding = judge_reference(&found);
-        assert_eq!(finding.state, State::Good);
+        assert_eq!(finding.severity, Severity::Ok);
         assert_eq!(finding.value, "ptp 00a069.fffe.0b552d, within ±10 us");
     }
 
@@ -203,7 +165,7 @@ mod tests {
     fn a_claimed_error_is_never_called_a_bound() {
         let discipline = kept();
         let finding = judge_discipline(&discipline);
-        assert_eq!(finding.state, State::Good);
+        assert_eq!(finding.severity, Severity::Ok);
         assert_eq!(
             finding.value,
             "synchronised, claimed error 16 us, estimate 3 us, rate -1200 ppb"
@@ -213,6 +175,23 @@ mod tests {
             is_kernel_synchronised: false,
             ..discipline
         };
-        assert_eq!(judge_discipline(&loose).state, State::Note);
+        assert_eq!(judge_discipline(&loose).severity, Severity::Note);
+    }
+
+    #[test]
+    fn two_hosts_are_bounded_only_by_one_reference_of_both() {
+        let mut own = kept();
+        own.reference = Some("ptp a".to_owned());
+        own.bound_ns = Some(4_000);
+        let other = own.clone();
+        let finding = between(Some(&own), ("robot-pc", Some(&other)));
+        assert_eq!(finding.severity, Severity::Ok);
+        assert_eq!(finding.id, "clock_between_hosts.robot-pc");
+        assert_eq!(finding.value, "apart by at most 8 us");
+        let finding = between(Some(&own), ("robot-pc", Some(&kept())));
+        assert_eq!(finding.severity, Severity::Note);
+        assert!(finding.value.contains("on robot-pc"), "{}", finding.value);
+        let finding = between(Some(&own), ("robot-pc", None));
+        assert_eq!(finding.severity, Severity::CannotTell);
     }
 }

@@ -2,100 +2,129 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::host_facts::Fact;
+use super::catalogue;
 
 /// How a finding bears on a measurement. Later is worse.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum State {
+pub enum Severity {
     /// As it should be.
-    Good,
-    /// Costs something, or could not be found out; a careful reader wants to know.
+    Ok,
+    /// Costs something that a careful reader wants to know of.
     Note,
-    /// Spoils a measurement or prevents a run.
-    Problem,
+    /// Could not be read; the value says why. Never taken for ok.
+    CannotTell,
+    /// Spoils figures in microseconds, or a run as the topology wants it.
+    Warning,
+    /// Prevents a run, or makes its figures wrong.
+    Error,
+}
+
+impl Severity {
+    /// All of them, from the best to the worst.
+    pub const ALL: [Self; 5] = [
+        Self::Ok,
+        Self::Note,
+        Self::CannotTell,
+        Self::Warning,
+        Self::Error,
+    ];
+
+    /// The word in the JSON.
+    pub const fn word(self) -> &'static str {
+        match self {
+            Self::Ok => "ok",
+            Self::Note => "note",
+            Self::CannotTell => "cannot_tell",
+            Self::Warning => "warning",
+            Self::Error => "error",
+        }
+    }
 }
 
 /// What the doctor found about one thing.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Finding {
-    /// Stable identifier for scripts, for example `realtime_throttle`.
+    /// Stable identifier for scripts, for example `realtime_throttle`; of several of a kind with the
+    /// name of the one, `radio.wlan0`. `docs/doctor.md` lists them.
     pub id: String,
     /// What was looked at.
     pub title: String,
     /// The judgement.
-    pub state: State,
-    /// What was seen, with its unit.
+    pub severity: Severity,
+    /// What was seen, with its unit; or why nothing was.
     pub value: String,
-    /// What it means for a measurement; empty when all is well.
+    /// Where it was read.
+    pub source: String,
+    /// What it means for a measurement.
     pub why: String,
-    /// What to do about it; empty when all is well.
+    /// What to do about it.
     pub fix: String,
 }
 
 impl Finding {
-    pub(crate) fn new(id: &str, title: &str, state: State, value: impl Into<String>) -> Self {
+    /// A finding of the catalogue.
+    ///
+    /// # Panics
+    /// When the catalogue has no `id`: a finding that nobody documented.
+    pub(super) fn new(id: &str, severity: Severity, value: impl Into<String>) -> Self {
+        let entry = catalogue::entry(id).expect("every finding is in the catalogue");
         Self {
             id: id.to_owned(),
-            title: title.to_owned(),
-            state,
+            title: entry.title.to_owned(),
+            severity,
             value: value.into(),
-            why: String::new(),
-            fix: String::new(),
+            source: entry.source.to_owned(),
+            why: entry.why.to_owned(),
+            fix: entry.fix.to_owned(),
         }
     }
 
-    pub(crate) fn good(id: &str, title: &str, value: impl Into<String>) -> Self {
-        Self::new(id, title, State::Good, value)
+    pub(super) fn ok(id: &str, value: impl Into<String>) -> Self {
+        Self::new(id, Severity::Ok, value)
     }
 
-    pub(crate) fn note(id: &str, title: &str, value: impl Into<String>) -> Self {
-        Self::new(id, title, State::Note, value)
+    pub(super) fn note(id: &str, value: impl Into<String>) -> Self {
+        Self::new(id, Severity::Note, value)
     }
 
-    pub(crate) fn problem(id: &str, title: &str, value: impl Into<String>) -> Self {
-        Self::new(id, title, State::Problem, value)
+    pub(super) fn warning(id: &str, value: impl Into<String>) -> Self {
+        Self::new(id, Severity::Warning, value)
     }
 
-    /// Good when `is_good`, else a note.
-    pub(crate) fn note_unless(
-        is_good: bool,
-        id: &str,
-        title: &str,
-        value: impl Into<String>,
-    ) -> Self {
-        Self::new(
-            id,
-            title,
-            if is_good { State::Good } else { State::Note },
-            value,
-        )
+    pub(super) fn error(id: &str, value: impl Into<String>) -> Self {
+        Self::new(id, Severity::Error, value)
     }
 
-    /// Something the host did not say: a note, never a pass.
-    pub(crate) fn unknown(id: &str, title: &str, reason: &str) -> Self {
-        let fact: Fact<String> = Fact::Unavailable(reason.to_owned());
-        Self::note(id, title, fact.to_text())
-            .because("the host does not tell, so this was not checked")
-            .fixed_by("look it up by hand if the result depends on it")
+    /// Something the host did not say, and why.
+    pub(super) fn cannot_tell(id: &str, reason: impl Into<String>) -> Self {
+        Self::new(id, Severity::CannotTell, reason)
     }
 
-    pub(crate) fn because(mut self, why: impl Into<String>) -> Self {
+    /// It is about this one of several.
+    pub(super) fn of(mut self, which: &str) -> Self {
+        self.id = format!("{}.{which}", self.id);
+        self.title = format!("{} {which}", self.title);
+        self.source = self.source.replace("{}", which);
+        self.fix = self.fix.replace("{}", which);
+        self
+    }
+
+    /// What it means here, in place of the catalogue's words.
+    pub(super) fn because(mut self, why: impl Into<String>) -> Self {
         self.why = why.into();
         self
     }
 
-    pub(crate) fn fixed_by(mut self, fix: impl Into<String>) -> Self {
+    /// The cure here, in place of the catalogue's.
+    pub(super) fn fixed_by(mut self, fix: impl Into<String>) -> Self {
         self.fix = fix.into();
         self
     }
 
-    /// Drops the explanation of a finding that turned out good.
-    pub(crate) fn quiet_when_good(mut self) -> Self {
-        if self.state == State::Good {
-            self.why.clear();
-            self.fix.clear();
-        }
+    /// Where it was read this time.
+    pub(super) fn read_from(mut self, source: impl Into<String>) -> Self {
+        self.source = source.into();
         self
     }
 }

@@ -1,57 +1,58 @@
 //! `hil-runtime doctor`: what this host can measure, what stands in the way, and the cure for
 //! each. It examines and reports; it changes nothing that outlives it, prints nothing and knows
-//! no exit codes: the caller turns [`DoctorReport::worst_state`] into one.
+//! no exit codes: the caller turns [`DoctorReport::worst_severity`] into one.
 //!
-//! One file per subject: clocks, processors, privileges, wake-ups, shared memory and
-//! network; each is a function from the kernel's files to findings.
+//! One file per subject, each a function from the kernel's files (below a root that tests can move)
+//! and a [`Plan`] to findings; [`latency`] measures. Every finding is in the catalogue, from which
+//! `docs/doctor.md` is checked.
 
 mod card;
+mod catalogue;
+pub mod cli;
 mod clock_path;
 mod clocks;
+mod driver;
 mod finding;
+mod firewall;
+mod interrupts;
+mod kernel;
+pub mod latency;
 mod network;
+mod paths;
+mod plan;
+mod ports;
 mod privileges;
 mod processors;
 mod radio;
 mod render;
 mod shared_memory;
+mod storage;
 mod wakeup;
 
-use std::path::PathBuf;
-use std::time::Duration;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
 
 use hil_gateways::transport::interface::interface_with_address;
 use serde::{Deserialize, Serialize};
 
-pub use self::finding::{Finding, State};
+pub use self::finding::{Finding, Severity};
+use self::latency::LatencyReport;
 pub use self::network::{StampCapabilities, StampCapabilityQuery};
-pub use self::wakeup::WakeupMeasurement;
+pub use self::plan::{LinkLoad, Peer, Pin, Plan, Protocol, WantedPort};
+use self::privileges::Rights;
 use crate::card_clock::probing::probe_card;
+use crate::channel::ForeignNodes;
+use crate::clock_discipline::HostDiscipline;
 use crate::host_facts::{HostFacts, HostFiles};
-use crate::topology::ClockEnd;
-
-/// Which end of a clock path to look at.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum ClockQuestion {
-    /// No topology was given.
-    NotAsked,
-    /// The topology has this host, and no clock address of it.
-    NoneNamed,
-    /// This one.
-    End(ClockEnd),
-}
+use crate::supervisor::domain_base_candidates;
 
 /// What to examine.
 #[derive(Debug, Clone)]
 pub struct DoctorRequest {
-    /// CPUs a topology pins threads to; empty when none is known.
-    pub pinned_cpus: Vec<usize>,
-    /// Network interfaces a topology uses; empty for all of this host.
-    pub interfaces: Vec<String>,
-    /// Where a topology has this host exchange clocks.
-    pub clock_end: ClockQuestion,
-    /// How long the wake-up latency is measured.
-    pub wakeup_duration: Duration,
+    /// What a topology has this host do; `None` when none was given.
+    pub plan: Option<Plan>,
+    /// Another host's report, with its name, to compare clocks with.
+    pub other: Option<(String, Box<DoctorReport>)>,
     /// Folders for sockets and service files, in the order the runtime tries them.
     pub runtime_folders: Vec<PathBuf>,
     /// The kernel's text files.
@@ -61,36 +62,72 @@ pub struct DoctorRequest {
 impl Default for DoctorRequest {
     fn default() -> Self {
         Self {
-            pinned_cpus: Vec::new(),
-            interfaces: Vec::new(),
-            clock_end: ClockQuestion::NotAsked,
-            wakeup_duration: Duration::from_secs(1),
-            runtime_folders: vec![PathBuf::from("/run/hil"), std::env::temp_dir()],
+            plan: None,
+            other: None,
+            runtime_folders: domain_base_candidates(),
             files: HostFiles::of_this_host(),
         }
     }
 }
 
-/// The facts of a host and what they mean for a measurement.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+/// The facts of a host and what they mean for a measurement. `docs/doctor.md` describes its JSON.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DoctorReport {
+    /// [`DoctorReport::SCHEMA`].
+    pub schema: String,
     /// The host described.
     pub host: HostFacts,
+    /// How many findings there are of each severity, by its word.
+    pub counts: BTreeMap<String, usize>,
     /// What was found, grouped by subject.
     pub findings: Vec<Finding>,
-    /// The wake-up latency in numbers; `None` when none could be measured.
-    pub wakeup: Option<WakeupMeasurement>,
+    /// How the time of day is kept; `None` when the kernel does not say.
+    pub clock: Option<HostDiscipline>,
+    /// The lateness of wake-ups; `None` before it is measured.
+    pub latency: Option<LatencyReport>,
 }
 
 impl DoctorReport {
-    /// The worst state among the findings. A strict caller treats [`State::Problem`] as a host
-    /// that is not fit.
-    pub fn worst_state(&self) -> State {
-        self.findings
-            .iter()
-            .map(|finding| finding.state)
-            .max()
-            .unwrap_or(State::Good)
+    /// The form of the JSON. It changes when a field goes or changes its meaning.
+    pub const SCHEMA: &'static str = "hil-doctor/1";
+
+    /// A report of these findings alone.
+    fn of(findings: Vec<Finding>) -> Self {
+        let mut report = Self {
+            schema: Self::SCHEMA.to_owned(),
+            host: HostFacts::default(),
+            counts: BTreeMap::new(),
+            findings,
+            clock: None,
+            latency: None,
+        };
+        report.recount();
+        report
+    }
+
+    fn recount(&mut self) {
+        let counts =
+            Severity::ALL.map(|severity| (severity.word().to_owned(), self.count(severity)));
+        self.counts = counts.into();
+    }
+
+    fn count(&self, severity: Severity) -> usize {
+        let own = self.findings.iter().filter(|one| one.severity == severity);
+        own.count()
+    }
+
+    /// Takes a measurement in, with its finding.
+    pub fn add_latency(&mut self, measured: LatencyReport) {
+        self.findings.push(wakeup::judge(&measured));
+        self.latency = Some(measured);
+        self.recount();
+    }
+
+    /// The worst severity among the findings. A strict caller takes [`Severity::Warning`] and worse
+    /// for a host that is not fit.
+    pub fn worst_severity(&self) -> Severity {
+        let severities = self.findings.iter().map(|finding| finding.severity);
+        severities.max().unwrap_or(Severity::Ok)
     }
 
     /// The finding with this identifier.
@@ -101,13 +138,29 @@ impl DoctorReport {
     /// The report as indented JSON.
     ///
     /// # Panics
-    /// Never: the report holds strings and lists only.
+    /// Never: the report holds strings, numbers and lists only.
     pub fn to_json(&self) -> String {
-        serde_json::to_string_pretty(self).expect("strings and lists always serialise")
+        serde_json::to_string_pretty(self).expect("strings, numbers and lists always serialise")
+    }
+
+    /// Reads another host's report.
+    ///
+    /// # Errors
+    /// When the text is no report of this form.
+    pub fn from_json(text: &str) -> Result<Self, String> {
+        let read: Self = serde_json::from_str(text).map_err(|error| error.to_string())?;
+        if read.schema == Self::SCHEMA {
+            Ok(read)
+        } else {
+            let (found, known) = (read.schema, Self::SCHEMA);
+            Err(format!(
+                "its schema is `{found}`, this program reads `{known}`"
+            ))
+        }
     }
 }
 
-/// Examines this host. Takes [`DoctorRequest::wakeup_duration`] and a fraction of a second.
+/// Examines this host; takes a fraction of a second. It measures no latency, see [`latency::measure`].
 ///
 /// A network card with a clock of its own is asked for stamps, sent a few datagrams through and put
 /// back as it was; that takes another half second for each.
@@ -115,114 +168,73 @@ impl DoctorReport {
 /// `stamps` answers which timestamps an interface claims; the gateways own that system call.
 pub fn examine(request: &DoctorRequest, stamps: &dyn StampCapabilityQuery) -> DoctorReport {
     let files = &request.files;
+    let plan = request.plan.clone().unwrap_or_default();
+    let rights = Rights::tried();
     let mut findings = Vec::new();
-    findings.extend(network::examine(files, &request.interfaces, stamps));
-    findings.extend(card::examine(&request.interfaces, stamps, &probe_card));
-    findings.extend(radio::examine(&request.interfaces));
-    let end = &request.clock_end;
-    let interface_of =
-        |address| interface_with_address(address).map_err(|error| format!("getifaddrs: {error}"));
-    findings.extend(clock_path::examine(end, &interface_of, stamps));
-    findings.extend(clocks::examine(files));
-    findings.extend(processors::examine(files, &request.pinned_cpus));
-    findings.extend(privileges::examine(files));
-    let cpu = request.pinned_cpus.first().copied();
-    let measured = wakeup::measure(request.wakeup_duration, cpu);
-    findings.push(wakeup::judge(measured.as_ref(), files));
-    findings.extend(shared_memory::examine(files, &request.runtime_folders));
+    findings.extend(kernel::examine(files, &plan, rights.is_fifo_granted()));
+    findings.extend(processors::examine(files, &plan));
+    findings.extend(privileges::examine(files, &rights));
+    examine_network(request, &plan, stamps, &mut findings);
+    let discipline = HostDiscipline::gather();
+    let other = request.other.as_ref();
+    let other = other.map(|(name, report)| (name.as_str(), report.clock.as_ref()));
+    findings.extend(clocks::examine(&discipline, other));
+    let folders = &request.runtime_folders;
+    findings.extend(shared_memory::examine(files, folders, ForeignNodes::list()));
+    let runtime_folder = shared_memory::usable(folders).unwrap_or(Path::new("/run/hil"));
+    let record_folder = if plan.record_folder.as_os_str().is_empty() {
+        Path::new("runs")
+    } else {
+        &plan.record_folder
+    };
+    findings.extend(storage::examine(files, record_folder, runtime_folder));
     DoctorReport {
         host: HostFacts::gather_from(files),
-        findings,
-        wakeup: measured,
+        clock: discipline.ok(),
+        ..DoctorReport::of(findings)
+    }
+}
+
+fn examine_network(
+    request: &DoctorRequest,
+    plan: &Plan,
+    stamps: &dyn StampCapabilityQuery,
+    findings: &mut Vec<Finding>,
+) {
+    let files = &request.files;
+    let present = match network::interfaces() {
+        Ok(present) => present,
+        Err(reason) => {
+            findings.push(Finding::cannot_tell("interface", reason).of("any"));
+            network::Interfaces::new()
+        }
+    };
+    let names = network::wanted(&present, plan);
+    findings.extend(network::examine(files, &present, &names, stamps));
+    findings.extend(card::examine(&present, &names, stamps, &probe_card));
+    findings.extend(radio::examine(&names));
+    findings.extend(interrupts::examine(files, &names, plan));
+    let mut ask_driver = driver::asker();
+    for name in names.iter().filter(|name| network::has_device(files, name)) {
+        findings.extend(driver::examine(name, &ask_driver(name)));
+    }
+    findings.extend(paths::examine(
+        files,
+        &present,
+        plan,
+        &paths::source_towards,
+    ));
+    findings.extend(ports::examine(files, &plan.ports));
+    findings.push(firewall::examine(files, firewall::chains(), &plan.ports));
+    if request.plan.is_some() {
+        let interface_of = |address| {
+            interface_with_address(address).map_err(|error| format!("getifaddrs: {error}"))
+        };
+        let end = plan.clock_end.as_ref();
+        findings.push(clock_path::examine(end, &interface_of, stamps));
     }
 }
 
 #[cfg(test)]
-mod tests {
-    use std::collections::BTreeSet;
-
-    use super::*;
-
-    fn examined() -> DoctorReport {
-        let request = DoctorRequest {
-            wakeup_duration: Duration::from_millis(20),
-            ..Default::default()
-        };
-        examine(&request, &|_: &str| Err("no query in this test".to_owned()))
-    }
-
-    #[test]
-    fn every_finding_has_its_own_name_and_every_complaint_a_cure() {
-        let report = examined();
-        let names: BTreeSet<&str> = report.findings.iter().map(|f| f.id.as_str()).collect();
-        assert_eq!(names.len(), report.findings.len());
-        for finding in &report.findings {
-            assert!(
-                !finding.title.is_empty() && !finding.value.is_empty(),
-                "{finding:?}"
-            );
-            if finding.state != State::Good {
-                assert!(
-                    !finding.why.is_empty() && !finding.fix.is_empty(),
-                    "{finding:?}"
-                );
-            }
-        }
-    }
-
-    #[test]
-    fn the_whole_list_is_covered() {
-        let report = examined();
-        for id in [
-            "udp_buffers",
-            "clocksource",
-            "clock_synchronisation",
-            "clock_read_cost",
-            "preemption",
-            "isolated_cpus",
-            "nohz_full",
-            "governor",
-            "idle_states",
-            "smt",
-            "irqbalance",
-            "transparent_huge_pages",
-            "realtime_throttle",
-            "fifo",
-            "memory_lock",
-            "probe_tap",
-            "wakeup_latency",
-            "shared_memory",
-            "shared_memory_leftovers",
-            "runtime_folder",
-            "remove_ipc",
-        ] {
-            assert!(report.find(id).is_some(), "no finding `{id}`");
-        }
-    }
-
-    #[test]
-    fn the_worst_finding_decides() {
-        let mut report = DoctorReport {
-            host: HostFacts::default(),
-            findings: Vec::new(),
-            wakeup: None,
-        };
-        assert_eq!(report.worst_state(), State::Good);
-        report
-            .findings
-            .push(Finding::note("a", "a", "a").because("b").fixed_by("c"));
-        report.findings.push(Finding::good("b", "b", "b"));
-        assert_eq!(report.worst_state(), State::Note);
-        report
-            .findings
-            .push(Finding::problem("c", "c", "c").because("b").fixed_by("c"));
-        assert_eq!(report.worst_state(), State::Problem);
-    }
-
-    #[test]
-    fn the_report_survives_json() {
-        let report = examined();
-        let read: DoctorReport = serde_json::from_str(&report.to_json()).unwrap();
-        assert_eq!(read, report);
-    }
-}
+#[path = "mod_tests.rs"]
+mod tests;

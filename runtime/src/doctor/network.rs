@@ -1,13 +1,18 @@
-//! The network interfaces: what timestamps they claim, and how much the sockets may buffer. Claims
-//! only: drivers lie, so a run probes its stamps by sending and reports the share that came back.
+//! The network interfaces: which there are, what timestamps they claim, and how much the sockets may
+//! buffer. Claims only: drivers lie, so a run probes its stamps by sending and reports the share that
+//! came back.
 
 use std::collections::BTreeMap;
+use std::net::IpAddr;
 
-use nix::ifaddrs::getifaddrs;
+use nix::ifaddrs::{InterfaceAddress, getifaddrs};
 use nix::net::if_::InterfaceFlags;
+use nix::sys::socket::SockaddrStorage;
 use serde::{Deserialize, Serialize};
 
 use super::Finding;
+use super::finding::Severity;
+use super::plan::Plan;
 use crate::host_facts::{Fact, HostFiles};
 
 /// Bits of `SO_TIMESTAMPING` in `linux/net_tstamp.h`.
@@ -39,7 +44,19 @@ impl StampCapabilities {
     }
 
     pub(super) fn describe(self) -> String {
-        describe(self)
+        let kind = |tx: u32, rx: u32| match (self.has(tx), self.has(rx)) {
+            (true, true) => "tx+rx",
+            (true, false) => "tx only",
+            (false, true) => "rx only",
+            (false, false) => "none",
+        };
+        let software = kind(TX_SOFTWARE, RX_SOFTWARE);
+        let hardware = kind(TX_HARDWARE | RAW_HARDWARE, RX_HARDWARE | RAW_HARDWARE);
+        let clock = match self.hardware_clock_index {
+            Some(index) => format!(" (/dev/ptp{index})"),
+            None => String::new(),
+        };
+        format!("software {software}, hardware {hardware}{clock}")
     }
 }
 
@@ -63,98 +80,141 @@ where
     }
 }
 
-pub(crate) fn examine(
+/// One interface of this network namespace.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub(super) struct Interface {
+    /// It is switched on.
+    pub(super) is_up: bool,
+    /// And has a link.
+    pub(super) has_link: bool,
+    /// Its addresses with the length of their network part.
+    pub(super) addresses: Vec<(IpAddr, u32)>,
+}
+
+/// The interfaces by name.
+pub(super) type Interfaces = BTreeMap<String, Interface>;
+
+/// The interfaces of this network namespace. Not from `/sys`, which may show another one's.
+pub(super) fn interfaces() -> Result<Interfaces, String> {
+    let entries = getifaddrs().map_err(|errno| format!("getifaddrs: {}", errno.desc()))?;
+    let mut found = Interfaces::new();
+    for entry in entries {
+        let one = found.entry(entry.interface_name.clone()).or_default();
+        one.is_up |= entry.flags.contains(InterfaceFlags::IFF_UP);
+        one.has_link |= entry
+            .flags
+            .contains(InterfaceFlags::IFF_UP | InterfaceFlags::IFF_RUNNING);
+        one.addresses.extend(address_of(&entry));
+    }
+    Ok(found)
+}
+
+fn address_of(entry: &InterfaceAddress) -> Option<(IpAddr, u32)> {
+    let of = |storage: &SockaddrStorage| {
+        let v4 = storage.as_sockaddr_in().map(|a| IpAddr::V4(a.ip()));
+        let v6 = storage.as_sockaddr_in6().map(|a| IpAddr::V6(a.ip()));
+        v4.or(v6)
+    };
+    let address = of(entry.address.as_ref()?)?;
+    let prefix = match entry.netmask.as_ref().and_then(of) {
+        Some(IpAddr::V4(mask)) => mask.to_bits().count_ones(),
+        Some(IpAddr::V6(mask)) => mask.to_bits().count_ones(),
+        // A point-to-point address may come without a mask.
+        None if address.is_ipv4() => 32,
+        None => 128,
+    };
+    Some((address, prefix))
+}
+
+/// The names to look at: those of the plan, by name or address, else every one that is up.
+pub(super) fn wanted(present: &Interfaces, plan: &Plan) -> Vec<String> {
+    let has_own = |interface: &Interface| {
+        let mut own = interface.addresses.iter();
+        own.any(|(address, _)| plan.addresses.contains(address))
+    };
+    let by_address = present.iter().filter(|(_, one)| has_own(one));
+    let mut names: Vec<String> = by_address.map(|(name, _)| name.clone()).collect();
+    names.extend(plan.interfaces.iter().cloned());
+    if names.is_empty() {
+        let up = present.iter().filter(|(_, one)| one.is_up);
+        names.extend(up.map(|(name, _)| name.clone()));
+    }
+    names.sort();
+    names.dedup();
+    names
+}
+
+/// True for an interface with hardware, or a paravirtual device, behind it.
+pub(super) fn has_device(files: &HostFiles, name: &str) -> bool {
+    files
+        .locate(&format!("/sys/class/net/{name}/device"))
+        .exists()
+}
+
+pub(super) fn examine(
     files: &HostFiles,
-    wanted: &[String],
+    present: &Interfaces,
+    names: &[String],
     query: &dyn StampCapabilityQuery,
 ) -> Vec<Finding> {
-    let mut findings = Vec::new();
-    match interfaces() {
-        Ok(present) => {
-            let names: Vec<&String> = if wanted.is_empty() {
-                present.keys().collect()
-            } else {
-                wanted.iter().collect()
-            };
-            for name in names {
-                findings.push(match present.get(name) {
-                    Some(flags) => interface(files, name, *flags, query),
-                    None => missing(name, &present),
-                });
-            }
-        }
-        Err(reason) => {
-            findings.push(Finding::unknown(
-                "timestamps",
-                "Network interfaces",
-                &reason,
-            ));
-        }
-    }
+    let mut findings: Vec<Finding> = names
+        .iter()
+        .map(|name| match present.get(name) {
+            Some(one) => stamps(files, name, one, query),
+            None => missing(name, present),
+        })
+        .collect();
     findings.push(buffers(files));
     findings
 }
 
-/// The interfaces of this network namespace with their flags, sorted by name.
-pub(super) fn interfaces() -> Result<BTreeMap<String, InterfaceFlags>, String> {
-    let addresses = getifaddrs().map_err(|errno| format!("getifaddrs: {errno}"))?;
-    Ok(addresses
-        .map(|address| (address.interface_name, address.flags))
-        .collect())
-}
-
-fn missing(name: &str, present: &BTreeMap<String, InterfaceFlags>) -> Finding {
+fn missing(name: &str, present: &Interfaces) -> Finding {
     let known: Vec<&str> = present.keys().map(String::as_str).collect();
-    Finding::problem(
-        &format!("timestamps.{name}"),
-        &format!("Stamps on {name}"),
-        "no such interface",
-    )
-    .because("the topology names it, so the run cannot start")
-    .fixed_by(format!("use one of {}", known.join(", ")))
+    Finding::error("interface", "there is none of this name")
+        .of(name)
+        .fixed_by(format!("name one of {}", known.join(", ")))
 }
 
-fn interface(
+fn stamps(
     files: &HostFiles,
     name: &str,
-    flags: InterfaceFlags,
+    interface: &Interface,
     query: &dyn StampCapabilityQuery,
 ) -> Finding {
-    let (id, title) = (format!("timestamps.{name}"), format!("Stamps on {name}"));
-    let capabilities = match query.stamp_capabilities(name) {
-        Ok(capabilities) => capabilities,
-        Err(reason) => return Finding::unknown(&id, &title, &reason),
+    let claims = match query.stamp_capabilities(name) {
+        Ok(claims) => claims,
+        Err(reason) => return Finding::cannot_tell("timestamps", reason).of(name),
     };
     let is_wireless = ["wireless", "phy80211"].iter().any(|entry| {
         files
             .locate(&format!("/sys/class/net/{name}/{entry}"))
             .exists()
     });
-    let is_up = flags.contains(InterfaceFlags::IFF_UP | InterfaceFlags::IFF_RUNNING);
-    let value = format!(
-        "{}{}{}",
-        describe(capabilities),
-        if is_wireless { ", wireless" } else { "" },
-        if is_up { "" } else { ", link down" }
-    );
-    judge(Finding::good(&id, &title, value), capabilities, is_wireless)
+    judge(name, claims, (is_wireless, interface.has_link))
 }
 
-fn judge(finding: Finding, capabilities: StampCapabilities, is_wireless: bool) -> Finding {
+fn judge(name: &str, claims: StampCapabilities, (is_wireless, has_link): (bool, bool)) -> Finding {
+    let value = format!(
+        "{}{}{}",
+        claims.describe(),
+        if is_wireless { ", wireless" } else { "" },
+        if has_link { "" } else { ", link down" }
+    );
+    let severity = if claims.has_software_both_ways() && !is_wireless {
+        Severity::Ok
+    } else {
+        Severity::Note
+    };
+    let finding = Finding::new("timestamps", severity, value).of(name);
     if is_wireless {
-        return worsen(finding)
+        return finding
             .because(
                 "wireless drivers stamp no departures whatever they claim, so a run asks for the \
                  stamp before the queue instead and for the radio's acknowledgements",
             )
             .fixed_by("none needed; the report says which stamps there were");
     }
-    if !capabilities.has(RX_SOFTWARE) || !capabilities.has(TX_SOFTWARE) {
-        return worsen(finding)
-            .because("without kernel stamps the scheduler's delay is counted as the network's")
-            .fixed_by("use a driver with software stamps (ethtool -T shows them)");
-    }
-    if capabilities.has(TX_HARDWARE | RX_HARDWARE | RAW_HARDWARE) {
+    if claims.has(TX_HARDWARE | RX_HARDWARE | RAW_HARDWARE) {
         return finding.because(
             "claimed only: some drivers advertise hardware stamps that never arrive, so a run \
              probes them before it relies on them",
@@ -163,49 +223,23 @@ fn judge(finding: Finding, capabilities: StampCapabilities, is_wireless: bool) -
     finding
 }
 
-fn worsen(mut finding: Finding) -> Finding {
-    finding.state = super::State::Note;
-    finding
-}
-
-fn describe(capabilities: StampCapabilities) -> String {
-    let kind = |tx: u32, rx: u32| match (capabilities.has(tx), capabilities.has(rx)) {
-        (true, true) => "tx+rx",
-        (true, false) => "tx only",
-        (false, true) => "rx only",
-        (false, false) => "none",
-    };
-    let software = kind(TX_SOFTWARE, RX_SOFTWARE);
-    let hardware = kind(TX_HARDWARE | RAW_HARDWARE, RX_HARDWARE | RAW_HARDWARE);
-    let clock = match capabilities.hardware_clock_index {
-        Some(index) => format!(" (/dev/ptp{index})"),
-        None => String::new(),
-    };
-    format!("software {software}, hardware {hardware}{clock}")
-}
-
 fn buffers(files: &HostFiles) -> Finding {
-    let (id, title) = ("udp_buffers", "Largest socket buffers");
+    let id = "udp_buffers";
     let read = |name: &str| files.read_number(&format!("/proc/sys/net/core/{name}"));
     match (read("rmem_max"), read("wmem_max")) {
         (Fact::Available(receive), Fact::Available(send)) => {
-            let is_good = receive >= BUFFER_BYTES_MIN && send >= BUFFER_BYTES_MIN;
-            Finding::note_unless(
-                is_good,
-                id,
-                title,
-                format!("receive {receive} bytes, send {send} bytes"),
-            )
-            .because(
-                "transmit stamps are charged to the receive buffer too: a small one fills within a \
-                 stall of some 250 messages and then drops what arrives",
-            )
-            .fixed_by("sysctl net.core.rmem_max=4194304 net.core.wmem_max=4194304")
-            .quiet_when_good()
+            let is_enough = receive >= BUFFER_BYTES_MIN && send >= BUFFER_BYTES_MIN;
+            let severity = if is_enough {
+                Severity::Ok
+            } else {
+                Severity::Note
+            };
+            let value = format!("receive {receive} bytes, send {send} bytes");
+            Finding::new(id, severity, value)
         }
+        // A network namespace other than the first one hides these limits.
         (Fact::Unavailable(reason), _) | (_, Fact::Unavailable(reason)) => {
-            // A network namespace other than the first one hides these limits.
-            Finding::unknown(id, title, &reason)
+            Finding::cannot_tell(id, reason)
         }
     }
 }
@@ -213,7 +247,6 @@ fn buffers(files: &HostFiles) -> Finding {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::doctor::State;
     use crate::host_facts::FakeHost;
 
     const VETH: StampCapabilities = StampCapabilities {
@@ -225,59 +258,99 @@ mod tests {
         hardware_clock_index: Some(0),
     };
 
-    fn judged(capabilities: StampCapabilities, is_wireless: bool) -> Finding {
-        let finding = Finding::good("timestamps.x", "Stamps on x", describe(capabilities));
-        judge(finding, capabilities, is_wireless)
+    fn judged(claims: StampCapabilities, is_wireless: bool) -> Finding {
+        judge("x", claims, (is_wireless, true))
+    }
+
+    fn present(name: &str, address: [u8; 4]) -> (String, Interface) {
+        let interface = Interface {
+            is_up: true,
+            has_link: true,
+            addresses: vec![(address.into(), 24)],
+        };
+        (name.to_owned(), interface)
     }
 
     #[test]
     fn the_ethtool_bits_are_put_into_words() {
-        assert_eq!(describe(VETH), "software tx+rx, hardware none");
-        assert_eq!(describe(IGB), "software tx+rx, hardware tx+rx (/dev/ptp0)");
+        assert_eq!(VETH.describe(), "software tx+rx, hardware none");
+        assert_eq!(IGB.describe(), "software tx+rx, hardware tx+rx (/dev/ptp0)");
         let wireless = StampCapabilities {
             so_timestamping: 0x18,
             hardware_clock_index: None,
         };
-        assert_eq!(describe(wireless), "software rx only, hardware none");
+        assert_eq!(wireless.describe(), "software rx only, hardware none");
     }
 
     #[test]
     fn claims_are_labelled_as_claims() {
-        assert_eq!(judged(VETH, false).state, State::Good);
+        assert_eq!(judged(VETH, false).severity, Severity::Ok);
         assert!(judged(IGB, false).why.contains("claimed only"));
-        assert_eq!(judged(VETH, true).state, State::Note);
+        assert_eq!(judged(VETH, true).severity, Severity::Note);
         let deaf = StampCapabilities {
             so_timestamping: 0,
             hardware_clock_index: None,
         };
-        assert_eq!(judged(deaf, false).state, State::Note);
-    }
-
-    #[test]
-    fn the_query_is_asked_once_per_interface() {
-        let host = FakeHost::with(&[]);
-        let asked = std::cell::RefCell::new(Vec::new());
-        let query = |name: &str| {
-            asked.borrow_mut().push(name.to_owned());
-            Ok(VETH)
-        };
-        let findings = examine(&host.files(), &["lo".to_owned()], &query);
-        assert_eq!(*asked.borrow(), ["lo"]);
-        assert_eq!(findings[0].id, "timestamps.lo");
+        assert_eq!(judged(deaf, false).severity, Severity::Note);
         assert!(
-            findings[0].value.starts_with("software tx+rx"),
-            "{}",
-            findings[0].value
+            judge("x", VETH, (false, false))
+                .value
+                .ends_with("link down")
         );
     }
 
     #[test]
-    fn an_interface_that_does_not_exist_is_a_problem() {
+    fn interfaces_are_asked_once_and_silence_is_no_pass() {
         let host = FakeHost::with(&[]);
-        let query = |_: &str| Ok(VETH);
-        let findings = examine(&host.files(), &["nosuch0".to_owned()], &query);
-        assert_eq!(findings[0].state, State::Problem);
-        assert!(findings[0].fix.contains("lo"), "{}", findings[0].fix);
+        let asked = std::cell::RefCell::new(Vec::new());
+        let query = |name: &str| {
+            asked.borrow_mut().push(name.to_owned());
+            if name == "lo" {
+                Ok(VETH)
+            } else {
+                Err("no".to_owned())
+            }
+        };
+        let here = Interfaces::from([present("lo", [127, 0, 0, 1]), present("e", [10, 0, 0, 1])]);
+        let names = ["lo", "e", "nosuch0"].map(str::to_owned);
+        let findings = examine(&host.files(), &here, &names, &query);
+        assert_eq!(*asked.borrow(), ["lo", "e"]);
+        let found: Vec<(&str, Severity)> = findings
+            .iter()
+            .map(|finding| (finding.id.as_str(), finding.severity))
+            .collect();
+        assert_eq!(
+            found,
+            [
+                ("timestamps.lo", Severity::Ok),
+                ("timestamps.e", Severity::CannotTell),
+                ("interface.nosuch0", Severity::Error),
+                ("udp_buffers", Severity::CannotTell),
+            ]
+        );
+        assert!(findings[2].fix.contains("e, lo"), "{}", findings[2].fix);
+    }
+
+    #[test]
+    fn a_plan_chooses_by_name_and_by_address() {
+        let mut here = Interfaces::from([
+            present("eth0", [10, 0, 0, 1]),
+            present("eth1", [10, 1, 0, 1]),
+        ]);
+        here.insert("down0".to_owned(), Interface::default());
+        assert_eq!(wanted(&here, &Plan::default()), ["eth0", "eth1"]);
+        let plan = Plan {
+            interfaces: vec!["nosuch0".to_owned()],
+            addresses: vec![[10, 1, 0, 1].into()],
+            ..Plan::default()
+        };
+        assert_eq!(wanted(&here, &plan), ["eth1", "nosuch0"]);
+    }
+
+    #[test]
+    fn this_host_has_loopback_with_its_prefix() {
+        let here = interfaces().unwrap();
+        assert!(here["lo"].addresses.contains(&([127, 0, 0, 1].into(), 8)));
     }
 
     #[test]
@@ -288,8 +361,7 @@ mod tests {
                 ("/proc/sys/net/core/wmem_max", bytes),
             ])
         };
-        assert_eq!(buffers(&files("212992").files()).state, State::Note);
-        assert_eq!(buffers(&files("4194304").files()).state, State::Good);
-        assert_eq!(buffers(&FakeHost::with(&[]).files()).state, State::Note);
+        assert_eq!(buffers(&files("212992").files()).severity, Severity::Note);
+        assert_eq!(buffers(&files("4194304").files()).severity, Severity::Ok);
     }
 }

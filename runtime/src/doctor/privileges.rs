@@ -5,8 +5,10 @@
 use std::thread;
 
 use hil_gateways::transport::bpf_tap;
+use nix::errno::Errno;
 use nix::sys::mman::{MlockAllFlags, mlockall, munlockall};
 use nix::sys::resource::Resource;
+use nix::unistd::{Uid, User};
 
 use super::Finding;
 use crate::host_facts::{CAP_IPC_LOCK, CAP_SYS_NICE, Fact, HostFiles, limit};
@@ -15,108 +17,139 @@ use crate::realtime::{GrantOutcome, RealtimeRequest, SchedulingPolicy, apply};
 /// A typical priority of a control loop, above the interrupt threads of `PREEMPT_RT`.
 const TRIED_PRIORITY: u8 = 80;
 
-pub(crate) fn examine(files: &HostFiles) -> Vec<Finding> {
-    vec![throttle(files), fifo(files), memory_lock(files), tap()]
+/// What the tries came to.
+#[derive(Debug)]
+pub(super) struct Rights {
+    /// `SCHED_FIFO`; `None` when the trial itself failed.
+    pub(super) fifo: Option<GrantOutcome>,
 }
 
-fn throttle(files: &HostFiles) -> Finding {
-    let (id, title) = ("realtime_throttle", "Share of time for SCHED_FIFO");
-    let runtime_us = match files.read_number("/proc/sys/kernel/sched_rt_runtime_us") {
-        Fact::Available(runtime_us) => runtime_us,
-        Fact::Unavailable(reason) => return Finding::unknown(id, title, &reason),
-    };
-    let period_us = files.read_number("/proc/sys/kernel/sched_rt_period_us");
-    let period_us = period_us.available().copied().unwrap_or(1_000_000);
-    if runtime_us < 0 || runtime_us >= period_us {
-        return Finding::good(
-            id,
-            title,
-            format!("unlimited (sched_rt_runtime_us={runtime_us})"),
-        );
+impl Rights {
+    /// Tries.
+    pub(super) fn tried() -> Self {
+        let trial = thread::spawn(|| {
+            let policy = SchedulingPolicy::Fifo {
+                priority: TRIED_PRIORITY,
+            };
+            apply(&RealtimeRequest {
+                policy,
+                ..RealtimeRequest::default()
+            })
+        });
+        let grant = trial.join().ok();
+        Self {
+            fifo: grant.and_then(|mut grant| Some(grant.items.pop()?.outcome)),
+        }
     }
-    let lost_ms = (period_us - runtime_us) / 1000;
-    Finding::note(id, title, format!("{runtime_us} of {period_us} us"))
-        .because(format!(
-            "a busy-polling FIFO thread blacks out for about {lost_ms} ms per period on a CPU it \
-             shares; loops that block are not affected"
-        ))
-        .fixed_by("isolate the CPU of a busy poller, then sysctl kernel.sched_rt_runtime_us=-1")
+
+    /// `SCHED_FIFO` was granted; `None` when that is not known.
+    pub(super) fn is_fifo_granted(&self) -> Option<bool> {
+        let outcome = self.fifo.as_ref()?;
+        Some(*outcome == GrantOutcome::Granted)
+    }
 }
 
-fn fifo(files: &HostFiles) -> Finding {
-    let (id, title) = ("fifo", "SCHED_FIFO priority");
-    let tried = thread::spawn(|| {
-        let policy = SchedulingPolicy::Fifo {
-            priority: TRIED_PRIORITY,
-        };
-        apply(&RealtimeRequest {
-            policy,
-            ..RealtimeRequest::default()
-        })
-    });
-    let Ok(grant) = tried.join() else {
-        return Finding::unknown(id, title, "the trial thread died");
-    };
-    let rtprio = limit(Resource::RLIMIT_RTPRIO, "").to_text();
+pub(super) fn examine(files: &HostFiles, rights: &Rights) -> Vec<Finding> {
+    let rtprio = limit(Resource::RLIMIT_RTPRIO, "");
+    let memlock = limit(Resource::RLIMIT_MEMLOCK, " bytes");
+    vec![
+        fifo(files, rights.fifo.as_ref(), &rtprio.to_text()),
+        memory_lock(files, &memlock.to_text(), try_lock),
+        tap(),
+    ]
+}
+
+fn user() -> String {
+    let found = User::from_uid(Uid::current()).ok().flatten();
+    found.map_or_else(|| Uid::current().to_string(), |user| user.name)
+}
+
+fn limit_line(name: &str, value: &str, file: &str) -> String {
+    let user = user();
+    format!(
+        "echo \"{user} - {name} {value}\" | sudo tee /etc/security/limits.d/{file} and log in again; \
+         in a unit Limit{}={}",
+        name.to_uppercase(),
+        if value == "unlimited" {
+            "infinity"
+        } else {
+            value
+        }
+    )
+}
+
+fn fifo(files: &HostFiles, tried: Option<&GrantOutcome>, rtprio: &str) -> Finding {
+    let id = "fifo";
     let rights = format!(
         "RLIMIT_RTPRIO {rtprio}, CAP_SYS_NICE {}",
         held(files, CAP_SYS_NICE)
     );
-    match grant.items.first().map(|entry| &entry.outcome) {
-        Some(GrantOutcome::Refused { error, reason, fix }) => Finding::problem(
-            id,
-            title,
-            format!("{TRIED_PRIORITY} refused ({error}); {rights}"),
-        )
-        .because(format!(
-            "without it any load delays the loop by milliseconds: {reason}"
-        ))
-        .fixed_by(fix.clone()),
-        _ => Finding::good(id, title, format!("{TRIED_PRIORITY} granted; {rights}")),
+    match tried {
+        None => Finding::cannot_tell(id, format!("the trial thread died; {rights}")),
+        Some(GrantOutcome::Granted) => {
+            Finding::ok(id, format!("priority {TRIED_PRIORITY} granted; {rights}"))
+        }
+        Some(GrantOutcome::Refused { error, reason, fix }) => {
+            let value = format!("priority {TRIED_PRIORITY} refused ({error}); {rights}");
+            if held(files, CAP_SYS_NICE) == "held" {
+                // Then it is not for want of rights.
+                Finding::error(id, format!("{value}: {reason}")).fixed_by(fix.clone())
+            } else {
+                Finding::error(id, value).fixed_by(limit_line("rtprio", "90", "90-hil.conf"))
+            }
+        }
     }
 }
 
-fn memory_lock(files: &HostFiles) -> Finding {
-    let (id, title) = ("memory_lock", "Locked memory");
-    let memlock = limit(Resource::RLIMIT_MEMLOCK, " bytes").to_text();
+/// Locks what is there and releases it again.
+fn try_lock() -> Result<(), Errno> {
+    mlockall(MlockAllFlags::MCL_CURRENT)?;
+    munlockall()
+}
+
+fn memory_lock(
+    files: &HostFiles,
+    memlock: &str,
+    trial: impl FnOnce() -> Result<(), Errno>,
+) -> Finding {
+    let id = "memory_lock";
     let rights = format!(
         "RLIMIT_MEMLOCK {memlock}, CAP_IPC_LOCK {}",
         held(files, CAP_IPC_LOCK)
     );
     // Somebody else's lock must survive the trial, so a locked process is not tried.
-    let locked = files.read_field("/proc/self/status", "VmLck");
-    if locked
-        .available()
-        .is_some_and(|amount| !amount.starts_with("0 "))
-    {
-        return Finding::good(
-            id,
-            title,
-            format!("in force ({}); {rights}", locked.to_text()),
-        );
-    }
-    match mlockall(MlockAllFlags::MCL_CURRENT) {
-        Ok(()) => {
-            let released = munlockall().map_or_else(
-                |errno| format!(", release failed: {errno}"),
-                |()| String::new(),
-            );
-            Finding::good(id, title, format!("granted{released}; {rights}"))
+    let locked = match files.read_field("/proc/self/status", "VmLck") {
+        Fact::Available(locked) => locked,
+        Fact::Unavailable(reason) => {
+            return Finding::cannot_tell(id, format!("not tried: {reason}; {rights}"));
         }
-        Err(errno) => Finding::problem(id, title, format!("refused ({errno}); {rights}"))
-            .because("a page fault in the loop costs microseconds to milliseconds")
-            .fixed_by("needs CAP_IPC_LOCK or LimitMEMLOCK=infinity in the unit"),
+    };
+    if !locked.starts_with("0 ") {
+        return Finding::ok(id, format!("in force ({locked}); {rights}"));
+    }
+    match trial() {
+        Ok(()) => Finding::ok(id, format!("granted; {rights}")),
+        Err(errno) => {
+            // The kernel says "out of memory" for what is beyond the limit.
+            let why = match errno {
+                Errno::ENOMEM => "more than the limit",
+                _ => errno.desc(),
+            };
+            Finding::error(id, format!("refused ({why}); {rights}")).fixed_by(limit_line(
+                "memlock",
+                "unlimited",
+                "91-hil.conf",
+            ))
+        }
     }
 }
 
 /// What `hil-runtime probe` can tap an interface with.
 fn tap() -> Finding {
-    let (id, title) = ("probe_tap", "Tap of the passive probe");
+    let id = "probe_tap";
     match bpf_tap::is_granted() {
-        Ok(()) => Finding::good(id, title, "eBPF programs granted"),
-        Err(error) => Finding::note(id, title, format!("packet ring at most: {error}"))
-            .because("a packet ring costs the watched hop more")
-            .fixed_by("Linux 6.6 or newer, with CAP_BPF and CAP_NET_ADMIN (run as root)"),
+        Ok(()) => Finding::ok(id, "eBPF programs granted"),
+        Err(error) => Finding::note(id, format!("a packet ring at most: {error}")),
     }
 }
 
@@ -131,41 +164,73 @@ fn held(files: &HostFiles, capability: u32) -> &'static str {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::doctor::State;
+    use crate::doctor::finding::Severity;
     use crate::host_facts::FakeHost;
 
-    #[test]
-    fn the_throttle_is_stated_in_lost_milliseconds() {
-        let host = FakeHost::with(&[
-            ("/proc/sys/kernel/sched_rt_runtime_us", "950000"),
-            ("/proc/sys/kernel/sched_rt_period_us", "1000000"),
-        ]);
-        let finding = throttle(&host.files());
-        assert_eq!(finding.state, State::Note);
-        assert!(
-            finding.why.contains("about 50 ms per period"),
-            "{}",
-            finding.why
-        );
-        let off = FakeHost::with(&[("/proc/sys/kernel/sched_rt_runtime_us", "-1")]);
-        assert_eq!(throttle(&off.files()).state, State::Good);
-    }
+    const UNLOCKED: (&str, &str) = (
+        "/proc/self/status",
+        "VmLck:\t     0 kB\nCapEff:\t0000000000000000\n",
+    );
 
     #[test]
     fn the_trials_say_what_the_limits_are() {
         let files = HostFiles::of_this_host();
-        assert!(fifo(&files).value.contains("RLIMIT_RTPRIO"));
-        assert!(memory_lock(&files).value.contains("RLIMIT_MEMLOCK"));
+        for finding in examine(&files, &Rights::tried()) {
+            assert_ne!(finding.severity, Severity::CannotTell, "{finding:?}");
+        }
+    }
+
+    #[test]
+    fn a_refusal_names_the_line_that_cures_it() {
+        let host = FakeHost::with(&[UNLOCKED]);
+        let refused = GrantOutcome::Refused {
+            error: "EPERM".to_owned(),
+            reason: "RLIMIT_RTPRIO is 0".to_owned(),
+            fix: "needs CAP_SYS_NICE".to_owned(),
+        };
+        let finding = fifo(&host.files(), Some(&refused), "0");
+        assert_eq!(finding.severity, Severity::Error);
+        assert!(finding.fix.contains("- rtprio 90\""), "{}", finding.fix);
+        let locking = memory_lock(&host.files(), "65536 bytes", || Err(Errno::ENOMEM));
+        assert_eq!(locking.severity, Severity::Error);
+        assert!(
+            locking.fix.contains("LimitMEMLOCK=infinity"),
+            "{}",
+            locking.fix
+        );
+        assert!(
+            locking
+                .value
+                .contains("RLIMIT_MEMLOCK 65536 bytes, CAP_IPC_LOCK missing")
+        );
+    }
+
+    #[test]
+    fn what_was_not_tried_is_not_ok() {
+        let silent = FakeHost::with(&[]);
+        let finding = fifo(&silent.files(), None, "0");
+        assert_eq!(finding.severity, Severity::CannotTell);
+        let finding = memory_lock(&silent.files(), "1", || panic!("tried in the dark"));
+        assert_eq!(finding.severity, Severity::CannotTell);
     }
 
     #[test]
     fn memory_that_is_already_locked_stays_locked() {
         let host = FakeHost::with(&[("/proc/self/status", "VmLck:\t  5120 kB\n")]);
-        let finding = memory_lock(&host.files());
+        let finding = memory_lock(&host.files(), "1", || panic!("tried all the same"));
         assert!(
             finding.value.starts_with("in force (5120 kB)"),
-            "{}",
-            finding.value
+            "{finding:?}"
         );
+        assert_eq!(finding.severity, Severity::Ok);
+    }
+
+    #[test]
+    fn granted_is_ok() {
+        let host = FakeHost::with(&[UNLOCKED]);
+        let granted = fifo(&host.files(), Some(&GrantOutcome::Granted), "90");
+        assert_eq!(granted.severity, Severity::Ok);
+        let locked = memory_lock(&host.files(), "unlimited", || Ok(()));
+        assert_eq!(locked.severity, Severity::Ok);
     }
 }

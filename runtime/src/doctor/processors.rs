@@ -1,310 +1,380 @@
-//! The processors: who else may run on them, how fast they clock and how deep they sleep. It reads
-//! settings only; what they cost is measured by the wake-up finding.
+//! The processors: who else may run on those that the topology pins to, how fast they clock, how
+//! deep they sleep, with whom they share a core. It reads settings only; what they cost is measured
+//! by the wake-ups.
 
-use super::{Finding, State};
-use crate::host_facts::{Fact, HostFiles, format_cpu_list, preemption};
-use crate::realtime::isolated_cpus_in;
+use super::Finding;
+use super::finding::Severity;
+use super::plan::Plan;
+use crate::host_facts::{
+    CPU_FOLDER, Fact, HostFiles, IsolatedCpus, KernelOptions, format_cpu_list, governors,
+    online_cpus,
+};
 
 /// An idle state that takes longer to leave shows up in every blocking receive.
-const IDLE_EXIT_US_GOOD: i64 = 10;
+const IDLE_EXIT_US_OK: i64 = 10;
+/// And one that takes longer than this dwarfs what a wake-up costs otherwise.
+const IDLE_EXIT_US_NOTE: i64 = 100;
 
-pub(crate) fn examine(files: &HostFiles, pinned: &[usize]) -> Vec<Finding> {
+pub(super) fn examine(files: &HostFiles, plan: &Plan) -> Vec<Finding> {
+    let isolation = IsolatedCpus::read(files);
+    let without_tick = isolation.nohz_full.clone();
+    let without_tick = match (without_tick, KernelOptions::read(files)) {
+        // A kernel without the option has no such file, and ticks everywhere.
+        (Fact::Unavailable(_), Fact::Available(options)) if !options.has("NO_HZ_FULL") => {
+            Fact::Available(Vec::new())
+        }
+        (found, _) => found,
+    };
     vec![
-        preemption_model(files),
-        isolated(files, pinned),
-        nohz_full(files, pinned),
-        governor(files),
-        idle_states(files),
-        siblings(files, pinned),
-        irqbalance(files),
-        huge_pages(files),
+        covered("isolated_cpus", &isolation.isolated, plan),
+        covered("nohz_full", &without_tick, plan),
+        covered("rcu_nocbs", &isolation.without_callbacks, plan),
+        governor(files, plan),
+        idle_states(files, plan),
+        siblings(files, plan),
     ]
 }
 
-fn preemption_model(files: &HostFiles) -> Finding {
-    let (id, title) = ("preemption", "Kernel preemption");
-    match preemption(files) {
-        Fact::Available(model) => {
-            let is_good = model == "PREEMPT_RT" || model.ends_with("mode full");
-            Finding::note_unless(is_good, id, title, model)
-                .because("a system call of another task may hold a wake-up back for milliseconds")
-                .fixed_by("boot a PREEMPT_RT kernel, or add preempt=full to a PREEMPT_DYNAMIC one")
-                .quiet_when_good()
-        }
-        Fact::Unavailable(reason) => Finding::unknown(id, title, &reason),
-    }
-}
-
-/// The pinned CPUs missing from `listed`.
-fn missing(listed: &[usize], pinned: &[usize]) -> Vec<usize> {
-    pinned
-        .iter()
-        .copied()
-        .filter(|cpu| !listed.contains(cpu))
-        .collect()
-}
-
-fn isolated(files: &HostFiles, pinned: &[usize]) -> Finding {
-    let (id, title) = ("isolated_cpus", "Isolated CPUs");
-    let isolated = match isolated_cpus_in(files).isolated {
+/// Whether the pinned CPUs are among those that were set apart.
+fn covered(id: &str, apart: &Fact<Vec<usize>>, plan: &Plan) -> Finding {
+    let apart = match apart {
         Fact::Available(cpus) => cpus,
-        Fact::Unavailable(reason) => return Finding::unknown(id, title, &reason),
+        Fact::Unavailable(reason) => return Finding::cannot_tell(id, reason),
     };
-    let value = format_cpu_list(&isolated);
-    let uncovered = missing(&isolated, pinned);
-    if isolated.is_empty() {
-        return Finding::note(id, title, value)
-            .because("every task of the host may run on the CPU of a busy poller")
-            .fixed_by(
-                "boot with isolcpus=CPUS nohz_full=CPUS rcu_nocbs=CPUS, or do not busy-poll",
-            );
+    let value = format_cpu_list(apart);
+    if plan.pins.is_empty() {
+        return if apart.is_empty() {
+            Finding::note(id, value)
+        } else {
+            let value = format!("{value}; the topology pins nothing, or none was given");
+            Finding::ok(id, value)
+        };
     }
-    if uncovered.is_empty() {
-        return Finding::good(id, title, value);
-    }
-    let uncovered = format_cpu_list(&uncovered);
-    Finding::note(
-        id,
-        title,
-        format!("{value}; pinned but not isolated: {uncovered}"),
-    )
-    .because("the topology pins threads to CPUs that other tasks use as well")
-    .fixed_by(format!(
-        "pin to the isolated CPUs, or isolate {uncovered} too"
-    ))
-}
-
-fn nohz_full(files: &HostFiles, pinned: &[usize]) -> Finding {
-    let (id, title) = ("nohz_full", "CPUs without a periodic tick");
-    let isolation = isolated_cpus_in(files);
-    match isolation.nohz_full {
-        Fact::Available(cpus) => {
-            let is_good = !cpus.is_empty() && missing(&cpus, pinned).is_empty();
-            Finding::note_unless(is_good, id, title, format_cpu_list(&cpus))
-                .because(
-                    "each timer tick takes microseconds from a busy poller, 100 to 1000 times \
-                          a second",
-                )
-                .fixed_by("boot with nohz_full=CPUS for the CPUs that busy-poll")
-                .quiet_when_good()
-        }
-        Fact::Unavailable(reason) => Finding::note(id, title, format!("unavailable ({reason})"))
-            .because("this kernel has no nohz_full; a busy poller pays for every timer tick")
-            .fixed_by("use a kernel with CONFIG_NO_HZ_FULL for microsecond busy polling"),
-    }
-}
-
-fn governor(files: &HostFiles) -> Finding {
-    let (id, title) = ("governor", "Frequency governor");
-    let mut governors: Vec<String> = cpu_folders(files)
-        .into_iter()
-        .filter_map(|cpu| {
-            let path = format!("/sys/devices/system/cpu/{cpu}/cpufreq/scaling_governor");
-            files.read(&path).available().cloned()
-        })
-        .collect();
-    governors.sort();
-    governors.dedup();
-    if governors.is_empty() {
-        return Finding::unknown(id, title, "no cpufreq driver, as in most virtual machines");
-    }
-    let is_good = governors == ["performance"];
-    Finding::note_unless(is_good, id, title, governors.join(", "))
-        .because("the clock rate follows the load, so the same work takes differently long")
-        .fixed_by("cpupower frequency-set -g performance")
-        .quiet_when_good()
-}
-
-fn cpu_folders(files: &HostFiles) -> Vec<String> {
-    let mut names = files.names_in("/sys/devices/system/cpu");
-    names.retain(|name| {
-        name.strip_prefix("cpu")
-            .is_some_and(|index| index.parse::<usize>().is_ok())
-    });
-    names
-}
-
-fn idle_states(files: &HostFiles) -> Finding {
-    let (id, title) = ("idle_states", "Deepest idle state in use");
-    let folder = "/sys/devices/system/cpu/cpu0/cpuidle";
-    let enabled = files.names_in(folder).into_iter().filter_map(|state| {
-        let file = |name: &str| format!("{folder}/{state}/{name}");
-        let is_disabled = files.read_number(&file("disable")) == Fact::Available(1);
-        let exit_us = files.read_number(&file("latency")).available().copied()?;
-        let name = files.read(&file("name")).available().cloned()?;
-        (!is_disabled).then_some((exit_us, name))
-    });
-    let Some((exit_us, name)) = enabled.max() else {
-        return Finding::unknown(id, title, "no cpuidle driver, as in most virtual machines");
-    };
-    Finding::note_unless(
-        exit_us <= IDLE_EXIT_US_GOOD,
-        id,
-        title,
-        format!("{name}, {exit_us} us"),
-    )
-    .because("a CPU that sleeps this deep adds its exit latency to the next wake-up")
-    .fixed_by("hold /dev/cpu_dma_latency open at 0 during a run, or cpupower idle-set -D 10")
-    .quiet_when_good()
-}
-
-fn siblings(files: &HostFiles, pinned: &[usize]) -> Finding {
-    let (id, title) = ("smt", "Hardware threads sharing a core");
-    match files.read("/sys/devices/system/cpu/smt/active") {
-        Fact::Unavailable(reason) => return Finding::unknown(id, title, &reason),
-        Fact::Available(active) if active != "1" => return Finding::good(id, title, "none"),
-        Fact::Available(_) => {}
-    }
-    let cpus = if pinned.is_empty() { &[0][..] } else { pinned };
-    let groups: Vec<String> = cpus
+    let outside: Vec<_> = plan
+        .pins
         .iter()
-        .map(|cpu| {
-            let path = format!("/sys/devices/system/cpu/cpu{cpu}/topology/thread_siblings_list");
-            format!("cpu {cpu} shares with {}", files.read(&path).to_text())
-        })
+        .filter(|pin| !apart.contains(&pin.cpu))
         .collect();
-    Finding::note(id, title, groups.join("; "))
-        .because("a neighbour on the same core takes half of its execution units at any time")
-        .fixed_by("leave the sibling of a pinned CPU idle, or boot with nosmt")
-}
-
-fn irqbalance(files: &HostFiles) -> Finding {
-    let (id, title) = ("irqbalance", "Interrupt balancing daemon");
-    let processes = files.names_in("/proc");
-    let mut names = processes
-        .iter()
-        .filter(|name| name.bytes().all(|byte| byte.is_ascii_digit()))
-        .map(|process| files.read(&format!("/proc/{process}/comm")));
-    if processes.is_empty() {
-        return Finding::unknown(id, title, "/proc cannot be listed");
+    if outside.is_empty() {
+        return Finding::ok(id, value);
     }
-    let is_running = names.any(|name| name == Fact::Available("irqbalance".to_owned()));
-    Finding::note_unless(
-        !is_running,
-        id,
-        title,
-        if is_running { "running" } else { "not running" },
-    )
-    .because("it moves network interrupts between CPUs during a run, onto pinned ones too")
-    .fixed_by("systemctl stop irqbalance, or ban the pinned CPUs in its configuration")
-    .quiet_when_good()
-}
-
-fn huge_pages(files: &HostFiles) -> Finding {
-    let (id, title) = ("transparent_huge_pages", "Transparent huge pages");
-    let modes = match files.read("/sys/kernel/mm/transparent_hugepage/enabled") {
-        Fact::Available(modes) => modes,
-        Fact::Unavailable(reason) => return Finding::unknown(id, title, &reason),
-    };
-    let chosen = modes
-        .split_once('[')
-        .and_then(|(_, rest)| rest.split_once(']'));
-    let Some((chosen, _)) = chosen else {
-        return Finding::unknown(id, title, &format!("no mode is marked in `{modes}`"));
-    };
-    let state = if chosen == "always" {
-        State::Note
+    let spins = outside.iter().any(|pin| pin.spins);
+    let severity = if spins {
+        Severity::Warning
     } else {
-        State::Good
+        Severity::Note
     };
-    Finding::new(id, title, state, chosen)
-        .because("the kernel merges pages in the background and holds the process up while it does")
-        .fixed_by("echo madvise > /sys/kernel/mm/transparent_hugepage/enabled")
-        .quiet_when_good()
+    let words: Vec<String> = outside
+        .iter()
+        .map(|pin| {
+            let what = if pin.spins { ", which busy-polls" } else { "" };
+            format!("{} ({}{what})", pin.cpu, pin.of)
+        })
+        .collect();
+    let value = format!("{value}; pinned to outside: {}", words.join(", "));
+    let mut cpus: Vec<usize> = outside.iter().map(|pin| pin.cpu).collect();
+    cpus.dedup();
+    let cpus = format_cpu_list(&cpus);
+    let parameter = if id == "isolated_cpus" {
+        "isolcpus"
+    } else {
+        id
+    };
+    Finding::new(id, severity, value).fixed_by(format!("boot with {parameter}={cpus}"))
+}
+
+fn governor(files: &HostFiles, plan: &Plan) -> Finding {
+    let id = "governor";
+    let found = match governors(files, &plan.cpus()) {
+        Fact::Available(found) => found,
+        Fact::Unavailable(reason) => {
+            let why = format!("{reason}: no cpufreq driver, as in most virtual machines");
+            return Finding::cannot_tell(id, why);
+        }
+    };
+    let slow: Vec<usize> = found
+        .iter()
+        .filter(|(_, governor)| governor != "performance")
+        .map(|(cpu, _)| *cpu)
+        .collect();
+    if slow.is_empty() {
+        return Finding::ok(id, "performance");
+    }
+    let mut names: Vec<&str> = found
+        .iter()
+        .filter(|(cpu, _)| slow.contains(cpu))
+        .map(|(_, governor)| governor.as_str())
+        .collect();
+    names.sort_unstable();
+    names.dedup();
+    let cpus = format_cpu_list(&slow);
+    Finding::warning(id, format!("{} on CPU {cpus}", names.join(", ")))
+        .fixed_by(format!("cpupower -c {cpus} frequency-set -g performance"))
+}
+
+/// The enabled idle state of a CPU with the longest way out.
+fn deepest_idle(files: &HostFiles, cpu: usize) -> Fact<(i64, String)> {
+    let folder = format!("{CPU_FOLDER}/cpu{cpu}/cpuidle");
+    files.list(&folder).and_then(|states| {
+        let mut deepest: Option<(i64, String)> = None;
+        for state in states.iter().filter(|name| name.starts_with("state")) {
+            let file = |name: &str| format!("{folder}/{state}/{name}");
+            if files.read_number(&file("disable")) == Fact::Available(1) {
+                continue;
+            }
+            let exit_us = match files.read_number(&file("latency")) {
+                Fact::Available(us) => us,
+                Fact::Unavailable(reason) => return Fact::Unavailable(reason),
+            };
+            if deepest.as_ref().is_none_or(|(us, _)| exit_us > *us) {
+                deepest = Some((exit_us, files.read(&file("name")).to_text()));
+            }
+        }
+        deepest.map_or_else(
+            || Fact::Unavailable(format!("{folder} has no enabled state")),
+            Fact::Available,
+        )
+    })
+}
+
+fn idle_states(files: &HostFiles, plan: &Plan) -> Finding {
+    let id = "idle_states";
+    let cpus = if plan.pins.is_empty() {
+        match online_cpus(files) {
+            Fact::Available(cpus) => cpus,
+            Fact::Unavailable(reason) => return Finding::cannot_tell(id, reason),
+        }
+    } else {
+        plan.cpus()
+    };
+    let mut worst: Option<(i64, String)> = None;
+    for cpu in cpus {
+        match deepest_idle(files, cpu) {
+            Fact::Available((us, name)) => {
+                if worst.as_ref().is_none_or(|(most, _)| us > *most) {
+                    worst = Some((us, format!("{name} on CPU {cpu}, {us} us to leave")));
+                }
+            }
+            Fact::Unavailable(reason) => {
+                let why = format!("{reason}: no cpuidle driver, as in most virtual machines");
+                return Finding::cannot_tell(id, why);
+            }
+        }
+    }
+    let Some((exit_us, words)) = worst else {
+        return Finding::cannot_tell(id, "no CPU is online");
+    };
+    // What a program that holds the file open asked for; the kernel then avoids deeper states.
+    let held = files.read_word("/dev/cpu_dma_latency");
+    let (bound, also) = match &held {
+        Fact::Available(us) if i64::from(*us) < exit_us => (
+            i64::from(*us),
+            format!("; /dev/cpu_dma_latency holds it at {us} us"),
+        ),
+        Fact::Available(_) => (exit_us, "; nobody holds /dev/cpu_dma_latency".to_owned()),
+        Fact::Unavailable(reason) => (exit_us, format!("; a bound on it is unknown ({reason})")),
+    };
+    let severity = if bound > IDLE_EXIT_US_NOTE {
+        Severity::Warning
+    } else if bound > IDLE_EXIT_US_OK {
+        Severity::Note
+    } else {
+        Severity::Ok
+    };
+    Finding::new(id, severity, format!("{words}{also}"))
+}
+
+fn siblings(files: &HostFiles, plan: &Plan) -> Finding {
+    let id = "smt";
+    let active = match files.read(&format!("{CPU_FOLDER}/smt/active")) {
+        Fact::Available(active) => active,
+        Fact::Unavailable(reason) => return Finding::cannot_tell(id, reason),
+    };
+    if active != "1" {
+        return Finding::ok(id, "none");
+    }
+    let pinned = plan.cpus();
+    if pinned.is_empty() {
+        return Finding::note(id, "in use; the topology pins nothing, or none was given");
+    }
+    let isolated = IsolatedCpus::read(files).isolated;
+    let isolated = isolated.available().cloned().unwrap_or_default();
+    let mut shared = Vec::new();
+    for cpu in &pinned {
+        let path = format!("{CPU_FOLDER}/cpu{cpu}/topology/thread_siblings_list");
+        let group = match files.read_cpu_list(&path) {
+            Fact::Available(group) => group,
+            Fact::Unavailable(reason) => return Finding::cannot_tell(id, reason),
+        };
+        for other in group.into_iter().filter(|other| other != cpu) {
+            if pinned.contains(&other) {
+                shared.push(format!("CPU {cpu} shares with CPU {other}, pinned too"));
+            } else if !isolated.contains(&other) {
+                shared.push(format!(
+                    "CPU {cpu} shares with CPU {other}, open to all tasks"
+                ));
+            }
+        }
+    }
+    if shared.is_empty() {
+        return Finding::ok(id, "in use; those of the pinned CPUs are isolated and idle");
+    }
+    Finding::warning(id, shared.join("; "))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::doctor::plan::Pin;
     use crate::host_facts::FakeHost;
 
-    const CPU: &str = "/sys/devices/system/cpu";
+    fn pinned(cpus: &[usize], spins: bool) -> Plan {
+        let pins = cpus.iter().map(|cpu| Pin {
+            cpu: *cpu,
+            of: "gateway of hop".to_owned(),
+            spins,
+        });
+        Plan {
+            pins: pins.collect(),
+            ..Plan::default()
+        }
+    }
+
+    fn at(path: &str) -> String {
+        format!("{CPU_FOLDER}/{path}")
+    }
+
+    fn found<'a>(findings: &'a [Finding], id: &str) -> &'a Finding {
+        findings.iter().find(|finding| finding.id == id).unwrap()
+    }
+
+    fn with(files: &[(String, &str)], plan: &Plan) -> Vec<Finding> {
+        let files: Vec<(&str, &str)> = files.iter().map(|(p, t)| (p.as_str(), *t)).collect();
+        examine(&FakeHost::with(&files).files(), plan)
+    }
 
     #[test]
     fn a_tuned_host_gets_no_complaint() {
-        let host = FakeHost::with(&[
-            (&format!("{CPU}/isolated"), "2-3"),
-            (&format!("{CPU}/nohz_full"), "2-3"),
-            (
-                &format!("{CPU}/cpu0/cpufreq/scaling_governor"),
-                "performance",
-            ),
-            (&format!("{CPU}/cpu0/cpuidle/state0/latency"), "0"),
-            (&format!("{CPU}/cpu0/cpuidle/state0/name"), "POLL"),
-            (&format!("{CPU}/smt/active"), "0"),
-            ("/sys/kernel/realtime", "1"),
-            ("/proc/1/comm", "systemd"),
-            (
-                "/sys/kernel/mm/transparent_hugepage/enabled",
-                "always [madvise] never",
-            ),
-        ]);
-        for finding in examine(&host.files(), &[2, 3]) {
-            assert_eq!(finding.state, State::Good, "{finding:?}");
-            assert!(finding.why.is_empty());
+        let files = [
+            (at("online"), "0-3"),
+            (at("isolated"), "2-3"),
+            (at("nohz_full"), "2-3"),
+            ("/proc/cmdline".to_owned(), "rcu_nocbs=2-3"),
+            (at("cpu2/cpufreq/scaling_governor"), "performance"),
+            (at("cpu2/cpuidle/state0/latency"), "0"),
+            (at("cpu2/cpuidle/state0/name"), "POLL"),
+            (at("cpu2/topology/thread_siblings_list"), "2-3"),
+            (at("smt/active"), "1"),
+        ];
+        for finding in with(&files, &pinned(&[2], true)) {
+            assert_eq!(finding.severity, Severity::Ok, "{finding:?}");
         }
     }
 
     #[test]
-    fn a_desktop_gets_every_complaint() {
-        let host = FakeHost::with(&[
-            (&format!("{CPU}/isolated"), ""),
-            (&format!("{CPU}/nohz_full"), "(null)"),
-            (&format!("{CPU}/cpu0/cpufreq/scaling_governor"), "powersave"),
+    fn a_desktop_gets_each_complaint_with_its_numbers() {
+        let files = [
+            (at("online"), "0-1"),
+            (at("isolated"), ""),
+            (at("nohz_full"), "(null)"),
+            ("/proc/cmdline".to_owned(), "quiet"),
+            (at("cpu0/cpufreq/scaling_governor"), "performance"),
+            (at("cpu1/cpufreq/scaling_governor"), "powersave"),
+            (at("cpu1/cpuidle/state1/latency"), "890"),
+            (at("cpu1/cpuidle/state1/name"), "C10"),
+            (at("cpu1/topology/thread_siblings_list"), "0-1"),
+            (at("smt/active"), "1"),
+        ];
+        let findings = with(&files, &pinned(&[1], true));
+        for (id, value) in [
             (
-                &format!("{CPU}/cpu1/cpufreq/scaling_governor"),
-                "performance",
+                "isolated_cpus",
+                "none; pinned to outside: 1 (gateway of hop, which busy-polls)",
             ),
-            (&format!("{CPU}/cpu0/cpuidle/state0/latency"), "2"),
-            (&format!("{CPU}/cpu0/cpuidle/state0/name"), "C1"),
-            (&format!("{CPU}/cpu0/cpuidle/state1/latency"), "890"),
-            (&format!("{CPU}/cpu0/cpuidle/state1/name"), "C10"),
-            (&format!("{CPU}/smt/active"), "1"),
-            (&format!("{CPU}/cpu0/topology/thread_siblings_list"), "0,4"),
-            ("/proc/sys/kernel/version", "#1 SMP PREEMPT_DYNAMIC"),
-            ("/proc/77/comm", "irqbalance"),
             (
-                "/sys/kernel/mm/transparent_hugepage/enabled",
-                "[always] madvise never",
+                "rcu_nocbs",
+                "none; pinned to outside: 1 (gateway of hop, which busy-polls)",
             ),
-        ]);
-        let findings = examine(&host.files(), &[]);
-        for finding in &findings {
-            assert_eq!(finding.state, State::Note, "{finding:?}");
+            ("governor", "powersave on CPU 1"),
+            ("smt", "CPU 1 shares with CPU 0, open to all tasks"),
+        ] {
+            let finding = found(&findings, id);
+            assert_eq!(finding.severity, Severity::Warning, "{finding:?}");
+            assert_eq!(finding.value, value);
         }
-        let values: Vec<&str> = findings
-            .iter()
-            .map(|finding| finding.value.as_str())
-            .collect();
-        assert!(values.contains(&"performance, powersave"));
-        assert!(values.contains(&"C10, 890 us"));
-        assert!(values.contains(&"cpu 0 shares with 0,4"));
-    }
-
-    #[test]
-    fn a_disabled_idle_state_does_not_count() {
-        let host = FakeHost::with(&[
-            (&format!("{CPU}/cpu0/cpuidle/state0/latency"), "2"),
-            (&format!("{CPU}/cpu0/cpuidle/state0/name"), "C1"),
-            (&format!("{CPU}/cpu0/cpuidle/state1/latency"), "890"),
-            (&format!("{CPU}/cpu0/cpuidle/state1/name"), "C10"),
-            (&format!("{CPU}/cpu0/cpuidle/state1/disable"), "1"),
-        ]);
-        assert_eq!(idle_states(&host.files()).value, "C1, 2 us");
-    }
-
-    #[test]
-    fn a_pin_outside_the_isolated_cpus_is_named() {
-        let host = FakeHost::with(&[(&format!("{CPU}/isolated"), "2-3")]);
-        let finding = isolated(&host.files(), &[1, 2]);
-        assert_eq!(finding.value, "2-3; pinned but not isolated: 1");
+        let idle = found(&findings, "idle_states");
+        assert!(idle.value.starts_with("C10 on CPU 1, 890 us"), "{idle:?}");
+        assert_eq!(idle.severity, Severity::Warning);
+        assert_eq!(
+            found(&findings, "isolated_cpus").fix,
+            "boot with isolcpus=1"
+        );
+        // What only blocks feels it less.
+        let findings = with(&files, &pinned(&[1], false));
+        assert_eq!(found(&findings, "nohz_full").severity, Severity::Note);
     }
 
     #[test]
     fn a_silent_host_passes_nothing() {
-        let host = FakeHost::with(&[]);
-        for finding in examine(&host.files(), &[]) {
-            assert_eq!(finding.state, State::Note, "{finding:?}");
+        for plan in [Plan::default(), pinned(&[0], true)] {
+            for finding in with(&[], &plan) {
+                assert_eq!(finding.severity, Severity::CannotTell, "{finding:?}");
+                assert!(finding.value.contains('/'), "names its file: {finding:?}");
+            }
         }
+    }
+
+    #[test]
+    fn disabled_idle_states_do_not_count_and_a_held_latency_bounds_the_rest() {
+        let mut files = vec![
+            (at("cpu1/cpuidle/state0/latency"), "2"),
+            (at("cpu1/cpuidle/state0/name"), "C1"),
+            (at("cpu1/cpuidle/state1/latency"), "890"),
+            (at("cpu1/cpuidle/state1/name"), "C10"),
+        ];
+        files.push((at("cpu1/cpuidle/state1/disable"), "1"));
+        let findings = with(&files, &pinned(&[1], false));
+        let idle = found(&findings, "idle_states");
+        assert!(idle.value.starts_with("C1 on CPU 1, 2 us"), "{idle:?}");
+        assert_eq!(idle.severity, Severity::Ok);
+        files.pop();
+        files.push(("/dev/cpu_dma_latency".to_owned(), "\0\0\0\0"));
+        let findings = with(&files, &pinned(&[1], false));
+        let idle = found(&findings, "idle_states");
+        assert_eq!(idle.severity, Severity::Ok);
+        assert!(idle.value.contains("holds it at 0 us"), "{idle:?}");
+    }
+
+    #[test]
+    fn siblings_that_are_both_pinned_are_named() {
+        let files = [
+            (at("smt/active"), "1"),
+            (at("isolated"), "2-3"),
+            (at("cpu2/topology/thread_siblings_list"), "2-3"),
+            (at("cpu3/topology/thread_siblings_list"), "2-3"),
+        ];
+        let findings = with(&files, &pinned(&[2, 3], false));
+        let smt = found(&findings, "smt");
+        assert_eq!(smt.severity, Severity::Warning);
+        assert!(smt.value.contains("CPU 3, pinned too"), "{smt:?}");
+    }
+
+    #[test]
+    fn a_kernel_that_cannot_leave_the_tick_out_is_known_to_tick() {
+        let files = [
+            ("/proc/sys/kernel/osrelease".to_owned(), "6.1"),
+            ("/boot/config-6.1".to_owned(), "CONFIG_NO_HZ_IDLE=y"),
+        ];
+        let findings = with(&files, &pinned(&[1], true));
+        let tick = found(&findings, "nohz_full");
+        assert_eq!(tick.severity, Severity::Warning, "{tick:?}");
+        // One that can, and does not tell where, is not known to do anything.
+        let able = [
+            files[0].clone(),
+            (files[1].0.clone(), "CONFIG_NO_HZ_FULL=y"),
+        ];
+        let findings = with(&able, &pinned(&[1], true));
+        let tick = found(&findings, "nohz_full");
+        assert_eq!(tick.severity, Severity::CannotTell, "{tick:?}");
     }
 }

@@ -14,6 +14,7 @@ use super::line::Line;
 use crate::channel::Waiter;
 use crate::clock::MonotonicClock;
 use crate::gateway::poll_descriptors;
+use crate::process::pulse::Pulse;
 use crate::process::recording::{RecordedInput, RecordedOutput};
 use crate::wait::{Pause, WaitStrategy};
 
@@ -40,6 +41,7 @@ pub(super) struct Arm {
     pub(super) attention: Attention,
     /// Datagrams that came before the run began, dropped.
     pub(super) early_count: u64,
+    pub(super) pulse: Pulse,
 }
 
 /// What waiting found.
@@ -83,6 +85,7 @@ impl Arm {
             if !has_moved {
                 self.rest(work.next_due())?;
             }
+            self.pulse.beat();
         }
         // None of ours publishes any more, but the foreign program may go on sending.
         for _ in 0..CLEARING_TURNS_MAX {

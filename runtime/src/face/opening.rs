@@ -23,6 +23,7 @@ use crate::channel::{Domain, OutputSettings, ShmInput, ShmOutput, Waiter};
 use crate::clock::MonotonicClock;
 use crate::gateway::socket::timestamp_mode;
 use crate::process::pipe::FaceReport;
+use crate::process::pulse::Pulse;
 use crate::process::recording::{Destination, RecordedInput, RecordedOutput};
 use crate::record::{RecordKind, RecordSink, Recorder};
 use crate::topology::FaceKind;
@@ -40,6 +41,8 @@ pub struct OpenedArm {
     messages: RecordSink,
     /// Messages taken from and published to shared memory so far.
     pub(super) counts: [Arc<AtomicU64>; 2],
+    /// The turns of the thread that will carry the messages.
+    pub(super) pulse: Pulse,
     /// What was granted, in words.
     pub(super) facts: Vec<(String, String)>,
 }
@@ -84,6 +87,7 @@ impl OpenedArm {
             published: sink(RecordKind::Published, output, size_of::<PublishedRecord>())?,
             messages: sink(RecordKind::Message, output, message_size)?,
             counts: [Arc::default(), Arc::default()],
+            pulse: Pulse::default(),
             facts: facts(&settings, granted, what),
         })
     }
@@ -160,6 +164,7 @@ impl OpenedArm {
             buffer: Box::new([0; DATAGRAM_BYTES_MAX]),
             attention: Attention::default(),
             early_count: 0,
+            pulse: self.pulse,
         })
     }
 }

@@ -20,11 +20,12 @@ use crate::clock::MonotonicClock;
 use crate::gateway::GatewayError;
 use crate::gateway::arming::arm_and_describe;
 use crate::gateway::process::{
-    Counter, PROBE_BOUND, report_progress, wait_until_open, warn_of_spinning,
+    Counter, PROBE_BOUND, report_progress, say_if_alive, wait_until_open, warn_of_spinning,
 };
 use crate::gateway::socket::timestamp_mode;
 use crate::process::launch::read;
 use crate::process::pipe::{FaceReport, FromProcess, Orders, ProcessReport, say};
+use crate::process::pulse::Pulses;
 use crate::process::usage::add_usage;
 use crate::realtime::{self, RealtimeGrant};
 use crate::record::Recorder;
@@ -59,11 +60,15 @@ fn prepare_and_live(path: &Path) -> Result<(), FaceError> {
         opened.push((arm.clone(), OpenedArm::open(&launch, arm, &mut recorder)?));
     }
     let spare = Spare::open(&launch.face.spare, &mut recorder)?;
-    recorder.start().map_err(GatewayError::Thread)?;
+    let on_failure = orders.stopper();
+    recorder
+        .start_and_tell(on_failure)
+        .map_err(GatewayError::Thread)?;
     let counters: Vec<Counter> = opened
         .iter()
         .flat_map(|(arm, one)| counters(arm, one))
         .collect();
+    let mut pulses = Pulses::of(opened.iter().map(|(_, one)| one.pulse.clone()));
     let (sender, ready) = channel();
     let mut threads = Vec::new();
     for (arm, one) in opened {
@@ -77,7 +82,7 @@ fn prepare_and_live(path: &Path) -> Result<(), FaceError> {
         say(&FromProcess::Ready);
         if orders.wait_for_start() {
             gate.open();
-            watch(&orders, &threads, &counters);
+            watch(&orders, &threads, &counters, &mut pulses);
         }
     }
     gate.close();
@@ -101,13 +106,19 @@ fn probe_settings(launch: &FaceLaunch) -> Option<ProbeSettings> {
 }
 
 /// Says how many messages passed, until told to stop or a thread ends.
-fn watch(orders: &Orders, threads: &[JoinHandle<Lived>], counters: &[Counter]) {
+fn watch(
+    orders: &Orders,
+    threads: &[JoinHandle<Lived>],
+    counters: &[Counter],
+    pulses: &mut Pulses,
+) {
     let mut told = MonotonicClock::now();
     while !orders.is_stopping() && !threads.iter().any(JoinHandle::is_finished) {
         let now = MonotonicClock::now();
         if now.saturating_duration_since(told) >= PROGRESS_PERIOD {
             told = now;
             report_progress(counters);
+            say_if_alive(pulses);
         }
         thread::sleep(WATCH_PERIOD);
     }
@@ -188,9 +199,10 @@ fn finish(
         }
     }
     let written = recorder.finish();
+    let problem = written.problem();
     report.recorder_dropped = written.dropped_count;
     report.recorder_failures = written.failures;
     add_usage(&mut report);
     say(&FromProcess::Finished(Box::new(report)));
-    outcome
+    outcome.and(problem.map_or(Ok(()), |text| Err(GatewayError::Unrecorded(text).into())))
 }

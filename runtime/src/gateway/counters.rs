@@ -1,5 +1,6 @@
 //! The counters of one channel direction under the names a report prints. It counts nothing itself.
 
+use hil_gateways::protocol::seal::SealCounts;
 use hil_gateways::protocol::{PeerState, RefusalCounts};
 use hil_gateways::transport::ReceiverCounters;
 
@@ -109,6 +110,20 @@ pub(super) fn of_ingress(ingress: &Ingress) -> Vec<(String, u64)> {
         .chain(named("", [steps, foreign]))
         .chain(named("", stray))
         .chain(refusals(bridge.refusals()))
+        .collect()
+}
+
+/// What the seal of a direction counted.
+pub(super) fn of_seal(counts: &SealCounts) -> Vec<(String, u64)> {
+    let kept = [
+        ("sealed_count", counts.sealed_count),
+        ("opened_count", counts.opened_count),
+        ("key_exchange_count", counts.key_exchange_count),
+        ("agreement_count", counts.agreement_count),
+        ("rotation_count", counts.rotation_count),
+    ];
+    named("seal: ", kept)
+        .chain(named("refused: ", counts.refusals()))
         .collect()
 }
 

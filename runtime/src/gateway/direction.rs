@@ -25,7 +25,9 @@ use crate::channel::{RawInput, RawOutput, Waiter};
 use crate::clock::MonotonicClock;
 use crate::process::launch::{DirectionLaunch, Side};
 use crate::process::pipe::{DirectionReport, RunStart};
+use crate::process::pulse::Pulse;
 use crate::record::{RecordKind, RecordSink, Recorder};
+use crate::security::RunSeal;
 use crate::wait::{WaitMode, WaitStrategy};
 
 /// Records a ring holds.
@@ -45,6 +47,7 @@ pub struct Opened {
     sinks: Sinks,
     count: Arc<AtomicU64>,
     is_established: Arc<AtomicBool>,
+    pulse: Pulse,
     plan: StampPlan,
 }
 
@@ -52,6 +55,7 @@ pub struct Opened {
 #[derive(Debug)]
 pub struct Direction {
     way: Way,
+    pulse: Pulse,
     facts: Vec<(String, String)>,
     replay: Option<ReplayTally>,
 }
@@ -73,10 +77,10 @@ pub fn open<'a>(
     start: &RunStart,
 ) -> Result<(&'a DirectionLaunch, Opened), GatewayError> {
     let plan = StampPlan::asked(stamps_of(&launch.socket));
-    open_with(launch, recorder, start, plan)
+    open_with(launch, recorder, start, (plan, None))
 }
 
-/// As [`open`], with what a probe found of the interface.
+/// As [`open`], with what a probe found of the interface, and sealed when the run's hops are.
 ///
 /// # Errors
 /// As [`open`].
@@ -84,10 +88,10 @@ pub fn open_with<'a>(
     launch: &'a DirectionLaunch,
     recorder: &mut Recorder,
     start: &RunStart,
-    plan: StampPlan,
+    (plan, seal): (StampPlan, Option<&RunSeal>),
 ) -> Result<(&'a DirectionLaunch, Opened), GatewayError> {
     let sinks = open_sinks(launch, recorder)?;
-    let socket = OpenSocket::open(launch, start, plan)?;
+    let socket = OpenSocket::open(launch, start, (plan, seal))?;
     Ok((
         launch,
         Opened {
@@ -95,6 +99,7 @@ pub fn open_with<'a>(
             sinks,
             plan,
             count: Arc::default(),
+            pulse: Pulse::default(),
             // A receiver has nobody to wait for: it takes what comes.
             is_established: Arc::new(AtomicBool::new(launch.side == Side::Ingress)),
         },
@@ -138,6 +143,11 @@ impl Opened {
         self.socket.tally.clone()
     }
 
+    /// The turns of the thread that will carry the messages.
+    pub(crate) fn pulse(&self) -> Pulse {
+        self.pulse.clone()
+    }
+
     /// True while the peer takes this direction's messages.
     pub fn is_established(&self) -> Arc<AtomicBool> {
         Arc::clone(&self.is_established)
@@ -172,7 +182,12 @@ impl Opened {
                 (launch, surroundings),
             )?)),
         };
-        Ok(Direction { way, facts, replay })
+        Ok(Direction {
+            way,
+            pulse: self.pulse,
+            facts,
+            replay,
+        })
     }
 }
 
@@ -258,8 +273,8 @@ impl Direction {
     /// When the channel or the socket itself breaks, or the peer refuses the channel for good.
     pub fn run(&mut self) -> Result<(), GatewayError> {
         match &mut self.way {
-            Way::Egress(egress) => egress.run(),
-            Way::Ingress(ingress) => ingress.run(),
+            Way::Egress(egress) => egress.run(&self.pulse),
+            Way::Ingress(ingress) => ingress.run(&self.pulse),
         }
     }
 
@@ -288,18 +303,24 @@ impl Direction {
     /// Every counter of the direction.
     pub fn report(&self, launch: &DirectionLaunch) -> DirectionReport {
         let now = MonotonicClock::now();
-        let (direction, peer_state, mut counters, stream) = match &self.way {
+        let (direction, peer_state, mut counters, (stream, seal)) = match &self.way {
             Way::Egress(egress) => (
                 "egress",
                 counters::egress_state(egress),
                 counters::of_egress(egress),
-                egress.line.sender().stream_figures(now),
+                (
+                    egress.line.sender().stream_figures(now),
+                    egress.line.sender().seal_counts(),
+                ),
             ),
             Way::Ingress(ingress) => (
                 "ingress",
                 counters::ingress_state(ingress),
                 counters::of_ingress(ingress),
-                ingress.receiver.stream_figures(now),
+                (
+                    ingress.receiver.stream_figures(now),
+                    ingress.receiver.seal_counts(),
+                ),
             ),
         };
         let mut facts = self.facts.clone();
@@ -309,6 +330,7 @@ impl Direction {
             let counters = ingress.receiver.counters();
             facts.extend(counters::mark_fact(launch.socket.dscp, &counters));
         }
+        counters.extend(seal.iter().flat_map(counters::of_seal));
         if let Some(figures) = stream {
             counters.extend(stream::counters(&figures));
             facts.extend(stream::facts(&figures, launch.side));

@@ -14,6 +14,7 @@ use super::line::{Line, STAMP_PATIENCE_NS};
 use super::{GatewayError, poll_descriptors};
 use crate::channel::{RawInput, Waiter};
 use crate::clock::MonotonicClock;
+use crate::process::pulse::Pulse;
 use crate::wait::{Pause, WaitStrategy};
 
 /// Longer than any reply; what is longer is no reply and is cut.
@@ -55,11 +56,12 @@ impl Egress {
     ///
     /// # Errors
     /// When the channel or the socket itself breaks, or the peer refuses the channel for good.
-    pub(crate) fn run(&mut self) -> Result<(), GatewayError> {
+    pub(crate) fn run(&mut self, pulse: &Pulse) -> Result<(), GatewayError> {
         while !self.stop.load(Ordering::Acquire) {
             if !self.step()? {
                 self.rest()?;
             }
+            pulse.beat();
         }
         self.bridge.bye();
         self.line.transmit(&mut self.bridge);
@@ -232,7 +234,8 @@ impl Egress {
                     None => (false, is_announced),
                 };
                 self.attention.has_news |= has_socket_news;
-                self.attention.is_announced |= is_announced;
+                // After a quiet wait it is looked at as well: see `Waiter::drain`.
+                self.attention.is_announced |= is_announced || !has_socket_news;
             }
         }
         Ok(())

@@ -18,6 +18,7 @@ use super::kernel_clock::KernelClock;
 use super::{GatewayError, poll_descriptors};
 use crate::channel::{ChannelError, RawOutput};
 use crate::clock::MonotonicClock;
+use crate::process::pulse::Pulse;
 use crate::record::RecordSink;
 use crate::wait::{Pause, WaitStrategy, release};
 
@@ -94,11 +95,12 @@ impl Ingress {
     ///
     /// # Errors
     /// When the channel or the socket itself breaks.
-    pub(crate) fn run(&mut self) -> Result<(), GatewayError> {
+    pub(crate) fn run(&mut self, pulse: &Pulse) -> Result<(), GatewayError> {
         while !self.stop.load(Ordering::Acquire) {
             if !self.step()? {
                 self.rest()?;
             }
+            pulse.beat();
         }
         self.bridge.finish();
         Ok(())

@@ -76,12 +76,18 @@ pub enum GatewayError {
     /// No thread.
     #[error("cannot start a thread: {0}")]
     Thread(io::Error),
+    /// The run's secret, without which its hops are not opened.
+    #[error("the supervisor did not give the run's secret")]
+    SecretMissing,
     /// No random session number.
     #[error("cannot choose a session number: {0}")]
     Session(io::Error),
     /// The other end does not want this channel.
     #[error("the gateway at the other end refused the channel: {}", .0.label())]
     Refused(HelloStatus),
+    /// A record file could not be written any more.
+    #[error("{0}")]
+    Unrecorded(String),
     /// A thread panicked.
     #[error("a gateway thread panicked")]
     Panicked,

@@ -22,6 +22,7 @@ use crate::process::launch::{DirectionLaunch, GatewayLaunch, Side, read};
 use crate::process::pipe::{
     ChannelProgress, DirectionReport, FromProcess, Orders, ProcessReport, say,
 };
+use crate::process::pulse::Pulses;
 use crate::process::usage::add_usage;
 use crate::radio::sampler::Sampler;
 use crate::realtime::{self, RealtimeGrant, SpinAdvice};
@@ -31,6 +32,8 @@ use crate::wait::WaitMode;
 const PROGRESS_PERIOD: Duration = Duration::from_millis(250);
 /// How often orders and threads are looked at.
 const WATCH_PERIOD: Duration = Duration::from_millis(5);
+/// How long the run's secret may take, which the supervisor writes as soon as the process is there.
+const SEAL_PATIENCE: Duration = Duration::from_secs(5);
 /// How long each half of the stamp probe may take; a restart must not wait long for it.
 pub(crate) const PROBE_BOUND: Duration = Duration::from_millis(300);
 
@@ -49,6 +52,13 @@ pub(crate) fn run(launch: &Path) -> Result<(), GatewayError> {
 fn prepare_and_live(path: &Path) -> Result<(), GatewayError> {
     let orders = Orders::listen().map_err(GatewayError::Thread)?;
     let launch: GatewayLaunch = read(path)?;
+    let seal = launch
+        .is_sealed
+        .then(|| orders.wait_for_seal(SEAL_PATIENCE));
+    if matches!(seal, Some(None)) {
+        return Err(GatewayError::SecretMissing);
+    }
+    let seal = seal.flatten();
     let domain = Domain::open(&launch.domain.parse()?)?;
     let surroundings = Arc::new(Surroundings::new(domain)?);
     let mut armed = arming::arm(&launch);
@@ -60,14 +70,17 @@ fn prepare_and_live(path: &Path) -> Result<(), GatewayError> {
             direction,
             &mut recorder,
             &orders.run_start(),
-            armed.plan(direction),
+            (armed.plan(direction), seal.as_ref()),
         )?);
     }
     let sampler = armed.prepare_sampler(&launch.process, &mut recorder);
     let switches = opened.iter_mut().filter_map(|(_, one)| one.take_switch());
     let switches = switches.collect();
     let mut control = LinkControl::open(&surroundings.domain, &launch, switches)?;
-    recorder.start().map_err(GatewayError::Thread)?;
+    let on_failure = orders.stopper();
+    recorder
+        .start_and_tell(on_failure)
+        .map_err(GatewayError::Thread)?;
     let stop = Arc::clone(&surroundings.stop);
     let sampler = sampler.map(|one| one.start(stop)).transpose()?;
     let counters: Vec<Counter> = opened
@@ -75,6 +88,7 @@ fn prepare_and_live(path: &Path) -> Result<(), GatewayError> {
         .map(|(launch, one)| counter(launch, one))
         .collect();
     let established: Vec<_> = opened.iter().map(|(_, one)| one.is_established()).collect();
+    let mut pulses = Pulses::of(opened.iter().map(|(_, one)| one.pulse()));
     let mut watched: Vec<_> = opened
         .iter()
         .filter_map(|(launch, one)| Some(Connection::new(launch, one.tally()?)))
@@ -97,7 +111,7 @@ fn prepare_and_live(path: &Path) -> Result<(), GatewayError> {
             launch: &launch,
         });
         let hops = (counters.as_slice(), established.as_slice());
-        let beside = (watched.as_mut_slice(), &mut control);
+        let beside = (watched.as_mut_slice(), &mut control, &mut pulses);
         watch(&orders, &threads, hops, (beside, patience));
     }
     surroundings.stop.store(true, Ordering::Release);
@@ -131,8 +145,8 @@ fn watch(
     orders: &Orders,
     threads: &[JoinHandle<Lived>],
     (counters, established): (&[Counter], &[Arc<AtomicBool>]),
-    ((connections, control), patience): (
-        (&mut [Connection], &mut LinkControl),
+    ((connections, control, pulses), patience): (
+        (&mut [Connection], &mut LinkControl, &mut Pulses),
         Option<Patience<'_>>,
     ),
 ) {
@@ -155,6 +169,7 @@ fn watch(
         if now.saturating_duration_since(told) >= PROGRESS_PERIOD {
             told = now;
             report_progress(counters);
+            say_if_alive(pulses);
         }
         if is_ready {
             for connection in &mut *connections {
@@ -175,6 +190,13 @@ fn counter(launch: &DirectionLaunch, opened: &Opened) -> Counter {
         Side::Ingress => "received",
     };
     (launch.channel.clone(), what, opened.count())
+}
+
+/// Says that the threads of this process turn, if they do.
+pub(crate) fn say_if_alive(pulses: &mut Pulses) {
+    if pulses.have_all_beaten() {
+        say(&FromProcess::Alive);
+    }
 }
 
 pub(crate) fn report_progress(counters: &[Counter]) {
@@ -260,11 +282,12 @@ fn finish(
         }
     }
     let written = recorder.finish();
+    let problem = written.problem();
     report.recorder_dropped = written.dropped_count;
     report.recorder_failures = written.failures;
     add_usage(&mut report);
     say(&FromProcess::Finished(Box::new(report)));
-    outcome
+    outcome.and(problem.map_or(Ok(()), |text| Err(GatewayError::Unrecorded(text))))
 }
 
 /// Says what a spinning thread, of the channel or arm `name`, will lose or take on its CPU.

@@ -1,13 +1,13 @@
 //! The socket of one channel direction: opened as its launch description says, behind a link model
 //! where it has one, with what the kernel granted. It moves no message.
 
-use std::fs;
 use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
 use hil_gateways::protocol::wire::{self, Kind};
 use hil_gateways::transport::emulated::{EmulatedReceiver, EmulatedSettings};
+use hil_gateways::transport::sealed::{SealedReceiver, SealedSender};
 use hil_gateways::transport::tcp::{
     ConnectionTally, KEEP_ALIVE_COUNT, KEEP_ALIVE_IDLE, KEEP_ALIVE_INTERVAL, TcpReceiver,
     TcpSender, TcpSettings, USER_TIMEOUT,
@@ -23,12 +23,14 @@ use super::GatewayError;
 use super::link_switch::{SwitchHandle, switch};
 use super::stamp_plan::StampPlan;
 use crate::clock::MonotonicClock;
+use crate::host_facts::{HostFiles, kernel_release};
 use crate::process::emulation_room::EmulationRoom;
 use crate::process::launch::{
     DirectionLaunch, EmulationError, EmulationLaunch, Side, SocketLaunch, Transport,
 };
 use crate::process::pipe::RunStart;
 use crate::radio::category;
+use crate::security::RunSeal;
 use crate::topology::Timestamps;
 
 /// IP and UDP headers of a datagram.
@@ -61,19 +63,21 @@ impl OpenSocket {
     pub(super) fn open(
         launch: &DirectionLaunch,
         start: &RunStart,
-        plan: StampPlan,
+        (plan, seal): (StampPlan, Option<&RunSeal>),
     ) -> Result<Self, GatewayError> {
         let settings = udp_settings(launch, plan);
-        match launch.socket.transport {
-            Transport::Udp => Self::open_udp(&settings, (launch, plan), start),
-            Transport::Tcp => Self::open_tcp(&settings, launch),
-        }
+        let mut opened = match launch.socket.transport {
+            Transport::Udp => Self::open_udp(&settings, (launch, plan), (start, seal)),
+            Transport::Tcp => Self::open_tcp(&settings, launch, seal),
+        }?;
+        opened.facts.push(security_fact(seal));
+        Ok(opened)
     }
 
     fn open_udp(
         settings: &UdpSettings,
         (launch, plan): (&DirectionLaunch, StampPlan),
-        start: &RunStart,
+        (start, seal): (&RunStart, Option<&RunSeal>),
     ) -> Result<Self, GatewayError> {
         let (ends, mut facts, (replay, switch)) = match launch.side {
             Side::Egress => {
@@ -87,11 +91,14 @@ impl OpenSocket {
                 let text = format!("{} bytes, {configured} configured", mtu.packet_bytes);
                 facts.push(("path MTU".to_owned(), text));
                 let longest = datagram_bytes_max(launch, mtu);
-                (Ends::Sender(Box::new(sender), longest), facts, (None, None))
+                let sender = sealed_sender(sender, launch, seal)?;
+                (Ends::Sender(sender, longest), facts, (None, None))
             }
             Side::Ingress => {
                 let receiver = UdpReceiver::open(settings)?;
                 let facts = socket_facts(settings, receiver.granted());
+                // Below the link model, which must not meet what a stranger sends.
+                let receiver = sealed_receiver(receiver, launch, seal)?;
                 let (receiver, replay, switch) = emulate(receiver, launch, start)?;
                 (Ends::Receiver(receiver), facts, (replay, switch))
             }
@@ -115,7 +122,11 @@ impl OpenSocket {
         })
     }
 
-    fn open_tcp(common: &UdpSettings, launch: &DirectionLaunch) -> Result<Self, GatewayError> {
+    fn open_tcp(
+        common: &UdpSettings,
+        launch: &DirectionLaunch,
+        seal: Option<&RunSeal>,
+    ) -> Result<Self, GatewayError> {
         let settings = TcpSettings {
             interface: common.interface.clone(),
             dscp: common.dscp,
@@ -130,12 +141,14 @@ impl OpenSocket {
                 let sender = TcpSender::open(settings)?;
                 let (granted, longest) = (sender.granted(), sender.datagram_bytes_max());
                 let tally = Some(sender.tally());
-                (Ends::Sender(Box::new(sender), longest), granted, tally)
+                let sender = sealed_sender(sender, launch, seal)?;
+                (Ends::Sender(sender, longest), granted, tally)
             }
             Side::Ingress => {
                 let receiver = TcpReceiver::open(settings)?;
                 let granted = receiver.granted();
-                (Ends::Receiver(Box::new(receiver)), granted, None)
+                let receiver = sealed_receiver(receiver, launch, seal)?;
+                (Ends::Receiver(receiver), granted, None)
             }
         };
         let mut facts = socket_facts(common, granted);
@@ -155,6 +168,42 @@ impl OpenSocket {
             switch: None,
         })
     }
+}
+
+fn sealed_sender(
+    sender: impl DatagramSender + 'static,
+    launch: &DirectionLaunch,
+    seal: Option<&RunSeal>,
+) -> Result<Box<dyn DatagramSender>, GatewayError> {
+    let Some(seal) = seal else {
+        return Ok(Box::new(sender));
+    };
+    let initiator = seal.initiator(launch).map_err(GatewayError::Session)?;
+    Ok(Box::new(SealedSender::new(sender, initiator)))
+}
+
+fn sealed_receiver(
+    receiver: impl DatagramReceiver + 'static,
+    launch: &DirectionLaunch,
+    seal: Option<&RunSeal>,
+) -> Result<Box<dyn DatagramReceiver>, GatewayError> {
+    let Some(seal) = seal else {
+        return Ok(Box::new(receiver));
+    };
+    let responder = seal.responder(launch).map_err(GatewayError::Session)?;
+    Ok(Box::new(SealedReceiver::new(
+        receiver,
+        responder,
+        launch.peer,
+    )))
+}
+
+fn security_fact(seal: Option<&RunSeal>) -> (String, String) {
+    let text = match seal {
+        Some(seal) => format!("sealed, {}", seal.suite().label()),
+        None => "plain".to_owned(),
+    };
+    ("security".to_owned(), text)
 }
 
 fn udp_settings(launch: &DirectionLaunch, plan: StampPlan) -> UdpSettings {
@@ -192,8 +241,8 @@ pub(crate) const fn timestamp_mode(asked: Timestamps) -> TimestampMode {
 
 /// Where this direction stands when stations contend for the air.
 fn access_category(granted: GrantedOptions) -> (String, String) {
-    let release = fs::read_to_string("/proc/sys/kernel/osrelease").unwrap_or_default();
-    let text = category::describe(granted.priority, granted.dscp, release.trim());
+    let release = kernel_release(&HostFiles::of_this_host());
+    let text = category::describe(granted.priority, granted.dscp, &release.to_text());
     ("access category".to_owned(), text)
 }
 
@@ -246,12 +295,12 @@ type Emulated = (
 /// Puts the receiver behind the launch's link model, if it has one. Greetings and clock exchanges
 /// pass freely: the model stands for what happens to the robot's messages.
 fn emulate(
-    receiver: UdpReceiver,
+    receiver: Box<dyn DatagramReceiver>,
     launch: &DirectionLaunch,
     start: &RunStart,
 ) -> Result<Emulated, GatewayError> {
     let Some(emulation) = &launch.emulation else {
-        return Ok((Box::new(receiver), None, None));
+        return Ok((receiver, None, None));
     };
     let link = SinceStart {
         link: emulation.model(&launch.channel)?,

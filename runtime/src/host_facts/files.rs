@@ -63,17 +63,58 @@ impl HostFiles {
             })
     }
 
-    /// The names in a folder, sorted; empty when the folder cannot be read.
-    pub fn names_in(&self, path: &str) -> Vec<String> {
-        let Ok(entries) = fs::read_dir(self.locate(path)) else {
-            return Vec::new();
+    /// The names in a folder, sorted.
+    pub fn list(&self, path: &str) -> Fact<Vec<String>> {
+        let entries = match fs::read_dir(self.locate(path)) {
+            Ok(entries) => entries,
+            Err(error) => return Fact::Unavailable(format!("{path}: {error}")),
         };
         let mut names: Vec<String> = entries
             .flatten()
             .map(|entry| entry.file_name().to_string_lossy().into_owned())
             .collect();
         names.sort();
-        names
+        Fact::Available(names)
+    }
+
+    /// The names of the processes that this one can see, cut at fifteen bytes as the kernel does.
+    pub(crate) fn process_names(&self) -> Fact<Vec<String>> {
+        self.list("/proc").and_then(|entries| {
+            let is_number = |name: &&String| name.bytes().all(|byte| byte.is_ascii_digit());
+            let names: Vec<String> = entries
+                .iter()
+                .filter(is_number)
+                .filter_map(|process| {
+                    // One that ended in between has no name any more.
+                    let name = self.read(&format!("/proc/{process}/comm"));
+                    name.available().cloned()
+                })
+                .collect();
+            if names.is_empty() {
+                return Fact::Unavailable("/proc shows no process".to_owned());
+            }
+            Fact::Available(names)
+        })
+    }
+
+    /// Where the symbolic link `path` points, as it is written.
+    pub fn link_target(&self, path: &str) -> Fact<String> {
+        match fs::read_link(self.locate(path)) {
+            Ok(target) => Fact::Available(target.to_string_lossy().into_owned()),
+            Err(error) => Fact::Unavailable(format!("{path}: {error}")),
+        }
+    }
+
+    /// The first number of a binary file: a signed 32-bit word in the host's order.
+    pub(crate) fn read_word(&self, path: &str) -> Fact<i32> {
+        let read = fs::File::open(self.locate(path)).and_then(|mut file| {
+            let mut word = [0; 4];
+            io::Read::read_exact(&mut file, &mut word).map(|()| i32::from_ne_bytes(word))
+        });
+        match read {
+            Ok(word) => Fact::Available(word),
+            Err(error) => Fact::Unavailable(format!("{path}: {error}")),
+        }
     }
 
     /// The value behind `key` in a file of `key: value` lines, such as `/proc/meminfo`.

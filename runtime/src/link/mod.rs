@@ -476,7 +476,7 @@ mod tests {
             loss_ratio,
         };
         let mut said = |condition| links.set(&direction, condition).unwrap_err().to_string();
-        assert!(said(fixed(1, 1.5)).contains("1.5 is outside 0..=1"));
+        assert!(said(fixed(1, 1.5)).contains("1.5 is outside 0 to 1"));
         assert!(said(fixed(20, 0.0)).contains("room for 10.0 s of 100 messages per second"));
         assert!(said(fixed(1, 0.0)).contains("the run has ended"));
     }

@@ -295,6 +295,12 @@ impl Observer {
                 _ => tails.entry(channel.to_owned()).or_default().add(batch),
             }
         });
+        // A link that lets nothing through leaves its far end's records as they are: they are at hand.
+        for header in follower.headers() {
+            if let Some(tail) = tails.get_mut(&header.channel) {
+                tail.expect(header.kind);
+            }
+        }
         problems.extend(follower.take_problems());
         passive.retain(|channel, reader| {
             let known = arrivals.entry(channel.clone()).or_default();
@@ -348,6 +354,20 @@ impl Observer {
             return Some(self.tails.get(channel)?.arrivals());
         }
         self.arrivals.get(channel).cloned()
+    }
+
+    /// How many messages of `channel` a gateway of this host brought. `None` when none is here that
+    /// could have.
+    pub(crate) fn brought_count(&self, channel: &str) -> Option<usize> {
+        let to_host = self.ends(channel).1?;
+        let is_here = self.run.hosts().any(|here| here == to_host);
+        let tail = self.tails.get(channel).filter(|_| is_here)?;
+        Some(tail.arrivals().len())
+    }
+
+    /// True when the records of `channel` are kept here, whatever is in them.
+    pub(crate) fn is_recorded(&self, channel: &str) -> bool {
+        self.follower.headers().any(|one| one.channel == channel)
     }
 
     /// As [`Self::arrivals`], and forgets them.

@@ -93,6 +93,18 @@ impl ChannelTail {
         }
     }
 
+    /// Knows from now on that records of this kind are at hand: that a message has none then means
+    /// something.
+    pub(crate) fn expect(&mut self, kind: RecordKind) {
+        match kind {
+            RecordKind::Published => drop(self.published.get_or_insert_default()),
+            RecordKind::Egress => drop(self.egress.get_or_insert_default()),
+            RecordKind::Ingress => drop(self.ingress.get_or_insert_default()),
+            RecordKind::Taken => drop(self.taken.get_or_insert_default()),
+            _ => {}
+        }
+    }
+
     fn see(&mut self, (published_ns, here_ns): (Option<i64>, Option<i64>)) {
         self.newest_published_ns = self.newest_published_ns.max(published_ns);
         self.newest_here_ns = self.newest_here_ns.max(here_ns);
@@ -258,6 +270,7 @@ fn renumber<R: OfMessage>(records: Option<&[R]>, lowest: &[(u32, u64)]) -> Optio
 mod tests {
     use super::*;
     use hil_models::measure::account::{ChannelPath, MessageFate};
+    use hil_models::time::Alignment;
 
     const MS: i64 = 1_000_000;
 
@@ -314,6 +327,36 @@ mod tests {
         assert_eq!(account.fates.of(MessageFate::SupersededAtConsumer), 2);
         let delay = account.end_to_end.distribution.measured().unwrap();
         assert_eq!((delay.min_ns, delay.max_ns), (129, 149));
+    }
+
+    #[test]
+    fn what_left_and_never_came_is_lost_only_where_its_arrival_would_be_on_record() {
+        let mut tail = ChannelTail::default();
+        let each = tail_of_sent();
+        let seen = extend(&mut tail.egress, each.into_iter());
+        tail.see(seen);
+        let path = ChannelPath::Gateway {
+            alignment: Some(Alignment::SAME_CLOCK),
+        };
+        let context = AccountContext::new(path);
+        let fates = |tail: &ChannelTail| tail.account((i64::MAX, 0), &context).fates;
+        let unknown = MessageFate::UnknownPeerRecordsUnavailable;
+        assert_eq!(fates(&tail).of(unknown), 20);
+        tail.expect(RecordKind::Ingress);
+        assert_eq!(fates(&tail).of(unknown), 0);
+        assert_eq!(fates(&tail).of(MessageFate::LostOnWire), 20);
+        assert!(tail.arrivals().is_empty());
+    }
+
+    /// What a gateway sent, one message each millisecond.
+    fn tail_of_sent() -> Vec<EgressRecord> {
+        let one = |number: u64| EgressRecord {
+            sequence: number,
+            published_ns: number.cast_signed() * MS,
+            handed_ns: number.cast_signed() * MS + 10,
+            ..bytemuck::Zeroable::zeroed()
+        };
+        (0..20).map(one).collect()
     }
 
     #[test]

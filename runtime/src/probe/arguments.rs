@@ -33,6 +33,19 @@ Exit codes: 0 done; 1 packets were dropped, an interface failed, a file has a fa
 differ; 2 wrong arguments, nothing to read, or a capture without anything of the run; 69 no such interface; 78 the right to capture is missing (root or
 CAP_NET_RAW), --tap bpf cannot be had, or the card gives no stamps; 130 interrupted before --duration was over, the file is complete";
 
+const ANALYSE_EXAMPLES: &str = "\
+Examples:
+  hil-runtime probe analyse here.pcapng there.pcapng
+      our own datagrams between two points
+  hil-runtime probe analyse bridge.pcapng --flow udp:dport=5004,id=2+2 --json
+      RTP in one capture, known again by its sequence number";
+
+const COMPARE_EXAMPLES: &str = "\
+Example:
+  hil-runtime probe compare runs/shuttle-split-20261122-101500-control-pc here.pcapng there.pcapng
+
+Exit code 1 when counts differ, or medians lie farther apart than --limit.";
+
 /// Look at the wire without taking part: capture, analyse, compare with a run.
 #[derive(Debug, Args)]
 #[command(
@@ -99,6 +112,7 @@ pub(crate) enum Stamps {
 #[derive(Debug, Subcommand)]
 pub(crate) enum ProbeWork {
     /// Delay, jitter, loss, reordering and gaps of the flows in one or two captures.
+    #[command(after_help = ANALYSE_EXAMPLES)]
     Analyse {
         /// pcap or pcapng, also of an ET2000.
         file: PathBuf,
@@ -113,6 +127,7 @@ pub(crate) enum ProbeWork {
         reading: ReadingArgs,
     },
     /// The gateways' account of a finished run beside two captures of its wire.
+    #[command(after_help = COMPARE_EXAMPLES)]
     Compare {
         /// The run's folder, of either host.
         run: PathBuf,

@@ -19,6 +19,7 @@ use serde::Serialize;
 
 use super::analyse::{Reading, quantiles};
 use super::point_clocks::WireClocks;
+use crate::progress::Stage;
 use crate::record::{RecordFile, RecordFileError, RecordKind};
 use crate::report::summary::{RunSummary, SummaryError};
 use crate::run_folder::RunFolder;
@@ -169,9 +170,11 @@ pub(super) fn compare(
     run: &Path,
     captures: &Reading,
     window_ns: i64,
+    stage: &Stage,
 ) -> Result<Comparison, CompareError> {
     let folder = RunFolder::existing(run);
-    let sides = gateway_sides(&folder)?;
+    let sides = gateway_sides(&folder, stage)?;
+    stage.tell(None, "joining with the run");
     if sides.is_empty() {
         return Err(CompareError::NoGateway(run.to_owned()));
     }
@@ -223,17 +226,22 @@ fn file_without(sides: &BTreeMap<String, GatewaySide>, captures: &Reading) -> Op
     Some(file.path.clone())
 }
 
-fn gateway_sides(folder: &RunFolder) -> Result<BTreeMap<String, GatewaySide>, CompareError> {
-    let failed = |source| CompareError::Folder {
-        path: folder.records(),
-        source,
-    };
+fn gateway_sides(
+    folder: &RunFolder,
+    stage: &Stage,
+) -> Result<BTreeMap<String, GatewaySide>, CompareError> {
+    let files = folder
+        .record_files()
+        .map_err(|source| CompareError::Folder {
+            path: folder.records(),
+            source,
+        })?;
+    let all_bytes: u64 = files.iter().map(|(_, bytes)| bytes).sum();
+    let mut read_bytes = 0;
     let mut sides: BTreeMap<String, GatewaySide> = BTreeMap::new();
-    for entry in fs::read_dir(folder.records()).map_err(failed)? {
-        let path = entry.map_err(failed)?.path();
-        if path.extension().is_none_or(|extension| extension != "rec") {
-            continue;
-        }
+    for (path, bytes) in files {
+        stage.reach(read_bytes as f64 / all_bytes.max(1) as f64);
+        read_bytes += bytes;
         let file = RecordFile::read(&path)?;
         let channel = file.header.channel.clone();
         match file.header.kind {

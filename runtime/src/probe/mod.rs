@@ -62,8 +62,9 @@ pub(crate) fn run(args: &ProbeArgs, console: &mut Console) -> u8 {
             for complaint in captures.complaints() {
                 console.warn(&complaint);
             }
-            let compared = Progress::begin().during(console, "joining with the run", |_| {
-                compare::compare(run, &captures, window_ns(reading))
+            let words = "reading records of the run";
+            let compared = Progress::begin().during(console, words, |stage| {
+                compare::compare(run, &captures, window_ns(reading), stage)
             });
             match compared {
                 Ok(comparison) => {

@@ -14,6 +14,7 @@ use hil_models::message::{Envelope, MessageType};
 
 use super::launch::{ComponentLaunch, LaunchError, read};
 use super::pipe::{ChannelProgress, FromProcess, Orders, ProcessReport, say};
+use super::pulse::{Pulse, Pulses};
 use super::recording::{Destination, RecordedInput, RecordedOutput};
 use super::usage::add_usage;
 use crate::channel::{
@@ -53,6 +54,8 @@ pub(crate) enum ComponentError {
     Ports(#[from] PortCountError),
     #[error("cannot start a thread: {0}")]
     Thread(#[from] std::io::Error),
+    #[error("{0}")]
+    Unrecorded(String),
 }
 
 type ComponentEndpoint = Endpoint<RecordedInput, RecordedOutput>;
@@ -79,7 +82,7 @@ fn prepare_and_live(path: &Path, registry: &Registry) -> Result<(), ComponentErr
     let counts = Counts::of(&card);
     let mut recorder = Recorder::new(&launch.records, &launch.process, launch.instance);
     let sinks = Sinks::open(&card, &mut recorder)?;
-    recorder.start()?;
+    recorder.start_and_tell(orders.stopper())?;
     let progress = counts.report_progress()?;
 
     // Everything below runs on this thread, which from here on is the measured one.
@@ -96,17 +99,19 @@ fn prepare_and_live(path: &Path, registry: &Registry) -> Result<(), ComponentErr
     };
     let mut lived = Ok(());
     if orders.wait_for_start() {
-        let how = (launch.wait, counts.skipped.as_ref());
+        let how = (launch.wait, &counts);
         lived = live(endpoint, waiter.as_mut(), &orders, how, &mut report);
         progress.store(false, Ordering::Release);
     }
     drop(waiter);
     let outcome = recorder.finish();
+    let problem = outcome.problem();
     report.recorder_dropped = outcome.dropped_count;
     report.recorder_failures = outcome.failures;
     add_usage(&mut report);
     say(&FromProcess::Finished(Box::new(report)));
-    Ok(lived?)
+    lived?;
+    problem.map_or(Ok(()), |text| Err(ComponentError::Unrecorded(text)))
 }
 
 fn make_role(card: &ProcessCard, registry: &Registry) -> Result<Box<dyn Role>, ComponentError> {
@@ -129,6 +134,7 @@ struct Counts {
     given: Vec<Count>,
     /// Ticks that passed without the role; [`NO_TIMER`] for one that has none.
     skipped: Arc<AtomicU64>,
+    pulse: Pulse,
 }
 
 /// How many messages of a channel went which way.
@@ -160,6 +166,7 @@ impl Counts {
             taken: card.inputs.iter().map(|one| count(one, "taken")).collect(),
             given: card.outputs.iter().map(given).collect(),
             skipped: Arc::new(AtomicU64::new(NO_TIMER)),
+            pulse: Pulse::default(),
         }
     }
 
@@ -179,6 +186,7 @@ impl Counts {
             })
             .collect();
         let skipped = Arc::clone(&self.skipped);
+        let mut pulses = Pulses::of([self.pulse.clone()]);
         let is_running = Arc::new(AtomicBool::new(true));
         let running = Arc::clone(&is_running);
         thread::Builder::new()
@@ -186,6 +194,9 @@ impl Counts {
             .spawn(move || {
                 while running.load(Ordering::Acquire) {
                     thread::sleep(PROGRESS_PERIOD);
+                    if pulses.have_all_beaten() {
+                        say(&FromProcess::Alive);
+                    }
                     let counts = all.iter().map(|(progress, count)| ChannelProgress {
                         count: count.load(Ordering::Relaxed),
                         ..progress.clone()
@@ -327,7 +338,7 @@ fn live(
     mut endpoint: ComponentEndpoint,
     mut waiter: Option<&mut Waiter>,
     orders: &Orders,
-    (mode, skipped): (WaitMode, &AtomicU64),
+    (mode, counts): (WaitMode, &Counts),
     report: &mut ProcessReport,
 ) -> Result<(), ChannelError> {
     let own_wait = WaitStrategy::new(mode);
@@ -336,7 +347,9 @@ fn live(
     while outcome.is_ok() && !orders.is_stopping() {
         let ticks = report.ticks;
         outcome = turn(&mut endpoint, &mut waiter, &own_wait, report);
+        counts.pulse.beat();
         if report.ticks != ticks {
+            let skipped = &counts.skipped;
             skipped.store(endpoint.role().skipped_ticks(), Ordering::Relaxed);
         }
     }

@@ -56,6 +56,9 @@ pub struct GatewayLaunch {
     /// How long it waits for the peer's answer before it is ready without; `None` waits on.
     #[serde(default)]
     pub ready_within: Option<Duration>,
+    /// Its hops are sealed: the first word on its standard input is the run's secret.
+    #[serde(default)]
+    pub is_sealed: bool,
 }
 
 /// One channel direction through a gateway.

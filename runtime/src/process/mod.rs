@@ -6,5 +6,6 @@ pub mod emulation_room;
 pub mod launch;
 pub(crate) mod own_program;
 pub mod pipe;
+pub mod pulse;
 pub(crate) mod recording;
 pub(crate) mod usage;

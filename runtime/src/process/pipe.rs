@@ -2,21 +2,27 @@
 //! the child's standard input and output. Messages of channels never go this way.
 
 use std::io::{self, BufRead, Write};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicI64, AtomicU8, Ordering};
+use std::sync::mpsc::{Receiver, channel};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::Duration;
 
 use hil_models::link::trace::ReplayCounts;
 use hil_models::time::Instant;
 use serde::{Deserialize, Serialize};
+use zeroize::Zeroizing;
 
 use crate::realtime::RealtimeGrant;
+use crate::security::RunSeal;
 
 /// From the supervisor to a process.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum ToProcess {
+    /// The run's secret, the first word to a gateway whose hops are sealed. It goes this way because
+    /// a launch file stays behind.
+    Seal(RunSeal),
     /// Begin the run.
     Start {
         /// When it began on the host's monotonic clock; earlier than now for a process that was
@@ -33,6 +39,8 @@ pub enum ToProcess {
 pub enum FromProcess {
     /// Everything is open; waiting for the start.
     Ready,
+    /// Every loop of the process has turned since it last said so: a few times a second.
+    Alive,
     /// Counts so far, a few times a second.
     Progress(Vec<ChannelProgress>),
     /// Grid points of the role's timer that passed without a tick so far; not of a role without one.
@@ -138,6 +146,7 @@ const STOPPING: u8 = 2;
 pub struct Orders {
     state: Arc<AtomicU8>,
     start: RunStart,
+    seal: Arc<Mutex<Receiver<RunSeal>>>,
 }
 
 /// When the run began, for whoever counts from there; readable without a system call.
@@ -178,11 +187,17 @@ impl Orders {
         let shared = Arc::clone(&state);
         let start = RunStart::default();
         let began = start.clone();
+        let (sealed, seal) = channel();
         thread::Builder::new()
             .name("orders".to_owned())
             .spawn(move || {
                 for line in io::stdin().lock().lines() {
-                    match line.ok().and_then(|line| serde_json::from_str(&line).ok()) {
+                    let line = line.ok().map(Zeroizing::new);
+                    match line.and_then(|line| serde_json::from_str(&line).ok()) {
+                        Some(ToProcess::Seal(seal)) => {
+                            // A gateway of plain hops asks for none.
+                            let _unasked = sealed.send(seal).is_err();
+                        }
                         Some(ToProcess::Start { at_ns }) => {
                             began.set(Instant::from_ns(at_ns));
                             shared.store(STARTED, Ordering::Release);
@@ -192,12 +207,25 @@ impl Orders {
                 }
                 shared.store(STOPPING, Ordering::Release);
             })?;
-        Ok(Self { state, start })
+        let seal = Arc::new(Mutex::new(seal));
+        Ok(Self { state, start, seal })
     }
 
     /// When the run began.
     pub fn run_start(&self) -> RunStart {
         self.start.clone()
+    }
+
+    /// Ends the process as an order to stop would, from whichever thread calls it.
+    pub fn stopper(&self) -> impl Fn() + Send + use<> {
+        let state = Arc::clone(&self.state);
+        move || state.store(STOPPING, Ordering::Release)
+    }
+
+    /// Waits up to `limit` for the run's secret; once.
+    pub fn wait_for_seal(&self, limit: Duration) -> Option<RunSeal> {
+        let seal = self.seal.lock().unwrap_or_else(PoisonError::into_inner);
+        seal.recv_timeout(limit).ok()
     }
 
     /// True once the process should end.
@@ -244,6 +272,7 @@ mod tests {
         };
         for message in [
             FromProcess::Ready,
+            FromProcess::Alive,
             FromProcess::Warning("spin on a shared CPU".to_owned()),
             FromProcess::Finished(Box::new(report)),
         ] {

@@ -3,32 +3,24 @@
 
 use std::io;
 use std::os::fd::{AsRawFd, OwnedFd, RawFd};
-use std::time::Duration;
 
 use nix::errno::Errno;
 use nix::net::if_::if_nametoindex;
-use nix::sys::socket::{
-    AddressFamily, MsgFlags, NetlinkAddr, SockFlag, SockProtocol, SockType, bind, recv, send,
-    setsockopt, socket, sockopt,
-};
-use nix::sys::time::{TimeVal, TimeValLike};
+use nix::sys::socket::{MsgFlags, SockProtocol, recv};
 
-use super::netlink::{Answer, Answers, Attributes, CONTROL_FAMILY, Request};
-use super::nl80211::{self, Happening, Station, Wireless, attribute, command, control};
+use super::conversation::{Conversation, netlink_socket};
+use super::netlink::{Answer, Answers, Attributes};
+use super::nl80211::{self, Happening, Station, Wireless, attribute, command};
 
-/// The longest answer of the kernel: it fills pages of 32 KiB at most.
-const ANSWER_BYTES: usize = 65_536;
-/// How long an answer may take; the kernel gives it in the send call.
-const ANSWER_WAIT: Duration = Duration::from_millis(200);
-
+/// The longest event of the kernel: it fills pages of 32 KiB at most.
+const EVENT_BYTES: usize = 65_536;
 /// A way to ask the wireless subsystem about one interface.
 #[derive(Debug)]
 pub(crate) struct RadioSocket {
-    requests: OwnedFd,
+    requests: Conversation,
     events: Option<OwnedFd>,
     family: u16,
     ifindex: u32,
-    sequence: u32,
     buffer: Box<[u8]>,
 }
 
@@ -61,29 +53,18 @@ impl RadioSocket {
         };
         let ifindex = if_nametoindex(interface)
             .map_err(|_no_such| RadioError::NoInterface(interface.to_owned()))?;
-        let requests = netlink_socket(0).map_err(failed)?;
+        let mut requests = Conversation::open(SockProtocol::NetlinkGeneric).map_err(failed)?;
+        let not_wireless = || RadioError::NotWireless(interface.to_owned());
+        // Without the family no driver of a radio is loaded.
+        let found = requests.family(b"nl80211\0", b"mlme\0").map_err(failed)?;
+        let (family, group) = found.ok_or_else(not_wireless)?;
         let mut radio = Self {
             requests,
             events: None,
-            family: CONTROL_FAMILY,
+            family,
             ifindex,
-            sequence: 0,
-            buffer: vec![0; ANSWER_BYTES].into_boxed_slice(),
+            buffer: vec![0; EVENT_BYTES].into_boxed_slice(),
         };
-        let not_wireless = || RadioError::NotWireless(interface.to_owned());
-        let asked = radio.ask(
-            control::GET_FAMILY,
-            false,
-            &[(control::FAMILY_NAME, b"nl80211\0")],
-            |_, attributes| nl80211::family(attributes, b"mlme\0"),
-        );
-        let found = match asked {
-            // ENOENT: no driver of a radio is loaded.
-            Err(error) if error.raw_os_error() == Some(libc::ENOENT) => return Err(not_wireless()),
-            other => other.map_err(failed)?,
-        };
-        let (family, group) = found.into_iter().next().ok_or_else(not_wireless)?;
-        radio.family = family;
         let interfaces = radio
             .ask(command::GET_INTERFACE, true, &[], |_, attributes| {
                 let own = nl80211::number(attributes, attribute::IFINDEX) == Some(ifindex);
@@ -93,7 +74,8 @@ impl RadioSocket {
         let wireless = interfaces.into_iter().next().ok_or_else(not_wireless)?;
         // A socket of its own: an event between two parts of an answer would be in the way.
         let mask = group.and_then(|group| 1_u32.checked_shl(group.checked_sub(1)?));
-        radio.events = mask.and_then(|mask| netlink_socket(mask).ok());
+        radio.events =
+            mask.and_then(|mask| netlink_socket(SockProtocol::NetlinkGeneric, mask).ok());
         Ok((radio, wireless))
     }
 
@@ -163,46 +145,10 @@ impl RadioSocket {
         command: u8,
         is_dump: bool,
         attributes: &[(u16, &[u8])],
-        mut take: impl FnMut(u8, Attributes<'_>) -> Option<T>,
+        take: impl FnMut(u8, Attributes<'_>) -> Option<T>,
     ) -> io::Result<Vec<T>> {
-        self.sequence = self.sequence.wrapping_add(1);
-        let request = Request {
-            family: self.family,
-            command,
-            is_dump,
-            sequence: self.sequence,
-            attributes,
-        };
-        let descriptor = self.requests.as_raw_fd();
-        send(descriptor, &request.encode(), MsgFlags::empty())?;
-        let mut found = Vec::new();
-        loop {
-            let length = match recv(descriptor, &mut self.buffer, MsgFlags::empty()) {
-                Ok(length) => length,
-                Err(Errno::EINTR) => continue,
-                Err(errno) => return Err(errno.into()),
-            };
-            for (sequence, answer) in Answers::new(&self.buffer[..length]) {
-                // An answer to an earlier request that was given up.
-                if sequence != self.sequence {
-                    continue;
-                }
-                match answer {
-                    Answer::Done | Answer::Error(0) => return Ok(found),
-                    Answer::Error(errno) => return Err(io::Error::from_raw_os_error(errno)),
-                    Answer::Message {
-                        command,
-                        attributes,
-                        ..
-                    } => {
-                        found.extend(take(command, attributes));
-                        if !is_dump {
-                            return Ok(found);
-                        }
-                    }
-                }
-            }
-        }
+        let to = (self.family, command);
+        self.requests.ask(to, is_dump, attributes, take)
     }
 }
 
@@ -220,20 +166,6 @@ fn drain(descriptor: RawFd, buffer: &mut [u8], mut take: impl FnMut(&[u8])) -> i
             Err(errno) => return Err(errno.into()),
         }
     }
-}
-
-/// A socket bound to the groups of `mask`.
-fn netlink_socket(mask: u32) -> io::Result<OwnedFd> {
-    let opened = socket(
-        AddressFamily::Netlink,
-        SockType::Raw,
-        SockFlag::SOCK_CLOEXEC,
-        SockProtocol::NetlinkGeneric,
-    )?;
-    bind(opened.as_raw_fd(), &NetlinkAddr::new(0, mask))?;
-    let wait = TimeVal::milliseconds(i64::try_from(ANSWER_WAIT.as_millis()).unwrap_or(i64::MAX));
-    setsockopt(&opened, sockopt::ReceiveTimeout, &wait)?;
-    Ok(opened)
 }
 
 #[cfg(test)]

@@ -301,10 +301,14 @@ impl RecordFile {
             path: path.to_owned(),
             source,
         })?;
-        Self::parse(path, bytes)
+        Self::from_bytes(path, bytes)
     }
 
-    fn parse(path: &Path, bytes: Vec<u8>) -> Result<Self, RecordFileError> {
+    /// Reads a whole file that is in memory; `path` stands in what is said of it.
+    ///
+    /// # Errors
+    /// When its header is not that of a record file.
+    pub fn from_bytes(path: &Path, bytes: Vec<u8>) -> Result<Self, RecordFileError> {
         let header = RecordHeader::decode(path, &bytes)?;
         let truncated_bytes = (bytes.len() - HEADER_BYTES) % header.record_bytes as usize;
         Ok(Self {
@@ -318,6 +322,13 @@ impl RecordFile {
     pub fn records<T: Pod>(&self) -> impl Iterator<Item = T> + '_ {
         self.raw()
             .filter_map(|bytes| bytemuck::try_pod_read_unaligned(bytes).ok())
+    }
+
+    /// The record with `index` in the order of the file as `T`; `None` beyond the last, and when
+    /// `T` has another size.
+    pub fn record<T: Pod>(&self, index: usize) -> Option<T> {
+        let bytes = self.raw().nth(index)?;
+        bytemuck::try_pod_read_unaligned(bytes).ok()
     }
 
     /// How many whole records there are.
@@ -384,8 +395,11 @@ mod tests {
 
     #[test]
     fn a_file_gives_back_its_header_and_records() {
-        let file = RecordFile::parse(Path::new("x"), sample()).unwrap();
+        let file = RecordFile::from_bytes(Path::new("x"), sample()).unwrap();
         assert_eq!(file.header.channel, "arm/command");
+        let sequence = |index| Some(file.record::<PublishedRecord>(index)?.sequence);
+        assert_eq!([0, 2, 3].map(sequence), [Some(0), Some(2), None]);
+        assert!(file.record::<u64>(0).is_none(), "another size");
         assert_eq!(
             file.header.file_name("robot"),
             "arm.command.published.robot.2.rec"
@@ -401,7 +415,7 @@ mod tests {
     fn a_file_cut_short_keeps_its_whole_records() {
         let mut bytes = sample();
         bytes.truncate(bytes.len() - 5);
-        let file = RecordFile::parse(Path::new("x"), bytes).unwrap();
+        let file = RecordFile::from_bytes(Path::new("x"), bytes).unwrap();
         assert_eq!(file.records::<PublishedRecord>().count(), 2);
         assert_eq!(file.truncated_bytes, size_of::<PublishedRecord>() - 5);
     }
@@ -410,7 +424,7 @@ mod tests {
     fn a_file_of_another_layout_names_both_sizes_and_where_it_comes_from() {
         let mut bytes = sample();
         bytes[12] += 8;
-        let error = RecordFile::parse(Path::new("x"), bytes).unwrap_err();
+        let error = RecordFile::from_bytes(Path::new("x"), bytes).unwrap_err();
         let size = size_of::<PublishedRecord>();
         let expected = format!(
             "record file x, byte 12: published records of {} bytes, where this program has {size} \
@@ -421,7 +435,7 @@ mod tests {
         let mut bytes = sample();
         bytes[8] = 6;
         bytes[12..16].copy_from_slice(&1_u32.to_le_bytes());
-        let error = RecordFile::parse(Path::new("x"), bytes).unwrap_err();
+        let error = RecordFile::from_bytes(Path::new("x"), bytes).unwrap_err();
         let text = error.to_string();
         assert!(
             text.contains("message records of 1 bytes, where this program has at least"),
@@ -440,7 +454,7 @@ mod tests {
                 bytes[at] = random.next_u64().to_le_bytes()[0];
             }
             bytes.truncate(usize::try_from(random.next_u64()).unwrap() % (bytes.len() + 1));
-            if let Ok(file) = RecordFile::parse(Path::new("x"), bytes) {
+            if let Ok(file) = RecordFile::from_bytes(Path::new("x"), bytes) {
                 assert!(file.records::<PublishedRecord>().count() <= 3);
                 file.append_messages(&mut RunLog::default());
             }

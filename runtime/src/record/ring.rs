@@ -82,6 +82,17 @@ pub struct Recorder {
     thread: Option<JoinHandle<Vec<String>>>,
 }
 
+impl RecorderOutcome {
+    /// Why a process that could not record cannot go on: the first failure stands for those that
+    /// followed from it.
+    pub fn problem(&self) -> Option<String> {
+        let first = self.failures.first()?;
+        Some(format!(
+            "cannot record: {first}; messages after that would be in no account"
+        ))
+    }
+}
+
 impl Recorder {
     /// A recorder for process `writer` below `folder`; opens nothing yet.
     pub fn new(folder: &Path, writer: &str, instance: u32) -> Self {
@@ -146,6 +157,15 @@ impl Recorder {
     /// # Errors
     /// When the system gives no thread.
     pub fn start(&mut self) -> io::Result<()> {
+        self.start_and_tell(|| ())
+    }
+
+    /// As [`Recorder::start`]; `on_failure` is called from the writer thread when a file can no
+    /// longer be written, so that a run does not go on for hours without its account.
+    ///
+    /// # Errors
+    /// As [`Recorder::start`].
+    pub fn start_and_tell(&mut self, on_failure: impl Fn() + Send + 'static) -> io::Result<()> {
         let mut drains = core::mem::take(&mut self.drains);
         let stop = Arc::clone(&self.stop);
         let builder = thread::Builder::new().name("recorder".to_owned());
@@ -157,6 +177,7 @@ impl Recorder {
                     Ok(()) => true,
                     Err(error) => {
                         failures.push(format!("{}: {error}", drain.path.display()));
+                        on_failure();
                         false
                     }
                 });
@@ -230,6 +251,32 @@ mod tests {
         assert_eq!(recorder.finish().dropped_count, 2);
         assert_eq!(fs::read_dir(&folder).unwrap().count(), 0);
         fs::remove_dir_all(&folder).unwrap();
+    }
+
+    #[test]
+    fn a_file_that_cannot_be_written_is_told_at_once_and_named() {
+        // The one device of every Linux that takes nothing.
+        let (mut ring, drained) = rtrb::RingBuffer::new(64);
+        ring.push(1).unwrap();
+        let path = PathBuf::from("/dev/full");
+        let file = File::options().write(true).open(&path).unwrap();
+        let mut recorder = Recorder::new(&env::temp_dir(), "robot", 0);
+        recorder.drains.push(Drain {
+            ring: drained,
+            file,
+            path,
+        });
+        let told = Arc::new(AtomicU64::new(0));
+        let counted = Arc::clone(&told);
+        let count = move || {
+            counted.fetch_add(1, Ordering::Relaxed);
+        };
+        recorder.start_and_tell(count).unwrap();
+        let outcome = recorder.finish();
+        assert_eq!(told.load(Ordering::Relaxed), 1);
+        let problem = outcome.problem().unwrap();
+        assert!(problem.starts_with("cannot record: /dev/full: No space left on device"));
+        assert_eq!(RecorderOutcome::default().problem(), None);
     }
 
     #[test]

@@ -108,7 +108,7 @@ impl Run {
         let mut registry = Registry::default();
         registry.add::<Doubler>();
         registry.add::<Shuttle>();
-        replay(&self.folder, &registry)
+        replay(&self.folder, &registry, &|_, _| {})
     }
 }
 

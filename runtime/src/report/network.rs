@@ -16,7 +16,7 @@ pub const FOREGOING_S: f64 = 5.0;
 pub struct NetworkReport {
     /// Channels that crossed a network or the model of one, each one direction.
     pub channels: Vec<ChannelNetwork>,
-    /// What happened on them, in order of time.
+    /// What happened on them, in order of time; of too much the outages and then what lasted longest.
     pub events: Vec<TimedEvent>,
     /// Events that found no room.
     pub events_dropped_count: u64,
@@ -66,6 +66,34 @@ pub struct TimedEvent {
 }
 
 impl TimedEvent {
+    /// How long it lasted, seconds; without end when it was not over before the end of the run.
+    pub(crate) fn length_s(&self) -> f64 {
+        self.until_s
+            .map_or(f64::INFINITY, |until_s| until_s - self.from_s)
+    }
+
+    /// At most `count_max` of `events`, in order of time. Independent losses alone may make too many: then
+    /// the longest stay, outages first.
+    pub(crate) fn kept(mut events: Vec<Self>, count_max: usize) -> Vec<Self> {
+        if events.len() > count_max {
+            events.sort_by(|a, b| {
+                let is_outage = b.is_outage().cmp(&a.is_outage());
+                is_outage.then(b.length_s().total_cmp(&a.length_s()))
+            });
+            events.truncate(count_max);
+            events.sort_by(|a, b| a.from_s.total_cmp(&b.from_s));
+        }
+        events
+    }
+
+    /// True when nothing got through: an outage, or a process that was down.
+    pub(crate) const fn is_outage(&self) -> bool {
+        matches!(
+            self.kind,
+            NetworkEventKind::Outage { .. } | NetworkEventKind::ProcessDown { .. }
+        )
+    }
+
     /// How long before `at_s` it was over, seconds; 0 when it was under way, `None` when it cannot have
     /// been within [`FOREGOING_S`] before, as two hosts' times are known to `clock_bound_s` of each other.
     pub(crate) fn over_for_s(&self, at_s: f64, clock_bound_s: f64) -> Option<f64> {
@@ -321,6 +349,25 @@ impl TestedPair {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn of_too_many_events_the_outages_and_the_longest_stay() {
+        let burst = |from_s: f64, length_s: f64| TimedEvent {
+            kind: NetworkEventKind::LossBurst {
+                lost_count: 2,
+                of_count: 9,
+            },
+            ..outage(from_s, Some(from_s + length_s))
+        };
+        let mut events: Vec<_> = (0..10).map(|at| burst(f64::from(at), 0.125)).collect();
+        events.push(burst(50.0, 0.25));
+        events.push(outage(60.0, Some(60.01)));
+        events.push(outage(61.0, None));
+        assert_eq!(TimedEvent::kept(events.clone(), 13), events);
+        let kept = TimedEvent::kept(events, 4);
+        let at: Vec<f64> = kept.iter().map(|one| one.from_s).collect();
+        assert_eq!(at, [0.0, 50.0, 60.0, 61.0]);
+    }
 
     fn outage(from_s: f64, until_s: Option<f64>) -> TimedEvent {
         TimedEvent {

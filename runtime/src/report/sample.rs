@@ -27,6 +27,7 @@ fn run_facts() -> RunFacts {
         topology_file: "deploy/topologies/split.toml".to_owned(),
         topology_hash: "5d1c9a70e2b34f18".to_owned(),
         seed: 42,
+        security: None,
         host: "operator".to_owned(),
         started: "2026-03-14 09:26:53 +01:00".to_owned(),
         starts_ns: BTreeMap::new(),

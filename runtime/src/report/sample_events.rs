@@ -136,6 +136,7 @@ pub(super) fn summary(channel: ChannelSummary) -> RunSummary {
         topology_file: "fleet-split.toml".to_owned(),
         topology_hash: String::new(),
         seed: 1,
+        security: None,
         host: "control-pc".to_owned(),
         started: String::new(),
         starts_ns: BTreeMap::new(),

@@ -186,6 +186,9 @@ pub struct RunFacts {
     pub topology_hash: String,
     /// Seed of every random stream.
     pub seed: u64,
+    /// How the hops between hosts were protected, in words; `None` when there were none.
+    #[serde(default)]
+    pub security: Option<String>,
     /// The host that wrote this summary.
     pub host: String,
     /// Wall-clock time of the start, with its zone.

@@ -13,8 +13,10 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::{Signal, killpg};
 use nix::sys::wait::{Id, WaitPidFlag, WaitStatus, waitid};
 use nix::unistd::Pid;
+use zeroize::Zeroizing;
 
 use crate::process::pipe::{FromProcess, ToProcess};
+use crate::systemd;
 
 /// A word from a process: which one (index and instance), and what.
 pub(crate) type Word = (usize, u32, FromProcess);
@@ -124,17 +126,21 @@ impl Child {
 
     /// Gives an order. A foreign command gets SIGTERM for [`ToProcess::Stop`] and nothing for
     /// [`ToProcess::Start`].
-    pub(crate) fn order(&mut self, order: ToProcess) {
+    pub(crate) fn order(&mut self, order: &ToProcess) {
         if self.is_foreign {
-            if order == ToProcess::Stop {
+            if *order == ToProcess::Stop {
                 self.signal(Signal::SIGTERM);
             }
             return;
         }
-        let line = serde_json::to_string(&order).expect("a unit variant always serialises");
+        let mut line = serde_json::to_string(order).expect("an order always serialises");
+        line.push('\n');
+        // It may be the run's secret.
+        let line = Zeroizing::new(line);
         if let Some(stdin) = &mut self.stdin {
             // A process that is gone is noticed by poll_exit.
-            let _gone = writeln!(stdin, "{line}")
+            let _gone = stdin
+                .write_all(line.as_bytes())
                 .and_then(|()| stdin.flush())
                 .is_err();
         }
@@ -170,10 +176,13 @@ impl Drop for Child {
 }
 
 /// A group of its own keeps the terminal's Ctrl-C away from the child, so that the supervisor
-/// ends it in order.
+/// ends it in order. To systemd the supervisor speaks alone.
 fn prepared(mut command: Command, log: &Path) -> io::Result<Command> {
     let log = File::options().create(true).append(true).open(log)?;
     command.stderr(log).process_group(0);
+    for variable in systemd::VARIABLES {
+        command.env_remove(variable);
+    }
     Ok(command)
 }
 
@@ -228,7 +237,7 @@ mod tests {
             assert!(Instant::now() < deadline, "the script did not begin");
             thread::sleep(Duration::from_millis(2));
         }
-        child.order(ToProcess::Stop);
+        child.order(&ToProcess::Stop);
         assert!(!child.end(Instant::now() + Duration::from_millis(50)));
         assert_eq!(
             describe_exit(child.poll_exit().unwrap()),

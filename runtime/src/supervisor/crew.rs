@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::env;
 use std::io;
 use std::os::unix::process::ExitStatusExt;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::{Command, ExitStatus};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::time::Duration;
@@ -14,13 +14,14 @@ use hil_models::time::{Instant, duration_ns};
 
 use super::child::{Child, Word, describe_exit};
 use super::event::{Event, Interruption};
+use super::launching::write_launch;
 use super::plan::{ProcessKind, ProcessPlan};
 use crate::clock::MonotonicClock;
-use crate::face::launch::FaceLaunch;
-use crate::process::launch::{ComponentLaunch, GatewayLaunch, LaunchError, write};
+use crate::process::launch::{LaunchError, write};
 use crate::process::own_program;
 use crate::process::pipe::{ChannelProgress, FromProcess, ProcessReport, ToProcess};
 use crate::run_folder::RunFolder;
+use crate::security::RunSeal;
 use crate::topology::OnExit;
 
 /// Words that may wait for the supervisor.
@@ -70,6 +71,8 @@ pub(crate) struct Member {
     pub(crate) skipped_tick_count: Option<u64>,
     pub(super) child: Option<Child>,
     pub(super) is_ready: bool,
+    /// When it last said that its loops turn, or was asked to begin.
+    pub(super) heard: Instant,
     seen_alive: Instant,
     complaint: Option<String>,
 }
@@ -81,6 +84,8 @@ pub(crate) struct Crew {
     places: BTreeMap<String, String>,
     folder: RunFolder,
     own_program: PathBuf,
+    /// The run's secret, for its gateways; `None` when its hops are plain.
+    seal: Option<RunSeal>,
     sender: SyncSender<Word>,
     words: Receiver<Word>,
     /// When the run began.
@@ -94,6 +99,7 @@ impl Crew {
         plans: Vec<ProcessPlan>,
         places: BTreeMap<String, String>,
         folder: &RunFolder,
+        seal: Option<RunSeal>,
     ) -> Result<Self, CrewError> {
         let (sender, words) = sync_channel(WORDS_MAX);
         let members = plans.into_iter().map(|plan| Member {
@@ -105,6 +111,7 @@ impl Crew {
             skipped_tick_count: None,
             child: None,
             is_ready: false,
+            heard: Instant::ZERO,
             seen_alive: Instant::ZERO,
             complaint: None,
         });
@@ -112,6 +119,7 @@ impl Crew {
             members: members.collect(),
             places,
             folder: folder.clone(),
+            seal,
             own_program: env::current_exe().map_err(CrewError::OwnPath)?,
             sender,
             words,
@@ -153,18 +161,22 @@ impl Crew {
             Child::spawn_foreign(program, &log).map_err(|error| (command[0].clone(), error))
         } else {
             let launch = self.folder.launch(&name, instance);
-            let word = write_launch(member, &self.folder, &launch, domain)?;
+            let is_sealed = self.seal.is_some();
+            let word = write_launch(member, (&self.folder, is_sealed), &launch, domain)?;
             let mut program = Command::new(&self.own_program);
             program.arg(word).arg("--launch").arg(&launch);
             member.is_ready = false;
             Child::spawn_speaking(program, &log, (index, instance), self.sender.clone())
                 .map_err(|error| (self.own_program.display().to_string(), error))
         };
-        let child = spawned.map_err(|(program, source)| CrewError::Spawn {
+        let mut child = spawned.map_err(|(program, source)| CrewError::Spawn {
             process: name,
             program,
             source,
         })?;
+        if let Some(seal) = self.seal.as_ref().filter(|_| member.plan.is_gateway()) {
+            child.order(&ToProcess::Seal(seal.clone()));
+        }
         let now = MonotonicClock::now();
         member.child = Some(child);
         member.seen_alive = now;
@@ -195,8 +207,9 @@ impl Crew {
         self.started = Some(started);
         let at_ns = started.as_ns();
         for member in &mut self.members {
+            member.heard = started;
             if let Some(child) = &mut member.child {
-                child.order(ToProcess::Start { at_ns });
+                child.order(&ToProcess::Start { at_ns });
             }
         }
     }
@@ -303,14 +316,16 @@ impl Crew {
             }
             let member = &mut self.members[index];
             match word {
+                FromProcess::Alive => member.heard = now,
                 FromProcess::Ready => {
                     member.is_ready = true;
+                    member.heard = now;
                     if let Some(started) = self.started
                         && instance > 0
                     {
                         let at_ns = started.as_ns();
                         if let Some(child) = &mut member.child {
-                            child.order(ToProcess::Start { at_ns });
+                            child.order(&ToProcess::Start { at_ns });
                         }
                         self.close_interruptions(index, now);
                     }
@@ -338,7 +353,7 @@ impl Crew {
         }
     }
 
-    fn note(
+    pub(super) fn note(
         &mut self,
         at: Instant,
         index: usize,
@@ -364,7 +379,7 @@ impl Crew {
         for index in &chosen {
             let member = &mut self.members[*index];
             if let Some(child) = &mut member.child {
-                child.order(ToProcess::Stop);
+                child.order(&ToProcess::Stop);
             }
         }
         let deadline = std::time::Instant::now() + patience;
@@ -428,60 +443,4 @@ pub(crate) fn find_programs(plans: &[ProcessPlan]) -> Result<(), CrewError> {
         }
     }
     Ok(())
-}
-
-fn write_launch(
-    member: &Member,
-    folder: &RunFolder,
-    path: &Path,
-    domain: String,
-) -> Result<&'static str, LaunchError> {
-    let plan = &member.plan;
-    let (process, instance) = (plan.name.clone(), member.restart_count);
-    match &plan.kind {
-        ProcessKind::Component(card) => {
-            let card_path = folder.card(&process);
-            write(&card_path, card)?;
-            let launch = ComponentLaunch {
-                process,
-                instance,
-                card: card_path,
-                domain,
-                realtime: plan.realtime.clone(),
-                wait: plan.wait,
-                records: folder.records(),
-            };
-            write(path, &launch)?;
-            Ok("component")
-        }
-        ProcessKind::Gateway(directions) | ProcessKind::ClockPath { directions, .. } => {
-            let ready_within = match &plan.kind {
-                ProcessKind::ClockPath { ready_within, .. } => Some(*ready_within),
-                _ => None,
-            };
-            let launch = GatewayLaunch {
-                process,
-                instance,
-                domain,
-                records: folder.records(),
-                directions: directions.clone(),
-                ready_within,
-            };
-            write(path, &launch)?;
-            Ok("gateway")
-        }
-        ProcessKind::Face(face) => {
-            let launch = FaceLaunch {
-                process,
-                instance,
-                domain,
-                records: folder.records(),
-                wait: plan.wait,
-                face: face.clone(),
-            };
-            write(path, &launch)?;
-            Ok("face")
-        }
-        ProcessKind::Foreign { .. } => Ok("foreign"),
-    }
 }

@@ -66,7 +66,7 @@ impl Domains {
         base: Option<&PathBuf>,
         run: &str,
     ) -> Result<Self, DomainsError> {
-        sweep(&domain_base(base));
+        sweep_below(&domain_base(base));
         let hosts = plans.iter().map(|plan| create_host(plan, base, run));
         Ok(Self {
             hosts: hosts.collect::<Result<_, _>>()?,
@@ -142,9 +142,16 @@ impl Domains {
     }
 }
 
+/// Removes what runs of this user whose supervisor was killed left in shared memory, where runs have it
+/// by default. Those that go on are left alone. The next run does so as well; this is for when there
+/// is none.
+pub fn sweep() {
+    sweep_below(&domain_base(None));
+}
+
 /// Removes the domains of supervisors that were killed: nobody holds their lock any more. A run
 /// that is just starting has taken the lock before its folder can be told for a domain's.
-fn sweep(base: &Path) {
+fn sweep_below(base: &Path) {
     let Ok(entries) = fs::read_dir(base) else {
         return;
     };

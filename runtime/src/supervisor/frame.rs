@@ -4,17 +4,19 @@
 use std::io::{self, Read, Write};
 
 use serde::{Deserialize, Serialize};
+use zeroize::Zeroizing;
 
 use super::event::HostStory;
+use crate::security::RunSeal;
 
 /// Largest frame either side accepts; a longer length field is an error, not an allocation.
-pub(crate) const FRAME_BYTES_MAX: usize = 1 << 20;
+pub const FRAME_BYTES_MAX: usize = 1 << 20;
 /// Piece in which record files travel.
-pub(crate) const CHUNK_BYTES: usize = 1 << 18;
+pub const CHUNK_BYTES: usize = 1 << 18;
 
 /// Who a supervisor is; the first frame each way.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub(crate) struct PeerHello {
+pub struct PeerHello {
     /// Version of this program; both ends must be equal.
     pub version: String,
     /// Hash of the resolved topology; both ends must be equal.
@@ -25,16 +27,20 @@ pub(crate) struct PeerHello {
     pub clock_id: u64,
     /// Fingerprint of the host's shared-memory domain; must differ.
     pub domain: [u8; 16],
+    /// Its processor has instructions for AES.
+    pub has_fast_aes: bool,
 }
 
 /// What supervisors tell each other.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub(crate) enum PeerMessage {
+pub enum PeerMessage {
     /// First frame each way.
     Hello(PeerHello),
     /// The other end does not fit, and why; the last frame.
     Refused(String),
+    /// The run's secret; from the first host, over a secured connection only.
+    Seal(RunSeal),
     /// Every process of this host is ready.
     Ready,
     /// Begin.
@@ -69,7 +75,7 @@ pub(crate) enum PeerMessage {
 /// How the other hosts are to take the end of a run on one of them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub(crate) enum EndMeaning {
+pub enum EndMeaning {
     /// The planned time passed.
     Planned,
     /// A program ended by itself without a fault.
@@ -80,7 +86,7 @@ pub(crate) enum EndMeaning {
 
 /// One frame as read.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) enum Frame {
+pub enum Frame {
     /// A message.
     Message(PeerMessage),
     /// The next piece of the file announced last.
@@ -94,15 +100,17 @@ const KIND_CHUNK: u8 = 1;
 ///
 /// # Errors
 /// When the connection fails, or the message is longer than a frame may be.
-pub(crate) fn write_message(out: &mut impl Write, message: &PeerMessage) -> io::Result<()> {
-    write_frame(out, KIND_MESSAGE, &serde_json::to_vec(message)?)
+pub fn write_message(out: &mut impl Write, message: &PeerMessage) -> io::Result<()> {
+    // It may hold the run's secret.
+    let body = Zeroizing::new(serde_json::to_vec(message)?);
+    write_frame(out, KIND_MESSAGE, &body)
 }
 
 /// Writes one piece of a file.
 ///
 /// # Errors
 /// When the connection fails.
-pub(crate) fn write_chunk(out: &mut impl Write, bytes: &[u8]) -> io::Result<()> {
+pub fn write_chunk(out: &mut impl Write, bytes: &[u8]) -> io::Result<()> {
     write_frame(out, KIND_CHUNK, bytes)
 }
 
@@ -123,20 +131,27 @@ fn write_frame(out: &mut impl Write, kind: u8, body: &[u8]) -> io::Result<()> {
 ///
 /// # Errors
 /// When the connection ends or says something that is not a frame.
-pub(crate) fn read_frame(input: &mut impl Read) -> io::Result<Frame> {
+pub fn read_frame(input: &mut impl Read) -> io::Result<Frame> {
+    read_frame_within(input, FRAME_BYTES_MAX)
+}
+
+/// As [`read_frame`], of at most `bytes_max`: what a stranger may announce.
+///
+/// # Errors
+/// As [`read_frame`].
+pub fn read_frame_within(input: &mut impl Read, bytes_max: usize) -> io::Result<Frame> {
     let mut head = [0; 5];
     input.read_exact(&mut head)?;
     let length = u32::from_le_bytes([head[0], head[1], head[2], head[3]]) as usize;
-    if length > FRAME_BYTES_MAX {
-        let text =
-            format!("the peer announced a frame of {length} bytes, {FRAME_BYTES_MAX} is most");
+    if length > bytes_max {
+        let text = format!("the peer announced a frame of {length} bytes, {bytes_max} is most");
         return Err(io::Error::new(io::ErrorKind::InvalidData, text));
     }
-    let mut body = vec![0; length];
+    let mut body = Zeroizing::new(vec![0_u8; length]);
     input.read_exact(&mut body)?;
     match head[4] {
         KIND_MESSAGE => Ok(Frame::Message(serde_json::from_slice(&body)?)),
-        KIND_CHUNK => Ok(Frame::Chunk(body)),
+        KIND_CHUNK => Ok(Frame::Chunk(core::mem::take(&mut *body))),
         kind => {
             let text = format!("the peer sent a frame of unknown kind {kind}");
             Err(io::Error::new(io::ErrorKind::InvalidData, text))
@@ -145,7 +160,7 @@ pub(crate) fn read_frame(input: &mut impl Read) -> io::Result<Frame> {
 }
 
 /// A record file's name as a peer may give it: nothing that could leave the records folder.
-pub(crate) fn is_plain_record_name(name: &str) -> bool {
+pub fn is_plain_record_name(name: &str) -> bool {
     let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || matches!(byte, b'.' | b'-' | b'_');
     name.len() <= 255
         && name.as_bytes().ends_with(b".rec")

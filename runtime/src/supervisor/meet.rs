@@ -2,20 +2,22 @@
 //! to it, and both ends check that they fit. What they say to each other afterwards is not here.
 
 use std::io;
-use std::net::{IpAddr, SocketAddr, TcpListener, TcpStream};
+use std::net::{IpAddr, SocketAddr, TcpStream};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use socket2::{Domain, Socket, Type};
 
-use super::frame::{Frame, PeerHello, PeerMessage, read_frame, write_message};
-use super::peer::Peer;
+use super::door::{Admission, Arrived, Door, KEY_NEEDED, knock, read_hello, say};
+use super::frame::{PeerHello, PeerMessage};
+use super::peer::{ControlEnds, Peer};
+use crate::security::PreSharedKey;
+use crate::security::greeting::GreetingError;
 
 /// How often a host that cannot connect yet tries again.
 const RETRY_PERIOD: Duration = Duration::from_millis(200);
 /// How often the caller is told whom the host waits for, and may end the waiting.
 const TELL_PERIOD: Duration = Duration::from_millis(200);
-const GREETING_TIMEOUT: Duration = Duration::from_secs(3);
 
 /// Why the hosts of a run did not come together.
 #[derive(Debug, thiserror::Error)]
@@ -49,6 +51,14 @@ pub enum PeerError {
         own: IpAddr,
         /// What the system said.
         source: io::Error,
+    },
+    /// One end holds another key, or none.
+    #[error("no connection with {host}: {reason}")]
+    Key {
+        /// The other host.
+        host: String,
+        /// What does not fit, and what to do.
+        reason: String,
     },
     /// The ends do not fit.
     #[error("{host} does not fit this run: {reason}")]
@@ -87,6 +97,24 @@ pub(crate) struct Meeting {
     pub(crate) expected: Vec<(String, IpAddr)>,
     /// How long to wait for all of them.
     pub(crate) timeout: Duration,
+    /// The key they all hold; `None` when the topology says that hops are plain.
+    pub(crate) key: Option<PreSharedKey>,
+}
+
+impl Meeting {
+    /// Who is at `ip` by the topology.
+    fn name_of(&self, ip: IpAddr) -> String {
+        let mut expected = self.expected.iter();
+        let known = expected.find(|(_, address)| *address == ip);
+        known.map_or_else(|| ip.to_string(), |(name, _)| format!("{name} ({ip})"))
+    }
+
+    /// Who is not among `peers`.
+    fn missing(&self, peers: &[Peer]) -> String {
+        let names = self.expected.iter().map(|(name, _)| name.as_str());
+        let missing = names.filter(|name| peers.iter().all(|peer| peer.hello.host != *name));
+        missing.collect::<Vec<_>>().join(", ")
+    }
 }
 
 /// Brings the hosts of a run together. `waiting` is told whom it waits for, a few times a second;
@@ -104,6 +132,7 @@ pub(crate) fn meet(
         waiting,
         began: Instant::now(),
         told: None,
+        turned_away: None,
     };
     if meeting.is_here {
         host(meeting, hello, &mut patience)
@@ -117,13 +146,25 @@ struct Patience<'a> {
     waiting: &'a mut dyn FnMut(&str, Duration) -> bool,
     began: Instant,
     told: Option<Instant>,
+    /// Whoever came last without this run's key, and what it did.
+    turned_away: Option<(String, &'static str)>,
 }
 
 impl Patience<'_> {
+    /// Remembers one that was turned away. It ends no waiting: whoever takes a host's address could
+    /// end a run with it, and the right one may still come.
+    fn note(&mut self, meeting: &Meeting, ip: IpAddr, why: &'static str) {
+        self.turned_away = Some((meeting.name_of(ip), why));
+    }
+
     /// Waits a moment for `missing`, or says why not. True a few times a second.
     fn wait(&mut self, missing: &str) -> Result<bool, PeerError> {
         let waited = self.began.elapsed();
         if waited > self.meeting.timeout {
+            if let Some((host, reason)) = self.turned_away.take() {
+                let reason = format!("it {reason}");
+                return Err(PeerError::Key { host, reason });
+            }
             return Err(PeerError::Absent {
                 missing: missing.to_owned(),
                 waited_s: waited.as_secs(),
@@ -133,7 +174,11 @@ impl Patience<'_> {
         let is_time = self.told.is_none_or(|told| told.elapsed() >= TELL_PERIOD);
         if is_time {
             self.told = Some(Instant::now());
-            if !(self.waiting)(missing, waited) {
+            let who = match &self.turned_away {
+                Some((host, why)) => format!("{missing}; {host} {why}"),
+                None => missing.to_owned(),
+            };
+            if !(self.waiting)(&who, waited) {
                 return Err(PeerError::Interrupted {
                     missing: missing.to_owned(),
                 });
@@ -151,28 +196,35 @@ fn host(
 ) -> Result<Vec<Peer>, PeerError> {
     let address = meeting.address;
     let listen = |source| PeerError::Listen { address, source };
-    let listener = TcpListener::bind(address).map_err(listen)?;
-    listener.set_nonblocking(true).map_err(listen)?;
+    let admission = Admission {
+        own: hello.host.clone(),
+        expected: meeting.expected.clone(),
+        key: meeting.key.clone(),
+    };
+    let mut door = Door::open(address, admission).map_err(listen)?;
     let mut peers: Vec<Peer> = Vec::new();
     while peers.len() < meeting.expected.len() {
-        let missing: Vec<&str> = meeting
-            .expected
-            .iter()
-            .map(|(name, _)| name.as_str())
-            .filter(|name| peers.iter().all(|peer| peer.hello.host != *name))
-            .collect();
-        let missing = missing.join(", ");
-        match listener.accept() {
-            // Strangers are turned away before a byte of theirs is read.
-            Ok((stream, from)) if meeting.expected.iter().any(|(_, ip)| *ip == from.ip()) => {
-                if let Some(peer) = welcome(stream, &meeting.expected, hello)? {
+        match door.look().map_err(listen)? {
+            Some(Arrived::Peer(ip, arrived)) => {
+                let (ends, theirs) = *arrived;
+                if let Some(peer) = welcome(ends, (ip, theirs), meeting, hello)? {
                     // One that gave up and came again: its first connection is a dead one.
                     peers.retain(|known| known.hello.host != peer.hello.host);
                     peers.push(peer);
                 }
             }
-            Ok(_stranger) => {}
-            Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
+            Some(Arrived::TurnedAway(ip, why)) => patience.note(meeting, ip, why),
+            Some(Arrived::Keyed(ip)) => {
+                return Err(PeerError::Key {
+                    host: meeting.name_of(ip),
+                    reason: "it came with a key and this topology says [security] hops = \
+                             \"plain\"; use the same file on both"
+                        .to_owned(),
+                });
+            }
+            Some(Arrived::Nobody) => {}
+            None => {
+                let missing = meeting.missing(&peers);
                 if patience.wait(&missing)? {
                     // Those that are here must not take the waiting for an absence.
                     for peer in &mut peers {
@@ -180,25 +232,22 @@ fn host(
                     }
                 }
             }
-            Err(source) => return Err(listen(source)),
         }
     }
     Ok(peers)
 }
 
-/// Greets one that connected; `None` when it left before it had said who it is, or is nobody of
-/// this run.
+/// Greets one that said who it is; `None` when it is nobody of this run, or not at its own address.
 fn welcome(
-    stream: TcpStream,
-    expected: &[(String, IpAddr)],
+    mut ends: ControlEnds,
+    (ip, theirs): (IpAddr, PeerHello),
+    meeting: &Meeting,
     hello: &PeerHello,
 ) -> Result<Option<Peer>, PeerError> {
-    let Ok((mut stream, PeerMessage::Hello(theirs))) = read_hello(stream) else {
-        return Ok(None);
-    };
-    if !expected.iter().any(|(name, _)| *name == theirs.host) {
-        let text = format!("host {} is not awaited here", theirs.host);
-        let _left = write_message(&mut stream, &PeerMessage::Refused(text)).is_err();
+    let mut expected = meeting.expected.iter();
+    if !expected.any(|(name, from)| *name == theirs.host && *from == ip) {
+        let text = format!("host {} is not awaited here at {ip}", theirs.host);
+        let _left = say(&mut ends, &PeerMessage::Refused(text)).is_err();
         return Ok(None);
     }
     let reason = misfit(hello, &theirs);
@@ -207,14 +256,17 @@ fn welcome(
         source,
     };
     if let Some(reason) = reason {
-        write_message(&mut stream, &PeerMessage::Refused(reason.clone())).map_err(connection)?;
+        say(&mut ends, &PeerMessage::Refused(reason.clone())).map_err(connection)?;
         return Err(PeerError::Mismatch {
             host: theirs.host,
             reason,
         });
     }
-    write_message(&mut stream, &PeerMessage::Hello(hello.clone())).map_err(connection)?;
-    Peer::new(stream, theirs.clone())
+    // One that is gone again by now comes back.
+    if say(&mut ends, &PeerMessage::Hello(hello.clone())).is_err() {
+        return Ok(None);
+    }
+    Peer::new(ends, theirs.clone())
         .map(Some)
         .map_err(connection)
 }
@@ -224,41 +276,57 @@ fn join(
     hello: &PeerHello,
     patience: &mut Patience<'_>,
 ) -> Result<Vec<Peer>, PeerError> {
-    let name = meeting
-        .expected
-        .first()
-        .map_or("the first host", |(name, _)| name)
-        .to_owned();
-    let connection = |source| PeerError::Connection {
-        host: name.clone(),
-        source,
-    };
+    let first = meeting.expected.first();
+    let name = first.map_or("the first host", |(name, _)| name).to_owned();
     loop {
-        let Ok(mut stream) = connect(meeting)? else {
+        let Ok(stream) = connect(meeting)? else {
             patience.wait(&name)?;
             continue;
         };
-        let answer = write_message(&mut stream, &PeerMessage::Hello(hello.clone()))
-            .and_then(|()| read_hello(stream));
-        match answer {
-            Ok((stream, PeerMessage::Hello(theirs))) => {
+        match greet(stream, (hello, &name), meeting.key.as_ref()) {
+            Ok((ends, PeerMessage::Hello(theirs))) => {
                 if let Some(reason) = misfit(hello, &theirs) {
                     return Err(PeerError::Mismatch {
                         host: theirs.host,
                         reason,
                     });
                 }
-                return Ok(vec![Peer::new(stream, theirs).map_err(connection)?]);
+                let connection = |source| PeerError::Connection { host: name, source };
+                return Ok(vec![Peer::new(ends, theirs).map_err(connection)?]);
+            }
+            Ok((_, PeerMessage::Refused(reason))) if reason == KEY_NEEDED => {
+                return Err(PeerError::Key {
+                    host: name,
+                    reason: "it speaks with holders of its key only, and this topology says \
+                             [security] hops = \"plain\"; use the same file on both"
+                        .to_owned(),
+                });
             }
             Ok((_, PeerMessage::Refused(reason))) => {
                 return Err(PeerError::Mismatch { host: name, reason });
             }
+            Err(GreetingError::Refused(why)) => {
+                let reason = why.words().to_owned();
+                return Err(PeerError::Key { host: name, reason });
+            }
             // Somebody else's service, or a peer that is just going away.
-            Ok(_) | Err(_) => {
+            Ok(_) | Err(GreetingError::Connection(_)) => {
                 patience.wait(&name)?;
             }
         }
     }
+}
+
+/// What the first host answers to this one's name.
+fn greet(
+    stream: TcpStream,
+    (hello, other): (&PeerHello, &str),
+    key: Option<&PreSharedKey>,
+) -> Result<(ControlEnds, PeerMessage), GreetingError> {
+    let mut ends = knock(stream, (&hello.host, other), key)?;
+    say(&mut ends, &PeerMessage::Hello(hello.clone()))?;
+    let answer = read_hello(&mut ends)?;
+    Ok((ends, answer))
 }
 
 /// One attempt to reach the first host, from this host's own address: the kernel would choose the
@@ -274,21 +342,6 @@ fn connect(meeting: &Meeting) -> Result<io::Result<TcpStream>, PeerError> {
     let socket = prepare().map_err(|source| PeerError::Own { own, source })?;
     let connected = socket.connect_timeout(&meeting.address.into(), RETRY_PERIOD);
     Ok(connected.map(|()| socket.into()))
-}
-
-fn read_hello(stream: TcpStream) -> io::Result<(TcpStream, PeerMessage)> {
-    stream.set_nonblocking(false)?;
-    stream.set_nodelay(true)?;
-    stream.set_read_timeout(Some(GREETING_TIMEOUT))?;
-    stream.set_write_timeout(Some(GREETING_TIMEOUT))?;
-    let mut input = &stream;
-    match read_frame(&mut input)? {
-        Frame::Message(message) => Ok((stream, message)),
-        Frame::Chunk(_) => Err(io::Error::new(
-            io::ErrorKind::InvalidData,
-            "a chunk, not a hello",
-        )),
-    }
 }
 
 /// Why two hosts cannot share a run.
@@ -317,90 +370,5 @@ fn misfit(ours: &PeerHello, theirs: &PeerHello) -> Option<String> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::supervisor::peer::PeerEvent;
-    use std::net::Ipv4Addr;
-
-    fn hello(host: &str, hash: u64, domain: u8) -> PeerHello {
-        PeerHello {
-            version: "1".to_owned(),
-            topology_hash: hash,
-            host: host.to_owned(),
-            clock_id: 1,
-            domain: [domain; 16],
-        }
-    }
-
-    fn pair(left: &PeerHello, right: &PeerHello) -> [Result<Vec<Peer>, PeerError>; 2] {
-        let probe = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
-        let address = probe.local_addr().unwrap();
-        drop(probe);
-        let meeting = |is_here, other: &PeerHello| Meeting {
-            address,
-            is_here,
-            own: address.ip(),
-            expected: vec![(other.host.clone(), address.ip())],
-            timeout: Duration::from_secs(10),
-        };
-        let (there, here) = (meeting(false, left), meeting(true, right));
-        let right = right.clone();
-        let joining = thread::spawn(move || meet(&there, &right, &mut |_, _| true));
-        let hosting = meet(&here, left, &mut |_, _| true);
-        [hosting, joining.join().unwrap()]
-    }
-
-    #[test]
-    fn two_hosts_meet_and_talk() {
-        let [left, right] = pair(&hello("a", 1, 1), &hello("b", 1, 2));
-        let (mut left, mut right) = (left.unwrap(), right.unwrap());
-        assert_eq!(left[0].hello.host, "b");
-        left[0].say(&PeerMessage::Ready);
-        let event = right[0].receive(Duration::from_secs(5));
-        assert!(matches!(
-            event,
-            Some(PeerEvent::Frame(Frame::Message(PeerMessage::Ready)))
-        ));
-        drop(left);
-        let event = right[0].receive(Duration::from_secs(5));
-        assert!(matches!(event, Some(PeerEvent::Closed(_))));
-    }
-
-    #[test]
-    fn another_topology_is_refused_on_both_hosts() {
-        let [left, right] = pair(&hello("a", 1, 1), &hello("b", 2, 2));
-        for outcome in [left, right] {
-            let error = outcome.map(|_| ()).unwrap_err().to_string();
-            assert!(error.contains("topology"), "{error}");
-        }
-    }
-
-    #[test]
-    fn one_domain_at_both_ends_is_refused() {
-        let [left, _] = pair(&hello("a", 1, 7), &hello("b", 1, 7));
-        assert!(
-            left.map(|_| ())
-                .unwrap_err()
-                .to_string()
-                .contains("bypass the network")
-        );
-    }
-
-    #[test]
-    fn nobody_there_is_said_with_the_name_and_the_address() {
-        let meeting = Meeting {
-            address: SocketAddr::from((Ipv4Addr::LOCALHOST, 1)),
-            is_here: false,
-            own: Ipv4Addr::LOCALHOST.into(),
-            expected: vec![("robot-pc".to_owned(), Ipv4Addr::LOCALHOST.into())],
-            timeout: Duration::from_millis(1),
-        };
-        let error = meet(&meeting, &hello("a", 1, 1), &mut |_, _| true)
-            .map(|_| ())
-            .unwrap_err();
-        assert!(
-            error.to_string().starts_with("robot-pc did not appear"),
-            "{error}"
-        );
-    }
-}
+#[path = "meet_tests.rs"]
+mod tests;

@@ -19,6 +19,7 @@ use crate::clock_discipline::HostDiscipline;
 use crate::host_facts::HostFacts;
 use crate::process::launch::EmulationError;
 use crate::run_folder::RunFolder;
+use crate::security::KeyFileError;
 
 /// What the command line asks of a run beyond the topology.
 #[derive(Debug, Clone, Default)]
@@ -37,7 +38,7 @@ pub struct RunOptions {
 #[derive(Debug, thiserror::Error)]
 pub enum RunError {
     /// The run folder cannot be written.
-    #[error("run folder below {folder}: {source}")]
+    #[error("no run folder can be made below {folder}: {source}; run.record names another place")]
     Folder {
         /// Parent folder.
         folder: PathBuf,
@@ -56,6 +57,18 @@ pub enum RunError {
     /// A process cannot be started.
     #[error("{0}")]
     Start(String),
+    /// The topology does not say whether strangers may read and forge its messages.
+    #[error("{0}")]
+    SecurityUnsaid(String),
+    /// The key file cannot be used.
+    #[error(transparent)]
+    Key(KeyFileError),
+    /// The system gives no random numbers.
+    #[error("cannot draw the run's secret: {0}")]
+    Random(io::Error),
+    /// The first host did not give the run's secret.
+    #[error("the run's secret did not come: {0}")]
+    SecretMissing(String),
     /// An emulated link asks for more than a gateway can hold.
     #[error("the emulated link cannot be kept: {0}")]
     Emulation(EmulationError),
@@ -138,6 +151,8 @@ pub struct RunResult {
     pub cards: Vec<CardStory>,
     /// True when all hosts read one clock.
     pub has_one_clock: bool,
+    /// How the hops between hosts are protected, in words; `None` when there are none.
+    pub security: Option<String>,
     /// Who steers each host's system clock, of the hosts that told.
     pub disciplines: BTreeMap<String, HostDiscipline>,
     /// Hosts that ran here.

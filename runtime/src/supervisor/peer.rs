@@ -1,13 +1,14 @@
 //! One connected peer: another host's supervisor at the other end of a TCP connection. How hosts
 //! find each other is in `meet.rs`.
 
-use std::io::{self, BufReader, BufWriter, Write};
+use std::io::{self, BufReader, BufWriter, Read, Write};
 use std::net::{Shutdown, TcpStream};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use super::frame::{Frame, PeerHello, PeerMessage, read_frame, write_message};
+use crate::security::{SecureReader, SecureWriter, TimedStream};
 
 /// Frames that may wait between the reader thread and the supervisor.
 const INBOX_FRAMES: usize = 256;
@@ -21,12 +22,73 @@ pub(crate) enum PeerEvent {
     Closed(String),
 }
 
+/// The receiving half of a connection.
+#[derive(Debug)]
+pub(super) enum ControlReader {
+    Plain(BufReader<TimedStream>),
+    Secured(Box<SecureReader>),
+}
+
+impl ControlReader {
+    /// From now on a read waits for as long as it takes.
+    fn wait_for_ever(&mut self) -> io::Result<()> {
+        match self {
+            Self::Plain(reader) => reader.get_mut().wait_for_ever(),
+            Self::Secured(reader) => reader.wait_for_ever(),
+        }
+    }
+}
+
+impl Read for ControlReader {
+    fn read(&mut self, out: &mut [u8]) -> io::Result<usize> {
+        match self {
+            Self::Plain(reader) => reader.read(out),
+            Self::Secured(reader) => reader.read(out),
+        }
+    }
+}
+
+/// The sending half of a connection.
+#[derive(Debug)]
+pub(super) enum ControlWriter {
+    Plain(BufWriter<TcpStream>),
+    Secured(SecureWriter),
+}
+
+impl ControlWriter {
+    fn stream(&self) -> &TcpStream {
+        match self {
+            Self::Plain(writer) => writer.get_ref(),
+            Self::Secured(writer) => writer.stream(),
+        }
+    }
+}
+
+impl Write for ControlWriter {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        match self {
+            Self::Plain(writer) => writer.write(bytes),
+            Self::Secured(writer) => writer.write(bytes),
+        }
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        match self {
+            Self::Plain(writer) => writer.flush(),
+            Self::Secured(writer) => writer.flush(),
+        }
+    }
+}
+
+/// Both halves.
+pub(super) type ControlEnds = (ControlReader, ControlWriter);
+
 /// One connected peer.
 #[derive(Debug)]
 pub(crate) struct Peer {
     /// What it said of itself.
     pub(crate) hello: PeerHello,
-    writer: BufWriter<TcpStream>,
+    writer: ControlWriter,
     inbox: Receiver<PeerEvent>,
     heard: Instant,
     is_open: bool,
@@ -37,14 +99,12 @@ pub(crate) struct Peer {
 
 impl Peer {
     /// Listens to the connection in a thread of its own.
-    pub(crate) fn new(stream: TcpStream, hello: PeerHello) -> io::Result<Self> {
-        stream.set_read_timeout(None)?;
-        let input = stream.try_clone()?;
+    pub(super) fn new((mut input, writer): ControlEnds, hello: PeerHello) -> io::Result<Self> {
+        input.wait_for_ever()?;
         let (sender, inbox) = sync_channel(INBOX_FRAMES);
         thread::Builder::new()
             .name(format!("peer {}", hello.host))
             .spawn(move || forward(input, &sender))?;
-        let writer = BufWriter::new(stream);
         Ok(Self {
             hello,
             writer,
@@ -81,7 +141,7 @@ impl Peer {
 
     /// Records are larger than greetings: a write may take up to `limit`.
     pub(crate) fn allow_writes_to_take(&mut self, limit: Duration) -> io::Result<()> {
-        self.writer.get_ref().set_write_timeout(Some(limit))
+        self.writer.stream().set_write_timeout(Some(limit))
     }
 
     /// The sending half by itself, so that a thread can send while another receives.
@@ -95,12 +155,11 @@ impl Peer {
 impl Drop for Peer {
     /// Ends the connection both ways, so that the reader thread and the other end notice.
     fn drop(&mut self) {
-        let _already_closed = self.writer.get_ref().shutdown(Shutdown::Both).is_err();
+        let _already_closed = self.writer.stream().shutdown(Shutdown::Both).is_err();
     }
 }
 
-fn forward(input: TcpStream, out: &SyncSender<PeerEvent>) {
-    let mut input = BufReader::new(input);
+fn forward(mut input: ControlReader, out: &SyncSender<PeerEvent>) {
     loop {
         let event = match read_frame(&mut input) {
             Ok(frame) => PeerEvent::Frame(frame),

@@ -91,6 +91,11 @@ impl ProcessPlan {
         matches!(self.kind, ProcessKind::ClockPath { .. })
     }
 
+    /// True for what has datagrams of ours on the network.
+    pub(crate) fn is_gateway(&self) -> bool {
+        matches!(self.kind, ProcessKind::Gateway(_)) || self.is_clock_path()
+    }
+
     /// True for what carries messages instead of making them: a gateway, or a face.
     pub(crate) fn is_carrier(&self) -> bool {
         matches!(self.kind, ProcessKind::Gateway(_) | ProcessKind::Face(_))

@@ -11,8 +11,8 @@ use super::crew::{self, Crew, Verdict};
 use super::domains::Domains;
 use super::event::{Event, HostStory, ProcessStory, disciplines};
 use super::exchange::exchange;
-use super::frame::{Frame, PeerHello, PeerMessage};
-use super::meet::{Meeting, meet};
+use super::frame::{Frame, PeerMessage};
+use super::gathering::{gather, read_key};
 use super::outcome::{Heard, Outcome, RunError, RunOptions, RunResult};
 use super::peer::{Peer, PeerEvent};
 use super::plan::{ProcessPlan, plan};
@@ -59,6 +59,7 @@ pub fn run(
         .iter()
         .filter(|host| options.hosts.contains(&host.name))
         .collect();
+    let key = read_key(topology, &hosts)?;
     let plan = plan(topology, &hosts);
     crew::find_programs(&plan.processes)?;
     check_emulation(topology).map_err(RunError::Emulation)?;
@@ -73,9 +74,11 @@ pub fn run(
     let run = folder.root().to_string_lossy();
     let domains = Domains::create(&plan.hosts, options.domain_root.as_ref(), &run)?;
     console.say(&format!("run folder {}", folder.root().display()));
-    let peers = gather_peers(topology, &hosts, &domains, (signals, console))?;
+    let meant = (topology, key.as_ref());
+    let gathered = gather(meant, &hosts, &domains, (signals, console))?;
+    let peers = gathered.peers;
     let here = clock_id()?;
-    let crew = Crew::new(plan.processes, domains.addresses(), &folder)?;
+    let crew = Crew::new(plan.processes, domains.addresses(), &folder, gathered.seal)?;
     let announcement = Announcement::make(
         topology,
         &folder,
@@ -91,10 +94,7 @@ pub fn run(
         topology,
         announcement,
         cards,
-        is_first_host: topology
-            .hosts()
-            .first()
-            .is_some_and(|host| is_here(host, &hosts)),
+        is_first_host: is_here(&topology.hosts()[0], &hosts),
         has_one_clock: peers.iter().all(|peer| peer.hello.clock_id == here),
         crew,
         domains,
@@ -102,6 +102,7 @@ pub fn run(
         signals,
         console,
         discipline,
+        security: gathered.security,
         cleaned: WallInstant::now(),
         greeted: WallInstant::now(),
         teller,
@@ -118,7 +119,7 @@ pub fn run(
     Ok(session.conclude(folder, outcome, span, (started, facts)))
 }
 
-fn is_here(host: &Host, hosts: &[&Host]) -> bool {
+pub(super) fn is_here(host: &Host, hosts: &[&Host]) -> bool {
     hosts.iter().any(|here| here.name == host.name)
 }
 
@@ -137,56 +138,6 @@ fn make_folder(topology: &Topology, hosts: &[&Host]) -> Result<RunFolder, RunErr
     })
 }
 
-fn gather_peers(
-    topology: &Topology,
-    hosts: &[&Host],
-    domains: &Domains,
-    (signals, console): (&Signals, &mut Console),
-) -> Result<Vec<Peer>, RunError> {
-    let first = &topology.hosts()[0];
-    let Some(address) = first.control_address() else {
-        return Ok(Vec::new());
-    };
-    if hosts.len() == topology.hosts().len() {
-        return Ok(Vec::new());
-    }
-    let is_first = is_here(first, hosts);
-    let others = topology.hosts().iter().filter(|host| !is_here(host, hosts));
-    let expected = others
-        .filter(|host| is_first || host.name == first.name)
-        .map(|host| (host.name.clone(), host.gateway_address()))
-        .collect();
-    let meeting = Meeting {
-        address,
-        is_here: is_first,
-        own: hosts[0].gateway_address(),
-        expected,
-        timeout: topology.run().start_timeout,
-    };
-    let hello = PeerHello {
-        version: env!("CARGO_PKG_VERSION").to_owned(),
-        topology_hash: topology.hash(),
-        host: hosts[0].name.clone(),
-        clock_id: clock_id()?,
-        domain: domains.fingerprint()?,
-    };
-    let peers = meet(&meeting, &hello, &mut |missing, waited| {
-        let waited_s = waited.as_secs();
-        let role = if is_first {
-            "to connect to"
-        } else {
-            "to answer at"
-        };
-        console.progress(&format!(
-            "waiting for {missing} {role} {address} ({waited_s} s)"
-        ));
-        signals.received().is_none()
-    })?;
-    let names: Vec<&str> = peers.iter().map(|peer| peer.hello.host.as_str()).collect();
-    console.say(&format!("connected with {}", names.join(", ")));
-    Ok(peers)
-}
-
 struct Session<'a> {
     topology: &'a Topology,
     // Before the domains: its files lie beside theirs.
@@ -203,6 +154,8 @@ struct Session<'a> {
     console: &'a mut Console,
     /// Who steered the system clock before the run.
     discipline: Option<HostDiscipline>,
+    /// How the hops are protected, in words.
+    security: Option<String>,
     cleaned: WallInstant,
     greeted: WallInstant,
     teller: Teller,
@@ -365,7 +318,7 @@ impl Session<'_> {
     }
 
     fn tell(&mut self, phase: Phase) {
-        let run = (self.topology, &self.crew);
+        let run = (self.topology, &mut self.crew);
         self.teller.tell(phase, run, self.console);
     }
 
@@ -463,6 +416,7 @@ impl Session<'_> {
             processes,
             cards,
             has_one_clock,
+            security: self.security,
             disciplines,
             own_hosts,
             problems,

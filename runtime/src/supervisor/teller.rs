@@ -1,5 +1,5 @@
-//! Tells how a run stands: to the person who started it, in one line, and to whoever looks on, in
-//! `status.json`. It decides nothing.
+//! Tells how a run stands: to the person who started it, in one line, to whoever looks on, in
+//! `status.json`, and to the service manager. It decides nothing.
 
 use std::path::Path;
 use std::time::{Duration, Instant as WallInstant};
@@ -8,6 +8,7 @@ use hil_models::time::Instant;
 
 use super::child::Child;
 use super::crew::{Crew, Member};
+use super::heartbeat::Heartbeats;
 use super::progress_line;
 use crate::clock::MonotonicClock;
 use crate::console::Console;
@@ -22,6 +23,7 @@ pub(super) struct Teller {
     file: StatusFile,
     /// What was told last, and when.
     told: Option<(Phase, WallInstant)>,
+    heartbeats: Heartbeats,
 }
 
 impl Teller {
@@ -30,6 +32,7 @@ impl Teller {
         Self {
             file: StatusFile::of(folder),
             told: None,
+            heartbeats: Heartbeats::default(),
         }
     }
 
@@ -37,7 +40,7 @@ impl Teller {
     pub(super) fn tell(
         &mut self,
         phase: Phase,
-        (topology, crew): (&Topology, &Crew),
+        (topology, crew): (&Topology, &mut Crew),
         console: &mut Console,
     ) {
         let is_due = self
@@ -47,6 +50,7 @@ impl Teller {
             return;
         }
         self.told = Some((phase, WallInstant::now()));
+        self.tell_service(phase, crew, console);
         let duration = topology.run().duration;
         let processes = crew.members().iter().map(process);
         let duration_ns = u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX);
@@ -63,6 +67,23 @@ impl Teller {
         let channels = progress_line::of_channels(topology, progress);
         let (elapsed_s, total_s) = (elapsed.as_secs_f64(), duration.as_secs_f64());
         console.progress(&format!("{elapsed_s:6.1} / {total_s:.0} s  {channels}"));
+    }
+
+    /// A tick of the watchdog says that the loop of the supervisor turns, which calls this, and those
+    /// of all processes that it started.
+    fn tell_service(&mut self, phase: Phase, crew: &mut Crew, console: &mut Console) {
+        match phase {
+            Phase::Starting => console.announce_alive(),
+            Phase::Running => {
+                for words in self.heartbeats.look(crew, MonotonicClock::now()) {
+                    console.warn(&words);
+                }
+                if self.heartbeats.are_all_there() {
+                    console.announce_up();
+                }
+            }
+            Phase::Ending => console.announce_ending(),
+        }
     }
 }
 

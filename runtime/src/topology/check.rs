@@ -62,6 +62,7 @@ pub(super) fn check(file: File<'_>, known: &KnownCases, needs: Needs, faults: &F
         processes,
         channels: Vec::new(),
         links: Vec::new(),
+        security: file.security,
     };
     // Without the case, its channels would look like foreign ones.
     if known_case.is_some() || case_entry.is_none() {

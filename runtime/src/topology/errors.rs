@@ -9,6 +9,9 @@ use annotate_snippets::{AnnotationKind, Group, Level, Renderer, Snippet};
 
 use super::suggest::{listed, nearest};
 
+/// Errors that are told at once: of a file that is no topology at all, every line would be one.
+const TOLD_MAX: usize = 10;
+
 /// Everything wrong with a topology, in the order of files and lines; never empty.
 #[derive(Debug)]
 pub struct TopologyErrors {
@@ -187,19 +190,23 @@ impl TopologyErrors {
         &self.errors
     }
 
-    /// The errors as annotated snippets of the files, with terminal colours if wanted.
+    /// The first errors as annotated snippets of the files, with terminal colours if wanted.
     pub fn render(&self, with_colours: bool) -> String {
         let renderer = if with_colours {
             Renderer::styled()
         } else {
             Renderer::plain()
         };
-        let blocks: Vec<_> = self
-            .errors
-            .iter()
-            .map(|error| renderer.render(&[self.report(error)]))
-            .collect();
+        let told = self.errors.iter().take(TOLD_MAX);
+        let blocks = told.map(|error| renderer.render(&[self.report(error)]));
+        let blocks: Vec<_> = blocks.chain(self.untold()).collect();
         blocks.join("\n\n")
+    }
+
+    /// Words for the errors that are not told.
+    fn untold(&self) -> Option<String> {
+        let count = self.errors.len().saturating_sub(TOLD_MAX);
+        (count > 0).then(|| format!("and {count} more"))
     }
 
     fn report<'a>(&'a self, error: &'a TopologyError) -> Group<'a> {
@@ -225,15 +232,11 @@ impl TopologyErrors {
 }
 
 impl fmt::Display for TopologyErrors {
-    /// One line per error.
+    /// One line for each of the first errors.
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        for (index, error) in self.errors.iter().enumerate() {
-            if index > 0 {
-                formatter.write_str("\n")?;
-            }
-            write!(formatter, "{error}")?;
-        }
-        Ok(())
+        let told = self.errors.iter().take(TOLD_MAX).map(ToString::to_string);
+        let lines: Vec<String> = told.chain(self.untold()).collect();
+        formatter.write_str(&lines.join("\n"))
     }
 }
 

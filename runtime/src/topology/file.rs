@@ -13,6 +13,7 @@ use super::file_links::LinkEntry;
 use super::limits;
 use super::model::{Execution, Host, MessageLayout, OnExit, Run, Scheduling, Wait};
 use super::reader::{At, Reader};
+use super::security::Security;
 use super::tree::Table;
 
 /// The file, table by table.
@@ -25,6 +26,7 @@ pub(super) struct File<'t> {
     pub processes: Vec<ProcessEntry>,
     pub channels: Vec<ChannelEntry>,
     pub links: Vec<LinkEntry>,
+    pub security: Security,
     /// Where a missing table would stand.
     pub place: Place,
 }
@@ -114,6 +116,7 @@ pub(super) fn read<'t>(table: &'t Table, place: Place, faults: &'t Faults) -> Fi
         processes: each(&mut root, "processes", read_process),
         channels: each(&mut root, "channels", read_channel),
         links: each(&mut root, "links", LinkEntry::read),
+        security: Security::read(root.table("security")),
         place,
     };
     root.finish();

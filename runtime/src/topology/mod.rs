@@ -31,6 +31,7 @@ mod model_links;
 mod reader;
 mod resolved;
 mod resolved_impairments;
+mod security;
 mod suggest;
 mod tree;
 mod units;
@@ -52,6 +53,7 @@ pub use model::{
     Process, Program, Run, Scheduling, Topology, Wait,
 };
 pub use model_links::{Emulation, Gateway, Hop, Link, Timestamps, Via};
+pub use security::{Hops, Security};
 
 pub(crate) use units::parse_duration;
 
@@ -160,7 +162,7 @@ fn read_and_check(
         let file = file::read(&table, top, &layers.faults);
         check::check(file, known, needs, &layers.faults)
     };
-    let topology = topology.with_traces_beside(path);
+    let topology = topology.with_traces_beside(path).with_key_beside(path);
     if layers.faults.is_empty() {
         Ok(topology)
     } else {

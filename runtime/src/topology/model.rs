@@ -13,6 +13,7 @@ use super::model_links::{Hop, Link};
 
 use super::clock_path::ClockEnd;
 use super::face::EgmFace;
+use super::security::Security;
 
 /// A topology file after every check. Only [`load`](super::load) and [`parse`](super::parse)
 /// make one.
@@ -25,6 +26,7 @@ pub struct Topology {
     pub(super) processes: Vec<Process>,
     pub(super) channels: Vec<Channel>,
     pub(super) links: Vec<Link>,
+    pub(super) security: Security,
 }
 
 /// `[run]`: how long, from which seed, recorded where.

@@ -24,6 +24,10 @@ impl Topology {
 
     /// The same as a tree, for a manifest of any format.
     pub fn resolved(&self) -> Table {
+        self.resolved_with(true)
+    }
+
+    fn resolved_with(&self, key_path: bool) -> Table {
         let mut table = Table::new();
         put(&mut table, "version", super::limits::VERSION.default);
         put(&mut table, "name", self.name.as_str());
@@ -52,15 +56,24 @@ impl Topology {
             .iter()
             .map(|link| (link.name.clone(), resolved_link(link)));
         put_named(&mut table, "links", links);
+        if let Some(security) = self.security.resolved(key_path) {
+            put(&mut table, "security", security);
+        }
         table
     }
 
-    /// 64-bit FNV-1a of [`Topology::to_toml`]: equal on two hosts that mean the same run.
+    /// 64-bit FNV-1a of [`Topology::to_toml`] but for the place of the key file: equal on two hosts that
+    /// mean the same run.
     ///
     /// It guards against two versions of a file, not against an adversary.
+    ///
+    /// # Panics
+    /// Never: tables with string keys can be written as TOML.
     pub fn hash(&self) -> u64 {
         let step = |hash: u64, byte: u8| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3);
-        self.to_toml().bytes().fold(0xcbf2_9ce4_8422_2325, step)
+        let text = toml::to_string(&self.resolved_with(false));
+        let text = text.expect("tables with string keys can be written as TOML");
+        text.bytes().fold(0xcbf2_9ce4_8422_2325, step)
     }
 
     fn resolved_run(&self) -> Table {

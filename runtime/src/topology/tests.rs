@@ -13,6 +13,7 @@ mod misspelt;
 mod mutation;
 mod recorded;
 mod relations;
+mod security;
 mod wifi;
 
 use core::time::Duration;
@@ -139,6 +140,7 @@ const EVERYTHING: &str = r#"
 version = 1
 name = "everything"
 run = { duration = "2 min", seed = 7, record = "out", start_timeout = "5 s" }
+security = { hops = "sealed", key = "keys/hop.key" }
 [case]
 name = "teleoperation"
 [case.parameters]

@@ -169,6 +169,11 @@ impl RecordFollower {
         core::mem::take(&mut self.problems)
     }
 
+    /// What the files at hand hold, and of which channels, also where nothing came from them yet.
+    pub(crate) fn headers(&self) -> impl Iterator<Item = &RecordHeader> {
+        self.files.iter().filter_map(|one| one.header.as_ref())
+    }
+
     /// Files found so far.
     pub fn file_count(&self) -> usize {
         self.files.len()

@@ -34,4 +34,4 @@ pub use follow::{Batch, RecordFollower};
 pub use live::{LIVE_VERSION, LiveChannel, LiveRun, Source, Stage};
 pub use passive::{PassiveCounters, PassiveReader, observer_depth};
 pub use seen::Seen;
-pub use select::{SelectError, running_runs, running_runs_below, select};
+pub use select::{SelectError, running_runs, running_runs_below, select, select_below};

@@ -82,6 +82,21 @@ pub fn select(wanted: Option<&str>) -> Result<LiveRun, SelectError> {
     choose(wanted, running_runs())
 }
 
+/// As [`select`], of the runs whose folders lie below `below` only.
+///
+/// # Errors
+/// As [`select`].
+pub fn select_below(below: &Path, wanted: Option<&str>) -> Result<LiveRun, SelectError> {
+    choose(wanted, lying_below(below, running_runs()))
+}
+
+/// A run's folder is announced without symbolic links in it; one that is not there yet holds none.
+fn lying_below(below: &Path, mut running: Vec<LiveRun>) -> Vec<LiveRun> {
+    let below = fs::canonicalize(below).unwrap_or_else(|_absent| below.to_owned());
+    running.retain(|run| run.folder.starts_with(&below));
+    running
+}
+
 fn choose(wanted: Option<&str>, mut running: Vec<LiveRun>) -> Result<LiveRun, SelectError> {
     if let Some(wanted) = wanted {
         let folder = Path::new(wanted);
@@ -172,6 +187,19 @@ mod tests {
         running[1].folder = PathBuf::from("/elsewhere/fleet-1");
         let error = choose(Some("fleet-1"), running).unwrap_err().to_string();
         assert!(error.contains("/r/fleet-1, /elsewhere/fleet-1"), "{error}");
+    }
+
+    #[test]
+    fn runs_of_other_folders_are_not_known_below_one() {
+        let mut running = vec![run("fleet-1"), run("fleet-2")];
+        running[1].folder = PathBuf::from("/elsewhere/fleet-2");
+        let below = |folder: &str| {
+            let found = lying_below(Path::new(folder), running.clone());
+            names(&found)
+        };
+        assert_eq!(below("/elsewhere"), ["fleet-2"]);
+        assert_eq!(below("/"), ["fleet-1", "fleet-2"]);
+        assert!(below("/else").is_empty());
     }
 
     #[test]

@@ -66,6 +66,23 @@ impl<'a> Page<'a> {
         self.ask("Emulation.setEmulatedMedia", &media);
     }
 
+    /// Lays the page out as for paper, or for the screen again; nothing is printed.
+    pub fn set_paper(&mut self, is_paper: bool) {
+        let media = if is_paper { "print" } else { "" };
+        self.ask("Emulation.setEmulatedMedia", &json!({"media": media}));
+    }
+
+    /// Prints the page, as PDF.
+    ///
+    /// # Panics
+    /// When it cannot be printed.
+    pub fn printed(&mut self) -> Vec<u8> {
+        let printed = self.ask("Page.printToPDF", &json!({}));
+        let bytes = decoded(printed["data"].as_str().unwrap_or_default());
+        assert!(bytes.starts_with(b"%PDF"), "nothing was printed");
+        bytes
+    }
+
     /// Goes to an address and waits until the page and what it names are loaded.
     ///
     /// # Panics

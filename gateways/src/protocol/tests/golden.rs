@@ -223,11 +223,12 @@ fn data(payload: &[u8]) -> Vec<u8> {
 fn each_broken_field_has_its_own_refusal() {
     let valid = data(&[1, 2, 3]);
     assert!(decode(&valid).is_ok());
-    let table: [(usize, u8, Refusal); 10] = [
+    let table: [(usize, u8, Refusal); 11] = [
         (0, b'X', Refusal::BadMagic),
         (4, 2, Refusal::UnsupportedVersion),
         (5, 0, Refusal::UnknownKind),
-        (5, 7, Refusal::UnknownKind),
+        (5, 7, Refusal::UnexpectedKind),
+        (5, 9, Refusal::UnknownKind),
         (6, 2, Refusal::UnknownFlags),
         (7, 1, Refusal::UnknownFlags),
         (14, 71, Refusal::BadHeaderLength),

@@ -5,6 +5,6 @@ mod clock_path;
 mod fragments;
 mod golden;
 mod mutation;
-mod network;
+pub(super) mod network;
 mod recovery;
 mod sequences;

@@ -4,6 +4,7 @@
 use hil_models::link::condition::LinkConditionRecord;
 
 use super::LiveTopics;
+use crate::scene::waiting::LiveScene;
 use crate::sink::Sink;
 
 impl LiveTopics {
@@ -17,16 +18,21 @@ impl LiveTopics {
             .map_or(Ok(()), |scene| scene.settle(sink))
     }
 
-    /// Nothing more will come: draws the rest of the scene; why it lacks something, if it does.
+    /// False while something is being made that the scene waits for.
+    pub(crate) fn is_scene_ready(&mut self) -> bool {
+        self.scene.as_mut().is_none_or(LiveScene::is_ready)
+    }
+
+    /// Nothing more will come: draws the rest of the scene; what it lacks.
     ///
     /// # Errors
     /// When the sink cannot take it.
-    pub(crate) fn finish_scene<S: Sink>(&mut self, sink: &mut S) -> Result<Option<&str>, S::Error> {
+    pub(crate) fn finish_scene<S: Sink>(&mut self, sink: &mut S) -> Result<Vec<String>, S::Error> {
         let Some(scene) = &mut self.scene else {
-            return Ok(None);
+            return Ok(Vec::new());
         };
         scene.finish(sink)?;
-        Ok(scene.problem())
+        Ok(scene.problems())
     }
 
     /// An order to an emulated link.

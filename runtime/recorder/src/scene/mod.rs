@@ -1,6 +1,8 @@
 //! The scene of a run in its recording: `/scene`, `/scene/ground` and `/tf`, which viewers draw by
 //! themselves. What is in it is worked out by [`crate::view`], as for the live page; here it is drawn
-//! at an even pace of the run's own time, so that a file has the same pictures however it was made.
+//! at an even pace of the run's own time, so that a file made live has the pictures of a converted
+//! one as far as the same messages reached it in time: not those that only another host has, and not
+//! those before it began.
 
 mod arms;
 mod fleet;

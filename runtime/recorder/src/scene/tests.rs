@@ -109,11 +109,18 @@ fn robots_move_at_the_pace_of_the_pictures_and_each_picture_is_whole() {
     }
 }
 
+fn wait_for(is_ready: &mut dyn FnMut() -> bool) {
+    while !is_ready() {
+        std::thread::sleep(std::time::Duration::from_millis(5));
+    }
+}
+
 #[test]
 fn a_live_file_has_the_pictures_of_one_made_in_order() {
     let (mut ordered, mut kept) = (crossing(), Kept::default());
     let mut live = LiveScene::new(crossing());
     let mut kept_live = Kept::default();
+    wait_for(&mut || ordered.is_ready());
     for number in 0..200 {
         for robot in 0..2 {
             let (state, at_ns) = state(robot, number);
@@ -130,16 +137,58 @@ fn a_live_file_has_the_pictures_of_one_made_in_order() {
             }
         }
         live.settle(&mut kept_live).unwrap();
+        if piece == 9 {
+            wait_for(&mut || live.is_ready());
+        }
     }
     assert!(kept_live.scenes().len() > 70);
     live.finish(&mut kept_live).unwrap();
-    let places = |kept: &Kept| -> Vec<_> {
-        let scenes = kept.scenes();
-        let robots = ["fleet 0 robot 0", "fleet 0 robot 1"];
-        let of = |(at_ns, update): &(u64, SceneUpdate)| (*at_ns, robots.map(|id| x_of(update, id)));
-        scenes.iter().map(of).collect()
-    };
-    assert_eq!(places(&kept), places(&kept_live));
+    assert!(kept.messages == kept_live.messages);
+    assert_eq!(live.problems(), [""; 0]);
+    assert!(!kept.messages["/scene/ground"].is_empty());
+}
+
+#[test]
+fn one_damaged_time_does_not_hurry_a_live_scene() {
+    let mut live = LiveScene::new(crossing());
+    let mut kept = Kept::default();
+    for number in 0..20 {
+        let (state, at_ns) = state(0, number);
+        let at_ns = if number == 10 { at_ns << 20 } else { at_ns };
+        live.take(&told(&state, at_ns), &mut kept).unwrap();
+    }
+    wait_for(&mut || live.is_ready());
+    live.settle(&mut kept).unwrap();
+    // The second robot's file is read after the first one's.
+    for number in 0..20 {
+        let (state, at_ns) = state(1, number);
+        live.take(&told(&state, at_ns), &mut kept).unwrap();
+    }
+    live.finish(&mut kept).unwrap();
+    let scenes = kept.scenes();
+    let both = scenes.iter().filter(|(_, update)| {
+        ["fleet 0 robot 0", "fleet 0 robot 1"]
+            .iter()
+            .all(|id| x_of(update, id).is_some())
+    });
+    assert!(both.count() > 2, "{}", scenes.len());
+}
+
+#[test]
+fn a_scene_that_is_finished_before_its_ground_says_what_it_lacks() {
+    // Which of the two happens depends on how fast the ground is made; each is said.
+    let mut live = LiveScene::new(crossing());
+    let mut kept = Kept::default();
+    assert!(live.is_ready(), "nothing waits for a ground");
+    for number in 0..20 {
+        let (state, at_ns) = state(0, number);
+        live.take(&told(&state, at_ns), &mut kept).unwrap();
+    }
+    live.settle(&mut kept).unwrap();
+    live.finish(&mut kept).unwrap();
+    let has_ground = kept.messages.contains_key("/scene/ground");
+    assert!(has_ground || !live.problems().is_empty());
+    assert_eq!(kept.scenes().len(), 8);
 }
 
 #[test]
@@ -162,9 +211,7 @@ fn a_silence_is_not_drawn_and_a_silent_robot_fades() {
 #[test]
 fn the_ground_comes_once_it_is_known_and_again_after_ten_seconds() {
     let (mut scene, mut kept) = (crossing(), Kept::default());
-    while !scene.is_ready() {
-        std::thread::sleep(std::time::Duration::from_millis(5));
-    }
+    wait_for(&mut || scene.is_ready());
     assert_eq!(scene.problem(), None);
     for number in 0..=1050 {
         let (state, at_ns) = state(0, number);

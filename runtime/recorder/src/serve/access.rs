@@ -13,10 +13,10 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use super::head::{Head, only};
 
-/// What programs with pages of their own in them send, as Lichtblick's desktop application does.
-/// Browsers do not: of a file they say `null`, as of any page that another shows in a sandbox.
+/// What programs with pages of their own in them send, as Lichtblick's desktop application does. So does
+/// any saved page in some browsers and web views, those of iOS among them; others say `null` of a file.
 const FILE_ORIGIN: &str = "file://";
-/// Which any page can have.
+/// Which any page can have, in a sandbox that another shows it in.
 pub(crate) const NO_ORIGIN: &str = "null";
 
 /// As much of a foreign word is repeated.
@@ -63,14 +63,26 @@ impl Refusal {
     pub(crate) fn words(&self) -> String {
         let advice = match self {
             Self::ForeignHost(host) => {
-                format!("; that is not this machine's name; --allow-host {host} says that it is")
+                let cure = offered(host, self::host(host).is_ok());
+                let cure = cure.map(|host| format!("; --allow-host {host} says that it is"));
+                format!(
+                    "; that is not this machine's name{}",
+                    cure.unwrap_or_default()
+                )
             }
             Self::ForeignOrigin(origin) if origin == NO_ORIGIN => {
                 "; every page can be one".to_owned()
             }
-            Self::ForeignOrigin(origin) => format!(
-                "; --allow-origin {origin} lets its pages see the run and change emulated links"
+            Self::ForeignOrigin(origin) if origin == FILE_ORIGIN => format!(
+                "; desktop applications such as Lichtblick's are one, and so can any saved page be: \
+                 --allow-origin {FILE_ORIGIN} lets them all see the run and change emulated links"
             ),
+            Self::ForeignOrigin(origin) => {
+                let cure = offered(origin, self::origin(origin).is_ok());
+                let lets = "lets its pages see the run and change emulated links";
+                let cure = cure.map(|origin| format!("; --allow-origin {origin} {lets}"));
+                cure.unwrap_or_default()
+            }
             _ => String::new(),
         };
         format!("refused {self}{advice}")
@@ -124,12 +136,10 @@ impl Access {
         let short = machine.and_then(|name| name.split('.').next());
         let own = ["localhost"].into_iter().chain(machine).chain(short);
         let hosts = own.chain(hosts.iter().map(String::as_str));
-        let origins = [FILE_ORIGIN]
-            .into_iter()
-            .chain(origins.iter().map(String::as_str));
+        let origins = origins.iter();
         Self {
             hosts: hosts.map(str::to_ascii_lowercase).collect(),
-            origins: origins.map(str::to_ascii_lowercase).collect(),
+            origins: origins.map(|one| one.to_ascii_lowercase()).collect(),
             refused: Mutex::default(),
         }
     }
@@ -279,6 +289,20 @@ fn word(text: &str) -> String {
     word
 }
 
+/// A foreign word as part of a command that is offered for pasting into a shell: only a whole one that the
+/// option takes, and that means nothing else to a shell.
+fn offered(word: &str, is_taken: bool) -> Option<String> {
+    let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b"._:/+-".contains(&byte);
+    let is_own = |byte: u8| is_plain(byte) || b"[]".contains(&byte);
+    // What begins with a hyphen would be taken for another option.
+    let is_misleading = word.starts_with('-') || word.len() > WORD_MAX;
+    if !is_taken || is_misleading || !word.bytes().all(is_own) {
+        return None;
+    }
+    let quote = if word.bytes().all(is_plain) { "" } else { "'" };
+    Some(format!("{quote}{word}{quote}"))
+}
+
 /// An origin as the command line names it: that of a page, without its path.
 pub(crate) fn origin(text: &str) -> Result<String, String> {
     let known = text.to_ascii_lowercase();
@@ -308,183 +332,4 @@ pub(crate) fn host(text: &str) -> Result<String, String> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    const PAGE: u16 = 8766;
-
-    fn judged(host: &str, origin: Option<&str>) -> Result<(), Refusal> {
-        let (hosts, origins) = (
-            ["robot.example.org".to_owned()],
-            ["https://app.foxglove.dev".to_owned()],
-        );
-        let access = Access::new(&hosts, &origins, Some("Control-PC.lab"));
-        let head = Head {
-            host: Some(host.to_owned()),
-            origin: origin.map(str::to_owned),
-        };
-        access.judge(&head, PAGE)
-    }
-
-    fn foreign_origin(origin: &str) -> Result<(), Refusal> {
-        Err(Refusal::ForeignOrigin(origin.to_owned()))
-    }
-
-    #[test]
-    fn programs_own_pages_and_allowed_pages_may_look_on() {
-        for (host, origin) in [
-            ("127.0.0.1:8765", None),
-            ("localhost:8765", Some("http://localhost:8766")),
-            ("LOCALHOST:8765", Some("http://localhost:8766")),
-            ("127.0.0.1:8765", Some("http://127.0.0.1:8766")),
-            ("[::1]:8765", Some("http://[::1]:8766")),
-            ("192.168.0.7:8765", Some("http://192.168.0.7:8766")),
-            ("control-pc:8765", Some("http://control-pc:8766")),
-            ("control-pc.lab:8765", Some("http://control-pc.lab:8766")),
-            // A tunnel may have another port for the socket; the page's stays.
-            ("localhost:18765", Some("http://localhost:8766")),
-            ("robot.example.org", Some("http://robot.example.org:8766")),
-            ("localhost:8765", Some("https://app.foxglove.dev")),
-            ("localhost:8765", Some("file://")),
-            ("localhost", None),
-            // As Python's websocket-client does.
-            ("127.0.0.1:8765", Some("http://127.0.0.1:8765")),
-        ] {
-            assert_eq!(judged(host, origin), Ok(()), "{host} {origin:?}");
-        }
-    }
-
-    #[test]
-    fn pages_of_others_may_not() {
-        for origin in [
-            "https://evil.example",
-            "null",
-            "",
-            "http://localhost",
-            "http://localhost:3000",
-            "https://localhost:8766",
-            "http://127.0.0.1:8766",
-            "http://localhost:8766/",
-            "http://localhost:8766.evil.example",
-            "http://localhost:8766@evil.example",
-            "https://app.foxglove.dev.evil.example",
-            "http://app.foxglove.dev",
-        ] {
-            assert_eq!(
-                judged("localhost:8765", Some(origin)),
-                foreign_origin(origin)
-            );
-        }
-    }
-
-    #[test]
-    fn names_that_may_be_anybodys_are_refused_whoever_asks() {
-        for name in [
-            "evil.example",
-            "localhost.evil.example",
-            "127.0.0.1.evil.example",
-            "control-pc.evil.example",
-            "127.1",
-        ] {
-            let refused = Err(Refusal::ForeignHost(name.to_owned()));
-            assert_eq!(judged(name, None), refused);
-            let own = format!("http://{name}:8766");
-            assert_eq!(judged(&format!("{name}:8765"), Some(&own)), refused);
-        }
-        for broken in [
-            "",
-            ":8765",
-            "localhost:",
-            "localhost:99999",
-            "[::1",
-            "a@localhost",
-            "a b",
-        ] {
-            assert_eq!(judged(broken, None), Err(Refusal::Malformed), "{broken}");
-        }
-        let access = Access::new(&[], &[], None);
-        let (host, origin) = (None, None);
-        assert_eq!(
-            access.judge(&Head { host, origin }, PAGE),
-            Err(Refusal::NoHost)
-        );
-    }
-
-    #[test]
-    fn a_page_on_the_port_of_the_web_has_none_in_its_origin() {
-        let access = Access::new(&[], &[], None);
-        let head = |origin: &str| Head {
-            host: Some("127.0.0.1:8765".to_owned()),
-            origin: Some(origin.to_owned()),
-        };
-        assert_eq!(access.judge(&head("http://127.0.0.1"), 80), Ok(()));
-        assert!(access.judge(&head("http://127.0.0.1:80"), 80).is_err());
-    }
-
-    #[test]
-    fn each_refusal_is_said_once_and_all_are_counted() {
-        let access = Access::new(&[], &[], None);
-        assert_eq!(access.account(), None);
-        let evil = Refusal::ForeignOrigin("https://evil.example".to_owned());
-        for _attempt in 0..3 {
-            access.count(&evil);
-        }
-        access.count(&Refusal::Full(32));
-        let said = access.take_unsaid();
-        assert_eq!(said.len(), 2, "{said:?}");
-        assert!(
-            said[0].contains("--allow-origin https://evil.example"),
-            "{said:?}"
-        );
-        access.count(&evil);
-        assert!(access.take_unsaid().is_empty());
-        assert_eq!(
-            access.account().unwrap(),
-            "refused 5 requests: 4 × a page of https://evil.example; \
-             1 × a viewer, as 32 look on already"
-        );
-        for index in 0..1000 {
-            access.count(&Refusal::ForeignHost(format!("{index}.example")));
-        }
-        assert_eq!(access.take_unsaid().len(), NAMED_MAX - 2 + 1);
-        let account = access.account().unwrap();
-        assert!(
-            account.starts_with("refused 1005 requests: 4 ×"),
-            "{account}"
-        );
-        assert!(account.ends_with("; 994 others"), "{account}");
-    }
-
-    #[test]
-    fn foreign_words_are_short_and_leave_the_terminal_alone() {
-        assert_eq!(word("http://\u{1b}[31m\u{9b}x\n"), "http://?[31m?x?");
-        assert_eq!(word(&"a".repeat(5000)).len(), WORD_MAX + 3);
-    }
-
-    #[test]
-    fn the_command_line_names_origins_and_hosts() {
-        assert_eq!(
-            origin("https://App.foxglove.dev/").unwrap(),
-            "https://app.foxglove.dev"
-        );
-        assert_eq!(
-            origin("http://localhost:9000").unwrap(),
-            "http://localhost:9000"
-        );
-        assert_eq!(origin("file://").unwrap(), "file://");
-        for wrong in [
-            "*",
-            "app.foxglove.dev",
-            "https://",
-            "https://a/b",
-            "https://a:b",
-            "://a",
-        ] {
-            assert!(origin(wrong).is_err(), "{wrong}");
-        }
-        assert_eq!(host("Robot.example.org.").unwrap(), "robot.example.org");
-        for wrong in ["", "*", "robot:8765", "http://robot", "a b"] {
-            assert!(host(wrong).is_err(), "{wrong}");
-        }
-    }
-}
+mod tests;

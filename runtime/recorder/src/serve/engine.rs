@@ -9,7 +9,7 @@ use hil_runtime::console::Console;
 use serde_json::{Value, json};
 
 use super::parameters::Links;
-use super::recording::Recording;
+use super::recording::{Recording, Target};
 use super::source::{Progress, Source};
 use super::viewers::Viewers;
 use crate::view::facts::RunFacts;
@@ -24,6 +24,11 @@ const LARGE_PICTURE_PERIOD: Duration = Duration::from_millis(200);
 const CHANNELS_PERIOD: Duration = Duration::from_millis(100);
 /// Between two words on the run.
 const RUN_PERIOD: Duration = Duration::from_secs(1);
+
+/// Between two rounds, when something is read from shared memory.
+const MEMORY_REST: Duration = Duration::from_millis(10);
+/// The same when all that is read are files, which wait: half of what is between two pictures.
+const REST: Duration = Duration::from_millis(25);
 
 /// When the next of each is due.
 #[derive(Debug, Default)]
@@ -105,14 +110,16 @@ pub(crate) struct Engine {
     /// Parameters as they were told last.
     told: Vec<Parameter>,
     /// Where what is shown is recorded, and the recording.
-    target: Option<PathBuf>,
+    target: Option<Target>,
     recording: Option<Recording>,
+    /// A recording before this one came to nothing.
+    has_failed: bool,
     due: Due,
 }
 
 impl Engine {
     /// Nothing is shown yet.
-    pub(crate) fn new(viewers: Viewers, links: Links, target: Option<PathBuf>) -> Self {
+    pub(crate) fn new(viewers: Viewers, links: Links, target: Option<Target>) -> Self {
         Self {
             shown: None,
             viewers,
@@ -120,6 +127,7 @@ impl Engine {
             told: Vec::new(),
             target,
             recording: None,
+            has_failed: false,
             due: Due::default(),
         }
     }
@@ -134,10 +142,11 @@ impl Engine {
         self.links.show(shown.links.clone());
         if let Some(mut before) = self.recording.take() {
             before.end(console);
+            self.has_failed |= before.has_failed;
         }
         // What is played back is on record already.
-        let target = self.target.as_ref().filter(|_| shown.links.is_some());
-        self.recording = target.map(|path| Recording::begin(&shown.state.facts.name, path));
+        let goes_on = self.target.as_ref().zip(shown.links.as_ref());
+        self.recording = goes_on.map(|(target, (folder, _))| Recording::begin(folder, target));
         self.shown = Some(shown);
         self.due = Due::default();
     }
@@ -152,13 +161,25 @@ impl Engine {
         })
     }
 
-    /// The viewers, at the end.
-    pub(crate) fn into_viewers(self, console: &mut Console) -> Viewers {
+    /// How long it may rest before the next round: shared memory has room for little.
+    pub(crate) fn rest(&self) -> Duration {
+        let shown = self.shown.as_ref();
+        if shown.is_some_and(|shown| shown.source.reads_memory()) {
+            MEMORY_REST
+        } else {
+            REST
+        }
+    }
+
+    /// The viewers, at the end, and whether all that was to be recorded is.
+    pub(crate) fn into_viewers(self, console: &mut Console) -> (Viewers, bool) {
         self.links.show(None);
+        let mut has_failed = self.has_failed;
         if let Some(mut recording) = self.recording {
             recording.end(console);
+            has_failed |= recording.has_failed;
         }
-        self.viewers
+        (self.viewers, !has_failed)
     }
 
     /// Reads what came and shows what is due.

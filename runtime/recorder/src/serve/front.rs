@@ -8,9 +8,11 @@
 use std::fs::File;
 use std::io::{self, Read as _};
 use std::net::{Ipv4Addr, SocketAddr};
+use std::os::fd::AsFd;
 use std::sync::Arc;
 use std::time::Duration;
 
+use nix::sys::socket::{setsockopt, sockopt};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _, BufReader};
 use tokio::net::tcp::{ReadHalf, WriteHalf};
 use tokio::net::{TcpListener, TcpSocket, TcpStream};
@@ -42,6 +44,9 @@ const BUFFER_BYTES: usize = 32 * 1024;
 /// Bytes that the kernel keeps for a slow viewer, at either end of our part of the way. Without a
 /// bound it would keep megabytes, and what a viewer sees would be as old as they are.
 const KERNEL_BYTES: u32 = 128 * 1024;
+/// How long a viewer may neither acknowledge nor have room for what it is sent: one whose cable was
+/// pulled says no goodbye, and would keep its seat for the kernel's two hours.
+const GONE_AFTER: Duration = Duration::from_secs(30);
 /// Out of file descriptors, mostly: others must close first.
 const PAUSE: Duration = Duration::from_millis(50);
 
@@ -64,6 +69,21 @@ fn hidden([a, b, c]: [u8; 3]) -> Ipv4Addr {
     }
 }
 
+/// Has the kernel close a connection of `socket`, and of those that it accepts, when the other side has
+/// acknowledged nothing, or had no room for anything, for so long. It is asked when there is nothing to send.
+///
+/// # Errors
+/// When the kernel does not know these options.
+pub(super) fn let_go_after(socket: &impl AsFd, time: Duration) -> io::Result<()> {
+    let whole = |number: u128| u32::try_from(number).unwrap_or(u32::MAX);
+    let asked_every_s = whole(u128::from(time.as_secs() / 3).max(1));
+    setsockopt(socket, sockopt::KeepAlive, &true)?;
+    setsockopt(socket, sockopt::TcpKeepIdle, &asked_every_s)?;
+    setsockopt(socket, sockopt::TcpKeepInterval, &asked_every_s)?;
+    setsockopt(socket, sockopt::TcpUserTimeout, &whole(time.as_millis()))?;
+    Ok(())
+}
+
 /// The port that viewers connect to, before anybody is let in.
 #[derive(Debug)]
 pub(super) struct Door {
@@ -77,14 +97,19 @@ impl Door {
     /// # Errors
     /// When it cannot be had.
     pub(super) fn take(runtime: &Handle, address: SocketAddr) -> io::Result<Self> {
+        Self::take_for(runtime, address, GONE_AFTER)
+    }
+
+    /// As [`Door::take`]; viewers that take nothing for `gone_after` lose their place.
+    fn take_for(runtime: &Handle, address: SocketAddr, gone_after: Duration) -> io::Result<Self> {
         let _entered = runtime.enter();
         let socket = match address {
             SocketAddr::V4(_) => TcpSocket::new_v4()?,
             SocketAddr::V6(_) => TcpSocket::new_v6()?,
         };
         socket.set_reuseaddr(true)?;
-        socket.set_keepalive(true)?;
         // Handed down to the connections.
+        let_go_after(&socket, gone_after)?;
         socket.set_send_buffer_size(KERNEL_BYTES)?;
         socket.bind(address)?;
         let listener = socket.listen(1024)?;
@@ -312,17 +337,55 @@ mod tests {
     use super::*;
 
     const REQUEST: &[u8] = b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n";
+    /// Nothing here takes a tenth of this on an overloaded machine.
+    const LIMIT: Duration = Duration::from_mins(1);
 
     /// A door before what listens at `server`: its address, and what keeps it open.
     fn door(server: SocketAddr) -> (SocketAddr, Front, Runtime) {
+        door_for(server, GONE_AFTER)
+    }
+
+    fn door_for(server: SocketAddr, gone_after: Duration) -> (SocketAddr, Front, Runtime) {
         let mut builder = Builder::new_multi_thread();
         let runtime = builder.worker_threads(2).enable_all().build().unwrap();
         let loopback = SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 0);
-        let door = Door::take(runtime.handle(), loopback).unwrap();
+        let door = Door::take_for(runtime.handle(), loopback, gone_after).unwrap();
         let address = SocketAddr::new(loopback.ip(), door.port());
         let access = Arc::new(Access::new(&[], &[], None));
         let front = door.open(runtime.handle(), server, access, 80);
         (address, front, runtime)
+    }
+
+    /// A viewer that has asked; whatever it waits for ends in time.
+    fn viewer(address: SocketAddr) -> StdStream {
+        let mut stream = StdStream::connect(address).unwrap();
+        bounded(&stream);
+        stream.write_all(REQUEST).unwrap();
+        stream
+    }
+
+    /// The next connection to what is behind the door.
+    fn accepted(listener: &StdListener) -> StdStream {
+        listener.set_nonblocking(true).unwrap();
+        let deadline = std::time::Instant::now() + LIMIT;
+        loop {
+            match listener.accept() {
+                Ok((stream, _)) => {
+                    stream.set_nonblocking(false).unwrap();
+                    bounded(&stream);
+                    return stream;
+                }
+                Err(error) => {
+                    assert!(std::time::Instant::now() < deadline, "{error}");
+                    thread::sleep(Duration::from_millis(5));
+                }
+            }
+        }
+    }
+
+    fn bounded(stream: &StdStream) {
+        stream.set_read_timeout(Some(LIMIT)).unwrap();
+        stream.set_write_timeout(Some(LIMIT)).unwrap();
     }
 
     fn listener() -> (StdListener, SocketAddr) {
@@ -336,17 +399,17 @@ mod tests {
         const BYTES: usize = 3_000_000;
         let (listener, server) = listener();
         let answering = thread::spawn(move || {
-            let (mut stream, _) = listener.accept().unwrap();
+            let mut stream = accepted(&listener);
             let mut bytes = Vec::new();
             stream.read_to_end(&mut bytes).unwrap();
             // Only now, when the other way is closed already.
             stream.write_all(&bytes).unwrap();
         });
         let (address, front, runtime) = door(server);
-        let mut stream = StdStream::connect(address).unwrap();
+        let mut stream = viewer(address);
         let body: Vec<u8> = (0..=250).cycle().take(BYTES).collect();
+        stream.write_all(&body).unwrap();
         let sent = [REQUEST, &body].concat();
-        stream.write_all(&sent).unwrap();
         stream.shutdown(std::net::Shutdown::Write).unwrap();
         let mut received = Vec::new();
         stream.read_to_end(&mut received).unwrap();
@@ -365,8 +428,7 @@ mod tests {
         let (listener, server) = listener();
         drop(listener);
         let (address, front, runtime) = door(server);
-        let mut stream = StdStream::connect(address).unwrap();
-        stream.write_all(REQUEST).unwrap();
+        let mut stream = viewer(address);
         let mut answer = String::new();
         stream.read_to_string(&mut answer).unwrap();
         assert!(answer.starts_with("HTTP/1.1 503 "), "{answer}");
@@ -382,17 +444,37 @@ mod tests {
     fn one_that_neither_reads_nor_goes_does_not_keep_the_door_open() {
         let (listener, server) = listener();
         let (address, front, runtime) = door(server);
-        let mut stream = StdStream::connect(address).unwrap();
-        stream.write_all(REQUEST).unwrap();
-        let (mut inside, _) = listener.accept().unwrap();
-        let writing = thread::spawn(move || inside.write_all(&vec![0; 50_000_000]));
+        let mut stream = viewer(address);
+        let writing = writing_on(&listener);
         let mut first = [0; 1];
         stream.read_exact(&mut first).unwrap();
         front.end(runtime.handle());
-        assert!(
-            writing.join().unwrap().is_err(),
-            "the connection was closed"
-        );
+        assert_closed(writing);
+    }
+
+    #[test]
+    fn one_that_takes_nothing_for_long_loses_its_seat() {
+        let (listener, server) = listener();
+        let (address, front, runtime) = door_for(server, Duration::from_secs(1));
+        let mut stream = viewer(address);
+        let writing = writing_on(&listener);
+        let mut first = [0; 1];
+        stream.read_exact(&mut first).unwrap();
+        assert_closed(writing);
+        front.end(runtime.handle());
+    }
+
+    /// Writes to the next connection, until that fails, more than there is room for on the way.
+    fn writing_on(listener: &StdListener) -> thread::JoinHandle<io::Result<()>> {
+        let mut inside = accepted(listener);
+        thread::spawn(move || inside.write_all(&vec![0; 50_000_000]))
+    }
+
+    /// Our part of the way has ended: its other end did not only wait in vain.
+    fn assert_closed(writing: thread::JoinHandle<io::Result<()>>) {
+        let kind = writing.join().unwrap().unwrap_err().kind();
+        let in_vain = [io::ErrorKind::WouldBlock, io::ErrorKind::TimedOut];
+        assert!(!in_vain.contains(&kind), "{kind}");
     }
 
     #[test]

@@ -24,22 +24,29 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use hil_runtime::console::Console;
+use hil_runtime::progress::Progress;
 use hil_runtime::run_folder::RunFolder;
 use hil_runtime::signals::{EXIT_INTERRUPTED, Signals};
 use hil_runtime::watch::{FeedError, LiveRun, SelectError, select};
 use tokio::runtime::Runtime;
 
 use crate::cli::ServeOptions;
+use crate::priority::{Looks, Precedence};
+use crate::scene::Scenery;
+use crate::split::{Split, prepare};
+use crate::writer::WriteError;
 use access::{Access, NO_ORIGIN};
 use engine::{Engine, Showing, Shown};
 use front::{Door, Front};
 use parameters::Links;
 use playback::Playback;
+use recording::Target;
 use running::Running;
+use source::Source as _;
 use viewers::Viewers;
 
-/// Between two looks at the records.
-const LOOK_PERIOD: Duration = Duration::from_millis(10);
+/// Pictures that come so much later than they should show that others leave it no processor time.
+const LATE_MAX: Duration = Duration::from_millis(500);
 /// Between two looks for a run that begins.
 const WAIT_PERIOD: Duration = Duration::from_millis(300);
 
@@ -61,6 +68,18 @@ pub(crate) enum ServeError {
     /// A run that goes on cannot be watched.
     #[error(transparent)]
     Feed(#[from] FeedError),
+    /// Nowhere to record it.
+    #[error("--record: {0}")]
+    Record(#[from] WriteError),
+    /// To be recorded, but over.
+    #[error(
+        "--record: the run in {folder} is over and would only be played back; `hil-recorder convert \
+         {folder} -o FILE` makes a file of it"
+    )]
+    Over {
+        /// The run's folder.
+        folder: PathBuf,
+    },
     /// The socket.
     #[error(
         "cannot listen for viewers at {address}: {why}; --port takes another, 0 any that is free"
@@ -89,7 +108,7 @@ pub(crate) enum ServeError {
     Runtime(#[from] std::io::Error),
 }
 
-/// Serves until a signal comes; the exit code.
+/// Serves until a signal comes; the exit code, which says whether what was to be recorded is.
 ///
 /// # Errors
 /// When there is nothing to show or nowhere to show it.
@@ -98,7 +117,11 @@ pub(crate) fn serve(
     signals: &Signals,
     console: &mut Console,
 ) -> Result<i32, ServeError> {
-    let shown = first(options, signals, console)?;
+    if let Some(output) = &options.record {
+        prepare(output, Split::default(), false)?;
+    }
+    let precedence = Precedence::new(options.priority);
+    let shown = first(options, &precedence, signals, console)?;
     if signals.received().is_some() {
         return Ok(EXIT_INTERRUPTED);
     }
@@ -110,37 +133,55 @@ pub(crate) fn serve(
         .build()?;
     let access = Arc::new(admitted(options));
     let (viewers, front) = open(options, &runtime, (&links, &access), console)?;
-    let mut engine = Engine::new(viewers, links, options.record.clone());
+    let mut engine = Engine::new(viewers, links, target(options, &precedence));
     match shown {
         Some(shown) => engine.show(shown, console),
         None => console.say("no run goes on here; waiting for one"),
     }
     let mut looked = Instant::now();
-    let mut said = None;
+    let (mut said, mut looks) = (None, Looks::new(LATE_MAX));
+    let mut is_precedence_said = false;
     while signals.received().is_none() {
         if options.wait && looked.elapsed() >= WAIT_PERIOD {
             looked = Instant::now();
-            show_next(options, &mut engine, &mut said, console);
+            show_next(options, (&mut engine, &precedence), &mut said, console);
         }
         engine.round(console);
         for words in access.take_unsaid() {
             console.warn(&words);
         }
-        thread::sleep(LOOK_PERIOD);
+        thread::sleep(engine.rest());
+        looks.judge(&precedence);
+        if let Some(words) = precedence.warning().filter(|_| !is_precedence_said) {
+            console.warn(&words);
+            is_precedence_said = true;
+        }
     }
-    engine.into_viewers(console).end(runtime.handle());
+    let (viewers, is_recorded) = engine.into_viewers(console);
+    viewers.end(runtime.handle());
     front.end(runtime.handle());
     runtime.shutdown_timeout(Duration::from_secs(1));
     if let Some(account) = access.account() {
         console.say(&account);
     }
     console.say("ended");
-    Ok(0)
+    Ok(i32::from(!is_recorded))
+}
+
+/// Where what is shown is recorded, if it is.
+fn target(options: &ServeOptions, precedence: &Precedence) -> Option<Target> {
+    let path = options.record.clone()?;
+    Some(Target {
+        path,
+        precedence: precedence.clone(),
+        scenery: Scenery::of(options.no_scene),
+    })
 }
 
 /// What is shown first; `None` when it has to be waited for.
 fn first(
     options: &ServeOptions,
+    precedence: &Precedence,
     signals: &Signals,
     console: &mut Console,
 ) -> Result<Option<Shown>, ServeError> {
@@ -156,8 +197,16 @@ fn first(
         };
     }
     if let Some(folder) = folder.filter(|folder| !goes_on(folder)) {
+        if options.record.is_some() {
+            let folder = folder.to_owned();
+            return Err(ServeError::Over { folder });
+        }
         let how = (options.speed, options.repeats);
-        let read = Playback::read(folder, how, &mut |_| signals.received().is_none());
+        let progress = Progress::begin();
+        let read = Playback::read(folder, how, &mut |(share, path)| {
+            progress.show(console, Some(share), &format!("reading {path}"));
+            signals.received().is_none()
+        });
         let (playback, facts) = read?;
         for words in playback.words() {
             console.warn(words);
@@ -166,7 +215,7 @@ fn first(
         return Ok(Some(Shown::new(facts, source, Some(options.speed), None)));
     }
     match select(wanted) {
-        Ok(run) => Ok(Some(watch(run)?)),
+        Ok(run) => Ok(Some(watch(run, precedence)?)),
         Err(error) if options.wait && is_none_yet(&error) => Ok(None),
         Err(error) => Err(error.into()),
     }
@@ -189,9 +238,11 @@ const fn is_none_yet(error: &SelectError) -> bool {
     matches!(error, SelectError::NoneRuns | SelectError::NoSuch { .. })
 }
 
-fn watch(run: LiveRun) -> Result<Shown, ServeError> {
+fn watch(run: LiveRun, precedence: &Precedence) -> Result<Shown, ServeError> {
     let folder = run.folder.clone();
     let (running, facts) = Running::open(run)?;
+    // Before anything is worked out for it.
+    precedence.settle(running.reads_memory());
     let topology = running.topology().clone();
     let links = Some((folder, topology));
     Ok(Shown::new(facts, Box::new(running), None, links))
@@ -201,7 +252,7 @@ fn watch(run: LiveRun) -> Result<Shown, ServeError> {
 /// was said last of why none can be chosen.
 fn show_next(
     options: &ServeOptions,
-    engine: &mut Engine,
+    (engine, precedence): (&mut Engine, &Precedence),
     said: &mut Option<String>,
     console: &mut Console,
 ) {
@@ -227,7 +278,7 @@ fn show_next(
         return;
     }
     let name = run.name.clone();
-    match watch(run) {
+    match watch(run, precedence) {
         Ok(shown) => {
             console.say(&format!("showing {name}"));
             engine.show(shown, console);

@@ -1,5 +1,6 @@
 //! The page over HTTP: one file that is part of the program, and where the socket is. It reads no file
-//! and knows no other path, so there is nothing outside to reach.
+//! and knows no other path, so there is nothing outside to reach. Nobody keeps a place for ever: asking
+//! and taking the answer are both bounded in time.
 
 use std::convert::Infallible;
 use std::io;
@@ -15,10 +16,12 @@ use hyper::service::service_fn;
 use hyper::{Method, Request, Response, StatusCode};
 use hyper_util::rt::{TokioIo, TokioTimer};
 use serde_json::json;
-use tokio::net::TcpListener;
+use tokio::net::{TcpListener, TcpSocket, TcpStream};
 use tokio::runtime::Handle;
+use tokio::time::timeout;
 
 use super::access::{Access, Refusal};
+use super::front::let_go_after;
 
 /// The page with its style and scripts, made of the folder `page` by the build script.
 const PAGE: &str = include_str!(concat!(env!("OUT_DIR"), "/page.html"));
@@ -39,6 +42,11 @@ const CONNECTIONS_MAX: usize = 64;
 /// How long a browser may take to say what it wants; one that says nothing would keep its place
 /// from the others.
 const REQUEST_WITHIN: Duration = Duration::from_secs(5);
+/// How long a connection may last: the page is small, and one that never reads it would keep its
+/// place as well.
+const SERVED_WITHIN: Duration = Duration::from_secs(30);
+/// Bytes of an answer that the kernel keeps for one browser.
+const KERNEL_BYTES: u32 = 32 * 1024;
 
 /// Serves the page at `address` from now on; where it really is. The page will look for the socket
 /// at `ws_port` of the same host. Requests to names that `access` does not know are refused.
@@ -51,43 +59,65 @@ pub(crate) fn serve(
     ws_port: u16,
     access: Arc<Access>,
 ) -> io::Result<SocketAddr> {
-    let listener = runtime.block_on(TcpListener::bind(address))?;
+    let listener = listen(runtime, address)?;
     let at = listener.local_addr()?;
     let config = json!({ "ws_port": ws_port, "version": env!("CARGO_PKG_VERSION") });
     let config = Bytes::from(config.to_string());
-    runtime.spawn(async move {
-        let room = Arc::new(tokio::sync::Semaphore::new(CONNECTIONS_MAX));
-        loop {
-            let Ok(place) = Arc::clone(&room).acquire_owned().await else {
-                return;
-            };
-            let Ok((stream, _)) = listener.accept().await else {
-                // Out of file descriptors, mostly: others must close first.
-                tokio::time::sleep(Duration::from_millis(50)).await;
-                continue;
-            };
-            let (config, access) = (config.clone(), Arc::clone(&access));
-            tokio::spawn(async move {
-                let service = service_fn(move |request: Request<Incoming>| {
-                    let hosts = request.headers().get_all(header::HOST).iter();
-                    let answer = match access.judge_page(hosts.map(HeaderValue::as_bytes)) {
-                        Ok(()) => answer(request.method(), request.uri().path(), &config),
-                        Err(refusal) => refused(&refusal),
-                    };
-                    async move { Ok::<_, Infallible>(answer) }
-                });
-                let connection = http1::Builder::new()
-                    .timer(TokioTimer::new())
-                    .header_read_timeout(REQUEST_WITHIN)
-                    .keep_alive(false)
-                    .serve_connection(TokioIo::new(stream), service);
-                // A browser that goes away in the middle is nobody's fault.
-                let _is_served = connection.await.is_ok();
-                drop(place);
-            });
-        }
-    });
+    runtime.spawn(attend(listener, (config, access), SERVED_WITHIN));
     Ok(at)
+}
+
+fn listen(runtime: &Handle, address: SocketAddr) -> io::Result<TcpListener> {
+    let _entered = runtime.enter();
+    let socket = match address {
+        SocketAddr::V4(_) => TcpSocket::new_v4()?,
+        SocketAddr::V6(_) => TcpSocket::new_v6()?,
+    };
+    socket.set_reuseaddr(true)?;
+    // Handed down to the connections. What is unsent when one is closed is the kernel's, which would
+    // try for minutes.
+    socket.set_send_buffer_size(KERNEL_BYTES)?;
+    let_go_after(&socket, SERVED_WITHIN)?;
+    socket.bind(address)?;
+    socket.listen(1024)
+}
+
+/// Takes connections, and gives each at most `within` for all of it.
+async fn attend(listener: TcpListener, (config, access): (Bytes, Arc<Access>), within: Duration) {
+    let room = Arc::new(tokio::sync::Semaphore::new(CONNECTIONS_MAX));
+    loop {
+        let Ok(place) = Arc::clone(&room).acquire_owned().await else {
+            return;
+        };
+        let Ok((stream, _)) = listener.accept().await else {
+            // Out of file descriptors, mostly: others must close first.
+            tokio::time::sleep(Duration::from_millis(50)).await;
+            continue;
+        };
+        let (config, access) = (config.clone(), Arc::clone(&access));
+        tokio::spawn(async move {
+            // A browser that goes away in the middle, or is too slow, is nobody's fault.
+            let _is_served = timeout(within, serve_one(stream, config, access)).await;
+            drop(place);
+        });
+    }
+}
+
+async fn serve_one(stream: TcpStream, config: Bytes, access: Arc<Access>) -> hyper::Result<()> {
+    let service = service_fn(move |request: Request<Incoming>| {
+        let hosts = request.headers().get_all(header::HOST).iter();
+        let answer = match access.judge_page(hosts.map(HeaderValue::as_bytes)) {
+            Ok(()) => answer(request.method(), request.uri().path(), &config),
+            Err(refusal) => refused(&refusal),
+        };
+        async move { Ok::<_, Infallible>(answer) }
+    });
+    let connection = http1::Builder::new()
+        .timer(TokioTimer::new())
+        .header_read_timeout(REQUEST_WITHIN)
+        .keep_alive(false)
+        .serve_connection(TokioIo::new(stream), service);
+    connection.await
 }
 
 fn answer(method: &Method, path: &str, config: &Bytes) -> Response<Full<Bytes>> {
@@ -145,7 +175,12 @@ fn with_headers(status: StatusCode, kind: &'static str, content: Bytes) -> Respo
 
 #[cfg(test)]
 mod tests {
+    use std::io::{Read as _, Write as _};
+
     use super::*;
+
+    /// No answer takes a tenth of this on an overloaded machine.
+    const LIMIT: Duration = Duration::from_mins(1);
 
     fn get(path: &str) -> Response<Full<Bytes>> {
         answer(&Method::GET, path, &Bytes::from_static(b"{}"))
@@ -194,5 +229,48 @@ mod tests {
             }
         }
         assert!(!PAGE.contains("src=") && !PAGE.contains("rel=\"stylesheet"));
+    }
+    /// A connection that has asked for `path`, with as little room for the answer as there can be.
+    fn asked(runtime: &tokio::runtime::Runtime, at: SocketAddr, path: &str) -> std::net::TcpStream {
+        let connected = runtime.block_on(async {
+            let socket = TcpSocket::new_v4().unwrap();
+            socket.set_recv_buffer_size(2048).unwrap();
+            socket.connect(at).await.unwrap()
+        });
+        let mut stream = connected.into_std().unwrap();
+        stream.set_nonblocking(false).unwrap();
+        stream.set_read_timeout(Some(LIMIT)).unwrap();
+        let request = format!("GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n");
+        stream.write_all(request.as_bytes()).unwrap();
+        stream
+    }
+
+    #[test]
+    fn browsers_that_never_read_do_not_keep_all_places() {
+        let runtime = tokio::runtime::Builder::new_multi_thread()
+            .worker_threads(2)
+            .enable_all()
+            .build()
+            .unwrap();
+        let listener = listen(runtime.handle(), ([127, 0, 0, 1], 0).into()).unwrap();
+        let at = listener.local_addr().unwrap();
+        let access = Arc::new(Access::new(&[], &[], None));
+        let served = (Bytes::from_static(b"{}"), access);
+        runtime.spawn(attend(listener, served, Duration::from_millis(300)));
+        let mut stuck: Vec<_> = (0..CONNECTIONS_MAX)
+            .map(|_| asked(&runtime, at, "/"))
+            .collect();
+        let mut answer = String::new();
+        let mut late = asked(&runtime, at, "/config.json");
+        late.read_to_string(&mut answer).unwrap();
+        assert!(answer.starts_with("HTTP/1.1 200 OK"), "{answer}");
+        // They were cut off, and not merely quick.
+        let mut page = Vec::new();
+        let read = stuck[0].read_to_end(&mut page);
+        assert!(
+            read.is_err() || page.len() < PAGE.len(),
+            "{} bytes",
+            page.len()
+        );
     }
 }

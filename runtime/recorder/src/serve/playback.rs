@@ -51,14 +51,15 @@ enum What {
 }
 
 impl Playback {
-    /// Reads the run at `path`; `goes_on` hears the name of each file, and ends it with false.
+    /// Reads the run at `path`; `goes_on` hears the share that is read and the name of each file, and
+    /// ends it with false.
     ///
     /// # Errors
     /// When it is no run's folder.
     pub(crate) fn read(
         path: &Path,
         (speed, repeats): (f64, bool),
-        goes_on: &mut dyn FnMut(&str) -> bool,
+        goes_on: &mut dyn FnMut((f64, &str)) -> bool,
     ) -> Result<(Self, RunFacts), RunError> {
         let run = Run::read(path, goes_on)?;
         let clocks = Clocks::of(&run);

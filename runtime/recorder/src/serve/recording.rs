@@ -9,36 +9,52 @@ use std::time::Duration;
 
 use hil_runtime::console::Console;
 
-use crate::priority::Priority;
-use crate::record::{RecordError, Recorded, Request, record};
+use crate::priority::Precedence;
+use crate::record::{RecordError, Recorded, Request, Which, record};
 use crate::scene::Scenery;
 use crate::split::Split;
 
 /// What a kill may lose at most.
 const FLUSH: Duration = Duration::from_secs(1);
 
+/// Where what is shown is recorded, and how.
+#[derive(Debug, Clone)]
+pub(super) struct Target {
+    /// The file, or the folder that files are written into.
+    pub(super) path: PathBuf,
+    /// How the whole process stands against the run.
+    pub(super) precedence: Precedence,
+    /// Draw the scene.
+    pub(super) scenery: Scenery,
+}
+
 /// A run that is being recorded.
 #[derive(Debug)]
 pub(super) struct Recording {
     /// The file, or the folder that it is written into.
     pub(super) path: PathBuf,
+    precedence: Precedence,
+    /// No file came of it.
+    pub(super) has_failed: bool,
     thread: Option<JoinHandle<Result<Recorded, RecordError>>>,
     stop: Arc<AtomicBool>,
 }
 
 impl Recording {
-    /// Records the run called `run` into `path`, from its first message on.
-    pub(super) fn begin(run: &str, path: &Path) -> Self {
+    /// Records the run in `folder`, from its first message on. Its name would not do: two runs may
+    /// bear one.
+    pub(super) fn begin(folder: &Path, target: &Target) -> Self {
         let request = Request {
-            run: Some(run.to_owned()),
-            output: path.to_owned(),
+            run: Which::In(folder.to_owned()),
+            output: target.path.clone(),
             waits: false,
+            below: None,
             from_now: false,
             split: Split::default(),
             flush: FLUSH,
             force: false,
-            priority: Priority::Idle,
-            scenery: Scenery::Drawn,
+            precedence: target.precedence.clone(),
+            scenery: target.scenery,
         };
         let stop = Arc::new(AtomicBool::new(false));
         let is_stopped = Arc::clone(&stop);
@@ -48,7 +64,9 @@ impl Recording {
             })
         });
         Self {
-            path: path.to_owned(),
+            path: target.path.clone(),
+            precedence: target.precedence.clone(),
+            has_failed: false,
             thread: Some(thread),
             stop,
         }
@@ -72,13 +90,21 @@ impl Recording {
             return;
         };
         let path = self.path.display();
-        match thread.join() {
+        let joined = thread.join();
+        self.has_failed = !matches!(joined, Ok(Ok(_)));
+        match joined {
             Err(_) => console.error(&format!(
                 "{path}: the recorder failed; its file is not whole"
             )),
             Ok(Err(error)) => console.error(&format!("nothing is recorded: {error}")),
             Ok(Ok(recorded)) => {
-                for words in &recorded.words {
+                // The server says by itself how it stands.
+                let said = self.precedence.warning();
+                for words in recorded
+                    .words
+                    .iter()
+                    .filter(|one| said.as_ref() != Some(*one))
+                {
                     console.warn(words);
                 }
                 let files = recorded.paths.iter().map(|path| path.display().to_string());

@@ -12,6 +12,7 @@ use hil_runtime::watch::{self, Event, Feed, FeedError, LiveRun, Origin, Poll, Re
 use super::playback::how_ended;
 use super::source::{Progress, Source, Warning};
 use crate::clocks::Clocks;
+use crate::record::reads_memory;
 use crate::view::facts::RunFacts;
 use crate::view::{Body, LiveRecord};
 
@@ -177,6 +178,10 @@ impl Source for Running {
             is_shared.then(|| self.feed.missed_count(name))
         });
         missed.flatten().reduce(u64::saturating_add)
+    }
+
+    fn reads_memory(&self) -> bool {
+        reads_memory(&self.feed)
     }
 
     fn take_problems(&mut self) -> Vec<String> {

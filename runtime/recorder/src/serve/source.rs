@@ -31,6 +31,11 @@ pub(crate) trait Source {
         None
     }
 
+    /// True when something of it is read from shared memory, which does not wait for who reads it.
+    fn reads_memory(&self) -> bool {
+        false
+    }
+
     /// True when the stamps of all hosts compare; may become true while a run goes on.
     fn has_one_clock(&self) -> bool;
 

@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::compare::Comparison;
-use crate::compare::conditions::Condition;
+use crate::compare::conditions::{Condition, Verdicts};
 
 fn p99(base_ms: &[f64], new_ms: &[f64], of: Counts) -> ComparedFigure {
     let side = |all: &[f64]| -> Vec<(Estimate, &'static str)> {
@@ -41,9 +41,10 @@ fn judged(condition: &str, figure: &ComparedFigure) -> Result<bool, String> {
         figures: vec![figure.clone()],
     };
     let condition = Condition::parse(condition).unwrap();
-    let found = condition.judge(&comparison, false);
-    let found = found.map_err(|error| error.to_string())?;
-    Ok(found.iter().any(|one| one.holds))
+    let mut verdicts = Verdicts::default();
+    let found = condition.judge(&comparison, false, &mut verdicts);
+    found.map_err(|error| error.to_string())?;
+    Ok(verdicts.judged.iter().any(|one| one.holds))
 }
 
 #[test]

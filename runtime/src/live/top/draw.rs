@@ -162,7 +162,13 @@ fn head(view: &View) -> Vec<Line> {
         TITLE,
     )];
     let time = |seconds: f64| format!("{seconds:.1} s");
+    let seen = if run.elapsed_s.is_some() {
+        "; the figures are the last ones from while it ran"
+    } else {
+        ""
+    };
     let text = match (run.elapsed_s, run.duration_s, view.progress_ratio()) {
+        _ if view.is_over() => format!("over{seen}"),
         (Some(elapsed_s), Some(duration_s), Some(ratio)) => {
             let left = time((duration_s - elapsed_s).max(0.0));
             let (whole, of) = (time(elapsed_s), time(duration_s));

@@ -152,6 +152,25 @@ fn a_low_terminal_keeps_the_chosen_channel_in_sight() {
 }
 
 #[test]
+fn a_run_that_is_over_keeps_its_last_figures_and_says_so() {
+    let mut over = view();
+    over.run.state = View::ENDED.to_owned();
+    let page = plain(&over, 100);
+    assert!(page.contains("ended"), "{page}");
+    assert!(page.contains("over; the figures are the last"), "{page}");
+    assert!(
+        page.contains("egm/right/command") && page.contains("4711"),
+        "{page}"
+    );
+    over.run.elapsed_s = None;
+    let page = plain(&over, 100);
+    assert!(
+        page.contains("\nover\n") && !page.contains("not begun"),
+        "{page}"
+    );
+}
+
+#[test]
 fn the_help_names_the_keys() {
     let frame = Frame {
         shows_help: true,

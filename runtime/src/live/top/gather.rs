@@ -19,7 +19,7 @@ use crate::clock::MonotonicClock;
 use crate::live::observer::Observer;
 use crate::live::pace::Pace;
 use crate::live::process;
-use crate::live::status::{ProcessStatus, RunStatus};
+use crate::live::status::{Phase, ProcessStatus, RunStatus};
 use crate::topology::{Channel, Direction, Link, Topology};
 
 /// The supervisor tells of its processes twice a second; what is older than this is said to be old.
@@ -32,24 +32,36 @@ pub(crate) struct Gatherer {
     cpu: BTreeMap<u32, (u64, i64)>,
     /// 99th percentiles of the delay, by channel.
     history: BTreeMap<String, Vec<Option<i64>>>,
+    /// What the supervisor told last; it removes its file a moment before the run is over.
+    status: Option<RunStatus>,
+    /// The view while the run still ran: what is left to show when it is over.
+    last: Option<View>,
 }
 
 impl Gatherer {
     /// Looks at the run.
     pub(crate) fn look(&mut self, observer: &Observer, window: Duration) -> View {
+        let is_over = observer.is_over();
+        if is_over && let Some(mut last) = self.last.clone() {
+            state_of(observer, None).clone_into(&mut last.run.state);
+            return last;
+        }
         let status = RunStatus::read(&observer.run().folder);
         let mut problems = observer.problems().to_vec();
-        if !observer.is_over() {
+        if !is_over {
             problems.extend(status_problem(status.as_ref()));
         }
-        let status = status.ok();
+        if let Ok(status) = status {
+            self.status = Some(status);
+        }
+        let status = self.status.clone();
         let accounts: BTreeMap<&str, ChannelAccount> = observer
             .manifest()
             .channels
             .iter()
             .filter_map(|one| Some((one.name.as_str(), observer.account(&one.name, window)?)))
             .collect();
-        View {
+        let view = View {
             run: run_view(observer, status.as_ref(), window),
             processes: self.processes(status.as_ref()),
             channels: self.channels(observer, &accounts),
@@ -59,7 +71,11 @@ impl Gatherer {
                 .unwrap_or_default(),
             clocks: clocks(observer),
             problems,
+        };
+        if status.is_some_and(|status| status.phase == Phase::Running) {
+            self.last = Some(view.clone());
         }
+        view
     }
 
     fn processes(&mut self, status: Option<&RunStatus>) -> Vec<ProcessRow> {
@@ -120,15 +136,20 @@ fn status_problem(status: Result<&RunStatus, &io::Error>) -> Option<String> {
     })
 }
 
+fn state_of(observer: &Observer, status: Option<&RunStatus>) -> &'static str {
+    let run = observer.run();
+    match status {
+        _ if run.is_supervisor_gone() => View::SUPERVISOR_GONE,
+        _ if !run.is_announced() => View::ENDED,
+        Some(status) => status.phase.word(),
+        None => "unknown",
+    }
+}
+
 fn run_view(observer: &Observer, status: Option<&RunStatus>, window: Duration) -> RunView {
     let run = observer.run();
     let seconds = |ns: i64| Duration::from_nanos(ns.max(0).unsigned_abs()).as_secs_f64();
-    let state = match status {
-        _ if run.is_supervisor_gone() => "supervisor gone",
-        _ if !run.is_announced() => "ended",
-        Some(status) => status.phase.word(),
-        None => "unknown",
-    };
+    let state = state_of(observer, status);
     let now_ns = MonotonicClock::now().as_ns();
     let start_ns = status.and_then(|status| status.start_ns);
     RunView {
@@ -200,7 +221,8 @@ fn channel_row(observer: &Observer, name: &str, account: Option<&ChannelAccount>
             None if channel.is_some_and(Channel::is_recorded_only) => {
                 Some("its messages only go to the record".to_owned())
             }
-            None => Some("nothing of it was recorded here yet".to_owned()),
+            None if observer.is_recorded(name) => Some("no message in this time".to_owned()),
+            None => Some("nothing of it is recorded here".to_owned()),
         },
         bound_ns: end_to_end.and_then(|one| one.alignment_bound_ns),
         segments: segments.unwrap_or_default(),
@@ -255,25 +277,25 @@ fn link_row(
 ) -> LinkRow {
     let crossings = topology.crossings();
     let carried = crossings.filter(|crossing| crossing.link.name == link.name);
-    let (mut came_count, mut lost_count, mut known_count) = (0, 0, 0);
-    let mut has_records = false;
+    let (mut came_count, mut lost_count, mut known_count) = (None, 0, 0);
     for crossing in carried {
         let name = crossing.channel.name.as_str();
+        if let Some(count) = observer.brought_count(name) {
+            came_count = Some(came_count.unwrap_or(0) + count);
+        }
         let Some(account) = accounts.get(name) else {
             continue;
         };
-        has_records = true;
-        came_count += observer.arrivals(name).map_or(0, |arrivals| arrivals.len());
         let fates = &account.fates;
         let unknown = fates.of(MessageFate::UnknownPeerRecordsUnavailable);
         let never_sent = fates.of(MessageFate::SupersededAtInput) + fates.of(MessageFate::InFlight);
         lost_count += fates.of(MessageFate::LostOnWire);
         known_count += fates.total().saturating_sub(unknown + never_sent);
     }
-    let state = match (has_records, came_count) {
-        (false, _) => "unknown",
-        (true, 0) => "silent",
-        (true, _) => "carries",
+    let state = match came_count {
+        None => "unknown",
+        Some(0) => "silent",
+        Some(_) => "carries",
     };
     LinkRow {
         name: link.name.clone(),

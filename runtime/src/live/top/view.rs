@@ -141,6 +141,16 @@ pub(crate) struct ClockRow {
 }
 
 impl View {
+    /// State of a run that is over.
+    pub(crate) const ENDED: &str = "ended";
+    /// State of a run whose supervisor was killed.
+    pub(crate) const SUPERVISOR_GONE: &str = "supervisor gone";
+
+    /// True when nothing of the run goes on: the figures are the last ones from while it did.
+    pub(crate) fn is_over(&self) -> bool {
+        [Self::ENDED, Self::SUPERVISOR_GONE].contains(&self.run.state.as_str())
+    }
+
     /// How much of the run is over, 0 to 1.
     pub(crate) fn progress_ratio(&self) -> Option<f64> {
         let (elapsed_s, duration_s) = self.run.elapsed_s.zip(self.run.duration_s)?;

@@ -141,12 +141,7 @@ pub(super) fn network_events(report: &NetworkReport) -> EventList {
 fn longest(events: &[TimedEvent]) -> Vec<&TimedEvent> {
     let mut chosen: Vec<&TimedEvent> = events.iter().collect();
     if chosen.len() > NETWORK_EVENTS_MAX {
-        let length = |event: &TimedEvent| {
-            event
-                .until_s
-                .map_or(f64::MAX, |until_s| until_s - event.from_s)
-        };
-        chosen.sort_by(|a, b| length(b).total_cmp(&length(a)));
+        chosen.sort_by(|a, b| b.length_s().total_cmp(&a.length_s()));
         chosen.truncate(NETWORK_EVENTS_MAX);
         chosen.sort_by(|a, b| a.from_s.total_cmp(&b.from_s));
     }

@@ -158,7 +158,7 @@ fn live_facts(summary: &RunSummary) -> Vec<FactGroup> {
         .collect();
     hosts.sort_unstable();
     hosts.dedup();
-    let facts = vec![
+    let mut facts = vec![
         Fact::new("started", &run.started),
         Fact::new("length", seconds(run.duration_s)),
         Fact::new(
@@ -177,6 +177,8 @@ fn live_facts(summary: &RunSummary) -> Vec<FactGroup> {
         Fact::new("seed", run.seed.to_string()),
         Fact::new("folder", &run.folder),
     ];
+    let security = run.security.iter();
+    facts.extend(security.map(|text| Fact::new("hops between hosts", text)));
     let group = |title: &str, facts: Vec<Fact>| FactGroup {
         title: title.to_owned(),
         facts,
@@ -360,6 +362,14 @@ fn clocks(section: &ClockSection) -> Vec<String> {
     words
 }
 
+/// True when the 99th percentile of a channel is more than its largest value: that of two messages is
+/// no figure to see first.
+fn has_a_hundredth(channel: &Channel) -> bool {
+    let mut figures = channel.figures.iter();
+    let delivered = figures.find(|one| one.name == "delivered");
+    delivered.and_then(|one| one.value).unwrap_or(0.0) >= 100.0
+}
+
 /// The figures to see first: what the case is about, the worst of the network, and how often the
 /// robot came to harm.
 fn headline(run: &Run) -> Vec<Figure> {
@@ -378,7 +388,10 @@ fn headline(run: &Run) -> Vec<Figure> {
         ("p99", "largest p99"),
         ("network_p99", "network's largest p99"),
     ] {
-        let found = run.channels.iter().flat_map(|channel| {
+        let is_quantile = name != "loss_ratio";
+        let channels = run.channels.iter();
+        let told = channels.filter(|one| !is_quantile || has_a_hundredth(one));
+        let found = told.flat_map(|channel| {
             let of_name = channel
                 .figures
                 .iter()
@@ -399,4 +412,29 @@ fn headline(run: &Run) -> Vec<Figure> {
         }
     }
     figures
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_worst_delay_to_see_first_rests_on_a_hundred_messages() {
+        let channel = |name: &str, delivered, p99| Channel {
+            name: name.to_owned(),
+            figures: vec![
+                Figure::new("delivered", "delivered", "1", delivered),
+                Figure::new("p99", "p99", "s", p99),
+            ],
+            ..Channel::default()
+        };
+        let mut run = Run {
+            channels: vec![channel("often", 100.0, 1e-3), channel("twice", 2.0, 5e-3)],
+            ..Run::default()
+        };
+        let [first] = headline(&run).try_into().unwrap();
+        assert_eq!(first.label, "largest p99: often");
+        run.channels.remove(0);
+        assert!(headline(&run).is_empty());
+    }
 }

@@ -1,7 +1,7 @@
 //! Data into text by templates (minijinja): the page, Markdown and `LaTeX` of this program, or a user's
 //! own. HTML is escaped wherever a template puts a value; figures alone are put as they are.
 
-use minijinja::{AutoEscape, Environment, UndefinedBehavior, Value, context};
+use minijinja::{AutoEscape, Environment, ErrorKind, UndefinedBehavior, Value, context};
 use serde_json::json;
 
 use super::data::Page;
@@ -132,8 +132,8 @@ fn rendered(
 fn alike(figures: Vec<Value>) -> Result<Vec<Value>, minijinja::Error> {
     let mut rows: Vec<(String, Vec<Value>)> = Vec::new();
     for figure in figures {
-        let reason = if figure.get_attr("value")?.is_none() {
-            figure.get_attr("method")?.to_string()
+        let reason = if field(&figure, "value")?.is_none() {
+            field(&figure, "method")?.to_string()
         } else {
             String::new()
         };
@@ -144,7 +144,7 @@ fn alike(figures: Vec<Value>) -> Result<Vec<Value>, minijinja::Error> {
         }
     }
     let row = |(_, row): (String, Vec<Value>)| {
-        let label = |one: &Value| Ok(one.get_attr("label")?.to_string());
+        let label = |one: &Value| Ok(field(one, "label")?.to_string());
         let labels = row.iter().map(label);
         let labels = labels.collect::<Result<Vec<String>, minijinja::Error>>()?;
         let labels: Vec<&str> = labels.iter().map(String::as_str).collect();
@@ -152,6 +152,16 @@ fn alike(figures: Vec<Value>) -> Result<Vec<Value>, minijinja::Error> {
         Ok(context! { label, ..row[0].clone() })
     };
     rows.into_iter().map(row).collect()
+}
+
+/// A field that every figure has; the engine's own look gives an empty text for one that is not there.
+fn field(figure: &Value, name: &str) -> Result<Value, minijinja::Error> {
+    let found = figure.get_attr(name)?;
+    if found.is_undefined() {
+        let text = format!("alike: {figure} is no figure, it has no field {name}");
+        return Err(minijinja::Error::new(ErrorKind::UndefinedError, text));
+    }
+    Ok(found)
 }
 
 /// For a cell of a GitHub table or a line of prose.
@@ -217,5 +227,28 @@ mod tests {
             .to_string();
         assert!(error.contains("undefined"), "{error}");
         assert_eq!(own(("mine.txt", "{{ title }}"), &page).unwrap(), "0 runs");
+    }
+
+    #[test]
+    fn what_is_no_figure_is_an_error_and_not_an_empty_row() {
+        let page = super::super::page_of(&[], 10);
+        let used = |figures: &str| {
+            let text = format!("\n{{{{ [{figures}]|alike|length }}}}");
+            own(("mine.txt", &text), &page)
+        };
+        assert_eq!(
+            used("{'label': 'a', 'value': 1, 'method': ''}").unwrap(),
+            "\n1"
+        );
+        for (figures, missing) in [
+            ("{'name': 'a', 'value': 1, 'method': ''}", "label"),
+            ("{'label': 'a', 'method': ''}", "value"),
+            ("{'label': 'a', 'value': none}", "method"),
+            ("'a'", "value"),
+        ] {
+            let error = used(figures).unwrap_err().to_string();
+            assert!(error.starts_with("template mine.txt, line 2: "), "{error}");
+            assert!(error.contains(&format!("no field {missing}")), "{error}");
+        }
     }
 }

@@ -271,6 +271,20 @@ fn several_runs_get_a_row_each_and_figures_of_their_own() {
 }
 
 #[test]
+fn markdown_says_the_name_of_its_only_run_once() {
+    let one = material(full());
+    let headings = |materials: &[Material]| {
+        let text = render(materials, Format::Md, None).unwrap();
+        let lines = text
+            .lines()
+            .filter(|line| line.starts_with("# ") || line.starts_with("## "));
+        lines.map(str::to_owned).collect::<Vec<_>>()
+    };
+    assert_eq!(headings(std::slice::from_ref(&one)).len(), 1);
+    assert_eq!(headings(&[one, material(full())]).len(), 3);
+}
+
+#[test]
 fn the_other_formats_have_the_same_figures() {
     let one = [material(full())];
     let csv = render(&one, Format::Csv, None).unwrap();

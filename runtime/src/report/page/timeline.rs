@@ -1,8 +1,6 @@
 //! Figures over time: the network and the robot on the axis of the run, and the case's own series on
 //! theirs.
 
-use hil_models::measure::network::NetworkEventKind;
-
 use super::data::Drawing;
 use super::drawings::{name_of, severity_word};
 use super::figures::time::{Mark, over_time};
@@ -67,17 +65,16 @@ pub(super) fn over_run(
     }
 }
 
-/// What is shaded: outages and processes that were down.
+/// What is shaded: outages and processes that were down; of too many the longest.
 fn bands(report: &NetworkReport) -> Vec<Mark> {
-    let outages = report.events.iter().filter(|event| {
-        let kind = &event.kind;
-        matches!(
-            kind,
-            NetworkEventKind::Outage { .. } | NetworkEventKind::ProcessDown { .. }
-        )
-    });
+    let outages = report.events.iter().filter(|event| event.is_outage());
+    let mut outages: Vec<_> = outages.collect();
+    if outages.len() > BANDS_MAX {
+        outages.sort_by(|a, b| b.length_s().total_cmp(&a.length_s()));
+        outages.truncate(BANDS_MAX);
+    }
     outages
-        .take(BANDS_MAX)
+        .into_iter()
         .map(|event| Mark {
             from_s: event.from_s,
             until_s: event.until_s,
@@ -94,7 +91,7 @@ fn run_caption(report: &NetworkReport, (robot_s, width_s): (f64, f64), is_cut: b
          largest value within; the robot's for {}. Figures are from all messages. Shaded: outages{}.",
         duration_s(width_s),
         duration_s(robot_s),
-        if is_cut { ", the first 300" } else { "" }
+        if is_cut { ", the longest 300" } else { "" }
     );
     if report.clocks_differ {
         caption.push_str(

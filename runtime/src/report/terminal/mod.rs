@@ -149,6 +149,11 @@ fn verdict(canvas: &mut Canvas, summary: &RunSummary, assessment: &Assessment) {
     );
     let (tone, text) = network_words(&assessment.network);
     canvas.field("Network", tone, &text);
+    if let Some(text) = &summary.run.security {
+        let is_plain = text.starts_with("PLAIN");
+        let tone = if is_plain { Tone::Caution } else { Tone::Good };
+        canvas.field("Security", tone, text);
+    }
     for (index, warning) in assessment.warnings.iter().enumerate() {
         let label = if index == 0 { "Warnings" } else { "" };
         canvas.field(label, Tone::Caution, warning);

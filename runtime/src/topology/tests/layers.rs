@@ -93,6 +93,22 @@ fn a_fault_in_a_base_file_points_into_that_file() {
 }
 
 #[test]
+fn of_a_file_that_is_no_topology_only_the_first_errors_are_told() {
+    let folder = Folder::new("no-topology");
+    let path = folder.write("main.out", &"what a program printed\n".repeat(40));
+    let errors = load(&path, &[], &known()).unwrap_err();
+    let count = errors.errors().len();
+    assert!(count > 10, "{errors}");
+    let end = format!("\nand {} more", count - 10);
+    let rendered = errors.render(false);
+    assert!(rendered.ends_with(&end), "{rendered}");
+    assert_eq!(rendered.matches("error: ").count(), 10, "{rendered}");
+    let lines = errors.to_string();
+    assert!(lines.ends_with(&end), "{lines}");
+    assert_eq!(lines.lines().count(), 11, "{lines}");
+}
+
+#[test]
 fn files_that_extend_each_other_in_a_circle_are_refused() {
     let folder = Folder::new("cycle");
     let a = folder.write("a.toml", "version = 1\nextends = 'b.toml'\n");

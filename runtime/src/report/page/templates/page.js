@@ -1,7 +1,19 @@
 // The page is whole without this. It adds a cursor over all panels of one axis, zoom by dragging, and
-// channels that can be hidden. It fetches nothing and keeps nothing.
+// channels that can be hidden, and unfolds for paper what is folded. It fetches nothing and keeps nothing.
 (function () {
   "use strict";
+  var unfolded = [];
+  window.addEventListener("beforeprint", function () {
+    document.querySelectorAll("details:not([open])").forEach(function (one) {
+      one.open = true;
+      unfolded.push(one);
+    });
+  });
+  window.addEventListener("afterprint", function () {
+    unfolded.forEach(function (one) { one.open = false; });
+    unfolded = [];
+  });
+
   var plots = JSON.parse(document.getElementById("plots").textContent);
   var NS = "http:" + "//www.w3.org/2000/svg";
 

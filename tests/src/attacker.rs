@@ -1,0 +1,189 @@
+//! A stranger on the wire of a lab: a network namespace of its own, joined to the hosts' bridge, that
+//! takes the address of a host, listens to what passes and sends what it likes. It judges nothing.
+
+use std::fs::File;
+use std::net::{Ipv4Addr, SocketAddrV4, UdpSocket};
+use std::os::fd::AsRawFd;
+use std::process::Command;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use nix::sched::{CloneFlags, setns};
+use nix::sys::socket::{AddressFamily, MsgFlags, SockFlag, SockProtocol, SockType, recv, socket};
+
+use crate::child;
+
+/// No set-up command takes a tenth of this on an overloaded machine.
+const SETUP_LIMIT: Duration = Duration::from_secs(20);
+/// Ethernet, IPv4 without options and UDP.
+const BEFORE_PAYLOAD_BYTES: usize = 14 + 20 + 8;
+/// Datagrams of one burst; the pace is kept between bursts.
+const BURST: u32 = 64;
+
+/// The stranger; dropping it takes its namespace away.
+#[derive(Debug)]
+pub struct Attacker {
+    namespace: String,
+}
+
+/// What a flood came to.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Flood {
+    /// Datagrams that left.
+    pub sent_count: u64,
+    /// How long it took.
+    pub took: Duration,
+}
+
+impl Flood {
+    /// Datagrams in a second.
+    pub fn rate(&self) -> f64 {
+        self.sent_count as f64 / self.took.as_secs_f64().max(1e-9)
+    }
+}
+
+impl Attacker {
+    /// Joins a namespace called `namespace` to `bridge` of the namespace `first`, which becomes a hub, so
+    /// that the stranger hears everything. It takes the address `as_host` and knows where `towards` is.
+    ///
+    /// # Panics
+    /// When it cannot be built.
+    pub fn join(
+        first: &str,
+        namespace: &str,
+        as_host: Ipv4Addr,
+        towards: (Ipv4Addr, &str),
+    ) -> Self {
+        let ip = |words: String| {
+            let words: Vec<&str> = words.split(' ').collect();
+            child::run(Command::new("ip").args(words), SETUP_LIMIT).map(drop)
+        };
+        let (target, hardware) = towards;
+        // From here on dropping it cleans up.
+        let attacker = Self {
+            namespace: namespace.to_owned(),
+        };
+        let name = namespace;
+        let built = [
+            format!("netns add {name}"),
+            format!("-n {first} link set bridge0 type bridge ageing_time 0"),
+            format!("-n {first} link add port9 type veth peer name eth0 netns {name}"),
+            format!("-n {first} link set port9 master bridge0 up"),
+            // Without ARP it does not tell the hosts where to find the address it took.
+            format!("-n {name} link set eth0 arp off"),
+            format!("-n {name} address add {as_host}/24 dev eth0"),
+            format!("-n {name} link set eth0 up"),
+            format!("-n {name} neigh replace {target} lladdr {hardware} dev eth0"),
+        ]
+        .into_iter()
+        .try_for_each(ip);
+        if let Err(reason) = built {
+            panic!("no attacker: {reason}");
+        }
+        attacker
+    }
+
+    /// Runs `work` in a thread of the stranger's network.
+    fn within<T: Send>(&self, work: impl FnOnce() -> T + Send) -> T {
+        let path = format!("/run/netns/{}", self.namespace);
+        let result = thread::scope(|scope| {
+            let entered = scope.spawn(|| {
+                let file = File::open(&path).map_err(|error| format!("{path}: {error}"))?;
+                setns(file, CloneFlags::CLONE_NEWNET).map_err(|errno| errno.to_string())?;
+                Ok::<T, String>(work())
+            });
+            entered.join()
+        });
+        match result {
+            Ok(Ok(value)) => value,
+            Ok(Err(reason)) => panic!("the attacker's network cannot be entered: {reason}"),
+            Err(cause) => std::panic::resume_unwind(cause),
+        }
+    }
+
+    /// Listens until `count` UDP payloads to port `port` have passed, or `limit` is over.
+    ///
+    /// # Panics
+    /// When it cannot listen.
+    pub fn overhear(&self, port: u16, count: usize, limit: Duration) -> Vec<Vec<u8>> {
+        self.within(|| {
+            let opened = socket(
+                AddressFamily::Packet,
+                SockType::Raw,
+                SockFlag::SOCK_NONBLOCK,
+                SockProtocol::EthAll,
+            );
+            let raw = match opened {
+                Ok(raw) => raw,
+                Err(errno) => panic!("no packet socket: {errno}"),
+            };
+            let deadline = Instant::now() + limit;
+            let mut heard = Vec::new();
+            let mut frame = [0; 2048];
+            while heard.len() < count && Instant::now() < deadline {
+                match recv(raw.as_raw_fd(), &mut frame, MsgFlags::MSG_DONTWAIT) {
+                    Ok(length) => heard.extend(payload_to(&frame[..length], port)),
+                    Err(_nothing_yet) => thread::sleep(Duration::from_millis(1)),
+                }
+            }
+            heard
+        })
+    }
+
+    /// Sends what `next` makes of the number of each datagram, from `from` to `to`, for `span` at `rate`
+    /// a second or as fast as it goes.
+    ///
+    /// # Panics
+    /// When it has no socket.
+    pub fn flood(
+        &self,
+        (from, to): (SocketAddrV4, SocketAddrV4),
+        (span, rate): (Duration, u32),
+        next: &mut (dyn FnMut(u64, &mut Vec<u8>) + Send),
+    ) -> Flood {
+        self.within(|| {
+            let opened = UdpSocket::bind(from).and_then(|one| one.connect(to).map(|()| one));
+            let socket = match opened {
+                Ok(socket) => socket,
+                Err(error) => panic!("no socket for the attacker: {error}"),
+            };
+            let began = Instant::now();
+            let mut flood = Flood::default();
+            let mut datagram = Vec::with_capacity(2048);
+            let mut number = 0_u64;
+            while began.elapsed() < span {
+                for _ in 0..BURST {
+                    datagram.clear();
+                    next(number, &mut datagram);
+                    number += 1;
+                    // A refusal that comes back is no reason to stop.
+                    flood.sent_count += u64::from(socket.send(&datagram).is_ok());
+                }
+                let due = Duration::from_secs_f64(number as f64 / f64::from(rate));
+                let early = due.saturating_sub(began.elapsed());
+                if early > Duration::from_micros(200) {
+                    thread::sleep(early);
+                }
+            }
+            flood.took = began.elapsed();
+            flood
+        })
+    }
+}
+
+impl Drop for Attacker {
+    fn drop(&mut self) {
+        let mut command = Command::new("ip");
+        command.args(["netns", "delete", &self.namespace]);
+        drop(child::run(&mut command, SETUP_LIMIT));
+    }
+}
+
+/// The payload of an IPv4 UDP frame to `port`.
+fn payload_to(frame: &[u8], port: u16) -> Option<Vec<u8>> {
+    let is_ours = frame.len() > BEFORE_PAYLOAD_BYTES
+        && frame[12..15] == [0x08, 0x00, 0x45]
+        && frame[23] == 17
+        && frame[36..38] == port.to_be_bytes();
+    is_ours.then(|| frame[BEFORE_PAYLOAD_BYTES..].to_vec())
+}
