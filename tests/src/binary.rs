@@ -58,7 +58,9 @@ fn build(package: &str) -> Result<PathBuf, String> {
     let cargo = env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
     let output = Command::new(cargo)
         .current_dir(workspace_folder())
-        .args(["build", "--package", package, "--bin", package])
+        // With the features of the whole workspace: those of one package alone would build most of
+        // what it depends on a second time.
+        .args(["build", "--workspace", "--bin", package])
         .args([
             "--profile",
             &profile(),
