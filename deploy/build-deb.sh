@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Builds the Debian package: both programs, units, manual pages, completions, topologies, documents.
+# Builds the Debian package: both programs, units, manual pages, completions, the schema of topology
+# files, topologies, documents.
 #
 #   deploy/build-deb.sh [--profile NAME] [--output DIR]
 #
@@ -62,7 +63,10 @@ third_party() {
     done
 }
 
-cargo build --locked --profile "$PROFILE" --package hil-runtime --package hil-recorder --bins >&2
+# For a test the features of the whole workspace will do, which `cargo test` has built already.
+SELECTION=(--package hil-runtime --package hil-recorder)
+[[ $PROFILE != dev ]] || SELECTION=(--workspace)
+cargo build --locked --profile "$PROFILE" "${SELECTION[@]}" --bin hil-runtime --bin hil-recorder >&2
 rm -rf "$STAGE"
 mkdir -p "$STAGE/bin" "$OUTPUT"
 for program in hil-runtime hil-recorder; do

@@ -128,7 +128,9 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
 }
 
 fn write_documents(folder: &Path, console: &mut Console) -> u8 {
-    code_of(documents::write(Cli::command(), folder).map(drop), console)
+    let written = documents::write(Cli::command(), folder)
+        .and_then(|_paths| documents::write_schema(&topology::schema(), folder));
+    code_of(written.map(drop), console)
 }
 
 fn sweep() -> u8 {

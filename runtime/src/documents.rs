@@ -1,6 +1,6 @@
 //! The command line as documents for a package: a manual page of every command, and completions for
 //! the shells. They are made from the same definitions that `--help` is, so they cannot differ from
-//! it.
+//! it. The schema of topology files is laid beside them.
 
 use std::fs;
 use std::io;
@@ -10,6 +10,7 @@ use clap::Command;
 use clap_complete::Shell;
 use clap_mangen::Man;
 use clap_mangen::roff::Roff;
+use serde_json::Value;
 
 /// Begins the list of exit codes in the help of a program.
 const EXIT_CODES: &str = "Exit codes:";
@@ -41,6 +42,20 @@ pub fn write(command: Command, folder: &Path) -> io::Result<Vec<PathBuf>> {
         written.push(path);
     }
     Ok(written)
+}
+
+/// Writes the schema of topology files below `folder`: `schema/topology.schema.json`.
+///
+/// # Errors
+/// When it cannot be written.
+pub fn write_schema(schema: &Value, folder: &Path) -> io::Result<PathBuf> {
+    let folder = folder.join("schema");
+    fs::create_dir_all(&folder)?;
+    let path = folder.join("topology.schema.json");
+    let mut text = serde_json::to_string_pretty(schema)?;
+    text.push('\n');
+    fs::write(&path, text)?;
+    Ok(path)
 }
 
 /// `help` is a way to ask for a page, not a command with one.

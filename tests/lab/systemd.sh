@@ -122,6 +122,7 @@ has_documents() {
     pc "$1" sh -c 'zgrep -q "EXIT STATUS" /usr/share/man/man1/hil-runtime-doctor.1.gz &&
         test -s /usr/share/bash-completion/completions/hil-runtime &&
         test -s /usr/lib/x86_64-linux-gnu/wireshark/plugins/hil.lua &&
+        test -s /usr/share/hil-runtime/topology.schema.json &&
         ls /usr/share/man/man1/hil-* | wc -l' && echo "manual pages"
 }
 

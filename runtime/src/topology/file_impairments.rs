@@ -63,11 +63,21 @@ enum LossWord {
     Bursts,
 }
 
+/// The names of the delay laws.
+pub(super) fn delay_laws() -> impl Iterator<Item = &'static str> {
+    DELAY_WORDS.iter().map(|(word, _)| *word)
+}
+
 const LOSS_WORDS: &[(&str, LossWord)] = &[
     ("bernoulli", LossWord::Bernoulli),
     ("gilbert-elliott", LossWord::GilbertElliott),
     ("bursts", LossWord::Bursts),
 ];
+
+/// The names of the loss laws.
+pub(super) fn loss_laws() -> impl Iterator<Item = &'static str> {
+    LOSS_WORDS.iter().map(|(word, _)| *word)
+}
 
 /// Reads what the link does: each direction does what is said for both, but for the parts it has a
 /// key or table of its own for.

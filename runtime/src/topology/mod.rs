@@ -31,6 +31,7 @@ mod model_links;
 mod reader;
 mod resolved;
 mod resolved_impairments;
+mod schema;
 mod security;
 mod suggest;
 mod tree;
@@ -53,6 +54,7 @@ pub use model::{
     Process, Program, Run, Scheduling, Topology, Wait,
 };
 pub use model_links::{Emulation, Gateway, Hop, Link, Timestamps, Via};
+pub use schema::schema;
 pub use security::{Hops, Security};
 
 pub(crate) use units::parse_duration;

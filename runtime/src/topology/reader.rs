@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 
 use super::errors::{Fault, Faults, Place};
 use super::limits::{Limit, NAME_LENGTH_MAX, RangeText};
+use super::schema::Shape;
 use super::tree::{Node, Table, Value, join};
 use super::units::parse_duration;
 
@@ -78,9 +79,10 @@ impl<'t> Reader<'t> {
         }
     }
 
-    /// The value of `key`, which becomes a known key.
-    fn node(&mut self, key: &'static str) -> Option<&'t Node> {
+    /// The value of `key`, which becomes a known key; what it may be is noted for the schema.
+    fn node(&mut self, key: &'static str, shape: impl FnOnce() -> Shape) -> Option<&'t Node> {
         self.asked.push(key);
+        self.faults.note(&self.path, key, shape);
         self.table.get(key)
     }
 
@@ -93,7 +95,11 @@ impl<'t> Reader<'t> {
 
     /// A string.
     pub(super) fn text(&mut self, key: &'static str) -> Option<At<String>> {
-        let node = self.node(key)?;
+        self.text_as(key, || Shape::Text)
+    }
+
+    fn text_as(&mut self, key: &'static str, shape: impl FnOnce() -> Shape) -> Option<At<String>> {
+        let node = self.node(key, shape)?;
         match &node.value {
             Value::Text(text) => Some(At {
                 value: text.clone(),
@@ -105,7 +111,7 @@ impl<'t> Reader<'t> {
 
     /// A string that can name a folder and a shared-memory service.
     pub(super) fn name(&mut self, key: &'static str) -> Option<At<String>> {
-        let name = self.text(key)?;
+        let name = self.text_as(key, || Shape::Name)?;
         if !is_name(&name.value, false) {
             self.refuse(key, bad_name(&name.value, false));
             return None;
@@ -115,7 +121,7 @@ impl<'t> Reader<'t> {
 
     /// A boolean.
     pub(super) fn boolean(&mut self, key: &'static str) -> Option<bool> {
-        let node = self.node(key)?;
+        let node = self.node(key, || Shape::Boolean)?;
         match &node.value {
             Value::Boolean(boolean) => Some(*boolean),
             _ => self.wrong_type(key, node, "true or false"),
@@ -127,7 +133,7 @@ impl<'t> Reader<'t> {
     where
         T: TryFrom<i64>,
     {
-        let node = self.node(key)?;
+        let node = self.node(key, || Shape::integer(limit))?;
         self.integer_of(key, node, limit)
     }
 
@@ -150,7 +156,7 @@ impl<'t> Reader<'t> {
     where
         T: TryFrom<i64>,
     {
-        let Some(node) = self.node(key) else {
+        let Some(node) = self.node(key, || Shape::integers(limit)) else {
             return Vec::new();
         };
         match &node.value {
@@ -169,7 +175,7 @@ impl<'t> Reader<'t> {
 
     /// A number within `limit`; integers are numbers.
     pub(super) fn number(&mut self, key: &'static str, limit: &Limit<f64>) -> Option<f64> {
-        let node = self.node(key)?;
+        let node = self.node(key, || Shape::number(limit))?;
         self.number_of(key, node, limit)
     }
 
@@ -188,7 +194,7 @@ impl<'t> Reader<'t> {
 
     /// An array of numbers within `limit`.
     pub(super) fn numbers(&mut self, key: &'static str, limit: &Limit<f64>) -> Option<Vec<f64>> {
-        let node = self.node(key)?;
+        let node = self.node(key, || Shape::numbers(limit))?;
         let Value::Array(items) = &node.value else {
             return self.wrong_type(key, node, "an array of numbers");
         };
@@ -202,7 +208,7 @@ impl<'t> Reader<'t> {
         key: &'static str,
         limit: &Limit<Duration>,
     ) -> Option<Vec<Duration>> {
-        let node = self.node(key)?;
+        let node = self.node(key, || Shape::durations(limit))?;
         let Value::Array(items) = &node.value else {
             return self.wrong_type(
                 key,
@@ -220,7 +226,7 @@ impl<'t> Reader<'t> {
         key: &'static str,
         limit: &Limit<Duration>,
     ) -> Option<Duration> {
-        let node = self.node(key)?;
+        let node = self.node(key, || Shape::duration(limit))?;
         self.duration_of(key, node, limit)
     }
 
@@ -256,7 +262,8 @@ impl<'t> Reader<'t> {
         key: &'static str,
         words: &[(&'static str, T)],
     ) -> Option<T> {
-        let text = self.text(key)?;
+        let shape = || Shape::Words(words.iter().map(|(word, _)| *word).collect());
+        let text = self.text_as(key, shape)?;
         let found = words.iter().find(|(word, _)| *word == text.value);
         if found.is_none() {
             let fault = Fault::UnknownWord {
@@ -271,7 +278,7 @@ impl<'t> Reader<'t> {
 
     /// An array of strings.
     pub(super) fn texts(&mut self, key: &'static str) -> Option<At<Vec<At<String>>>> {
-        let node = self.node(key)?;
+        let node = self.node(key, || Shape::Texts)?;
         let Value::Array(items) = &node.value else {
             return self.wrong_type(key, node, "an array of strings");
         };
@@ -291,7 +298,8 @@ impl<'t> Reader<'t> {
 
     /// A table of strings, e.g. environment variables.
     pub(super) fn text_table(&mut self, key: &'static str) -> BTreeMap<String, String> {
-        let Some(reader) = self.table(key) else {
+        let node = self.node(key, || Shape::TextTable);
+        let Some(reader) = node.and_then(|node| self.table_of(key, node)) else {
             return BTreeMap::new();
         };
         let mut texts = BTreeMap::new();
@@ -316,7 +324,7 @@ impl<'t> Reader<'t> {
         key: &'static str,
         expected: &'static str,
     ) -> Option<Reader<'t>> {
-        let node = self.node(key)?;
+        let node = self.node(key, || Shape::Table)?;
         if matches!(node.value, Value::Table(_)) {
             return self.table_of(key, node);
         }
@@ -337,7 +345,8 @@ impl<'t> Reader<'t> {
 
     /// The tables of a table, by name.
     pub(super) fn named_tables(&mut self, key: &'static str) -> Vec<(String, Reader<'t>)> {
-        let Some(reader) = self.table(key) else {
+        let node = self.node(key, || Shape::Tables);
+        let Some(reader) = node.and_then(|node| self.table_of(key, node)) else {
             return Vec::new();
         };
         let has_slashes = key == "channels";
@@ -356,6 +365,7 @@ impl<'t> Reader<'t> {
 
     /// The tree below this table, for what is handed on unread.
     pub(super) fn unread(&self) -> &'t Table {
+        self.faults.note_unread(&self.path);
         self.table
     }
 

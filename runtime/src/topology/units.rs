@@ -12,6 +12,11 @@ const UNITS: &[(&str, u128)] = &[
     ("ns", 1),
 ];
 
+/// The words of all units, largest first.
+pub(super) fn unit_words() -> impl Iterator<Item = &'static str> {
+    UNITS.iter().map(|(word, _)| *word)
+}
+
 /// Why a text is no duration.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub(crate) enum DurationError {
