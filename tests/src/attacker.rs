@@ -18,12 +18,17 @@ const SETUP_LIMIT: Duration = Duration::from_secs(20);
 /// Ethernet, IPv4 without options and UDP.
 const BEFORE_PAYLOAD_BYTES: usize = 14 + 20 + 8;
 /// Datagrams of one burst; the pace is kept between bursts.
-const BURST: u32 = 64;
+const BURST: usize = 64;
+
+/// What a bridge does unless told otherwise: five minutes.
+const SWITCH_AGEING: u32 = 30_000;
 
 /// The stranger; dropping it takes its namespace away.
 #[derive(Debug)]
 pub struct Attacker {
     namespace: String,
+    /// Where the bridge is.
+    first: String,
 }
 
 /// What a flood came to.
@@ -43,8 +48,8 @@ impl Flood {
 }
 
 impl Attacker {
-    /// Joins a namespace called `namespace` to `bridge` of the namespace `first`, which becomes a hub, so
-    /// that the stranger hears everything. It takes the address `as_host` and knows where `towards` is.
+    /// Joins a namespace called `namespace` to the bridge of the namespace `first`. It takes the address
+    /// `as_host` and knows where `towards` is.
     ///
     /// # Panics
     /// When it cannot be built.
@@ -54,19 +59,15 @@ impl Attacker {
         as_host: Ipv4Addr,
         towards: (Ipv4Addr, &str),
     ) -> Self {
-        let ip = |words: String| {
-            let words: Vec<&str> = words.split(' ').collect();
-            child::run(Command::new("ip").args(words), SETUP_LIMIT).map(drop)
-        };
         let (target, hardware) = towards;
         // From here on dropping it cleans up.
         let attacker = Self {
             namespace: namespace.to_owned(),
+            first: first.to_owned(),
         };
         let name = namespace;
         let built = [
             format!("netns add {name}"),
-            format!("-n {first} link set bridge0 type bridge ageing_time 0"),
             format!("-n {first} link add port9 type veth peer name eth0 netns {name}"),
             format!("-n {first} link set port9 master bridge0 up"),
             // Without ARP it does not tell the hosts where to find the address it took.
@@ -76,7 +77,7 @@ impl Attacker {
             format!("-n {name} neigh replace {target} lladdr {hardware} dev eth0"),
         ]
         .into_iter()
-        .try_for_each(ip);
+        .try_for_each(|words| ip(&words));
         if let Err(reason) = built {
             panic!("no attacker: {reason}");
         }
@@ -101,11 +102,29 @@ impl Attacker {
         }
     }
 
-    /// Listens until `count` UDP payloads to port `port` have passed, or `limit` is over.
+    /// Listens until `count` UDP payloads to port `port` have passed, or `limit` is over. Meanwhile the
+    /// bridge is a hub, so that the stranger hears everything; afterwards it is a switch again, which does
+    /// not have every host look at what it sends to one.
     ///
     /// # Panics
     /// When it cannot listen.
     pub fn overhear(&self, port: u16, count: usize, limit: Duration) -> Vec<Vec<u8>> {
+        self.forget_after(0);
+        let heard = self.listen(port, count, limit);
+        self.forget_after(SWITCH_AGEING);
+        heard
+    }
+
+    /// After how many hundredths of a second the bridge forgets where an address is.
+    fn forget_after(&self, ageing: u32) {
+        let first = &self.first;
+        let words = format!("-n {first} link set bridge0 type bridge ageing_time {ageing}");
+        if let Err(reason) = ip(&words) {
+            panic!("the bridge does not change: {reason}");
+        }
+    }
+
+    fn listen(&self, port: u16, count: usize, limit: Duration) -> Vec<Vec<u8>> {
         self.within(|| {
             let opened = socket(
                 AddressFamily::Packet,
@@ -130,17 +149,18 @@ impl Attacker {
         })
     }
 
-    /// Sends what `next` makes of the number of each datagram, from `from` to `to`, for `span` at `rate`
-    /// a second or as fast as it goes.
+    /// Sends `datagrams` one after the other and again from the first, from `from` to `to`, for `span` at
+    /// `rate` a second or as fast as it goes.
     ///
     /// # Panics
-    /// When it has no socket.
+    /// When it has no socket, or nothing to send.
     pub fn flood(
         &self,
         (from, to): (SocketAddrV4, SocketAddrV4),
         (span, rate): (Duration, u32),
-        next: &mut (dyn FnMut(u64, &mut Vec<u8>) + Send),
+        datagrams: &[Vec<u8>],
     ) -> Flood {
+        assert!(!datagrams.is_empty(), "nothing to send");
         self.within(|| {
             let opened = UdpSocket::bind(from).and_then(|one| one.connect(to).map(|()| one));
             let socket = match opened {
@@ -149,16 +169,14 @@ impl Attacker {
             };
             let began = Instant::now();
             let mut flood = Flood::default();
-            let mut datagram = Vec::with_capacity(2048);
+            let mut next = datagrams.iter().cycle();
             let mut number = 0_u64;
             while began.elapsed() < span {
-                for _ in 0..BURST {
-                    datagram.clear();
-                    next(number, &mut datagram);
-                    number += 1;
+                for datagram in next.by_ref().take(BURST) {
                     // A refusal that comes back is no reason to stop.
-                    flood.sent_count += u64::from(socket.send(&datagram).is_ok());
+                    flood.sent_count += u64::from(socket.send(datagram).is_ok());
                 }
+                number += BURST as u64;
                 let due = Duration::from_secs_f64(number as f64 / f64::from(rate));
                 let early = due.saturating_sub(began.elapsed());
                 if early > Duration::from_micros(200) {
@@ -177,6 +195,11 @@ impl Drop for Attacker {
         command.args(["netns", "delete", &self.namespace]);
         drop(child::run(&mut command, SETUP_LIMIT));
     }
+}
+
+fn ip(words: &str) -> Result<(), String> {
+    let mut command = Command::new("ip");
+    child::run(command.args(words.split(' ')), SETUP_LIMIT).map(drop)
 }
 
 /// The payload of an IPv4 UDP frame to `port`.

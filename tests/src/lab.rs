@@ -244,6 +244,14 @@ impl LabHost {
         }
     }
 
+    /// Gives this host one more address on the first cable.
+    ///
+    /// # Panics
+    /// When it cannot be done.
+    pub fn add_address(&self, address: Ipv4Addr) {
+        self.change(&["address", "add", &format!("{address}/24")]);
+    }
+
     /// Takes the address of the first cable away from this host, as a lease that ran out does.
     ///
     /// # Panics

@@ -22,7 +22,8 @@ const COUNT_MIN: usize = 100;
 pub struct Latencies(Vec<i64>);
 
 impl Latencies {
-    fn of(mut latencies_ns: Vec<i64>) -> Self {
+    /// Of latencies in any order, nanoseconds.
+    pub fn of(mut latencies_ns: Vec<i64>) -> Self {
         latencies_ns.sort_unstable();
         Self(latencies_ns)
     }
@@ -36,7 +37,7 @@ impl Latencies {
 
 impl fmt::Display for Latencies {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        for (name, per_mille) in [("p50", 500), ("p99", 990), ("max", 1000)] {
+        for (name, per_mille) in [("p50", 500), ("p99", 990), ("p99.9", 999), ("max", 1000)] {
             let us = self
                 .quantile_ns(per_mille)
                 .map_or(f64::NAN, |ns| ns as f64 * 1e-3);

@@ -133,6 +133,56 @@ fn cable_address_and_packet_size_change_under_a_run_and_it_goes_on() {
 }
 
 #[test]
+fn a_gateway_that_comes_back_while_the_path_is_away_waits_for_it() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let record = RunFolder::new("path-away");
+    let trial = Trial::shipped("shuttle-split.toml", record.path())
+        .set("links.hop.port=48790")
+        .set("run.duration=\"10 min\"")
+        // The supervisors' connection leads over the same cable.
+        .set("run.peer_timeout=\"60 s\"");
+    let (mut hosts, files) = start(&lab, &trial);
+    let robot = lab.host(1);
+    for instance in [0, 1] {
+        let is_cable = instance == 0;
+        if is_cable {
+            robot.set_link(INTERFACE, "down");
+        } else {
+            robot.set_mtu(TINY_MTU);
+        }
+        files[1].kill_process("gateway-hop-robot-pc", instance, LIMIT);
+        wait_until(LIMIT, "that it waits", || {
+            let told = hosts[1].stderr_so_far();
+            told.matches("waiting for the link").count() > usize::from(!is_cable)
+        });
+        if is_cable {
+            robot.set_link(INTERFACE, "up");
+        } else {
+            robot.set_mtu(1500);
+        }
+        wait_for_messages(&files, "a gateway came back without a path");
+    }
+    hosts[0].signal(nix::sys::signal::Signal::SIGTERM).unwrap();
+    for host in &mut hosts {
+        host.wait_within(RUN_LIMIT).unwrap();
+    }
+    for index in [0, 1] {
+        let summary = files[index].summary();
+        assert_eq!(summary.run.outcome, Outcome::Stopped);
+        assert_every_message_is_accounted_for(&summary);
+        let mut events = summary.events.iter();
+        assert!(events.any(|event| event.what.contains("waiting for the link")));
+        for channel in CHANNELS {
+            let said = describe(channel, account(&summary, channel));
+            println!("{}: {said}", HOSTS[index]);
+        }
+        files[index].assert_nothing_left_on(lab.host(index));
+    }
+}
+
+#[test]
 fn a_host_that_never_comes_and_one_that_goes_for_good_are_named() {
     let Some(lab) = Lab::two_hosts_or_skip() else {
         return;

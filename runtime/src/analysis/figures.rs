@@ -18,6 +18,10 @@ use crate::supervisor::event::{Event, ProcessStory};
 use crate::supervisor::{self, RunResult};
 use crate::topology::{Channel, Topology, Via};
 
+/// Datagrams that came while the socket's receive buffer was full, and how a report calls them.
+const NO_ROOM_COUNTER: &str = "socket: kernel_drop_count";
+const NO_ROOM: &str = "no room in the receive buffer";
+
 /// What a receiving gateway calls the datagrams that its emulated link had no room for.
 const OVERFLOW_COUNTER: &str = "socket: link_overflow_count";
 
@@ -184,9 +188,13 @@ pub(super) fn channel_summary(
         .flat_map(|direction| &direction.counters)
         .filter(|counter| counter.count > 0)
         .filter_map(|counter| {
-            let name = counter.name.strip_prefix("refused: ")?.to_owned();
+            // What the kernel dropped for want of room may have been anything, also a message.
+            let name = match counter.name.as_str() {
+                NO_ROOM_COUNTER => NO_ROOM,
+                name => name.strip_prefix("refused: ")?,
+            };
             Some(CountByName {
-                name,
+                name: name.to_owned(),
                 count: counter.count,
             })
         })

@@ -6,7 +6,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64};
 use std::time::Duration;
 
-use hil_gateways::protocol::{EgressBridge, EgressSettings, IngressBridge, IngressSettings};
+use hil_gateways::protocol::{
+    EgressBridge, EgressSettings, IngressBridge, IngressSettings, SettingsError,
+};
 use hil_gateways::transport::tcp::ConnectionTally;
 use hil_gateways::transport::{DatagramReceiver, DatagramSender};
 use hil_models::link::trace::ReplayTally;
@@ -27,7 +29,6 @@ use crate::process::launch::{DirectionLaunch, Side};
 use crate::process::pipe::{DirectionReport, RunStart};
 use crate::process::pulse::Pulse;
 use crate::record::{RecordKind, RecordSink, Recorder};
-use crate::security::RunSeal;
 use crate::wait::{WaitMode, WaitStrategy};
 
 /// Records a ring holds.
@@ -77,33 +78,8 @@ pub fn open<'a>(
     start: &RunStart,
 ) -> Result<(&'a DirectionLaunch, Opened), GatewayError> {
     let plan = StampPlan::asked(stamps_of(&launch.socket));
-    open_with(launch, recorder, start, (plan, None))
-}
-
-/// As [`open`], with what a probe found of the interface, and sealed when the run's hops are.
-///
-/// # Errors
-/// As [`open`].
-pub fn open_with<'a>(
-    launch: &'a DirectionLaunch,
-    recorder: &mut Recorder,
-    start: &RunStart,
-    (plan, seal): (StampPlan, Option<&RunSeal>),
-) -> Result<(&'a DirectionLaunch, Opened), GatewayError> {
-    let sinks = open_sinks(launch, recorder)?;
-    let socket = OpenSocket::open(launch, start, (plan, seal))?;
-    Ok((
-        launch,
-        Opened {
-            socket,
-            sinks,
-            plan,
-            count: Arc::default(),
-            pulse: Pulse::default(),
-            // A receiver has nobody to wait for: it takes what comes.
-            is_established: Arc::new(AtomicBool::new(launch.side == Side::Ingress)),
-        },
-    ))
+    let socket = OpenSocket::open(launch, start, (plan, None))?;
+    Ok((launch, Opened::new(launch, recorder, (socket, plan))?))
 }
 
 fn open_sinks(launch: &DirectionLaunch, recorder: &mut Recorder) -> Result<Sinks, GatewayError> {
@@ -128,6 +104,26 @@ fn open_sinks(launch: &DirectionLaunch, recorder: &mut Recorder) -> Result<Sinks
 }
 
 impl Opened {
+    /// The direction of an open socket, with its record files.
+    ///
+    /// # Errors
+    /// When a file cannot be made.
+    pub(super) fn new(
+        launch: &DirectionLaunch,
+        recorder: &mut Recorder,
+        (socket, plan): (OpenSocket, StampPlan),
+    ) -> Result<Self, GatewayError> {
+        Ok(Self {
+            socket,
+            sinks: open_sinks(launch, recorder)?,
+            plan,
+            count: Arc::default(),
+            pulse: Pulse::default(),
+            // A receiver has nobody to wait for: it takes what comes.
+            is_established: Arc::new(AtomicBool::new(launch.side == Side::Ingress)),
+        })
+    }
+
     /// Messages carried so far.
     pub fn count(&self) -> Arc<AtomicU64> {
         Arc::clone(&self.count)
@@ -191,13 +187,12 @@ impl Opened {
     }
 }
 
-fn egress(
-    (sender, datagram_max_bytes): (Box<dyn DatagramSender>, usize),
-    sinks: Sinks,
-    (count, is_established): (Arc<AtomicU64>, Arc<AtomicBool>),
-    (launch, around, plan): (&DirectionLaunch, &Surroundings, StampPlan),
-) -> Result<Egress, GatewayError> {
-    let bridge = EgressBridge::new(EgressSettings {
+/// A bridge over a path that takes datagrams of so many bytes.
+pub(super) fn egress_bridge(
+    datagram_max_bytes: usize,
+    (launch, around): (&DirectionLaunch, &Surroundings),
+) -> Result<EgressBridge, SettingsError> {
+    EgressBridge::new(EgressSettings {
         channel: Surroundings::identity(launch),
         session: around.session,
         domain: around.fingerprint,
@@ -208,7 +203,16 @@ fn egress(
         } else {
             SYNC_PERIOD
         },
-    })?;
+    })
+}
+
+fn egress(
+    (sender, datagram_max_bytes): (Box<dyn DatagramSender>, usize),
+    sinks: Sinks,
+    (count, is_established): (Arc<AtomicU64>, Arc<AtomicBool>),
+    (launch, around, plan): (&DirectionLaunch, &Surroundings, StampPlan),
+) -> Result<Egress, GatewayError> {
+    let bridge = egress_bridge(datagram_max_bytes, (launch, around))?;
     let input = (!launch.is_clock_path)
         .then(|| RawInput::open(&around.domain, &launch.channel, launch.depth))
         .transpose()?;

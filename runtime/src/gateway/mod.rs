@@ -16,6 +16,7 @@ pub(crate) mod kernel_clock;
 mod line;
 pub(crate) mod link_control;
 mod link_switch;
+mod opening;
 pub(crate) mod process;
 pub(crate) mod socket;
 pub mod stamp_plan;

@@ -11,9 +11,10 @@ use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use super::connection::Connection;
-use super::direction::{self, Opened};
+use super::direction::Opened;
 use super::link_control::LinkControl;
-use super::{GatewayError, Surroundings, arming};
+use super::opening::{OpenSockets, open_sockets};
+use super::{GatewayError, Surroundings};
 use hil_models::time::Instant;
 
 use crate::channel::Domain;
@@ -61,17 +62,15 @@ fn prepare_and_live(path: &Path) -> Result<(), GatewayError> {
     let seal = seal.flatten();
     let domain = Domain::open(&launch.domain.parse()?)?;
     let surroundings = Arc::new(Surroundings::new(domain)?);
-    let mut armed = arming::arm(&launch);
     warn_of_shared_cpus(&launch);
     let mut recorder = Recorder::new(&launch.records, &launch.process, launch.instance);
+    let sockets = open_sockets(&launch, &orders, (seal.as_ref(), &surroundings))?;
+    let Some(OpenSockets { mut armed, sockets }) = sockets else {
+        return finish(Vec::new(), recorder, &[]);
+    };
     let mut opened = Vec::new();
-    for direction in &launch.directions {
-        opened.push(direction::open_with(
-            direction,
-            &mut recorder,
-            &orders.run_start(),
-            (armed.plan(direction), seal.as_ref()),
-        )?);
+    for (direction, socket) in launch.directions.iter().zip(sockets) {
+        opened.push((direction, Opened::new(direction, &mut recorder, socket)?));
     }
     let sampler = armed.prepare_sampler(&launch.process, &mut recorder);
     let switches = opened.iter_mut().filter_map(|(_, one)| one.take_switch());

@@ -365,7 +365,7 @@ pub struct ChannelSummary {
     /// What was recorded of a channel that is only recorded; `None` when nothing was.
     #[serde(default)]
     pub recorded: Option<RecordedFigures>,
-    /// Datagrams the gateways refused, by reason; only reasons that occurred.
+    /// Datagrams the gateways refused, or the kernel for want of room, by reason; only reasons that occurred.
     pub refusals: Vec<CountByName>,
     /// The gateway threads that carried it; empty on a direct channel.
     pub directions: Vec<DirectionSummary>,

@@ -17,8 +17,11 @@ use crate::security::greeting::{self, GreetingError, MAGIC, TimedStream, Why};
 
 /// How long a greeting may take altogether.
 pub(super) const GREETING_TIMEOUT: Duration = Duration::from_secs(3);
-/// Connections of one address that have not said who they are; the oldest makes way.
-const HALF_OPEN_MAX: usize = 4;
+/// Connections taken in one turn; the others wait in the kernel's queue, or are turned away there.
+const ADMITTED_MAX: usize = 64;
+/// Connections of one address that have not said who they are; the oldest makes way. Not fewer than one
+/// turn takes: each has at least the time between two turns, in which a host of ours says who it is.
+const HALF_OPEN_MAX: usize = ADMITTED_MAX;
 /// Longest frame before the other end is known.
 const HELLO_BYTES_MAX: usize = 16_384;
 /// What a plain end is told where a key is needed. A stranger may hear it: it is shorter than any hello.
@@ -33,8 +36,48 @@ pub(super) enum Arrived {
     TurnedAway(IpAddr, &'static str),
     /// It came with a key where none is used.
     Keyed(IpAddr),
-    /// It left, or was no host of ours.
+    /// It left, was too slow, or was no host of ours.
     Nobody,
+}
+
+/// Connections that came to nothing, by cause.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(super) struct DoorCounts {
+    /// From an address that is not awaited.
+    foreign: u64,
+    /// They came with another key, or without one, or under another name.
+    turned_away: u64,
+    /// They said something else, or nothing in time, or left.
+    nobody: u64,
+    /// They made way for newer ones of their address before they said who they were.
+    crowded_out: u64,
+}
+
+impl DoorCounts {
+    /// In words; `None` when there were none.
+    pub(super) fn words(self) -> Option<String> {
+        let Self {
+            foreign,
+            turned_away,
+            nobody,
+            crowded_out,
+        } = self;
+        let causes = [
+            (foreign, "from a foreign address"),
+            (turned_away, "with another key or name"),
+            (nobody, "without a greeting"),
+            (crowded_out, "that made way for newer ones"),
+        ];
+        let causes = causes.into_iter().filter(|(count, _)| *count > 0);
+        let causes: Vec<String> = causes
+            .map(|(count, cause)| format!("{count} {cause}"))
+            .collect();
+        let total = foreign + turned_away + nobody + crowded_out;
+        (total > 0).then(|| {
+            let causes = causes.join(", ");
+            format!("{total} connections came to nothing while the hosts met: {causes}")
+        })
+    }
 }
 
 /// Whom the door opens for.
@@ -62,6 +105,8 @@ struct HalfOpen {
     thread: thread::JoinHandle<()>,
     /// It said who it is: from then on the connection is somebody else's to end.
     is_known: Arc<AtomicBool>,
+    /// It made way for a newer one.
+    is_crowded_out: Arc<AtomicBool>,
 }
 
 impl HalfOpen {
@@ -76,9 +121,13 @@ pub(super) struct Door {
     listener: TcpListener,
     admission: Admission,
     half_open: Vec<HalfOpen>,
-    sender: Sender<Arrived>,
-    arrived: Receiver<Arrived>,
+    sender: Sender<Word>,
+    arrived: Receiver<Word>,
+    counts: DoorCounts,
 }
+
+/// What became of a connection, and whether it had to make way.
+type Word = (Arrived, bool);
 
 impl Door {
     pub(super) fn open(address: SocketAddr, admission: Admission) -> io::Result<Self> {
@@ -91,13 +140,18 @@ impl Door {
             half_open: Vec::new(),
             sender,
             arrived,
+            counts: DoorCounts::default(),
         })
     }
 
-    /// Takes waiting connections, a bounded number of them, and gives the next that turned out to be
-    /// something; `None` when there is none now.
-    pub(super) fn look(&mut self) -> io::Result<Option<Arrived>> {
-        for _ in 0..64 {
+    /// What came to nothing so far.
+    pub(super) fn counts(&self) -> DoorCounts {
+        self.counts
+    }
+
+    /// Takes waiting connections, a bounded number of them.
+    pub(super) fn admit_waiting(&mut self) -> io::Result<()> {
+        for _ in 0..ADMITTED_MAX {
             match self.listener.accept() {
                 Ok((stream, from)) => self.admit(stream, from.ip()),
                 Err(error) if error.kind() == io::ErrorKind::WouldBlock => break,
@@ -107,7 +161,24 @@ impl Door {
             }
         }
         self.half_open.retain(HalfOpen::is_unknown);
-        Ok(self.arrived.try_recv().ok())
+        Ok(())
+    }
+
+    /// The next connection that turned out to be something; `None` when there is none now. No more come
+    /// than were admitted, so looking until there is none comes to an end.
+    pub(super) fn look(&mut self) -> Option<Arrived> {
+        loop {
+            let (arrived, is_crowded_out) = self.arrived.try_recv().ok()?;
+            match arrived {
+                Arrived::Nobody if is_crowded_out => self.counts.crowded_out += 1,
+                Arrived::Nobody => self.counts.nobody += 1,
+                Arrived::TurnedAway(..) => {
+                    self.counts.turned_away += 1;
+                    return Some(arrived);
+                }
+                Arrived::Peer(..) | Arrived::Keyed(_) => return Some(arrived),
+            }
+        }
     }
 
     /// Strangers are turned away before a byte of theirs is read.
@@ -117,7 +188,12 @@ impl Door {
             .expected
             .iter()
             .any(|(_, known)| *known == ip);
-        let Some(handle) = stream.try_clone().ok().filter(|_| is_expected) else {
+        if !is_expected {
+            self.counts.foreign += 1;
+            return;
+        }
+        let Ok(handle) = stream.try_clone() else {
+            self.counts.crowded_out += 1;
             return;
         };
         self.half_open.retain(HalfOpen::is_unknown);
@@ -126,26 +202,31 @@ impl Door {
             && let Some(oldest) = self.half_open.iter().position(same)
         {
             let oldest = self.half_open.remove(oldest);
+            oldest.is_crowded_out.store(true, Ordering::Release);
             // Its thread notices at once and ends.
             let _gone = oldest.stream.shutdown(Shutdown::Both).is_err();
         }
         let (admission, sender) = (self.admission.clone(), self.sender.clone());
         let is_known = Arc::new(AtomicBool::new(false));
-        let known = Arc::clone(&is_known);
+        let is_crowded_out = Arc::new(AtomicBool::new(false));
+        let (known, crowded_out) = (Arc::clone(&is_known), Arc::clone(&is_crowded_out));
         let greet = move || {
             let arrived = greet(stream, ip, &admission).unwrap_or(Arrived::Nobody);
             known.store(matches!(arrived, Arrived::Peer(..)), Ordering::Release);
             // Nobody listens once all hosts are here.
-            let _late = sender.send(arrived).is_err();
+            let word = (arrived, crowded_out.load(Ordering::Acquire));
+            let _late = sender.send(word).is_err();
         };
         // Without a thread the connection is dropped, and its end tries again.
-        if let Ok(thread) = thread::Builder::new().name("door".to_owned()).spawn(greet) {
-            self.half_open.push(HalfOpen {
+        match thread::Builder::new().name("door".to_owned()).spawn(greet) {
+            Ok(thread) => self.half_open.push(HalfOpen {
                 ip,
                 stream: handle,
                 thread,
                 is_known,
-            });
+                is_crowded_out,
+            }),
+            Err(_) => self.counts.crowded_out += 1,
         }
     }
 }

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use super::domains::Domains;
 use super::frame::{Frame, PeerHello, PeerMessage};
-use super::meet::{Meeting, PeerError, meet};
+use super::meet::{Meeting, Met, PeerError, meet};
 use super::outcome::RunError;
 use super::peer::{Peer, PeerEvent};
 use super::session::is_here;
@@ -80,7 +80,10 @@ pub(super) fn gather(
         domain: domains.fingerprint()?,
         has_fast_aes: has_fast_aes(),
     };
-    let mut peers = meet(&meeting, &hello, &mut |missing, waited| {
+    let Met {
+        mut peers,
+        strangers,
+    } = meet(&meeting, &hello, &mut |missing, waited| {
         let waited_s = waited.as_secs();
         let role = if is_first {
             "to connect to"
@@ -99,7 +102,25 @@ pub(super) fn gather(
         Some(_) => Some(be_handed(&mut peers, meeting.timeout, signals)?),
     };
     let names: Vec<&str> = peers.iter().map(|peer| peer.hello.host.as_str()).collect();
-    let secured = match (key, &seal) {
+    let secured = protection(key, seal.as_ref());
+    console.say(&format!(
+        "connected with {}; hops {secured}",
+        names.join(", ")
+    ));
+    if let Some(strangers) = &strangers {
+        console.warn(strangers);
+    }
+    let security = [Some(secured), strangers].into_iter().flatten();
+    Ok(Gathered {
+        peers,
+        seal,
+        security: Some(security.collect::<Vec<_>>().join("; ")),
+    })
+}
+
+/// How the hops are protected, in words.
+fn protection(key: Option<&PreSharedKey>, seal: Option<&RunSeal>) -> String {
+    match (key, seal) {
         (Some(key), Some(seal)) => format!(
             "sealed ({}) with the key {}",
             seal.suite().label(),
@@ -107,16 +128,7 @@ pub(super) fn gather(
         ),
         _ => "PLAIN, as the topology says: whoever reaches the network can read and forge messages"
             .to_owned(),
-    };
-    console.say(&format!(
-        "connected with {}; hops {secured}",
-        names.join(", ")
-    ));
-    Ok(Gathered {
-        peers,
-        seal,
-        security: Some(secured),
-    })
+    }
 }
 
 fn meeting(

@@ -117,6 +117,15 @@ impl Meeting {
     }
 }
 
+/// The hosts of a run that met.
+#[derive(Debug)]
+pub(crate) struct Met {
+    /// All that were awaited.
+    pub(crate) peers: Vec<Peer>,
+    /// What else came to the door and got no further, in words.
+    pub(crate) strangers: Option<String>,
+}
+
 /// Brings the hosts of a run together. `waiting` is told whom it waits for, a few times a second;
 /// it returns false to give up.
 ///
@@ -126,7 +135,7 @@ pub(crate) fn meet(
     meeting: &Meeting,
     hello: &PeerHello,
     waiting: &mut dyn FnMut(&str, Duration) -> bool,
-) -> Result<Vec<Peer>, PeerError> {
+) -> Result<Met, PeerError> {
     let mut patience = Patience {
         meeting,
         waiting,
@@ -137,7 +146,11 @@ pub(crate) fn meet(
     if meeting.is_here {
         host(meeting, hello, &mut patience)
     } else {
-        join(meeting, hello, &mut patience)
+        let peers = join(meeting, hello, &mut patience)?;
+        Ok(Met {
+            peers,
+            strangers: None,
+        })
     }
 }
 
@@ -193,7 +206,7 @@ fn host(
     meeting: &Meeting,
     hello: &PeerHello,
     patience: &mut Patience<'_>,
-) -> Result<Vec<Peer>, PeerError> {
+) -> Result<Met, PeerError> {
     let address = meeting.address;
     let listen = |source| PeerError::Listen { address, source };
     let admission = Admission {
@@ -203,38 +216,43 @@ fn host(
     };
     let mut door = Door::open(address, admission).map_err(listen)?;
     let mut peers: Vec<Peer> = Vec::new();
-    while peers.len() < meeting.expected.len() {
-        match door.look().map_err(listen)? {
-            Some(Arrived::Peer(ip, arrived)) => {
-                let (ends, theirs) = *arrived;
-                if let Some(peer) = welcome(ends, (ip, theirs), meeting, hello)? {
-                    // One that gave up and came again: its first connection is a dead one.
-                    peers.retain(|known| known.hello.host != peer.hello.host);
-                    peers.push(peer);
-                }
-            }
-            Some(Arrived::TurnedAway(ip, why)) => patience.note(meeting, ip, why),
-            Some(Arrived::Keyed(ip)) => {
-                return Err(PeerError::Key {
-                    host: meeting.name_of(ip),
-                    reason: "it came with a key and this topology says [security] hops = \
-                             \"plain\"; use the same file on both"
-                        .to_owned(),
-                });
-            }
-            Some(Arrived::Nobody) => {}
-            None => {
-                let missing = meeting.missing(&peers);
-                if patience.wait(&missing)? {
-                    // Those that are here must not take the waiting for an absence.
-                    for peer in &mut peers {
-                        peer.say(&PeerMessage::Alive);
+    loop {
+        door.admit_waiting().map_err(listen)?;
+        while let Some(arrived) = door.look() {
+            match arrived {
+                Arrived::Peer(ip, arrived) => {
+                    let (ends, theirs) = *arrived;
+                    if let Some(peer) = welcome(ends, (ip, theirs), meeting, hello)? {
+                        // One that gave up and came again: its first connection is a dead one.
+                        peers.retain(|known| known.hello.host != peer.hello.host);
+                        peers.push(peer);
                     }
                 }
+                Arrived::TurnedAway(ip, why) => patience.note(meeting, ip, why),
+                Arrived::Keyed(ip) => {
+                    return Err(PeerError::Key {
+                        host: meeting.name_of(ip),
+                        reason: "it came with a key and this topology says [security] hops = \
+                                 \"plain\"; use the same file on both"
+                            .to_owned(),
+                    });
+                }
+                Arrived::Nobody => {}
+            }
+        }
+        if peers.len() == meeting.expected.len() {
+            let strangers = door.counts().words();
+            return Ok(Met { peers, strangers });
+        }
+        // Whatever came: strangers must not keep this host from its deadline and its signals.
+        let missing = meeting.missing(&peers);
+        if patience.wait(&missing)? {
+            // Those that are here must not take the waiting for an absence.
+            for peer in &mut peers {
+                peer.say(&PeerMessage::Alive);
             }
         }
     }
-    Ok(peers)
 }
 
 /// Greets one that said who it is; `None` when it is nobody of this run, or not at its own address.

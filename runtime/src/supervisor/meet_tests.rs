@@ -42,7 +42,7 @@ fn pair_with(
     let right = right.clone();
     let joining = thread::spawn(move || meet(&there, &right, &mut |_, _| true));
     let hosting = meet(&here, left, &mut |_, _| true);
-    [hosting, joining.join().unwrap()]
+    [hosting, joining.join().unwrap()].map(|end| end.map(|met| met.peers))
 }
 
 #[test]
@@ -143,5 +143,47 @@ fn nobody_there_is_said_with_the_name_and_the_address() {
     assert!(
         error.to_string().starts_with("robot-pc did not appear"),
         "{error}"
+    );
+}
+
+#[test]
+fn connections_that_say_nothing_keep_a_host_neither_from_its_deadline_nor_from_its_signals() {
+    let probe = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
+    let address = probe.local_addr().unwrap();
+    drop(probe);
+    let meeting = Meeting {
+        address,
+        is_here: true,
+        own: address.ip(),
+        expected: vec![("b".to_owned(), address.ip())],
+        timeout: Duration::from_secs(1),
+        key: Some(key("knocked")),
+    };
+    let is_over = std::sync::atomic::AtomicBool::new(false);
+    let (mut told_count, mut tried_count) = (0, 0);
+    let outcome = thread::scope(|scope| {
+        let knocking = scope.spawn(|| {
+            let mut open = std::collections::VecDeque::new();
+            while !is_over.load(std::sync::atomic::Ordering::Acquire) {
+                open.extend(TcpStream::connect_timeout(&address, RETRY_PERIOD));
+                tried_count += 1;
+                if open.len() > 100 {
+                    open.pop_front();
+                }
+            }
+        });
+        let outcome = meet(&meeting, &hello("a", 1, 1), &mut |_, _| {
+            told_count += 1;
+            true
+        });
+        is_over.store(true, std::sync::atomic::Ordering::Release);
+        knocking.join().unwrap();
+        outcome
+    });
+    let error = outcome.map(|_| ()).unwrap_err();
+    assert!(matches!(error, PeerError::Absent { .. }), "{error}");
+    assert!(
+        told_count > 1 && tried_count > 1,
+        "{told_count} {tried_count}"
     );
 }

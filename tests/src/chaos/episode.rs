@@ -14,8 +14,9 @@ use super::verdict::{self, Verdict};
 use crate::binary::hil_runtime_binary;
 use crate::child::{self, ChildGuard, Finished};
 use crate::lab::{Lab, LabHost};
+use crate::run_folder::RunFolder;
 use crate::soak::held::Held;
-use crate::trial::{processes_mentioning, shipped_topology};
+use crate::trial::{hop_key, processes_mentioning, shipped_topology};
 
 /// Names of the hosts in the topology.
 pub const HOSTS: [&str; 2] = ["control-pc", "robot-pc"];
@@ -134,7 +135,10 @@ pub fn play(plan: &Plan) -> Report {
     for host in 0..2 {
         mount_disk(lab.host(host), &record);
     }
-    let mut guards = [0, 1].map(|host| start(lab.host(host), plan, &record));
+    // Outside of what the hosts have for themselves.
+    let keys = RunFolder::new("chaos-key");
+    let key = plan.is_sealed.then(|| hop_key(keys.path()));
+    let mut guards = [0, 1].map(|host| start(lab.host(host), plan, (&record, key.as_deref())));
     let supervisors = [guards[0].pid(), guards[1].pid()];
     let stage = Stage {
         lab,
@@ -205,14 +209,17 @@ fn mount_disk(host: &LabHost, folder: &Path) {
     assert!(mounted.is_ok(), "{mounted:?}");
 }
 
-fn start(host: &LabHost, plan: &Plan, record: &Path) -> ChildGuard {
+fn start(host: &LabHost, plan: &Plan, (record, key): (&Path, Option<&Path>)) -> ChildGuard {
     let settings = [
         format!("run.record=\"{}\"", record.display()),
         format!("run.duration=\"{} ms\"", RUN_LENGTH.as_millis()),
         format!("run.seed={}", plan.seed % 1_000_000),
         "run.start_timeout=\"8 s\"".to_owned(),
-        // Damage must reach the bridges, which a seal would keep from them.
-        "security.hops=\"plain\"".to_owned(),
+        // On plain hops damage reaches the bridges, which a seal keeps from them.
+        match key {
+            Some(key) => format!("security.key=\"{}\"", key.display()),
+            None => "security.hops=\"plain\"".to_owned(),
+        },
         format!("run.peer_timeout=\"{} s\"", PEER_TIMEOUT.as_secs()),
         "case.parameters.rate_hz=200".to_owned(),
         "processes.controller.on_exit=\"restart\"".to_owned(),

@@ -66,10 +66,16 @@ fn nonsense(random: &mut RandomStream, looks_real: bool) -> Vec<u8> {
         .collect();
     if looks_real {
         bytes.resize(bytes.len().max(72 + 16), 0);
-        let kind = 1 + random.next_u64().to_le_bytes()[0] % 6;
-        bytes[..8].copy_from_slice(&[b'H', b'I', b'L', b'G', 1, kind, 0, 0]);
+        // Requests for keys and answers among them, which only sealed hops know.
+        let kind = 1 + random.next_u64().to_le_bytes()[0] % 8;
+        let is_sealed = random.chance(0.5);
+        bytes[..8].copy_from_slice(&[b'H', b'I', b'L', b'G', 1, kind, is_sealed.into(), 0]);
         bytes[12..16].copy_from_slice(&[random.next_u64().to_le_bytes()[0] % 3, 0, 72, 0]);
-        bytes[68..72].fill(0);
+        if is_sealed {
+            bytes[68..72].copy_from_slice(&random.next_u64().to_le_bytes()[..4]);
+        } else {
+            bytes[68..72].fill(0);
+        }
     }
     bytes
 }

@@ -21,8 +21,6 @@ use crate::trial::processes_mentioning;
 
 /// Exit codes of a run: as planned, failed, another host vanished or never came, interrupted.
 const EXIT_CODES: [i32; 4] = [0, 1, 69, 130];
-/// A run whose report cannot be written.
-const EXIT_INTERNAL: i32 = 70;
 /// Files that a process may hold for a moment.
 const FILES_MORE_MAX: u64 = 3;
 
@@ -89,11 +87,7 @@ impl Verdict {
             .as_ref()
             .map(|summary| format!("{:?}", summary.run.outcome));
         self.ends[host] = format!("{} ({code})", word.unwrap_or_else(|| "no run".to_owned()));
-        // Without room for its report a host says so, and with a code of its own.
-        let has_no_room = plan.has(Kind::FillDisk, Some(host))
-            && code == EXIT_INTERNAL
-            && end.stderr.contains("No space left");
-        if !EXIT_CODES.contains(&code) && !has_no_room {
+        if !EXIT_CODES.contains(&code) {
             self.complain(host, &format!("exit code {code}\n{}", end.stderr));
         }
         if end.stderr.contains("panicked") {

@@ -1,0 +1,125 @@
+//! A sealed run of the real binary between both hosts of a lab, and what its gateways counted. It judges
+//! nothing but that the run went as planned.
+#![allow(clippy::print_stdout, reason = "a test's figures are its result")]
+
+use std::time::Duration;
+
+use hil_models::measure::record::TakenRecord;
+use hil_runtime::report::summary::{DirectionSummary, Outcome, RunSummary};
+
+use crate::account::{account, assert_every_message_is_accounted_for, channel, describe};
+use crate::child::ChildGuard;
+use crate::lab::Lab;
+use crate::latency::Latencies;
+use crate::shuttle::{CHANNELS, records};
+use crate::trial::{RunFiles, Trial, wait_until};
+
+/// Names of the hosts in the topology.
+pub const HOSTS: [&str; 2] = ["control-pc", "robot-pc"];
+const LIMIT: Duration = Duration::from_mins(1);
+const RUN_LIMIT: Duration = Duration::from_mins(3);
+
+/// The run, on both hosts.
+#[derive(Debug)]
+pub struct Split<'a> {
+    hosts: [ChildGuard; 2],
+    files: [RunFiles; 2],
+    lab: &'a Lab,
+}
+
+impl<'a> Split<'a> {
+    /// Starts it.
+    ///
+    /// # Panics
+    /// When it does not start.
+    pub fn start(lab: &'a Lab, trial: &Trial) -> Self {
+        let hosts = [0, 1].map(|index| trial.start_on(lab.host(index)));
+        Self::of(lab, trial, hosts)
+    }
+
+    /// Of supervisors that were started one by one.
+    ///
+    /// # Panics
+    /// When their run folders do not appear.
+    pub fn of(lab: &'a Lab, trial: &Trial, hosts: [ChildGuard; 2]) -> Self {
+        let files = HOSTS.map(|host| trial.folder(&format!("-{host}"), LIMIT));
+        Self { hosts, files, lab }
+    }
+
+    /// What host `index` leaves.
+    pub fn files(&self, index: usize) -> &RunFiles {
+        &self.files[index]
+    }
+
+    /// Waits until commands flow.
+    ///
+    /// # Panics
+    /// When none do.
+    pub fn wait_for_messages(&self) {
+        wait_until(LIMIT, "commands", || {
+            self.files[1].record_bytes("shuttle.command.taken.") > 100 * 32
+        });
+    }
+
+    /// Waits for the end, and checks that it was the planned one and left nothing behind.
+    ///
+    /// # Panics
+    /// When it was not, or did, or a message has no fate.
+    pub fn finish(mut self) -> [RunSummary; 2] {
+        for host in &mut self.hosts {
+            match host.wait_within(RUN_LIMIT) {
+                Ok(finished) => finished.assert_success(),
+                Err(reason) => panic!("{reason}"),
+            }
+        }
+        let summaries = [0, 1].map(|index| self.files[index].summary());
+        for (index, files) in self.files.iter().enumerate() {
+            files.assert_nothing_left_on(self.lab.host(index));
+        }
+        for summary in &summaries {
+            assert_eq!(summary.run.outcome, Outcome::Completed, "{:?}", summary.run);
+            assert_every_message_is_accounted_for(summary);
+            for name in CHANNELS {
+                let said = describe(name, account(summary, name));
+                println!("{}: {said}", summary.run.host);
+            }
+        }
+        summaries
+    }
+}
+
+/// One way of the channel `name`: `egress` or `ingress`.
+///
+/// # Panics
+/// When the summary has none.
+pub fn direction<'a>(summary: &'a RunSummary, name: &str, which: &str) -> &'a DirectionSummary {
+    let mut all = channel(summary, name).directions.iter();
+    let found = all.find(|one| one.direction.contains(which));
+    found.unwrap_or_else(|| panic!("{name} has no {which}"))
+}
+
+/// The counter `name` of a direction; 0 when there is none.
+pub fn count(direction: &DirectionSummary, name: &str) -> u64 {
+    let counters = direction.counters.iter().filter(|one| one.name == name);
+    counters.map(|one| one.count).sum()
+}
+
+/// Datagrams that a direction refused, whatever the cause.
+pub fn refused(direction: &DirectionSummary) -> u64 {
+    let counters = direction.counters.iter();
+    let refused = counters.filter(|one| one.name.starts_with("refused: "));
+    refused.map(|one| one.count).sum()
+}
+
+/// How long the messages of `channel` that were published between `from_ns` and `until_ns` took over the hop
+/// (until the receiving gateway published them) and end to end.
+///
+/// # Panics
+/// When the records cannot be read.
+pub fn delays(files: &RunFiles, channel: &str, (from_ns, until_ns): (i64, i64)) -> [Latencies; 2] {
+    let mut taken: Vec<TakenRecord> = records(files, channel, "taken");
+    taken.retain(|one| (from_ns..until_ns).contains(&one.published_ns));
+    let hop = taken.iter().map(|one| one.forwarded_ns - one.published_ns);
+    let whole = taken.iter().map(|one| one.taken_ns - one.published_ns);
+    [Latencies::of(hop.collect()), Latencies::of(whole.collect())]
+}
