@@ -89,10 +89,13 @@ pub fn encode(trace: &Trace) -> String {
     text
 }
 
+/// A name as a remark can hold it: on one line, without blanks around it.
 fn one_line(text: &str) -> String {
-    text.chars()
+    let line: String = text
+        .chars()
         .map(|c| if c.is_control() { ' ' } else { c })
-        .collect()
+        .collect();
+    line.trim().to_owned()
 }
 
 /// Reads a text. Columns may stand in any order; needed are `published_ns` or `departure_ns`, and

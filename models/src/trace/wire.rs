@@ -3,6 +3,7 @@
 //! before it is kept. Bytes in, bytes out: it opens no file.
 
 use super::checksum::crc32;
+use super::csv::SIZE_BYTES_MAX;
 use super::fault::{EncodeError, FaultKind, TraceFault};
 use super::{
     Trace, TraceArrival, TraceDirection, TraceFate, TraceHeader, TraceRecord, UNAVAILABLE_NS,
@@ -355,6 +356,9 @@ fn decode_record(bytes: &[u8]) -> Result<TraceRecord, (u64, FaultKind)> {
     Ok(record)
 }
 
+// In the words of a fault.
+const _: () = assert!(SIZE_BYTES_MAX == 67_107_840);
+
 /// What the fields of a record say together.
 fn check_record(record: &TraceRecord) -> Result<(), (u64, FaultKind)> {
     let field = |at, field, value, allowed| {
@@ -367,6 +371,14 @@ fn check_record(record: &TraceRecord) -> Result<(), (u64, FaultKind)> {
     };
     if record.flags & !TraceRecord::FLAGS != 0 {
         return field(55, "flags", u64::from(record.flags), "0..=31");
+    }
+    if record.size_bytes > SIZE_BYTES_MAX {
+        return field(
+            48,
+            "size_bytes",
+            u64::from(record.size_bytes),
+            "0..=67107840",
+        );
     }
     if record.published_ns == UNAVAILABLE_NS {
         return field(0, "published_ns", 1 << 63, "any instant");
