@@ -3,8 +3,8 @@
 //! and tapped on the hosts' own interfaces, by a packet ring and by eBPF programs. Not a test: it
 //! states the aim and whether it was met, or that the rounds were too few to tell, and ends with code 0.
 //!
-//! `cargo bench -p hil-benches --bench probe_in_a_run -- [--rounds N] [--rate HZ] [--set KEY=VALUE]...`,
-//! about 9 s a round. Namespaces and taps take root; without, it says what is missing. What the taps
+//! `cargo bench -p hil-benches --bench probe_in_a_run -- [--rounds N] [--turn SECONDS] [--rate HZ]
+//! [--set KEY=VALUE]...`, about 9 s a round. Namespaces and taps take root; without, it says what is missing. What the taps
 //! cost a bare hop, back to back, is measured by `probe_overhead`.
 #![allow(clippy::print_stdout, reason = "a bench prints its result")]
 
@@ -74,7 +74,7 @@ const CONTEST: Contest<TAP_COUNT> = Contest {
         TAPS[3].name(),
     ],
     aims: [1.02, 1.02],
-    extra: Duration::from_secs(1),
+    extra: Duration::from_secs(2),
 };
 
 /// What the taps saw.
@@ -85,7 +85,7 @@ struct Tapped {
 }
 
 fn measure() -> Result<(), SetupError> {
-    let arguments = Arguments::read()?;
+    let arguments = Arguments::read((30, 1.0))?;
     // Built before anything is measured, not between.
     println!("binary: {}", hil_runtime_binary().display());
     let drainer = Drainer::start();
@@ -96,10 +96,11 @@ fn measure() -> Result<(), SetupError> {
     lab.put_bridge_between();
     let mirror = lab.add_mirror_port();
     let mut tapped = Tapped::default();
-    CONTEST.hold(&arguments, lab, &mut |kind| {
+    CONTEST.hold(&arguments, lab, &mut |kind, length| {
         let places = TAPS[kind].places(mirror);
         let taps = (TAPS[kind].engine(), &*places);
-        let (turn, counters) = drainer.while_tapped_at(&network, taps, || wait_turn(GUARD))?;
+        let (turn, counters) =
+            drainer.while_tapped_at(&network, taps, || wait_turn(GUARD, length))?;
         tapped.matched_count += counters.matched_count;
         tapped.dropped_count += counters.dropped_count;
         Ok(turn)

@@ -2,10 +2,14 @@
 //! which in turns is recorded on both hosts and is not. Not a test: it states the aim and whether it
 //! was met, or that the rounds were too few to tell, and ends with code 0.
 //!
-//! `cargo bench -p hil-benches --bench recorder_on_off -- [--rounds N] [--rate HZ] [--set KEY=VALUE]...`,
-//! about 7 s a round. `HIL_RUNTIME_BINARY` and `HIL_RECORDER_BINARY` name the programs; without them
-//! they are built, as tests build them and not as users do. Namespaces take root; without, it says
-//! what is missing.
+//! `cargo bench -p hil-benches --bench recorder_on_off -- [--rounds N] [--turn SECONDS] [--rate HZ]
+//! [--pin CPU,CPU] [--set KEY=VALUE]...`, also by `HIL_BENCH_ROUNDS`, `HIL_BENCH_TURN_S` and
+//! `HIL_BENCH_PIN`, which keeps the processes of each host on a processor of its own. About 9 s a round of
+//! four turns, off, on, on, off or the other way round, and ten minutes for all. Both hops are judged
+//! together as well, as "all channels": that is the figure with the least noise.
+//!
+//! `HIL_RUNTIME_BINARY` and `HIL_RECORDER_BINARY` name the programs; without them they are built, as tests
+//! build them and not as users do. Namespaces take root; without, it says what is missing.
 #![allow(clippy::print_stdout, reason = "a bench prints its result")]
 
 use std::path::{Path, PathBuf};
@@ -14,7 +18,7 @@ use std::time::Duration;
 
 use hil_benches::gateway::hosts::SetupError;
 use hil_benches::gateway::network::Network;
-use hil_benches::turns::{self, Arguments, Contest, TURN, Turn, wait_turn};
+use hil_benches::turns::{self, Arguments, Contest, Turn, wait_turn};
 use hil_tests::binary::{hil_recorder_binary, hil_runtime_binary};
 use hil_tests::child::ChildGuard;
 use hil_tests::lab::Lab;
@@ -33,7 +37,7 @@ const CONTEST: Contest<2> = Contest {
     kinds: ["off", "on"],
     aims: [1.02, 1.05],
     // A recorder takes a moment to come and to go, after each of its turns.
-    extra: Duration::from_secs(3),
+    extra: Duration::from_secs(7),
 };
 
 /// What the recorders did in all turns.
@@ -44,7 +48,11 @@ struct Work {
     missed: Vec<String>,
 }
 
-fn recorded_turn(lab: &Lab, folder: &Path, work: &mut Work) -> Result<Turn, SetupError> {
+fn recorded_turn(
+    (lab, folder): (&Lab, &Path),
+    length: Duration,
+    work: &mut Work,
+) -> Result<Turn, SetupError> {
     let files: [PathBuf; 2] = [0, 1].map(|index| folder.join(format!("{index}.mcap")));
     let mut recorders = [0, 1].map(|index| {
         let mut command = lab.host(index).command(hil_recorder_binary());
@@ -55,7 +63,7 @@ fn recorded_turn(lab: &Lab, folder: &Path, work: &mut Work) -> Result<Turn, Setu
         let partial = file.with_extension("mcap.partial");
         wait_until(LIMIT, "a recorder's file", || partial.is_file());
     }
-    let turn = wait_turn(GUARD);
+    let turn = wait_turn(GUARD, length);
     let before_s = children_s()?;
     for recorder in &mut recorders {
         let recorder = recorder.as_mut().map_err(|error| error.to_string())?;
@@ -70,7 +78,7 @@ fn recorded_turn(lab: &Lab, folder: &Path, work: &mut Work) -> Result<Turn, Setu
         }
     }
     work.processor_s += children_s()? - before_s;
-    work.wall_s += 2.0 * (TURN + GUARD).as_secs_f64();
+    work.wall_s += 2.0 * (length + GUARD).as_secs_f64();
     Ok(turn)
 }
 
@@ -82,7 +90,7 @@ fn children_s() -> Result<f64, SetupError> {
 }
 
 fn measure() -> Result<(), SetupError> {
-    let arguments = Arguments::read()?;
+    let arguments = Arguments::read((60, 1.5))?;
     // Built before anything is measured, not between.
     let binaries = [hil_runtime_binary(), hil_recorder_binary()];
     println!(
@@ -96,9 +104,9 @@ fn measure() -> Result<(), SetupError> {
     };
     let recordings = RunFolder::new("recordings");
     let mut work = Work::default();
-    CONTEST.hold(&arguments, lab, &mut |kind| match kind {
-        0 => Ok(wait_turn(GUARD)),
-        _ => recorded_turn(lab, recordings.path(), &mut work),
+    CONTEST.hold(&arguments, lab, &mut |kind, length| match kind {
+        0 => Ok(wait_turn(GUARD, length)),
+        _ => recorded_turn((lab, recordings.path()), length, &mut work),
     })?;
     println!(
         "\na recorder took {:.1} % of a processor, its start and end included",

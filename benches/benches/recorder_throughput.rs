@@ -78,6 +78,7 @@ fn announce(domain: &Domain, run: &Path, holder: u32) -> Result<(), Box<dyn Erro
             is_forwarded: false,
         },
         noted: Vec::new(),
+        comes_again: false,
     });
     let live = LiveRun {
         schema_version: LIVE_VERSION,

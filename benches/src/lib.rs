@@ -16,6 +16,6 @@ mod rounds;
 pub mod turns;
 
 pub use host::{HostFacts, pin_to_cpu};
-pub use quantiles::{MedianInterval, PairedRatio, Quantiles};
+pub use quantiles::{PairedRatio, Quantiles, TypicalRatio};
 pub use report::{json_line, table};
 pub use rounds::{Case, Comparison, FLOOR_JUMP_RATIO_MAX, Row, compare};

@@ -1,6 +1,7 @@
 //! Quantiles of nanosecond samples and ratios paired by round. Exact: samples are sorted, not
 //! binned.
 
+use hil_models::random::RandomStream;
 use serde_json::{Value, json};
 
 /// Quantiles of a set of samples.
@@ -82,42 +83,63 @@ impl PairedRatio {
     }
 }
 
-/// The median of independent figures with its 95 % interval by order statistics: whatever their
-/// distribution, the true median lies outside with at most that probability.
+/// The typical ratio of rounds that are independent of each other: the mean of their logarithms without
+/// the fifth at either end, with a 95 % bootstrap interval over the rounds. A round that was disturbed
+/// has little weight, and all others count, so that it takes fewer rounds than the median does.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct MedianInterval {
-    /// Median of the figures.
-    pub median: f64,
+pub struct TypicalRatio {
+    /// The ratio.
+    pub ratio: f64,
     /// Lower end.
     pub low: f64,
     /// Upper end.
     pub high: f64,
 }
 
-impl MedianInterval {
-    /// Largest probability on either side of the interval.
-    const TAIL: f64 = 0.025;
+impl TypicalRatio {
+    /// Rounds without which nothing is said of the others' spread.
+    const ROUNDS_MIN: usize = 6;
+    /// Sets of rounds that are drawn.
+    const DRAWN_COUNT: usize = 10_000;
+    const SEED: u64 = 17;
+    /// What is left out at either end: one of so many.
+    const TRIMMED_PART: usize = 5;
 
-    /// `None` with fewer than six figures: not even the smallest and the largest make an interval
-    /// of 95 %.
-    pub fn of(mut figures: Vec<f64>) -> Option<Self> {
-        figures.sort_unstable_by(f64::total_cmp);
-        let count = figures.len();
-        // Terms of a binomial distribution of one half; the first `left_out` lie below the interval.
-        let mut term = 0.5_f64.powi(i32::try_from(count).ok()?);
-        let (mut sum, mut left_out) = (0.0, 0_usize);
-        while left_out < count && sum + term <= Self::TAIL {
-            sum += term;
-            term *= (count - left_out) as f64 / (left_out + 1) as f64;
-            left_out += 1;
+    /// `None` with too few rounds, or a ratio that is no number above 0.
+    pub fn of(ratios: &[f64]) -> Option<Self> {
+        let logs: Vec<f64> = ratios.iter().map(|ratio| ratio.ln()).collect();
+        if logs.len() < Self::ROUNDS_MIN || logs.iter().any(|log| !log.is_finite()) {
+            return None;
         }
-        let first = left_out.checked_sub(1)?;
+        let mut lots = RandomStream::new(Self::SEED, "bootstrap");
+        let mut drawn = Vec::with_capacity(logs.len());
+        let mut means: Vec<f64> = (0..Self::DRAWN_COUNT)
+            .map(|_| {
+                drawn.clear();
+                drawn.extend((0..logs.len()).map(|_| logs[draw(&mut lots, logs.len())]));
+                Self::trimmed_mean(&mut drawn)
+            })
+            .collect();
+        means.sort_unstable_by(f64::total_cmp);
+        let at = |per_mille: usize| means[(means.len() * per_mille).div_ceil(1000) - 1].exp();
         Some(Self {
-            median: f64::midpoint(figures[(count - 1) / 2], figures[count / 2]),
-            low: figures[first],
-            high: figures[count - 1 - first],
+            ratio: Self::trimmed_mean(&mut logs.clone()).exp(),
+            low: at(25),
+            high: at(975),
         })
     }
+
+    fn trimmed_mean(logs: &mut [f64]) -> f64 {
+        logs.sort_unstable_by(f64::total_cmp);
+        let out = logs.len() / Self::TRIMMED_PART;
+        let kept = &logs[out..logs.len() - out];
+        kept.iter().sum::<f64>() / kept.len() as f64
+    }
+}
+
+/// One of `count`, by lot.
+fn draw(lots: &mut RandomStream, count: usize) -> usize {
+    usize::try_from(lots.next_u64() % count as u64).unwrap_or(0)
 }
 
 /// The middle of a few figures; `None` without any.
@@ -149,16 +171,41 @@ mod tests {
     }
 
     #[test]
-    fn the_interval_of_a_median_is_that_of_the_tables() {
-        // Ranks 2 and 9 of 10, 6 and 15 of 20, 10 and 21 of 30: Conover, Practical Nonparametric
-        // Statistics, table A3.
-        for (count, low, high) in [(10, 2.0, 9.0), (20, 6.0, 15.0), (30, 10.0, 21.0)] {
-            let interval = MedianInterval::of((1..=count).rev().map(f64::from).collect()).unwrap();
-            let found = (interval.low, interval.median, interval.high);
-            assert_eq!(found, (low, f64::midpoint(low, high), high), "{count}");
+    fn the_interval_holds_what_is_true_about_as_often_as_it_says() {
+        let mut lots = RandomStream::new(5, "rounds");
+        let mut unit = || lots.next_u64() as f64 / u64::MAX as f64;
+        let (mut held, mut widths) = (0, 0.0);
+        for _ in 0..20 {
+            // Ratios about 1.1, spread by some 20 %, one of ten far off.
+            let mut round = || {
+                let spread = unit() + unit() + unit() - 1.5;
+                let is_off = unit() < 0.1;
+                1.1 * (0.4 * spread).exp()
+                    * if is_off {
+                        8.0_f64.powf(2.0 * unit() - 1.0)
+                    } else {
+                        1.0
+                    }
+            };
+            let ratios: Vec<f64> = (0..40).map(|_| round()).collect();
+            let found = TypicalRatio::of(&ratios).unwrap();
+            held += usize::from((found.low..=found.high).contains(&1.1));
+            widths += (found.high / found.low).ln() / 20.0;
         }
-        assert_eq!(MedianInterval::of(vec![1.0; 5]), None);
-        assert!(MedianInterval::of(vec![1.0; 6]).is_some());
+        assert!((16..=20).contains(&held), "seed 5: {held} of 20");
+        assert!(widths < 0.3, "{widths}");
+    }
+
+    #[test]
+    fn a_typical_ratio_needs_rounds_and_is_the_same_each_time() {
+        let ratios = [1.0, 1.1, 0.9, 1.05, 0.95, 50.0];
+        let found = TypicalRatio::of(&ratios).unwrap();
+        // Without the smallest and the largest.
+        let expected = (1.0_f64 * 1.1 * 1.05 * 0.95).powf(0.25);
+        assert!((found.ratio - expected).abs() < 1e-9);
+        assert_eq!(TypicalRatio::of(&ratios), Some(found));
+        assert_eq!(TypicalRatio::of(&ratios[..5]), None);
+        assert_eq!(TypicalRatio::of(&[1.0, 1.0, 1.0, 1.0, 1.0, 0.0]), None);
     }
 
     #[test]

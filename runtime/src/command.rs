@@ -383,10 +383,13 @@ fn hosts_here(topology: &Topology, requested: Option<&str>) -> Result<Vec<String
 
 /// Columns of the terminal; where there is none, a page's.
 fn columns() -> usize {
-    env::var("COLUMNS")
-        .ok()
-        .and_then(|text| text.parse().ok())
-        .unwrap_or(100)
+    columns_or(100)
+}
+
+/// Columns of the terminal, or of what is written where there is none.
+fn columns_or(otherwise: usize) -> usize {
+    let said = env::var("COLUMNS").ok();
+    said.and_then(|text| text.parse().ok()).unwrap_or(otherwise)
 }
 
 fn write_motion(

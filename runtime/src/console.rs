@@ -91,7 +91,8 @@ pub struct Console {
     is_quiet: bool,
     listener: Listener,
     has_open_line: bool,
-    last_plain: Option<Instant>,
+    /// The progress line that was said last, where it cannot be redrawn.
+    last_plain: Option<(Instant, String)>,
     service: Option<ServiceManager>,
 }
 
@@ -175,8 +176,8 @@ impl Console {
             // Carriage return, text, erase to the end of the line.
             write_to(&mut io::stderr(), &format!("\r{text}\x1b[K"));
             self.has_open_line = true;
-        } else if self.last_plain.is_none_or(|last| last.elapsed() >= period) {
-            self.last_plain = Some(Instant::now());
+        } else if is_worth_saying(self.last_plain.as_ref(), text, period) {
+            self.last_plain = Some((Instant::now(), text.to_owned()));
             self.line(Weight::Progress, text);
         }
     }
@@ -231,6 +232,11 @@ impl Console {
     }
 }
 
+/// Where a line cannot be redrawn it is said now and then, and not again while it is the same.
+fn is_worth_saying(last: Option<&(Instant, String)>, text: &str, period: Duration) -> bool {
+    last.is_none_or(|(at, said)| said != text && at.elapsed() >= period)
+}
+
 /// The journal takes each line for a message of its own.
 fn for_journal(weight: Weight, text: &str) -> String {
     let priority = weight.priority();
@@ -275,6 +281,16 @@ mod tests {
         assert!(!is_journal(Some("journal"), Some((8, 1234))));
         assert!(!is_journal(Some("a:b"), None));
         assert!(!is_journal(None, Some((8, 1234))));
+    }
+
+    #[test]
+    fn a_progress_line_is_not_said_twice() {
+        let said = (Instant::now(), "waiting".to_owned());
+        let again = |text, period| is_worth_saying(Some(&said), text, period);
+        assert!(is_worth_saying(None, "waiting", PLAIN_PERIOD));
+        assert!(!again("waiting", Duration::ZERO));
+        assert!(again("12 s", Duration::ZERO));
+        assert!(!again("12 s", Duration::MAX));
     }
 
     #[test]

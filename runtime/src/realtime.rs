@@ -36,6 +36,8 @@ pub enum SchedulingPolicy {
     /// `SCHED_IDLE`: runs when no normal task of its control group wants the CPU, and never
     /// interrupts one by waking up. For what must not be felt by what it looks at.
     Idle,
+    /// `SCHED_BATCH`: as the normal one, but never interrupts a task by waking up.
+    Batch,
 }
 
 impl SchedulingPolicy {
@@ -45,6 +47,7 @@ impl SchedulingPolicy {
             Self::Other => (libc::SCHED_OTHER, 0),
             Self::Fifo { priority } => (libc::SCHED_FIFO | libc::SCHED_RESET_ON_FORK, priority),
             Self::Idle => (libc::SCHED_IDLE, 0),
+            Self::Batch => (libc::SCHED_BATCH, 0),
         }
     }
 }
@@ -55,6 +58,7 @@ impl std::fmt::Display for SchedulingPolicy {
             Self::Other => f.write_str("SCHED_OTHER"),
             Self::Fifo { priority } => write!(f, "SCHED_FIFO {priority}"),
             Self::Idle => f.write_str("SCHED_IDLE"),
+            Self::Batch => f.write_str("SCHED_BATCH"),
         }
     }
 }
@@ -322,7 +326,7 @@ fn schedule(policy: libc::c_int, priority: u8) -> Result<(), Refusal> {
 
 fn explain(errno: Errno, (policy, priority): (libc::c_int, u8)) -> Refusal {
     match policy {
-        libc::SCHED_OTHER | libc::SCHED_IDLE => explain_raising(errno),
+        libc::SCHED_OTHER | libc::SCHED_IDLE | libc::SCHED_BATCH => explain_raising(errno),
         _ => explain_scheduling(errno, priority, &HostFiles::of_this_host()),
     }
 }

@@ -183,7 +183,7 @@ fn a_channel_with_a_living_writer_is_refused_and_so_is_what_does_not_fit() {
             vec![file, "--only", MOTION, "--speed", "0"],
             "must be a number from 0.01 to 100",
         ),
-        (vec![file], "give --only CHANNEL"),
+        (vec![file], "Give --only CHANNEL"),
         (
             vec![first.root().to_str().unwrap(), "--only", MOTION],
             "is a run's folder",

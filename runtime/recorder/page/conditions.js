@@ -29,23 +29,22 @@ export class Conditions {
   build(links, key) {
     this.key = key;
     this.controls.clear();
-    const emulated = links.filter((link) => link.via === "emulated");
-    this.none.hidden = emulated.length > 0;
-    this.list.replaceChildren(...emulated.flatMap((link) => link.directions.map((way) => this.group(link, way))));
+    const ways = links.filter((link) => link.via === "emulated").flatMap((link) => link.directions.map((way) => [link, way]));
+    const settable = ways.filter(([, way]) => way.is_settable);
+    this.none.hidden = ways.length > 0;
+    this.list.replaceChildren(...settable.map(([link, way]) => this.group(link, way)), ...fixed(ways.filter(([, way]) => !way.is_settable)));
     for (const [name, value] of this.confirmed) this.show(name, value);
   }
 
   group(link, way) {
-    const [from, to] = way.way === "backward" ? [link.to_host, link.from_host] : [link.from_host, link.to_host];
-    const title = `${link.name}, ${from ?? "?"} → ${to ?? "?"}`;
-    const rows = Object.keys(CONTROLS).map((name) => this.control(parameterName(link, way, name), name, title, way.is_settable));
-    const why = way.is_settable ? [] : [make("p", { class: "faint" }, `cannot be changed: ${way.why_not ?? "the server does not say why"}`)];
-    return make("fieldset", { disabled: !way.is_settable, "data-link": `${link.name}.${way.way}` }, make("legend", {}, title), ...why, ...rows);
+    const title = titleOf(link, way);
+    const rows = Object.keys(CONTROLS).map((name) => this.control(parameterName(link, way, name), name, title));
+    return make("fieldset", { "data-link": `${link.name}.${way.way}` }, make("legend", {}, title), ...rows);
   }
 
-  control(parameter, name, title, isSettable) {
+  control(parameter, name, title) {
     const kind = CONTROLS[name];
-    const state = make("output", { "data-parameter": parameter }, isSettable ? "not told" : "");
+    const state = make("output", { "data-parameter": parameter }, "not told");
     const described = `${kind.label} of ${title}`;
     if (name === "is_cut") return this.cutControl(parameter, kind, described, state);
     const [most, step] = [kind.most, kind.step];
@@ -131,6 +130,21 @@ export class Conditions {
     for (const control of this.controls.values()) this.tell(control.state, "", "not told");
     this.confirmed.clear();
   }
+}
+
+const titleOf = (link, way) => {
+  const [from, to] = way.way === "backward" ? [link.to_host, link.from_host] : [link.from_host, link.to_host];
+  return `${link.name}, ${from ?? "?"} → ${to ?? "?"}`;
+};
+
+// What cannot be changed from here needs no controls: a line for each reason, with the ways it holds for.
+function fixed(ways) {
+  const reasons = new Map();
+  for (const [link, way] of ways) {
+    const why = way.why_not ?? "the server does not say why";
+    reasons.set(why, [...(reasons.get(why) ?? []), titleOf(link, way)]);
+  }
+  return [...reasons].map(([why, titles]) => make("p", { class: "faint", "data-fixed": titles.length }, `Not to be changed here: ${titles.join("; ")} (${why})`));
 }
 
 const parameterName = (link, way, name) => `link.${link.name}.${way.way}.${name}`;

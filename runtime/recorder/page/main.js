@@ -158,7 +158,9 @@ function elapsedAt(moment) {
 }
 
 function drawPanels(moment) {
-  const run = shelves.run.at(moment)?.value ?? shelves.run.at(Infinity)?.value;
+  // Unless a past moment is looked at, what is known of the run itself is the newest: it goes on being told
+  // after the last figures have come.
+  const run = (view.isPaused ? shelves.run.at(moment)?.value : undefined) ?? shelves.run.at(Infinity)?.value;
   if (!run) return;
   showRun(run, elapsedAt(moment));
   const stretch_s = strips.stretch(moment - (shelves.channels.oldest ?? moment));

@@ -51,7 +51,7 @@ export function showFacts(run, channels) {
 }
 
 export function showWarnings(run) {
-  const warnings = [...overran(run.overruns ?? []), ...run.warnings];
+  const warnings = [...overran(run.overruns ?? [], run.state), ...run.warnings];
   const section = byId("warnings");
   const key = JSON.stringify(warnings);
   if (section.dataset.key === key) return;
@@ -64,11 +64,12 @@ export function showWarnings(run) {
 }
 
 // Ticks that went by without their process, by host: no delay of these is the network's.
-function overran(overruns) {
+function overran(overruns, state) {
+  const when = state === "ended" ? "as last told before the end" : "so far";
   const some = overruns.filter((one) => one.skipped_tick_count > 0);
   return [...new Set(some.map((one) => one.host))].map((host) => {
     const each = some.filter((one) => one.host === host).map((one) => `${one.process} ${count(one.skipped_tick_count)}`);
-    return { what: `host ${host} overran, ticks skipped so far: ${each.join(", ")}` };
+    return { what: `host ${host} overran, ticks skipped ${when}: ${each.join(", ")}` };
   });
 }
 

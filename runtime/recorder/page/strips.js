@@ -55,7 +55,7 @@ export class Strips {
     if (!newest) return;
     const wanted = this.wanted(newest);
     const present = new Set();
-    this.list.style.setProperty("--strip", `${wanted.length > 6 ? 40 : wanted.length > 3 ? 58 : 84}px`);
+    this.list.style.setProperty("--strip", `${this.stripHeight(wanted.length)}px`);
     for (const [index, one] of wanted.entries()) {
       const key = `${one.channel}\n${one.label}`;
       present.add(key);
@@ -68,6 +68,13 @@ export class Strips {
       strip.item.remove();
       this.strips.delete(key);
     }
+  }
+
+  // Few strips are drawn large; of many, each stays high enough to be read. Those without a figure take
+  // no room.
+  stripHeight(wanted) {
+    const drawn = [...this.strips.values()].filter((strip) => !strip.item.classList.contains("off")).length || wanted;
+    return drawn > 9 ? 48 : drawn > 3 ? 60 : 84;
   }
 
   strip(one) {
@@ -88,9 +95,12 @@ export class Strips {
       return { time: sample.time, entry, figures: entry && one.take(entry) };
     });
     const last = points.at(-1).figures;
-    const isEmpty = !points.some((point) => point.figures);
+    // Nothing to draw: nobody can tell, or nothing came and nothing is missed.
+    const isUnknown = !points.some((point) => point.figures);
+    const hasFigures = points.some((point) => point.figures?.p50_us != null);
+    const isEmpty = !hasFigures && !losses.some((loss) => loss.channel === one.channel) && !points.some((point) => point.entry?.link_state === "silent");
     strip.item.classList.toggle("off", isEmpty);
-    const words = isEmpty ? `${UNAVAILABLE}: ${one.unknown}` : last?.p50_us === null || !last ? "no message in the last second"
+    const words = isUnknown ? `${UNAVAILABLE}: ${one.unknown}` : isEmpty ? `no message in the last ${Math.round(this.drawn_s)} s` : last?.p50_us === null || !last ? "no message in the last second"
       : `p50 ${microseconds(last.p50_us)} · p99 ${microseconds(last.p99_us)} · max ${microseconds(last.max_us)}`;
     write(strip.values, words);
     strip.values.dataset.points = points.filter((point) => point.figures?.p50_us != null).length;

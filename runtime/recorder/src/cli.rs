@@ -208,8 +208,8 @@ pub(crate) enum Command {
         /// The MCAP file.
         #[arg(value_name = "FILE")]
         file: PathBuf,
-        /// Play this channel; may be repeated.
-        #[arg(long, value_name = "CHANNEL", required = true)]
+        /// Play this channel; may be repeated. Without one, those of the file are listed.
+        #[arg(long, value_name = "CHANNEL")]
         only: Vec<String>,
         /// How much faster than recorded, 0.01 to 100.
         #[arg(long, value_name = "FACTOR", value_parser = speed, default_value = "1")]

@@ -12,6 +12,7 @@ use hil_runtime::signals::{EXIT_INTERRUPTED, Signals};
 
 use crate::cli::{Cli, Command, ServeOptions};
 use crate::convert::{ConvertError, convert};
+use crate::ending::Ending;
 use crate::info::info;
 use crate::play::{PlayEnd, PlayError, PlayOptions, SourceError, TargetError, play};
 use crate::priority::Precedence;
@@ -21,7 +22,7 @@ use crate::scan::ScanError;
 use crate::scene::Scenery;
 use crate::serve::{ServeError, serve};
 use crate::split::Split;
-use crate::writer::{WriteError, check_target};
+use crate::writer::{WriteError, check_target, partial};
 
 /// Exit codes, as `--help` lists them; those of `hil-runtime`.
 mod exit {
@@ -175,10 +176,13 @@ fn convert_run(
     console: &mut Console,
 ) -> u8 {
     let progress = Progress::begin();
+    // Much of the work is done in one piece, of a large run for seconds.
+    let ending = Ending::watch(signals, partial(output));
     let converted = convert(run, output, scenery, &mut |share, words| {
         progress.show(console, share, words);
         signals.received()
     });
+    drop(ending);
     match converted {
         Ok(converted) => {
             for words in &converted.words {
@@ -361,7 +365,9 @@ fn play_file(options: &PlayOptions, signals: &Signals, console: &mut Console) ->
                 | PlayError::Target(TargetError::Domain(_) | TargetError::Channel(_)) => {
                     exit::FAILED
                 }
-                PlayError::Source(_) | PlayError::Target(_) => exit::USAGE,
+                PlayError::NoneChosen { .. } | PlayError::Source(_) | PlayError::Target(_) => {
+                    exit::USAGE
+                }
             }
         }
     }

@@ -4,8 +4,8 @@
 //! Read in this order: [`run`] and [`clocks`], what there is and when it was; [`schema`] and
 //! [`encode`], what a message looks like; [`topics`] and [`net`], what is made of it; [`writer`],
 //! the file; [`convert`], all of them together. While a run goes, [`live`] makes the same topics of
-//! its events for any [`sink`], and [`record`] puts them into files; [`priority`] keeps it out of the
-//! run's way. [`scan`] reads files, for [`recover`] and [`info`]; [`play`] feeds what [`decode`]
+//! its events for any [`sink`], and [`record`] puts them into files; [`priority`] and [`pace`] keep
+//! it out of the run's way. [`scan`] reads files, for [`recover`] and [`info`]; [`play`] feeds what [`decode`]
 //! makes of them into a run. [`view`] is the state of a run that goes on, [`serve`] shows it.
 
 mod cli;
@@ -16,6 +16,7 @@ mod convert;
 mod decode;
 mod disk;
 mod encode;
+mod ending;
 mod facts;
 mod info;
 mod joining;
@@ -23,6 +24,7 @@ mod live;
 mod live_clocks;
 mod net;
 mod newest;
+mod pace;
 mod play;
 mod priority;
 mod record;

@@ -1,9 +1,13 @@
 //! How the recorder stands against what it looks at: it gives way to everything where nothing is lost
 //! by that, and stops giving way when it can no longer keep up. All threads of the process stand
-//! alike, for what one of them is waited for all are late.
+//! alike, for what one of them is waited for all are late; but for the one that sees to it, [`watcher`].
+
+mod watcher;
+
+pub(crate) use watcher::Looks;
 
 use std::fmt;
-use std::fs;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::Duration;
@@ -41,7 +45,14 @@ enum State {
 
 /// How all threads of this process stand.
 #[derive(Debug, Clone)]
-pub(crate) struct Precedence(Arc<Mutex<State>>);
+pub(crate) struct Precedence(Arc<Standing>);
+
+#[derive(Debug)]
+struct Standing {
+    state: Mutex<State>,
+    /// Beside the state, whose lock a thread that gets no processor may hold.
+    gives_way: AtomicBool,
+}
 
 impl Precedence {
     /// As the command line asks; nothing is changed yet.
@@ -50,21 +61,42 @@ impl Precedence {
             Priority::Idle => State::Asked,
             Priority::Normal => State::Normal,
         };
-        Self(Arc::new(Mutex::new(state)))
+        Self::of(state)
     }
 
-    /// Takes its place for a run that is read from files only, which wait for as long as it takes, or
-    /// also from shared memory, which does not wait.
-    pub(crate) fn settle(&self, reads_memory: bool) {
+    fn of(state: State) -> Self {
+        let gives_way = AtomicBool::new(state == State::GivesWay);
+        Self(Arc::new(Standing {
+            state: Mutex::new(state),
+            gives_way,
+        }))
+    }
+
+    /// True when it may come to give way, so that somebody has to watch over it.
+    fn may_give_way(&self) -> bool {
+        matches!(
+            *self.lock(),
+            State::Asked | State::ReadsMemory | State::GivesWay
+        )
+    }
+
+    fn gives_way(&self) -> bool {
+        self.0.gives_way.load(Ordering::Relaxed)
+    }
+
+    /// Takes its place for a run of which nothing is lost by looking late, since all `waits` in files or
+    /// comes again, or something would be.
+    pub(crate) fn settle(&self, waits: bool) {
         let mut state = self.lock();
         match *state {
-            State::Asked | State::ReadsMemory if !reads_memory => *state = give_way(),
+            State::Asked | State::ReadsMemory if waits => {
+                *state = give_way();
+                let gives_way = *state == State::GivesWay;
+                self.0.gives_way.store(gives_way, Ordering::Relaxed);
+            }
             State::Asked => *state = State::ReadsMemory,
-            State::GivesWay if reads_memory => {
-                *state = match outcome(&move_threads(
-                    SchedulingPolicy::Idle,
-                    SchedulingPolicy::Other,
-                )) {
+            State::GivesWay if !waits && self.0.gives_way.swap(false, Ordering::Relaxed) => {
+                *state = match come_back() {
                     Ok(()) => State::ReadsMemory,
                     Err(refusal) => State::Refused(Duration::ZERO, refusal),
                 };
@@ -75,12 +107,12 @@ impl Precedence {
 
     /// Gives way no longer: it was kept waiting for so long.
     fn raise(&self, waited: Duration) {
-        let mut state = self.lock();
-        if *state != State::GivesWay {
+        if !self.0.gives_way.swap(false, Ordering::Relaxed) {
             return;
         }
-        let moved = move_threads(SchedulingPolicy::Idle, SchedulingPolicy::Other);
-        *state = match outcome(&moved) {
+        // Before the lock: who holds it may be waiting for a processor.
+        let came = come_back();
+        *self.lock() = match came {
             Ok(()) => State::Raised(waited),
             Err(refusal) => State::Refused(waited, refusal),
         };
@@ -108,7 +140,7 @@ impl Precedence {
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        self.0.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -135,15 +167,15 @@ impl fmt::Display for Precedence {
 
 /// Who gives way without the right to come back would stay there, however late it became.
 fn give_way() -> State {
-    let come_back = || {
-        if waited().is_none() {
+    let there_and_back = || {
+        if !watcher::can_tell() {
             return Err("/proc/thread-self/schedstat does not tell how long it waits".to_owned());
         }
         own(SchedulingPolicy::Idle)?;
         own(SchedulingPolicy::Other)
     };
     // A thread that may not come back takes that with it.
-    let tried = thread::spawn(come_back).join();
+    let tried = thread::spawn(there_and_back).join();
     let tried = tried.unwrap_or_else(|_panic| Err("its trial failed".to_owned()));
     let moved = tried.and_then(|()| {
         outcome(&move_threads(
@@ -152,6 +184,14 @@ fn give_way() -> State {
         ))
     });
     moved.map_or_else(State::CannotGiveWay, |()| State::GivesWay)
+}
+
+/// Takes all threads that gave way back among the others.
+fn come_back() -> Result<(), String> {
+    outcome(&move_threads(
+        SchedulingPolicy::Idle,
+        SchedulingPolicy::Other,
+    ))
 }
 
 /// Schedules the calling thread.
@@ -170,137 +210,27 @@ fn outcome(item: &RealtimeGrantItem) -> Result<(), String> {
     }
 }
 
-/// The looks of one thread, each judged by how long it was kept waiting for a processor. Use it in
-/// the thread that looks.
-#[derive(Debug)]
-pub(crate) struct Looks {
-    late_max: Duration,
-    /// So far.
-    waited: Duration,
-}
-
-impl Looks {
-    /// Between two looks it may wait for `late_max`.
-    pub(crate) fn new(late_max: Duration) -> Self {
-        Self {
-            late_max,
-            waited: waited().unwrap_or_default(),
-        }
-    }
-
-    /// Judges the time since the look before: nothing but a lack of processor time counts, neither
-    /// a slow disk nor a stopped terminal.
-    pub(crate) fn judge(&mut self, precedence: &Precedence) {
-        self.judge_by(waited().unwrap_or(self.waited), precedence);
-    }
-
-    fn judge_by(&mut self, waited: Duration, precedence: &Precedence) {
-        let late = waited.saturating_sub(self.waited);
-        self.waited = waited;
-        if late > self.late_max {
-            precedence.raise(late);
-        }
-    }
-}
-
-/// How long the calling thread could have run and had no processor, since it began; `None` where the
-/// kernel does not count it.
-fn waited() -> Option<Duration> {
-    let text = fs::read_to_string("/proc/thread-self/schedstat").ok()?;
-    waited_in(&text)
-}
-
-/// The second number of `schedstat`: time spent waiting on a run queue, nanoseconds.
-fn waited_in(schedstat: &str) -> Option<Duration> {
-    let number = schedstat.split_whitespace().nth(1)?;
-    number.parse().ok().map(Duration::from_nanos)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::sync::mpsc::channel;
-
-    fn of(state: State) -> Precedence {
-        Precedence(Arc::new(Mutex::new(state)))
-    }
-
-    /// The policy of the calling thread, field 41 of its `stat`.
-    fn policy() -> u32 {
-        let text = fs::read_to_string("/proc/thread-self/stat").unwrap();
-        let (_, after_name) = text.rsplit_once(')').unwrap();
-        let field = after_name.split_whitespace().nth(38).unwrap();
-        field.parse().unwrap()
-    }
-
-    #[test]
-    fn the_kernel_tells_how_long_a_thread_waited() {
-        assert_eq!(waited_in("123 4567 89\n"), Some(Duration::from_nanos(4567)));
-        assert_eq!(waited_in("123"), None);
-        assert!(waited().is_some());
-    }
-
-    /// No other test of this program gives way, so no other is moved.
-    #[test]
-    fn every_thread_gives_way_until_one_is_too_late() {
-        let judged = thread::spawn(|| {
-            own(SchedulingPolicy::Idle).unwrap();
-            let (go, wait) = channel::<()>();
-            let child = thread::spawn(move || {
-                let _is_told = wait.recv().is_ok();
-                policy()
-            });
-            let precedence = of(State::GivesWay);
-            let late_max = Duration::from_millis(250);
-            let mut looks = Looks {
-                late_max,
-                waited: Duration::from_secs(7),
-            };
-            let look_after = |more_ms: u64| Duration::from_millis(7000 + more_ms);
-            looks.judge_by(look_after(250), &precedence);
-            assert_eq!(
-                (precedence.to_string().as_str(), policy()),
-                ("SCHED_IDLE", 5)
-            );
-            assert_eq!(precedence.warning(), None);
-            looks.judge_by(look_after(501), &precedence);
-            let state = precedence.lock().clone();
-            drop(go);
-            let policies = [policy(), child.join().unwrap()];
-            (state, policies, precedence.warning())
-        });
-        let (state, policies, warning) = judged.join().unwrap();
-        let late = Duration::from_millis(251);
-        match state {
-            State::Raised(waited) => assert_eq!((waited, policies), (late, [0, 0])),
-            // Without the right to it.
-            State::Refused(waited, words) => {
-                assert_eq!(waited, late);
-                assert!(words.contains("RLIMIT_NICE"), "{words}");
-            }
-            other => panic!("{other:?}"),
-        }
-        assert!(warning.is_some_and(|words| words.contains("for 251 ms")));
-    }
 
     #[test]
     fn it_stays_where_memory_does_not_wait_and_where_it_was_told_to() {
         let asked = Precedence::new(Priority::Idle);
-        asked.settle(true);
+        asked.settle(false);
         assert_eq!(
             asked.to_string(),
             "SCHED_OTHER; shared memory does not wait for it"
         );
         let normal = Precedence::new(Priority::Normal);
-        normal.settle(false);
+        normal.settle(true);
         for precedence in [asked, normal] {
-            let mut looks = Looks::new(Duration::ZERO);
-            looks.judge_by(Duration::MAX, &precedence);
+            precedence.raise(Duration::MAX);
             assert_eq!(precedence.warning(), None);
             assert!(precedence.to_string().starts_with("SCHED_OTHER"));
         }
-        let cannot = of(State::CannotGiveWay("EPERM".to_owned()));
-        cannot.settle(false);
+        let cannot = Precedence::of(State::CannotGiveWay("EPERM".to_owned()));
+        cannot.settle(true);
         assert_eq!(cannot.to_string(), "SCHED_OTHER; EPERM");
         assert!(cannot.warning().is_some());
     }

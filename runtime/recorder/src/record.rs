@@ -9,21 +9,22 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use hil_runtime::watch::{
-    Event, Feed, FeedError, LiveRun, Poll, SelectError, Source, WatchedChannel, select,
-    select_below,
+    Event, Feed, FeedError, LiveRun, Poll, SelectError, select, select_below,
 };
 
 use crate::facts::{self, Words};
 use crate::live::LiveTopics;
+use crate::pace::Pace;
 use crate::priority::{Looks, Precedence};
 use crate::run::Run;
 use crate::scene::Scenery;
 use crate::split::{Files, Split, prepare, target};
 use crate::writer::WriteError;
 
-/// How long a recorder with nothing to do sleeps when it reads shared memory, whose buffers are short.
+/// How long a recorder with nothing to do sleeps when it reads shared memory, whose buffers are short,
+/// and how long at least when what it misses there comes again.
 const PAUSE: Duration = Duration::from_millis(10);
-/// The same when all it reads are files. Every wake-up empties the caches of a processor that carries
+/// The same when all it reads are files, and at most when what it misses comes again. Every wake-up empties the caches of a processor that carries
 /// messages in the next moment: two a second are felt less than a hundred.
 const LONG_PAUSE: Duration = Duration::from_millis(500);
 /// How often it looks whether a run has begun.
@@ -149,12 +150,13 @@ pub(crate) fn record(request: &Request, look: Look<'_>) -> Result<Recorded, Reco
     if request.from_now {
         feed.skip_to_now();
     }
-    request.precedence.settle(reads_memory(&feed));
+    let looks = Looks::begin(late_max(request.flush), &request.precedence);
+    request.precedence.settle(feed.waits());
     let files = Files::begin(&target, request.split, request.force)?;
     let topics = LiveTopics::of(&feed, request.scenery);
     let precedence = request.precedence.clone();
     let mut recording = LiveRecording::begin((feed, topics), files, precedence)?;
-    let signal = recording.run(request, look)?;
+    let signal = recording.run((request.flush, looks), look)?;
     recording.finish(signal)
 }
 
@@ -190,12 +192,6 @@ fn find(request: &Request, look: Look<'_>) -> Result<LiveRun, RecordError> {
         }
         thread::sleep(WAIT_PAUSE);
     }
-}
-
-/// Records wait in their files for as long as it takes; shared memory does not.
-pub(crate) fn reads_memory(feed: &Feed) -> bool {
-    let in_memory = |one: &WatchedChannel| matches!(one.source, Some(Source::SharedMemory { .. }));
-    feed.channels().any(in_memory)
 }
 
 /// For how long a look may be kept waiting, if what a kill loses is to stay below `flush`: half of that
@@ -251,19 +247,14 @@ impl LiveRecording {
     /// Records until the run ends or a signal comes, which it gives back.
     fn run(
         &mut self,
-        request: &Request,
+        (flush, mut looks): (Duration, Looks),
         look: Look<'_>,
     ) -> Result<Option<&'static str>, WriteError> {
         // A message waits for the ring of its process, for the next look, and for the flush.
-        let flush_period = request.flush / 2;
-        let pause = if reads_memory(&self.feed) {
-            PAUSE
-        } else {
-            LONG_PAUSE.min(flush_period)
-        };
+        let flush_period = flush / 2;
+        let mut pace = Pace::of(&self.feed, PAUSE, LONG_PAUSE.min(flush_period));
         let (mut flushed, mut told) = (Instant::now(), Instant::now());
         let (mut told_count, mut has_caught_up) = (0, false);
-        let mut looks = Looks::new(late_max(request.flush));
         loop {
             let polled = self.poll()?;
             let now = Instant::now();
@@ -295,9 +286,9 @@ impl LiveRecording {
                 }
             }
             if polled == Poll::Idle {
-                thread::sleep(pause);
+                thread::sleep(pace.after(self.feed.take_fill_ratio()));
             }
-            looks.judge(&self.precedence);
+            looks.judge();
         }
     }
 

@@ -15,6 +15,8 @@ use crate::writer::{Recording, Stamp, WriteError, check_folder, check_live_targe
 /// Files that may be on their way to the disk beside the open one: each has a queue of its own in
 /// memory.
 const CLOSING_MAX: usize = 2;
+/// Names that are tried for one file.
+const NUMBERS_MAX: usize = 10_000;
 
 /// When to begin another file.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -58,6 +60,24 @@ pub(crate) fn target(output: &Path, run: &str) -> PathBuf {
     } else {
         output.to_owned()
     }
+}
+
+/// Where the `number`th recording of one server goes, from 1: to `output` itself, or beside it under a
+/// name with the first number that is free there. In a folder each run has its own name anyway.
+pub(crate) fn another(output: &Path, number: usize) -> PathBuf {
+    if is_folder(output) || number <= 1 {
+        return output.to_owned();
+    }
+    let is_free = |path: &PathBuf| check_live_target(path, false).is_ok();
+    let mut names = (number..).map(|number| {
+        let stem = output.file_stem().unwrap_or_default().to_string_lossy();
+        let extension = output.extension().unwrap_or_default().to_string_lossy();
+        let dot = if extension.is_empty() { "" } else { "." };
+        output.with_file_name(format!("{stem}-{number}{dot}{extension}"))
+    });
+    // Where none can be written, the recording says why.
+    let found = names.by_ref().take(NUMBERS_MAX).find(is_free);
+    found.unwrap_or_else(|| output.to_owned())
 }
 
 /// Says that a recording may go to `output` before anything is waited for, and makes the folder that
@@ -294,6 +314,21 @@ mod tests {
     use std::fs;
     use std::sync::Arc;
     use std::sync::atomic::{AtomicBool, Ordering};
+
+    #[test]
+    fn each_run_of_a_server_gets_a_file_of_its_own() {
+        let folder = std::env::temp_dir().join(format!("hil-another-{}", std::process::id()));
+        fs::create_dir_all(&folder).unwrap();
+        let file = folder.join("a.mcap");
+        assert_eq!(another(&file, 1), file);
+        assert_eq!(another(&file, 2), folder.join("a-2.mcap"));
+        fs::write(folder.join("a-2.mcap"), "taken").unwrap();
+        fs::write(folder.join("a-3.mcap.partial"), "left").unwrap();
+        assert_eq!(another(&file, 2), folder.join("a-4.mcap"));
+        assert_eq!(another(&folder, 7), folder);
+        assert_eq!(another(&folder.join("a"), 7), folder.join("a-7"));
+        fs::remove_dir_all(&folder).unwrap();
+    }
 
     #[test]
     fn every_file_of_a_split_recording_is_whole_by_itself() {

@@ -126,6 +126,12 @@ pub(crate) fn check_target(path: &Path, input: &Path, may_replace: bool) -> Resu
     Ok(())
 }
 
+/// Where a recording that will be called `path` lies until this process has made it whole.
+pub(crate) fn partial(path: &Path) -> PathBuf {
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    path.with_file_name(format!(".{name}.{}.partial", process::id()))
+}
+
 /// Where a live recording that will be called `path` lies until it is whole.
 fn live_partial(path: &Path) -> PathBuf {
     let name = path.file_name().unwrap_or_default().to_string_lossy();
@@ -168,8 +174,7 @@ impl Recording {
     /// # Errors
     /// When there is no room, no right or no folder for it.
     pub(crate) fn create(path: &Path) -> Result<Self, WriteError> {
-        let name = path.file_name().unwrap_or_default().to_string_lossy();
-        let partial = path.with_file_name(format!(".{name}.{}.partial", process::id()));
+        let partial = partial(path);
         Self::begin(path, partial, false)
     }
 

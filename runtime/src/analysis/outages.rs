@@ -109,22 +109,32 @@ pub(crate) fn placed(outages: &[Outage], place: impl Fn(i64) -> Option<i64>) -> 
 
 /// An outage that began after the event did so `later_ns` later.
 fn words(outage: &EventOutage, interrupted: Option<&str>, later_ns: Option<i64>) -> String {
-    let length = match outage.length_s {
-        Some(length_s) => format!("outage of {}", duration_s(length_s)),
-        None => "outage of unknown length".to_owned(),
-    };
+    // One message lost is over with the next: the time between the two is no outage's length.
+    let is_single = outage.lost_count == 1 && interrupted.is_none();
     let time = match (outage.from_s, outage.until_s) {
         (Some(from_s), Some(until_s)) => format!("{} to {}", seconds(from_s), seconds(until_s)),
         (Some(from_s), None) => format!("from {} on", seconds(from_s)),
         (None, Some(until_s)) => format!("until {}", seconds(until_s)),
         (None, None) => "at an unknown time".to_owned(),
     };
-    let mut text = format!(
-        "{length} on {}, {time}, {} message{} lost",
-        outage.channel,
-        grouped(outage.lost_count),
-        if outage.lost_count == 1 { "" } else { "s" },
-    );
+    let mut text = if is_single {
+        let at = match (outage.from_s, outage.until_s) {
+            (Some(at_s), _) => format!("at {}", seconds(at_s)),
+            (None, _) => time,
+        };
+        format!("single message lost on {}, {at}", outage.channel)
+    } else {
+        let length = match outage.length_s {
+            Some(length_s) => format!("outage of {}", duration_s(length_s)),
+            None => "outage of unknown length".to_owned(),
+        };
+        let lost = grouped(outage.lost_count);
+        let plural = if outage.lost_count == 1 { "" } else { "s" };
+        format!(
+            "{length} on {}, {time}, {lost} message{plural} lost",
+            outage.channel
+        )
+    };
     if let Some(process) = interrupted {
         text.push_str(&[", while ", process, " was down"].concat());
     }
@@ -196,6 +206,7 @@ mod tests {
             outage(42_200, Some(44_040), 230),
             outage(44_100, Some(44_108), 1),
             broken,
+            outage(55_000, Some(55_008), 1),
             outage(60_000, None, 125),
         ]);
         for (at_ms, expected) in [
@@ -219,6 +230,10 @@ mod tests {
                     "outage of 8.00 ms on egm/right/command, 49.000 s to 49.008 s, 1 message \
                      lost, while gateway was down, over for 100 ms",
                 ),
+            ),
+            (
+                55_108,
+                Some("single message lost on egm/right/command, at 54.000 s, over for 100 ms"),
             ),
             (
                 60_900,

@@ -1,6 +1,6 @@
 //! The commands that look at a run while it goes: `channel` and `top`.
 
-use super::{columns, exit, interrupted, signals};
+use super::{columns_or, exit, interrupted, signals};
 use crate::console::Console;
 use crate::live::channel::{self, End};
 use crate::live::cli::{ChannelArgs, TopArgs};
@@ -27,13 +27,21 @@ pub(super) fn channel(args: ChannelArgs, registry: &Registry, console: &mut Cons
     }
 }
 
+/// Columns of `top` where there is no terminal: nothing of a process is cut.
+const PLAIN_COLUMNS: usize = 132;
+
 /// `top`.
 pub(super) fn top(args: &TopArgs, registry: &Registry, console: &mut Console) -> u8 {
     let signals = match signals(console) {
         Ok(signals) => signals,
         Err(code) => return code,
     };
-    match top::run(args, columns(), registry, (&signals, console)) {
+    match top::run(
+        args,
+        columns_or(PLAIN_COLUMNS),
+        registry,
+        (&signals, console),
+    ) {
         Ok(TopEnd::Done) => exit::RAN,
         Ok(TopEnd::Interrupted) => interrupted(),
         Err(error) => {

@@ -33,10 +33,6 @@ pub(super) fn play(args: &ReplayArgs, console: &mut Console) -> u8 {
         ));
         return exit::USAGE;
     }
-    if args.only.is_empty() {
-        console.error("which channel is to be played? give --only CHANNEL");
-        return exit::USAGE;
-    }
     let program = match recorder() {
         Ok(program) => program,
         Err(error) => {

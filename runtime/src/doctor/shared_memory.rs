@@ -157,13 +157,15 @@ fn judge_leftovers(runs: &[(&str, usize, Standing)]) -> Finding {
         kinds.join(", ")
     );
     let finding = Finding::note(id, value);
-    match of(Standing::Unplaced).next() {
-        None => finding,
-        Some((prefix, ..)) => finding.fixed_by(format!(
-            "if no other user's run goes on: rm /dev/shm/{prefix}*; any start of a run removes those \
-             of ended runs"
-        )),
+    let unplaced = of(Standing::Unplaced).map(|(prefix, ..)| format!("/dev/shm/{prefix}*"));
+    let unplaced: Vec<String> = unplaced.collect();
+    if unplaced.is_empty() {
+        return finding;
     }
+    finding.fixed_by(format!(
+        "if no other user's run goes on: rm {}; any start of a run removes those of ended runs",
+        unplaced.join(" ")
+    ))
 }
 
 /// The prefix and the root of every domain in `folders`.

@@ -76,7 +76,7 @@ pub enum ChannelCommand {
         #[arg(long)]
         json: bool,
         /// How long to count messages for the rates.
-        #[arg(long, value_name = "TIME", value_parser = window, default_value = "1 s")]
+        #[arg(long, value_name = "TIME", value_parser = window, default_value = "1s")]
         window: Duration,
     },
     /// Rate, gaps, jitter and missing numbers of a channel.
@@ -112,7 +112,7 @@ pub struct WindowArgs {
     #[arg(long)]
     pub json: bool,
     /// How long a window is, e.g. '1 s' or '500 ms'.
-    #[arg(long, value_name = "TIME", value_parser = window, default_value = "1 s")]
+    #[arg(long, value_name = "TIME", value_parser = window, default_value = "1s")]
     pub window: Duration,
 }
 
@@ -152,7 +152,7 @@ pub struct TopArgs {
     #[arg(long)]
     pub json: bool,
     /// How often to look, and how long figures reach back.
-    #[arg(long, value_name = "TIME", value_parser = window, default_value = "1 s")]
+    #[arg(long, value_name = "TIME", value_parser = window, default_value = "1s")]
     pub window: Duration,
 }
 

@@ -38,6 +38,7 @@ impl Announcement {
                 name: channel.name.clone(),
                 source: source(topology, channel, &is_here)?,
                 noted: noted(topology, channel, &is_here),
+                comes_again: comes_again(topology, channel, &is_here),
             })
         });
         let pid = std::process::id();
@@ -146,6 +147,16 @@ pub(crate) fn source(
     })
 }
 
+/// Whether a process that is not here records the messages of `channel`: own programs record nothing.
+fn comes_again(topology: &Topology, channel: &Channel, is_here: &dyn Fn(&str) -> bool) -> bool {
+    let producer = topology.process(&channel.from);
+    producer.is_some_and(|producer| !is_here(&producer.host) && keeps_records(&producer.program))
+}
+
+const fn keeps_records(program: &Program) -> bool {
+    !matches!(program, Program::Command { .. })
+}
+
 /// What the processes here note of each message of `channel`. Own programs note nothing.
 fn noted(topology: &Topology, channel: &Channel, is_here: &dyn Fn(&str) -> bool) -> Vec<Stage> {
     let ends = [Some(channel.from.as_str()), channel.to.as_deref()];
@@ -153,7 +164,6 @@ fn noted(topology: &Topology, channel: &Channel, is_here: &dyn Fn(&str) -> bool)
     let (Some(producer), Some(consumer)) = (producer, consumer) else {
         return Vec::new();
     };
-    let keeps_records = |program: &Program| !matches!(program, Program::Command { .. });
     let crosses = producer.host != consumer.host;
     let (from_here, to_here) = (is_here(&producer.host), is_here(&consumer.host));
     let stages = [

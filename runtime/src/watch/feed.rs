@@ -5,15 +5,13 @@ use std::collections::BTreeMap;
 use std::io;
 use std::time::{Duration, Instant as WallInstant};
 
-use hil_models::measure::record::{IngressRecord, UNAVAILABLE};
-
 use super::event::{Event, Origin, Record};
 use super::follow::{Batch, RecordFollower};
 use super::live::{LiveRun, Source};
 use super::passive::{PassiveCounters, PassiveReader};
-use super::seen::Seen;
+use super::shared::Shared;
 use super::since::Since;
-use crate::channel::{ChannelError, Domain, DomainError};
+use crate::channel::{Domain, DomainError};
 use crate::clock::MonotonicClock;
 use crate::manifest::{ChannelDescription, Manifest};
 
@@ -69,24 +67,6 @@ pub struct WatchedChannel {
     /// Where its messages are read; `None` when it has no end on this host: then its messages can
     /// only come at the end, from another host.
     pub source: Option<Source>,
-}
-
-/// A channel that is read from shared memory.
-#[derive(Debug)]
-struct Shared {
-    host: String,
-    reader: Option<PassiveReader>,
-    /// Of readers that were given up.
-    past: PassiveCounters,
-    seen: Seen,
-    is_forwarded: bool,
-    /// When reading began, on this host's monotonic clock, nanoseconds.
-    joined_ns: i64,
-    /// Messages that the gateway here published since then, by its records.
-    forwarded_count: u64,
-    /// The same when shared memory was last read.
-    forwarded_before: u64,
-    has_complained: bool,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -146,7 +126,11 @@ impl Feed {
             let Some(Source::SharedMemory { host, is_forwarded }) = &channel.source else {
                 return None;
             };
-            Some((name.clone(), Shared::new(host.clone(), *is_forwarded)))
+            let mut announced = run.channels.iter();
+            let comes_again = announced.any(|one| one.name == *name && one.comes_again);
+            let read = (host.clone(), *is_forwarded);
+            let size_bytes = channel.description.size_bytes;
+            Some((name.clone(), Shared::new(read, comes_again, size_bytes)))
         });
         let mut feed = Self {
             shared: shared.collect(),
@@ -208,6 +192,24 @@ impl Feed {
     /// What came of a channel that is read from shared memory; `None` for any other.
     pub fn counters(&self, channel: &str) -> Option<PassiveCounters> {
         self.shared.get(channel).map(Shared::counters)
+    }
+
+    /// True when nothing is lost by looking late: what is not followed from files comes again at the
+    /// end, with the records of another host.
+    pub fn waits(&self) -> bool {
+        self.shared.values().all(|shared| shared.comes_again)
+    }
+
+    /// True when something is read from shared memory, whose room is bounded.
+    pub fn reads_memory(&self) -> bool {
+        !self.shared.is_empty()
+    }
+
+    /// How full the fullest channel in shared memory was found since the last call: a share of the
+    /// messages that may wait there.
+    pub fn take_fill_ratio(&mut self) -> f64 {
+        let ratios = self.shared.values_mut().map(Shared::take_fill_ratio);
+        ratios.fold(0.0, f64::max)
     }
 
     /// Gives out what happened since the last poll, a bounded part of it.
@@ -306,10 +308,12 @@ impl Feed {
         let mut is_busy = false;
         for (name, shared) in &mut self.shared {
             let channel = &self.channels[name];
-            shared.forwarded_before = shared.forwarded_count;
+            shared.note_read();
             let Shared { reader, seen, .. } = shared;
             let Some(open) = reader else { continue };
+            let mut found_count = 0;
             let polled = open.poll(POLL_MESSAGES_MAX, &mut |envelope, payload| {
+                found_count += 1;
                 if seen.insert(envelope.epoch, envelope.sequence) {
                     if let Some(since) = &mut self.since {
                         since.admits(name, (envelope.epoch, envelope.sequence), true);
@@ -322,6 +326,7 @@ impl Feed {
                     });
                 }
             });
+            shared.note_found(found_count);
             match polled {
                 Ok(more) => is_busy |= more,
                 Err(error) => {
@@ -386,7 +391,7 @@ impl Feed {
         match self.stage {
             Stage::Emptying => {
                 for shared in self.shared.values_mut() {
-                    shared.forwarded_before = shared.forwarded_count;
+                    shared.note_read();
                 }
                 self.stage = Stage::Silent(WallInstant::now());
                 take(Event::Silent);
@@ -436,63 +441,6 @@ fn give_messages(
                 envelope: &envelope,
                 payload,
             });
-        }
-    }
-}
-
-impl Shared {
-    fn new(host: String, is_forwarded: bool) -> Self {
-        Self {
-            host,
-            reader: None,
-            past: PassiveCounters::default(),
-            seen: Seen::default(),
-            is_forwarded,
-            joined_ns: i64::MAX,
-            forwarded_count: 0,
-            forwarded_before: 0,
-            has_complained: false,
-        }
-    }
-
-    fn note_forwarded(&mut self, record: &IngressRecord) {
-        let is_published = record.forwarded_ns != UNAVAILABLE;
-        self.forwarded_count += u64::from(is_published && record.forwarded_ns >= self.joined_ns);
-    }
-
-    fn counters(&self) -> PassiveCounters {
-        let now = self
-            .reader
-            .as_ref()
-            .map_or_else(PassiveCounters::default, PassiveReader::counters);
-        PassiveCounters {
-            received_count: self.past.received_count + now.received_count,
-            earlier_count: self.past.earlier_count + now.earlier_count,
-            gap_count: self.past.gap_count + now.gap_count,
-            reordered_count: self.past.reordered_count + now.reordered_count,
-            restart_count: self.past.restart_count + now.restart_count,
-        }
-    }
-
-    fn missed_count(&self) -> u64 {
-        let counters = self.counters();
-        if self.is_forwarded {
-            // Gaps are the network's; the gateway's records say what it published here.
-            self.forwarded_before
-                .saturating_sub(counters.received_count)
-        } else {
-            counters.gap_count
-        }
-    }
-
-    fn give_up_reader(&mut self) {
-        self.past = self.counters();
-        self.reader = None;
-    }
-
-    fn complain(&mut self, error: &ChannelError, problems: &mut Vec<String>) {
-        if !core::mem::replace(&mut self.has_complained, true) {
-            problems.push(error.to_string());
         }
     }
 }

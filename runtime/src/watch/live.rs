@@ -60,6 +60,10 @@ pub struct LiveChannel {
     /// What the processes here note of each of its messages.
     #[serde(default)]
     pub noted: Vec<Stage>,
+    /// A process of another host records its messages, so that they come again with the records that
+    /// hosts exchange at the end.
+    #[serde(default)]
+    pub comes_again: bool,
 }
 
 /// A step on the way of a message that a process notes.
@@ -213,6 +217,7 @@ mod tests {
                     is_forwarded: true,
                 },
                 noted: vec![Stage::Received, Stage::Taken],
+                comes_again: true,
             }],
         };
         let text = serde_json::to_string(&run).unwrap();

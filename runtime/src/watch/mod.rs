@@ -22,6 +22,7 @@ mod live;
 mod passive;
 mod seen;
 mod select;
+mod shared;
 mod since;
 
 #[cfg(test)]

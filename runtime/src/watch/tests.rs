@@ -201,6 +201,7 @@ fn announced(place: &Place) -> (Domain, Vec<ChannelHolder>, LiveRun) {
             is_forwarded,
         },
         noted: Vec::new(),
+        comes_again: is_forwarded,
     };
     let run = LiveRun {
         schema_version: LIVE_VERSION,

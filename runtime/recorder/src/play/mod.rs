@@ -17,7 +17,7 @@ use hil_runtime::signals::Signals;
 
 use schedule::{Punctuality, Schedule};
 pub(crate) use source::SourceError;
-use source::{Material, read};
+use source::{Material, known_channels, read};
 pub(crate) use target::TargetError;
 use target::{Outlet, Target};
 
@@ -44,6 +44,14 @@ pub(crate) struct PlayOptions {
 /// Why nothing was played, or why it broke off.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum PlayError {
+    /// Nothing was chosen.
+    #[error("which channel is to be played? Give --only CHANNEL; {} has {known}", file.display())]
+    NoneChosen {
+        /// The file.
+        file: PathBuf,
+        /// Its channels.
+        known: String,
+    },
     /// What should be played.
     #[error(transparent)]
     Source(#[from] SourceError),
@@ -67,6 +75,12 @@ pub(crate) fn play(
     signals: &Signals,
     console: &mut Console,
 ) -> Result<PlayEnd, PlayError> {
+    if options.only.is_empty() {
+        return Err(PlayError::NoneChosen {
+            known: known_channels(&options.file)?,
+            file: options.file.clone(),
+        });
+    }
     let target = Target::find(options.into.as_deref())?;
     let channels = options.only.iter().map(|name| target.channel(name));
     let channels: Vec<&ChannelDescription> = channels.collect::<Result<_, _>>()?;

@@ -101,6 +101,40 @@ struct Wanted {
     count: u64,
 }
 
+/// The channels of a run whose messages a file has, with their number, in words.
+pub(crate) fn known_channels(path: &Path) -> Result<String, SourceError> {
+    let mut channels: BTreeMap<u16, (String, u64)> = BTreeMap::new();
+    scan(path, &mut |_, record| {
+        match record {
+            Record::Channel(topic) => {
+                // What is made of messages names their channel, and no message.
+                let is_own = topic.metadata.contains_key("message");
+                let channel = topic.metadata.get("channel").filter(|_| is_own);
+                if let Some(channel) = channel {
+                    let known = channels.entry(topic.id);
+                    known.or_insert_with(|| (channel.clone(), 0));
+                }
+            }
+            Record::Message { header, .. } => {
+                if let Some((_, count)) = channels.get_mut(&header.channel_id) {
+                    *count += 1;
+                }
+            }
+            _ => {}
+        }
+        true
+    })?;
+    let known = channels.into_values();
+    let known: Vec<String> = known
+        .map(|(channel, count)| format!("{channel} ({count} messages)"))
+        .collect();
+    Ok(if known.is_empty() {
+        "no channel of a run".to_owned()
+    } else {
+        known.join(", ")
+    })
+}
+
 /// Reads the messages of `channels`, whose layouts are those of the run they go into.
 pub(crate) fn read(path: &Path, channels: &[&ChannelDescription]) -> Result<Material, SourceError> {
     let mut reading = Reading::new(path, channels)?;

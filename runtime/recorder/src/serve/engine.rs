@@ -25,10 +25,8 @@ const CHANNELS_PERIOD: Duration = Duration::from_millis(100);
 /// Between two words on the run.
 const RUN_PERIOD: Duration = Duration::from_secs(1);
 
-/// Between two rounds, when something is read from shared memory.
-const MEMORY_REST: Duration = Duration::from_millis(10);
-/// The same when all that is read are files, which wait: half of what is between two pictures.
-const REST: Duration = Duration::from_millis(25);
+/// Between two rounds, where shared memory does not ask for more: half of what is between two pictures.
+pub(super) const REST: Duration = Duration::from_millis(25);
 
 /// When the next of each is due.
 #[derive(Debug, Default)]
@@ -112,6 +110,8 @@ pub(crate) struct Engine {
     /// Where what is shown is recorded, and the recording.
     target: Option<Target>,
     recording: Option<Recording>,
+    /// Recordings that were begun.
+    recorded_count: usize,
     /// A recording before this one came to nothing.
     has_failed: bool,
     due: Due,
@@ -127,6 +127,7 @@ impl Engine {
             told: Vec::new(),
             target,
             recording: None,
+            recorded_count: 0,
             has_failed: false,
             due: Due::default(),
         }
@@ -146,7 +147,10 @@ impl Engine {
         }
         // What is played back is on record already.
         let goes_on = self.target.as_ref().zip(shown.links.as_ref());
-        self.recording = goes_on.map(|(target, (folder, _))| Recording::begin(folder, target));
+        self.recording = goes_on.map(|(target, (folder, _))| {
+            self.recorded_count += 1;
+            Recording::begin(folder, target, self.recorded_count)
+        });
         self.shown = Some(shown);
         self.due = Due::default();
     }
@@ -162,13 +166,10 @@ impl Engine {
     }
 
     /// How long it may rest before the next round: shared memory has room for little.
-    pub(crate) fn rest(&self) -> Duration {
-        let shown = self.shown.as_ref();
-        if shown.is_some_and(|shown| shown.source.reads_memory()) {
-            MEMORY_REST
-        } else {
-            REST
-        }
+    pub(crate) fn rest(&mut self) -> Duration {
+        let shown = self.shown.as_mut();
+        let asked = shown.and_then(|shown| shown.source.rest());
+        asked.unwrap_or(REST)
     }
 
     /// The viewers, at the end, and whether all that was to be recorded is.

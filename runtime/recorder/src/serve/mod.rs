@@ -17,7 +17,7 @@ mod viewers;
 pub(crate) use access::{host, origin};
 
 use std::fs;
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::thread;
@@ -42,7 +42,6 @@ use parameters::Links;
 use playback::Playback;
 use recording::Target;
 use running::Running;
-use source::Source as _;
 use viewers::Viewers;
 
 /// Pictures that come so much later than they should show that others leave it no processor time.
@@ -121,6 +120,7 @@ pub(crate) fn serve(
         prepare(output, Split::default(), false)?;
     }
     let precedence = Precedence::new(options.priority);
+    let mut looks = Looks::begin(LATE_MAX, &precedence);
     let shown = first(options, &precedence, signals, console)?;
     if signals.received().is_some() {
         return Ok(EXIT_INTERRUPTED);
@@ -139,7 +139,7 @@ pub(crate) fn serve(
         None => console.say("no run goes on here; waiting for one"),
     }
     let mut looked = Instant::now();
-    let (mut said, mut looks) = (None, Looks::new(LATE_MAX));
+    let mut said = None;
     let mut is_precedence_said = false;
     while signals.received().is_none() {
         if options.wait && looked.elapsed() >= WAIT_PERIOD {
@@ -151,7 +151,7 @@ pub(crate) fn serve(
             console.warn(&words);
         }
         thread::sleep(engine.rest());
-        looks.judge(&precedence);
+        looks.judge();
         if let Some(words) = precedence.warning().filter(|_| !is_precedence_said) {
             console.warn(&words);
             is_precedence_said = true;
@@ -242,7 +242,7 @@ fn watch(run: LiveRun, precedence: &Precedence) -> Result<Shown, ServeError> {
     let folder = run.folder.clone();
     let (running, facts) = Running::open(run)?;
     // Before anything is worked out for it.
-    precedence.settle(running.reads_memory());
+    precedence.settle(running.waits());
     let topology = running.topology().clone();
     let links = Some((folder, topology));
     Ok(Shown::new(facts, Box::new(running), None, links))
@@ -330,7 +330,37 @@ fn open(
             .warn("--allow-origin null lets any page in: every page can show one of that origin");
     }
     console.result(&format!("page    http://{page}/\nviewers ws://{socket}\n"));
+    if options.host.is_unspecified() {
+        for address in own_addresses(options.host) {
+            let page = SocketAddr::new(address, page.port());
+            console.result(&format!("from other machines  http://{page}/\n"));
+        }
+    }
     Ok((viewers, front))
+}
+
+/// The addresses at which others find this machine, of the family of `any`; IPv6 takes both in. Those of
+/// loopback, and those that need an interface's name behind them, are of use to nobody else.
+fn own_addresses(any: IpAddr) -> Vec<IpAddr> {
+    let interfaces = nix::ifaddrs::getifaddrs();
+    let addresses = interfaces.into_iter().flatten().filter_map(|interface| {
+        let address = interface.address?;
+        let v4 = address.as_sockaddr_in().map(|one| IpAddr::from(one.ip()));
+        let v6 = address.as_sockaddr_in6().map(|one| IpAddr::from(one.ip()));
+        v4.or(v6)
+    });
+    let mut found: Vec<IpAddr> = addresses.filter(|one| is_of_use(*one, any)).collect();
+    found.sort_unstable();
+    found.dedup();
+    found
+}
+
+fn is_of_use(address: IpAddr, any: IpAddr) -> bool {
+    let is_far = match address {
+        IpAddr::V4(one) => !one.is_link_local(),
+        IpAddr::V6(one) => any.is_ipv6() && !one.is_unicast_link_local(),
+    };
+    is_far && !address.is_loopback()
 }
 
 /// Who may look on. A machine that does not know its name has none.
@@ -365,6 +395,22 @@ mod tests {
         fs::write(run.records().join("x.rec"), "").unwrap();
         assert!(!has_not_begun(&folder));
         fs::remove_dir_all(&folder).unwrap();
+    }
+
+    #[test]
+    fn only_addresses_that_others_reach_are_said() {
+        let of =
+            |address: &str, any: &str| is_of_use(address.parse().unwrap(), any.parse().unwrap());
+        assert!(of("192.0.2.7", "0.0.0.0") && of("192.0.2.7", "::") && of("2001:db8::1", "::"));
+        for (address, any) in [
+            ("127.0.0.1", "0.0.0.0"),
+            ("169.254.1.1", "0.0.0.0"),
+            ("2001:db8::1", "0.0.0.0"),
+            ("fe80::1", "::"),
+            ("::1", "::"),
+        ] {
+            assert!(!of(address, any), "{address}");
+        }
     }
 
     #[test]

@@ -12,7 +12,7 @@ use hil_runtime::console::Console;
 use crate::priority::Precedence;
 use crate::record::{RecordError, Recorded, Request, Which, record};
 use crate::scene::Scenery;
-use crate::split::Split;
+use crate::split::{Split, another};
 
 /// What a kill may lose at most.
 const FLUSH: Duration = Duration::from_secs(1);
@@ -41,12 +41,13 @@ pub(super) struct Recording {
 }
 
 impl Recording {
-    /// Records the run in `folder`, from its first message on. Its name would not do: two runs may
+    /// Records the run in `folder`, the `number`th that this server records, from its first message on. Its name would not do: two runs may
     /// bear one.
-    pub(super) fn begin(folder: &Path, target: &Target) -> Self {
+    pub(super) fn begin(folder: &Path, target: &Target, number: usize) -> Self {
+        let path = another(&target.path, number);
         let request = Request {
             run: Which::In(folder.to_owned()),
-            output: target.path.clone(),
+            output: path.clone(),
             waits: false,
             below: None,
             from_now: false,
@@ -64,7 +65,7 @@ impl Recording {
             })
         });
         Self {
-            path: target.path.clone(),
+            path,
             precedence: target.precedence.clone(),
             has_failed: false,
             thread: Some(thread),

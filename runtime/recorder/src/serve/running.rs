@@ -3,19 +3,23 @@
 use std::fs::{self, File};
 use std::io::{self, Read, Seek, SeekFrom};
 use std::path::Path;
+use std::time::Duration;
 
 use hil_runtime::clock::MonotonicClock;
 use hil_runtime::live::status::{self, ProcessOverruns};
 use hil_runtime::report::summary::RunSummary;
 use hil_runtime::watch::{self, Event, Feed, FeedError, LiveRun, Origin, Poll, Record};
 
+use super::engine::REST;
 use super::playback::how_ended;
 use super::source::{Progress, Source, Warning};
 use crate::clocks::Clocks;
-use crate::record::reads_memory;
+use crate::pace::Pace;
 use crate::view::facts::RunFacts;
 use crate::view::{Body, LiveRecord};
 
+/// Between two looks, when something is read from shared memory that comes only once.
+const MEMORY_REST: Duration = Duration::from_millis(10);
 /// Polls per look, so that a long past does not keep signals and pictures waiting.
 const POLLS_MAX: usize = 16;
 /// Lines shown of what a process said.
@@ -27,6 +31,7 @@ const LOG_END_BYTES: u64 = 64 * 1024;
 #[derive(Debug)]
 pub(crate) struct Running {
     feed: Feed,
+    pace: Pace,
     facts: Names,
     /// From this host's monotonic clock to the axis, nanoseconds.
     offset_ns: i64,
@@ -69,6 +74,7 @@ impl Running {
         let names = facts.channels.iter().map(|channel| channel.name.clone());
         let running = Self {
             facts: names.collect(),
+            pace: Pace::of(&feed, MEMORY_REST, REST),
             feed,
             offset_ns,
             is_silent: false,
@@ -77,6 +83,11 @@ impl Running {
             overruns: None,
         };
         Ok((running, facts))
+    }
+
+    /// True when nothing is lost by looking late.
+    pub(crate) fn waits(&self) -> bool {
+        self.feed.waits()
     }
 
     /// The topology with every default spelled out.
@@ -180,8 +191,8 @@ impl Source for Running {
         missed.flatten().reduce(u64::saturating_add)
     }
 
-    fn reads_memory(&self) -> bool {
-        reads_memory(&self.feed)
+    fn rest(&mut self) -> Option<Duration> {
+        Some(self.pace.after(self.feed.take_fill_ratio()))
     }
 
     fn take_problems(&mut self) -> Vec<String> {

@@ -1,5 +1,7 @@
 //! Where the records of a served run come from: a finished run's folder, or one that goes on.
 
+use std::time::Duration;
+
 use hil_runtime::live::status::ProcessOverruns;
 
 use crate::view::LiveRecord;
@@ -31,9 +33,9 @@ pub(crate) trait Source {
         None
     }
 
-    /// True when something of it is read from shared memory, which does not wait for who reads it.
-    fn reads_memory(&self) -> bool {
-        false
+    /// How long to rest before the next look, where that hangs on what was found.
+    fn rest(&mut self) -> Option<Duration> {
+        None
     }
 
     /// True when the stamps of all hosts compare; may become true while a run goes on.

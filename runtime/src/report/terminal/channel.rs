@@ -96,7 +96,11 @@ fn recorded(canvas: &mut Canvas, figures: Option<RecordedFigures>) {
         );
         return;
     };
-    let mut text = format!("{} messages recorded", grouped(figures.message_count));
+    let plural = if figures.message_count == 1 { "" } else { "s" };
+    let mut text = format!(
+        "{} message{plural} recorded",
+        grouped(figures.message_count)
+    );
     let mut tone = Tone::Plain;
     if figures.missing_count > 0 {
         let count = grouped(figures.missing_count);
