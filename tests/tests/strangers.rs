@@ -334,8 +334,8 @@ fn a_stranger_with_a_hosts_address_gets_nothing_in_and_stops_nothing() {
 /// Connections to the control port in a second, from each of two addresses.
 const KNOCKS_HZ: u32 = 1_000;
 /// Files and threads that a supervisor may have for connections that said nothing yet, beside its own.
-const HALF_OPEN_FILES_MAX: u64 = 400;
-const HALF_OPEN_THREADS_MAX: u64 = 150;
+const HALF_OPEN_FILES_MAX: u64 = 800;
+const HALF_OPEN_THREADS_MAX: u64 = 300;
 /// An address of the hosts' network that is in no topology.
 const FOREIGN: std::net::Ipv4Addr = std::net::Ipv4Addr::new(10, 77, 0, 66);
 
