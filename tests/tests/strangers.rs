@@ -1,7 +1,8 @@
 //! Strangers on the wire of a sealed run: one who spoofs a host's address and sends what a gateway might
 //! take, and connections to the supervisors' port that never become a greeting.
 //!
-//! `HIL_ATTACK_SECONDS=30` attacks for longer, after a quiet run of the same length.
+//! `HIL_ATTACK_SECONDS=30` attacks for longer, after a quiet run of the same length;
+//! `HIL_ATTACK_BUFFER_BYTES=4194304` gives the gateways' sockets that much room.
 #![allow(
     clippy::unwrap_used,
     clippy::print_stdout,
@@ -146,6 +147,10 @@ fn play(record: &Path, (lab, stranger): (&Lab, &Attacker), span: Duration, attac
         .set(&format!("links.hop.port={PORT}"))
         .set(&format!("case.parameters.rate_hz={MESSAGES_HZ}.0"))
         .set(&duration);
+    let trial = match env::var("HIL_ATTACK_BUFFER_BYTES") {
+        Ok(bytes) => trial.set(&format!("links.hop.receive_buffer_bytes={bytes}")),
+        Err(_unset) => trial,
+    };
     let split = Split::start(lab, &trial);
     split.wait_for_messages();
     let recorded = stranger.overhear(PORT + 1, 200, LIMIT);
@@ -329,8 +334,8 @@ fn a_stranger_with_a_hosts_address_gets_nothing_in_and_stops_nothing() {
 /// Connections to the control port in a second, from each of two addresses.
 const KNOCKS_HZ: u32 = 1_000;
 /// Files and threads that a supervisor may have for connections that said nothing yet, beside its own.
-const HALF_OPEN_FILES_MAX: u64 = 400;
-const HALF_OPEN_THREADS_MAX: u64 = 150;
+const HALF_OPEN_FILES_MAX: u64 = 800;
+const HALF_OPEN_THREADS_MAX: u64 = 300;
 /// An address of the hosts' network that is in no topology.
 const FOREIGN: std::net::Ipv4Addr = std::net::Ipv4Addr::new(10, 77, 0, 66);
 

@@ -40,6 +40,10 @@ pub(super) enum Arrived {
     Nobody,
 }
 
+/// Threads that greet, those of connections that had to make way and still notice it included; with more,
+/// connections wait in the kernel's queue.
+const THREADS_MAX: usize = 4 * ADMITTED_MAX;
+
 /// Connections that came to nothing, by cause.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct DoorCounts {
@@ -124,6 +128,8 @@ pub(super) struct Door {
     sender: Sender<Word>,
     arrived: Receiver<Word>,
     counts: DoorCounts,
+    /// Held by this and by every thread that greets.
+    alive: Arc<()>,
 }
 
 /// What became of a connection, and whether it had to make way.
@@ -141,6 +147,7 @@ impl Door {
             sender,
             arrived,
             counts: DoorCounts::default(),
+            alive: Arc::default(),
         })
     }
 
@@ -152,6 +159,9 @@ impl Door {
     /// Takes waiting connections, a bounded number of them.
     pub(super) fn admit_waiting(&mut self) -> io::Result<()> {
         for _ in 0..ADMITTED_MAX {
+            if Arc::strong_count(&self.alive) > THREADS_MAX {
+                break;
+            }
             match self.listener.accept() {
                 Ok((stream, from)) => self.admit(stream, from.ip()),
                 Err(error) if error.kind() == io::ErrorKind::WouldBlock => break,
@@ -210,7 +220,9 @@ impl Door {
         let is_known = Arc::new(AtomicBool::new(false));
         let is_crowded_out = Arc::new(AtomicBool::new(false));
         let (known, crowded_out) = (Arc::clone(&is_known), Arc::clone(&is_crowded_out));
+        let alive = Arc::clone(&self.alive);
         let greet = move || {
+            let _alive = alive;
             let arrived = greet(stream, ip, &admission).unwrap_or(Arrived::Nobody);
             known.store(matches!(arrived, Arrived::Peer(..)), Ordering::Release);
             // Nobody listens once all hosts are here.
