@@ -21,7 +21,7 @@ use std::time::{Duration, Instant as WallInstant};
 use hil_benches::gateway::hosts::SetupError;
 use hil_benches::gateway::network::Network;
 use hil_benches::gateway::parties::{MachineTime, stolen_text};
-use hil_benches::{HostFacts, MedianInterval, Quantiles};
+use hil_benches::{HostFacts, Quantiles, TypicalRatio};
 use hil_gateways::protocol::seal::{
     Association, Initiator, Opened, Responder, Rotation, RunSecret, Suite,
 };
@@ -202,14 +202,14 @@ fn compare(hops: &mut [Hop; 2], size: usize, (rounds, length): (u64, Duration)) 
         );
     }
     for (figure, ratios) in ["p50", "p99", "p99.9"].into_iter().zip(ratios) {
-        print_ratio(figure, size, ratios, quantiles);
+        print_ratio(figure, size, &ratios, quantiles);
     }
 }
 
 /// Only the median has an aim.
-fn print_ratio(figure: &str, size: usize, ratios: Vec<f64>, quantiles: [Option<Quantiles>; 2]) {
+fn print_ratio(figure: &str, size: usize, ratios: &[f64], quantiles: [Option<Quantiles>; 2]) {
     let count = ratios.len();
-    let Some(MedianInterval { median, low, high }) = MedianInterval::of(ratios) else {
+    let Some(TypicalRatio { ratio, low, high }) = TypicalRatio::of(ratios) else {
         println!("  {size} B: too few rounds for a ratio of {figure}");
         return;
     };
@@ -225,13 +225,13 @@ fn print_ratio(figure: &str, size: usize, ratios: Vec<f64>, quantiles: [Option<Q
         String::new()
     };
     println!(
-        "  {verdict:<9} {size} B: {figure} sealed / plain {median:.4} [{low:.4}, {high:.4}], {count} rounds{aim}"
+        "  {verdict:<9} {size} B: {figure} sealed / plain {ratio:.4} [{low:.4}, {high:.4}], {count} rounds{aim}"
     );
     let quantiles = quantiles.map(|found| found.map(|found| found.to_json()));
     println!(
         "{}",
         json!({
-            "bench": "secured_hop", "bytes": size, "figure": figure, "ratio": median,
+            "bench": "secured_hop", "bytes": size, "figure": figure, "ratio": ratio,
             "interval_95": [low, high], "rounds": count, "aim_max": (figure == "p50").then_some(AIM),
             "verdict": verdict, "quantiles": quantiles,
         })
@@ -335,7 +335,7 @@ fn measure() -> Result<(), SetupError> {
     let facts = HostFacts::read("nothing pinned; the parties block");
     println!(
         "{}\n{rounds} rounds of two turns of {length:?}, order by lot of seed {SEED}; ratios of each round's \
-         quantiles, their median with its 95 % interval by order statistics",
+         quantiles, the mean of their logarithms without the fifth at either end, 95 % bootstrap interval",
         facts.to_json()
     );
     println!("\nby itself");

@@ -111,12 +111,12 @@ impl TypicalRatio {
         if logs.len() < Self::ROUNDS_MIN || logs.iter().any(|log| !log.is_finite()) {
             return None;
         }
-        let mut lots = RandomStream::new(Self::SEED, "bootstrap");
+        let mut random = RandomStream::new(Self::SEED, "bootstrap");
         let mut drawn = Vec::with_capacity(logs.len());
         let mut means: Vec<f64> = (0..Self::DRAWN_COUNT)
             .map(|_| {
                 drawn.clear();
-                drawn.extend((0..logs.len()).map(|_| logs[draw(&mut lots, logs.len())]));
+                drawn.extend((0..logs.len()).map(|_| logs[draw(&mut random, logs.len())]));
                 Self::trimmed_mean(&mut drawn)
             })
             .collect();

@@ -222,12 +222,13 @@ impl Door {
         let (known, crowded_out) = (Arc::clone(&is_known), Arc::clone(&is_crowded_out));
         let alive = Arc::clone(&self.alive);
         let greet = move || {
-            let _alive = alive;
             let arrived = greet(stream, ip, &admission).unwrap_or(Arrived::Nobody);
             known.store(matches!(arrived, Arrived::Peer(..)), Ordering::Release);
             // Nobody listens once all hosts are here.
             let word = (arrived, crowded_out.load(Ordering::Acquire));
             let _late = sender.send(word).is_err();
+            // Counted among the threads until here.
+            drop(alive);
         };
         // Without a thread the connection is dropped, and its end tries again.
         match thread::Builder::new().name("door".to_owned()).spawn(greet) {
