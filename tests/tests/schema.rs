@@ -81,7 +81,7 @@ fn every_shipped_topology_fits_the_schema_and_a_wrong_one_does_not() {
     let mut right = shipped();
     assert!(right.len() > 10, "{right:?}");
     for (number, text) in RIGHT.iter().enumerate() {
-        right.push(folder.write(&format!("right-{number}.toml"), text));
+        right.push(folder.write(format!("right-{number}.toml"), text));
     }
     let found = judged(&python, &schema, &right);
     for path in &right {
@@ -89,7 +89,7 @@ fn every_shipped_topology_fits_the_schema_and_a_wrong_one_does_not() {
         assert!(faults.is_empty(), "{}: {faults:?}", path.display());
     }
     let named = |(number, (text, _)): (usize, &(&str, &str))| {
-        folder.write(&format!("wrong-{number}.toml"), text)
+        folder.write(format!("wrong-{number}.toml"), text)
     };
     let wrong: Vec<PathBuf> = WRONG.iter().enumerate().map(named).collect();
     let found = judged(&python, &schema, &wrong);
