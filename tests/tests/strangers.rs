@@ -2,7 +2,8 @@
 //! take, and connections to the supervisors' port that never become a greeting.
 //!
 //! `HIL_ATTACK_SECONDS=30` attacks for longer, after a quiet run of the same length;
-//! `HIL_ATTACK_BUFFER_BYTES=4194304` gives the gateways' sockets that much room.
+//! `HIL_ATTACK_BUFFER_BYTES=4194304` gives the gateways' sockets that much room, and
+//! `HIL_ATTACK_FIFO=1` the run real-time priority on the second processor; `taskset -c 0` keeps the stranger off it.
 #![allow(
     clippy::unwrap_used,
     clippy::print_stdout,
@@ -37,6 +38,15 @@ use hil_tests::trial::Trial;
 use nix::unistd::Pid;
 
 const LIMIT: Duration = Duration::from_mins(1);
+/// Every process of the run before whatever else the machine does, on the second processor.
+const REAL_TIME: [&str; 6] = [
+    "links.hop.gateway.scheduling=\"fifo\"",
+    "links.hop.gateway.cpu=1",
+    "processes.controller.scheduling=\"fifo\"",
+    "processes.controller.cpu=1",
+    "processes.robot.scheduling=\"fifo\"",
+    "processes.robot.cpu=1",
+];
 /// No other file of tests uses these ports.
 const PORT: u16 = 7840;
 /// Datagrams the stranger sends in a second, if it can.
@@ -150,6 +160,11 @@ fn play(record: &Path, (lab, stranger): (&Lab, &Attacker), span: Duration, attac
     let trial = match env::var("HIL_ATTACK_BUFFER_BYTES") {
         Ok(bytes) => trial.set(&format!("links.hop.receive_buffer_bytes={bytes}")),
         Err(_unset) => trial,
+    };
+    let trial = if env::var_os("HIL_ATTACK_FIFO").is_some() {
+        REAL_TIME.into_iter().fold(trial, Trial::set)
+    } else {
+        trial
     };
     let split = Split::start(lab, &trial);
     split.wait_for_messages();
