@@ -1,8 +1,14 @@
 //! The messages of a finished run, as the producers recorded them. It does not read files: the
-//! runtime and the simulation fill it.
+//! simulation fills it, and the runtime says where messages lie and reads them when they are asked for.
 
+#[cfg(test)]
+mod tests;
+
+use core::fmt::Debug;
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
+use crate::measure::packed::{Unpacked, put};
 use crate::message::{Envelope, Message};
 use crate::time::Instant;
 
@@ -15,14 +21,147 @@ pub struct LoggedMessage {
     pub payload: Vec<u8>,
 }
 
+/// Messages of one channel that lie elsewhere and are read whenever they are asked for.
+pub trait StoredMessages: Debug + Send + Sync {
+    /// How many.
+    fn count(&self) -> usize;
+
+    /// All of them from the first on, in order of publication; every call gives the same ones.
+    fn reader(&self) -> Box<dyn MessageReader + '_>;
+}
+
+/// Messages one after the other.
+pub trait MessageReader {
+    /// The next one, its payload put in the place of what `payload` holds; `None` behind the last.
+    fn next(&mut self, payload: &mut Vec<u8>) -> Option<Envelope>;
+}
+
 /// Everything a run's producers published, by channel, in order of publication.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct RunLog {
-    channels: BTreeMap<String, Vec<LoggedMessage>>,
+    channels: BTreeMap<String, Kept>,
     clocks_differ: bool,
     stamp_bound_ns: u64,
     clock_bound_ns: u64,
     early: Option<EarlyStamps>,
+}
+
+/// The messages of one channel.
+#[derive(Debug, Clone, Default)]
+struct Kept {
+    held: Vec<LoggedMessage>,
+    /// In place of the held ones.
+    stored: Option<Arc<dyn StoredMessages>>,
+    /// What was added to the stamps of the stored ones, each less what was added to the one before;
+    /// packed. Empty when nothing was.
+    shifts: Vec<u8>,
+}
+
+impl PartialEq for Kept {
+    fn eq(&self, other: &Self) -> bool {
+        Logged(Some(self)).iter().eq(Logged(Some(other)).iter())
+    }
+}
+
+impl Eq for Kept {}
+
+/// The messages of one channel, held or stored.
+#[derive(Debug, Clone, Copy)]
+pub struct Logged<'a>(Option<&'a Kept>);
+
+impl<'a> Logged<'a> {
+    /// How many.
+    pub fn len(self) -> usize {
+        let count = |kept: &Kept| match &kept.stored {
+            Some(stored) => stored.count(),
+            None => kept.held.len(),
+        };
+        self.0.map_or(0, count)
+    }
+
+    /// True without any.
+    pub fn is_empty(self) -> bool {
+        self.len() == 0
+    }
+
+    /// All of them at once; `None` when they lie elsewhere.
+    pub fn held(self) -> Option<&'a [LoggedMessage]> {
+        match self.0 {
+            Some(kept) if kept.stored.is_some() => None,
+            kept => Some(kept.map_or(&[], |kept| kept.held.as_slice())),
+        }
+    }
+
+    /// The first.
+    pub fn first(self) -> Option<LoggedMessage> {
+        self.iter().next()
+    }
+
+    /// All of them, in order of publication.
+    pub fn iter(self) -> LoggedMessages<'a> {
+        let held = self.0.map_or(&[][..], |kept| kept.held.as_slice());
+        let stored = self.0.and_then(|kept| {
+            let reader = kept.stored.as_ref()?.reader();
+            Some((reader, Unpacked(&kept.shifts), 0))
+        });
+        LoggedMessages {
+            held: held.iter(),
+            stored,
+        }
+    }
+}
+
+impl<'a> IntoIterator for Logged<'a> {
+    type Item = LoggedMessage;
+    type IntoIter = LoggedMessages<'a>;
+
+    fn into_iter(self) -> LoggedMessages<'a> {
+        self.iter()
+    }
+}
+
+/// The messages of one channel, one after the other.
+pub struct LoggedMessages<'a> {
+    held: core::slice::Iter<'a, LoggedMessage>,
+    /// With what is added to the stamps, and what was added to the last one.
+    stored: Option<(Box<dyn MessageReader + 'a>, Unpacked<'a>, i64)>,
+}
+
+impl Debug for LoggedMessages<'_> {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        let held_count = self.held.len();
+        f.debug_struct("LoggedMessages")
+            .field("held_count", &held_count)
+            .finish_non_exhaustive()
+    }
+}
+
+impl LoggedMessages<'_> {
+    /// The next message; see [`MessageReader::next`].
+    fn read(&mut self, payload: &mut Vec<u8>) -> Option<Envelope> {
+        if let Some(message) = self.held.next() {
+            payload.clear();
+            payload.extend_from_slice(&message.payload);
+            return Some(message.envelope);
+        }
+        let (reader, shifts, shift_ns) = self.stored.as_mut()?;
+        let mut envelope = reader.next(payload)?;
+        if let Some(more_ns) = shifts.next() {
+            *shift_ns = shift_ns.wrapping_add(more_ns);
+            envelope.published_ns = envelope.published_ns.wrapping_add(*shift_ns);
+        }
+        Some(envelope)
+    }
+}
+
+impl Iterator for LoggedMessages<'_> {
+    type Item = LoggedMessage;
+
+    fn next(&mut self) -> Option<LoggedMessage> {
+        let mut payload = Vec::new();
+        let envelope = self.read(&mut payload)?;
+        Some(LoggedMessage { envelope, payload })
+    }
 }
 
 /// A stamp brought to another clock.
@@ -45,6 +184,21 @@ struct EarlyStamps {
     bound_ns: u64,
     /// What [`RunLog::clock_bound_ns`] would be without them.
     clock_bound_without_ns: u64,
+}
+
+impl Kept {
+    /// Adds to every stamp what is packed in `shifts`, each less the one before.
+    fn shift(&mut self, shifts: Vec<u8>) {
+        let mut shift_ns = 0_i64;
+        for (message, more_ns) in self.held.iter_mut().zip(Unpacked(&shifts)) {
+            shift_ns = shift_ns.wrapping_add(more_ns);
+            let stamp_ns = &mut message.envelope.published_ns;
+            *stamp_ns = stamp_ns.wrapping_add(shift_ns);
+        }
+        if self.stored.is_some() {
+            self.shifts = shifts;
+        }
+    }
 }
 
 /// The sum of the two largest errors: stamps of two clocks err by what each of their conversions does.
@@ -76,19 +230,22 @@ impl RunLog {
         source_of: impl Fn(&str) -> Option<String>,
         convert: impl Fn(&str, i64) -> Option<BroughtStamp>,
     ) -> Result<(), String> {
-        let mut stamps_ns: Vec<i64> = Vec::new();
+        let mut all_shifts: Vec<Vec<u8>> = Vec::new();
         let mut by_source: BTreeMap<String, u64> = BTreeMap::new();
         let mut without_early: BTreeMap<String, u64> = BTreeMap::new();
         let mut widest_early: Option<(u64, String)> = None;
-        for (channel, messages) in &self.channels {
+        let mut payload = Vec::new();
+        for (channel, kept) in &self.channels {
             let Some(source) = source_of(channel) else {
                 return Err(channel.clone());
             };
             let regular_ns = without_early.entry(source.clone()).or_default();
             let largest_ns = by_source.entry(source).or_default();
             let mut before: Option<(i64, i64)> = None;
-            for message in messages {
-                let from_ns = message.envelope.published_ns;
+            let (mut shifts, mut last_ns) = (Vec::new(), 0_i64);
+            let mut messages = Logged(Some(kept)).iter();
+            while let Some(envelope) = messages.read(&mut payload) {
+                let from_ns = envelope.published_ns;
                 let Some(brought) = convert(channel, from_ns) else {
                     return Err(channel.clone());
                 };
@@ -100,7 +257,9 @@ impl RunLog {
                     at_ns = at_ns.max(known_ns);
                 }
                 before = Some((from_ns, at_ns));
-                stamps_ns.push(at_ns);
+                let shift_ns = at_ns.wrapping_sub(from_ns);
+                put(&mut shifts, shift_ns.wrapping_sub(last_ns));
+                last_ns = shift_ns;
                 *largest_ns = brought.bound_ns.max(*largest_ns);
                 if !brought.is_early {
                     *regular_ns = brought.bound_ns.max(*regular_ns);
@@ -111,10 +270,10 @@ impl RunLog {
                     widest_early = Some((brought.bound_ns, channel.clone()));
                 }
             }
+            all_shifts.push(shifts);
         }
-        let messages = self.channels.values_mut().flatten();
-        for (message, at_ns) in messages.zip(stamps_ns) {
-            message.envelope.published_ns = at_ns;
+        for (kept, shifts) in self.channels.values_mut().zip(all_shifts) {
+            kept.shift(shifts);
         }
         self.clocks_differ = false;
         self.stamp_bound_ns = by_source.values().copied().max().unwrap_or(0);
@@ -176,22 +335,32 @@ impl RunLog {
         )
     }
 
-    /// Appends a message to a channel.
+    /// Appends a message to a channel whose messages are held.
     pub fn push(&mut self, channel: &str, envelope: Envelope, payload: &[u8]) {
         let message = LoggedMessage {
             envelope,
             payload: payload.to_vec(),
         };
-        if let Some(messages) = self.channels.get_mut(channel) {
-            messages.push(message);
+        if let Some(kept) = self.channels.get_mut(channel) {
+            kept.held.push(message);
         } else {
-            self.channels.insert(channel.to_owned(), vec![message]);
+            let kept = self.channels.entry(channel.to_owned()).or_default();
+            kept.held.push(message);
         }
     }
 
+    /// Says where the messages of a channel lie, of which none were there before.
+    pub fn set_stored(&mut self, channel: &str, messages: Arc<dyn StoredMessages>) {
+        let kept = Kept {
+            stored: Some(messages),
+            ..Kept::default()
+        };
+        self.channels.insert(channel.to_owned(), kept);
+    }
+
     /// The recorded messages of `channel`; empty when nothing was recorded.
-    pub fn raw(&self, channel: &str) -> &[LoggedMessage] {
-        self.channels.get(channel).map_or(&[], Vec::as_slice)
+    pub fn raw(&self, channel: &str) -> Logged<'_> {
+        Logged(self.channels.get(channel))
     }
 
     /// The messages of `channel` as `M` with their publication time on the producer's clock.
@@ -199,10 +368,16 @@ impl RunLog {
     pub fn messages<'a, M: Message>(
         &'a self,
         channel: &str,
-    ) -> impl Iterator<Item = (Instant, M)> + 'a {
-        self.raw(channel).iter().filter_map(|logged| {
-            let message = bytemuck::try_pod_read_unaligned(&logged.payload).ok()?;
-            Some((Instant::from_ns(logged.envelope.published_ns), message))
+    ) -> impl Iterator<Item = (Instant, M)> + use<'a, M> {
+        let mut messages = self.raw(channel).iter();
+        let mut payload = Vec::new();
+        core::iter::from_fn(move || {
+            loop {
+                let envelope = messages.read(&mut payload)?;
+                if let Ok(message) = bytemuck::try_pod_read_unaligned(&payload) {
+                    return Some((Instant::from_ns(envelope.published_ns), message));
+                }
+            }
         })
     }
 
@@ -210,149 +385,6 @@ impl RunLog {
     pub fn counts(&self) -> impl Iterator<Item = (&str, usize)> {
         self.channels
             .iter()
-            .map(|(name, messages)| (name.as_str(), messages.len()))
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[allow(clippy::unnecessary_wraps, reason = "as `bring_to_one_clock` takes it")]
-    fn stamp(at_ns: i64, bound_ns: u64) -> Option<BroughtStamp> {
-        Some(BroughtStamp {
-            at_ns,
-            bound_ns,
-            is_early: false,
-        })
-    }
-
-    /// Every channel has a producer on a host of its own.
-    #[allow(clippy::unnecessary_wraps, reason = "as `bring_to_one_clock` takes it")]
-    fn source_of(channel: &str) -> Option<String> {
-        Some(channel.to_owned())
-    }
-
-    /// Messages of two channels, 10 ns apart.
-    fn log() -> RunLog {
-        let mut log = RunLog::default();
-        for channel in ["command", "status"] {
-            for sequence in 0..4 {
-                let envelope = Envelope {
-                    sequence,
-                    published_ns: i64::try_from(sequence).unwrap() * 10,
-                    ..Envelope::default()
-                };
-                log.push(channel, envelope, &[]);
-            }
-        }
-        log.set_clocks_differ();
-        log
-    }
-
-    #[test]
-    fn stamps_are_brought_to_one_clock_with_their_largest_error_and_keep_their_order() {
-        let mut log = log();
-        // The third command's offset is 15 ns less than its neighbours'.
-        let convert = |channel: &str, ns: i64| match (channel, ns) {
-            ("command", 20) => stamp(5_000 + 20 - 15, 40),
-            ("command", ns) => stamp(5_000 + ns, 30),
-            (_, ns) => stamp(ns, 0),
-        };
-        assert_eq!(log.bring_to_one_clock(source_of, convert), Ok(()));
-        assert!(log.has_one_clock());
-        assert_eq!((log.stamp_bound_ns(), log.clock_bound_ns()), (40, 40));
-        let stamps = |channel| -> Vec<i64> {
-            let all = log.raw(channel).iter();
-            all.map(|one| one.envelope.published_ns).collect()
-        };
-        assert_eq!(stamps("command"), [5_000, 5_010, 5_010, 5_030]);
-        assert_eq!(stamps("status"), [0, 10, 20, 30]);
-    }
-
-    #[test]
-    fn channels_of_two_other_clocks_are_off_by_both_conversions() {
-        let mut log = log();
-        for channel in ["orders", "order_answers"] {
-            log.push(channel, Envelope::default(), &[]);
-        }
-        // Robot and sensor are brought to the controller's clock; the answers are the sensor's too.
-        let source_of = |channel: &str| {
-            let source = match channel {
-                "command" => "controller",
-                "status" => "robot",
-                _ => "sensor",
-            };
-            Some(source.to_owned())
-        };
-        let convert = |channel: &str, ns: i64| match channel {
-            "command" => stamp(ns, 0),
-            "status" => stamp(ns + 7, 30),
-            "orders" => stamp(ns - 7, 25),
-            _ => stamp(ns - 7, 20),
-        };
-        assert_eq!(log.bring_to_one_clock(source_of, convert), Ok(()));
-        assert_eq!((log.stamp_bound_ns(), log.clock_bound_ns()), (30, 55));
-    }
-
-    #[test]
-    fn a_channel_of_an_unknown_clock_leaves_all_as_they_were() {
-        let mut changed = log();
-        let source_of = |channel: &str| source_of(channel).filter(|_| channel != "status");
-        let failed = changed.bring_to_one_clock(source_of, |_, ns| stamp(ns + 5, 1));
-        assert_eq!(failed, Err("status".to_owned()));
-        assert_eq!(changed, log());
-    }
-
-    #[test]
-    fn one_stamp_that_does_not_convert_leaves_all_as_they_were() {
-        let mut changed = log();
-        let convert =
-            |channel: &str, ns: i64| stamp(7, 1).filter(|_| channel != "status" || ns < 30);
-        let failed = changed.bring_to_one_clock(source_of, convert);
-        assert_eq!(failed, Err("status".to_owned()));
-        assert_eq!(changed, log());
-        assert!(!changed.has_one_clock());
-    }
-
-    #[test]
-    fn a_figure_says_of_two_clocks_what_one_clock_need_not() {
-        let mut log = log();
-        assert_eq!(log.clock_words(None), "");
-        let convert = |channel: &str, ns| stamp(ns, if channel == "status" { 15_700 } else { 0 });
-        log.bring_to_one_clock(source_of, convert).unwrap();
-        let words = "; stamps of two hosts, aligned within ±15.7 us";
-        assert_eq!(log.clock_words(Some(20e-6)), words);
-        let wide = [words, ", wider than the figure"].concat();
-        assert_eq!(log.clock_words(Some(-15e-6)), wide);
-    }
-
-    #[test]
-    fn a_message_before_the_first_exchange_is_named_with_what_it_widens() {
-        let brought = |widest_ns: u64| {
-            let mut log = log();
-            let convert = |channel: &str, ns: i64| match (channel, ns) {
-                ("status", 0) => Some(BroughtStamp {
-                    at_ns: ns,
-                    bound_ns: widest_ns,
-                    is_early: true,
-                }),
-                ("status", ns) => stamp(ns, 15_700),
-                _ => stamp(ns, 0),
-            };
-            log.bring_to_one_clock(source_of, convert).unwrap();
-            log
-        };
-        let wide = brought(2_000_000);
-        assert_eq!(wide.clock_bound_ns(), 2_000_000);
-        let words = wide.clock_words(None);
-        assert!(words.contains("no clock stepped until then"), "{words}");
-        assert!(
-            words.ends_with("the widest, of status, ±2000.0 us, without them ±15.7 us"),
-            "{words}"
-        );
-        // One that widens nothing rests on the same assumption.
-        let words = brought(9_000).clock_words(None);
-        assert!(words.ends_with("the widest, of status, ±9.0 us"), "{words}");
+            .map(|(name, kept)| (name.as_str(), Logged(Some(kept)).len()))
     }
 }

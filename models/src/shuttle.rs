@@ -133,7 +133,7 @@ impl CaseStudy for Shuttle {
     }
 
     fn score(&self, log: &RunLog) -> Score {
-        let commands: Vec<_> = log.messages::<ShuttleCommand>("shuttle/command").collect();
+        let command_count = log.messages::<ShuttleCommand>("shuttle/command").count();
         let travel = travel(log);
         Score {
             metrics: vec![Metric {
@@ -143,9 +143,8 @@ impl CaseStudy for Shuttle {
                 interval: travel.and_then(|travel| travel.interval),
                 unit: "m",
                 method: format!(
-                    "sum of status steps; {} commands sent; 95 % interval from the half waves of the \
-                     run, from 5 of them on",
-                    commands.len()
+                    "sum of status steps; {command_count} commands sent; 95 % interval from the half waves of the \
+                     run, from 5 of them on"
                 ),
             }],
             ..Score::default()
@@ -190,14 +189,16 @@ struct Travel {
 
 /// The whole way, and what the scatter of the half waves says of it; `None` without a status.
 fn travel(log: &RunLog) -> Option<Travel> {
-    let statuses: Vec<_> = log.messages::<ShuttleStatus>("shuttle/status").collect();
-    let (start, _) = *statuses.first()?;
-    let (end, _) = *statuses.last()?;
+    let mut statuses = log.messages::<ShuttleStatus>("shuttle/status");
+    let first = statuses.next()?;
+    let start = first.0;
+    let mut last = first;
     let (mut blocks, mut whole_m): (Vec<f64>, f64) = (Vec::new(), 0.0);
-    for pair in statuses.windows(2) {
-        let step_m = (pair[1].1.position_m - pair[0].1.position_m).abs();
+    for after in statuses {
+        let before = core::mem::replace(&mut last, after);
+        let step_m = (after.1.position_m - before.1.position_m).abs();
         whole_m += step_m;
-        let half_waves = pair[0].0.seconds_since(start) / HALF_WAVE_S;
+        let half_waves = before.0.seconds_since(start) / HALF_WAVE_S;
         let index = ceil_count(half_waves.floor());
         if blocks.len() <= index {
             blocks.resize(index + 1, 0.0);
@@ -205,7 +206,7 @@ fn travel(log: &RunLog) -> Option<Travel> {
         blocks[index] += step_m;
     }
     // The cart rests at the end of a half wave, so one that is all but over counts as whole.
-    let half_waves = (end.seconds_since(start) / HALF_WAVE_S).round();
+    let half_waves = (last.0.seconds_since(start) / HALF_WAVE_S).round();
     blocks.truncate(ceil_count(half_waves));
     let mean = Estimate::of_mean(&blocks)?;
     let spread_m = mean

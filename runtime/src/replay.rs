@@ -10,7 +10,7 @@ use serde::Deserialize;
 use serde_json::{Value, json};
 
 use crate::analysis::AnalysisError;
-use crate::analysis::records::{MessageRecords, missing_count};
+use crate::analysis::message_records::{MessageRecords, missing_count};
 use crate::registry::{CaseEntry, CaseError, Registry};
 use crate::report::summary::RunSummary;
 use crate::report::terminal::{grouped, wrapped};

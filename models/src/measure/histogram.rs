@@ -4,6 +4,7 @@
 use hdrhistogram::Histogram;
 use serde::{Deserialize, Serialize};
 
+use crate::measure::samples::Samples;
 use crate::measure::special::ceil_count;
 
 /// Digits a recorded value keeps: a quantile is right within 0.1 %.
@@ -267,24 +268,28 @@ impl LatencySummary {
     /// The exact figures of all of `samples_ns`, in any order; `None` when there are none. Where an
     /// interval is drawn from the samples, its figure must be too: a histogram's may lie beside it.
     pub fn of_samples(samples_ns: &[i64]) -> Option<Self> {
-        let mut ascending = samples_ns.to_vec();
-        ascending.sort_unstable();
-        let (min_ns, max_ns) = ascending.first().copied().zip(ascending.last().copied())?;
+        Self::of(&samples_ns.iter().copied().collect())
+    }
+
+    /// As [`Self::of_samples`].
+    pub(crate) fn of(samples: &Samples) -> Option<Self> {
+        let ascending = samples.ascending();
         let count = ascending.len();
+        let last = count.checked_sub(1)?;
         let at = |quantile: f64| {
             let rank = ceil_count(quantile * count as f64).clamp(1, count);
-            ascending[rank - 1]
+            ascending.at(rank - 1)
         };
-        let sum_ns: i128 = ascending.iter().copied().map(i128::from).sum();
+        let sum_ns: i128 = ascending.iter().map(i128::from).sum();
         Some(Self {
             count: count as u64,
-            negative_count: ascending.partition_point(|ns| *ns < 0) as u64,
-            min_ns,
+            negative_count: ascending.iter().take_while(|ns| *ns < 0).count() as u64,
+            min_ns: ascending.at(0),
             p50_ns: at(0.5),
             p90_ns: at(0.9),
             p99_ns: at(0.99),
             p999_ns: at(0.999),
-            max_ns,
+            max_ns: ascending.at(last),
             mean_ns: sum_ns as f64 / count as f64,
         })
     }

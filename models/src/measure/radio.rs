@@ -9,7 +9,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::account::{AccountContext, ChannelRecords, HandedFate, handed_fates};
+use super::account::{AccountContext, ChannelRecords, HandedFate, RecordSource, each_handed};
 use super::record::{EgressRecord, UNAVAILABLE};
 use super::statistics::{Interval, wilson};
 
@@ -119,7 +119,7 @@ pub struct TransmitStampFigures {
 }
 
 /// Where the transmit stamps of `egress` were taken.
-pub fn transmit_stamps(egress: &[EgressRecord]) -> TransmitStampFigures {
+pub fn transmit_stamps(egress: &dyn RecordSource<EgressRecord>) -> TransmitStampFigures {
     let mut figures = TransmitStampFigures::default();
     for record in handed(egress) {
         figures.handed_count += 1;
@@ -144,14 +144,14 @@ pub fn radio_figures(
     let reports = EgressRecord::RADIO_ACKNOWLEDGED | EgressRecord::RADIO_UNACKNOWLEDGED;
     if !records
         .egress?
-        .iter()
+        .each()
         .any(|record| record.flags & reports != 0)
     {
         return None;
     }
     let fates = records.ingress.map(|_| RadioFates::default());
     let mut rows = [RadioRow { count: 0, fates }; 3];
-    for (record, fate) in handed_fates(records, context) {
+    each_handed(records, context, |record, fate| {
         let row = if record.flags & EgressRecord::RADIO_ACKNOWLEDGED != 0 {
             0
         } else if record.flags & EgressRecord::RADIO_UNACKNOWLEDGED != 0 {
@@ -160,7 +160,7 @@ pub fn radio_figures(
             2
         };
         rows[row].add(fate);
-    }
+    });
     Some(figures(rows))
 }
 
@@ -190,8 +190,8 @@ fn figures(rows: [RadioRow; 3]) -> RadioFigures {
 }
 
 /// The messages that were handed to the kernel.
-fn handed(egress: &[EgressRecord]) -> impl Iterator<Item = &EgressRecord> {
-    egress.iter().filter(|record| {
+fn handed(egress: &dyn RecordSource<EgressRecord>) -> impl Iterator<Item = EgressRecord> {
+    egress.each().filter(|record| {
         record.handed_ns != UNAVAILABLE && record.flags & EgressRecord::REFUSED_BY_KERNEL == 0
     })
 }

@@ -7,8 +7,10 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::measure::resampling::BlockResampling;
+use crate::measure::samples::Samples;
 use crate::measure::special::{
-    binomial_cdf, ceil_count, incomplete_beta, incomplete_gamma, invert, normal_quantile,
+    binomial_cdf, incomplete_beta, incomplete_gamma, invert, normal_quantile,
 };
 use crate::random::RandomStream;
 
@@ -19,7 +21,7 @@ pub const CONFIDENCE: f64 = 0.95;
 pub const RESAMPLE_COUNT: usize = 400;
 
 /// Fewest blocks for which resampling blocks means anything.
-const BLOCK_COUNT_MIN: usize = 10;
+pub(super) const BLOCK_COUNT_MIN: usize = 10;
 
 /// A closed interval.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -199,61 +201,8 @@ pub fn block_bootstrap_quantile(
         quantile > 0.0 && quantile < 1.0,
         "quantile {quantile} is outside 0..1"
     );
-    let length = samples_ns.len().isqrt();
-    if length < BLOCK_COUNT_MIN {
-        return None;
-    }
-    let blocks: Vec<Vec<i64>> = samples_ns
-        .chunks_exact(length)
-        .map(|chunk| {
-            let mut block = chunk.to_vec();
-            block.sort_unstable();
-            block
-        })
-        .collect();
-    let mut ascending = samples_ns.to_vec();
-    ascending.sort_unstable();
-    ascending.dedup();
-    let wanted = ceil_count(quantile * (blocks.len() * length) as f64).max(1);
-    let mut drawn: Vec<&[i64]> = Vec::with_capacity(blocks.len());
-    let mut estimates: Vec<i64> = (0..RESAMPLE_COUNT)
-        .map(|_| {
-            drawn.clear();
-            drawn.extend(
-                (0..blocks.len()).map(|_| blocks[index_below(blocks.len(), random)].as_slice()),
-            );
-            rank_of_union(&ascending, &drawn, wanted)
-        })
-        .collect();
-    estimates.sort_unstable();
-    let tail = 0.5 * (1.0 - confidence);
-    let low = ceil_count(tail * RESAMPLE_COUNT as f64).min(RESAMPLE_COUNT) - 1;
-    Some(IntervalNs {
-        low_ns: estimates[low],
-        high_ns: estimates[RESAMPLE_COUNT - 1 - low],
-    })
-}
-
-/// A uniform index below `count`, by the multiplication of Lemire (2019); its bias is below
-/// `count / 2^64`.
-fn index_below(count: usize, random: &mut RandomStream) -> usize {
-    let product = u128::from(random.next_u64()) * count as u128;
-    usize::try_from(product >> 64).expect("the high half lies below count")
-}
-
-/// The `wanted`-th smallest value (1-based) of the union of sorted blocks: the smallest value
-/// that at least so many samples do not exceed. Counting inside sorted blocks is far cheaper
-/// than sorting each resample.
-fn rank_of_union(ascending: &[i64], blocks: &[&[i64]], wanted: usize) -> i64 {
-    let reaches = |value: i64| {
-        let mut count = 0;
-        for block in blocks {
-            count += block.partition_point(|sample| *sample <= value);
-        }
-        count >= wanted
-    };
-    let index = ascending.partition_point(|value| !reaches(*value));
-    ascending[index.min(ascending.len() - 1)]
+    let samples: Samples = samples_ns.iter().copied().collect();
+    Some(BlockResampling::of(&samples)?.interval(quantile, confidence, random))
 }
 
 #[cfg(test)]

@@ -44,20 +44,58 @@ pub struct Decoded {
 /// # Errors
 /// [`EncodeError`], for whatever [`decode`] would refuse or read otherwise.
 pub fn encode(trace: &Trace) -> Result<Vec<u8>, EncodeError> {
-    if let Some(index) = trace.first_out_of_order() {
-        return Err(EncodeError::OutOfOrder { index });
-    }
     let count = trace.records.len();
-    if count as u64 > RECORD_COUNT_MAX {
-        return Err(EncodeError::TooMany { count });
-    }
     let mut bytes = Vec::with_capacity(HEADER_BYTES + count * RECORD_BYTES);
-    bytes.extend_from_slice(&encode_header(&trace.header, count as u64)?);
-    for (record, index) in trace.records.iter().zip(0_u32..) {
-        check_record(record).map_err(|(_, what)| EncodeError::Record { index, what })?;
-        bytes.extend_from_slice(&encode_record(record, index));
+    let (mut encoder, header) = TraceEncoder::new(&trace.header, count)?;
+    bytes.extend_from_slice(&header);
+    for record in &trace.records {
+        bytes.extend_from_slice(&encoder.record(record)?);
     }
     Ok(bytes)
+}
+
+/// Writes a trace piece by piece; holds none of it.
+#[derive(Debug)]
+pub struct TraceEncoder {
+    next: u32,
+    before_ns: Option<i64>,
+}
+
+impl TraceEncoder {
+    /// The bytes of the header of a trace of `count` records, and what makes those of the records.
+    ///
+    /// # Errors
+    /// When a name does not fit, or there are too many records.
+    pub fn new(
+        header: &TraceHeader,
+        count: usize,
+    ) -> Result<(Self, [u8; HEADER_BYTES]), EncodeError> {
+        if count as u64 > RECORD_COUNT_MAX {
+            return Err(EncodeError::TooMany { count });
+        }
+        let encoder = Self {
+            next: 0,
+            before_ns: None,
+        };
+        Ok((encoder, encode_header(header, count as u64)?))
+    }
+
+    /// The bytes of the next record.
+    ///
+    /// # Errors
+    /// When it was published before the last one, or its fields cannot be read together.
+    pub fn record(&mut self, record: &TraceRecord) -> Result<[u8; RECORD_BYTES], EncodeError> {
+        let index = self.next;
+        let is_earlier = |before_ns: i64| record.published_ns < before_ns;
+        if self.before_ns.is_some_and(is_earlier) {
+            let index = index as usize;
+            return Err(EncodeError::OutOfOrder { index });
+        }
+        check_record(record).map_err(|(_, what)| EncodeError::Record { index, what })?;
+        self.before_ns = Some(record.published_ns);
+        self.next = index.saturating_add(1);
+        Ok(encode_record(record, index))
+    }
 }
 
 fn encode_header(header: &TraceHeader, count: u64) -> Result<[u8; HEADER_BYTES], EncodeError> {

@@ -40,7 +40,7 @@ pub(super) fn hardware_stamps(
                 path: context.path,
                 receiving_card: card_of(result, &crossing.to_host.name),
             };
-            channel_stamps(&crossing.channel.name, egress, ingress, &places)
+            channel_stamps(&crossing.channel.name, &egress, &ingress, &places)
         })
     });
     let stamps = HardwareStamps {

@@ -41,7 +41,7 @@ fn face_summary(
         FaceKind::Sensor => (command_channel(side), feedback_channel(side)),
     };
     let (sent, received) = records.of_face(out, back);
-    let figures = figures(face.kind, sent, received);
+    let figures = figures(face.kind, &sent, &received);
     let report = report_of(result, &process.name, side);
     let counters: Vec<CountByName> = report
         .iter()

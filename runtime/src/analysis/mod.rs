@@ -3,12 +3,16 @@
 
 mod axis;
 mod cards;
+mod channel_files;
 mod clock_path;
 mod clocks;
 mod events;
 mod faces;
 mod figures;
 pub(crate) mod link_changes;
+#[cfg(test)]
+mod memory_tests;
+pub(crate) mod message_records;
 pub(crate) mod network;
 pub(crate) mod outages;
 mod radio;
@@ -197,7 +201,7 @@ fn write_series(
 fn add_warnings(summary: &mut RunSummary, result: &RunResult, records: &RunRecords) {
     summary
         .warnings
-        .extend(result.problems.iter().chain(&records.problems).cloned());
+        .extend(result.problems.iter().cloned().chain(records.problems()));
     for process in &result.processes {
         let failures = process
             .report

@@ -9,7 +9,8 @@ use hil_models::measure::account::{Side, passages};
 use hil_models::measure::correlation::{self, LagWindow};
 use hil_models::measure::network::{
     Moment, NetworkBin, NetworkBins, NetworkContext, NetworkEvent, NetworkEventKind,
-    NetworkFigures, Passage, Place, bin_width_ns, clock_steps, interruptions, network_events,
+    NetworkFigures, PackedPassages, Place, bin_width_ns, clock_steps, interruptions,
+    network_events,
 };
 use hil_models::measure::record::IngressRecord;
 use hil_models::plot::PlotSeries;
@@ -43,7 +44,7 @@ const LAG_MAX_S: f64 = FOREGOING_S;
 pub(crate) struct ChannelPassages<'a> {
     pub(crate) channel: &'a str,
     pub(crate) hosts: [&'a str; 2],
-    pub(crate) passages: &'a [Passage],
+    pub(crate) passages: &'a PackedPassages,
     /// What the passages alone do not show.
     pub(crate) other_events: Vec<NetworkEvent>,
     pub(crate) duration_ns: i64,
@@ -432,7 +433,7 @@ fn add_channel(
     };
     records.consult(run, channel, |files, context| {
         let ways = passages(files, context);
-        let is_copy = |record: &&IngressRecord| record.flags & IngressRecord::DUPLICATE != 0;
+        let is_copy = |record: &IngressRecord| record.flags & IngressRecord::DUPLICATE != 0;
         let mut other_events = interruptions(context);
         other_events.extend(clock_steps(files));
         builder.add(ChannelPassages {
@@ -448,7 +449,7 @@ fn add_channel(
                 payload_bytes,
                 duplicated_count: files
                     .ingress
-                    .map(|ingress| ingress.iter().filter(is_copy).count() as u64),
+                    .map(|ingress| ingress.each().filter(is_copy).count() as u64),
                 round_trips_ns: context.round_trips_ns,
                 seed: context.seed,
             },

@@ -1,35 +1,36 @@
 //! The record files of a finished run, joined by channel, and the account drawn up from them. What
 //! the account means for a reader is decided elsewhere.
 
+use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 
 use hil_models::link::condition::LinkConditionRecord;
 use hil_models::measure::account::{
     AccountContext, ChannelAccount, ChannelPath, ChannelRecords, FLIGHT_TIME_MAX, Interruption,
-    MessageStory, ORDER_TOLERANCE_NS, Outage, PathProcess, RunSpan, TooManyMessages, TraceChannel,
-    account, link_trace, outages, stories,
+    MessageStory, ORDER_TOLERANCE_NS, Outage, PathProcess, RunSpan, account, outages, stories,
 };
 use hil_models::measure::card_clock::{CardClockRecord, CardTimeline};
 use hil_models::measure::radio::{
     RadioFigures, TransmitStampFigures, radio_figures, transmit_stamps,
 };
-use hil_models::measure::record::{
-    EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
-};
-use hil_models::run_log::{LoggedMessage, RunLog};
+use hil_models::measure::record::{EgressRecord, IngressRecord, RoundTripRecord};
+use hil_models::run_log::RunLog;
 use hil_models::time::Instant;
-use hil_models::trace::TraceRecord;
 
 use super::AnalysisError;
+use super::channel_files::{ChannelFiles, Signs, all, widen};
 use super::clocks::HostClocks;
+use super::message_records::missing_count;
 use super::{link_changes, stalls};
 use crate::face::record::{FaceReceivedRecord, FaceSentRecord};
 use crate::process::launch::EmulationLaunch;
 use crate::radio::record::RadioRecord;
-use crate::record::{RecordFile, RecordFileError, RecordKind};
+use crate::record::stored::{ReadFaults, StoredFile, StoredRecords, file_bytes, sort_by_start};
+use crate::record::{RecordFileError, RecordKind};
 use crate::report::summary::RecordedFigures;
 use crate::supervisor::RunResult;
 use crate::supervisor::plan::gateway_name;
@@ -38,19 +39,6 @@ use crate::topology::{Channel, Topology};
 /// Share of the messages of an emulated link that are not under way for longer than is allowed for:
 /// at the end of a run, what is younger may still arrive.
 const FLIGHT_QUANTILE: f64 = 0.9999;
-
-/// All records of one channel.
-#[derive(Debug, Default)]
-pub(crate) struct ChannelFiles {
-    pub(super) published: Option<Vec<PublishedRecord>>,
-    pub(super) egress: Option<Vec<EgressRecord>>,
-    pub(super) ingress: Option<Vec<IngressRecord>>,
-    follow_up: Option<Vec<FollowUpRecord>>,
-    pub(super) taken: Option<Vec<TakenRecord>>,
-    round_trips: BTreeMap<(u32, u64), RoundTripRecord>,
-    face_sent: Vec<FaceSentRecord>,
-    face_received: Vec<FaceReceivedRecord>,
-}
 
 /// Every record file of a run.
 #[derive(Debug, Default)]
@@ -63,62 +51,88 @@ pub(crate) struct RunRecords {
     pub(super) radios: BTreeMap<String, Vec<RadioRecord>>,
     /// Orders to emulated links, by the channel on which they were given.
     link_orders: BTreeMap<String, Vec<LinkConditionRecord>>,
-    /// Files that could not be read, with the reason.
-    pub(crate) problems: Vec<String>,
+    /// Files that could not be opened, with the reason.
+    problems: Vec<String>,
+    /// What went wrong later.
+    faults: ReadFaults,
+    /// Processes on the way of each channel that were held up as the run ended, once asked for.
+    held_up: RefCell<BTreeMap<String, Vec<Interruption>>>,
 }
 
 impl RunRecords {
-    /// Reads the records folder.
+    /// Opens the files of the records folder. What a channel has of every message stays in them.
     pub(crate) fn read(folder: &Path) -> Result<Self, AnalysisError> {
         let mut records = Self::default();
-        let mut add = |file| records.add(&file);
-        records.problems = read_files(folder, &|_| true, &|_| {}, &mut add)?;
+        let mut add = |path: &Path| {
+            records.add(StoredFile::open(path)?);
+            Ok(())
+        };
+        let problems = each_file(folder, &|_| true, &|_| {}, &mut add)?;
+        records.problems = problems;
+        for (name, files) in &mut records.channels {
+            files.signs = Signs::of(files);
+            if let Some(messages) = files.message.take() {
+                records.log.set_stored(name, Arc::new(messages));
+            }
+        }
         Ok(records)
     }
 
-    fn add(&mut self, file: &RecordFile) {
-        if file.header.kind == RecordKind::CardClock {
-            let card = self.cards.entry(file.header.channel.clone()).or_default();
-            card.extend(file.records::<CardClockRecord>());
-            return;
+    fn add(&mut self, file: StoredFile) {
+        let name = file.header.channel.clone();
+        let kind = file.header.kind;
+        let alone = |file| {
+            let mut records = StoredRecords::new(&self.faults);
+            records.push(file);
+            records
+        };
+        match kind {
+            RecordKind::CardClock => {
+                let card = self.cards.entry(name).or_default();
+                card.extend(alone(file).records::<CardClockRecord>());
+                return;
+            }
+            RecordKind::Radio => {
+                let radio = self.radios.entry(name).or_default();
+                radio.extend(alone(file).records::<RadioRecord>());
+                return;
+            }
+            RecordKind::LinkCondition => {
+                let orders = self.link_orders.entry(name).or_default();
+                orders.extend(alone(file).records::<LinkConditionRecord>());
+                return;
+            }
+            _ => {}
         }
-        if file.header.kind == RecordKind::Radio {
-            let radio = self.radios.entry(file.header.channel.clone());
-            radio.or_default().extend(file.records::<RadioRecord>());
-            return;
-        }
-        if file.header.kind == RecordKind::LinkCondition {
-            let orders = self.link_orders.entry(file.header.channel.clone());
-            orders
-                .or_default()
-                .extend(file.records::<LinkConditionRecord>());
-            return;
-        }
-        let channel = self
-            .channels
-            .entry(file.header.channel.clone())
-            .or_default();
-        match file.header.kind {
-            RecordKind::Published => extend(&mut channel.published, file.records()),
-            RecordKind::Taken => extend(&mut channel.taken, file.records()),
-            RecordKind::Egress => extend(&mut channel.egress, file.records()),
-            RecordKind::Ingress => extend(&mut channel.ingress, file.records()),
-            RecordKind::FollowUp => extend(&mut channel.follow_up, file.records()),
+        let channel = self.channels.entry(name).or_default();
+        let files = match kind {
+            RecordKind::Published => &mut channel.published,
+            RecordKind::Taken => &mut channel.taken,
+            RecordKind::Egress => &mut channel.egress,
+            RecordKind::Ingress => &mut channel.ingress,
+            RecordKind::FollowUp => &mut channel.follow_up,
+            RecordKind::FaceSent => &mut channel.face_sent,
+            RecordKind::FaceReceived => &mut channel.face_received,
+            RecordKind::Message => &mut channel.message,
             RecordKind::RoundTrip => {
-                let records = file.records::<RoundTripRecord>();
+                let records = alone(file);
                 // An exchange whose stamps were bettered later is there twice.
                 let of = |one: RoundTripRecord| ((one.session, one.sequence), one);
-                channel.round_trips.extend(records.map(of));
+                channel.round_trips.extend(records.records().map(of));
+                return;
             }
-            RecordKind::FaceSent => channel.face_sent.extend(file.records::<FaceSentRecord>()),
-            RecordKind::FaceReceived => {
-                let records = file.records::<FaceReceivedRecord>();
-                channel.face_received.extend(records);
-            }
-            RecordKind::Message => file.append_messages(&mut self.log),
             // They belong to no channel, see above.
-            RecordKind::CardClock | RecordKind::Radio | RecordKind::LinkCondition => {}
-        }
+            RecordKind::CardClock | RecordKind::Radio | RecordKind::LinkCondition => return,
+        };
+        files
+            .get_or_insert_with(|| StoredRecords::new(&self.faults))
+            .push(file);
+    }
+
+    /// Record files that could not be read, or not to their ends, with the reason.
+    pub(crate) fn problems(&self) -> Vec<String> {
+        let later = self.faults.texts();
+        self.problems.iter().cloned().chain(later).collect()
     }
 
     /// Orders to emulated links that were given on `channel`, in the order of the gateway's count.
@@ -132,11 +146,11 @@ impl RunRecords {
     }
 
     /// What the gateways recorded of `channel`: what they sent and what they received.
-    pub(super) fn of_gateways(&self, channel: &str) -> (&[EgressRecord], &[IngressRecord]) {
+    pub(super) fn of_gateways(&self, channel: &str) -> (Vec<EgressRecord>, Vec<IngressRecord>) {
         let files = self.channels.get(channel);
-        let egress = files.and_then(|files| files.egress.as_deref());
-        let ingress = files.and_then(|files| files.ingress.as_deref());
-        (egress.unwrap_or_default(), ingress.unwrap_or_default())
+        let egress = all(files.and_then(|files| files.egress.as_ref()));
+        let ingress = all(files.and_then(|files| files.ingress.as_ref()));
+        (egress.collect(), ingress.collect())
     }
 
     /// Every message of the run, to bring them to one clock.
@@ -175,16 +189,16 @@ impl RunRecords {
             let Some(files) = self.channels.get(&channel.name) else {
                 continue;
             };
-            let sent = files.egress.iter().flatten();
-            let sent = sent.map(|record| record.realtime_offset_ns);
-            let sent = sent.filter(|_| is_here(&channel.from));
             let is_receiver = channel.to.as_deref().is_some_and(is_here);
-            let received = files.ingress.iter().flatten();
-            let received = received.map(|record| record.realtime_offset_ns);
-            let received = received.filter(|_| is_receiver);
-            for offset_ns in sent.chain(received) {
-                let (lowest, highest) = ends.unwrap_or((offset_ns, offset_ns));
-                ends = Some((lowest.min(offset_ns), highest.max(offset_ns)));
+            let of_sender = files.signs.sender_realtime_ns;
+            let of_receiver = files.signs.receiver_realtime_ns;
+            let own = [
+                of_sender.filter(|_| is_here(&channel.from)),
+                of_receiver.filter(|_| is_receiver),
+            ];
+            for (lowest, highest) in own.into_iter().flatten() {
+                widen(&mut ends, lowest);
+                widen(&mut ends, highest);
             }
         }
         let (lowest, highest) = ends?;
@@ -198,10 +212,9 @@ impl RunRecords {
     }
 
     /// What the receiving gateway of `channel` noted of each datagram; empty when it left nothing.
-    pub(super) fn arrivals(&self, channel: &str) -> &[IngressRecord] {
+    pub(super) fn arrivals(&self, channel: &str) -> impl Iterator<Item = IngressRecord> + '_ {
         let files = self.channels.get(channel);
-        let records = files.and_then(|files| files.ingress.as_deref());
-        records.unwrap_or_default()
+        all(files.and_then(|files| files.ingress.as_ref()))
     }
 
     /// Every message of the run.
@@ -223,16 +236,12 @@ impl RunRecords {
         &self,
         out: &str,
         back: &str,
-    ) -> (&[FaceSentRecord], &[FaceReceivedRecord]) {
-        let sent = self
-            .channels
-            .get(out)
-            .map(|files| files.face_sent.as_slice());
-        let received = self
-            .channels
-            .get(back)
-            .map(|files| files.face_received.as_slice());
-        (sent.unwrap_or_default(), received.unwrap_or_default())
+    ) -> (Vec<FaceSentRecord>, Vec<FaceReceivedRecord>) {
+        let sent = self.channels.get(out);
+        let sent = all(sent.and_then(|files| files.face_sent.as_ref()));
+        let received = self.channels.get(back);
+        let received = all(received.and_then(|files| files.face_received.as_ref()));
+        (sent.collect(), received.collect())
     }
 
     /// The account of `channel`.
@@ -286,23 +295,8 @@ impl RunRecords {
         })
     }
 
-    /// What the link of `channel` did to every message.
-    ///
-    /// # Errors
-    /// When there are more than a trace holds.
-    pub(crate) fn link_trace(
-        &self,
-        run: (&Topology, &RunResult),
-        channel: &Channel,
-        traced: TraceChannel,
-    ) -> Result<Vec<TraceRecord>, TooManyMessages> {
-        self.consult(run, channel, |records, context| {
-            link_trace(records, context, traced)
-        })
-    }
-
     /// Asks something of the records of `channel` and of what the run knows about its way.
-    pub(super) fn consult<T>(
+    pub(crate) fn consult<T>(
         &self,
         (topology, result): (&Topology, &RunResult),
         channel: &Channel,
@@ -311,7 +305,7 @@ impl RunRecords {
         let nothing = ChannelFiles::default();
         let files = self.channels.get(&channel.name).unwrap_or(&nothing);
         let mut interruptions = interruptions(topology, result, channel);
-        interruptions.extend(stalls::at_end(self, (topology, result), channel));
+        interruptions.extend(self.held_up((topology, result), channel));
         let span_of = |process: &str| {
             let (start, end) = *result.spans.get(&topology.process(process)?.host)?;
             Some(RunSpan { start, end })
@@ -352,72 +346,34 @@ impl RunRecords {
             ..AccountContext::new(path)
         };
         let records = ChannelRecords {
-            published: files.published.as_deref(),
-            egress: files.egress.as_deref(),
-            ingress: files.ingress.as_deref(),
-            follow_up: files.follow_up.as_deref(),
-            taken: files.taken.as_deref(),
+            published: files.published.as_ref().map(|files| files as _),
+            egress: files.egress.as_ref().map(|files| files as _),
+            ingress: files.ingress.as_ref().map(|files| files as _),
+            follow_up: files.follow_up.as_ref().map(|files| files as _),
+            taken: files.taken.as_ref().map(|files| files as _),
         };
         ask(&records, &context)
     }
-}
 
-/// The messages of a run, without the rest of its records.
-#[derive(Debug, Default)]
-pub(crate) struct MessageRecords {
-    /// The messages.
-    pub(crate) log: RunLog,
-    /// Channels whose messages someone recorded, be it none.
-    pub(crate) files: BTreeSet<String>,
-    /// What could not be read.
-    pub(crate) problems: Vec<String>,
-}
-
-impl MessageRecords {
-    /// Reads them from a records folder; `reach` hears the share that is read.
-    ///
-    /// # Errors
-    /// When the folder cannot be read.
-    pub(crate) fn read(folder: &Path, reach: &dyn Fn(f64)) -> Result<Self, AnalysisError> {
-        let mut records = Self::default();
-        let wanted = |name: &str| name.contains(".message.");
-        let problems = read_files(folder, &wanted, reach, &mut |file| {
-            if file.header.kind != RecordKind::Message {
-                return;
-            }
-            let channel = &file.header.channel;
-            records.files.insert(channel.clone());
-            file.append_messages(&mut records.log);
-            if file.truncated_bytes > 0 {
-                let problem = format!("{channel}: a record file ends in half a message");
-                records.problems.push(problem);
-            }
-        })?;
-        records.problems.extend(problems);
-        Ok(records)
+    /// See [`stalls::at_end`], which reads what the channel published.
+    fn held_up(&self, run: (&Topology, &RunResult), channel: &Channel) -> Vec<Interruption> {
+        if let Some(known) = self.held_up.borrow().get(&channel.name) {
+            return known.clone();
+        }
+        let found = stalls::at_end(self, run, channel);
+        let mut held_up = self.held_up.borrow_mut();
+        held_up.insert(channel.name.clone(), found.clone());
+        found
     }
-}
-
-/// Sequence numbers below the highest of each start of a producer that are not among its
-/// recorded messages.
-pub(crate) fn missing_count(messages: &[LoggedMessage]) -> u64 {
-    let mut next_of_epoch: BTreeMap<u32, u64> = BTreeMap::new();
-    for message in messages {
-        let next = next_of_epoch.entry(message.envelope.epoch).or_default();
-        *next = (*next).max(message.envelope.sequence.saturating_add(1));
-    }
-    let given = next_of_epoch.values();
-    let given_count = given.fold(0_u64, |sum, count| sum.saturating_add(*count));
-    given_count.saturating_sub(messages.len() as u64)
 }
 
 /// Hands every record file of `folder` with a `wanted` name to `take`, and before each the share of
-/// their bytes that is read to `reach`; gives what could not be read.
-fn read_files(
+/// their bytes that lies before it to `reach`; gives what could not be read.
+pub(super) fn each_file(
     folder: &Path,
     wanted: &dyn Fn(&str) -> bool,
     reach: &dyn Fn(f64),
-    take: &mut dyn FnMut(RecordFile),
+    take: &mut dyn FnMut(&Path) -> Result<(), RecordFileError>,
 ) -> Result<Vec<String>, AnalysisError> {
     let failed = |source| AnalysisError::Folder {
         folder: folder.to_owned(),
@@ -426,21 +382,19 @@ fn read_files(
     let mut paths: Vec<PathBuf> = fs::read_dir(folder)
         .and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect())
         .map_err(failed)?;
-    // By name, so that the instances of a restarted process come in order.
-    paths.sort();
+    sort_by_start(&mut paths);
     paths.retain(|path| {
         let name = path.file_name().unwrap_or_default();
         wanted(&name.to_string_lossy())
     });
-    let size = |path: &PathBuf| fs::metadata(path).map_or(0, |file| file.len());
-    let all_bytes: u64 = paths.iter().map(size).sum();
+    let all_bytes: u64 = paths.iter().map(|path| file_bytes(path)).sum();
     let mut read_bytes = 0;
     let mut problems = Vec::new();
     for path in paths {
         reach(read_bytes as f64 / all_bytes.max(1) as f64);
-        read_bytes += size(&path);
-        match RecordFile::read(&path) {
-            Ok(file) => take(file),
+        read_bytes += file_bytes(&path);
+        match take(&path) {
+            Ok(()) => {}
             // A process killed while it opened its files leaves one without a header.
             Err(error @ RecordFileError::Malformed { offset: 0, .. }) => {
                 problems.push(format!("{error}; left out"));
@@ -449,10 +403,6 @@ fn read_files(
         }
     }
     Ok(problems)
-}
-
-fn extend<T>(records: &mut Option<Vec<T>>, more: impl Iterator<Item = T>) {
-    records.get_or_insert_default().extend(more);
 }
 
 /// The times in which a process on the channel's way was not there.

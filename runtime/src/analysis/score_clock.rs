@@ -139,7 +139,7 @@ mod tests {
         let mut log = log(&[("command", 2), ("status", 2), ("status", 12)]);
         assert_eq!(bring(&mut log, &clocks(), ("command", &host_of)), None);
         assert!(log.has_one_clock());
-        let at_ns = log.raw("status")[0].envelope.published_ns;
+        let at_ns = log.raw("status").first().unwrap().envelope.published_ns;
         assert!(at_ns.abs_diff(2 * SECOND) <= log.clock_bound_ns());
         // Eight seconds of 200 ppm.
         assert!(log.clock_bound_ns() >= 1_600_000);

@@ -3,9 +3,10 @@
 //! waited for them would count as vanished. It looks at the last sign of life in the records.
 
 use hil_models::measure::account::{FLIGHT_TIME_MAX, Interruption, PathProcess};
-use hil_models::measure::record::UNAVAILABLE;
+use hil_models::measure::record::{IngressRecord, PublishedRecord, UNAVAILABLE};
 use hil_models::time::{Instant, duration_ns};
 
+use super::channel_files::all;
 use super::records::RunRecords;
 use crate::supervisor::RunResult;
 use crate::supervisor::plan::gateway_name;
@@ -22,8 +23,10 @@ pub(super) fn at_end(
     let Some(files) = records.channels.get(&channel.name) else {
         return found;
     };
-    let published = files.published.iter().flatten();
-    let published: Vec<i64> = published.map(|record| record.published_ns).collect();
+    let published = || {
+        let records = all::<PublishedRecord>(files.published.as_ref());
+        records.map(|record| record.published_ns)
+    };
     let host_of = |process: &str| Some(topology.process(process)?.host.as_str());
     let is_crossing = topology.crossing(channel).is_some();
     if let Some(link) = channel.link.as_deref().filter(|_| is_crossing)
@@ -35,21 +38,26 @@ pub(super) fn at_end(
             place: PathProcess::SendingGateway,
             last_sign_ns: gateway_sign(records, topology, (link, host)),
         };
-        found.extend(stall.interruption(result, host, &published));
+        found.extend(stall.interruption(result, host, &mut published()));
     }
     if let Some(consumer) = channel.to.as_deref()
         && let Some(host) = host_of(consumer)
         && files.taken.is_some()
     {
-        let forwarded = files.ingress.iter().flatten();
-        let forwarded: Vec<i64> = forwarded.map(|record| record.forwarded_ns).collect();
+        let forwarded = || {
+            let records = all::<IngressRecord>(files.ingress.as_ref());
+            records.map(|record| record.forwarded_ns)
+        };
         let stall = Stall {
             process: consumer.to_owned(),
             place: PathProcess::Consumer,
             last_sign_ns: component_sign(records, topology, consumer),
         };
-        let came = if is_crossing { &forwarded } else { &published };
-        found.extend(stall.interruption(result, host, came));
+        found.extend(if is_crossing {
+            stall.interruption(result, host, &mut forwarded())
+        } else {
+            stall.interruption(result, host, &mut published())
+        });
     }
     found
 }
@@ -63,13 +71,18 @@ struct Stall {
 
 impl Stall {
     /// `came_ns`: when what it should have taken was there for it.
-    fn interruption(self, result: &RunResult, host: &str, came_ns: &[i64]) -> Option<Interruption> {
+    fn interruption(
+        self,
+        result: &RunResult,
+        host: &str,
+        came_ns: &mut dyn Iterator<Item = i64>,
+    ) -> Option<Interruption> {
         let (start, end) = *result.spans.get(host)?;
         let from_ns = self.last_sign_ns.unwrap_or(start.as_ns());
         // What came last may be under way at the end of any run.
         let until_ns = end.as_ns().saturating_sub(duration_ns(FLIGHT_TIME_MAX));
-        let mut waited = came_ns.iter().filter(|at_ns| **at_ns != UNAVAILABLE);
-        waited.find(|at_ns| (from_ns..until_ns).contains(*at_ns))?;
+        let mut waited = came_ns.filter(|at_ns| *at_ns != UNAVAILABLE);
+        waited.find(|at_ns| (from_ns..until_ns).contains(at_ns))?;
         let from = Instant::from_ns(from_ns);
         let silent_ms = end.ns_since(from) / 1_000_000;
         Some(Interruption {
@@ -96,14 +109,11 @@ fn gateway_sign(
     let of_link = topology.channels().iter();
     let of_link = of_link.filter(|channel| channel.link.as_deref() == Some(link));
     let signs = of_link.filter_map(|channel| {
-        let files = records.channels.get(&channel.name)?;
-        let sent = files.egress.iter().flatten().map(|record| record.taken_ns);
-        let received = files.ingress.iter().flatten();
-        let received = received.map(|record| record.received_ns);
+        let signs = &records.channels.get(&channel.name)?.signs;
         if is_there(&channel.from) {
-            sent.max()
+            signs.sent_ns
         } else if channel.to.as_deref().is_some_and(is_there) {
-            received.max()
+            signs.received_ns
         } else {
             None
         }
@@ -114,13 +124,10 @@ fn gateway_sign(
 /// When a component last published or took a message of any channel.
 fn component_sign(records: &RunRecords, topology: &Topology, process: &str) -> Option<i64> {
     let signs = topology.channels().iter().filter_map(|channel| {
-        let files = records.channels.get(&channel.name)?;
-        let published = files.published.iter().flatten();
-        let published = published.map(|record| record.published_ns);
-        let published = published.filter(|_| channel.from == process);
-        let taken = files.taken.iter().flatten().map(|record| record.taken_ns);
-        let taken = taken.filter(|_| channel.to.as_deref() == Some(process));
-        published.chain(taken).max()
+        let signs = &records.channels.get(&channel.name)?.signs;
+        let published_ns = signs.published_ns.filter(|_| channel.from == process);
+        let is_taker = channel.to.as_deref() == Some(process);
+        published_ns.max(signs.taken_ns.filter(|_| is_taker))
     });
     signs.max()
 }

@@ -196,11 +196,11 @@ impl ChannelTail {
             _ => None,
         };
         let records = ChannelRecords {
-            published: published.as_deref(),
-            egress: egress.as_deref(),
-            ingress: ingress.as_deref(),
-            follow_up: follow_up.as_deref(),
-            taken: taken.as_deref(),
+            published: published.as_ref().map(|records| records as _),
+            egress: egress.as_ref().map(|records| records as _),
+            ingress: ingress.as_ref().map(|records| records as _),
+            follow_up: follow_up.as_ref().map(|records| records as _),
+            taken: taken.as_ref().map(|records| records as _),
         };
         account(&records, context)
     }

@@ -163,7 +163,7 @@ mod tests {
         let file = RecordFile::read(&folder.join("fleet.truth.message.robots.0.rec")).unwrap();
         let mut log = RunLog::default();
         file.append_messages(&mut log);
-        let logged = log.raw("fleet/truth");
+        let logged = log.raw("fleet/truth").held().unwrap();
         let envelopes: Vec<_> = logged.iter().map(|one| one.envelope).collect();
         for (sequence, envelope) in (0_u64..).zip(&envelopes) {
             assert_eq!((envelope.sequence, envelope.epoch), (sequence, 3));

@@ -1,6 +1,8 @@
 //! How well the hosts kept an emulated link: the delay that the model asked for beside the delay
 //! that the gateway gave, and what it had no room for. It judges the emulation, not the model.
 
+use core::borrow::Borrow;
+
 use hil_models::measure::histogram::{LatencyHistogram, LatencySummary};
 use hil_models::measure::record::{IngressRecord, UNAVAILABLE};
 use serde::{Deserialize, Serialize};
@@ -28,16 +30,20 @@ pub struct EmulationFigures {
 
 impl EmulationFigures {
     /// The figures of a channel's arrivals; `None` when no link model took any.
-    pub fn of(records: &[IngressRecord], overflow_count: Option<u64>) -> Option<Self> {
+    pub fn of(
+        records: impl IntoIterator<Item = impl Borrow<IngressRecord>>,
+        overflow_count: Option<u64>,
+    ) -> Option<Self> {
         let (mut requested, mut achieved, mut error) = (
             LatencyHistogram::default(),
             LatencyHistogram::default(),
             LatencyHistogram::default(),
         );
-        let is_emulated = |record: &&IngressRecord| {
-            record.emulated_ns != UNAVAILABLE && record.due_ns != UNAVAILABLE
-        };
-        for record in records.iter().filter(is_emulated) {
+        for record in records {
+            let record = record.borrow();
+            if record.emulated_ns == UNAVAILABLE || record.due_ns == UNAVAILABLE {
+                continue;
+            }
             // Copied out: a record's fields may not be borrowed where it is packed.
             let (taken, due, back) = (record.emulated_ns, record.due_ns, record.received_ns);
             requested.record(due.saturating_sub(taken));
@@ -92,7 +98,7 @@ mod tests {
 
     #[test]
     fn requested_and_achieved_delay_differ_by_the_scheduling_error() {
-        let figures = EmulationFigures::of(&records(|_| 40_000), Some(0)).unwrap();
+        let figures = EmulationFigures::of(records(|_| 40_000), Some(0)).unwrap();
         assert_eq!(figures.scheduling_error.max_ns, 40_000);
         let close = |found: i64, expected: i64| (found - expected).abs() <= expected / 900;
         assert!(close(figures.requested.p50_ns, 15_000_000));
@@ -105,18 +111,18 @@ mod tests {
     fn a_late_host_and_a_full_one_did_not_keep_the_link() {
         // The delays span 10 ms, so a tenth of that is 1 ms: one in fifty is later.
         let late = |index: i64| if index % 50 == 0 { 1_200_000 } else { 0 };
-        let figures = EmulationFigures::of(&records(late), Some(0)).unwrap();
+        let figures = EmulationFigures::of(records(late), Some(0)).unwrap();
         assert_eq!(figures.error_max_ns, ERROR_FLOOR_NS);
         assert!(!figures.is_kept(), "{figures:?}");
         // One in two hundred does not reach the 99th percentile.
         let rarely = |index: i64| if index % 200 == 0 { 1_200_000 } else { 0 };
         assert!(
-            EmulationFigures::of(&records(rarely), None)
+            EmulationFigures::of(records(rarely), None)
                 .unwrap()
                 .is_kept()
         );
         assert!(
-            !EmulationFigures::of(&records(|_| 0), Some(1))
+            !EmulationFigures::of(records(|_| 0), Some(1))
                 .unwrap()
                 .is_kept()
         );
@@ -124,7 +130,7 @@ mod tests {
 
     #[test]
     fn a_run_whose_emulated_link_was_not_kept_blames_neither_network_nor_model() {
-        let late = EmulationFigures::of(&records(|_| 3_000_000), Some(7));
+        let late = EmulationFigures::of(records(|_| 3_000_000), Some(7));
         let mut run = summary(recorded_channel());
         run.channels.push(ChannelSummary {
             name: "arm/command".to_owned(),
@@ -153,7 +159,7 @@ mod tests {
         );
         let again = RunSummary::from_json(&run.to_json().unwrap()).unwrap();
         assert_eq!(again.channels[1].emulation, late);
-        run.channels[1].emulation = EmulationFigures::of(&records(|_| 0), Some(0));
+        run.channels[1].emulation = EmulationFigures::of(records(|_| 0), Some(0));
         assert_eq!(Assessment::of(&run).network, NetworkVerdict::EmulatedLink);
     }
 
@@ -180,6 +186,6 @@ mod tests {
             (record.emulated_ns, record.due_ns) = (UNAVAILABLE, UNAVAILABLE);
         }
         assert_eq!(EmulationFigures::of(&real, Some(0)), None);
-        assert_eq!(EmulationFigures::of(&[], None), None);
+        assert_eq!(EmulationFigures::of(&real[..0], None), None);
     }
 }

@@ -93,7 +93,7 @@ pub(super) fn network(names: [&str; 2], events: &mut ScoreEvents) -> NetworkRepo
         builder.add(ChannelPassages {
             channel: name,
             hosts: ["control-pc", "robot-pc"],
-            passages: &passages(index as u64, index == 0),
+            passages: &passages(index as u64, index == 0).into_iter().collect(),
             other_events: vec![down],
             duration_ns: RUN_NS,
             place: &|at: Moment| Some(at.ns),

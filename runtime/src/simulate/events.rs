@@ -116,7 +116,8 @@ fn is_lost(published_ns: i64, outages: &[Outage]) -> bool {
 /// When `message` was published. A producer numbers its messages in order, and in virtual time it
 /// never starts anew.
 fn published_ns(message: &MessageRef, log: &RunLog) -> Option<i64> {
-    let messages = log.raw(message.channel);
+    // A simulation holds its messages.
+    let messages = log.raw(message.channel).held()?;
     let key = |logged: &LoggedMessage| (logged.envelope.epoch, logged.envelope.sequence);
     let wanted = (message.epoch, message.sequence);
     let index = messages.binary_search_by_key(&wanted, key).ok()?;
@@ -154,7 +155,7 @@ mod tests {
             };
             log.push("shuttle/command", envelope, &[]);
         }
-        let named = log.raw("shuttle/command")[1_005].envelope;
+        let named = log.raw("shuttle/command").held().unwrap()[1_005].envelope;
         let early = Instant::from_ns(9_900_000_000);
         let early = ScoreEvent::new(Severity::Hazard, early, "shuttle/status", "held");
         score.add_event(early.naming(MessageRef::of("shuttle/command", &named)));

@@ -27,6 +27,7 @@ pub(super) fn of_simulation(
     for (name, watch) in watches {
         let crossing = topology.crossings().find(|one| one.channel.name == name)?;
         let (passages, duplicated_count) = watch.passages();
+        let passages = passages.into_iter().collect();
         let payload = log.raw(&name).first();
         builder.add(ChannelPassages {
             channel: &name,

@@ -1,14 +1,13 @@
 //! The traces a run leaves: one file for each channel that crossed a link, drawn up from the
 //! records after the run. A trace that cannot be written costs the run nothing but that file.
 
-use std::fs;
+use std::fs::{self, File};
+use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
-use hil_models::measure::account::TraceChannel;
-use hil_models::trace::wire;
-use hil_models::trace::{
-    Trace, TraceArrival, TraceDirection, TraceHeader, TraceRecord, UNAVAILABLE_NS,
-};
+use hil_models::measure::account::{TraceChannel, each_traced, link_trace};
+use hil_models::trace::wire::TraceEncoder;
+use hil_models::trace::{TraceArrival, TraceDirection, TraceHeader, TraceRecord, UNAVAILABLE_NS};
 
 use crate::analysis::link_changes;
 use crate::analysis::records::RunRecords;
@@ -64,30 +63,115 @@ fn write_one(
         size_bytes: u32::try_from(channel.message.size_bytes).unwrap_or(u32::MAX),
         is_emulated: matches!(crossing.link.via, Via::Emulated(..)),
     };
-    let found = records.link_trace(run, channel, traced);
-    let found = found.map_err(|error| error.to_string())?;
-    if found.is_empty() {
-        return Ok(false);
-    }
-    let trace = Trace {
-        header: TraceHeader {
+    records.consult(run, channel, |files, context| {
+        let mut seen = Seen::default();
+        each_traced(files, context, traced, |record| seen.note(&record))
+            .map_err(|error| error.to_string())?;
+        if seen.count == 0 {
+            return Ok(false);
+        }
+        let header = TraceHeader {
             link: link_words(run.0, crossing, records),
-            ..header(run.1, crossing, &found)
-        },
-        records: found,
-    };
-    let bytes = wire::encode(&trace).map_err(|error| error.to_string())?;
-    fs::create_dir_all(folder).map_err(|error| format!("{}: {error}", folder.display()))?;
-    let path = folder.join(file_name(&channel.name));
-    fs::write(&path, bytes).map_err(|error| format!("{}: {error}", path.display()))?;
-    Ok(true)
+            ..header(run.1, crossing, seen.has_delay)
+        };
+        fs::create_dir_all(folder).map_err(|error| format!("{}: {error}", folder.display()))?;
+        let path = folder.join(file_name(&channel.name));
+        let mut file = TraceFile::create(&path, &header, seen.count)?;
+        if seen.is_out_of_order {
+            // Only where two starts of a producer overlap; sorting needs all of them at once.
+            let found = link_trace(files, context, traced).map_err(|error| error.to_string())?;
+            for record in &found {
+                file.add(record);
+            }
+        } else {
+            each_traced(files, context, traced, |record| file.add(&record))
+                .map_err(|error| error.to_string())?;
+        }
+        file.finish()?;
+        Ok(true)
+    })
 }
 
-fn header(result: &RunResult, crossing: &Crossing<'_>, records: &[TraceRecord]) -> TraceHeader {
+/// What must be known of a trace before it is written.
+#[derive(Default)]
+struct Seen {
+    count: usize,
+    has_delay: bool,
+    is_out_of_order: bool,
+    last_ns: Option<i64>,
+}
+
+impl Seen {
+    fn note(&mut self, record: &TraceRecord) {
+        let is_earlier = |last_ns: i64| record.published_ns < last_ns;
+        self.is_out_of_order |= self.last_ns.is_some_and(is_earlier);
+        self.has_delay |= record.delay().is_some();
+        self.count += 1;
+        self.last_ns = Some(record.published_ns);
+    }
+}
+
+/// A trace under way to its file, which is not left half written.
+struct TraceFile<'a> {
+    path: &'a Path,
+    encoder: TraceEncoder,
+    file: BufWriter<File>,
+    fault: Option<String>,
+}
+
+impl<'a> TraceFile<'a> {
+    fn create(path: &'a Path, header: &TraceHeader, count: usize) -> Result<Self, String> {
+        let (encoder, bytes) =
+            TraceEncoder::new(header, count).map_err(|error| error.to_string())?;
+        let failed = |error: io::Error| format!("{}: {error}", path.display());
+        let mut trace = Self {
+            path,
+            encoder,
+            file: BufWriter::new(File::create(path).map_err(failed)?),
+            fault: None,
+        };
+        trace.write(&bytes);
+        Ok(trace)
+    }
+
+    /// Writes the next record, unless one before could not be written.
+    fn add(&mut self, record: &TraceRecord) {
+        if self.fault.is_some() {
+            return;
+        }
+        match self.encoder.record(record) {
+            Ok(bytes) => self.write(&bytes),
+            Err(error) => self.fault = Some(error.to_string()),
+        }
+    }
+
+    fn write(&mut self, bytes: &[u8]) {
+        if let Err(error) = self.file.write_all(bytes) {
+            self.fault = Some(format!("{}: {error}", self.path.display()));
+        }
+    }
+
+    fn finish(mut self) -> Result<(), String> {
+        if self.fault.is_none()
+            && let Err(error) = self.file.flush()
+        {
+            self.fault = Some(format!("{}: {error}", self.path.display()));
+        }
+        let Some(fault) = self.fault else {
+            return Ok(());
+        };
+        match fs::remove_file(self.path) {
+            Ok(()) => Err(fault),
+            Err(error) => Err(format!("{fault}; what is there of it stays: {error}")),
+        }
+    }
+}
+
+fn header(result: &RunResult, crossing: &Crossing<'_>, has_delay: bool) -> TraceHeader {
     let span = result.spans.get(&crossing.from_host.name);
     let clock = if result.has_one_clock {
         "one clock"
-    } else if records.iter().any(|record| record.delay().is_some()) {
+    } else if has_delay {
         "two clocks, aligned within the bound of each record"
     } else {
         NOT_ALIGNED

@@ -64,7 +64,7 @@ impl<'a> Judge<'a> {
     }
 
     /// The fate of one message; remembers what its interruption cost.
-    pub(super) fn judge(&mut self, joined: &Joined<'_>) -> MessageFate {
+    pub(super) fn judge(&mut self, joined: &Joined) -> MessageFate {
         let place = Place::of(joined);
         let fate = self.fate(joined, place);
         self.previous_producer_ns = place.producer_ns.or(self.previous_producer_ns);
@@ -93,7 +93,7 @@ impl<'a> Judge<'a> {
             .collect()
     }
 
-    fn fate(&mut self, joined: &Joined<'_>, place: Place) -> MessageFate {
+    fn fate(&mut self, joined: &Joined, place: Place) -> MessageFate {
         self.last_hit = None;
         if joined.taken.is_some() {
             return MessageFate::Taken;
@@ -117,9 +117,9 @@ impl<'a> Judge<'a> {
         }
     }
 
-    fn fate_over_gateway(&self, joined: &Joined<'_>, place: Place) -> MessageFate {
+    fn fate_over_gateway(&self, joined: &Joined, place: Place) -> MessageFate {
         if let Some(ingress) = joined.ingress {
-            return self.fate_after_reception(joined, ingress);
+            return self.fate_after_reception(joined, &ingress);
         }
         if let Some(egress) = joined.egress {
             if egress.flags & EgressRecord::REFUSED_BY_KERNEL != 0 {
@@ -145,7 +145,7 @@ impl<'a> Judge<'a> {
         self.in_flight_or_unexplained(place.producer_ns, self.producer_end_ns)
     }
 
-    fn fate_after_reception(&self, joined: &Joined<'_>, ingress: &IngressRecord) -> MessageFate {
+    fn fate_after_reception(&self, joined: &Joined, ingress: &IngressRecord) -> MessageFate {
         if let Some(forwarded_ns) = stamp(ingress.forwarded_ns) {
             return self.fate_at_consumer(joined, Some(forwarded_ns), self.consumer_end_ns);
         }
@@ -160,7 +160,7 @@ impl<'a> Judge<'a> {
 
     fn fate_at_consumer(
         &self,
-        joined: &Joined<'_>,
+        joined: &Joined,
         arrived_ns: Option<i64>,
         end_ns: Option<i64>,
     ) -> MessageFate {
@@ -189,7 +189,7 @@ impl<'a> Judge<'a> {
     }
 
     /// True when the message could have been in or before the interrupted process.
-    fn is_within_reach(&self, joined: &Joined<'_>, interruption: &Interruption) -> bool {
+    fn is_within_reach(&self, joined: &Joined, interruption: &Interruption) -> bool {
         if !self.is_gateway {
             return true;
         }
@@ -275,7 +275,7 @@ struct Place {
 }
 
 impl Place {
-    fn of(joined: &Joined<'_>) -> Self {
+    fn of(joined: &Joined) -> Self {
         let published = joined
             .published
             .and_then(|record| stamp(record.published_ns));

@@ -5,9 +5,11 @@ use std::collections::BTreeMap;
 
 use super::figures::{BurstCount, Gap, Gaps};
 use super::join::{Key, stamp};
+use super::source::each;
 use super::stage::{MessageFate, Side};
 use super::{AccountContext, ChannelRecords, Interruption};
 use crate::measure::histogram::LatencyHistogram;
+use crate::measure::in_order::in_order;
 
 /// Counts runs of successive losses; anything else, and a restart of the producer, ends a run.
 #[derive(Debug, Default)]
@@ -62,24 +64,24 @@ pub(super) fn gaps(
 ) -> (Gaps, Vec<Option<Gap>>) {
     let run = context.consumer_run;
     let start_ns = run.map_or(0, |run| run.start.as_ns());
-    let mut all: Vec<TakenAt> = records
-        .taken
-        .unwrap_or_default()
-        .iter()
-        .filter_map(|record| {
-            Some(TakenAt {
+    let read = || {
+        each(records.taken).filter_map(|record| {
+            let at = TakenAt {
                 taken_ns: stamp(record.taken_ns)?,
                 published_ns: record.published_ns,
                 sequence: record.sequence,
-            })
+            };
+            Some((at, ()))
         })
-        .collect();
-    all.sort_unstable();
+    };
     let mut histogram = LatencyHistogram::default();
     let (mut longest, mut longest_unattributed) = (None, None);
     let mut of_interruption = vec![None; context.interruptions.len()];
-    for pair in all.windows(2) {
-        let [before, after] = [pair[0], pair[1]];
+    let mut last: Option<TakenAt> = None;
+    for (after, ()) in in_order(read) {
+        let Some(before) = last.replace(after) else {
+            continue;
+        };
         let length_ns = after.taken_ns.saturating_sub(before.taken_ns);
         histogram.record(length_ns);
         let mut gap = Gap {
@@ -99,7 +101,7 @@ pub(super) fn gaps(
             keep_longer(&mut longest_unattributed, gap);
         }
     }
-    let tail_ns = |last: &TakenAt| Some(run?.end.as_ns().saturating_sub(last.taken_ns));
+    let tail_ns = |last: TakenAt| Some(run?.end.as_ns().saturating_sub(last.taken_ns));
     let reason = if records.taken.is_some() {
         "fewer than two messages were taken"
     } else {
@@ -109,7 +111,7 @@ pub(super) fn gaps(
         between_taken: histogram.distribution(reason),
         longest,
         longest_unattributed,
-        last_taken_to_run_end_ns: all.last().and_then(tail_ns),
+        last_taken_to_run_end_ns: last.and_then(tail_ns),
     };
     (gaps, of_interruption)
 }

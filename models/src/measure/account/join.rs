@@ -2,8 +2,12 @@
 //! keys, not fates.
 
 use std::collections::BTreeMap;
+use std::rc::Rc;
 
-use super::ChannelRecords;
+use super::follow_up::FollowUps;
+use super::source::each;
+use super::{ChannelRecords, RecordSource};
+use crate::measure::in_order::{InOrder, in_order};
 use crate::measure::record::{
     EgressRecord, IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE,
 };
@@ -17,18 +21,18 @@ pub(super) struct Key {
 
 /// Everything recorded about one message.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Joined<'a> {
+pub(super) struct Joined {
     pub(super) key: Key,
     /// 1, or the length of a run of sequence numbers that no file mentions.
     pub(super) count: u64,
-    pub(super) published: Option<&'a PublishedRecord>,
-    pub(super) egress: Option<&'a EgressRecord>,
-    pub(super) ingress: Option<&'a IngressRecord>,
-    pub(super) taken: Option<&'a TakenRecord>,
+    pub(super) published: Option<PublishedRecord>,
+    pub(super) egress: Option<EgressRecord>,
+    pub(super) ingress: Option<IngressRecord>,
+    pub(super) taken: Option<TakenRecord>,
     pub(super) handed_to_tx_ns: Option<i64>,
 }
 
-impl Joined<'_> {
+impl Joined {
     const fn empty(key: Key, count: u64) -> Self {
         Self {
             key,
@@ -77,28 +81,34 @@ struct Epochs {
 }
 
 impl Epochs {
-    fn see<R: Keyed>(&mut self, records: Option<&[R]>) {
-        let mut current: Option<(u32, i64)> = None;
-        for record in records.unwrap_or_default() {
+    /// Gives the last key of the records: start of the producer, not yet its rank, and number.
+    fn see<R: Keyed>(&mut self, source: Option<&dyn RecordSource<R>>) -> LastOfEpochs {
+        let mut last = LastOfEpochs::new();
+        let mut current: Option<(u32, i64, u64)> = None;
+        for record in each(source) {
             let published_ns = stamp(record.published_ns()).unwrap_or(i64::MAX);
-            // Runs of one epoch touch the map once.
+            // Runs of one epoch touch the maps once.
             match &mut current {
-                Some((epoch, first_ns)) if *epoch == record.epoch() => {
+                Some((epoch, first_ns, highest)) if *epoch == record.epoch() => {
                     *first_ns = (*first_ns).min(published_ns);
+                    *highest = (*highest).max(record.sequence());
                 }
                 _ => {
-                    self.note(current);
-                    current = Some((record.epoch(), published_ns));
+                    self.note(current, &mut last);
+                    current = Some((record.epoch(), published_ns, record.sequence()));
                 }
             }
         }
-        self.note(current);
+        self.note(current, &mut last);
+        last
     }
 
-    fn note(&mut self, run: Option<(u32, i64)>) {
-        if let Some((epoch, published_ns)) = run {
+    fn note(&mut self, run: Option<(u32, i64, u64)>, last: &mut LastOfEpochs) {
+        if let Some((epoch, published_ns, highest)) = run {
             let first_ns = self.first_published_ns.entry(epoch).or_insert(i64::MAX);
             *first_ns = (*first_ns).min(published_ns);
+            let known = last.entry(epoch).or_insert(highest);
+            *known = (*known).max(highest);
         }
     }
 
@@ -114,28 +124,29 @@ impl Epochs {
     }
 }
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-struct Entry {
-    key: Key,
-    index: u32,
+/// The highest number of each start of the producer in one file.
+type LastOfEpochs = BTreeMap<u32, u64>;
+
+/// The place of the last of them.
+fn last_key(last: &LastOfEpochs, ranks: &BTreeMap<u32, u32>) -> Option<Key> {
+    let keys = last.iter().map(|(epoch, sequence)| Key {
+        epoch_rank: ranks[epoch],
+        sequence: *sequence,
+    });
+    keys.max()
 }
 
-/// One file in key order, read group by group.
-#[derive(Debug)]
+/// The records of one file in key order, read group by group.
 struct Cursor<'a, R> {
-    records: &'a [R],
-    entries: Vec<Entry>,
-    position: usize,
+    order: InOrder<Key, R, Box<dyn Iterator<Item = (Key, R)> + 'a>>,
 }
 
-impl<'a, R: Keyed> Cursor<'a, R> {
-    fn new(records: Option<&'a [R]>, ranks: &BTreeMap<u32, u32>) -> Self {
-        let records = records.unwrap_or_default();
-        let mut current: Option<(u32, u32)> = None;
-        let mut entries: Vec<Entry> = records
-            .iter()
-            .zip(0_u32..)
-            .map(|(record, index)| {
+impl<'a, R: Keyed + 'a> Cursor<'a, R> {
+    fn new(source: Option<&'a dyn RecordSource<R>>, ranks: &Rc<BTreeMap<u32, u32>>) -> Self {
+        let read = || -> Box<dyn Iterator<Item = (Key, R)> + 'a> {
+            let ranks = Rc::clone(ranks);
+            let mut current: Option<(u32, u32)> = None;
+            Box::new(each(source).map(move |record| {
                 let epoch = record.epoch();
                 let epoch_rank = match current {
                     Some((known, rank)) if known == epoch => rank,
@@ -147,104 +158,44 @@ impl<'a, R: Keyed> Cursor<'a, R> {
                     epoch_rank,
                     sequence,
                 };
-                Entry { key, index }
-            })
-            .collect();
-        entries.sort_unstable();
-        Self {
-            records,
-            entries,
-            position: 0,
-        }
-    }
-
-    fn head(&self) -> Option<Key> {
-        self.entries.get(self.position).map(|entry| entry.key)
-    }
-
-    fn last(&self) -> Option<Key> {
-        self.entries.last().map(|entry| entry.key)
-    }
-
-    /// The records of `key`, in the order written; passes over them.
-    fn take(&mut self, key: Key) -> impl Iterator<Item = &'a R> + use<'_, 'a, R> {
-        let start = self.position;
-        while self.head() == Some(key) {
-            self.position += 1;
-        }
-        let group = &self.entries[start..self.position];
-        group
-            .iter()
-            .map(|entry| &self.records[entry.index as usize])
-    }
-}
-
-/// Transmit stamps reported by the sender, found by its session.
-#[derive(Debug, Default)]
-struct FollowUps {
-    entries: Vec<(u32, u64, i64)>,
-    /// Sequence numbers up to this occur in more than one epoch of the session, so a stamp for
-    /// them could belong to either message.
-    ambiguous_to: BTreeMap<u32, u64>,
-}
-
-impl FollowUps {
-    fn new(records: &ChannelRecords<'_>) -> Self {
-        let Some(follow_up) = records.follow_up else {
-            return Self::default();
+                (key, record)
+            }))
         };
-        let mut entries: Vec<_> = follow_up
-            .iter()
-            .map(|record| (record.session, record.sequence, record.handed_to_tx_ns))
-            .collect();
-        entries.sort_unstable();
-        let mut highest: BTreeMap<(u32, u32), u64> = BTreeMap::new();
-        for record in records.ingress.unwrap_or_default() {
-            let entry = highest.entry((record.session, record.epoch)).or_insert(0);
-            *entry = (*entry).max(record.sequence);
-        }
-        let mut tops: BTreeMap<u32, Vec<u64>> = BTreeMap::new();
-        for ((session, _), sequence) in highest {
-            tops.entry(session).or_default().push(sequence);
-        }
-        let ambiguous_to = tops
-            .into_iter()
-            .filter_map(|(session, mut sequences)| {
-                sequences.sort_unstable_by(|a, b| b.cmp(a));
-                sequences.get(1).map(|second| (session, *second))
-            })
-            .collect();
         Self {
-            entries,
-            ambiguous_to,
+            order: in_order(read),
         }
     }
 
-    fn find(&self, session: u32, sequence: u64) -> Option<i64> {
-        if self
-            .ambiguous_to
-            .get(&session)
-            .is_some_and(|to| sequence <= *to)
-        {
+    fn head(&mut self) -> Option<Key> {
+        self.order.head()
+    }
+
+    /// The next record of `key`, in the order written; passes over it.
+    fn next_of(&mut self, key: Key) -> Option<R> {
+        if self.head() != Some(key) {
             return None;
         }
-        let wanted = (session, sequence);
-        let start = self
-            .entries
-            .partition_point(|entry| (entry.0, entry.1) < wanted);
-        let found = self.entries.get(start)?;
-        ((found.0, found.1) == wanted).then_some(found.2)
+        self.order.next().map(|(_, record)| record)
+    }
+
+    /// The first record of `key`; passes over all of them.
+    fn first_of(&mut self, key: Key) -> Option<R> {
+        let first = self.next_of(key);
+        while self.next_of(key).is_some() {}
+        first
     }
 }
 
-/// All messages of a channel in key order, with the runs nobody mentions between them.
-#[derive(Debug)]
+/// All messages of a channel in key order, with the runs nobody mentions between them. It reads the
+/// records from their source three times and holds few of them.
 pub(super) struct Join<'a> {
     published: Cursor<'a, PublishedRecord>,
     egress: Cursor<'a, EgressRecord>,
     ingress: Cursor<'a, IngressRecord>,
     taken: Cursor<'a, TakenRecord>,
     follow_ups: FollowUps,
+    last_egress: Option<Key>,
+    last_taken: Option<Key>,
     epoch_count: u64,
     next: Key,
 }
@@ -253,16 +204,18 @@ impl<'a> Join<'a> {
     pub(super) fn new(records: &ChannelRecords<'a>) -> Self {
         let mut epochs = Epochs::default();
         epochs.see(records.published);
-        epochs.see(records.egress);
+        let egress = epochs.see(records.egress);
         epochs.see(records.ingress);
-        epochs.see(records.taken);
-        let ranks = epochs.ranks();
+        let taken = epochs.see(records.taken);
+        let ranks = Rc::new(epochs.ranks());
         Self {
             published: Cursor::new(records.published, &ranks),
             egress: Cursor::new(records.egress, &ranks),
             ingress: Cursor::new(records.ingress, &ranks),
             taken: Cursor::new(records.taken, &ranks),
             follow_ups: FollowUps::new(records),
+            last_egress: last_key(&egress, &ranks),
+            last_taken: last_key(&taken, &ranks),
             epoch_count: ranks.len() as u64,
             next: Key {
                 epoch_rank: 0,
@@ -277,19 +230,19 @@ impl<'a> Join<'a> {
     }
 
     /// The last message the sending gateway took.
-    pub(super) fn last_egress(&self) -> Option<Key> {
-        self.egress.last()
+    pub(super) const fn last_egress(&self) -> Option<Key> {
+        self.last_egress
     }
 
     /// The last message the consumer took.
-    pub(super) fn last_taken(&self) -> Option<Key> {
-        self.taken.last()
+    pub(super) const fn last_taken(&self) -> Option<Key> {
+        self.last_taken
     }
 
-    fn gather(&mut self, key: Key) -> Joined<'a> {
+    fn gather(&mut self, key: Key) -> Joined {
         let mut joined = Joined::empty(key, 1);
-        joined.published = self.published.take(key).next();
-        for record in self.ingress.take(key) {
+        joined.published = self.published.first_of(key);
+        while let Some(record) = self.ingress.next_of(key) {
             // The copy that was forwarded is the message, the others are its duplicates.
             let is_better = joined.ingress.is_none_or(|best| {
                 best.forwarded_ns == UNAVAILABLE && record.forwarded_ns != UNAVAILABLE
@@ -299,7 +252,7 @@ impl<'a> Join<'a> {
             }
         }
         let session = joined.ingress.map(|record| record.session);
-        for record in self.egress.take(key) {
+        while let Some(record) = self.egress.next_of(key) {
             // A restarted gateway may send a message again; keep the sending that arrived.
             let is_better = joined.egress.is_none_or(|best| {
                 Some(best.session) != session && Some(record.session) == session
@@ -308,7 +261,7 @@ impl<'a> Join<'a> {
                 joined.egress = Some(record);
             }
         }
-        joined.taken = self.taken.take(key).next();
+        joined.taken = self.taken.first_of(key);
         if let Some(ingress) = joined.ingress {
             joined.handed_to_tx_ns = self.follow_ups.find(ingress.session, key.sequence);
         }
@@ -316,10 +269,10 @@ impl<'a> Join<'a> {
     }
 }
 
-impl<'a> Iterator for Join<'a> {
-    type Item = Joined<'a>;
+impl Iterator for Join<'_> {
+    type Item = Joined;
 
-    fn next(&mut self) -> Option<Joined<'a>> {
+    fn next(&mut self) -> Option<Joined> {
         let heads = [
             self.published.head(),
             self.egress.head(),

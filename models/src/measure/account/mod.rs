@@ -17,6 +17,7 @@
 
 mod fate;
 mod figures;
+mod follow_up;
 mod gaps;
 mod join;
 mod outage;
@@ -25,6 +26,7 @@ mod radio;
 #[cfg(test)]
 mod random_fates;
 mod segments;
+mod source;
 mod stage;
 mod story;
 #[cfg(test)]
@@ -44,10 +46,12 @@ pub use outage::{
     OutageFinder, Standing, foregoing, outages,
 };
 pub use passage::passages;
-pub(crate) use radio::{HandedFate, handed_fates};
+pub(crate) use radio::{HandedFate, each_handed};
+pub use source::RecordSource;
+pub(crate) use source::each;
 pub use stage::{MessageFate, Side, Stage};
 pub use story::{MessageStory, stories};
-pub use trace::{TRACE_MESSAGES_MAX, TooManyMessages, TraceChannel, link_trace};
+pub use trace::{TRACE_MESSAGES_MAX, TooManyMessages, TraceChannel, each_traced, link_trace};
 
 use crate::clock::{ClockMap, ClockSettings};
 use crate::measure::histogram::LatencyHistogram;
@@ -73,15 +77,15 @@ pub const FLIGHT_TIME_MAX: Duration = Duration::from_millis(50);
 #[derive(Debug, Clone, Copy, Default)]
 pub struct ChannelRecords<'a> {
     /// The producer's.
-    pub published: Option<&'a [PublishedRecord]>,
+    pub published: Option<&'a dyn RecordSource<PublishedRecord>>,
     /// The sending gateway's.
-    pub egress: Option<&'a [EgressRecord]>,
+    pub egress: Option<&'a dyn RecordSource<EgressRecord>>,
     /// The receiving gateway's.
-    pub ingress: Option<&'a [IngressRecord]>,
+    pub ingress: Option<&'a dyn RecordSource<IngressRecord>>,
     /// Transmit stamps the sender reported to the receiver.
-    pub follow_up: Option<&'a [FollowUpRecord]>,
+    pub follow_up: Option<&'a dyn RecordSource<FollowUpRecord>>,
     /// The consumer's.
-    pub taken: Option<&'a [TakenRecord]>,
+    pub taken: Option<&'a dyn RecordSource<TakenRecord>>,
 }
 
 impl ChannelRecords<'_> {
@@ -304,7 +308,8 @@ impl<'a> AccountContext<'a> {
     }
 }
 
-/// Draws up the account of one channel. Time and memory grow with the number of records.
+/// Draws up the account of one channel. Time grows with the number of records; so does memory, by the
+/// few bytes a message that exact quantiles take, unless the source holds its records itself.
 ///
 /// # Panics
 /// Never for any records; it asserts its own invariant, that the fates sum to the published
@@ -331,17 +336,23 @@ pub fn account(records: &ChannelRecords<'_>, context: &AccountContext<'_>) -> Ch
         "every published message has exactly one fate"
     );
     let (gaps, gap_of_interruption) = gaps::gaps(&records, context);
+    let flags = [
+        IngressRecord::REORDERED,
+        IngressRecord::DUPLICATE,
+        IngressRecord::LATE,
+    ];
+    let [reordered_count, duplicated_count, late_count] = flag_counts(&records, flags);
     let mut random = RandomStream::new(context.seed, "measure.account.bootstrap");
     ChannelAccount {
         published_count,
         published_unrecorded_count: records
             .published
-            .map(|published| published_count.saturating_sub(published.len() as u64)),
+            .map(|published| published_count.saturating_sub(published.count())),
         producer_restart_count,
         fates,
-        reordered_count: flag_count(&records, IngressRecord::REORDERED),
-        duplicated_count: flag_count(&records, IngressRecord::DUPLICATE),
-        late_count: flag_count(&records, IngressRecord::LATE),
+        reordered_count,
+        duplicated_count,
+        late_count,
         segments: book.segments(),
         hardware_wire: book.hardware_wire(),
         end_to_end: book.end_to_end(&mut random),
@@ -360,7 +371,7 @@ pub fn account(records: &ChannelRecords<'_>, context: &AccountContext<'_>) -> Ch
 fn each_judged(
     records: &ChannelRecords<'_>,
     context: &AccountContext<'_>,
-    mut take: impl FnMut(&join::Joined<'_>, MessageFate, Option<usize>),
+    mut take: impl FnMut(&join::Joined, MessageFate, Option<usize>),
 ) {
     let records = records.on(context.path);
     let join = join::Join::new(&records);
@@ -371,12 +382,15 @@ fn each_judged(
     }
 }
 
-fn flag_count(records: &ChannelRecords<'_>, flag: u32) -> Option<u64> {
-    let flagged = records
-        .ingress?
-        .iter()
-        .filter(|record| record.flags & flag != 0);
-    Some(flagged.count() as u64)
+/// How many arrivals have each of `flags`; `None` without the receiving gateway's records.
+fn flag_counts<const N: usize>(records: &ChannelRecords<'_>, flags: [u32; N]) -> [Option<u64>; N] {
+    let mut counts = [records.ingress.map(|_| 0_u64); N];
+    for record in each(records.ingress) {
+        for (count, flag) in counts.iter_mut().flatten().zip(flags) {
+            *count += u64::from(record.flags & flag != 0);
+        }
+    }
+    counts
 }
 
 fn round_trip(context: &AccountContext<'_>) -> crate::measure::histogram::Distribution {

@@ -139,7 +139,7 @@ impl OutageFinder {
         self.found
     }
 
-    fn see(&mut self, joined: &Joined<'_>, fate: MessageFate, interruption: Option<usize>) {
+    fn see(&mut self, joined: &Joined, fate: MessageFate, interruption: Option<usize>) {
         let published_ns = published_ns(joined);
         match fate {
             MessageFate::Taken | MessageFate::SupersededAtConsumer => {

@@ -4,20 +4,20 @@
 use super::join::{Joined, stamp};
 use super::stage::MessageFate;
 use super::{AccountContext, ChannelRecords, each_judged};
-use crate::measure::network::{Crossing, Passage};
+use crate::measure::network::{Crossing, PackedPassages, Passage};
 use crate::time::RemoteInstant;
 
-/// The passages of a channel, in the order of the producer's starts and sequence numbers. Time and
-/// memory grow with the number of records.
-pub fn passages(records: &ChannelRecords<'_>, context: &AccountContext<'_>) -> Vec<Passage> {
-    let mut found = Vec::new();
+/// The passages of a channel, in the order of the producer's starts and sequence numbers. Time grows with
+/// the number of records, and memory by about a dozen bytes a message.
+pub fn passages(records: &ChannelRecords<'_>, context: &AccountContext<'_>) -> PackedPassages {
+    let mut found = PackedPassages::default();
     each_judged(records, context, |joined, fate, _| {
-        found.push(passage(joined, fate, context));
+        found.push(&passage(joined, fate, context));
     });
     found
 }
 
-fn passage(joined: &Joined<'_>, fate: MessageFate, context: &AccountContext<'_>) -> Passage {
+fn passage(joined: &Joined, fate: MessageFate, context: &AccountContext<'_>) -> Passage {
     let crossing = match fate {
         // What happened behind the receiving gateway is not the network's.
         _ if joined.ingress.is_some() => Crossing::Arrived,
@@ -58,6 +58,7 @@ mod tests {
     use super::*;
     use crate::measure::account::ChannelPath;
     use crate::measure::account::synthetic::{Files, HANDED_NS, RECEIVED_NS, at, same_clock};
+    use crate::measure::network::Passages as _;
     use crate::time::Alignment;
 
     #[test]
@@ -76,7 +77,9 @@ mod tests {
         ]) {
             files.write(at(7, sequence), fate);
         }
-        let found = passages(&files.records(), &same_clock(1_000_000_000));
+        let found: Vec<_> = passages(&files.records(), &same_clock(1_000_000_000))
+            .each()
+            .collect();
         let crossings: Vec<_> = found.iter().map(|one| one.crossing).collect();
         assert_eq!(
             crossings,
@@ -99,7 +102,7 @@ mod tests {
     fn a_delay_between_hosts_needs_an_alignment_and_carries_its_bound() {
         let files = Files::delivered(3);
         let unaligned = AccountContext::new(ChannelPath::Gateway { alignment: None });
-        let found = passages(&files.records(), &unaligned);
+        let found: Vec<_> = passages(&files.records(), &unaligned).each().collect();
         assert!(found.iter().all(|one| one.delay_ns.is_none()));
         assert!(found.iter().all(|one| one.received_ns.is_some()));
         let alignment = Some(Alignment {
@@ -107,7 +110,7 @@ mod tests {
             bound_ns: 70,
         });
         let aligned = AccountContext::new(ChannelPath::Gateway { alignment });
-        let found = passages(&files.records(), &aligned);
+        let found: Vec<_> = passages(&files.records(), &aligned).each().collect();
         assert_eq!(found[1].delay_ns, Some(RECEIVED_NS - HANDED_NS - 500));
         assert_eq!(found[1].delay_bound_ns, 70);
     }

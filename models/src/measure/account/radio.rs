@@ -21,14 +21,15 @@ pub(crate) enum HandedFate {
     Unknown,
 }
 
-/// The sending gateway's record of every message that was handed to the kernel, with what became of it.
-pub(crate) fn handed_fates(
+/// Hands the sending gateway's record of every message that was handed to the kernel to `take`, with what
+/// became of it.
+pub(crate) fn each_handed(
     records: &ChannelRecords<'_>,
     context: &AccountContext<'_>,
-) -> Vec<(EgressRecord, HandedFate)> {
-    let mut found = Vec::new();
+    mut take: impl FnMut(&EgressRecord, HandedFate),
+) {
     each_judged(records, context, |joined, fate, _| {
-        let handed = joined.egress.filter(|record| is_handed(record));
+        let handed = joined.egress.filter(is_handed);
         let Some(egress) = handed else { return };
         let fate = match fate {
             _ if joined.ingress.is_some() => HandedFate::Arrived,
@@ -45,9 +46,8 @@ pub(crate) fn handed_fates(
             | MessageFate::Late
             | MessageFate::Duplicate => HandedFate::Lost,
         };
-        found.push((*egress, fate));
+        take(&egress, fate);
     });
-    found
 }
 
 /// True for a message that was handed to the kernel and not refused.

@@ -5,10 +5,11 @@ use super::figures::{Closing, ClosingFigures, Coverage, EndToEnd, SegmentFigures
 use super::join::{Joined, stamp};
 use super::stage::{Side, Stage};
 use super::{AccountContext, ChannelPath, ChannelRecords, ORDER_TOLERANCE_NS, RESIDUAL_LIMIT_NS};
-use crate::clock::BoundFigures;
 use crate::measure::histogram::{Distribution, LatencyHistogram};
 use crate::measure::record::EgressRecord;
-use crate::measure::statistics::{CONFIDENCE, block_bootstrap_quantile};
+use crate::measure::resampling::BlockResampling;
+use crate::measure::samples::{Bounds, Samples};
+use crate::measure::statistics::CONFIDENCE;
 use crate::random::RandomStream;
 use crate::time::RemoteInstant;
 
@@ -32,7 +33,7 @@ struct Timeline {
 
 impl Timeline {
     /// A direct channel has no stages between its ends, whatever a record claims.
-    fn of(joined: &Joined<'_>, is_gateway: bool) -> Self {
+    fn of(joined: &Joined, is_gateway: bool) -> Self {
         let (egress, ingress, taken) = (joined.egress, joined.ingress, joined.taken);
         let published_ns = joined
             .published
@@ -107,12 +108,12 @@ pub(super) struct SegmentBook<'a> {
     /// By first and last stage of the segment.
     segments: Vec<Option<LatencyHistogram>>,
     /// Of the segments that cross from host to host: how far each length may be off.
-    bounds_ns: Vec<Vec<u64>>,
+    bounds_ns: Vec<Bounds>,
     mark_counts: [u64; Stage::COUNT],
     hardware: LatencyHistogram,
     end_to_end: LatencyHistogram,
-    end_to_end_ns: Vec<i64>,
-    end_to_end_bounds_ns: Vec<u64>,
+    end_to_end_ns: Samples,
+    end_to_end_bounds_ns: Bounds,
     residual: LatencyHistogram,
     closing: ClosingFigures,
     coverage: StampCoverage,
@@ -128,12 +129,12 @@ impl<'a> SegmentBook<'a> {
             path: context.path,
             cards_share_clock: context.cards_share_clock,
             segments: vec![None; Stage::COUNT * Stage::COUNT],
-            bounds_ns: vec![Vec::new(); Stage::COUNT * Stage::COUNT],
+            bounds_ns: vec![Bounds::default(); Stage::COUNT * Stage::COUNT],
             mark_counts: [0; Stage::COUNT],
             hardware: LatencyHistogram::default(),
             end_to_end: LatencyHistogram::default(),
-            end_to_end_ns: Vec::new(),
-            end_to_end_bounds_ns: Vec::new(),
+            end_to_end_ns: Samples::default(),
+            end_to_end_bounds_ns: Bounds::default(),
             residual: LatencyHistogram::default(),
             closing: ClosingFigures {
                 checked_count: 0,
@@ -158,7 +159,7 @@ impl<'a> SegmentBook<'a> {
 
     /// Counts one message. Segments are of taken messages, so that they belong to the same
     /// messages as end-to-end; of all messages when the consumer's records are not at hand.
-    pub(super) fn count(&mut self, joined: &Joined<'_>) {
+    pub(super) fn count(&mut self, joined: &Joined) {
         self.cover(joined);
         if self.files.taken.is_some() && joined.taken.is_none() {
             return;
@@ -201,12 +202,7 @@ impl<'a> SegmentBook<'a> {
         Some((to.host_ns.saturating_sub(local.as_ns()), bound_ns))
     }
 
-    fn close(
-        &mut self,
-        joined: &Joined<'_>,
-        timeline: &Timeline,
-        (sum_ns, is_ordered): (i64, bool),
-    ) {
+    fn close(&mut self, joined: &Joined, timeline: &Timeline, (sum_ns, is_ordered): (i64, bool)) {
         let Some(taken) = joined.taken.filter(|_| self.path.is_aligned()) else {
             return;
         };
@@ -247,7 +243,7 @@ impl<'a> SegmentBook<'a> {
 
     /// True when a file at hand lacks a stage the message must have passed. Kernel stamps may
     /// be missing: their segments are combined.
-    fn misses_stage(&self, joined: &Joined<'_>, timeline: &Timeline) -> bool {
+    fn misses_stage(&self, joined: &Joined, timeline: &Timeline) -> bool {
         let lacks = |stage: Stage| {
             let mut marks = timeline.marks.iter().flatten();
             !marks.any(|mark| mark.stage == stage)
@@ -265,7 +261,7 @@ impl<'a> SegmentBook<'a> {
                 && (joined.ingress.is_none() || arrived.into_iter().any(lacks)))
     }
 
-    fn cover(&mut self, joined: &Joined<'_>) {
+    fn cover(&mut self, joined: &Joined) {
         let has = |ns: i64| stamp(ns).is_some();
         let coverage = &mut self.coverage;
         let handed = joined.egress.filter(|record| {
@@ -294,7 +290,7 @@ impl<'a> SegmentBook<'a> {
         }
     }
 
-    fn count_hardware(&mut self, joined: &Joined<'_>) {
+    fn count_hardware(&mut self, joined: &Joined) {
         let sent_ns = joined
             .egress
             .and_then(|record| stamp(record.tx_hardware_ns));
@@ -337,7 +333,7 @@ impl<'a> SegmentBook<'a> {
                     is_combined,
                     distribution,
                     bins: histogram(from, to).map_or_else(Vec::new, LatencyHistogram::bins),
-                    bound: BoundFigures::of(self.bounds_ns[cell].clone()),
+                    bound: self.bounds_ns[cell].figures(),
                 }
             })
             .collect()
@@ -388,14 +384,21 @@ impl<'a> SegmentBook<'a> {
             (_, false) => NO_CONSUMER,
             _ => "no message was taken",
         };
-        let samples = &self.end_to_end_ns;
-        let bound = BoundFigures::of(self.end_to_end_bounds_ns.clone());
+        let bound = self.end_to_end_bounds_ns.figures();
         let exact = self.path.has_one_clock().then_some(0);
+        let resampling = BlockResampling::of(&self.end_to_end_ns);
+        let mut interval = |quantile| {
+            let resampling = resampling.as_ref()?;
+            Some(resampling.interval(quantile, CONFIDENCE, random))
+        };
+        let [p50_interval, p99_interval] = [0.5, 0.99].map(&mut interval);
+        // As large as the samples.
+        drop(resampling);
         EndToEnd {
-            distribution: Distribution::of_samples(samples, reason),
+            p50_interval,
+            p99_interval,
+            distribution: self.end_to_end_ns.distribution(reason),
             bins: self.end_to_end.bins(),
-            p50_interval: block_bootstrap_quantile(samples, 0.5, CONFIDENCE, random),
-            p99_interval: block_bootstrap_quantile(samples, 0.99, CONFIDENCE, random),
             alignment_bound_ns: bound.map(|bound| bound.largest_ns).or(exact),
             bound,
         }

@@ -58,7 +58,7 @@ pub fn stories(
 }
 
 /// Epoch and sequence number; `None` for a run of numbers that no record mentions.
-fn key(joined: &Joined<'_>) -> Option<(u32, u64)> {
+fn key(joined: &Joined) -> Option<(u32, u64)> {
     let epochs = [
         joined.published.map(|record| record.epoch),
         joined.egress.map(|record| record.epoch),
@@ -70,7 +70,7 @@ fn key(joined: &Joined<'_>) -> Option<(u32, u64)> {
 }
 
 /// The producer's stamp, from whichever record carries it.
-pub(super) fn published_ns(joined: &Joined<'_>) -> Option<i64> {
+pub(super) fn published_ns(joined: &Joined) -> Option<i64> {
     let stamps = [
         joined.published.map(|record| record.published_ns),
         joined.egress.map(|record| record.published_ns),
@@ -80,7 +80,7 @@ pub(super) fn published_ns(joined: &Joined<'_>) -> Option<i64> {
     stamps.into_iter().flatten().find_map(stamp)
 }
 
-fn delay(joined: &Joined<'_>, context: &AccountContext<'_>) -> Option<(i64, u64)> {
+fn delay(joined: &Joined, context: &AccountContext<'_>) -> Option<(i64, u64)> {
     let taken = joined.taken?;
     let (published_ns, taken_ns) = (stamp(taken.published_ns)?, stamp(taken.taken_ns)?);
     let remote = RemoteInstant::from_ns(published_ns);

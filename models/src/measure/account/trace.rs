@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 
 use super::fate::Judge;
 use super::join::{Join, Joined, stamp};
+use super::source::each;
 use super::stage::MessageFate;
 use super::story::published_ns;
 use super::{AccountContext, ChannelRecords};
@@ -46,6 +47,24 @@ pub fn link_trace(
     context: &AccountContext<'_>,
     channel: TraceChannel,
 ) -> Result<Vec<TraceRecord>, TooManyMessages> {
+    let mut found = Vec::new();
+    each_traced(records, context, channel, |record| found.push(record))?;
+    // Two starts of a producer may overlap; the order of publication is that of the link.
+    found.sort_by_key(|record| record.published_ns);
+    Ok(found)
+}
+
+/// Hands the records of [`link_trace`] to `take`, in the order of the producer's starts and numbers: that of
+/// publication, unless two starts of a producer overlap.
+///
+/// # Errors
+/// When there are more than [`TRACE_MESSAGES_MAX`]; those up to there were handed out.
+pub fn each_traced(
+    records: &ChannelRecords<'_>,
+    context: &AccountContext<'_>,
+    channel: TraceChannel,
+    mut take: impl FnMut(TraceRecord),
+) -> Result<(), TooManyMessages> {
     let records = records.on(context.path);
     let join = Join::new(&records);
     let mut judge = Judge::new(&records, context, &join);
@@ -58,7 +77,7 @@ pub fn link_trace(
         origin_ns,
         last_published_ns: 0,
     };
-    let (mut found, mut count) = (Vec::new(), 0_u64);
+    let mut count = 0_u64;
     for joined in join {
         count = count.saturating_add(joined.count);
         if count > TRACE_MESSAGES_MAX {
@@ -69,19 +88,17 @@ pub fn link_trace(
         for step in 0..joined.count {
             let mut record = tracer.record(&joined, fate, is_interrupted);
             record.sequence = joined.key.sequence + step;
-            found.push(record);
+            take(record);
         }
     }
-    // Two starts of a producer may overlap; the order of publication is that of the link.
-    found.sort_by_key(|record| record.published_ns);
-    Ok(found)
+    Ok(())
 }
 
 /// When the second copy of a message arrived, on the consumer's host clock, by start of the
 /// producer and sequence number.
 fn second_arrivals(records: &ChannelRecords<'_>) -> BTreeMap<(u32, u64), i64> {
     let mut copies = BTreeMap::new();
-    for record in records.ingress.unwrap_or_default() {
+    for record in each(records.ingress) {
         if record.flags & IngressRecord::DUPLICATE != 0 {
             let key = (record.epoch, record.sequence);
             copies.entry(key).or_insert(record.received_ns);
@@ -99,12 +116,7 @@ struct Tracer<'a> {
 }
 
 impl Tracer<'_> {
-    fn record(
-        &mut self,
-        joined: &Joined<'_>,
-        fate: MessageFate,
-        is_interrupted: bool,
-    ) -> TraceRecord {
+    fn record(&mut self, joined: &Joined, fate: MessageFate, is_interrupted: bool) -> TraceRecord {
         let published = published_ns(joined);
         // A run without a known start begins with its first message.
         let origin_ns = *self.origin_ns.get_or_insert(published.unwrap_or(0));
@@ -163,7 +175,7 @@ impl Tracer<'_> {
 }
 
 /// When it was handed to the link, on the producer's host clock.
-fn departure_ns(joined: &Joined<'_>) -> Option<i64> {
+fn departure_ns(joined: &Joined) -> Option<i64> {
     let stamps = [
         joined.egress.map(|record| record.handed_ns),
         joined.ingress.map(|record| record.handed_ns),
@@ -174,7 +186,7 @@ fn departure_ns(joined: &Joined<'_>) -> Option<i64> {
 }
 
 /// Whether the link delivered it; what the consumer made of it is not the link's business.
-fn trace_fate(joined: &Joined<'_>, fate: MessageFate) -> TraceFate {
+fn trace_fate(joined: &Joined, fate: MessageFate) -> TraceFate {
     if let Some(ingress) = joined.ingress {
         return match stamp(ingress.forwarded_ns) {
             Some(_) => TraceFate::Delivered,

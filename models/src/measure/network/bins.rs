@@ -2,9 +2,10 @@
 //! receiver had heard nothing. Stretches are equally long, so that they can be compared with what a
 //! robot did at the same time.
 
-use super::delay::at_share;
-use super::{Crossing, Moment, Passage};
+use super::{Crossing, Moment, Passages};
 use crate::measure::account::Side;
+use crate::measure::in_order::in_order;
+use crate::measure::samples::Samples;
 use crate::plot::{PlotColumn, PlotSeries};
 
 /// Shortest bin.
@@ -66,8 +67,8 @@ pub struct NetworkBins {
 impl NetworkBins {
     /// Of a run of `duration_ns`. Messages are put where they were handed to the network, silences
     /// where the receiver had them. `width_ns` is above zero.
-    pub fn of(
-        passages: &[Passage],
+    pub fn of<P: Passages + ?Sized>(
+        passages: &P,
         (duration_ns, width_ns): (i64, i64),
         place: &Place<'_>,
     ) -> Self {
@@ -75,9 +76,9 @@ impl NetworkBins {
         let count = usize::try_from(duration_ns.max(1).saturating_add(width_ns - 1) / width_ns)
             .unwrap_or(1);
         let mut bins = vec![NetworkBin::default(); count];
-        let mut delays_ns: Vec<Vec<i64>> = vec![Vec::new(); count];
+        let mut delays_ns = vec![Samples::default(); count];
         let mut unplaced_count = 0;
-        for one in passages {
+        for one in passages.each() {
             let Some(ns) = one.offered_ns else { continue };
             let side = Side::Producer;
             let Some(at_ns) = place(Moment { side, ns }) else {
@@ -102,10 +103,12 @@ impl NetworkBins {
             bin.delay_bound_ns = bin.delay_bound_ns.max(bound_ns);
         }
         for (bin, delays_ns) in bins.iter_mut().zip(&mut delays_ns) {
-            delays_ns.sort_unstable();
-            bin.delay_max_ns = delays_ns.last().copied();
-            bin.delay_p50_ns = bin.delay_max_ns.map(|_| at_share(delays_ns, 0.5));
+            delays_ns.sort();
+            let last = delays_ns.len().checked_sub(1);
+            bin.delay_max_ns = last.map(|last| delays_ns.at(last));
+            bin.delay_p50_ns = last.map(|_| delays_ns.at_share(0.5));
         }
+        drop(delays_ns);
         silences(&mut bins, passages, (duration_ns, width_ns), place);
         Self {
             width_ns,
@@ -190,16 +193,20 @@ fn index_of(ns: i64, width_ns: i64, count: usize) -> Option<usize> {
 
 /// Within a silence its length so far grows from bin to bin. Where it begins is a place on the axis; how
 /// long it is, the receiver's own clock says.
-fn silences(
+fn silences<P: Passages + ?Sized>(
     bins: &mut [NetworkBin],
-    passages: &[Passage],
+    passages: &P,
     (duration_ns, width_ns): (i64, i64),
     place: &Place<'_>,
 ) {
-    let mut received_ns: Vec<i64> = passages.iter().filter_map(|one| one.received_ns).collect();
-    received_ns.sort_unstable();
-    let nexts_ns = received_ns.iter().skip(1).copied().map(Some).chain([None]);
-    for (ns, next_ns) in received_ns.iter().copied().zip(nexts_ns) {
+    let received = || {
+        passages
+            .each()
+            .filter_map(|one| Some((one.received_ns?, ())))
+    };
+    let mut received = in_order(received).map(|(ns, ())| ns).peekable();
+    while let Some(ns) = received.next() {
+        let next_ns = received.peek();
         let side = Side::Consumer;
         let Some(from_ns) = place(Moment { side, ns }) else {
             continue;

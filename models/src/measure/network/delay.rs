@@ -4,11 +4,14 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Crossing, Figure, Passage};
+use super::{Figure, Passage, Passages, is_arrived};
 use crate::measure::account::ChannelPath;
 use crate::measure::histogram::{DurationBin, LatencyHistogram};
+use crate::measure::in_order::in_order;
+use crate::measure::resampling::BlockResampling;
+use crate::measure::samples::Samples;
 use crate::measure::special::ceil_count;
-use crate::measure::statistics::{CONFIDENCE, IntervalNs, block_bootstrap_quantile};
+use crate::measure::statistics::{CONFIDENCE, IntervalNs};
 use crate::random::RandomStream;
 use crate::time::RemoteInstant;
 
@@ -118,21 +121,14 @@ pub struct InterarrivalJitter {
     pub bound_ns: f64,
 }
 
-pub(super) fn delays(
-    passages: &[Passage],
+pub(super) fn delays<P: Passages + ?Sized>(
+    passages: &P,
     path: ChannelPath<'_>,
     random: &mut RandomStream,
 ) -> Figure<DelayFigures> {
-    let arrived = || {
-        passages
-            .iter()
-            .filter(|one| one.crossing == Crossing::Arrived)
-    };
-    let delays_ns: Vec<i64> = arrived().filter_map(|one| one.delay_ns).collect();
-    let mut ascending = delays_ns.clone();
-    ascending.sort_unstable();
-    let (Some(min_ns), Some(max_ns)) = (ascending.first().copied(), ascending.last().copied())
-    else {
+    let arrived = || passages.each().filter(is_arrived);
+    let delays_ns: Samples = arrived().filter_map(|one| one.delay_ns).collect();
+    let Some(last) = delays_ns.len().checked_sub(1) else {
         let reason = if arrived().next().is_none() {
             "no message is known to have arrived"
         } else if arrived().all(|one| one.received_ns.is_none()) {
@@ -142,10 +138,14 @@ pub(super) fn delays(
         };
         return Figure::unavailable(reason);
     };
+    let ascending = delays_ns.ascending();
+    let (min_ns, max_ns) = (ascending.at(0), ascending.at(last));
+    let resampling = BlockResampling::of(&delays_ns);
+    drop(delays_ns);
     let mut quantile = |share: f64| DelayQuantile {
-        value_ns: at_share(&ascending, share),
+        value_ns: ascending.at_share(share),
         interval: has_tail(ascending.len(), share)
-            .then(|| block_bootstrap_quantile(&delays_ns, share, CONFIDENCE, random))
+            .then(|| Some(resampling.as_ref()?.interval(share, CONFIDENCE, random)))
             .flatten(),
     };
     let [p50, p95, p99, p999] = [0.5, 0.95, 0.99, 0.999].map(&mut quantile);
@@ -175,11 +175,9 @@ pub(super) fn delays(
 }
 
 /// The delays of the messages that arrived, as a histogram.
-pub(super) fn delay_bins(passages: &[Passage]) -> Vec<DurationBin> {
+pub(super) fn delay_bins<P: Passages + ?Sized>(passages: &P) -> Vec<DurationBin> {
     let mut histogram = LatencyHistogram::default();
-    let arrived = passages
-        .iter()
-        .filter(|one| one.crossing == Crossing::Arrived);
+    let arrived = passages.each().filter(is_arrived);
     for delay_ns in arrived.filter_map(|one| one.delay_ns) {
         histogram.record(delay_ns);
     }
@@ -193,8 +191,8 @@ pub(super) fn exceeds(bound_ns: u64, figure_ns: i64) -> bool {
 
 /// See [`DelayVariation`]. All errors of delays lie in an interval as wide as this, so that the
 /// difference of any two of their quantiles is off by no more.
-fn variation_bound_ns<'a>(
-    arrived: impl Iterator<Item = &'a Passage>,
+fn variation_bound_ns(
+    arrived: impl Iterator<Item = Passage>,
     path: ChannelPath<'_>,
     alignment_bound_ns: u64,
 ) -> u64 {
@@ -232,31 +230,37 @@ pub(super) fn at_share(ascending: &[i64], share: f64) -> i64 {
     ascending[rank - 1]
 }
 
-pub(super) fn successive(
-    passages: &[Passage],
+pub(super) fn successive<P: Passages + ?Sized>(
+    passages: &P,
     path: ChannelPath<'_>,
 ) -> Figure<SuccessiveVariation> {
-    let mut magnitudes: Vec<i64> = Vec::new();
+    let mut magnitudes = Samples::default();
     let mut bound_ns = 0;
-    for pair in passages.windows(2) {
-        let [before, after] = [&pair[0], &pair[1]];
-        let follows = !after.begins_epoch_after(before)
+    let mut last: Option<Passage> = None;
+    for after in passages.each() {
+        let Some(before) = last.replace(after) else {
+            continue;
+        };
+        let follows = !after.begins_epoch_after(&before)
             && before.sequence.checked_add(1) == Some(after.sequence);
-        if let Some(one) = difference(before, after, path).filter(|_| follows) {
+        if !follows {
+            continue;
+        }
+        if let Some(one) = difference(&Ends::of(&before), &Ends::of(&after), path) {
             magnitudes.push(one.magnitude_ns);
             bound_ns = bound_ns.max(one.bound_ns);
         }
     }
-    magnitudes.sort_unstable();
-    let Some(max_ns) = magnitudes.last().copied() else {
+    magnitudes.sort();
+    let Some(last) = magnitudes.len().checked_sub(1) else {
         return Figure::unavailable("no two successive messages arrived");
     };
-    let p50_ns = at_share(&magnitudes, 0.5);
+    let p50_ns = magnitudes.at_share(0.5);
     Figure::Measured(SuccessiveVariation {
         count: magnitudes.len() as u64,
         p50_ns,
-        p99_ns: at_share(&magnitudes, 0.99),
-        max_ns,
+        p99_ns: magnitudes.at_share(0.99),
+        max_ns: magnitudes.at(last),
         bound_ns,
         is_bound_wider: exceeds(bound_ns, p50_ns),
         jitter: jitter(passages, path),
@@ -269,29 +273,50 @@ struct Difference {
     bound_ns: u64,
 }
 
+/// When a message was handed over and received.
+#[derive(Debug, Clone, Copy)]
+struct Ends {
+    offered_ns: Option<i64>,
+    received_ns: Option<i64>,
+}
+
+impl Ends {
+    const fn of(one: &Passage) -> Self {
+        Self {
+            offered_ns: one.offered_ns,
+            received_ns: one.received_ns,
+        }
+    }
+}
+
 /// `None` when one of the messages did not arrive, or a clock was stepped between them.
-fn difference(before: &Passage, after: &Passage, path: ChannelPath<'_>) -> Option<Difference> {
+fn difference(before: &Ends, after: &Ends, path: ChannelPath<'_>) -> Option<Difference> {
     let between = |from: Option<i64>, to: Option<i64>| Some(to?.saturating_sub(from?));
     let received_ns = between(before.received_ns, after.received_ns)?;
     let sent_ns = between(before.offered_ns, after.offered_ns)?;
-    let instant = |one: &Passage| one.offered_ns.map(RemoteInstant::from_ns);
+    let instant = |one: &Ends| one.offered_ns.map(RemoteInstant::from_ns);
     Some(Difference {
         magnitude_ns: received_ns.saturating_sub(sent_ns).saturating_abs(),
         bound_ns: path.drift_ns(instant(before)?, instant(after)?)?,
     })
 }
 
-fn jitter(passages: &[Passage], path: ChannelPath<'_>) -> InterarrivalJitter {
-    let mut arrivals: Vec<&Passage> = passages
-        .iter()
-        .filter(|one| one.received_ns.is_some() && one.offered_ns.is_some())
-        .collect();
-    arrivals.sort_by_key(|one| one.received_ns);
+fn jitter<P: Passages + ?Sized>(passages: &P, path: ChannelPath<'_>) -> InterarrivalJitter {
+    let read = || {
+        passages.each().filter_map(|one| {
+            one.offered_ns?;
+            Some((one.received_ns?, Ends::of(&one)))
+        })
+    };
+    let mut last: Option<Ends> = None;
     let (mut jitter_ns, mut sum, mut max_ns) = (0.0_f64, 0.0, 0.0_f64);
     let (mut error_ns, mut bound_ns) = (0.0_f64, 0.0_f64);
     let mut count = 0_u64;
-    for pair in arrivals.windows(2) {
-        let Some(one) = difference(pair[0], pair[1], path) else {
+    for (_, after) in in_order(read) {
+        let Some(before) = last.replace(after) else {
+            continue;
+        };
+        let Some(one) = difference(&before, &after, path) else {
             continue;
         };
         jitter_ns += (one.magnitude_ns as f64 - jitter_ns) / 16.0;

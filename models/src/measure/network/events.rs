@@ -4,12 +4,13 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::delay::at_share;
 use super::loss::{BURST_GAP_MIN, clusters, loss_runs};
-use super::order::extents;
-use super::{Crossing, Moment, Passage};
-use crate::measure::account::{AccountContext, ChannelRecords, Side};
+use super::order::{arrivals, extents};
+use super::{Moment, Passages};
+use crate::measure::account::{AccountContext, ChannelRecords, Side, each};
+use crate::measure::in_order::in_order;
 use crate::measure::record::UNAVAILABLE;
+use crate::measure::samples::Samples;
 
 /// Losses in a row that last this long are an outage, shorter ones a burst of losses.
 pub const EVENT_OUTAGE_MIN_NS: i64 = 100_000_000;
@@ -95,7 +96,7 @@ const fn producer(ns: i64) -> Moment {
 }
 
 /// Every event of the passages of one channel, in order of time.
-pub fn network_events(passages: &[Passage]) -> Vec<NetworkEvent> {
+pub fn network_events<P: Passages + ?Sized>(passages: &P) -> Vec<NetworkEvent> {
     let mut found = losses(passages);
     found.extend(late(passages));
     found.extend(reordering(passages));
@@ -103,7 +104,7 @@ pub fn network_events(passages: &[Passage]) -> Vec<NetworkEvent> {
     found
 }
 
-fn losses(passages: &[Passage]) -> Vec<NetworkEvent> {
+fn losses<P: Passages + ?Sized>(passages: &P) -> Vec<NetworkEvent> {
     let (runs, _) = loss_runs(passages);
     let mut found = Vec::new();
     for cluster in clusters(&runs) {
@@ -151,28 +152,36 @@ fn losses(passages: &[Passage]) -> Vec<NetworkEvent> {
 /// What a delay must exceed to be an event: the median and one mean period, so that the next
 /// message should have been there; and the 99th percentile, as messages of several robots may follow
 /// each other at once. `None` without delays or a period.
-fn delay_limit_ns(passages: &[Passage]) -> Option<i64> {
-    let mut delays_ns: Vec<i64> = passages.iter().filter_map(|one| one.delay_ns).collect();
-    delays_ns.sort_unstable();
-    let times = || passages.iter().filter_map(|one| one.offered_ns);
-    let length_ns = times().max()?.saturating_sub(times().min()?);
-    let period_ns = length_ns / i64::try_from(times().count()).ok()?;
-    if delays_ns.is_empty() || period_ns == 0 {
+fn delay_limit_ns<P: Passages + ?Sized>(passages: &P) -> Option<i64> {
+    let mut delays_ns = Samples::default();
+    let (mut ends, mut count): (Option<(i64, i64)>, i64) = (None, 0);
+    for one in passages.each() {
+        delays_ns.extend(one.delay_ns);
+        if let Some(ns) = one.offered_ns {
+            let (first_ns, last_ns) = ends.unwrap_or((ns, ns));
+            ends = Some((first_ns.min(ns), last_ns.max(ns)));
+            count += 1;
+        }
+    }
+    let (first_ns, last_ns) = ends?;
+    let period_ns = last_ns.saturating_sub(first_ns) / count;
+    if delays_ns.len() == 0 || period_ns == 0 {
         return None;
     }
-    let limit_ns = at_share(&delays_ns, 0.5).saturating_add(period_ns);
-    Some(limit_ns.max(at_share(&delays_ns, 0.99)))
+    delays_ns.sort();
+    let limit_ns = delays_ns.at_share(0.5).saturating_add(period_ns);
+    Some(limit_ns.max(delays_ns.at_share(0.99)))
 }
 
-fn late(passages: &[Passage]) -> Vec<NetworkEvent> {
+fn late<P: Passages + ?Sized>(passages: &P) -> Vec<NetworkEvent> {
     let Some(limit_ns) = delay_limit_ns(passages) else {
         return Vec::new();
     };
-    let with_delay = passages.iter().filter(|one| one.delay_ns.is_some());
+    let with_delay = passages.each().filter(|one| one.delay_ns.is_some());
     let bound_ns = with_delay.map(|one| one.delay_bound_ns).max().unwrap_or(0);
     let mut found: Vec<NetworkEvent> = Vec::new();
     let mut since_last = u64::MAX;
-    for one in passages {
+    for one in passages.each() {
         since_last = since_last.saturating_add(one.count);
         let Some((delay_ns, offered_ns)) = one.delay_ns.zip(one.offered_ns) else {
             continue;
@@ -213,35 +222,34 @@ fn late(passages: &[Passage]) -> Vec<NetworkEvent> {
     found
 }
 
-fn reordering(passages: &[Passage]) -> Vec<NetworkEvent> {
-    let mut arrivals: Vec<&Passage> = passages
-        .iter()
-        .filter(|one| one.crossing == Crossing::Arrived && one.received_ns.is_some())
-        .collect();
-    arrivals.sort_by_key(|one| one.received_ns);
-    let keys = arrivals.iter().map(|one| (one.epoch_rank, one.sequence));
-    let found = extents(keys);
-    let near = |before: &(usize, usize), after: &(usize, usize)| {
-        ((after.0 - before.0) as u64) <= BURST_GAP_MIN
-    };
-    let bursts = found.chunk_by(near);
-    let event = |burst: &[(usize, usize)]| {
+fn reordering<P: Passages + ?Sized>(passages: &P) -> Vec<NetworkEvent> {
+    let (found, _) = extents(arrivals(passages).map(|(_, number)| number));
+    let near = |before: &(u64, u64), after: &(u64, u64)| after.0 - before.0 <= BURST_GAP_MIN;
+    let mut times = arrivals(passages).map(|(ns, _)| ns).zip(0_u64..);
+    // Places ascend from burst to burst.
+    let mut received_ns = |place: u64| times.find(|one| one.1 == place).map(|one| one.0);
+    let event = |burst: &[(u64, u64)]| {
         let (first, last) = burst.first().zip(burst.last())?;
         let extent_max = burst.iter().map(|one| one.1).max()?;
-        let from_ns = arrivals[first.0].received_ns?;
+        let from_ns = received_ns(first.0)?;
+        let until_ns = if last.0 == first.0 {
+            Some(from_ns)
+        } else {
+            received_ns(last.0)
+        };
         Some(NetworkEvent {
             kind: NetworkEventKind::Reordering {
                 reordered_count: burst.len() as u64,
-                extent_max: extent_max as u64,
+                extent_max,
             },
             from: Moment {
                 side: Side::Consumer,
                 ns: from_ns,
             },
-            until_ns: arrivals[last.0].received_ns,
+            until_ns,
         })
     };
-    bursts.filter_map(event).collect()
+    found.chunk_by(near).filter_map(event).collect()
 }
 
 /// The interruptions of processes on a channel's way, as events.
@@ -268,24 +276,22 @@ pub fn interruptions(context: &AccountContext<'_>) -> Vec<NetworkEvent> {
 /// Steps of the two hosts' real-time clocks against their monotonic ones, as the gateways that
 /// read both saw them.
 pub fn clock_steps(records: &ChannelRecords<'_>) -> Vec<NetworkEvent> {
-    let egress = records.egress.unwrap_or_default().iter();
-    let ingress = records.ingress.unwrap_or_default().iter();
-    let mut sent: Vec<_> = egress
-        .map(|one| (one.handed_ns, one.realtime_offset_ns))
-        .collect();
-    let mut received: Vec<_> = ingress
-        .map(|one| (one.received_ns, one.realtime_offset_ns))
-        .collect();
-    let mut found = steps(&mut sent, Side::Producer);
-    found.extend(steps(&mut received, Side::Consumer));
+    let mut found = steps(Side::Producer, || {
+        each(records.egress).map(|one| (one.handed_ns, one.realtime_offset_ns))
+    });
+    found.extend(steps(Side::Consumer, || {
+        each(records.ingress).map(|one| (one.received_ns, one.realtime_offset_ns))
+    }));
     found
 }
 
-fn steps(readings: &mut Vec<(i64, i64)>, side: Side) -> Vec<NetworkEvent> {
-    readings.retain(|one| one.0 != UNAVAILABLE && one.1 != UNAVAILABLE);
-    readings.sort_unstable();
-    let step = |pair: &[(i64, i64)]| {
-        let [before, after] = [pair[0], pair[1]];
+/// The steps among readings, each with when it was and what it said.
+fn steps<I: Iterator<Item = (i64, i64)>>(side: Side, read: impl Fn() -> I) -> Vec<NetworkEvent> {
+    let known = |one: &(i64, i64)| one.0 != UNAVAILABLE && one.1 != UNAVAILABLE;
+    let readings = in_order(|| read().filter(known).map(|one| (one, ())));
+    let mut last: Option<(i64, i64)> = None;
+    let pairs = readings.filter_map(|(after, ())| Some((last.replace(after)?, after)));
+    let step = |(before, after): ((i64, i64), (i64, i64))| {
         let step_ns = after.1.saturating_sub(before.1);
         let passed_ns = after.0.saturating_sub(before.0) as f64;
         // A step shows up to a reading's age after it happened.
@@ -301,5 +307,5 @@ fn steps(readings: &mut Vec<(i64, i64)>, side: Side) -> Vec<NetworkEvent> {
             until_ns: Some(after.0),
         })
     };
-    readings.windows(2).filter_map(step).collect()
+    pairs.filter_map(step).collect()
 }

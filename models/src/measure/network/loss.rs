@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use super::{Crossing, Figure, Passage};
+use super::{Crossing, Figure, Passages};
 use crate::measure::account::BurstCount;
 use crate::measure::special::normal_quantile;
 use crate::measure::statistics::{CONFIDENCE, Interval, wilson};
@@ -86,10 +86,10 @@ pub(super) struct LossRun {
 }
 
 /// Runs of losses, and how many messages the network was handed.
-pub(super) fn loss_runs(passages: &[Passage]) -> (Vec<LossRun>, u64) {
+pub(super) fn loss_runs<P: Passages + ?Sized>(passages: &P) -> (Vec<LossRun>, u64) {
     let mut runs: Vec<LossRun> = Vec::new();
     let (mut is_open, mut place) = (false, 0_u64);
-    for one in passages {
+    for one in passages.each() {
         match one.crossing {
             Crossing::Arrived => {
                 if core::mem::take(&mut is_open)
@@ -129,7 +129,10 @@ pub(super) fn clusters(runs: &[LossRun]) -> impl Iterator<Item = &[LossRun]> {
     })
 }
 
-pub(super) fn losses(passages: &[Passage], run_ns: Option<(i64, i64)>) -> Figure<LossFigures> {
+pub(super) fn losses<P: Passages + ?Sized>(
+    passages: &P,
+    run_ns: Option<(i64, i64)>,
+) -> Figure<LossFigures> {
     let (runs, of_count) = loss_runs(passages);
     let lost_count = runs
         .iter()

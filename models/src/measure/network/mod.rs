@@ -14,6 +14,7 @@ mod bins;
 mod bound_tests;
 mod delay;
 mod events;
+mod list;
 mod loss;
 mod order;
 #[cfg(test)]
@@ -30,6 +31,7 @@ pub use events::{
     CLOCK_READING_AGE_NS_MAX, EVENT_OUTAGE_MIN_NS, NetworkEvent, NetworkEventKind, clock_steps,
     interruptions, network_events,
 };
+pub use list::{PackedPassages, Passages};
 pub use loss::{BURST_GAP_MIN, BurstFigures, LongestLoss, LossFigures};
 pub use order::OrderFigures;
 
@@ -167,20 +169,13 @@ pub struct NetworkFigures {
 
 impl NetworkFigures {
     /// The figures of `passages`, which are in the order of epochs and sequence numbers.
-    pub fn of(passages: &[Passage], context: &NetworkContext<'_>) -> Self {
-        let count = |crossing| {
-            let chosen = passages.iter().filter(|one| one.crossing == crossing);
-            chosen.fold(0_u64, |sum, one| sum.saturating_add(one.count))
-        };
-        let arrived_count = count(Crossing::Arrived);
-        let lost_count = count(Crossing::LostByNetwork);
-        let offered_count = arrived_count.saturating_add(lost_count);
+    pub fn of<P: Passages + ?Sized>(passages: &P, context: &NetworkContext<'_>) -> Self {
+        let counts = Counts::of(passages);
+        let offered_count = counts.arrived.saturating_add(counts.lost);
         let on_network =
-            |one: &&Passage| matches!(one.crossing, Crossing::Arrived | Crossing::LostByNetwork);
-        let offered = passages.iter().filter(on_network);
-        let arrived = passages
-            .iter()
-            .filter(|one| one.crossing == Crossing::Arrived);
+            |one: &Passage| matches!(one.crossing, Crossing::Arrived | Crossing::LostByNetwork);
+        let offered = passages.each().filter(on_network);
+        let arrived = passages.each().filter(is_arrived);
         let arrived_per_s = rate(arrived.filter_map(|one| Some((one.received_ns?, one.count))));
         let mut random = RandomStream::new(context.seed, "measure.network.bootstrap");
         let mut round_trip = LatencyHistogram::default();
@@ -189,10 +184,10 @@ impl NetworkFigures {
         }
         Self {
             offered_count,
-            arrived_count,
-            lost_count,
-            host_lost_count: count(Crossing::LostByHost),
-            unknown_count: count(Crossing::Unknown),
+            arrived_count: counts.arrived,
+            lost_count: counts.lost,
+            host_lost_count: counts.host_lost,
+            unknown_count: counts.unknown,
             duplicated_count: context.duplicated_count,
             offered_per_s: rate(offered.filter_map(|one| Some((one.offered_ns?, one.count)))),
             arrived_per_s,
@@ -208,6 +203,35 @@ impl NetworkFigures {
             round_trip: round_trip.distribution("no clock exchange took place"),
         }
     }
+}
+
+/// Messages by what became of them.
+#[derive(Debug, Default)]
+struct Counts {
+    arrived: u64,
+    lost: u64,
+    host_lost: u64,
+    unknown: u64,
+}
+
+impl Counts {
+    fn of<P: Passages + ?Sized>(passages: &P) -> Self {
+        let mut counts = Self::default();
+        for one in passages.each() {
+            let count = match one.crossing {
+                Crossing::Arrived => &mut counts.arrived,
+                Crossing::LostByNetwork => &mut counts.lost,
+                Crossing::LostByHost => &mut counts.host_lost,
+                Crossing::Unknown => &mut counts.unknown,
+            };
+            *count = count.saturating_add(one.count);
+        }
+        counts
+    }
+}
+
+fn is_arrived(one: &Passage) -> bool {
+    one.crossing == Crossing::Arrived
 }
 
 /// Messages per second from the first to the last of them; each with how many it stands for. `None` below

@@ -466,5 +466,5 @@ fn nothing_is_concluded_from_nothing() {
     let found = figures(&[]);
     assert!(found.delay.measured().is_none() && found.loss.measured().is_none());
     assert!(found.order.measured().is_none() && found.offered_per_s.is_none());
-    assert!(network_events(&[]).is_empty());
+    assert!(network_events::<[Passage]>(&[]).is_empty());
 }

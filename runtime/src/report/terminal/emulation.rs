@@ -79,7 +79,7 @@ mod tests {
             ..IngressRecord::zeroed()
         };
         let page = |overflow_count| {
-            let figures = EmulationFigures::of(&[record; 10], overflow_count).unwrap();
+            let figures = EmulationFigures::of([record; 10], overflow_count).unwrap();
             let mut canvas = Canvas::new(120, Style::Plain);
             emulation(&mut canvas, &figures);
             let text = canvas.finish().replace('\u{a0}', " ");

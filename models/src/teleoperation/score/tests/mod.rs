@@ -151,10 +151,8 @@ fn a_loop_lost_to_a_time_out_is_told_with_its_cause_and_the_commands_that_were_l
     );
     assert_eq!(lost[0].messages.len(), 16);
     // The first of them was the first to be lost.
-    let first = log.raw(EGM_RIGHT_COMMAND).iter();
-    let first = first
-        .clone()
-        .find(|logged| Instant::from_ns(logged.envelope.published_ns) >= at_s(12.0));
+    let mut first = log.raw(EGM_RIGHT_COMMAND).iter();
+    let first = first.find(|logged| Instant::from_ns(logged.envelope.published_ns) >= at_s(12.0));
     assert_eq!(
         lost[0].messages[0].sequence,
         first.unwrap().envelope.sequence
