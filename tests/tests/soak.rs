@@ -123,7 +123,7 @@ fn eight_channels_at_a_kilohertz_leave_every_process_as_large_as_it_was() {
         None => RunFolder::new("soak"),
     };
     let duration = Duration::from_secs_f64(60.0 * minutes);
-    // One after the other: an account at the end needs memory in proportion to its run.
+    // One after the other: an account at the end takes processors from the runs that go on.
     let longer = |index: usize| duration + duration.mul_f64(index as f64 / 16.0);
     let mut soaks: Vec<Soak> = (0..RUN_COUNT)
         .map(|index| start(&lab, &record, (index, longer(index))))

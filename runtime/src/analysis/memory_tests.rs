@@ -37,7 +37,7 @@ const THIS_TEST: &str =
 const PEAK: &str = "peak bytes: ";
 
 /// Bytes that a message of either of the two channels may add. Its records have 320, of both channels 640.
-const GROWTH_MAX: f64 = 150.0;
+const GROWTH_MAX: f64 = 100.0;
 
 const PERIOD_NS: i64 = 1_000_000;
 const START_NS: i64 = 50_000_000_000;

@@ -6,7 +6,7 @@ use nix::sys::socket::SockProtocol;
 use super::Finding;
 use super::finding::Severity;
 use crate::radio::conversation::Conversation;
-use crate::radio::netlink::{Attributes, u32_at};
+use crate::radio::netlink::{Attributes, encode_attributes, u32_at};
 
 /// Numbers of `linux/ethtool_netlink.h`.
 const RINGS_GET: u8 = 15;
@@ -78,12 +78,10 @@ fn ask<T>(
 ) -> Result<T, String> {
     let mut name = interface.as_bytes().to_vec();
     name.push(0);
-    let length = u16::try_from(4 + name.len()).map_err(|_too_long| "a name too long".to_owned())?;
-    let mut header = Vec::new();
-    header.extend(length.to_ne_bytes());
-    header.extend(HEADER_DEVICE_NAME.to_ne_bytes());
-    header.extend(&name);
-    header.resize(header.len().next_multiple_of(4), 0);
+    if name.len() > libc::IFNAMSIZ {
+        return Err("a name too long".to_owned());
+    }
+    let header = encode_attributes(&[(HEADER_DEVICE_NAME, &name)]);
     let answer = talk.ask(to, false, &[(HEADER, &header)], |_, attributes| {
         decode(attributes)
     });
@@ -173,17 +171,6 @@ fn ring(found: Result<&Ring, &String>) -> Finding {
 mod tests {
     use super::*;
 
-    fn bytes(attributes: &[(u16, &[u8])]) -> Vec<u8> {
-        let mut bytes = Vec::new();
-        for (number, content) in attributes {
-            bytes.extend(u16::try_from(4 + content.len()).unwrap().to_ne_bytes());
-            bytes.extend(number.to_ne_bytes());
-            bytes.extend(*content);
-            bytes.resize(bytes.len().next_multiple_of(4), 0);
-        }
-        bytes
-    }
-
     fn severities(driver: &Driver) -> [Severity; 2] {
         let findings = examine("eth0", driver);
         assert_eq!(findings[0].id, "coalescing.eth0");
@@ -194,7 +181,7 @@ mod tests {
     #[test]
     fn answers_are_decoded_by_their_numbers() {
         let (fifty, eight) = (50_u32.to_ne_bytes(), 8_u32.to_ne_bytes());
-        let answer = bytes(&[
+        let answer = encode_attributes(&[
             (COALESCE_RX_US, &fifty),
             (COALESCE_TX_US, &eight),
             (COALESCE_ADAPTIVE_RX, &[1]),
@@ -203,7 +190,7 @@ mod tests {
         assert_eq!((found.rx_us, found.tx_us), (Some(50), Some(8)));
         assert!(found.is_adaptive);
         assert_eq!(Coalescing::decode(Attributes::nested(&[])), None);
-        let answer = bytes(&[(RINGS_RX_MAX, &fifty), (RINGS_RX, &eight)]);
+        let answer = encode_attributes(&[(RINGS_RX_MAX, &fifty), (RINGS_RX, &eight)]);
         let found = Ring::decode(Attributes::nested(&answer)).unwrap();
         assert_eq!((found.places, found.places_max), (8, 50));
     }

@@ -180,21 +180,11 @@ mod tests {
     use super::*;
     use crate::doctor::finding::Severity;
     use crate::host_facts::FakeHost;
-
-    fn bytes(attributes: &[(u16, &[u8])]) -> Vec<u8> {
-        let mut bytes = Vec::new();
-        for (number, content) in attributes {
-            bytes.extend(u16::try_from(4 + content.len()).unwrap().to_ne_bytes());
-            bytes.extend(number.to_ne_bytes());
-            bytes.extend(*content);
-            bytes.resize(bytes.len().next_multiple_of(4), 0);
-        }
-        bytes
-    }
+    use crate::radio::netlink::encode_attributes;
 
     fn chain(hook: u32, policy: u32, rules: u32) -> Option<Chain> {
-        let hook = bytes(&[(HOOK_NUMBER, &hook.to_be_bytes())]);
-        let answer = bytes(&[
+        let hook = encode_attributes(&[(HOOK_NUMBER, &hook.to_be_bytes())]);
+        let answer = encode_attributes(&[
             (CHAIN_TABLE, b"filter\0"),
             (CHAIN_NAME, b"input\0"),
             (CHAIN_HOOK, &hook),
@@ -229,7 +219,7 @@ mod tests {
         assert_eq!((found.is_dropping, found.rule_count), (true, 12));
         assert_eq!(chain(FORWARD, 0, 12), None);
         assert_eq!(chain(99, 0, 0), None);
-        let jumped_to = bytes(&[(CHAIN_NAME, b"docker\0")]);
+        let jumped_to = encode_attributes(&[(CHAIN_NAME, b"docker\0")]);
         assert_eq!(Chain::decode(1, Attributes::nested(&jumped_to)), None);
     }
 

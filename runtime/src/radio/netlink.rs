@@ -44,14 +44,7 @@ impl Request<'_> {
     pub(crate) fn encode(&self) -> Vec<u8> {
         let mut bytes = vec![0; HEADER_BYTES];
         bytes.extend([self.command, 1, 0, 0]);
-        for (number, content) in self.attributes {
-            let length = u16::try_from(ATTRIBUTE_BYTES + content.len())
-                .expect("requests carry names and indexes");
-            bytes.extend(length.to_ne_bytes());
-            bytes.extend(number.to_ne_bytes());
-            bytes.extend(*content);
-            bytes.resize(bytes.len().next_multiple_of(ALIGNMENT_BYTES), 0);
-        }
+        bytes.extend(encode_attributes(self.attributes));
         let length = u32::try_from(bytes.len()).expect("requests are short");
         let flags = REQUEST | if self.is_dump { DUMP } else { 0 };
         bytes[..4].copy_from_slice(&length.to_ne_bytes());
@@ -60,6 +53,20 @@ impl Request<'_> {
         bytes[8..12].copy_from_slice(&self.sequence.to_ne_bytes());
         bytes
     }
+}
+
+/// Attributes one after the other, as a message or another attribute holds them: number and content.
+pub(crate) fn encode_attributes(attributes: &[(u16, &[u8])]) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    for (number, content) in attributes {
+        let length = u16::try_from(ATTRIBUTE_BYTES + content.len())
+            .expect("requests carry names and indexes");
+        bytes.extend(length.to_ne_bytes());
+        bytes.extend(number.to_ne_bytes());
+        bytes.extend(*content);
+        bytes.resize(bytes.len().next_multiple_of(ALIGNMENT_BYTES), 0);
+    }
+    bytes
 }
 
 /// One message of the kernel.
