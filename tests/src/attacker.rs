@@ -2,6 +2,7 @@
 //! takes the address of a host, listens to what passes and sends what it likes. It judges nothing.
 
 use std::fs::File;
+use std::io::IoSlice;
 use std::net::{Ipv4Addr, SocketAddrV4, UdpSocket};
 use std::os::fd::AsRawFd;
 use std::process::Command;
@@ -9,7 +10,10 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use nix::sched::{CloneFlags, setns};
-use nix::sys::socket::{AddressFamily, MsgFlags, SockFlag, SockProtocol, SockType, recv, socket};
+use nix::sys::prctl::set_timerslack;
+use nix::sys::socket::{
+    AddressFamily, MsgFlags, MultiHeaders, SockFlag, SockProtocol, SockType, recv, sendmmsg, socket,
+};
 
 use crate::child;
 
@@ -17,8 +21,10 @@ use crate::child;
 const SETUP_LIMIT: Duration = Duration::from_secs(20);
 /// Ethernet, IPv4 without options and UDP.
 const BEFORE_PAYLOAD_BYTES: usize = 14 + 20 + 8;
-/// Datagrams of one burst; the pace is kept between bursts.
-const BURST: usize = 64;
+/// Datagrams of one burst, which one call to the kernel sends; the pace is kept between bursts.
+const BURST: usize = 16;
+/// It sleeps no shorter than this: about what a sleep takes.
+const NAP_MIN: Duration = Duration::from_micros(50);
 
 /// What a bridge does unless told otherwise: five minutes.
 const SWITCH_AGEING: u32 = 30_000;
@@ -167,19 +173,33 @@ impl Attacker {
                 Ok(socket) => socket,
                 Err(error) => panic!("no socket for the attacker: {error}"),
             };
+            let slices: Vec<_> = datagrams.iter().map(|one| [IoSlice::new(one)]).collect();
+            let mut bursts = slices.chunks(BURST).cycle();
+            let mut headers = MultiHeaders::<()>::preallocate(BURST, None);
+            // So that it wakes in time for its next burst and need not send two at once.
+            if let Err(errno) = set_timerslack(1) {
+                panic!("the attacker's timers stay late: {errno}");
+            }
             let began = Instant::now();
             let mut flood = Flood::default();
-            let mut next = datagrams.iter().cycle();
             let mut number = 0_u64;
             while began.elapsed() < span {
-                for datagram in next.by_ref().take(BURST) {
-                    // A refusal that comes back is no reason to stop.
-                    flood.sent_count += u64::from(socket.send(datagram).is_ok());
-                }
-                number += BURST as u64;
+                let burst = bursts.next().unwrap_or_default();
+                let flags = MsgFlags::empty();
+                let sent = sendmmsg(
+                    socket.as_raw_fd(),
+                    &mut headers,
+                    burst,
+                    [None; BURST],
+                    [],
+                    flags,
+                );
+                // A refusal that comes back is no reason to stop.
+                flood.sent_count += sent.map_or(0, |sent| sent.count() as u64);
+                number += burst.len() as u64;
                 let due = Duration::from_secs_f64(number as f64 / f64::from(rate));
                 let early = due.saturating_sub(began.elapsed());
-                if early > Duration::from_micros(200) {
+                if early > NAP_MIN {
                     thread::sleep(early);
                 }
             }

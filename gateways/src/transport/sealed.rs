@@ -20,7 +20,7 @@ use crate::protocol::wire::{Kind, TAG_BYTES};
 const BUFFER_BYTES: usize = u16::MAX as usize + TAG_BYTES;
 /// Refused datagrams that one call passes over at most, so that a flood of them cannot keep the
 /// thread from its other work.
-const RECEIVE_ATTEMPT_COUNT_MAX: usize = 16;
+pub const REFUSED_PER_LOOK_MAX: usize = 16;
 /// Bytes of the longest greeting there is: its header, 40 bytes and two names of 255.
 const GREETING_BYTES_MAX: usize = 1024;
 
@@ -94,7 +94,7 @@ impl<S: DatagramSender> DatagramSender for SealedSender<S> {
     }
 
     fn receive(&mut self, buffer: &mut [u8]) -> io::Result<Option<Received>> {
-        for _ in 0..RECEIVE_ATTEMPT_COUNT_MAX {
+        for _ in 0..REFUSED_PER_LOOK_MAX {
             let Some(received) = self.inner.receive(buffer)? else {
                 return Ok(None);
             };
@@ -165,7 +165,7 @@ impl<R: DatagramReceiver> SealedReceiver<R> {
 
 impl<R: DatagramReceiver> DatagramReceiver for SealedReceiver<R> {
     fn receive(&mut self, now: Instant, buffer: &mut [u8]) -> io::Result<Option<Received>> {
-        for _ in 0..RECEIVE_ATTEMPT_COUNT_MAX {
+        for _ in 0..REFUSED_PER_LOOK_MAX {
             let Some(received) = self.inner.receive(now, buffer)? else {
                 return Ok(None);
             };

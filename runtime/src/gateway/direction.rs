@@ -15,6 +15,7 @@ use hil_models::link::trace::ReplayTally;
 use hil_models::measure::record::{EgressRecord, FollowUpRecord, IngressRecord, RoundTripRecord};
 
 use super::egress::{Attention, Egress};
+use super::gathering::Gathering;
 use super::ingress::{Ingress, Notes};
 use super::kernel_clock::KernelClock;
 use super::line::Line;
@@ -228,6 +229,7 @@ fn egress(
         sent: count,
         stop: Arc::clone(&around.stop),
         attention: Attention::default(),
+        gathering: Gathering::default(),
         is_established,
     })
 }
@@ -264,6 +266,7 @@ fn ingress(
         stop: Arc::clone(&around.stop),
         foreign_count: 0,
         stray_count: 0,
+        gathering: Gathering::default(),
         clock: KernelClock::read()?,
         response: None,
         buffer: vec![0; usize::from(u16::MAX)].into_boxed_slice(),

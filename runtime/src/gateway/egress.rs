@@ -10,6 +10,7 @@ use hil_models::measure::record::{EgressRecord, RoundTripRecord, UNAVAILABLE};
 use hil_models::message::Envelope;
 use hil_models::time::Instant;
 
+use super::gathering::Gathering;
 use super::line::{Line, STAMP_PATIENCE_NS};
 use super::{GatewayError, poll_descriptors};
 use crate::channel::{RawInput, Waiter};
@@ -32,6 +33,7 @@ pub(crate) struct Egress {
     pub(crate) sent: Arc<AtomicU64>,
     pub(crate) stop: Arc<AtomicBool>,
     pub(crate) attention: Attention,
+    pub(super) gathering: Gathering,
     /// Set while the peer takes messages.
     pub(crate) is_established: Arc<AtomicBool>,
 }
@@ -224,14 +226,17 @@ impl Egress {
         match self.wait.pause(now, due) {
             Pause::Spin => core::hint::spin_loop(),
             Pause::Sleep(until) => {
+                // Messages are never kept waiting for refused replies.
+                let away = self.gathering.until(now, self.refused_count());
+                let until = away.unwrap_or(until).min(until);
                 let listeners = self.waiter.iter().flat_map(Waiter::descriptors);
-                let socket = self.line.sender.poll_fd();
+                let socket = self.line.sender.poll_fd().filter(|_| away.is_none());
                 let [is_announced, has_socket_news] =
                     poll_descriptors(listeners.chain(socket), until)?;
                 // Without a waiter the socket comes first.
                 let (is_announced, has_socket_news) = match self.waiter {
-                    Some(_) => (is_announced, has_socket_news),
-                    None => (false, is_announced),
+                    Some(_) => (is_announced, has_socket_news || away.is_some()),
+                    None => (false, is_announced || away.is_some()),
                 };
                 self.attention.has_news |= has_socket_news;
                 // After a quiet wait it is looked at as well: see `Waiter::drain`.
@@ -239,5 +244,11 @@ impl Egress {
             }
         }
         Ok(())
+    }
+
+    /// Replies refused so far, by the seal or the bridge.
+    fn refused_count(&self) -> u64 {
+        let sealed = self.line.sender().seal_counts();
+        sealed.map_or(0, |counts| counts.refused_total()) + self.bridge.refusals().total()
     }
 }

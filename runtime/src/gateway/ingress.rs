@@ -14,6 +14,7 @@ use hil_models::measure::record::{FollowUpRecord, IngressRecord, UNAVAILABLE};
 use hil_models::message::Envelope;
 use hil_models::time::Instant;
 
+use super::gathering::Gathering;
 use super::kernel_clock::KernelClock;
 use super::{GatewayError, poll_descriptors};
 use crate::channel::{ChannelError, RawOutput};
@@ -40,6 +41,7 @@ pub(crate) struct Ingress {
     pub(crate) foreign_count: u64,
     /// Messages that came over a clock path, dropped.
     pub(crate) stray_count: u64,
+    pub(super) gathering: Gathering,
     pub(crate) clock: KernelClock,
     /// The clock response whose departure the kernel is to stamp.
     pub(crate) response: Option<Response>,
@@ -232,10 +234,19 @@ impl Ingress {
         match pause {
             Pause::Spin => core::hint::spin_loop(),
             Pause::Sleep(until) => {
-                poll_descriptors(self.receiver.poll_fd().into_iter(), until)?;
+                let away = self.gathering.until(now, self.refused_count());
+                let socket = self.receiver.poll_fd().filter(|_| away.is_none());
+                poll_descriptors(socket.into_iter(), away.unwrap_or(until).min(until))?;
             }
         }
         Ok(())
+    }
+
+    /// Datagrams refused so far, whoever refused them.
+    fn refused_count(&self) -> u64 {
+        let sealed = self.receiver.seal_counts();
+        let by_seal = sealed.map_or(0, |counts| counts.refused_total());
+        by_seal + self.foreign_count + self.bridge.refusals().total()
     }
 }
 

@@ -5,12 +5,14 @@
 //! - `process`: the process with its threads, one per channel direction.
 //! - [`direction`]: one direction from its launch description to its final counters.
 //! - `egress`: shared memory to network; `ingress`: network to shared memory.
+//! - `gathering`: what both do about a flood of datagrams that they refuse.
 
 pub(crate) mod arming;
 mod connection;
 mod counters;
 pub mod direction;
 pub(crate) mod egress;
+mod gathering;
 pub(crate) mod ingress;
 pub(crate) mod kernel_clock;
 mod line;
