@@ -1,4 +1,4 @@
-//! The arm of an ABB `YuMi` (IRB 14000): its joints, kinematics and limits. It knows no controller,
+//! The arm of an ABB `YuMi` (IRB 14000): its joints, kinematics, limits and looks. It knows no controller,
 //! no dynamics and no collision.
 //!
 //! **Chain order.** Every seven-joint array lists the joints from the body to the hand:
@@ -6,6 +6,7 @@
 //! the chain; [`CHAIN_TO_MAKER`] converts.
 
 pub mod arm;
+pub mod description;
 pub mod inverse;
 mod pose;
 
