@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Builds the Debian package: both programs, units, manual pages, completions, the schema of topology
-# files, topologies, documents.
+# files, the robot's description, topologies, documents.
 #
 #   deploy/build-deb.sh [--profile NAME] [--output DIR]
 #

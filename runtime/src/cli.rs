@@ -48,24 +48,27 @@ const CALIBRATE_EXAMPLES: &str = "\
 Examples:
   hil-runtime calibrate teleoperation --mlr 0.008
       the outages under which the default case loses 0.8 % of its motion loops
-  hil-runtime calibrate teleop --mlr 0.027 --topology deploy/topologies/emulated.toml
-      the same with the case's parameters of a file; `teleop` names one case only
-  hil-runtime calibrate teleoperation --figure mlr=0.008 --seeds 40 --output curve
+  hil-runtime calibrate teleop --mlr 0.027 --topology emulated.toml
+      the same with the case's parameters of a file; `teleop` names one case
+      only
+  hil-runtime calibrate teleop --figure mlr=0.008 --seeds 40 --output curve
       more runs per point, and the curve as CSV
 
-Equal seeds give equal tables, whatever the number of threads. Ctrl-C prints what is
-complete. Exit code 1 when the value cannot be reached or a criterion is missed.";
+Equal seeds give equal tables, whatever the number of threads. Ctrl-C prints
+what is complete. Exit code 1 when the value cannot be reached or a criterion is
+missed.";
 
 const REPLAY_EXAMPLES: &str = "\
 Examples:
   hil-runtime replay runs/teleop-local-20261121-101500
       run its robot again in virtual time and compare every message
   hil-runtime replay run.mcap --only human/frame --speed 2 --loop
-      feed a recorded channel into the run that goes on here (starts hil-recorder)
+      feed a recorded channel into the run that goes on here (starts
+      hil-recorder)
 
-Of a folder it reads the manifest and the records of the run, and nothing else. Exit code 0 when every
-message is the same to the last bit, 1 when one differs or records are missing, 2 when the
-folder cannot be replayed at all.";
+Of a folder it reads the manifest and the records of the run, and nothing else.
+Exit code 0 when every message is the same to the last bit, 1 when one differs
+or records are missing, 2 when the folder cannot be replayed at all.";
 
 const REPORT_EXAMPLES: &str = "\
 Examples:
@@ -82,8 +85,9 @@ Examples:
   hil-runtime report runs/a --template lab.html -o report.html
       the data of --format json through a template of your own
 
-A folder that `simulate --output` wrote is a run as well. A file that is there already is
-overwritten only if it is a report, or with --force. docs/reports.md has the rest.";
+A folder that `simulate --output` wrote is a run as well. A file that is there
+already is overwritten only if it is a report, or with --force. docs/reports.md
+has the rest.";
 
 /// Runs a robot's controller and its model as separate processes, over shared memory or a real
 /// network, and accounts for every microsecond in between.
@@ -249,7 +253,7 @@ pub struct CardGuardArgs {
 pub enum Command {
     /// Run a topology in virtual time: same components, same link models, no processes.
     #[command(
-        after_help = "Example:\n  hil-runtime simulate --topology deploy/topologies/emulated.toml --set run.duration='\"1 h\"'"
+        after_help = "Example:\n  hil-runtime simulate --topology emulated.toml --set run.duration='\"1 h\"'"
     )]
     Simulate {
         /// The topology file (TOML).
@@ -267,7 +271,7 @@ pub enum Command {
     },
     /// Compute a case's tables in virtual time, on all processors.
     #[command(
-        after_help = "Example:\n  hil-runtime tables --topology deploy/topologies/tables.toml --sections 100000\n\nEqual seeds give equal tables, whatever the number of threads. Ctrl-C prints what is\ncomplete. Exit code 1 when a criterion is missed."
+        after_help = "Example:\n  hil-runtime tables --topology deploy/topologies/tables.toml --sections 100000\n\nEqual seeds give equal tables, whatever the number of threads. Ctrl-C prints\nwhat is complete. Exit code 1 when a criterion is missed."
     )]
     Tables {
         /// The topology file (TOML); `[case]` and `[run]` are enough.
@@ -320,7 +324,7 @@ pub enum Command {
     Top(TopArgs),
     /// Make or check the key file that keeps strangers out of a run between two hosts.
     #[command(
-        after_help = "Examples:\n  sudo hil-runtime key new /etc/hil-runtime/hop.key\n  sudo hil-runtime key check /etc/hil-runtime/hop.key   # the fingerprint, equal on all hosts"
+        after_help = "Examples:\n  sudo hil-runtime key new /etc/hil-runtime/hop.key\n  sudo hil-runtime key check /etc/hil-runtime/hop.key   # its fingerprint"
     )]
     Key {
         /// What to do with it.
@@ -393,4 +397,38 @@ pub enum Command {
         #[arg(long)]
         launch: PathBuf,
     },
+}
+
+/// Reads a whole number from `least` to `most`, and says the range in words when it is none.
+pub(crate) fn whole<T>(least: u64, most: u64) -> impl Fn(&str) -> Result<T, String> + Clone
+where
+    T: TryFrom<u64>,
+{
+    move |text| {
+        let number = text.parse::<u64>().ok();
+        let number = number.filter(|number| (least..=most).contains(number));
+        number
+            .and_then(|number| T::try_from(number).ok())
+            .ok_or_else(|| match most {
+                u64::MAX => format!("must be a whole number, {least} or more"),
+                _ => format!("must be a whole number from {least} to {most}"),
+            })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_whole_number_outside_its_range_is_refused_with_it() {
+        let port = whole::<u16>(1, 99);
+        assert_eq!((port("1"), port("99")), (Ok(1), Ok(99)));
+        for text in ["0", "100", "-1", "1.5", "", "many"] {
+            let why = port(text).unwrap_err();
+            assert_eq!(why, "must be a whole number from 1 to 99", "{text}");
+        }
+        let why = whole::<u64>(1, u64::MAX)("0").unwrap_err();
+        assert_eq!(why, "must be a whole number, 1 or more");
+    }
 }

@@ -129,7 +129,8 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
 
 fn write_documents(folder: &Path, console: &mut Console) -> u8 {
     let written = documents::write(Cli::command(), folder)
-        .and_then(|_paths| documents::write_schema(&topology::schema(), folder));
+        .and_then(|_paths| documents::write_schema(&topology::schema(), folder))
+        .and_then(|_path| documents::write_robot(folder));
     code_of(written.map(drop), console)
 }
 

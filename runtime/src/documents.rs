@@ -1,6 +1,6 @@
 //! The command line as documents for a package: a manual page of every command, and completions for
 //! the shells. They are made from the same definitions that `--help` is, so they cannot differ from
-//! it. The schema of topology files is laid beside them.
+//! it. The schema of topology files and the description of the robot are laid beside them.
 
 use std::fs;
 use std::io;
@@ -10,6 +10,7 @@ use clap::Command;
 use clap_complete::Shell;
 use clap_mangen::Man;
 use clap_mangen::roff::Roff;
+use hil_models::yumi::description::Urdf;
 use serde_json::Value;
 
 /// Begins the list of exit codes in the help of a program.
@@ -55,6 +56,18 @@ pub fn write_schema(schema: &Value, folder: &Path) -> io::Result<PathBuf> {
     let mut text = serde_json::to_string_pretty(schema)?;
     text.push('\n');
     fs::write(&path, text)?;
+    Ok(path)
+}
+
+/// Writes the description of the robot below `folder`: `robots/yumi.urdf`.
+///
+/// # Errors
+/// When it cannot be written.
+pub fn write_robot(folder: &Path) -> io::Result<PathBuf> {
+    let folder = folder.join("robots");
+    fs::create_dir_all(&folder)?;
+    let path = folder.join("yumi.urdf");
+    fs::write(&path, Urdf.to_string())?;
     Ok(path)
 }
 

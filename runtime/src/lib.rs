@@ -61,6 +61,7 @@ pub mod topology;
 pub mod trace;
 pub mod wait;
 pub mod watch;
+pub mod words;
 
 use std::process::ExitCode;
 

@@ -344,7 +344,7 @@ fn explain_raising(errno: Errno) -> Refusal {
 
 fn explain_scheduling(errno: Errno, priority: u8, files: &HostFiles) -> Refusal {
     if errno == Errno::EINVAL {
-        let reason = format!("priority {priority} is outside 1..=99");
+        let reason = format!("priority {priority} is outside 1 to 99");
         return Refusal::new(errno, reason, "choose a priority from 1 to 99");
     }
     if files.holds_capability(CAP_SYS_NICE) == Fact::Available(true) {

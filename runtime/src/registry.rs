@@ -300,7 +300,7 @@ mod tests {
         let entry = registry.find("shuttle").unwrap();
         let error = entry.make(json!({ "gain_per_s": 101.0 }), 0).unwrap_err();
         assert_eq!(error.key.as_deref(), Some("gain_per_s"));
-        assert_eq!(error.message, "gain_per_s 101 is outside 0..=100");
+        assert_eq!(error.message, "gain_per_s 101 is outside 0 to 100");
         let error = entry.make(json!({ "gain": 1.0 }), 0).unwrap_err();
         assert!(error.message.contains("unknown field `gain`"), "{error}");
         assert!(entry.make(entry.defaults(), 0).is_ok());

@@ -15,6 +15,7 @@ use crate::registry::{CaseEntry, CaseError, Registry};
 use crate::report::summary::RunSummary;
 use crate::report::terminal::{grouped, wrapped};
 use crate::run_folder::RunFolder;
+use crate::words::counted;
 
 /// Columns of the outcome, and those before its texts.
 const PAGE_WIDTH: usize = 100;
@@ -213,15 +214,14 @@ impl Replayed {
             }
         };
         field("method", &replay.method);
-        let went_in = grouped(replay.input_count);
-        field("went in", &format!("{went_in} messages"));
-        let compared = grouped(replay.compared_count);
+        field("went in", &counted(replay.input_count, "message"));
+        let compared = counted(replay.compared_count, "message");
         let different = match replay.different_count {
             0 => "none differs".to_owned(),
             1 => "1 differs".to_owned(),
             count => format!("{} differ", grouped(count)),
         };
-        field("compared", &format!("{compared} messages, {different}"));
+        field("compared", &format!("{compared}, {different}"));
         if let Some(first) = &replay.first_difference {
             field("first difference", first);
         }

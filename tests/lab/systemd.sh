@@ -123,6 +123,7 @@ has_documents() {
         test -s /usr/share/bash-completion/completions/hil-runtime &&
         test -s /usr/lib/x86_64-linux-gnu/wireshark/plugins/hil.lua &&
         test -s /usr/share/hil-runtime/topology.schema.json &&
+        test -s /usr/share/hil-runtime/robots/yumi.urdf &&
         ls /usr/share/man/man1/hil-* | wc -l' && echo "manual pages"
 }
 

@@ -14,6 +14,7 @@ use hil_tests::child::{ChildGuard, Finished};
 use hil_tests::lab::{INTERFACE, Lab};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::{RunFiles, Trial, load_average, wait_until};
+use nix::sys::signal::Signal;
 
 const HOSTS: [&str; 2] = ["control-pc", "robot-pc"];
 const CHANNELS: [&str; 2] = ["shuttle/command", "shuttle/status"];
@@ -53,6 +54,25 @@ fn wait_for_messages(files: &[RunFiles; 2], after: &str) {
         let now = taken();
         (0..2).all(|way| now[way] >= before[way] + 50 * 32)
     });
+}
+
+/// Stops the run from its first host; every message of it has a fate, and nothing is left.
+fn stopped(lab: &Lab, hosts: &mut [ChildGuard; 2], files: &[RunFiles; 2]) -> [RunSummary; 2] {
+    hosts[0].signal(Signal::SIGTERM).unwrap();
+    for host in hosts {
+        host.wait_within(RUN_LIMIT).unwrap();
+    }
+    [0, 1].map(|index| {
+        let summary = files[index].summary();
+        assert_eq!(summary.run.outcome, Outcome::Stopped);
+        assert_every_message_is_accounted_for(&summary);
+        for channel in CHANNELS {
+            let said = describe(channel, account(&summary, channel));
+            println!("{}: {said}; load {}", HOSTS[index], load_average());
+        }
+        files[index].assert_nothing_left_on(lab.host(index));
+        summary
+    })
 }
 
 /// What neither the consumer took nor a newer message replaced.
@@ -111,24 +131,10 @@ fn cable_address_and_packet_size_change_under_a_run_and_it_goes_on() {
     assert_eq!(code(&double), PEER_ABSENT, "{double:?}");
     wait_for_messages(&files, "a second control-pc");
 
-    hosts[0].signal(nix::sys::signal::Signal::SIGTERM).unwrap();
-    for host in &mut hosts {
-        host.wait_within(RUN_LIMIT).unwrap();
-    }
-    for index in [0, 1] {
-        let summary = files[index].summary();
-        assert_eq!(summary.run.outcome, Outcome::Stopped);
-        assert_every_message_is_accounted_for(&summary);
+    for summary in stopped(&lab, &mut hosts, &files) {
         for channel in CHANNELS {
-            println!(
-                "{}: {}; load {}",
-                HOSTS[index],
-                describe(channel, account(&summary, channel)),
-                load_average()
-            );
             assert!(missing(&summary, channel) > 0, "{channel} felt nothing");
         }
-        files[index].assert_nothing_left_on(lab.host(index));
     }
 }
 
@@ -164,21 +170,9 @@ fn a_gateway_that_comes_back_while_the_path_is_away_waits_for_it() {
         }
         wait_for_messages(&files, "a gateway came back without a path");
     }
-    hosts[0].signal(nix::sys::signal::Signal::SIGTERM).unwrap();
-    for host in &mut hosts {
-        host.wait_within(RUN_LIMIT).unwrap();
-    }
-    for index in [0, 1] {
-        let summary = files[index].summary();
-        assert_eq!(summary.run.outcome, Outcome::Stopped);
-        assert_every_message_is_accounted_for(&summary);
+    for summary in stopped(&lab, &mut hosts, &files) {
         let mut events = summary.events.iter();
         assert!(events.any(|event| event.what.contains("waiting for the link")));
-        for channel in CHANNELS {
-            let said = describe(channel, account(&summary, channel));
-            println!("{}: {said}", HOSTS[index]);
-        }
-        files[index].assert_nothing_left_on(lab.host(index));
     }
 }
 

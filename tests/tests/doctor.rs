@@ -126,7 +126,7 @@ fn wrong_arguments_of_the_doctor_are_refused_with_what_is_right() {
     for (arguments, words) in [
         (["--latency", "30"].as_slice(), "no unit"),
         (&["--latency", "1 ms"], "100 ms to 24 h"),
-        (&["--latency", "1 s", "--priority", "0"], "1..=99"),
+        (&["--latency", "1 s", "--priority", "0"], "1 to 99"),
         (&["--latency", "1 s", "--period", "2 s"], "100 us to 1 s"),
         (
             &["--latency", "1 s", "--cpu", "4095"],

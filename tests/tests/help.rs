@@ -26,16 +26,28 @@ impl Program {
     }
 
     fn run(&self, words: &[&str]) -> Finished {
+        self.run_at(words, None)
+    }
+
+    /// On a terminal so wide.
+    fn run_at(&self, words: &[&str], columns: Option<usize>) -> Finished {
         let mut command = Command::new(self.path);
         command.args(words).env_remove("COLUMNS");
+        if let Some(columns) = columns {
+            command.env("COLUMNS", columns.to_string());
+        }
         let mut child = ChildGuard::spawn(&mut command).unwrap();
         child.wait_within(LIMIT).unwrap()
     }
 
     fn help(&self, command: &[String]) -> String {
+        self.help_at(command, None)
+    }
+
+    fn help_at(&self, command: &[String], columns: Option<usize>) -> String {
         let words = command.iter().map(String::as_str);
         let words: Vec<&str> = words.chain(["--help"]).collect();
-        let help = self.run(&words);
+        let help = self.run_at(&words, columns);
         assert_eq!(help.status.code(), Some(0), "{help:?}");
         help.stdout
     }
@@ -84,6 +96,45 @@ fn the_help_of_every_command_has_an_example_of_it() {
         }
         let (_, help) = &commands[0];
         assert!(help.contains("Exit codes:"), "{help}");
+    }
+}
+
+/// What is behind the list of options, which the program sets as it was written.
+fn behind_options(help: &str) -> &str {
+    help.find("\nExample").map_or("", |at| &help[at..])
+}
+
+/// The program breaks a line that is too wide wherever it is, so that examples and tables fall apart.
+#[test]
+fn a_help_fits_a_narrow_terminal_without_a_break_that_nobody_meant() {
+    const NARROW: usize = 80;
+    const WIDE: usize = 400;
+    for program in Program::both() {
+        for (command, usual) in program.commands() {
+            let name = [&[program.name.to_owned()], command.as_slice()].concat();
+            let name = name.join(" ");
+            let narrow = program.help_at(&command, Some(NARROW));
+            let wide = program.help_at(&command, Some(WIDE));
+            for (help, limit) in [(&narrow, NARROW), (&usual, 100)] {
+                for line in help.lines() {
+                    // The program sets its usage on one line, whatever the width.
+                    let limit = if line.starts_with("Usage:") {
+                        100
+                    } else {
+                        limit
+                    };
+                    assert!(line.chars().count() <= limit, "{name}: {line}");
+                }
+                assert_eq!(behind_options(help), behind_options(&wide), "{name}");
+            }
+            assert_ne!(behind_options(&narrow), "", "{name}");
+            for (what, why) in [
+                ("..=", "a range is said in words"),
+                ("[default: \"", "a value stands without quotes"),
+            ] {
+                assert!(!usual.contains(what), "{name}: {why}: {usual}");
+            }
+        }
     }
 }
 

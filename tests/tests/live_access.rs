@@ -257,7 +257,14 @@ fn viewers_whose_cable_was_pulled_lose_their_seats() {
     };
     let [here, there] = [0, 1].map(|index| lab.host(index));
     let program = here.command(hil_recorder_binary());
-    let server = Server::start_by(program, &["--host", "0.0.0.0"]);
+    let mut server = Server::start_by(program, &["--host", "0.0.0.0"]);
+    // Where others find it, which 0.0.0.0 does not say.
+    let page_port = server.page.rsplit(':').next().unwrap();
+    let said = format!(
+        "from other machines  http://{}:{page_port}/\n",
+        here.address()
+    );
+    server.child.wait_for_output(&said, LIMIT).unwrap();
     let port = server.socket.rsplit(':').next().unwrap();
     let [local, remote] = [Ipv4Addr::LOCALHOST, here.address()].map(|one| format!("{one}:{port}"));
     let look_on = || {

@@ -210,7 +210,10 @@ fn check_refusals(run: &Path) {
             "no link `hip`; its links: hop (emulated)",
         ),
         (&["set", "hop", "--loss", "1.5"], "1.5 is outside 0 to 1"),
-        (&["set", "hop", "--delay", "50"], "has no unit"),
+        (
+            &["set", "hop", "--delay", "50"],
+            "--delay 50: has no unit; allowed: h, min, s, ms, us, ns",
+        ),
         (&["set", "hop", "--delay", "50s"], "room for 10."),
     ] {
         let output = link(arguments, run);

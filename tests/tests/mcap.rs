@@ -7,7 +7,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::Path;
-use std::process::Output;
+use std::process::{Command, Output};
 use std::time::Duration;
 
 use hil_models::egm::messages::EgmFeedback;
@@ -15,9 +15,14 @@ use hil_models::measure::account::MessageFate;
 use hil_models::message::Envelope;
 use hil_runtime::record::RecordFile;
 use hil_runtime::report::summary::RunSummary;
+use hil_tests::binary::hil_recorder_binary;
+use hil_tests::child::ChildGuard;
 use hil_tests::mcap_file::{assert_code, python, read_back, recorder, words};
 use hil_tests::run_folder::RunFolder;
-use hil_tests::trial::{RunFiles, Trial};
+use hil_tests::trial::{RunFiles, Trial, wait_until_it_heeds_interrupts};
+use nix::sys::signal::Signal;
+use nix::sys::stat::Mode;
+use nix::unistd::mkfifo;
 use prost::Message;
 use serde_json::Value;
 
@@ -203,7 +208,9 @@ fn check_in_python(
     }
     assert_eq!(read["metadata"]["hil.clocks"]["has_one_clock"], "true");
     let attachments = read["attachments"].as_array().unwrap();
-    assert!(attachments.contains(&Value::from("summary.json")));
+    for name in ["summary.json", "yumi.urdf"] {
+        assert!(attachments.contains(&Value::from(name)), "{name}");
+    }
 }
 
 /// Frames move, and the shapes of the arms with them.
@@ -357,4 +364,32 @@ fn what_a_killed_writer_left_becomes_whole_again() {
         2,
     );
     assert!(!folder.join("y").exists());
+}
+
+/// Work that looks for no signal, as reading a large file in one piece, does not keep Ctrl-C waiting: here
+/// a file that never ends being opened.
+#[test]
+fn an_interrupted_conversion_ends_whatever_it_does_and_leaves_no_file() {
+    let folder = RunFolder::new("mcap-interrupted");
+    let trial = Trial::shipped("shuttle-local.toml", folder.path()).set("run.duration=\"1 s\"");
+    let run = run(&trial);
+    let records = fs::read_dir(run.root().join("records")).unwrap();
+    let mut paths = records.map(|entry| entry.unwrap().path());
+    let path = paths.find(|path| path.to_string_lossy().contains(".taken."));
+    let path = path.unwrap();
+    fs::remove_file(&path).unwrap();
+    mkfifo(&path, Mode::S_IRUSR | Mode::S_IWUSR).unwrap();
+    let output = folder.join("output");
+    fs::create_dir(&output).unwrap();
+    let mut command = Command::new(hil_recorder_binary());
+    command.arg("convert").arg(run.root()).arg("--output");
+    command.arg(output.join("run.mcap"));
+    let mut converting = ChildGuard::spawn(&mut command).unwrap();
+    wait_until_it_heeds_interrupts(&converting, LIMIT);
+    converting.signal(Signal::SIGINT).unwrap();
+    let finished = converting.wait_within(LIMIT).unwrap();
+    assert_eq!(finished.status.code(), Some(130), "{finished:?}");
+    let words = "ended by Ctrl-C (SIGINT); no file was written";
+    assert!(finished.stderr.contains(words), "{finished:?}");
+    assert_eq!(fs::read_dir(&output).unwrap().count(), 0);
 }

@@ -235,7 +235,7 @@ fn mistakes_in_a_calibration_are_named_with_what_would_do() {
             &["calibrate", "teleop", "--mlr", "1.5"],
             &[
                 "\"teleop\" is taken for case teleoperation",
-                "mlr 1.5 is outside 0.001..=0.3",
+                "mlr 1.5 is outside 0.001 to 0.3",
             ],
         ),
         (

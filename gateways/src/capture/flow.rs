@@ -133,7 +133,7 @@ fn port(key: &'static str, value: &str) -> Result<u16, FlowError> {
     parsed.ok_or_else(|| FlowError::Value {
         key,
         value: value.to_owned(),
-        expected: "a port is 1..=65535",
+        expected: "a port is 1 to 65535",
     })
 }
 
@@ -146,7 +146,7 @@ fn address(key: &'static str, value: &str) -> Result<IpAddr, FlowError> {
 }
 
 fn number(value: &str) -> Result<UdpIdentity, FlowError> {
-    let expected = "`payload`, or OFFSET+BYTES[le] with 0..=1400 and 1..=8, e.g. 2+2";
+    let expected = "`payload`, or OFFSET+BYTES[le] with 0 to 1400 and 1 to 8, e.g. 2+2";
     let wrong = || FlowError::Value {
         key: "id",
         value: value.to_owned(),

@@ -165,7 +165,7 @@ pub enum Problem {
         minor: u16,
     },
     /// A length that cannot be.
-    #[error("{what} is {length}, outside {min}..={max}")]
+    #[error("{what} is {length}, outside {min} to {max}")]
     Length {
         /// Which length.
         what: &'static str,

@@ -94,7 +94,7 @@ impl<'a> Hello<'a> {
             let length = u8::try_from(name.len()).unwrap_or(0);
             assert!(
                 length > 0,
-                "a name of {} bytes is outside 1..=255",
+                "a name of {} bytes is outside 1 to 255",
                 name.len()
             );
             buffer[offset] = length;

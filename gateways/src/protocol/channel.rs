@@ -61,7 +61,7 @@ impl ChannelIdentity {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum SettingsError {
     /// A name is empty or does not fit its length byte.
-    #[error("{key} has {bytes} bytes, allowed are 1..=255")]
+    #[error("{key} has {bytes} bytes, allowed are 1 to 255")]
     NameLength {
         /// `channel_name` or `type_name`.
         key: &'static str,

@@ -31,7 +31,7 @@ refusals! {
     /// Another version of the protocol.
     UnsupportedVersion => "unsupported_version", "protocol version is not 1";
     /// A kind this version does not know.
-    UnknownKind => "unknown_kind", "kind is outside 1..=8";
+    UnknownKind => "unknown_kind", "kind is outside 1 to 8";
     /// The header claims another length than this version's.
     BadHeaderLength => "bad_header_length", "header length is not 72 bytes";
     /// A flag this version does not know.

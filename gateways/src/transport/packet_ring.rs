@@ -91,7 +91,7 @@ pub enum RingError {
         hardware_type: u16,
     },
     /// A size that cannot be.
-    #[error("{what} of {value} bytes is outside {min}..={max}")]
+    #[error("{what} of {value} bytes is outside {min} to {max}")]
     Size {
         /// Which size.
         what: &'static str,

@@ -217,7 +217,7 @@ fn settings_that_cannot_be_are_refused_by_name_value_and_bound() {
     let mut settings = loopback_settings();
     settings.dscp = Some(64);
     let error = UdpReceiver::open(&settings).unwrap_err().to_string();
-    assert_eq!(error, "dscp 64 is outside 0..=63");
+    assert_eq!(error, "dscp 64 is outside 0 to 63");
     settings.dscp = None;
     settings.receive_buffer_bytes = Some(usize::MAX);
     let error = UdpReceiver::open(&settings).unwrap_err().to_string();

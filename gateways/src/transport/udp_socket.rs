@@ -63,7 +63,7 @@ impl UdpSettings {
 #[derive(Debug, Error)]
 pub enum UdpError {
     /// A code point of more than six bits.
-    #[error("dscp {dscp} is outside 0..=63")]
+    #[error("dscp {dscp} is outside 0 to 63")]
     Dscp {
         /// The value.
         dscp: u8,

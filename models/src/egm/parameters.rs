@@ -434,32 +434,32 @@ impl Range {
     }
 }
 
-const CYCLE_US: Range = Range::new("egm.cycle_us", 1000.0, 100_000.0, "1000..=100000");
-const QUEUE_CAPACITY: Range = Range::new("egm.queue_capacity", 1.0, 100_000.0, "1..=100000");
-const POSITION_GAIN_PER_S: Range = Range::new("egm.position_gain_per_s", 0.0, 20.0, "0..=20");
-const LOW_PASS_HZ: Range = Range::new("egm.low_pass_hz", 0.0, 100.0, "0..=100");
+const CYCLE_US: Range = Range::new("egm.cycle_us", 1000.0, 100_000.0, "1000 to 100000");
+const QUEUE_CAPACITY: Range = Range::new("egm.queue_capacity", 1.0, 100_000.0, "1 to 100000");
+const POSITION_GAIN_PER_S: Range = Range::new("egm.position_gain_per_s", 0.0, 20.0, "0 to 20");
+const LOW_PASS_HZ: Range = Range::new("egm.low_pass_hz", 0.0, 100.0, "0 to 100");
 const POSITION_CORRECTION_RATIO: Range =
-    Range::new("egm.position_correction_ratio", 0.0, 1.0, "0..=1");
-const RAMP_IN_S: Range = Range::new("egm.ramp_in_s", 0.0, 10.0, "0..=10");
-const RAMP_OUT_S: Range = Range::new("egm.ramp_out_s", 0.0, 10.0, "0..=10");
+    Range::new("egm.position_correction_ratio", 0.0, 1.0, "0 to 1");
+const RAMP_IN_S: Range = Range::new("egm.ramp_in_s", 0.0, 10.0, "0 to 10");
+const RAMP_OUT_S: Range = Range::new("egm.ramp_out_s", 0.0, 10.0, "0 to 10");
 const MAX_SPEED_DEVIATION_DEG_PER_S: Range = Range::new(
     "egm.max_speed_deviation_deg_per_s",
     0.01,
     1000.0,
-    "0.01..=1000",
+    "0.01 to 1000",
 );
 const MAX_POSITION_DEVIATION_DEG: Range =
-    Range::new("egm.max_position_deviation_deg", 0.1, 1000.0, "0.1..=1000");
-const CONVERGENCE_DEG: Range = Range::new("egm.convergence_deg", 0.001, 100.0, "0.001..=100");
-const CONDITION_TIME_S: Range = Range::new("egm.condition_time_s", 0.0, 1e6, "0..=1000000");
-const COMM_TIMEOUT_S: Range = Range::new("egm.comm_timeout_s", 0.004, 1e6, "0.004..=1000000");
-const RESTART_WAIT_S: Range = Range::new("egm.restart_wait_s", 0.0, 60.0, "0..=60");
-const ACTIVATION_S: Range = Range::new("egm.activation_s", 0.0, 60.0, "0..=60");
+    Range::new("egm.max_position_deviation_deg", 0.1, 1000.0, "0.1 to 1000");
+const CONVERGENCE_DEG: Range = Range::new("egm.convergence_deg", 0.001, 100.0, "0.001 to 100");
+const CONDITION_TIME_S: Range = Range::new("egm.condition_time_s", 0.0, 1e6, "0 to 1000000");
+const COMM_TIMEOUT_S: Range = Range::new("egm.comm_timeout_s", 0.004, 1e6, "0.004 to 1000000");
+const RESTART_WAIT_S: Range = Range::new("egm.restart_wait_s", 0.0, 60.0, "0 to 60");
+const ACTIVATION_S: Range = Range::new("egm.activation_s", 0.0, 60.0, "0 to 60");
 const CONTROL_DELAY_CYCLES: Range = Range::new(
     "egm.control_delay_cycles",
     0.0,
     DELAY_CYCLES_MAX as f64,
-    "0..=16",
+    "0 to 16",
 );
 
 #[cfg(test)]

@@ -83,7 +83,7 @@ fn each_number_outside_its_range_is_refused_by_its_key() {
             }
             let error = with(&key, value).unwrap_err();
             assert_eq!(error.key, format!("egm.{}", key.name));
-            assert!(error.to_string().contains(".."), "{error}");
+            assert!(error.to_string().contains(" to "), "{error}");
         }
     }
 }

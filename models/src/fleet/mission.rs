@@ -56,7 +56,7 @@ impl MissionParameters {
             "missions.parking_s",
             self.parking_s,
             0.0..=3600.0,
-            "0..=3600",
+            "0 to 3600",
         )
     }
 }

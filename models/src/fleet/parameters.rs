@@ -50,7 +50,7 @@ impl FleetParameters {
     /// # Errors
     /// The first key outside its range.
     pub fn check(&self) -> Result<(), ParameterError> {
-        ParameterError::check("fleets", f64::from(self.fleets), 1.0..=64.0, "1..=64")?;
+        ParameterError::check("fleets", f64::from(self.fleets), 1.0..=64.0, "1 to 64")?;
         self.robot.check()?;
         self.coordinator.check()?;
         self.missions.check()?;

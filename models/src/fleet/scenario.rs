@@ -222,10 +222,10 @@ impl WorldParameters {
 
     fn check(&self) -> Result<(), ParameterError> {
         let vehicle = self.vehicle();
-        let size = (0.05..=100.0, "0.05..=100");
-        let rate = (0.01..=100.0, "0.01..=100");
-        let spacing = (0.01..=5.0, "0.01..=5");
-        let radius = (0.05..=1000.0, "0.05..=1000");
+        let size = (0.05..=100.0, "0.05 to 100");
+        let rate = (0.01..=100.0, "0.01 to 100");
+        let spacing = (0.01..=5.0, "0.01 to 5");
+        let radius = (0.05..=1000.0, "0.05 to 1000");
         let numbers = [
             ("world.length_m", vehicle.footprint.length_m, &size),
             ("world.width_m", vehicle.footprint.width_m, &size),
@@ -236,12 +236,12 @@ impl WorldParameters {
             (
                 "world.clearance_m",
                 self.clearance_m(),
-                &(0.0..=100.0, "0..=100"),
+                &(0.0..=100.0, "0 to 100"),
             ),
             (
                 "world.robots",
                 f64::from(self.robots),
-                &(1.0..=448.0, "1..=448"),
+                &(1.0..=448.0, "1 to 448"),
             ),
         ];
         for (key, value, (allowed, text)) in numbers {

@@ -27,7 +27,7 @@ impl BernoulliLink {
         loss_ratio: f64,
         random: RandomStream,
     ) -> Result<Self, ParameterError> {
-        ParameterError::check("loss_ratio", loss_ratio, 0.0..=1.0, "0..=1")?;
+        ParameterError::check("loss_ratio", loss_ratio, 0.0..=1.0, "0 to 1")?;
         Ok(Self {
             delay,
             loss_ratio,

@@ -75,14 +75,14 @@ impl Impairments {
     /// The first key outside its range.
     pub fn check(&self) -> Result<(), ParameterError> {
         const LONG_MS: core::ops::RangeInclusive<f64> = 0.0..=60_000.0;
-        const LONG_MS_TEXT: &str = "0..=60000";
+        const LONG_MS_TEXT: &str = "0 to 60000";
         let ratios = [
             ("loss_ratio", self.loss_ratio),
             ("duplicate_ratio", self.duplicate_ratio),
             ("hold_ratio", self.hold_ratio),
         ];
         for (key, ratio) in ratios {
-            ParameterError::check(key, ratio, 0.0..=1.0, "0..=1")?;
+            ParameterError::check(key, ratio, 0.0..=1.0, "0 to 1")?;
         }
         let times = [
             ("delay_ms", self.delay_ms),
@@ -92,13 +92,13 @@ impl Impairments {
         for (key, time_ms) in times {
             ParameterError::check(key, time_ms, LONG_MS, LONG_MS_TEXT)?;
         }
-        ParameterError::check("copies", f64::from(self.copies), 1.0..=16.0, "1..=16")?;
-        ParameterError::check("stall_mean_s", self.stall_mean_s, 0.0..=60.0, "0..=60")?;
+        ParameterError::check("copies", f64::from(self.copies), 1.0..=16.0, "1 to 16")?;
+        ParameterError::check("stall_mean_s", self.stall_mean_s, 0.0..=60.0, "0 to 60")?;
         ParameterError::check(
             "stall_gap_mean_s",
             self.stall_gap_mean_s,
             0.1..=86_400.0,
-            "0.1..=86400",
+            "0.1 to 86400",
         )
     }
 }

@@ -48,8 +48,8 @@ impl Outages {
     /// # Errors
     /// The first key outside its range.
     pub fn check(&self) -> Result<(), ParameterError> {
-        ParameterError::check("mean_s", self.mean_s, 0.001..=HOUR_S, "0.001..=3600")?;
-        ParameterError::check("per_hour", self.per_hour, 0.0..=100_000.0, "0..=100000")?;
+        ParameterError::check("mean_s", self.mean_s, 0.001..=HOUR_S, "0.001 to 3600")?;
+        ParameterError::check("per_hour", self.per_hour, 0.0..=100_000.0, "0 to 100000")?;
         if self.down_ratio() > DOWN_RATIO_MAX {
             let problem = format!(
                 "{} of {} s on average leave less than 5 % of the time in service",

@@ -62,7 +62,7 @@ impl RateLimit {
         ];
         for (key, value, range) in ranges {
             if !range.contains(&value) {
-                let problem = format!("{value} is outside {}..={}", range.start(), range.end());
+                let problem = format!("{value} is outside {} to {}", range.start(), range.end());
                 return Err(ParameterError::new(key, problem));
             }
         }

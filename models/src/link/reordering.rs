@@ -54,11 +54,11 @@ impl Duplication {
 }
 
 fn check(ratio: f64, (key, later): (&str, Duration)) -> Result<(), ParameterError> {
-    ParameterError::check("ratio", ratio, 0.0..=1.0, "0..=1")?;
+    ParameterError::check("ratio", ratio, 0.0..=1.0, "0 to 1")?;
     if later <= LATER_MAX {
         return Ok(());
     }
-    let problem = format!("{later:?} is outside 0 s..={LATER_MAX:?}");
+    let problem = format!("{later:?} is outside 0 s to {LATER_MAX:?}");
     Err(ParameterError::new(key, problem))
 }
 

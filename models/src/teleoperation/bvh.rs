@@ -168,7 +168,7 @@ impl<L: Iterator<Item: AsRef<str>>> BvhReader<L> {
             return Err(words.error(BvhProblem::OutOfRange {
                 what: "frame time",
                 value: frame_time_s.to_string(),
-                allowed: "0.000001..=10 s",
+                allowed: "0.000001 to 10 s",
             }));
         }
         Ok(Self {
@@ -260,7 +260,7 @@ fn parse_joint<L: Iterator<Item: AsRef<str>>>(
         return Err(words.error(BvhProblem::OutOfRange {
             what: "joint count",
             value: (JOINT_COUNT_MAX + 1).to_string(),
-            allowed: "1..=1024",
+            allowed: "1 to 1024",
         }));
     }
     words.keyword("{", "an opening brace")?;
@@ -275,7 +275,7 @@ fn parse_joint<L: Iterator<Item: AsRef<str>>>(
         return Err(words.error(BvhProblem::OutOfRange {
             what: "channel count",
             value: count.to_string(),
-            allowed: "0..=6",
+            allowed: "0 to 6",
         }));
     }
     let mut channels = Vec::with_capacity(count);

@@ -40,7 +40,7 @@ impl Swing {
     /// # Errors
     /// When `amplitude_m` is outside 0.01..=0.4: the arm is 0.54 m long.
     pub fn new(amplitude_m: f64) -> Result<Self, ParameterError> {
-        ParameterError::check("amplitude_m", amplitude_m, 0.01..=0.4, "0.01..=0.4")?;
+        ParameterError::check("amplitude_m", amplitude_m, 0.01..=0.4, "0.01 to 0.4")?;
         let (skeleton, right_hand_index, left_hand_index) = person();
         let values = channel_values(0.0);
         Ok(Self {
@@ -76,8 +76,8 @@ impl Swing {
 /// When `period_s` is outside 0.5..=60, `amplitude_m` outside 0.01..=0.4 or `rate_hz` outside
 /// 10..=1000.
 pub fn swing_bvh(period_s: f64, amplitude_m: f64, rate_hz: f64) -> Result<String, ParameterError> {
-    ParameterError::check("motion_period_s", period_s, 0.5..=60.0, "0.5..=60")?;
-    ParameterError::check("rate_hz", rate_hz, 10.0..=1000.0, "10..=1000")?;
+    ParameterError::check("motion_period_s", period_s, 0.5..=60.0, "0.5 to 60")?;
+    ParameterError::check("rate_hz", rate_hz, 10.0..=1000.0, "10 to 1000")?;
     let swing = Swing::new(amplitude_m)?;
     let frame_time_s = 1.0 / rate_hz;
     let times = (0_u32..)

@@ -276,12 +276,12 @@ impl Columns {
         let size_bytes = optional(cell(6), COLUMNS[6])?.unwrap_or(0);
         if size_bytes > SIZE_BYTES_MAX {
             return Err(format!(
-                "size_bytes is {size_bytes}, allowed are 0..={SIZE_BYTES_MAX}"
+                "size_bytes is {size_bytes}, allowed are 0 to {SIZE_BYTES_MAX}"
             ));
         }
         let flags = optional(cell(9), COLUMNS[9])?.unwrap_or(0);
         if flags & !TraceRecord::FLAGS != 0 {
-            return Err(format!("flags are {flags}, allowed are 0..=31"));
+            return Err(format!("flags are {flags}, allowed are 0 to 31"));
         }
         Ok(TraceRecord {
             published_ns,
@@ -370,7 +370,7 @@ mod tests {
         assert_eq!((fault.line, sized.trace.records.len()), (3, 1));
         assert_eq!(
             fault.what,
-            "size_bytes is 67107841, allowed are 0..=67107840"
+            "size_bytes is 67107841, allowed are 0 to 67107840"
         );
         let text = encode(&sample());
         let cut = &text[..text.len() - "10,10,delivered,-3,9,12,40,2,0,1\n".len()];

@@ -136,7 +136,7 @@ fn opportunity(content: &str, before_ns: i64) -> Result<i64, String> {
     let ms = parsed
         .map_err(|_not_a_number| format!("\"{content}\" is no whole number of milliseconds"))?;
     let at_ns = ms.checked_mul(MS_NS).filter(|ns| *ns >= 0);
-    let at_ns = at_ns.ok_or_else(|| format!("{ms} ms is outside 0..=9223372036854"))?;
+    let at_ns = at_ns.ok_or_else(|| format!("{ms} ms is outside 0 to 9223372036854"))?;
     if at_ns < before_ns {
         return Err(format!("{ms} ms comes after {} ms", before_ns / MS_NS));
     }

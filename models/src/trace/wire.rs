@@ -355,7 +355,7 @@ fn decode_header(bytes: &[u8]) -> Result<(TraceHeader, u64), (u64, FaultKind)> {
     }
     let count = u64::from_le_bytes(array_at(bytes, 24));
     if count > RECORD_COUNT_MAX {
-        let (value, allowed) = (count, "0..=4294967295");
+        let (value, allowed) = (count, "0 to 4294967295");
         let field = "record_count";
         let what = FaultKind::Field {
             field,
@@ -408,14 +408,14 @@ fn check_record(record: &TraceRecord) -> Result<(), (u64, FaultKind)> {
         Err((at, what))
     };
     if record.flags & !TraceRecord::FLAGS != 0 {
-        return field(55, "flags", u64::from(record.flags), "0..=31");
+        return field(55, "flags", u64::from(record.flags), "0 to 31");
     }
     if record.size_bytes > SIZE_BYTES_MAX {
         return field(
             48,
             "size_bytes",
             u64::from(record.size_bytes),
-            "0..=67107840",
+            "0 to 67107840",
         );
     }
     if record.published_ns == UNAVAILABLE_NS {
@@ -449,7 +449,7 @@ fn code<T: Copy>(
     field: &'static str,
 ) -> Result<T, (u64, FaultKind)> {
     let value = bytes[at];
-    let allowed = if all.len() == 5 { "0..=4" } else { "0..=2" };
+    let allowed = if all.len() == 5 { "0 to 4" } else { "0 to 2" };
     let what = FaultKind::Field {
         field,
         value: u64::from(value),

@@ -55,7 +55,7 @@ export class ArmScene {
     this.floor(context);
     if (!arms) return;
     const parts = [...this.bodyParts(arms)];
-    for (const arm of arms.arms) parts.push(...this.armParts(arm.measured_frames, arms.shapes, this.colourOf(arm)));
+    for (const arm of arms.arms) parts.push(...this.armParts(arm.measured_frames, arms, this.colourOf(arm)));
     parts.sort((one, other) => other.depth - one.depth);
     for (const part of parts) paint(context, part, colours);
     this.ghost(context, arms, width, height);
@@ -84,27 +84,20 @@ export class ArmScene {
     for (let at = y[0]; at <= y[1] + 1e-9; at += step) line([x[0], at, 0], [x[1], at, 0]);
   }
 
-  // A plain column to which the arms are mounted, for orientation; its size is not the robot's.
+  // What the robot's description says carries the arms.
   bodyParts(arms) {
-    const mounts = arms.arms.map((arm) => (arm.measured_frames ?? arm.desired_frames)?.[0]).filter(Boolean);
-    if (mounts.length === 0) return [];
-    const top = mounts.reduce((sum, mount) => sum.map((value, axis) => value + mount[axis] / mounts.length), [0, 0, 0]);
-    const column = this.rod([top[0] - 0.02, top[1], 0.03], top, 0.06, this.colours.faint);
-    return [column, ...mounts.map((mount) => this.rod(top, mount, 0.05, this.colours.faint))].filter(Boolean);
+    const { body } = arms;
+    return body.map((rod) => this.rod(rod.from_m, rod.to_m, rod.radius_m, this.colours.faint)).filter(Boolean);
   }
 
-  armParts(frames, shapes, colour) {
+  // What it says of an arm: links between its frames, and fingers in the last.
+  armParts(frames, { shapes, fingers }, colour) {
     if (!frames) return [];
-    const rods = shapes.map((shape) => this.rod(frames[shape.from], frames[shape.to], shape.radius_m, colour));
-    return [...rods, ...this.fingers(frames.at(-1), colour)].filter(Boolean);
-  }
-
-  // Two fingers along the tool's z axis, so that its turn can be seen.
-  fingers(frame, colour) {
-    const across = rotate(frame, [0.02, 0, 0]);
-    const along = rotate(frame, [0, 0, 0.06]);
-    const add = (sign, share) => [0, 1, 2].map((axis) => frame[axis] + sign * across[axis] + share * along[axis]);
-    return [-1, 1].map((sign) => this.rod(add(sign, 0), add(sign, 1), 0.008, colour));
+    const links = shapes.map((shape) => this.rod(frames[shape.from], frames[shape.to], shape.radius_m, colour));
+    const tool = frames.at(-1);
+    const within = (place) => rotate(tool, place).map((value, axis) => tool[axis] + value);
+    const ends = fingers.map((rod) => this.rod(within(rod.from_m), within(rod.to_m), rod.radius_m, colour));
+    return [...links, ...ends].filter(Boolean);
   }
 
   // A rod with round ends as the screen has it; undefined when it is behind the eye.
@@ -124,7 +117,7 @@ export class ArmScene {
     pen.setTransform(ratio, 0, 0, ratio, 0, 0);
     pen.lineCap = "round";
     const colour = this.colours.series[1];
-    const rods = arms.arms.flatMap((arm) => this.armParts(arm.desired_frames, arms.shapes, colour));
+    const rods = arms.arms.flatMap((arm) => this.armParts(arm.desired_frames, arms, colour));
     for (const rod of rods) stroke(pen, rod, colour, rod.width + 1.6, 1);
     pen.globalCompositeOperation = "destination-out";
     for (const rod of rods) stroke(pen, rod, "#000", Math.max(rod.width - 1.6, 0.5), 1);

@@ -51,7 +51,7 @@ export function showFacts(run, channels) {
 }
 
 export function showWarnings(run) {
-  const warnings = [...overran(run.overruns ?? [], run.state), ...run.warnings];
+  const warnings = [...overran(run.overruns ?? [], run.overrun_hosts ?? [], run.state), ...run.warnings];
   const section = byId("warnings");
   const key = JSON.stringify(warnings);
   if (section.dataset.key === key) return;
@@ -63,13 +63,23 @@ export function showWarnings(run) {
   section.firstElementChild.replaceChildren(...items);
 }
 
-// Ticks that went by without their process, by host: no delay of these is the network's.
-function overran(overruns, state) {
-  const when = state === "ended" ? "as last told before the end" : "so far";
-  const some = overruns.filter((one) => one.skipped_tick_count > 0);
-  return [...new Set(some.map((one) => one.host))].map((host) => {
-    const each = some.filter((one) => one.host === host).map((one) => `${one.process} ${count(one.skipped_tick_count)}`);
-    return { what: `host ${host} overran, ticks skipped ${when}: ${each.join(", ")}` };
+// Ticks that went by without their process, by host: no delay of these is the network's. A host that is not
+// heard may have skipped any number by now.
+function overran(overruns, hosts, state) {
+  const skipped = (host) => overruns.filter((one) => one.host === host && one.skipped_tick_count > 0);
+  const words = (host) => {
+    const each = skipped(host.host).map((one) => `${one.process} ${count(one.skipped_tick_count)}`);
+    if (host.left_out_count > 0) each.push(`${count(host.left_out_count)} more processes`);
+    return each.join(", ");
+  };
+  return hosts.flatMap((host) => {
+    const each = words(host);
+    if (state !== "ended" && !host.is_heard) {
+      const silence = host.silent_s === null ? "not heard yet" : `not heard for ${seconds(host.silent_s, 0)}`;
+      return [{ what: `host ${host.host}: ticks skipped ${UNAVAILABLE}, ${silence}${each && `; last told: ${each}`}` }];
+    }
+    const when = state === "ended" ? "as last told before the end" : "so far";
+    return each ? [{ what: `host ${host.host} overran, ticks skipped ${when}: ${each}` }] : [];
   });
 }
 

@@ -19,7 +19,8 @@ Examples:
   hil-recorder recover broken.mcap -o whole.mcap
       a whole file of what a killed writer left
   hil-recorder serve
-      the run that goes on, in the browser and in whatever speaks the Foxglove WebSocket
+      the run that goes on, in the browser and in whatever speaks the Foxglove
+      WebSocket
   hil-recorder play run.mcap --only human/frame --speed 2 --loop
       a recorded channel into a run that goes on, in place of its producer
 
@@ -36,7 +37,8 @@ Examples:
   hil-recorder serve
       the run that goes on here; the page is at http://127.0.0.1:8766/
   hil-recorder serve --wait --record recordings/ --no-scene
-      the next one, and the one after it, each recorded as well, without pictures
+      the next one, and the one after it, each recorded as well, without
+      pictures
   hil-recorder serve runs/fleet-emulated-20261122-101806 --loop
       a finished run again and again
   ssh -L 8765:localhost:8765 -L 8766:localhost:8766 control-pc
@@ -46,58 +48,65 @@ Examples:
   hil-recorder serve --allow-origin file://
       for Lichtblick as an application; so may any saved page then
 
-Web pages of others are refused, and named here once. Programs and our own page need no option.
-Lichtblick and Foxglove connect to ws://127.0.0.1:8765. Topics and fields are in docs/live-view.md.
-It ends with Ctrl-C; the exit code is 0 then, or 1 when --record could not write a file.";
+Web pages of others are refused, and named here once. Programs and our own page
+need no option. Lichtblick and Foxglove connect to ws://127.0.0.1:8765. Topics
+and fields are in docs/live-view.md. It ends with Ctrl-C; the exit code is 0
+then, or 1 when --record could not write a file.";
 
 const CONVERT_EXAMPLES: &str = "\
 Examples:
   hil-recorder convert runs/teleop-local-20261121-101500 -o run.mcap
-  hil-recorder convert runs/fleet-split-20261121-101500-control-pc -o fleet.mcap --force
+  hil-recorder convert runs/NAME -o fleet.mcap --force
 
-Works for a run that was killed too: what is cut short is left out, counted, and said in the
-file; the exit code is 1 then. Topics and schemas are in docs/recordings.md.";
+Works for a run that was killed too: what is cut short is left out, counted, and
+said in the file; the exit code is 1 then. Topics and schemas are in
+docs/recordings.md.";
 
 const RECORD_EXAMPLES: &str = "\
 Examples:
   hil-recorder record -o run.mcap
       the only run that goes on this host, until it ends or Ctrl-C
   hil-recorder record --wait -o recordings/ &
-      started before the run: waits for it; the file gets the run's name, the folder is made
-  hil-recorder record teleop-split -o long.mcap --split-size 1GiB --split-time 10min
+      started before the run: waits for it; the file gets the run's name, the
+      folder is made
+  hil-recorder record teleop-split -o long.mcap --split-size 1GiB
       long_0001.mcap, long_0002.mcap and so on, each whole by itself
 
 Until it is whole, a file is called FILE.partial. When the recorder is killed,
-`hil-recorder recover FILE.partial -o FILE` gets back all but the last --flush. What was missed is
-counted by channel, here and in the file; the exit code is 1 then. See docs/recordings.md.";
+`hil-recorder recover FILE.partial -o FILE` gets back all but the last --flush.
+What was missed is counted by channel, here and in the file; the exit code is 1
+then. See docs/recordings.md.";
 
 const RECOVER_EXAMPLES: &str = "\
 Example:
   hil-recorder recover broken.mcap -o whole.mcap
 
-Every chunk whose check sum is right is copied, the last one as far as it goes. Each loss is said
-with the byte at which it begins, here and in the new file under `hil.recovery`. The exit code is
-0 when there is a new file, whatever was lost.";
+Every chunk whose check sum is right is copied, the last one as far as it goes.
+Each loss is said with the byte at which it begins, here and in the new file
+under `hil.recovery`. The exit code is 0 when there is a new file, whatever was
+lost.";
 
 const INFO_EXAMPLES: &str = "\
 Examples:
   hil-recorder info run.mcap
   hil-recorder info run.mcap --json | jq '.metadata[\"hil.run\"].seed'
 
-A broken file is shown as far as it goes, with where the damage begins; what `recover` makes of it
-is whole. The metadata are described in docs/recordings.md.";
+A broken file is shown as far as it goes, with where the damage begins; what
+`recover` makes of it is whole. The metadata are described in
+docs/recordings.md.";
 
 const PLAY_EXAMPLES: &str = "\
 Examples:
   hil-recorder play run.mcap --only human/frame --loop
       as the program of a process in a topology: into the run that started it
-  hil-recorder play run.mcap --only human/frame --into teleop-local-20261121-101500
+  hil-recorder play run.mcap --only human/frame --into teleop-local
       by hand, into a channel that has no writer
 
-Messages are rebuilt byte for byte and leave at their recorded spacing, with numbers and times of
-their own. A channel with a living writer is refused. Messages that leave late are counted and
-said at the end. As a process of a run it stays, silent, when the recording is over, because its
-end would end the run. docs/terminal.md has an example.";
+Messages are rebuilt byte for byte and leave at their recorded spacing, with
+numbers and times of their own. A channel with a living writer is refused.
+Messages that leave late are counted and said at the end. As a process of a run
+it stays, silent, when the recording is over, because its end would end the run.
+docs/terminal.md has an example.";
 
 /// Turns the runs of hil-runtime into MCAP files, which other people's tools read.
 #[derive(Debug, Parser)]

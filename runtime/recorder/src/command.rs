@@ -9,6 +9,7 @@ use hil_runtime::console::Console;
 use hil_runtime::documents;
 use hil_runtime::progress::Progress;
 use hil_runtime::signals::{EXIT_INTERRUPTED, Signals};
+use hil_runtime::words::counted_plainly;
 
 use crate::cli::{Cli, Command, ServeOptions};
 use crate::convert::{ConvertError, convert};
@@ -189,11 +190,11 @@ fn convert_run(
                 console.warn(words);
             }
             console.result(&format!(
-                "{}: {} messages of the run, {} in all on {} topics\n",
+                "{}: {} of the run, {} in all on {}\n",
                 output.display(),
-                converted.message_count,
+                counted_plainly(converted.message_count, "message"),
                 converted.written_count,
-                converted.topic_count
+                counted_plainly(converted.topic_count as u64, "topic")
             ));
             if converted.has_gaps {
                 console.error("the run's folder has gaps, see above; the file says so too");
@@ -237,7 +238,8 @@ fn record_run(request: &Request, signals: &Signals, console: &mut Console) -> u8
         console.warn(words);
     }
     for (channel, count) in &recorded.missed {
-        console.warn(&format!("{channel}: missed {count} messages"));
+        let count = counted_plainly(*count, "message");
+        console.warn(&format!("{channel}: missed {count}"));
     }
     let files: Vec<String> = recorded
         .paths
@@ -245,11 +247,11 @@ fn record_run(request: &Request, signals: &Signals, console: &mut Console) -> u8
         .map(|path| path.display().to_string())
         .collect();
     console.result(&format!(
-        "{}: {} messages of the run, {} in all on {} topics; missed {}\n",
+        "{}: {} of the run, {} in all on {}; missed {}\n",
         files.join(", "),
-        recorded.message_count,
+        counted_plainly(recorded.message_count, "message"),
         recorded.written_count,
-        recorded.topic_count,
+        counted_plainly(recorded.topic_count as u64, "topic"),
         recorded.missed.values().sum::<u64>()
     ));
     if recorded.signal.is_some() {
@@ -300,10 +302,8 @@ fn recover_file((broken, output): (&Path, &Path), signals: &Signals, console: &m
         console.warn(&format!("lost: {}", loss_words(loss)));
     }
     if recovered.homeless_count > 0 {
-        let count = recovered.homeless_count;
-        console.warn(&format!(
-            "lost: {count} messages whose topic is nowhere described"
-        ));
+        let count = counted_plainly(recovered.homeless_count, "message");
+        console.warn(&format!("lost: {count} whose topic is nowhere described"));
     }
     let lost = match recovered.lost_count() {
         Some(0) => "none is known to be lost".to_owned(),
@@ -311,9 +311,9 @@ fn recover_file((broken, output): (&Path, &Path), signals: &Signals, console: &m
         None => "how many were lost nobody counted".to_owned(),
     };
     console.result(&format!(
-        "{}: {} messages in {:.3} s recovered; {lost}\n",
+        "{}: {} in {:.3} s recovered; {lost}\n",
         output.display(),
-        recovered.message_count,
+        counted_plainly(recovered.message_count, "message"),
         recovered.span_s()
     ));
     exit::DONE

@@ -5,6 +5,7 @@ use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fs;
 
+use hil_models::yumi::description::Urdf;
 use hil_runtime::run_folder::RunFolder;
 use mcap::Attachment;
 use serde_json::Value;
@@ -12,6 +13,7 @@ use serde_json::Value;
 use crate::clocks::Clocks;
 use crate::convert::ChannelTopics;
 use crate::run::Run;
+use crate::scene::is_of_arms;
 use crate::topics::Names;
 use crate::writer::{Recording, WriteError};
 
@@ -68,7 +70,9 @@ pub(crate) fn write(
     recording.describe("hil.clocks", clock_words(run, clocks))?;
     recording.describe("hil.channels", channel_words(channels))?;
     recording.describe("hil.recording", recording_words(run, names))?;
-    attach(recording, &run.folder)
+    attach(recording, &run.folder)?;
+    let messages = channels.iter().filter_map(|one| one.message.as_deref());
+    attach_robot(recording, messages)
 }
 
 /// What ran.
@@ -167,6 +171,26 @@ fn recording_words(run: &Run, names: &Names) -> Words {
         words.insert(format!("renamed {given}"), format!("{wanted} was taken"));
     }
     words
+}
+
+/// The description of the robot, if any of `messages` is about its arms.
+///
+/// # Errors
+/// When the file cannot be written.
+pub(crate) fn attach_robot<'a>(
+    recording: &mut Recording,
+    messages: impl IntoIterator<Item = &'a str>,
+) -> Result<(), WriteError> {
+    if !messages.into_iter().any(is_of_arms) {
+        return Ok(());
+    }
+    recording.attach(&Attachment {
+        log_time: 0,
+        create_time: 0,
+        name: "yumi.urdf".to_owned(),
+        media_type: "application/xml".to_owned(),
+        data: Cow::Owned(Urdf.to_string().into_bytes()),
+    })
 }
 
 /// Report and figures as they are: whoever has only this file has them too.

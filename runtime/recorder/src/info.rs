@@ -6,6 +6,7 @@ use std::fmt::Write as _;
 use std::path::Path;
 
 use hil_runtime::run_folder::utc_text;
+use hil_runtime::words::counted_plainly;
 use mcap::records::Record;
 use serde::Serialize;
 use std::time::{Duration, UNIX_EPOCH};
@@ -130,14 +131,14 @@ impl Info {
             text.push('\n');
         };
         line(format!("{} bytes, {state}", self.size_bytes));
-        let count = self.message_count;
+        let count = counted_plainly(self.message_count, "message");
         line(match first.zip(last) {
             Some((first, last)) => format!(
-                "{count} messages in {:.3} s from {}",
+                "{count} in {:.3} s from {}",
                 seconds(first, last),
                 instant(first)
             ),
-            None => format!("{count} messages"),
+            None => count,
         });
         for loss in &self.losses {
             line(format!("lost: {loss}"));

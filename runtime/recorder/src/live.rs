@@ -378,6 +378,11 @@ impl LiveTopics {
         channels.map(|one| one.joining.unordered_count).sum()
     }
 
+    /// The names of the messages, a channel each.
+    pub(crate) fn messages(&self) -> impl Iterator<Item = &str> {
+        self.channels.values().map(|one| one.message.as_str())
+    }
+
     /// By channel: its message, and whether it is typed.
     pub(crate) fn channel_words(&self) -> BTreeMap<String, String> {
         let describe = |(name, channel): (&String, &ChannelTopics)| {

@@ -388,6 +388,7 @@ impl LiveRecording {
         }
         self.files.open().describe("hil.end", end)?;
         facts::attach(self.files.open(), &run.folder)?;
+        facts::attach_robot(self.files.open(), self.topics.messages())?;
         let counts = self.topics.counts();
         let missed = self.topics.missed(&self.feed, self.is_silent);
         let mut words = self.problems.clone();

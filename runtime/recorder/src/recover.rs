@@ -10,6 +10,7 @@ use mcap::{Attachment, Channel, Schema};
 
 use crate::scan::{Loss, ScanEnd, ScanError, scan};
 use crate::writer::{Recording, Stamp, WriteError};
+use hil_runtime::words::counted_plainly;
 
 /// How a recovery went wrong.
 #[derive(Debug, thiserror::Error)]
@@ -159,7 +160,7 @@ fn words(from: &Path, recovered: &Recovered) -> BTreeMap<String, String> {
 pub(crate) fn loss_words(loss: &Loss) -> String {
     let count = loss
         .message_count
-        .map(|count| format!("; its index names {count} messages"))
+        .map(|count| format!("; its index names {}", counted_plainly(count, "message")))
         .unwrap_or_default();
     let (offset, size, why) = (loss.offset, loss.size_bytes, &loss.why);
     format!("byte {offset}, {size} bytes: {why}{count}")

@@ -11,6 +11,7 @@ use hil_runtime::manifest::{ChannelDescription, Manifest};
 use hil_runtime::record::{RecordFile, RecordKind};
 use hil_runtime::report::summary::RunSummary;
 use hil_runtime::run_folder::RunFolder;
+use hil_runtime::words::counted_plainly;
 use serde_json::Value;
 
 /// The kinds of records that end in a recording.
@@ -238,7 +239,10 @@ impl Run {
             }
         }
         for (channel, count) in &self.gaps.missing {
-            let words = format!("{channel}: {count} messages were numbered and not recorded");
+            let words = format!(
+                "{channel}: {} numbered and not recorded",
+                counted_plainly(*count, "message")
+            );
             self.gaps.words.push(words);
         }
     }

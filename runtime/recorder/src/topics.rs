@@ -12,13 +12,12 @@ use hil_models::case_study::Severity;
 use hil_models::egm::messages::{EgmCommand, EgmFeedback};
 use hil_models::fleet::messages::State;
 use hil_models::message::Message;
+use hil_models::yumi::description::joint_name;
 use hil_runtime::report::score_event::ExplainedEvent;
 use prost::Message as _;
 
 use crate::schema::Schema;
 
-/// The joints of a YuMi arm in chain order, as its maker numbers them.
-const JOINTS_IN_CHAIN_ORDER: [u32; 7] = [1, 2, 7, 3, 4, 5, 6];
 /// How long a vehicle stays in a picture after its last state, seconds.
 const VEHICLE_SHOWN_S: i32 = 2;
 /// Size of a vehicle in a picture, metres. No message carries the true size.
@@ -158,16 +157,12 @@ fn joints(
     speeds_rad_per_s: Option<&[f64; 7]>,
 ) -> JointStates {
     let mut parts = channel.split('/');
-    let side = parts.find_map(|part| match part {
-        "right" => Some("_r"),
-        "left" => Some("_l"),
-        _ => None,
-    });
+    let side = parts.find(|part| ["right", "left"].contains(part));
     let side = side.unwrap_or_default();
-    let joints = JOINTS_IN_CHAIN_ORDER.iter().enumerate();
-    let joints = joints.map(|(index, number)| JointState {
-        name: format!("yumi_joint_{number}{side}"),
-        position: Some(positions_rad[index]),
+    let joints = positions_rad.iter().enumerate();
+    let joints = joints.map(|(index, position_rad)| JointState {
+        name: joint_name(side, index),
+        position: Some(*position_rad),
         velocity: speeds_rad_per_s.map(|speeds| speeds[index]),
         ..JointState::default()
     });

@@ -196,10 +196,12 @@ impl Recording {
             File::create(&partial)
         };
         let file = file.and_then(QueuedFile::new).map_err(|source| {
-            let path = partial.clone();
             if is_live && source.kind() == io::ErrorKind::AlreadyExists {
+                let path = partial.clone();
                 WriteError::Unfinished { path }
             } else {
+                // The name that was asked for: of the other one nobody has heard.
+                let path = path.to_owned();
                 WriteError::Io { path, source }
             }
         })?;
@@ -244,8 +246,18 @@ impl Recording {
         self.refused(McapError::TooManyChannels)
     }
 
+    /// What to call the file in an error: what is left of a live one lies under its partial name, of
+    /// another nothing is left.
+    fn told_path(&self) -> &Path {
+        if self.is_live {
+            &self.partial
+        } else {
+            &self.path
+        }
+    }
+
     fn refused(&self, source: McapError) -> WriteError {
-        let path = self.partial.clone();
+        let path = self.told_path().to_owned();
         match source {
             McapError::Io(source) => WriteError::Io { path, source },
             source => WriteError::Container { path, source },
@@ -359,7 +371,7 @@ impl Recording {
         };
         if let Some(writer) = self.writer.take() {
             let written = writer.into_inner().finish();
-            written.map_err(|error| failed(&self.partial, error))?;
+            written.map_err(|error| failed(self.told_path(), error))?;
         }
         fs::rename(&self.partial, &self.path).map_err(|source| {
             if self.is_live {

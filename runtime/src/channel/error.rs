@@ -131,7 +131,7 @@ pub enum ChannelError {
         expected: usize,
     },
     /// More channels than one waiter can wait for.
-    #[error("a waiter takes 1..={max} channels, {given} were given")]
+    #[error("a waiter takes 1 to {max} channels, {given} were given")]
     WaiterChannelCount {
         /// Channels given.
         given: usize,

@@ -45,7 +45,7 @@ impl ChronyTracking {
             if (lowest..=86_400.0).contains(&value) {
                 Ok(value)
             } else {
-                Err(format!("{name} {value} s is outside {lowest}..=86400"))
+                Err(format!("{name} {value} s is outside {lowest} to 86400"))
             }
         };
         let stratum = fields[2]
@@ -115,7 +115,7 @@ mod tests {
         assert!(short.starts_with("1 fields, 14 expected"), "{short}");
         let infinite = RECORDED.replace("0.000009866", "inf");
         let error = ChronyTracking::parse(&infinite).unwrap_err();
-        assert_eq!(error, "root delay inf s is outside 0..=86400");
+        assert_eq!(error, "root delay inf s is outside 0 to 86400");
     }
 
     #[test]

@@ -46,7 +46,7 @@ impl PtpStatus {
             if number.abs() <= 8e14 {
                 Ok(number)
             } else {
-                Err(format!("{name} {number} ns is outside -8e14..=8e14"))
+                Err(format!("{name} {number} ns is outside -8e14 to 8e14"))
             }
         };
         let path_delay_ns = number("meanPathDelay")?;

@@ -7,23 +7,28 @@ use clap::{Args, ValueEnum};
 pub(crate) const EXAMPLES: &str = "\
 Examples:
   hil-runtime compare runs/before runs/after
-      every delay, loss and score of both, their ratio or difference with its interval
-  hil-runtime compare --base runs/a1 runs/a2 runs/a3 --new runs/b1 runs/b2 runs/b3
+      every delay, loss and score of both, their ratio or difference with its
+      interval
+  hil-runtime compare --base runs/a1 runs/a2 --new runs/b1 runs/b2
       repetitions: intervals then know how runs differ from each other
-  hil-runtime compare runs/before runs/after --fail-if \"p99 > 1.2x\" --fail-if \"loss > 0.5pp\"
-      for a script: exit code 1 when a condition holds beyond the figure's interval
+  hil-runtime compare runs/a runs/b --fail-if \"p99 > 1.2x\"
+      for a script: exit code 1 when a condition holds beyond the figure's
+      interval
   hil-runtime compare runs/before runs/after --format md > comparison.md
 
-A condition is [CHANNEL:]METRIC OP VALUE[UNIT]. Without a channel it is one on every channel; those
-where it cannot be judged, as with too few messages, are named.
-  METRIC  p50, p99, p99.9, max (end to end), loss, or a score by its name in summary.json
+A condition is [CHANNEL:]METRIC OP VALUE[UNIT]. Without a channel it is one on
+every channel; those where it cannot be judged, as with too few messages, are
+named.
+  METRIC  p50, p99, p99.9, max (end to end), loss, or a score by its name in
+          summary.json
   OP      > >= < <=
   UNIT    of delays: x (new by base); s, ms, us, ns (of the new runs)
           of loss: % (of the new runs), pp (new less base, in percentage points)
           of scores: x, or none (of the new runs)
 
-Exit code 0 when no condition holds, 1 when one does, 2 for wrong arguments, folders that are no
-finished runs, and conditions that can be judged on no channel. docs/compare.md has the methods.";
+Exit code 0 when no condition holds, 1 when one does, 2 for wrong arguments,
+folders that are no finished runs, and conditions that can be judged on no
+channel. docs/compare.md has the methods.";
 
 /// Arguments of a comparison.
 #[derive(Debug, Args)]

@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use clap::Args;
 
+use crate::cli::whole;
 use crate::topology::parse_duration;
 
 const EXAMPLES: &str = "\
@@ -12,27 +13,32 @@ Examples:
   hil-runtime doctor
       what this host can measure, the worst first, each with why and the fix
   hil-runtime doctor --topology deploy/topologies/split.toml
-      with the topology's pinned CPUs, ports, routes, message sizes and clock path as well
-  hil-runtime doctor --strict && hil-runtime --topology deploy/topologies/split.toml
+      with the topology's pinned CPUs, ports, routes, message sizes and clock
+      path as well
+  hil-runtime doctor --strict && hil-runtime --topology split.toml
       run only on a host without warnings
   hil-runtime doctor --latency 30s --cpu 2,3
-      how late threads wake on two CPUs and what a busy poller loses there, with cyclictest
-      beside it when that is installed, and what figures in microseconds this supports
+      how late threads wake on two CPUs and what a busy poller loses there, with
+      cyclictest beside it when that is installed, and what figures in
+      microseconds this supports
   hil-runtime doctor --json > robot-pc.json
   hil-runtime doctor --with robot-pc.json
       how far the clocks of two hosts may be apart
 
-Severities, from good to bad: ok, note, cannot tell (it could not be read; never taken for ok),
-warning, error. docs/doctor.md explains every finding by its name, and the JSON.
+Severities, from good to bad: ok, note, cannot tell (it could not be read; never
+taken for ok), warning, error. docs/doctor.md explains every finding by its
+name, and the JSON.
 
---latency TIME measures for TIME on all CPUs at once, then lets a busy poller spin for TIME, 10 s
-at most, on one CPU after the other, then runs cyclictest for TIME. Ctrl-C gives what there is so far.
+--latency TIME measures for TIME on all CPUs at once, then lets a busy poller
+spin for TIME, 10 s at most, on one CPU after the other, then runs cyclictest
+for TIME. Ctrl-C gives what there is so far.
 
 Exit codes:
   0    examined; without --strict whatever was found
   2    wrong arguments, or a topology or report that cannot be read
   78   with --strict: a warning or an error
-  130  interrupted: with --latency the report is of what there was so far, else there is none";
+  130  interrupted: with --latency the report is of what there was so far, else
+       there is none";
 
 /// Arguments of `doctor`.
 #[derive(Debug, Args)]
@@ -64,7 +70,7 @@ pub struct DoctorArgs {
     pub cpu: Vec<usize>,
     /// Real-time (FIFO) priority of the measuring threads.
     #[arg(long, value_name = "P", default_value_t = 80, requires = "latency",
-          value_parser = clap::value_parser!(u8).range(1..=99))]
+          value_parser = whole::<u8>(1, 99))]
     pub priority: u8,
     /// From one wake-up to the next, 100 us to 1 s.
     #[arg(long, value_name = "TIME", default_value = "1ms", requires = "latency",

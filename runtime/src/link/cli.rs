@@ -5,7 +5,8 @@ use clap::{ArgGroup, Args, Subcommand};
 const SHOW_EXAMPLES: &str = "\
 Examples:
   hil-runtime link show
-      the links of the run that goes on here, and what each emulated one does now
+      the links of the run that goes on here, and what each emulated one does
+      now
   hil-runtime link show runs/teleop-emulated-20261122-101500 --json
       of one run, for scripts; a finished run shows what it ended with";
 
@@ -18,13 +19,14 @@ Examples:
   hil-runtime link set hop --delay 120ms runs/teleop-emulated-20261122-101500
       where several runs go on: a run by its folder or its name
 
-A condition that is set takes the place of everything the topology says of that direction: outages,
-rate, Wi-Fi model, trace. What is not given is none: --delay alone loses nothing. It holds for
-messages that the gateway receives from then on; what is under way keeps its fate. The gateway
-confirms it; the run's report names every change. docs/live-links.md has the rest.
+A condition that is set takes the place of everything the topology says of that
+direction: outages, rate, Wi-Fi model, trace. What is not given is none: --delay
+alone loses nothing. It holds for messages that the gateway receives from then
+on; what is under way keeps its fate. The gateway confirms it; the run's report
+names every change. docs/live-links.md has the rest.
 
-Exit code 1 when the gateway refuses or does not answer, 2 when there is no such link, it is not
-emulated, or a number is outside its range.";
+Exit code 1 when the gateway refuses or does not answer, 2 when there is no such
+link, it is not emulated, or a number is outside its range.";
 
 const RESET_EXAMPLES: &str = "\
 Example:

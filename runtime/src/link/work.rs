@@ -75,7 +75,7 @@ fn condition(args: &SetArgs) -> Outcome<LinkCondition> {
     let delay = args.delay.as_deref().map(|text| {
         parse_duration(text).map_err(|error| {
             refused(format!(
-                "--delay {text} {error}; write a number and h, min, s, ms, us or ns, e.g. 50ms, at most 60 s"
+                "--delay {text}: {error}; such as 50ms, at most 60 s"
             ))
         })
     });

@@ -4,6 +4,8 @@ use std::time::Duration;
 
 use clap::{Args, Subcommand};
 
+use crate::cli::whole;
+
 const CHANNEL_EXAMPLES: &str = "\
 Examples:
   hil-runtime channel list
@@ -13,10 +15,11 @@ Examples:
   hil-runtime channel echo egm/right/feedback --field tool.position_m --count 5
       a part of five messages; --raw for the bytes, --json for scripts
   hil-runtime channel delay egm/right/command --once --json
-      where the time of its messages went, segment by segment, as one JSON object
+      where the time of its messages went, segment by segment, as one JSON
+      object
 
-RUN is the name or the folder of a run; it may be left out when one run runs here. A run is
-watched, never disturbed. Ctrl-C ends with the totals so far.";
+RUN is the name or the folder of a run; it may be left out when one run runs
+here. A run is watched, never disturbed. Ctrl-C ends with the totals so far.";
 
 const LIST_EXAMPLES: &str = "\
 Examples:
@@ -34,15 +37,17 @@ Examples:
   hil-runtime channel echo egm/right/feedback --field measured_rad.0 --count 100
   hil-runtime channel echo egm/right/feedback --raw --once
 
-Fields are those of the run's manifest; a message whose fields nobody stated is shown as bytes.";
+Fields are those of the run's manifest; a message whose fields nobody stated is
+shown as bytes.";
 
 const DELAY_EXAMPLES: &str = "\
 Examples:
   hil-runtime channel delay egm/right/command
   hil-runtime channel delay egm/right/command --once --window '5 s' --json
 
-Only what this host recorded is shown: of a channel that comes from another host, the segments
-beyond the wire are \"unavailable\", here as in the run's report without the other host's records.";
+Only what this host recorded is shown: of a channel that comes from another
+host, the segments beyond the wire are \"unavailable\", here as in the run's
+report without the other host's records.";
 
 const TOP_EXAMPLES: &str = "\
 Examples:
@@ -126,7 +131,7 @@ pub struct EchoArgs {
     #[arg(long, conflicts_with = "count")]
     pub once: bool,
     /// End after so many messages.
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
+    #[arg(long, value_name = "N", value_parser = whole::<u64>(1, u64::MAX))]
     pub count: Option<u64>,
     /// Show one field only, e.g. `tool.position_m` or `measured_rad.0`.
     #[arg(long, value_name = "NAME", conflicts_with = "raw")]

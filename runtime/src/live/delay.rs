@@ -16,6 +16,7 @@ use super::observer::Observer;
 use crate::console::Console;
 use crate::report::terminal::{JOINT, duration, grouped};
 use crate::signals::Signals;
+use crate::words::counted;
 
 /// The totals reach back no further: they are of messages that are kept in memory.
 const TOTAL_MAX: Duration = Duration::from_mins(10);
@@ -188,7 +189,7 @@ fn quantiles(distribution: &Distribution) -> Value {
 }
 
 fn text(head: &str, account: &ChannelAccount, clock: &Clock) -> String {
-    let mut text = format!("{head}: {} messages", grouped(account.published_count));
+    let mut text = format!("{head}: {}", counted(account.published_count, "message"));
     for (fate, count) in account.fates.iter() {
         let words = match fate {
             MessageFate::Taken => continue,

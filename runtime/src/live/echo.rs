@@ -16,6 +16,7 @@ use crate::manifest::ChannelDescription;
 use crate::record::RecordKind;
 use crate::signals::Signals;
 use crate::watch::{PassiveReader, RecordFollower, Source};
+use crate::words::counted_plainly;
 
 /// How often it looks for messages.
 const LOOK_PERIOD: Duration = Duration::from_millis(5);
@@ -104,7 +105,11 @@ pub(super) fn run(
         }
     };
     if wanted.is_none() {
-        console.say(&format!("{shown_count} messages{}", place.missed()));
+        console.say(&format!(
+            "{}{}",
+            counted_plainly(shown_count, "message"),
+            place.missed()
+        ));
     }
     match wanted {
         Some(wanted) if shown_count < wanted && end == End::Done => Err(ChannelError::Ended {

@@ -7,9 +7,10 @@ use super::cli::WindowArgs;
 use super::observer::Observer;
 use super::pace::{Pace, PaceFigures};
 use crate::console::Console;
-use crate::report::terminal::{JOINT, duration, grouped};
+use crate::report::terminal::{JOINT, duration};
 use crate::signals::Signals;
 use crate::watch::Source;
+use crate::words::counted;
 
 /// One answer.
 #[derive(Debug, Serialize)]
@@ -95,8 +96,8 @@ pub(super) fn run(
 
 /// The figures on one line.
 fn words(channel: &str, figures: &PaceFigures) -> String {
-    let count = grouped(figures.message_count);
-    let mut parts = vec![channel.to_owned(), format!("{count} messages")];
+    let count = counted(figures.message_count, "message");
+    let mut parts = vec![channel.to_owned(), count];
     if let (Some(rate_hz), Some(gap)) = (figures.rate_hz, &figures.gap) {
         let [min, p99, max] = [gap.min_ns, gap.p99_ns, gap.max_ns].map(duration);
         let mean = rounded(gap.mean_ns);

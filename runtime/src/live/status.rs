@@ -1,10 +1,13 @@
 //! What a supervisor says of its processes while the run goes: the file `status.json` in the run's
 //! folder, twice a second. It is for people who look on; nothing in the run reads it.
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
+use hil_models::time::Instant;
 use serde::{Deserialize, Serialize};
 
 /// Name of the file.
@@ -27,6 +30,31 @@ pub(crate) struct RunStatus {
     pub(crate) duration_ns: u64,
     /// What runs here.
     pub(crate) processes: Vec<ProcessStatus>,
+    /// What the other hosts of the run said.
+    #[serde(default)]
+    pub(crate) elsewhere: Vec<HostStatus>,
+}
+
+/// What another host said of its processes.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct HostStatus {
+    /// Its name.
+    pub(crate) name: String,
+    /// When it last said something, on this host's monotonic clock; `None` when it never did.
+    pub(crate) heard_ns: Option<i64>,
+    /// Its processes.
+    pub(crate) processes: Vec<TickStatus>,
+    /// Processes that skipped ticks and are not among them.
+    pub(crate) left_out_count: usize,
+}
+
+/// The ticks of a process of another host.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct TickStatus {
+    /// Its name in the topology.
+    pub(crate) name: String,
+    /// As [`ProcessStatus::skipped_tick_count`].
+    pub(crate) skipped_tick_count: Option<u64>,
 }
 
 /// How far a run is.
@@ -81,6 +109,7 @@ impl RunStatus {
             start_ns: None,
             duration_ns,
             processes,
+            elsewhere: Vec::new(),
         }
     }
 
@@ -111,18 +140,72 @@ pub struct ProcessOverruns {
     pub skipped_tick_count: Option<u64>,
 }
 
-/// The overruns of every process here of the run in `folder`, while it goes on.
+/// How much of a host's overruns is known.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct HostHearing {
+    /// The host.
+    pub host: String,
+    /// False when it has not been heard for [`HEARING_MAX`]: what it said before is out of date.
+    pub is_heard: bool,
+    /// How long ago it was heard; `None` when it never was.
+    pub silent_s: Option<f64>,
+    /// Processes that skipped ticks and of which it found no room to tell.
+    pub left_out_count: usize,
+}
+
+/// The overruns of a run's hosts.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Overruns {
+    /// Of all processes that were told of.
+    pub processes: Vec<ProcessOverruns>,
+    /// The hosts of the run, those here first.
+    pub hosts: Vec<HostHearing>,
+}
+
+/// A host says how it stands twice a second; one that says nothing for this long is not heard.
+pub const HEARING_MAX: Duration = Duration::from_secs(3);
+
+/// The overruns of the run in `folder` as of `now`, while it goes on.
 ///
 /// # Errors
 /// When there is no `status.json`, as before and after a run, or none that this program can read.
-pub fn overruns(folder: &Path) -> io::Result<Vec<ProcessOverruns>> {
-    let processes = RunStatus::read(folder)?.processes.into_iter();
-    let overruns = processes.map(|one| ProcessOverruns {
-        process: one.name,
-        host: one.host,
+pub fn overruns(folder: &Path, now: Instant) -> io::Result<Overruns> {
+    let status = RunStatus::read(folder)?;
+    let hearing = |host: &str, heard_ns: Option<i64>, left_out_count: usize| {
+        let silent = heard_ns.map(|at| now.saturating_duration_since(Instant::from_ns(at)));
+        HostHearing {
+            host: host.to_owned(),
+            is_heard: silent.is_some_and(|silent| silent <= HEARING_MAX),
+            silent_s: silent.map(|silent| silent.as_secs_f64()),
+            left_out_count,
+        }
+    };
+    // The supervisor here speaks for the hosts here, unless it hangs.
+    let here: BTreeSet<&str> = status
+        .processes
+        .iter()
+        .map(|one| one.host.as_str())
+        .collect();
+    let here = here
+        .into_iter()
+        .map(|host| hearing(host, Some(status.written_ns), 0));
+    let elsewhere = status.elsewhere.iter();
+    let elsewhere = elsewhere.map(|host| hearing(&host.name, host.heard_ns, host.left_out_count));
+    let hosts = here.chain(elsewhere).collect();
+    let own = status.processes.iter().map(|one| ProcessOverruns {
+        process: one.name.clone(),
+        host: one.host.clone(),
         skipped_tick_count: one.skipped_tick_count,
     });
-    Ok(overruns.collect())
+    let others = status.elsewhere.iter().flat_map(|host| {
+        host.processes.iter().map(|one| ProcessOverruns {
+            process: one.name.clone(),
+            host: host.name.clone(),
+            skipped_tick_count: one.skipped_tick_count,
+        })
+    });
+    let processes = own.chain(others).collect();
+    Ok(Overruns { processes, hosts })
 }
 
 /// The file for as long as the run goes; it is removed when this is dropped.
@@ -187,15 +270,13 @@ mod tests {
             restart_count: 1,
             skipped_tick_count: None,
         };
-        let status = RunStatus::new(Phase::Running, 5, vec![process]);
+        let mut status = RunStatus::new(Phase::Running, 5, vec![process]);
+        status.elsewhere = ["there", "nowhere"].map(elsewhere).to_vec();
+        status.elsewhere[0].heard_ns = Some(status.written_ns);
         let mut file = StatusFile::of(&folder);
         assert_eq!(file.write(&status), None);
         assert_eq!(RunStatus::read(&folder).unwrap(), status);
-        let overruns = overruns(&folder).unwrap();
-        assert_eq!(
-            (overruns[0].process.as_str(), overruns[0].skipped_tick_count),
-            ("robot", None)
-        );
+        check_overruns(&folder, Instant::from_ns(status.written_ns));
         drop(file);
         assert!(RunStatus::read(&folder).is_err());
         fs::remove_dir_all(&folder).unwrap();
@@ -211,5 +292,45 @@ mod tests {
         assert_eq!(RunStatus::read(&folder).unwrap(), status);
         drop(nowhere);
         fs::remove_dir_all(&folder).unwrap();
+    }
+    fn elsewhere(name: &str) -> HostStatus {
+        HostStatus {
+            name: name.to_owned(),
+            heard_ns: None,
+            processes: vec![TickStatus {
+                name: "arm".to_owned(),
+                skipped_tick_count: Some(3),
+            }],
+            left_out_count: 2,
+        }
+    }
+
+    /// A host that was not heard is said to be so, also when the supervisor here is the one that hangs.
+    fn check_overruns(folder: &Path, written: Instant) {
+        let at = |after: Duration| {
+            let after_ns = i64::try_from(after.as_nanos()).unwrap();
+            let now = Instant::from_ns(written.as_ns() + after_ns);
+            overruns(folder, now).unwrap()
+        };
+        let found = at(Duration::from_secs(1));
+        let counts = found.processes.iter();
+        let counts: Vec<_> = counts
+            .map(|one| (one.host.as_str(), one.skipped_tick_count))
+            .collect();
+        let expected = [("here", None), ("there", Some(3)), ("nowhere", Some(3))];
+        assert_eq!(counts, expected);
+        let heard = |overruns: &Overruns| -> Vec<_> {
+            let hosts = overruns.hosts.iter();
+            hosts.map(|one| (one.is_heard, one.silent_s)).collect()
+        };
+        assert_eq!(
+            heard(&found),
+            [(true, Some(1.0)), (true, Some(1.0)), (false, None)]
+        );
+        let late = HEARING_MAX + Duration::from_secs(1);
+        assert_eq!(
+            heard(&at(late)),
+            [(false, Some(4.0)), (false, Some(4.0)), (false, None)]
+        );
     }
 }

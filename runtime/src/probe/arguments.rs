@@ -7,31 +7,38 @@ use clap::{Args, Subcommand, ValueEnum};
 use hil_gateways::capture::flow::FlowFilter;
 
 use super::tap::TapChoice;
+use crate::cli::whole;
 
 const EXAMPLES: &str = "\
 Examples:
   hil-runtime probe --interface eth0 --output here.pcapng
       our own datagrams on eth0, until Ctrl-C
-  hil-runtime probe -i lan1 -i lan2 -o bridge.pcapng --duration 60s --flow udp:dport=5004,id=2+2
+  hil-runtime probe -i lan1 -i lan2 -o lan.pcapng --flow udp:dport=5004,id=2+2
       RTP through a bridge with two ports, known again by its sequence number
   hil-runtime probe -i eth0 -o card.pcapng --stamps card
       with the network card's own stamps of what arrives beside the kernel's
   hil-runtime probe -i eth0 -o queued.pcapng --tap packet
-      by a packet ring: what leaves is stamped behind the queueing discipline instead of before it
+      by a packet ring: what leaves is stamped behind the queueing discipline
+      instead of before it
   ip netns exec robot hil-runtime probe -i eth0 -o robot.pcapng
       the same in another network namespace
   hil-runtime probe analyse here.pcapng there.pcapng
-      delay, jitter, loss and reordering between two points, or between two ports of an ET2000
-  hil-runtime probe compare runs/shuttle-split-20261122-101500-control-pc here.pcapng there.pcapng
+      delay, jitter, loss and reordering between two points, or between two
+      ports of an ET2000
+  hil-runtime probe compare runs/NAME here.pcapng there.pcapng
       the gateways' own account of the wire beside the probe's
 
-Flows: hil (our datagrams), egm:port=6510, udp:CONDITIONS; conditions with commas between:
-  port=N sport=N dport=N src=ADDRESS dst=ADDRESS, and for udp id=OFFSET+BYTES[le] (a number in
-  the payload; without it the whole payload is hashed)
+Flows: hil (our datagrams), egm:port=6510, udp:CONDITIONS; conditions with
+commas between:
+  port=N sport=N dport=N src=ADDRESS dst=ADDRESS, and for udp
+  id=OFFSET+BYTES[le] (a number in the payload; without it the whole payload is
+  hashed)
 
-Exit codes: 0 done; 1 packets were dropped, an interface failed, a file has a fault, or the figures
-differ; 2 wrong arguments, nothing to read, or a capture without anything of the run; 69 no such interface; 78 the right to capture is missing (root or
-CAP_NET_RAW), --tap bpf cannot be had, or the card gives no stamps; 130 interrupted before --duration was over, the file is complete";
+Exit codes: 0 done; 1 packets were dropped, an interface failed, a file has a
+fault, or the figures differ; 2 wrong arguments, nothing to read, or a capture
+without anything of the run; 69 no such interface; 78 the right to capture is
+missing (root or CAP_NET_RAW), --tap bpf cannot be had, or the card gives no
+stamps; 130 interrupted before --duration was over, the file is complete";
 
 const ANALYSE_EXAMPLES: &str = "\
 Examples:
@@ -42,7 +49,7 @@ Examples:
 
 const COMPARE_EXAMPLES: &str = "\
 Example:
-  hil-runtime probe compare runs/shuttle-split-20261122-101500-control-pc here.pcapng there.pcapng
+  hil-runtime probe compare runs/NAME here.pcapng there.pcapng
 
 Exit code 1 when counts differ, or medians lie farther apart than --limit.";
 
@@ -81,11 +88,11 @@ pub(crate) struct LiveArgs {
     #[arg(long, value_name = "TIME", value_parser = parse_duration)]
     pub(crate) duration: Option<Duration>,
     /// Bytes kept of a packet; otherwise as many as the flows need to be known again.
-    #[arg(long, value_name = "BYTES", value_parser = clap::value_parser!(u32).range(64..=65_536))]
+    #[arg(long, value_name = "BYTES", value_parser = whole::<u32>(64, 65_536))]
     pub(crate) snap_length: Option<u32>,
     /// Memory for packets between two looks, MiB per interface.
     #[arg(long, value_name = "MIB", default_value_t = 8,
-          value_parser = clap::value_parser!(u16).range(1..=256))]
+          value_parser = whole::<u16>(1, 256))]
     pub(crate) ring: u16,
     /// Whose stamps; `card` adds those of the network card, on its own clock, for what arrives. It
     /// sets the card up (`CAP_NET_ADMIN`) and puts it back.
@@ -176,7 +183,7 @@ fn parse_duration(text: &str) -> Result<Duration, String> {
         .map_err(|_unsaid| format!("`{text}` is no time; e.g. 60s"))?;
     let whole = number * seconds;
     if !(1e-3..=1e7).contains(&whole) {
-        return Err(format!("{text} is outside 1ms..=10000000s"));
+        return Err(format!("{text} is outside 1ms to 10000000s"));
     }
     Ok(Duration::from_secs_f64(whole))
 }

@@ -90,7 +90,7 @@ fn a_priority_out_of_range_states_the_range() {
     };
     let grant = apply_in_scratch_thread(request, |grant| grant);
     let text = grant.refusals().next().unwrap().to_string();
-    assert!(text.contains("priority 0 is outside 1..=99"), "{text}");
+    assert!(text.contains("priority 0 is outside 1 to 99"), "{text}");
 }
 
 #[test]

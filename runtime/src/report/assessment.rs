@@ -8,6 +8,7 @@ use super::face::FaceSummary;
 use super::face_warnings;
 use super::summary::{ChannelSummary, Fact, LinkKind, Outcome, ProcessSummary, RunSummary};
 use super::terminal::{JOINT, grouped, percent};
+use crate::words::counted;
 
 /// Share of skipped ticks above which the host, not the network, shaped the run.
 pub const SKIPPED_TICK_RATIO_MAX: f64 = 0.001;
@@ -188,20 +189,23 @@ fn overrun_warning(overrun: &Overrun) -> String {
 
 fn process_warnings(process: &ProcessSummary) -> Vec<String> {
     let name = &process.name;
-    let some = |count: Option<u64>| count.filter(|count| *count > 0).map(grouped);
+    let some = |count: Option<u64>| count.filter(|count| *count > 0);
     let mut warnings = Vec::new();
     if let Some(count) = some(process.recorder_drop_count) {
         warnings.push(format!(
-            "{name} could not write {count} records; their messages show as missing stages"
+            "{name} could not write {}; their messages show as missing stages",
+            counted(count, "record")
         ));
     }
     if let Some(count) = some(process.outbox_drop_count) {
-        warnings.push(format!(
-            "{name} dropped {count} messages into a full outbox"
-        ));
+        let count = counted(count, "message");
+        warnings.push(format!("{name} dropped {count} into a full outbox"));
     }
     if let Some(count) = some(process.malformed_count) {
-        warnings.push(format!("{name} refused {count} malformed messages"));
+        warnings.push(format!(
+            "{name} refused {}",
+            counted(count, "malformed message")
+        ));
     }
     warnings
 }
@@ -217,10 +221,8 @@ fn channel_warnings(channel: &ChannelSummary) -> Vec<String> {
     let mut warnings = Vec::new();
     let unexplained = account.fates.of(MessageFate::Unexplained);
     if unexplained > 0 {
-        let count = grouped(unexplained);
-        warnings.push(format!(
-            "{name}: {count} messages vanished without explanation"
-        ));
+        let count = counted(unexplained, "message");
+        warnings.push(format!("{name}: {count} vanished without explanation"));
     }
     if let Some((ratio, _)) = account
         .closing
@@ -246,10 +248,8 @@ fn recorded_warnings(channel: &ChannelSummary) -> Vec<String> {
     match &channel.recorded {
         None => vec![format!("{name} left no record")],
         Some(figures) if figures.missing_count > 0 => {
-            let count = grouped(figures.missing_count);
-            vec![format!(
-                "{name}: {count} messages are missing in its record"
-            )]
+            let count = counted(figures.missing_count, "message");
+            vec![format!("{name}: {count} missing in its record")]
         }
         Some(_) => Vec::new(),
     }

@@ -6,6 +6,7 @@ use hil_models::measure::network::{NetworkEventKind, NetworkFigures};
 use serde::{Deserialize, Serialize};
 
 use super::terminal::{JOINT, duration_s, grouped, seconds};
+use crate::words::plural;
 
 /// How long before an event of the score the network is looked at, seconds. The longest effect
 /// that is known of: a session that an outage ended takes that long to come back.
@@ -169,8 +170,7 @@ pub(crate) fn within(bound_ns: u64, figure_ns: i64) -> String {
 }
 
 fn counted(count: u64, what: &str) -> String {
-    let plural = if count == 1 { "" } else { "s" };
-    format!("{}{JOINT}{what}{plural}", grouped(count))
+    format!("{}{JOINT}{}", grouped(count), plural(count, what))
 }
 
 /// What the network went through before one event of the score.

@@ -164,7 +164,7 @@ fn a_recorded_channel_needs_no_account_but_every_message() {
     let torn = summary(torn);
     assert_eq!(
         Assessment::of(&torn).warnings,
-        ["fleet/truth: 4 messages are missing in its record"]
+        ["fleet/truth: 4 messages missing in its record"]
     );
     let text = render(&torn, 100, Style::Plain);
     assert!(text.contains("12,345 messages recorded, 4 missing in the record"));

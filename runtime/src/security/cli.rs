@@ -11,7 +11,7 @@ use super::key_file::{KeyFileError, PreSharedKey};
 pub enum KeyCommand {
     /// Make a key file for its owner alone.
     #[command(
-        after_help = "Example:\n  sudo hil-runtime key new /etc/hil-runtime/hop.key\n  sudo scp -p /etc/hil-runtime/hop.key root@robot-pc:/etc/hil-runtime/\n\nA file that is there already is not overwritten. The topology names it in [security] key."
+        after_help = "Example:\n  sudo hil-runtime key new /etc/hil-runtime/hop.key\n  sudo scp -p /etc/hil-runtime/hop.key root@robot-pc:/etc/hil-runtime/\n\nA file that is there already is not overwritten. The topology names it in\n[security] key."
     )]
     New {
         /// The file to make.

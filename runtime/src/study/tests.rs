@@ -44,7 +44,7 @@ impl CaseStudy for Tuned {
         if figure != "mlr" {
             return Ok(None);
         }
-        ParameterError::check(figure, value, 0.0..=1.0, "0..=1")?;
+        ParameterError::check(figure, value, 0.0..=1.0, "0 to 1")?;
         let Self { gain_per_s } = self;
         Ok(Some(into_batch(Curve(value * gain_per_s))))
     }
@@ -125,7 +125,7 @@ fn a_calibration_is_computed_and_written_like_tables() {
 #[test]
 fn what_cannot_be_calibrated_is_said_with_what_can() {
     let error = |case, wanted| calibration(case, &[], wanted).unwrap_err().to_string();
-    assert_eq!(error("tuned", ("mlr", 1.5)), "mlr 1.5 is outside 0..=1");
+    assert_eq!(error("tuned", ("mlr", 1.5)), "mlr 1.5 is outside 0 to 1");
     let expected = "case tuned cannot be calibrated for lag; there is mlr";
     assert_eq!(error("tuned", ("lag", 0.5)), expected);
     let expected = "case shuttle cannot be calibrated for mlr; it has no calibration";

@@ -6,6 +6,7 @@ use std::io::{self, Read, Write};
 use serde::{Deserialize, Serialize};
 use zeroize::Zeroizing;
 
+use super::elsewhere::HostTicks;
 use super::event::HostStory;
 use crate::security::RunSeal;
 
@@ -50,6 +51,9 @@ pub enum PeerMessage {
     },
     /// Nothing new; sent so that silence means something.
     Alive,
+    /// How many ticks passed without the processes of the hosts that the sender knows of. Sent in
+    /// place of [`PeerMessage::Alive`] while a run goes on.
+    Ticks(Vec<HostTicks>),
     /// The run ends here, and why.
     Stop {
         /// In words.

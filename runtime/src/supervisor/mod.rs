@@ -6,6 +6,7 @@ pub(crate) mod clock_path;
 pub(crate) mod crew;
 pub(crate) mod domains;
 mod door;
+pub mod elsewhere;
 pub mod event;
 pub(crate) mod exchange;
 pub mod frame;

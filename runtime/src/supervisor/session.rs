@@ -9,6 +9,7 @@ use hil_models::time::Instant;
 
 use super::crew::{self, Crew, Verdict};
 use super::domains::Domains;
+use super::elsewhere::{Elsewhere, own_ticks};
 use super::event::{Event, HostStory, ProcessStory, disciplines};
 use super::exchange::exchange;
 use super::frame::{Frame, PeerMessage};
@@ -106,6 +107,7 @@ pub fn run(
         cleaned: WallInstant::now(),
         greeted: WallInstant::now(),
         teller,
+        elsewhere: Elsewhere::new(topology, &hosts),
     };
     let begun = session.begin(topology.run().start_timeout);
     let start = MonotonicClock::now();
@@ -159,6 +161,7 @@ struct Session<'a> {
     cleaned: WallInstant,
     greeted: WallInstant,
     teller: Teller,
+    elsewhere: Elsewhere,
 }
 
 impl Session<'_> {
@@ -259,7 +262,9 @@ impl Session<'_> {
             self.cleaned = WallInstant::now();
         }
         if self.greeted.elapsed() >= ALIVE_PERIOD {
-            self.say_to_all(&PeerMessage::Alive);
+            let ticks = own_ticks(&self.own_hosts(), self.crew.members());
+            let told = self.elsewhere.told(ticks, MonotonicClock::now());
+            self.say_to_all(&PeerMessage::Ticks(told));
             self.greeted = WallInstant::now();
         }
         if let Some(signal) = self.signals.received() {
@@ -281,6 +286,11 @@ impl Session<'_> {
         }
     }
 
+    /// Names of the hosts that run here.
+    fn own_hosts(&self) -> Vec<String> {
+        self.domains.addresses().into_keys().collect()
+    }
+
     fn say_to_all(&mut self, message: &PeerMessage) {
         for peer in &mut self.peers {
             peer.say(message);
@@ -296,6 +306,9 @@ impl Session<'_> {
             {
                 match event {
                     PeerEvent::Frame(Frame::Message(PeerMessage::Quiet)) => peer.is_quiet = true,
+                    PeerEvent::Frame(Frame::Message(PeerMessage::Ticks(said))) => {
+                        self.elsewhere.hear(&host, said, MonotonicClock::now());
+                    }
                     PeerEvent::Frame(Frame::Message(message)) => {
                         heard.push(Heard::Said(message).named(&host));
                     }
@@ -318,7 +331,7 @@ impl Session<'_> {
     }
 
     fn tell(&mut self, phase: Phase) {
-        let run = (self.topology, &mut self.crew);
+        let run = (self.topology, &mut self.crew, &self.elsewhere);
         self.teller.tell(phase, run, self.console);
     }
 
@@ -361,7 +374,7 @@ impl Session<'_> {
         span: (Instant, Instant),
         (started, facts): (String, HostFacts),
     ) -> RunResult {
-        let own_hosts: Vec<String> = self.domains.addresses().into_keys().collect();
+        let own_hosts = self.own_hosts();
         let watch = core::mem::take(&mut self.cards);
         let (cards, mut problems) = watch.finish();
         let own = HostStory {

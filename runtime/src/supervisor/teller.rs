@@ -8,6 +8,7 @@ use hil_models::time::Instant;
 
 use super::child::Child;
 use super::crew::{Crew, Member};
+use super::elsewhere::Elsewhere;
 use super::heartbeat::Heartbeats;
 use super::progress_line;
 use crate::clock::MonotonicClock;
@@ -40,7 +41,7 @@ impl Teller {
     pub(super) fn tell(
         &mut self,
         phase: Phase,
-        (topology, crew): (&Topology, &mut Crew),
+        (topology, crew, elsewhere): (&Topology, &mut Crew, &Elsewhere),
         console: &mut Console,
     ) {
         let is_due = self
@@ -55,6 +56,7 @@ impl Teller {
         let processes = crew.members().iter().map(process);
         let duration_ns = u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX);
         let mut status = RunStatus::new(phase, duration_ns, processes.collect());
+        status.elsewhere = elsewhere.status();
         status.start_ns = crew.started.map(Instant::as_ns);
         if let Some(complaint) = self.file.write(&status) {
             console.warn(&complaint);

@@ -418,7 +418,7 @@ fn check_port_ranges(links: &[LinkEntry], carried_counts: &[usize], faults: &Fau
         };
         if let Some((other, _)) = taken.iter().find(overlaps) {
             let last = range.end.saturating_sub(1);
-            let fault = format!("{base}..={last} overlaps with the ports of link `{other}`");
+            let fault = format!("{base} to {last} overlaps with the ports of link `{other}`");
             let key = join(&link.path, "port");
             faults.add(key, Some(link.place), Fault::Inconsistent(fault));
         }

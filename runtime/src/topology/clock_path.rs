@@ -375,7 +375,7 @@ fn check_ports(
             .any(|port| (first..=last).contains(&usize::from(*port)))
         {
             add(format!(
-                "{first}..={last} overlaps with the ports of link `{}`",
+                "{first} to {last} overlaps with the ports of link `{}`",
                 crossing.link.name
             ));
             return;

@@ -187,7 +187,7 @@ fn read_address(reader: &mut Reader<'_>, key: &'static str) -> Option<SocketAddr
         let text = text.value;
         let fault = format!(
             "\"{text}\" is no address of the form 192.168.125.1:6510 with a port of \
-             {EGM_PORT_MIN}..=65535"
+             {EGM_PORT_MIN} to 65535"
         );
         reader.refuse(key, Fault::Inconsistent(fault));
         return None;

@@ -136,7 +136,7 @@ impl RangeText for Limit<f64> {
 impl RangeText for Limit<Duration> {
     fn range_text(&self) -> String {
         let (min, max) = (format_duration(self.min), format_duration(self.max));
-        format!("\"{min}\"..=\"{max}\"")
+        format!("\"{min}\" to \"{max}\"")
     }
 }
 
@@ -144,7 +144,7 @@ fn plain_range<T: fmt::Display + PartialEq>(limit: &Limit<T>) -> String {
     if limit.min == limit.max {
         limit.min.to_string()
     } else {
-        format!("{}..={}", limit.min, limit.max)
+        format!("{} to {}", limit.min, limit.max)
     }
 }
 

@@ -75,9 +75,9 @@ impl CaseStudy for Teleoperation {
     type Parameters = TeleoperationParameters;
 
     fn new(parameters: Self::Parameters, _seed: u64) -> Result<Self, ParameterError> {
-        ParameterError::check("rate_hz", parameters.rate_hz, 0.0..=1000.0, "0..=1000")?;
+        ParameterError::check("rate_hz", parameters.rate_hz, 0.0..=1000.0, "0 to 1000")?;
         let gain = parameters.servo.gain_per_s;
-        ParameterError::check("servo.gain_per_s", gain, 0.0..=20.0, "0..=20")?;
+        ParameterError::check("servo.gain_per_s", gain, 0.0..=20.0, "0 to 20")?;
         Ok(Self)
     }
 

@@ -17,14 +17,19 @@ pub(super) fn unit_words() -> impl Iterator<Item = &'static str> {
     UNITS.iter().map(|(word, _)| *word)
 }
 
+/// All of them, for whoever wrote none.
+fn allowed() -> String {
+    unit_words().collect::<Vec<_>>().join(", ")
+}
+
 /// Why a text is no duration.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub(crate) enum DurationError {
     #[error("has no number before its unit")]
     NoNumber,
-    #[error("has no unit")]
+    #[error("has no unit; allowed: {}", allowed())]
     NoUnit,
-    #[error("has the unknown unit `{0}`")]
+    #[error("has the unknown unit `{0}`; allowed: {allowed}", allowed = allowed())]
     UnknownUnit(String),
     #[error("is finer than 1 ns")]
     TooFine,

@@ -11,15 +11,16 @@ Examples:
   hil-runtime trace info runs/NAME/traces/egm.right.command.trace --json
       one channel, for scripts
 
-Exit code 1 when a file is damaged: the offset of its first fault is named, and what stands before
-it is shown. Exit code 2 when it is no trace at all.";
+Exit code 1 when a file is damaged: the offset of its first fault is named, and
+what stands before it is shown. Exit code 2 when it is no trace at all.";
 
 const FIT_EXAMPLES: &str = "\
 Examples:
   hil-runtime trace fit runs/NAME/traces/shuttle.command.trace
       loss and delay laws, ranked, with what speaks against each
   hil-runtime trace fit runs/NAME
-      every trace of a run, as [links.NAME.forward] and .backward; a second channel's as a remark
+      every trace of a run, as [links.NAME.forward] and .backward; a second
+      channel's as a remark
   hil-runtime trace fit FILE --link wlan >> my-topology.toml
       the best laws as [links.wlan]; the table goes to standard error
 
@@ -30,20 +31,23 @@ Examples:
   hil-runtime trace plot FILE
       delay distribution, burst lengths and memory in the terminal
   hil-runtime trace plot FILE --output plots
-      every series as CSV as well: cdf, bursts, memory, and delay and loss over time";
+      every series as CSV as well: cdf, bursts, memory, and delay and loss over
+      time";
 
 const CONVERT_EXAMPLES: &str = "\
 Examples:
   hil-runtime trace convert runs/NAME/traces/shuttle.command.trace command.csv
   hil-runtime trace convert measured.csv measured.trace
-      two columns are enough: published_ns and delay_ns, empty where the message was lost
+      two columns are enough: published_ns and delay_ns, empty where the message
+      was lost
   hil-runtime trace convert FILE.trace link.mahimahi
       delivery opportunities of 1500 bytes; what is not kept is said
   hil-runtime trace convert FILE.trace delays.netem
       a delay distribution for tc ... netem
 
-The form of the input is found by its content, that of the output by the ending of its name, or
---to. A damaged trace is converted up to its first fault, with exit code 1.";
+The form of the input is found by its content, that of the output by the ending
+of its name, or --to. A damaged trace is converted up to its first fault, with
+exit code 1.";
 
 /// What to do with link traces.
 #[derive(Debug, Subcommand)]

@@ -52,7 +52,7 @@ pub enum Refusal {
         joint: usize,
     },
     /// A position outside the joint's limits.
-    #[error("J{joint} at {value_rad} rad is outside {min_rad}..={max_rad}")]
+    #[error("J{joint} at {value_rad} rad is outside {min_rad} to {max_rad}")]
     OutsideLimits {
         /// The first such joint.
         joint: usize,

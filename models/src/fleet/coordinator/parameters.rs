@@ -99,7 +99,7 @@ impl CoordinatorParameters {
         ];
         for (key, value, min, max) in numbers {
             let key = format!("coordinator.{key}");
-            ParameterError::check(&key, value, min..=max, &format!("{min}..={max}"))?;
+            ParameterError::check(&key, value, min..=max, &format!("{min} to {max}"))?;
         }
         self.safe.check()
     }
@@ -164,7 +164,7 @@ mod tests {
         };
         check(
             |p| p.replicas = 11,
-            "coordinator.replicas 11 is outside 1..=10",
+            "coordinator.replicas 11 is outside 1 to 10",
         );
         check(
             |p| p.known_delay_ms = f64::NAN,

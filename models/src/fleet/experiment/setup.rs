@@ -66,6 +66,6 @@ impl Setup {
         self.links.commands.check()?;
         self.links.status.check()?;
         let overrun_s = self.overrun_max_s;
-        ParameterError::check("overrun_max_s", overrun_s, 0.0..=600.0, "0..=600")
+        ParameterError::check("overrun_max_s", overrun_s, 0.0..=600.0, "0 to 600")
     }
 }

@@ -70,13 +70,13 @@ impl TableParameters {
             "tables.sections",
             self.sections as f64,
             1.0..=1e9,
-            "1..=1000000000",
+            "1 to 1000000000",
         )?;
         ParameterError::check(
             "tables.sections_per_task",
             self.sections_per_task as f64,
             100.0..=1e6,
-            "100..=1000000",
+            "100 to 1000000",
         )
     }
 }

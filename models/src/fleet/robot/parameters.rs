@@ -63,19 +63,19 @@ impl RobotParameters {
                 "robot.tracking_period_ms",
                 self.tracking_period_ms,
                 1.0..=1000.0,
-                "1..=1000",
+                "1 to 1000",
             ),
             (
                 "robot.parked_period_ms",
                 self.parked_period_ms,
                 1.0..=10_000.0,
-                "1..=10000",
+                "1 to 10000",
             ),
             (
                 "robot.inflation_delay_ms",
                 self.inflation_delay_ms,
                 0.0..=10_000.0,
-                "0..=10000",
+                "0 to 10000",
             ),
         ];
         for (key, value, allowed, allowed_text) in ranges {

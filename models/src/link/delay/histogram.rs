@@ -32,7 +32,7 @@ impl Histogram {
     fn check_edges(&self) -> Result<(), ParameterError> {
         let (edges, bins) = (self.edges.len(), self.weights.len());
         if !(1..=BIN_COUNT_MAX).contains(&bins) {
-            let problem = format!("{bins} bins are outside 1..={BIN_COUNT_MAX}");
+            let problem = format!("{bins} bins are outside 1 to {BIN_COUNT_MAX}");
             return Err(ParameterError::new("weights", problem));
         }
         if edges != bins + 1 {
@@ -88,7 +88,7 @@ impl Law for Histogram {
     fn check(&self) -> Result<(), ParameterError> {
         self.check_edges()?;
         for weight in &self.weights {
-            ParameterError::check("weights", *weight, 0.0..=1e12, "0..=1e12")?;
+            ParameterError::check("weights", *weight, 0.0..=1e12, "0 to 1e12")?;
         }
         if self.total() > 0.0 {
             return Ok(());

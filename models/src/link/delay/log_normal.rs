@@ -53,7 +53,7 @@ impl Law for LogNormal {
     fn check(&self) -> Result<(), ParameterError> {
         check_time("min", self.min, Duration::ZERO)?;
         check_time("median", self.median, Duration::from_nanos(1))?;
-        ParameterError::check("sigma", self.sigma, 0.001..=3.0, "0.001..=3")?;
+        ParameterError::check("sigma", self.sigma, 0.001..=3.0, "0.001 to 3")?;
         let kept = distribution(self.standard(self.max.as_secs_f64()));
         check_max(self.max, kept, 0.5)
     }

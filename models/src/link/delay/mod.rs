@@ -263,7 +263,7 @@ fn check_time(key: &str, time: Duration, least: Duration) -> Result<(), Paramete
     if (least..=DELAY_MAX).contains(&time) {
         return Ok(());
     }
-    let problem = format!("{time:?} is outside {least:?}..={DELAY_MAX:?}");
+    let problem = format!("{time:?} is outside {least:?} to {DELAY_MAX:?}");
     Err(ParameterError::new(key, problem))
 }
 

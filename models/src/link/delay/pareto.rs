@@ -51,7 +51,7 @@ impl Law for Pareto {
     fn check(&self) -> Result<(), ParameterError> {
         check_time("min", self.min, Duration::ZERO)?;
         check_time("scale", self.scale, Duration::from_nanos(1))?;
-        ParameterError::check("shape", self.shape, 1.05..=100.0, "1.05..=100")?;
+        ParameterError::check("shape", self.shape, 1.05..=100.0, "1.05 to 100")?;
         check_max(self.max, self.uncut(self.max.as_secs_f64()), 0.5)
     }
 

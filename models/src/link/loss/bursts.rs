@@ -47,7 +47,7 @@ impl Bursts {
     pub fn check(&self) -> Result<(), ParameterError> {
         for (key, mean) in [("good_mean", self.good_mean), ("bad_mean", self.bad_mean)] {
             if !(SHORTEST..=LONGEST).contains(&mean) {
-                let problem = format!("{mean:?} is outside {SHORTEST:?}..={LONGEST:?}");
+                let problem = format!("{mean:?} is outside {SHORTEST:?} to {LONGEST:?}");
                 return Err(ParameterError::new(key, problem));
             }
         }

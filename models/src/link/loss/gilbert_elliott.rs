@@ -42,7 +42,7 @@ impl GilbertElliott {
     /// The first key outside its range.
     pub fn check(&self) -> Result<(), ParameterError> {
         for (key, step) in [("to_bad", self.to_bad), ("to_good", self.to_good)] {
-            ParameterError::check(key, step, 1e-9..=1.0, "1e-9..=1")?;
+            ParameterError::check(key, step, 1e-9..=1.0, "1e-9 to 1")?;
         }
         check_loss_ratios(self.bad_loss_ratio, self.good_loss_ratio)
     }

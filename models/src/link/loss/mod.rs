@@ -54,7 +54,7 @@ impl LossLaw {
     pub fn check(&self) -> Result<(), ParameterError> {
         match self {
             Self::Bernoulli(law) => {
-                ParameterError::check("loss_ratio", law.ratio, 0.0..=1.0, "0..=1")
+                ParameterError::check("loss_ratio", law.ratio, 0.0..=1.0, "0 to 1")
             }
             Self::GilbertElliott(law) => law.check(),
             Self::Bursts(law) => law.check(),
@@ -74,7 +74,7 @@ impl LossLaw {
 /// The shares of the messages lost in either state of a law with two.
 fn check_loss_ratios(bad: f64, good: f64) -> Result<(), ParameterError> {
     for (key, ratio) in [("bad_loss_ratio", bad), ("good_loss_ratio", good)] {
-        ParameterError::check(key, ratio, 0.0..=1.0, "0..=1")?;
+        ParameterError::check(key, ratio, 0.0..=1.0, "0 to 1")?;
     }
     Ok(())
 }

@@ -170,7 +170,7 @@ pub struct WifiField {
 impl WifiField {
     /// The range in words.
     pub fn range_text(&self) -> String {
-        format!("{}..={}", self.low, self.high)
+        format!("{} to {}", self.low, self.high)
     }
 }
 
@@ -300,7 +300,7 @@ impl WifiSpec {
         }
         if self.fading_m > 0.0 && self.fading_m < 0.5 {
             let problem = format!(
-                "{} is neither 0, for no fading, nor within 0.5..=100",
+                "{} is neither 0, for no fading, nor within 0.5 to 100",
                 self.fading_m
             );
             return refuse("fading_m", problem);

@@ -106,7 +106,7 @@ impl Calibration {
     /// When `ratio` is outside what a search can aim at, or the motion has no loops.
     pub(crate) fn new(case: &Teleoperation, ratio: f64) -> Result<Self, ParameterError> {
         let allowed = RATIO_MIN..=RATIO_MAX;
-        ParameterError::check("mlr", ratio, allowed, "0.001..=0.3")?;
+        ParameterError::check("mlr", ratio, allowed, "0.001 to 0.3")?;
         let loops = case.parameters.tables.loops;
         Ok(Self {
             ratio,

@@ -37,13 +37,13 @@ impl TableParameters {
             "tables.loops",
             f64::from(self.loops),
             5.0..=2000.0,
-            "5..=2000",
+            "5 to 2000",
         )?;
         ParameterError::check(
             "tables.seeds",
             f64::from(self.seeds),
             1.0..=1000.0,
-            "1..=1000",
+            "1 to 1000",
         )
     }
 }

@@ -246,7 +246,7 @@ fn mean_in_range(
     let is_judged = is_fitted && runs.len() >= RUNS_MIN;
     Criterion {
         text: format!(
-            "{}: mean MLR of at least {RUNS_MIN} runs in {low}..={high}",
+            "{}: mean MLR of at least {RUNS_MIN} runs in {low} to {high}",
             condition.name
         ),
         is_met: is_judged.then(|| (low..=high).contains(&mean)),

@@ -14,6 +14,7 @@ use hil_runtime::clock::{MonotonicClock, Wake};
 use hil_runtime::console::Console;
 use hil_runtime::manifest::ChannelDescription;
 use hil_runtime::signals::Signals;
+use hil_runtime::words::counted_plainly;
 
 use schedule::{Punctuality, Schedule};
 pub(crate) use source::SourceError;
@@ -121,12 +122,8 @@ fn schedule_of(material: &Material, speed: f64) -> Schedule {
 }
 
 fn announcement(file: &Path, material: &Material, target: &Target) -> String {
-    let count = material.messages.len();
-    format!(
-        "{}: {count} messages for run {}",
-        file.display(),
-        target.name()
-    )
+    let count = counted_plainly(material.messages.len() as u64, "message");
+    format!("{}: {count} for run {}", file.display(), target.name())
 }
 
 struct Player<'a> {
@@ -204,7 +201,10 @@ impl Player<'_> {
     }
 
     fn account(&self) -> String {
-        format!("{} messages published", self.kept.published_count)
+        format!(
+            "{} published",
+            counted_plainly(self.kept.published_count, "message")
+        )
     }
 
     fn lateness(&self) -> String {

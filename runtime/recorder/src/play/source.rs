@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use hil_runtime::layout::LayoutFault;
 use hil_runtime::manifest::ChannelDescription;
+use hil_runtime::words::counted_plainly;
 use mcap::records::Record;
 
 use crate::decode::{DecodeFault, Decoder};
@@ -126,7 +127,7 @@ pub(crate) fn known_channels(path: &Path) -> Result<String, SourceError> {
     })?;
     let known = channels.into_values();
     let known: Vec<String> = known
-        .map(|(channel, count)| format!("{channel} ({count} messages)"))
+        .map(|(channel, count)| format!("{channel} ({})", counted_plainly(count, "message")))
         .collect();
     Ok(if known.is_empty() {
         "no channel of a run".to_owned()

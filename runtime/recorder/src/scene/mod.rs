@@ -105,7 +105,8 @@ fn is_of_fleet(message: &str) -> bool {
     [State::NAME, Mission::NAME, Truth::NAME].contains(&message)
 }
 
-fn is_of_arms(message: &str) -> bool {
+/// True when messages of this name are about arms.
+pub(crate) fn is_of_arms(message: &str) -> bool {
     [EgmCommand::NAME, EgmFeedback::NAME].contains(&message)
 }
 

@@ -13,6 +13,8 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use super::head::{Head, only};
 
+use hil_runtime::words::counted_plainly;
+
 /// What programs with pages of their own in them send, as Lichtblick's desktop application does. So does
 /// any saved page in some browsers and web views, those of iOS among them; others say `null` of a file.
 const FILE_ORIGIN: &str = "file://";
@@ -236,7 +238,7 @@ impl Access {
         counts.sort_by_key(|(_, count)| core::cmp::Reverse(*count));
         let total: u64 = counts.iter().map(|(_, count)| count).sum();
         let total = total.saturating_add(refused.unnamed_count);
-        let mut words = format!("refused {total} requests");
+        let mut words = format!("refused {}", counted_plainly(total, "request"));
         for (index, (who, count)) in counts.iter().take(ACCOUNT_MAX).enumerate() {
             let between = if index == 0 { ": " } else { "; " };
             let _infallible = write!(words, "{between}{count} × {who}");
@@ -248,7 +250,7 @@ impl Access {
             .sum();
         let rest = rest.saturating_add(refused.unnamed_count);
         if rest > 0 {
-            let _infallible = write!(words, "; {rest} others");
+            let _infallible = write!(words, "; {}", counted_plainly(rest, "other"));
         }
         (total > 0).then_some(words)
     }

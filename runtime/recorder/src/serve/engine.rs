@@ -58,8 +58,8 @@ pub(crate) struct Shown {
     pub(crate) links: Option<(PathBuf, Value)>,
     /// What became known of what is amiss, once a second.
     warnings: Vec<Value>,
-    /// Ticks skipped here, by process, as often.
-    overruns: Value,
+    /// Ticks skipped, by process, and of which hosts they are known, as often.
+    overruns: [Value; 2],
 }
 
 impl Shown {
@@ -76,7 +76,7 @@ impl Shown {
             playback_speed,
             links,
             warnings: Vec::new(),
-            overruns: Value::Null,
+            overruns: [Value::Null, Value::Null],
         }
     }
 
@@ -85,7 +85,9 @@ impl Shown {
         let warnings = self.source.warnings().into_iter().chain(own);
         let warnings = warnings.map(|(process, what)| json!({ "process": process, "what": what }));
         self.warnings = warnings.collect();
-        self.overruns = json!(self.source.overruns());
+        let overruns = self.source.overruns();
+        let overruns = overruns.map(|all| [json!(all.processes), json!(all.hosts)]);
+        self.overruns = overruns.unwrap_or_default();
     }
 }
 
@@ -308,7 +310,9 @@ fn words(shown: &Shown, links: &Links, viewer_count: usize, now_ns: i64) -> Valu
     run["is_playback"] = json!(shown.playback_speed.is_some());
     run["speed"] = json!(shown.playback_speed.unwrap_or(1.0));
     run["warnings"] = json!(shown.warnings);
-    run["overruns"] = shown.overruns.clone();
+    let [overruns, hosts] = &shown.overruns;
+    run["overruns"] = overruns.clone();
+    run["overrun_hosts"] = hosts.clone();
     run["recorder"]["missed_count"] = json!(shown.source.missed_count());
     run["recorder"]["viewer_count"] = json!(viewer_count);
     run
@@ -320,7 +324,7 @@ fn waiting(viewer_count: usize) -> Value {
         "name": null, "case": null, "state": "waiting", "how": null,
         "is_playback": false, "speed": 1.0, "elapsed_s": null, "duration_s": null,
         "hosts_here": [], "hosts": [], "topology_hash": null, "seed": null,
-        "channels": [], "links": [], "warnings": [], "overruns": null,
+        "channels": [], "links": [], "warnings": [], "overruns": null, "overrun_hosts": null,
         "recorder": {
             "file": null, "read_count": 0, "missed_count": null, "viewer_count": viewer_count,
         },

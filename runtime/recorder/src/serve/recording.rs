@@ -8,6 +8,7 @@ use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use hil_runtime::console::Console;
+use hil_runtime::words::counted_plainly;
 
 use crate::priority::Precedence;
 use crate::record::{RecordError, Recorded, Request, Which, record};
@@ -110,9 +111,9 @@ impl Recording {
                 }
                 let files = recorded.paths.iter().map(|path| path.display().to_string());
                 console.say(&format!(
-                    "{}: {} messages of the run; missed {}",
+                    "{}: {} of the run; missed {}",
                     files.collect::<Vec<_>>().join(", "),
-                    recorded.message_count,
+                    counted_plainly(recorded.message_count, "message"),
                     recorded.missed.values().sum::<u64>()
                 ));
             }

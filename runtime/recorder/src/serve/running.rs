@@ -6,7 +6,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use hil_runtime::clock::MonotonicClock;
-use hil_runtime::live::status::{self, ProcessOverruns};
+use hil_runtime::live::status::{self, Overruns};
 use hil_runtime::report::summary::RunSummary;
 use hil_runtime::watch::{self, Event, Feed, FeedError, LiveRun, Origin, Poll, Record};
 
@@ -39,7 +39,7 @@ pub(crate) struct Running {
     ended: Option<String>,
     problems: Vec<String>,
     /// As they were told last: the supervisor takes them away with the run's end.
-    overruns: Option<Vec<ProcessOverruns>>,
+    overruns: Option<Overruns>,
 }
 
 /// The channels in the order of the facts.
@@ -203,8 +203,9 @@ impl Source for Running {
         self.feed.has_one_clock() == Some(true)
     }
 
-    fn overruns(&mut self) -> Option<Vec<ProcessOverruns>> {
-        if let Ok(told) = status::overruns(&self.feed.run().folder) {
+    fn overruns(&mut self) -> Option<Overruns> {
+        let now = MonotonicClock::now();
+        if let Ok(told) = status::overruns(&self.feed.run().folder, now) {
             self.overruns = Some(told);
         }
         self.overruns.clone()

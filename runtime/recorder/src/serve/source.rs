@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use hil_runtime::live::status::ProcessOverruns;
+use hil_runtime::live::status::Overruns;
 
 use crate::view::LiveRecord;
 
@@ -44,9 +44,9 @@ pub(crate) trait Source {
     /// What is amiss with the run or its host, as far as it is known by now.
     fn warnings(&self) -> Vec<Warning>;
 
-    /// Ticks that the processes here skipped so far; `None` where nobody tells, as of a finished run,
+    /// Ticks that the processes of the run skipped so far, and which hosts are heard; `None` where nobody tells, as of a finished run,
     /// whose report has them among its warnings.
-    fn overruns(&mut self) -> Option<Vec<ProcessOverruns>> {
+    fn overruns(&mut self) -> Option<Overruns> {
         None
     }
 

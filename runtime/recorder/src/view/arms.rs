@@ -1,16 +1,14 @@
 //! The arms as their messages tell of them: commanded and measured joints, and where these put the
-//! links. Kinematics is that of the models; shapes are thick lines from joint to joint.
+//! links. Kinematics and shapes are those of the models, as in the robot's URDF.
 
 use hil_models::egm::messages::{EgmCommand, EgmFeedback, Side};
 use hil_models::message::Message;
 use hil_models::yumi::arm::Arm;
-use hil_models::yumi::{JOINT_COUNT, Joints, Pose};
+use hil_models::yumi::description::{self, Rod};
+use hil_models::yumi::{Joints, Pose};
 use serde_json::{Value, json};
 
 use super::{rounded, seconds};
-
-/// Radius of the line from frame to frame, metres: about the arm's own thickness.
-const RADII_M: [f64; JOINT_COUNT] = [0.065, 0.06, 0.055, 0.05, 0.045, 0.04, 0.035];
 
 /// Both arms.
 #[derive(Debug)]
@@ -73,12 +71,18 @@ impl ArmsView {
 
     /// `/live/arms` at `now_ns`; `origin_ns` is the run's beginning.
     pub(crate) fn picture(&self, now_ns: i64, origin_ns: i64) -> Value {
-        let shapes = RADII_M.iter().enumerate();
+        let shapes = description::link_radii_m();
+        let shapes = shapes.iter().enumerate();
         let shapes: Vec<Value> = shapes
             .map(|(from, radius_m)| json!({ "from": from, "to": from + 1, "radius_m": radius_m }))
             .collect();
         let arms: Vec<Value> = self.arms.iter().map(|arm| arm.picture(now_ns)).collect();
-        json!({ "at_s": seconds(now_ns - origin_ns), "shapes": shapes, "arms": arms })
+        let fingers = description::fingers().map(rod);
+        let body = description::body().map(rod);
+        json!({
+            "at_s": seconds(now_ns - origin_ns),
+            "body": body, "shapes": shapes, "fingers": fingers, "arms": arms,
+        })
     }
 }
 
@@ -145,6 +149,12 @@ impl OneArm {
         });
         numbers.collect()
     }
+}
+
+/// A rod in the frame of whoever has it.
+fn rod(rod: Rod) -> Value {
+    let round = |place: [f64; 3]| place.map(|number| (number * 1e4).round() / 1e4);
+    json!({ "from_m": round(rod.from_m), "to_m": round(rod.to_m), "radius_m": rod.radius_m })
 }
 
 fn is_finite(joints: &Joints) -> bool {

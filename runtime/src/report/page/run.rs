@@ -15,6 +15,7 @@ use crate::report::clock_summary::ClockSection;
 use crate::report::score_event::ScoreEvents;
 use crate::report::summary::{ChannelSummary, Fact, LinkKind, RunSummary, ScoreMetric};
 use crate::report::terminal::{self, duration, grouped, seconds};
+use crate::words::counted;
 
 /// How figures came about, for every run.
 pub(super) const METHOD: [&str; 3] = [
@@ -228,11 +229,9 @@ fn live_channel(key: &str, one: &ChannelSummary, summary: &RunSummary) -> Channe
         let recorded = one.recorded.map_or_else(
             || format!("{UNAVAILABLE}: no record of this channel"),
             |figures| {
-                let (all, missing) = (
-                    grouped(figures.message_count),
-                    grouped(figures.missing_count),
-                );
-                format!("{all} messages recorded, {missing} missing in the record")
+                let all = counted(figures.message_count, "message");
+                let missing = grouped(figures.missing_count);
+                format!("{all} recorded, {missing} missing in the record")
             },
         );
         channel.notes.push(recorded);

@@ -9,9 +9,9 @@ use hil_models::measure::statistics::IntervalNs;
 
 use super::canvas::{Canvas, INDENT, Tone, bar, left, right};
 use super::clocks;
-use super::events::counted;
 use super::units::{duration, grouped, percent};
 use crate::report::summary::{ChannelSummary, CountByName, LinkKind, RecordedFigures};
+use crate::words::counted;
 
 /// Columns of a stage's name, of each of the four figures, and between figures and bar.
 const NAME_WIDTH: usize = 22;
@@ -96,11 +96,7 @@ fn recorded(canvas: &mut Canvas, figures: Option<RecordedFigures>) {
         );
         return;
     };
-    let plural = if figures.message_count == 1 { "" } else { "s" };
-    let mut text = format!(
-        "{} message{plural} recorded",
-        grouped(figures.message_count)
-    );
+    let mut text = format!("{} recorded", counted(figures.message_count, "message"));
     let mut tone = Tone::Plain;
     if figures.missing_count > 0 {
         let count = grouped(figures.missing_count);

@@ -7,6 +7,7 @@ use hil_models::measure::account::MessageFate;
 use super::canvas::{Canvas, INDENT, Tone, shortened};
 use super::units::{duration_s, grouped, seconds};
 use crate::report::score_event::{ExplainedEvent, ExplainedMessage, ScoreEvents};
+use crate::words::counted;
 
 /// Events on the page, and messages of each; all of them are in the summary.
 const SHOWN_COUNT: usize = 12;
@@ -62,11 +63,6 @@ pub(super) fn score_events(canvas: &mut Canvas, all: &ScoreEvents) {
     if !more.is_empty() {
         canvas.paragraph(INDENT, Tone::Faint, &more.join("; "));
     }
-}
-
-pub(crate) fn counted(count: u64, what: &str) -> String {
-    let plural = if count == 1 { "" } else { "s" };
-    format!("{} {what}{plural}", grouped(count))
 }
 
 /// The gravest events, the earlier ones first among equals, in the order of the score.

@@ -16,10 +16,10 @@ mod timeline;
 mod trace;
 mod units;
 
+pub(crate) use crate::words::counted;
 pub use canvas::Style;
 pub(crate) use canvas::{Tone, shortened, wrapped};
 pub(crate) use channel::closing_text;
-pub(crate) use events::counted;
 pub(crate) use trace::{render_fit, render_trace, render_trace_plots};
 pub(crate) use units::{JOINT, duration, duration_s, figure, grouped, percent, seconds};
 

@@ -174,7 +174,7 @@ const FAULTY: &[Faulty] = &[
         "127.0.0.1:6510",
         "127.0.0.1:80",
         "egm.right",
-        "1024..=65535",
+        "1024 to 65535",
     ),
     Faulty(
         CLIENT,
@@ -195,7 +195,7 @@ const FAULTY: &[Faulty] = &[
         "right =",
         "axes = 8, right =",
         "egm.axes",
-        "8 is outside 6..=7",
+        "8 is outside 6 to 7",
     ),
     Faulty(
         ROBOT,
@@ -209,7 +209,7 @@ const FAULTY: &[Faulty] = &[
         "right =",
         "robotware = 5, right =",
         "egm.robotware",
-        "5 is outside 6..=7",
+        "5 is outside 6 to 7",
     ),
     Faulty(
         CLIENT,
@@ -286,7 +286,7 @@ const FAULTY: &[Faulty] = &[
         "send_hz = 125",
         "send_hz = 0.5",
         "egm.send_hz",
-        "0.5 is outside 1..=1000",
+        "0.5 is outside 1 to 1000",
     ),
     Faulty(
         ROBOT,

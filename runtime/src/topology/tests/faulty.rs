@@ -91,31 +91,31 @@ const FAULTY: &[Faulty] = &[
         "via = \"udp\"",
         "via = \"udp\"\ndscp = 64 #!",
         "links.hop.dscp",
-        &["64 is outside 0..=63"],
+        &["64 is outside 0 to 63"],
     ),
     Faulty(
         "via = \"udp\"",
         "via = \"udp\"\nport = 80 #!",
         "links.hop.port",
-        &["80 is outside 1024..=65534"],
+        &["80 is outside 1024 to 65534"],
     ),
     Faulty(
         "via = \"udp\"",
         "via = \"emulated\"\nloss_ratio = 1.5 #!",
         "links.hop.loss_ratio",
-        &["1.5 is outside 0..=1"],
+        &["1.5 is outside 0 to 1"],
     ),
     Faulty(
         "via = \"udp\"",
         "via = \"emulated\"\nloss_ratio = nan #!",
         "links.hop.loss_ratio",
-        &["NaN is outside 0..=1"],
+        &["NaN is outside 0 to 1"],
     ),
     Faulty(
         "via = \"udp\"",
         "via = \"emulated\"\n[links.hop.outages]\nper_hour = -1 #!",
         "links.hop.outages.per_hour",
-        &["-1 is outside 0..=100000"],
+        &["-1 is outside 0 to 100000"],
     ),
     Faulty(
         "via = \"udp\"",
@@ -151,7 +151,7 @@ const FAULTY: &[Faulty] = &[
         "via = \"udp\"",
         "via = \"emulated\"\n[links.hop.forward]\ndelay = \"11 s\" #!",
         "links.hop.forward.delay",
-        &["\"11 s\" is outside \"0 s\"..=\"10 s\""],
+        &["\"11 s\" is outside \"0 s\" to \"10 s\""],
     ),
     Faulty(
         "via = \"udp\"",
@@ -175,13 +175,13 @@ const FAULTY: &[Faulty] = &[
         "[case]",
         "[run]\nseed = -1 #!\n[case]",
         "run.seed",
-        &["-1 is outside 0..="],
+        &["-1 is outside 0 to "],
     ),
     Faulty(
         "role = \"robot\"",
         "role = \"robot\"\nscheduling = \"fifo\"\npriority = 100 #!",
         "processes.robot.priority",
-        &["100 is outside 1..=99"],
+        &["100 is outside 1 to 99"],
     ),
     Faulty(
         "role = \"robot\"",
@@ -211,7 +211,7 @@ const FAULTY: &[Faulty] = &[
         "role = \"robot\"",
         "role = \"robot\"\ncpu = [1, -2] #!",
         "processes.robot.cpu",
-        &["-2 is outside 0..=1023"],
+        &["-2 is outside 0 to 1023"],
     ),
     Faulty(
         "role = \"robot\"",
@@ -273,7 +273,7 @@ const FAULTY: &[Faulty] = &[
         "rate_hz = 125.0",
         "rate_hz = 5000 #!",
         "case.parameters.rate_hz",
-        &["5000 is outside 0..=1000"],
+        &["5000 is outside 0 to 1000"],
     ),
     Faulty(
         "rate_hz = 125.0",
@@ -291,7 +291,7 @@ const FAULTY: &[Faulty] = &[
         "rate_hz = 125.0",
         "servo.gain_per_s = 50.0 #!",
         "case.parameters.servo.gain_per_s",
-        &["50 is outside 0..=20"],
+        &["50 is outside 0 to 20"],
     ),
     Faulty(
         "rate_hz = 125.0",

@@ -53,7 +53,7 @@ const FAULTY: &[Faulty] = &[
         "speed_max_mps = 2.0",
         "speed_max_mps = 0.0 #!",
         "case.parameters.world.speed_max_mps",
-        "0 is outside 0.01..=100",
+        "0 is outside 0.01 to 100",
     ),
     Faulty(
         "[[case.parameters.world.bays]]\nx_m = 3.0",

@@ -58,7 +58,7 @@ fn an_override_is_refused_with_its_own_text() {
         (
             "links.hop.dscp=64",
             "links.hop.dscp",
-            "64 is outside 0..=63",
+            "64 is outside 0 to 63",
         ),
         ("links.hop.dcsp=6", "links.hop.dcsp", "did you mean `dscp`?"),
         (
@@ -138,7 +138,7 @@ fn ports_of_two_links_may_not_meet() {
     assert!(
         errors
             .to_string()
-            .contains("8003..=8004 overlaps with the ports of link `hop`")
+            .contains("8003 to 8004 overlaps with the ports of link `hop`")
     );
     let text = EVERYTHING.replace("port = 8000", "port = 65534");
     let errors = parse("ports.toml", &text, &[], &known()).unwrap_err();
@@ -205,7 +205,7 @@ fn the_outages_of_a_link_are_those_of_both_ways() {
 
 fn check_with_refusal(table: &toml::Table, seed: u64) -> Result<toml::Table, Vec<ParameterFault>> {
     let mut refuse =
-        |_: &mut ShuttleParameters| ParameterError::check("gain_per_s", 1.0, 2.0..=3.0, "2..=3");
+        |_: &mut ShuttleParameters| ParameterError::check("gain_per_s", 1.0, 2.0..=3.0, "2 to 3");
     check_parameters_with::<Shuttle>(table, seed, &mut refuse)
 }
 
@@ -219,6 +219,6 @@ fn a_callers_own_parameter_check_points_at_the_line_too() {
                 robot.role = 'robot'\n[case]\nname = 'shuttle'\nparameters.gain_per_s = 1.0\n";
     let known = KnownCases::new().with_case(case);
     let errors = parse("own.toml", text, &[], &known).unwrap_err();
-    let says = "own.toml:8:25: case.parameters.gain_per_s 1 is outside 2..=3";
+    let says = "own.toml:8:25: case.parameters.gain_per_s 1 is outside 2 to 3";
     assert_eq!(errors.to_string(), says);
 }

@@ -76,7 +76,7 @@ fn what_a_radio_cannot_be_is_refused_with_its_reason() {
         (
             "wifi = { preset = \"wifi6-short-range\", fading_m = 0.2 }",
             "wifi.fading_m",
-            "0.5..=100",
+            "0.5 to 100",
         ),
         (
             "wifi = { channel_width_mhz = 60 }",

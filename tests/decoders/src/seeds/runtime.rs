@@ -12,6 +12,7 @@ use hil_runtime::manifest::describe_fields;
 use hil_runtime::record::RecordKind;
 use hil_runtime::record::file::RecordHeader;
 use hil_runtime::report::summary::{Fact, Outcome, RunFacts, RunSummary};
+use hil_runtime::supervisor::elsewhere::HostTicks;
 use hil_runtime::supervisor::event::{Event, HostStory, Interruption, ProcessStory};
 use hil_runtime::supervisor::frame::{
     EndMeaning, PeerHello, PeerMessage, write_chunk, write_message,
@@ -150,7 +151,21 @@ pub(crate) fn peer_frames() -> Vec<Seed> {
     write_message(&mut file, &PeerMessage::Done).expect("memory takes it");
     inputs.push(file);
     inputs.push(b"arm.command.taken.robot.0.rec".to_vec());
+    inputs.push(ticks());
     numbered("frames", inputs)
+}
+
+/// What supervisors say of ticks.
+fn ticks() -> Vec<u8> {
+    let mut wire = Vec::new();
+    let told = vec![HostTicks {
+        host: "robot-pc".to_owned(),
+        age_ms: 250,
+        processes: vec![("robot".to_owned(), Some(3)), ("other".to_owned(), None)],
+        left_out_count: 1,
+    }];
+    write_message(&mut wire, &PeerMessage::Ticks(told)).expect("memory takes it");
+    wire
 }
 
 pub(crate) fn summaries() -> Vec<Seed> {

@@ -60,7 +60,7 @@ impl SafeParameters {
         ];
         for (key, value, min, max) in numbers {
             let key = format!("coordinator.safe.{key}");
-            ParameterError::check(&key, value, min..=max, &format!("{min}..={max}"))?;
+            ParameterError::check(&key, value, min..=max, &format!("{min} to {max}"))?;
         }
         if self.lease_ms > 0.0 && self.delay_bound_ms <= 0.0 {
             return Err(ParameterError::new(
