@@ -38,6 +38,10 @@ fn the_other_hosts_overruns_are_on_the_page_or_said_to_be_unavailable() {
     let mut page = browser.page(DESKTOP.0, DESKTOP.1);
     page.go(&address);
     page.wait_until("document.getElementById('run-state').textContent === 'running'");
+    page.wait_until(
+        "(window.hil.snapshot().run.overrun_hosts ?? []) \
+         .some((host) => host.host === 'robot-pc' && host.is_heard)",
+    );
     page.wait_until(&format!("!{}", says("robot-pc: ticks skipped unavailable")));
 
     // Its ticks pass without it, as on a host that has no time for it.

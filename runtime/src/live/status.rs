@@ -168,9 +168,13 @@ pub const HEARING_MAX: Duration = Duration::from_secs(3);
 /// The overruns of the run in `folder` as of `now`, while it goes on.
 ///
 /// # Errors
-/// When there is no `status.json`, as before and after a run, or none that this program can read.
+/// When there is no `status.json`, as before and after a run, or none that this program can read; and
+/// while the run is being ended, when no host tells any more.
 pub fn overruns(folder: &Path, now: Instant) -> io::Result<Overruns> {
     let status = RunStatus::read(folder)?;
+    if status.phase == Phase::Ending {
+        return Err(io::Error::other("the run is being ended"));
+    }
     let hearing = |host: &str, heard_ns: Option<i64>, left_out_count: usize| {
         let silent = heard_ns.map(|at| now.saturating_duration_since(Instant::from_ns(at)));
         HostHearing {

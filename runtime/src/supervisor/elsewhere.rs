@@ -8,6 +8,7 @@ use std::cmp::Reverse;
 use std::collections::BTreeMap;
 
 use super::crew::Member;
+use super::frame::PeerMessage;
 use crate::live::status::{HostStatus, TickStatus};
 use crate::topology::{Host, Topology};
 
@@ -57,6 +58,17 @@ pub(super) fn own_ticks(hosts: &[String], members: &[Member]) -> Vec<HostTicks> 
     hosts.iter().map(of_host).collect()
 }
 
+/// What a peer is told of `ticks` while the run goes on: those of other hosts than its own, in place of
+/// a word that this one lives. A peer that is not heard may not be reached; what it is told piles up in
+/// the connection, which is lost when it takes no more, so it is told the least.
+pub(super) fn greeting(ticks: &[HostTicks], peer: &str, is_heard: bool) -> PeerMessage {
+    if !is_heard {
+        return PeerMessage::Alive;
+    }
+    let others = ticks.iter().filter(|ticks| ticks.host != peer);
+    PeerMessage::Ticks(others.cloned().collect())
+}
+
 /// What the other hosts said last.
 #[derive(Debug)]
 pub(super) struct Elsewhere {
@@ -92,7 +104,7 @@ impl Elsewhere {
     /// Takes down what the supervisor of `from` said at `now`. What it cannot know, or the topology
     /// does not name, is left: it cannot make this grow.
     pub(super) fn hear(&mut self, from: &str, said: Vec<HostTicks>, now: Instant) {
-        for mut ticks in said {
+        for mut ticks in said.into_iter().take(HOSTS_MAX) {
             let may_say = from == ticks.host || from == self.first_host;
             let (Some(known), Some(names), true) = (
                 self.hosts.get_mut(&ticks.host),
@@ -101,8 +113,8 @@ impl Elsewhere {
             ) else {
                 continue;
             };
-            ticks.processes.retain(|(name, _)| names.contains(name));
             ticks.processes.truncate(PROCESSES_MAX);
+            ticks.processes.retain(|(name, _)| names.contains(name));
             let age_ns = i64::try_from(ticks.age_ms.saturating_mul(1_000_000)).unwrap_or(i64::MAX);
             let heard = Instant::from_ns(now.as_ns().saturating_sub(age_ns));
             *known = Some((heard, ticks));
@@ -203,12 +215,22 @@ mod tests {
         assert_eq!(counts(&first), unheard);
         let mut many = of("b", 4);
         let stranger = |index| (format!("stranger-{index}"), Some(9));
-        many.processes.extend((0..100_000).map(stranger));
+        many.processes.splice(0..0, (0..10).map(stranger));
+        many.processes.extend((10..100_000).map(stranger));
         many.age_ms = u64::MAX;
         first.hear("b", vec![many], now);
         let known = first.status();
-        assert_eq!(known[0].processes.len(), 1, "names that the topology has");
+        let names: Vec<_> = known[0].processes.iter().map(|one| &*one.name).collect();
+        assert_eq!(names, ["p"], "names that the topology has");
         assert!(known[0].heard_ns < Some(0), "older than this host's clock");
+    }
+
+    #[test]
+    fn a_peer_is_told_of_the_others_and_an_unheard_one_the_least() {
+        let ticks = [of("a", 1), of("b", 2)];
+        let told = PeerMessage::Ticks(vec![of("a", 1)]);
+        assert_eq!(greeting(&ticks, "b", true), told);
+        assert_eq!(greeting(&ticks, "b", false), PeerMessage::Alive);
     }
 
     #[test]

@@ -9,7 +9,7 @@ use hil_models::time::Instant;
 
 use super::crew::{self, Crew, Verdict};
 use super::domains::Domains;
-use super::elsewhere::{Elsewhere, own_ticks};
+use super::elsewhere::{Elsewhere, greeting, own_ticks};
 use super::event::{Event, HostStory, ProcessStory, disciplines};
 use super::exchange::exchange;
 use super::frame::{Frame, PeerMessage};
@@ -262,9 +262,7 @@ impl Session<'_> {
             self.cleaned = WallInstant::now();
         }
         if self.greeted.elapsed() >= ALIVE_PERIOD {
-            let ticks = own_ticks(&self.own_hosts(), self.crew.members());
-            let told = self.elsewhere.told(ticks, MonotonicClock::now());
-            self.say_to_all(&PeerMessage::Ticks(told));
+            self.greet();
             self.greeted = WallInstant::now();
         }
         if let Some(signal) = self.signals.received() {
@@ -283,6 +281,17 @@ impl Session<'_> {
             Verdict::GoesOn => None,
             Verdict::Finished(text) => Some(Outcome::EndedEarly(text)),
             Verdict::Failed(text) => Some(Outcome::Failed(text)),
+        }
+    }
+
+    /// Tells each peer that this host lives, and what is known of ticks.
+    fn greet(&mut self) {
+        let ticks = own_ticks(&self.own_hosts(), self.crew.members());
+        let told = self.elsewhere.told(ticks, MonotonicClock::now());
+        for peer in &mut self.peers {
+            let is_heard = peer.silence() <= 2 * ALIVE_PERIOD;
+            let greeting = greeting(&told, &peer.hello.host, is_heard);
+            peer.say(&greeting);
         }
     }
 
