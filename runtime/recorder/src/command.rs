@@ -33,8 +33,8 @@ mod exit {
     pub(super) const INTERNAL: u8 = 70;
 }
 
-/// Does what the command line says.
-pub(crate) fn run() -> ExitCode {
+/// Does what the command line of this process says, and tells the exit code.
+pub fn run() -> ExitCode {
     let cli = Cli::parse();
     let mut console = Console::new(cli.quiet);
     let signals = match Signals::install() {

@@ -5,8 +5,10 @@
 //! [`encode`], what a message looks like; [`topics`] and [`net`], what is made of it; [`writer`],
 //! the file; [`convert`], all of them together. While a run goes, [`live`] makes the same topics of
 //! its events for any [`sink`], and [`record`] puts them into files; [`priority`] and [`pace`] keep
-//! it out of the run's way. [`scan`] reads files, for [`recover`] and [`info`]; [`play`] feeds what [`decode`]
+//! it out of the run's way. [`scan`] reads files as far as their [`lengths`] hold, for [`recover`] and [`info`]; [`play`] feeds what [`decode`]
 //! makes of them into a run. [`view`] is the state of a run that goes on, [`serve`] shows it.
+//!
+//! The program is [`run()`]; nothing else is for other crates but [`decoders`], for tests.
 
 mod cli;
 mod clocks;
@@ -14,12 +16,14 @@ mod command;
 mod conditions;
 mod convert;
 mod decode;
+pub mod decoders;
 mod disk;
 mod encode;
 mod ending;
 mod facts;
 mod info;
 mod joining;
+mod lengths;
 mod live;
 mod live_clocks;
 mod net;
@@ -43,8 +47,4 @@ mod writer;
 #[cfg(test)]
 mod tests;
 
-use std::process::ExitCode;
-
-fn main() -> ExitCode {
-    command::run()
-}
+pub use command::run;

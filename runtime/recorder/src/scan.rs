@@ -10,8 +10,10 @@ use mcap::MAGIC;
 use mcap::records::{Record, op};
 use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
 
+use crate::lengths;
+
 /// Largest record, compressed or not: a bound on what a damaged length may ask for.
-const RECORD_BYTES_MAX: usize = 1 << 30;
+pub(crate) const RECORD_BYTES_MAX: usize = 1 << 30;
 /// Bytes before the body of a record: what it is, and its length.
 const RECORD_HEAD_BYTES: u64 = 9;
 /// Bytes of a chunk's header without the name of the compression.
@@ -80,28 +82,56 @@ pub(crate) fn scan(path: &Path, visit: &mut Visit<'_>) -> Result<ScanEnd, ScanEr
     };
     let file = File::open(path).map_err(failed)?;
     let size_bytes = file.metadata().map_err(failed)?.len();
+    let limits = Limits {
+        size_bytes,
+        record_bytes_max: RECORD_BYTES_MAX,
+    };
+    let end = scan_from(BufReader::new(file), limits, visit).map_err(failed)?;
+    end.ok_or_else(|| ScanError::Foreign {
+        path: path.to_owned(),
+    })
+}
+
+/// What a scan keeps to.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Limits {
+    /// Size of the file, bytes.
+    pub(crate) size_bytes: u64,
+    /// Largest record, compressed or not.
+    pub(crate) record_bytes_max: usize,
+}
+
+/// As [`scan`], of bytes from anywhere; `None` when they are no MCAP file.
+///
+/// # Errors
+/// When they cannot be read.
+pub(crate) fn scan_from(
+    file: impl Read,
+    limits: Limits,
+    visit: &mut Visit<'_>,
+) -> io::Result<Option<ScanEnd>> {
     let mut scanner = Scanner {
-        file: BufReader::new(file),
+        file,
         offset: 0,
+        record_bytes_max: limits.record_bytes_max,
         end: ScanEnd {
-            size_bytes,
+            size_bytes: limits.size_bytes,
             ..ScanEnd::default()
         },
         damaged: None,
         is_summary: false,
     };
-    let magic = scanner.take(MAGIC.len() as u64).map_err(failed)?;
-    if magic != MAGIC {
-        let path = path.to_owned();
-        return Err(ScanError::Foreign { path });
+    if scanner.take(MAGIC.len() as u64)? != MAGIC {
+        return Ok(None);
     }
-    while scanner.next(visit).map_err(failed)? {}
-    Ok(scanner.end)
+    while scanner.next(visit)? {}
+    Ok(Some(scanner.end))
 }
 
-struct Scanner {
-    file: BufReader<File>,
+struct Scanner<R> {
+    file: R,
     offset: u64,
+    record_bytes_max: usize,
     end: ScanEnd,
     /// The last chunk that was passed over, until its index says how many messages it had.
     damaged: Option<usize>,
@@ -109,7 +139,7 @@ struct Scanner {
     is_summary: bool,
 }
 
-impl Scanner {
+impl<R: Read> Scanner<R> {
     /// The next bytes, fewer at the end of the file.
     fn take(&mut self, count: u64) -> io::Result<Vec<u8>> {
         let mut bytes = Vec::new();
@@ -146,8 +176,9 @@ impl Scanner {
             self.lose(start, "a record goes on beyond the end of the file");
             return Ok(false);
         }
-        if length.min(left) > RECORD_BYTES_MAX as u64 {
-            self.lose(start, "a record is larger than 1 GiB");
+        if length.min(left) > self.record_bytes_max as u64 {
+            let why = format!("a record is larger than {} bytes", self.record_bytes_max);
+            self.lose(start, &why);
             return Ok(false);
         }
         let body = self.take(length.min(left))?;
@@ -218,12 +249,12 @@ impl Scanner {
             Ok(goes_on)
         };
         let decoded = if is_whole {
-            decode(&framed(body), true, &mut take)
+            decode(&framed(body), (true, self.record_bytes_max), &mut take)
         } else {
             // Its header was to be written last, so nothing in it but the compression counts.
             unfinished(body).map_or_else(
                 || Err("its header is not whole".to_owned()),
-                |bytes| decode(&bytes, false, &mut take),
+                |bytes| decode(&bytes, (false, self.record_bytes_max), &mut take),
             )
         };
         let why = match decoded {
@@ -244,25 +275,12 @@ impl Scanner {
     }
 }
 
-/// As [`mcap::read::parse_record`], with a message in words; that one panics on short attachments.
+/// As [`mcap::read::parse_record`], with a message in words, of a record that keeps to its length.
 fn parse(opcode: u8, body: &[u8]) -> Result<Record<'_>, String> {
-    if opcode == op::ATTACHMENT && !is_attachment(body) {
-        return Err("an attachment is shorter than it says".to_owned());
+    if !lengths::lie_within(opcode, body) {
+        return Err("something in it is longer than the record".to_owned());
     }
     mcap::parse_record(opcode, body).map_err(|error| error.to_string())
-}
-
-/// True when an attachment's body has room for its parts: two times, two texts with their lengths,
-/// the length of the data, and a check sum.
-fn is_attachment(body: &[u8]) -> bool {
-    let mut at = 16_usize;
-    for _ in 0..2 {
-        let Some(length) = body.get(at..).and_then(|rest| rest.first_chunk::<4>()) else {
-            return false;
-        };
-        at = at.saturating_add(4 + u32::from_le_bytes(*length) as usize);
-    }
-    at.saturating_add(8 + 4) <= body.len()
 }
 
 /// A chunk record with this body.
@@ -298,12 +316,16 @@ fn unfinished(body: &[u8]) -> Option<Vec<u8>> {
 type Take<'a> = dyn FnMut(u8, &[u8]) -> Result<bool, String> + 'a;
 
 /// Hands every record of the chunk record `bytes` to `take` until that wants no more.
-fn decode(bytes: &[u8], is_checked: bool, take: &mut Take<'_>) -> Result<(), String> {
+fn decode(
+    bytes: &[u8],
+    (is_checked, record_bytes_max): (bool, usize),
+    take: &mut Take<'_>,
+) -> Result<(), String> {
     let options = LinearReaderOptions::default()
         .with_skip_start_magic(true)
         .with_skip_end_magic(true)
         .with_prevalidate_chunk_crcs(is_checked)
-        .with_record_length_limit(RECORD_BYTES_MAX);
+        .with_record_length_limit(record_bytes_max);
     let mut reader = LinearReader::new_with_options(options);
     let mut rest = bytes;
     while let Some(event) = reader.next_event() {

@@ -12,6 +12,8 @@ mod egm;
 mod gateway;
 mod input;
 mod motion;
+#[cfg(feature = "recorder")]
+mod recorder;
 #[cfg(feature = "runtime")]
 mod runtime;
 mod seeds;
@@ -164,6 +166,16 @@ targets! {
     layout: "the layout of a message, and a message by it", runtime::layout, seeds::layouts,
         (4 * MIB, 16 * KIB);
     #[cfg(feature = "runtime")]
+    radio: "what the kernel says of a radio", runtime::radio, seeds::radio_answers, (KIB, 64);
+    #[cfg(feature = "runtime")]
     words: "durations, addresses, flows, and what time daemons say", runtime::words, seeds::words,
         (64 * KIB, 256);
+    #[cfg(feature = "recorder")]
+    viewer_request: "the head of a viewer's request", recorder::viewer_request,
+        seeds::viewer_requests, (64 * KIB, 256);
+    #[cfg(feature = "recorder")]
+    recording: "an MCAP file", recorder::recording, seeds::recordings, (8 * MIB, 64 * KIB);
+    #[cfg(feature = "recorder")]
+    recorded_message: "a message as a recording has it", recorder::recorded_message,
+        seeds::recorded_messages, (4 * MIB, 16 * KIB);
 }

@@ -9,6 +9,7 @@ use hil_runtime::channel::DomainAddress;
 use hil_runtime::clock_discipline::{ChronyTracking, NtpVariables, PtpStatus};
 use hil_runtime::layout::{Decoder, Value};
 use hil_runtime::manifest::FieldDescription;
+use hil_runtime::radio;
 use hil_runtime::record::RecordFile;
 use hil_runtime::record::file::HEADER_BYTES;
 use hil_runtime::report::summary::RunSummary;
@@ -119,7 +120,7 @@ pub(crate) fn summary(bytes: &[u8]) -> Verdict {
 }
 
 /// Messages that are shown: larger ones show nothing new and take long.
-const MESSAGE_BYTES_MAX: usize = 1 << 12;
+pub(crate) const MESSAGE_BYTES_MAX: usize = 1 << 12;
 
 /// By a layout that is accepted every message of its size is read, each part as in the whole, and
 /// none of another size.
@@ -179,6 +180,30 @@ pub(crate) fn sized(bytes: &[u8], size_bytes: usize) -> Vec<u8> {
     let mut message = bytes[..bytes.len().min(size_bytes)].to_vec();
     message.resize(size_bytes, 0);
     message
+}
+
+/// Each answer takes at least a header's bytes, and one cut off within a header is none.
+pub(crate) fn radio(bytes: &[u8]) -> Verdict {
+    const HEADER_BYTES: usize = 16;
+    let heard = radio::heard(bytes);
+    assert!(
+        heard.answer_count * HEADER_BYTES <= bytes.len(),
+        "{heard:?}"
+    );
+    for count in [
+        heard.station_count,
+        heard.interface_count,
+        heard.event_count,
+        heard.family_count,
+    ] {
+        assert!(count <= heard.answer_count, "{heard:?}");
+    }
+    let piece = radio::heard(&bytes[..bytes.len() / 2]);
+    assert!(
+        piece.answer_count <= heard.answer_count,
+        "{piece:?} of {heard:?}"
+    );
+    Verdict::of(heard.answer_count > 0)
 }
 
 /// Words of users and of other programs: the first byte says which.

@@ -6,10 +6,59 @@ use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
 
-use hil_decoders::{Seed, TARGETS, Verdict};
+use hil_decoders::{Seed, TARGETS, Target, Verdict};
+use hil_models::random::RandomStream;
 
 /// What the corpus may take of the repository.
 const CORPUS_BYTES_MAX: usize = 200_000;
+
+/// Inputs made of each seed, and of those that guard a door.
+const MUTATION_COUNT: usize = 100;
+const DOOR_MUTATION_COUNT: usize = 16_000;
+
+fn below(random: &mut RandomStream, bound: usize) -> usize {
+    usize::try_from(random.next_u64() % bound as u64).unwrap()
+}
+
+/// Changes, removes, adds or repeats some of the bytes, some of them such as texts turn on.
+fn mutate(bytes: &mut Vec<u8>, random: &mut RandomStream) {
+    const TELLING: &[u8] = b"\r\n: \tOoHh,/[]@%\x00\x7f\xff\x1b";
+    for _ in 0..=below(random, 4) {
+        let byte = match below(random, 2) {
+            0 => TELLING[below(random, TELLING.len())],
+            _ => u8::try_from(below(random, 256)).unwrap(),
+        };
+        if bytes.is_empty() {
+            bytes.push(byte);
+        }
+        let at = below(random, bytes.len());
+        match below(random, 4) {
+            0 => bytes[at] = byte,
+            1 => drop(bytes.remove(at)),
+            2 => bytes.insert(at, byte),
+            _ => {
+                let end = (at + 1 + below(random, 48)).min(bytes.len());
+                let piece = bytes[at..end].to_vec();
+                let to = below(random, bytes.len());
+                bytes.splice(to..to, piece);
+            }
+        }
+    }
+}
+
+/// How many mutations of `seed` mean something.
+fn accepted_mutations(target: &Target, seed: &[u8], random: &mut RandomStream) -> usize {
+    let count = match target.name {
+        "viewer_request" => DOOR_MUTATION_COUNT,
+        _ => MUTATION_COUNT,
+    };
+    let mutated = (0..count).map(|_| {
+        let mut bytes = seed.to_vec();
+        mutate(&mut bytes, random);
+        target.check(&bytes)
+    });
+    mutated.filter(|one| *one == Verdict::Accepted).count()
+}
 
 /// The files of a folder by name; none when there is no such folder.
 fn files(folder: &Path) -> Vec<Seed> {
@@ -28,6 +77,7 @@ fn files(folder: &Path) -> Vec<Seed> {
 #[test]
 fn every_decoder_keeps_its_promises_for_the_corpus_and_all_regressions() {
     let mut total_bytes = 0;
+    let mut random = RandomStream::new(1, "mutations of seeds");
     for target in TARGETS {
         let (seeds, regressions) = (
             files(&target.corpus_folder()),
@@ -43,7 +93,17 @@ fn every_decoder_keeps_its_promises_for_the_corpus_and_all_regressions() {
         );
         let mut verdicts = BTreeSet::new();
         for (name, bytes) in seeds.iter().chain(&regressions) {
-            println!("{} {name}: {} bytes", target.name, bytes.len());
+            let accepted_count = accepted_mutations(target, bytes, &mut random);
+            println!(
+                "{} {name}: {} bytes; {accepted_count} mutations mean something",
+                target.name,
+                bytes.len()
+            );
+            let is_door = ["request-00", "request-01"].contains(&name.as_str());
+            assert!(
+                !is_door || accepted_count > 1000,
+                "{name}: the test would prove nothing"
+            );
             verdicts.insert(target.check(bytes));
             total_bytes += bytes.len();
             // What a search tries first.

@@ -35,7 +35,7 @@ use crate::priority::{Looks, Precedence};
 use crate::scene::Scenery;
 use crate::split::{Split, prepare};
 use crate::writer::WriteError;
-use access::{Access, NO_ORIGIN};
+use access::{Access, NO_ORIGIN, Refusal};
 use engine::{Engine, Showing, Shown};
 use front::{Door, Front};
 use parameters::Links;
@@ -373,6 +373,22 @@ fn admitted(options: &ServeOptions) -> Access {
         &options.allow_origin,
         machine.as_deref(),
     )
+}
+
+/// What [`front`] decides by the head of a request, of a machine called `machine` where nothing more was
+/// allowed: the host it names, or why it is refused; `None` while the head is not whole.
+pub(crate) fn judge_head(
+    bytes: &[u8],
+    machine: &str,
+    page_port: u16,
+) -> Option<Result<String, Refusal>> {
+    let head = match head::parse(bytes) {
+        head::Parsed::Partial => return None,
+        head::Parsed::Broken => return Some(Err(Refusal::Malformed)),
+        head::Parsed::Whole(head) => head,
+    };
+    let judged = Access::new(&[], &[], Some(machine)).judge(&head, page_port);
+    Some(judged.and_then(|()| head.host.ok_or(Refusal::NoHost)))
 }
 
 #[cfg(test)]

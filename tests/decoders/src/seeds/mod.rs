@@ -3,6 +3,8 @@
 
 mod files;
 mod network;
+#[cfg(feature = "recorder")]
+mod recorder;
 #[cfg(feature = "runtime")]
 mod runtime;
 
@@ -11,8 +13,12 @@ pub(crate) use network::{
     captures, control_messages, conversations, datagrams, egm_datagrams, egm_sessions, frames,
     reassembly, tcp_streams,
 };
+#[cfg(feature = "recorder")]
+pub(crate) use recorder::{recorded_messages, recordings, viewer_requests};
 #[cfg(feature = "runtime")]
-pub(crate) use runtime::{layouts, peer_frames, record_files, summaries, topologies, words};
+pub(crate) use runtime::{
+    layouts, peer_frames, radio_answers, record_files, summaries, topologies, words,
+};
 
 use crate::Seed;
 

@@ -191,20 +191,34 @@ pub(crate) fn summaries() -> Vec<Seed> {
     numbered("summary", [text, newer])
 }
 
+/// As a kernel with simulated radios gave them.
+pub(crate) fn radio_answers() -> Vec<Seed> {
+    macro_rules! recorded {
+        ($($name:literal),*) => {[$(
+            include_bytes!(concat!("../../../../runtime/src/radio/recorded/", $name, ".netlink"))
+                .to_vec(),
+        )*]};
+    }
+    numbered(
+        "answer",
+        recorded!("station", "disconnect", "family", "interfaces"),
+    )
+}
+
 /// An input that `runtime::split_layout` takes apart.
-fn with_layout(fields: &[Field], size_bytes: usize, message: &[u8]) -> Vec<u8> {
+pub(super) fn with_layout(fields: &[Field], size_bytes: usize, message: &[u8]) -> Vec<u8> {
     let layout = json!({ "fields": describe_fields(fields), "size_bytes": size_bytes });
     let json = layout.to_string();
     let length = u16::try_from(json.len()).expect("layouts are short");
     [&length.to_le_bytes()[..], json.as_bytes(), message].concat()
 }
 
-fn bytes_of(size_bytes: usize) -> Vec<u8> {
+pub(super) fn bytes_of(size_bytes: usize) -> Vec<u8> {
     let bytes = (0..size_bytes).map(|at| (at * 37 % 256).to_le_bytes()[0]);
     bytes.collect()
 }
 
-fn message_inputs(make: impl Fn(&'static [Field], usize) -> Vec<u8>) -> Vec<Vec<u8>> {
+pub(super) fn message_inputs(make: impl Fn(&'static [Field], usize) -> Vec<u8>) -> Vec<Vec<u8>> {
     vec![
         make(ShuttleCommand::FIELDS, size_of::<ShuttleCommand>()),
         make(ShuttleStatus::FIELDS, size_of::<ShuttleStatus>()),

@@ -1,0 +1,6 @@
+//! Searches for an input that `radio` of hil-decoders does not keep its promises for.
+#![no_main]
+
+libfuzzer_sys::fuzz_target!(|input: &[u8]| {
+    hil_decoders::target("radio").check(input);
+});
