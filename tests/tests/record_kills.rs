@@ -130,6 +130,10 @@ fn lost_ns(killed: &Killed, run: &RunFiles) -> [i64; 2] {
     );
     let found = read_back(&mended);
     assert!(!found.is_empty(), "nothing was recovered");
+    let bytes = fs::read(&mended).unwrap();
+    let index = mcap::Summary::read(&bytes).unwrap().unwrap();
+    let mut attachments = index.attachment_indexes.iter();
+    assert!(attachments.any(|one| one.name == "yumi.urdf"));
     [messages(run), stamped(run)].map(|published| lost_of(&found, published, killed.at_ns))
 }
 

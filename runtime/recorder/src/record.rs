@@ -388,7 +388,6 @@ impl LiveRecording {
         }
         self.files.open().describe("hil.end", end)?;
         facts::attach(self.files.open(), &run.folder)?;
-        facts::attach_robot(self.files.open(), self.topics.messages())?;
         let counts = self.topics.counts();
         let missed = self.topics.missed(&self.feed, self.is_silent);
         let mut words = self.problems.clone();
@@ -430,7 +429,8 @@ impl LiveRecording {
         file.describe("hil.clocks", self.told_clocks.clone())?;
         file.describe("hil.run", words)?;
         file.describe("hil.topology", topology)?;
-        file.describe("hil.host_facts", host)
+        file.describe("hil.host_facts", host)?;
+        facts::attach_robot(file, self.topics.messages())
     }
 
     /// What was recorded so far, at the end of each file.
