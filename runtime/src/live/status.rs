@@ -165,6 +165,21 @@ pub struct Overruns {
 /// A host says how it stands twice a second; one that says nothing for this long is not heard.
 pub const HEARING_MAX: Duration = Duration::from_secs(3);
 
+/// How well `host` is heard at `now` when it was last at `heard_ns`.
+pub(crate) fn hearing(
+    host: &str,
+    (heard_ns, now): (Option<i64>, Instant),
+    left_out_count: usize,
+) -> HostHearing {
+    let silent = heard_ns.map(|at| now.saturating_duration_since(Instant::from_ns(at)));
+    HostHearing {
+        host: host.to_owned(),
+        is_heard: silent.is_some_and(|silent| silent <= HEARING_MAX),
+        silent_s: silent.map(|silent| silent.as_secs_f64()),
+        left_out_count,
+    }
+}
+
 /// The overruns of the run in `folder` as of `now`, while it goes on.
 ///
 /// # Errors
@@ -175,15 +190,6 @@ pub fn overruns(folder: &Path, now: Instant) -> io::Result<Overruns> {
     if status.phase == Phase::Ending {
         return Err(io::Error::other("the run is being ended"));
     }
-    let hearing = |host: &str, heard_ns: Option<i64>, left_out_count: usize| {
-        let silent = heard_ns.map(|at| now.saturating_duration_since(Instant::from_ns(at)));
-        HostHearing {
-            host: host.to_owned(),
-            is_heard: silent.is_some_and(|silent| silent <= HEARING_MAX),
-            silent_s: silent.map(|silent| silent.as_secs_f64()),
-            left_out_count,
-        }
-    };
     // The supervisor here speaks for the hosts here, unless it hangs.
     let here: BTreeSet<&str> = status
         .processes
@@ -192,9 +198,10 @@ pub fn overruns(folder: &Path, now: Instant) -> io::Result<Overruns> {
         .collect();
     let here = here
         .into_iter()
-        .map(|host| hearing(host, Some(status.written_ns), 0));
+        .map(|host| hearing(host, (Some(status.written_ns), now), 0));
     let elsewhere = status.elsewhere.iter();
-    let elsewhere = elsewhere.map(|host| hearing(&host.name, host.heard_ns, host.left_out_count));
+    let elsewhere =
+        elsewhere.map(|host| hearing(&host.name, (host.heard_ns, now), host.left_out_count));
     let hosts = here.chain(elsewhere).collect();
     let own = status.processes.iter().map(|one| ProcessOverruns {
         process: one.name.clone(),

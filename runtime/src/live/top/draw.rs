@@ -141,6 +141,7 @@ FIGURES
 fn body(view: &View, frame: Frame, columns: usize) -> Vec<Line> {
     let mut lines = head(view);
     processes(view, &mut lines);
+    elsewhere(view, &mut lines);
     channels(view, frame, columns, &mut lines);
     links(view, &mut lines);
     clocks(view, &mut lines);
@@ -225,6 +226,36 @@ fn processes(view: &View, lines: &mut Vec<Line>) {
         );
         let is_well = matches!(one.state.as_str(), "running" | "starting");
         lines.push(line(text, if is_well { NORMAL } else { BAD }));
+    }
+}
+
+/// Whether other hosts keep up: what passed without their processes is no delay of the network.
+fn elsewhere(view: &View, lines: &mut Vec<Line>) {
+    for one in &view.elsewhere {
+        let mut each: Vec<String> = one
+            .overruns
+            .iter()
+            .map(|(process, count)| format!("{process} {count}"))
+            .collect();
+        if one.hearing.left_out_count > 0 {
+            each.push(format!("{} more", one.hearing.left_out_count));
+        }
+        let each = each.join(", ");
+        let host = &one.hearing.host;
+        let (text, style) = match (one.hearing.is_heard, each.as_str()) {
+            (true, "") => (format!("{host}: no overruns"), NORMAL),
+            (true, each) => (format!("{host}: overruns {each}"), BAD),
+            (false, each) => {
+                let silence = one.hearing.silent_s.map_or_else(
+                    || "not heard yet".to_owned(),
+                    |silent_s| format!("not heard for {silent_s:.0} s"),
+                );
+                let last = if each.is_empty() { "" } else { "; last told: " };
+                let text = format!("{host}: overruns unavailable, {silence}{last}{each}");
+                (text, BAD)
+            }
+        };
+        lines.push(line(text, style));
     }
 }
 

@@ -6,7 +6,8 @@ use ratatui::Terminal;
 use ratatui::backend::TestBackend;
 
 use super::*;
-use crate::live::top::view::{ClockRow, LinkRow, RunView, SegmentRow};
+use crate::live::status::HostHearing;
+use crate::live::top::view::{ClockRow, ElsewhereRow, LinkRow, RunView, SegmentRow};
 
 fn quantiles(p50_ns: i64, p99_ns: i64) -> Quantiles {
     Quantiles { p50_ns, p99_ns }
@@ -28,6 +29,30 @@ fn process(name: &str, state: &str, restart_count: u32) -> ProcessRow {
     }
 }
 
+fn heard(host: &str, silent_s: Option<f64>, overruns: &[(&str, u64)]) -> ElsewhereRow {
+    let overruns = overruns.iter();
+    ElsewhereRow {
+        hearing: HostHearing {
+            host: host.to_owned(),
+            is_heard: silent_s.is_some_and(|silent_s| silent_s < 3.0),
+            silent_s,
+            left_out_count: usize::from(host == "camera-pc"),
+        },
+        overruns: overruns
+            .map(|(name, count)| ((*name).to_owned(), *count))
+            .collect(),
+    }
+}
+
+fn elsewhere_rows() -> Vec<ElsewhereRow> {
+    vec![
+        heard("robot-pc", Some(0.4), &[]),
+        heard("camera-pc", Some(0.4), &[("tracker", 12), ("writer", 3)]),
+        heard("spare-pc", Some(7.2), &[("robot", 4)]),
+        heard("late-pc", None, &[]),
+    ]
+}
+
 fn view() -> View {
     let segment = |name: &str, time| SegmentRow {
         name: name.to_owned(),
@@ -47,6 +72,7 @@ fn view() -> View {
             process("controller", "running", 1),
             process("human", "killed by signal 9", 0),
         ],
+        elsewhere: elsewhere_rows(),
         channels: vec![
             ChannelRow {
                 name: "egm/right/command".to_owned(),

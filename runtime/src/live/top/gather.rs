@@ -10,16 +10,17 @@ use hil_models::link::condition::LinkCondition;
 use hil_models::link::spec::{LinkSpec, Way};
 use hil_models::measure::account::{ChannelAccount, MessageFate};
 use hil_models::measure::histogram::Distribution;
+use hil_models::time::Instant;
 
 use super::draw::HISTORY_COLUMNS;
 use super::view::{
-    ChannelRow, ClockRow, LinkRow, ProcessRow, Quantiles, RunView, SegmentRow, View,
+    ChannelRow, ClockRow, ElsewhereRow, LinkRow, ProcessRow, Quantiles, RunView, SegmentRow, View,
 };
 use crate::clock::MonotonicClock;
 use crate::live::observer::Observer;
 use crate::live::pace::Pace;
 use crate::live::process;
-use crate::live::status::{Phase, ProcessStatus, RunStatus};
+use crate::live::status::{self, Phase, ProcessStatus, RunStatus};
 use crate::topology::{Channel, Direction, Link, Topology};
 
 /// The supervisor tells of its processes twice a second; what is older than this is said to be old.
@@ -64,6 +65,7 @@ impl Gatherer {
         let view = View {
             run: run_view(observer, status.as_ref(), window),
             processes: self.processes(status.as_ref()),
+            elsewhere: status.as_ref().map(elsewhere).unwrap_or_default(),
             channels: self.channels(observer, &accounts),
             links: observer
                 .topology()
@@ -115,6 +117,26 @@ impl Gatherer {
         });
         rows.collect()
     }
+}
+
+/// The other hosts; once the run is being ended, as they were heard before.
+fn elsewhere(status: &RunStatus) -> Vec<ElsewhereRow> {
+    let now = match status.phase {
+        Phase::Ending => Instant::from_ns(status.written_ns),
+        Phase::Starting | Phase::Running => MonotonicClock::now(),
+    };
+    let hosts = status.elsewhere.iter().map(|host| {
+        let processes = host.processes.iter();
+        let skipped = processes.filter_map(|one| {
+            let count = one.skipped_tick_count.filter(|count| *count > 0)?;
+            Some((one.name.clone(), count))
+        });
+        ElsewhereRow {
+            hearing: status::hearing(&host.name, (host.heard_ns, now), host.left_out_count),
+            overruns: skipped.collect(),
+        }
+    });
+    hosts.collect()
 }
 
 /// What is wrong with what the supervisor tells.

@@ -1,9 +1,12 @@
 //! What `top` shows: plain figures of one look, ready to be drawn or printed as JSON. What is not
 //! known is `None`. Nothing here gathers or draws.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use serde::Serialize;
+
+use crate::live::status::HostHearing;
 
 /// One look at a run.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -12,6 +15,8 @@ pub(crate) struct View {
     pub(crate) run: RunView,
     /// What runs on this host.
     pub(crate) processes: Vec<ProcessRow>,
+    /// The other hosts of the run.
+    pub(crate) elsewhere: Vec<ElsewhereRow>,
     /// The channels with an end on this host, and those that are only recorded here.
     pub(crate) channels: Vec<ChannelRow>,
     /// What carries them.
@@ -64,6 +69,17 @@ pub(crate) struct ProcessRow {
     pub(crate) overrun_count: Option<u64>,
     /// How often it was started again.
     pub(crate) restart_count: u32,
+}
+
+/// Another host, as far as it is heard here.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub(crate) struct ElsewhereRow {
+    /// How well it is heard.
+    #[serde(flatten)]
+    pub(crate) hearing: HostHearing,
+    /// Ticks that passed without its processes, as it last said; those that skipped none, and those
+    /// that have not said, left out.
+    pub(crate) overruns: BTreeMap<String, u64>,
 }
 
 /// Median and 99th percentile, nanoseconds.
