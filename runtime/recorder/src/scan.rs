@@ -249,7 +249,8 @@ impl<R: Read> Scanner<R> {
             Ok(goes_on)
         };
         let decoded = if is_whole {
-            decode(&framed(body), (true, self.record_bytes_max), &mut take)
+            let bytes = framed(unpadded(body));
+            decode(&bytes, (true, self.record_bytes_max), &mut take)
         } else {
             // Its header was to be written last, so nothing in it but the compression counts.
             unfinished(body).map_or_else(
@@ -281,6 +282,19 @@ fn parse(opcode: u8, body: &[u8]) -> Result<Record<'_>, String> {
         return Err("something in it is longer than the record".to_owned());
     }
     mcap::parse_record(opcode, body).map_err(|error| error.to_string())
+}
+
+/// A chunk's body without what may follow its records: the reader would take a record that goes on
+/// into that for one of them, and lose count.
+fn unpadded(body: &[u8]) -> &[u8] {
+    let end = || {
+        let name_bytes = body.get(COMPRESSION_AT..)?.first_chunk::<4>()?;
+        let name_bytes = usize::try_from(u32::from_le_bytes(*name_bytes)).ok()?;
+        let head_bytes = CHUNK_HEAD_BYTES.checked_add(name_bytes)?;
+        let size = body.get(head_bytes - 8..)?.first_chunk::<8>()?;
+        head_bytes.checked_add(usize::try_from(u64::from_le_bytes(*size)).ok()?)
+    };
+    end().and_then(|end| body.get(..end)).unwrap_or(body)
 }
 
 /// A chunk record with this body.
