@@ -162,7 +162,7 @@ export function showEvents(losses, collisions, elapsedOf) {
   if (list.dataset.key === key) return;
   list.dataset.key = key;
   list.replaceChildren(...shown.map((row) => make("li", { class: row.tone }, make("time", {}, seconds(elapsedOf(row.at_s), 2)), make("span", {}, row.words))));
-  write(byId("events-note"), shown.length === 0 ? "nothing lost, no collision" : rows.length > shown.length ? `the last ${shown.length}` : "");
+  write(byId("events-note"), shown.length === 0 ? "nothing lost, no collision since this page was opened" : rows.length > shown.length ? `the last ${shown.length}` : "");
 }
 
 function lossWords(loss) {

@@ -62,7 +62,10 @@ pub enum LinkError {
         via: String,
     },
     /// Another host receives that way, and emulates it.
-    #[error("{link}.{way} is not emulated on this host but on the one that receives; set it there", way = .way.word())]
+    #[error(
+        "{link}.{way} is not emulated on this host: either no channel goes that way, or the host that \
+         receives it does; `hil-runtime link show` lists what can be set here", way = .way.word()
+    )]
     Elsewhere {
         /// The link.
         link: String,

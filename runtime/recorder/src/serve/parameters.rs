@@ -138,7 +138,7 @@ impl Links {
         let why_not = match wish {
             _ if via != "emulated" => Some(format!("it is carried by {via}, not emulated")),
             _ if is_over => Some("the run does not go on".to_owned()),
-            None => Some("another host emulates this way".to_owned()),
+            None => Some("no channel goes this way, or another host emulates it".to_owned()),
             Some(_) => None,
         };
         json!({

@@ -20,6 +20,8 @@ const UNDER_WAY_MAX: usize = 50_000;
 /// Periods of silence after which a link is called silent, and the least time.
 const SILENT_PERIODS: i64 = 5;
 const SILENT_NS: i64 = 500_000_000;
+/// Messages after which their period is known.
+const RHYTHM_COUNT: u64 = 32;
 /// Numbers listed of one loss event.
 const LISTED_MAX: usize = 64;
 /// Single messages shown each time that messages are settled, ten times a second.
@@ -292,8 +294,13 @@ impl Account {
             .arrived_ns
             .filter(|_| self.has_link)
             .map(|ns| now_ns - ns);
-        let rate_hz = self.rate.count(now_ns) as f64 * 1e9 / WINDOW_NS as f64;
         let counts = &self.counts;
+        // What no process here has to do with has no rate here.
+        let is_seen = [counts.published(), counts.received, counts.taken]
+            .iter()
+            .any(Option::is_some);
+        let rate_hz = self.rate.count(now_ns) as f64 * 1e9 / WINDOW_NS as f64;
+        let rate_hz = is_seen.then_some(rate_hz);
         json!({
             "name": name,
             "rate_hz": rate_hz,
@@ -316,10 +323,12 @@ impl Account {
             return if waits { "silent" } else { "none" };
         };
         let patience_ns = (SILENT_PERIODS * self.period_ns).max(SILENT_NS);
-        // A channel on which nobody spoke is not silent because of its link.
+        // A channel on which nobody spoke is not silent because of its link. Where nobody here knows
+        // whether anybody did, only one that had a rhythm can be said to have lost it.
+        let has_rhythm = self.counts.received >= Some(RHYTHM_COUNT);
         let was_offered = self
             .left_ns
-            .is_none_or(|left_ns| left_ns > arrived_ns + patience_ns / 2);
+            .map_or(has_rhythm, |left_ns| left_ns > arrived_ns + patience_ns / 2);
         if now_ns - arrived_ns > patience_ns && was_offered {
             "silent"
         } else {
