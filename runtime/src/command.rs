@@ -213,7 +213,8 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
         console.error(&error.to_string());
         return exit::USAGE;
     }
-    if args.check {
+    // A file is checked anywhere, also where none of its hosts is.
+    if args.check && args.host.is_none() {
         return show_check(path, &topology, console);
     }
     let hosts = match hosts_here(&topology, args.host.as_deref()) {
@@ -223,6 +224,9 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
             return exit::USAGE;
         }
     };
+    if args.check {
+        return show_check(path, &topology, console);
+    }
     let signals = match signals(console) {
         Ok(signals) => signals,
         Err(code) => return code,

@@ -194,7 +194,8 @@ impl Observer {
         })?;
         if self.source(name).is_none() {
             let hosts = [&description.from_host, &description.to_host];
-            let hosts: Vec<&str> = hosts.into_iter().flatten().map(String::as_str).collect();
+            let mut hosts: Vec<&str> = hosts.into_iter().flatten().map(String::as_str).collect();
+            hosts.dedup();
             return Err(ObserveError::Elsewhere {
                 channel: name.to_owned(),
                 hosts: hosts.join(" or "),

@@ -203,8 +203,8 @@ impl ForegoingEvent {
     pub(crate) fn of(event: &TimedEvent, at_s: f64, over_for_s: f64) -> Self {
         let when = if event.until_s.is_none_or(|until_s| until_s >= at_s) {
             // Within the clocks' bound it may seem to have begun after.
-            let since_s = (at_s - event.from_s).max(0.0);
-            format!("under way since {}", duration_s(since_s))
+            let for_s = (at_s - event.from_s).max(0.0);
+            format!("under way for {}", duration_s(for_s))
         } else {
             format!("{} before", duration_s(over_for_s))
         };
@@ -409,7 +409,7 @@ mod tests {
         );
         assert_eq!(
             words(3.0, None, 4.0),
-            "under way since 1.00 s: outage to the end on shuttle/command, 80 messages lost, from \
+            "under way for 1.00 s: outage to the end on shuttle/command, 80 messages lost, from \
              3.000 s"
         );
     }

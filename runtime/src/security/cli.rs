@@ -36,12 +36,14 @@ impl KeyCommand {
         Ok(match self {
             Self::New { file } => {
                 let key = PreSharedKey::create(file)?;
+                // In a topology a path counts from the topology's folder.
+                let named = std::path::absolute(file).unwrap_or_else(|_| file.clone());
                 format!(
                     "made {}\nfingerprint {}\n\nCopy it to the other hosts with its mode (scp -p) and name it in the topology:\n\n\
                      [security]\nkey = \"{}\"\n",
                     file.display(),
                     key.fingerprint(),
-                    file.display()
+                    named.display()
                 )
             }
             Self::Check { file } => {

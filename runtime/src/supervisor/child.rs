@@ -2,7 +2,7 @@
 //! stop it is decided in `crew.rs`.
 
 use std::fs::File;
-use std::io::{self, BufRead, BufReader, Write};
+use std::io::{self, BufRead, BufReader, Read as _, Seek as _, SeekFrom, Write};
 use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::path::Path;
 use std::process::{ChildStdin, Command, ExitStatus, Stdio};
@@ -199,6 +199,24 @@ pub(crate) fn describe_exit(status: ExitStatus) -> String {
     }
 }
 
+/// The last line that a process said on its standard error, if it said any: as much of it as fits a
+/// line of a report.
+pub(crate) fn last_line(log: &Path) -> Option<String> {
+    const TAIL_BYTES: u64 = 4096;
+    const LINE_CHARS: usize = 200;
+    let mut file = File::open(log).ok()?;
+    let size_bytes = file.metadata().ok()?.len();
+    file.seek(SeekFrom::Start(size_bytes.saturating_sub(TAIL_BYTES)))
+        .ok()?;
+    let mut bytes = Vec::new();
+    file.take(TAIL_BYTES).read_to_end(&mut bytes).ok()?;
+    let text = String::from_utf8_lossy(&bytes);
+    let lines = text.lines().map(str::trim);
+    let last = lines.rev().find(|line| !line.is_empty())?;
+    let plain = last.chars().filter(|one| !one.is_control());
+    Some(plain.take(LINE_CHARS).collect())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -223,6 +241,27 @@ mod tests {
         assert_eq!(words.recv().unwrap(), (3, 1, FromProcess::Ready));
         let (_, _, word) = words.recv().unwrap();
         assert_eq!(word, FromProcess::Warning("said: hello".to_owned()));
+        fs::remove_file(log).unwrap();
+    }
+
+    #[test]
+    fn the_last_line_that_was_said_is_found_whatever_it_is() {
+        let log = env::temp_dir().join(format!("hil-last-{}.log", std::process::id()));
+        assert_eq!(last_line(&log), None);
+        for (said, expected) in [
+            ("", None),
+            ("\n \n", None),
+            (
+                "one\ntwo: no license file\n\n",
+                Some("two: no license file"),
+            ),
+            ("\u{1b}[31mred\n", Some("[31mred")),
+        ] {
+            fs::write(&log, said).unwrap();
+            assert_eq!(last_line(&log).as_deref(), expected, "{said:?}");
+        }
+        fs::write(&log, [vec![0xff; 10_000], b"end".to_vec()].concat()).unwrap();
+        assert_eq!(last_line(&log).map(|line| line.chars().count()), Some(200));
         fs::remove_file(log).unwrap();
     }
 

@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use hil_models::time::{Instant, duration_ns};
 
-use super::child::{Child, Word, describe_exit};
+use super::child::{Child, Word, describe_exit, last_line};
 use super::event::{Event, Interruption};
 use super::launching::write_launch;
 use super::plan::{ProcessKind, ProcessPlan};
@@ -247,8 +247,13 @@ impl Crew {
     fn judge(&mut self, index: usize, status: ExitStatus, now: Instant) -> Verdict {
         let member = &mut self.members[index];
         let mut what = describe_exit(status);
+        let log = self.folder.log(&member.plan.name);
         if let Some(complaint) = &member.complaint {
             what = format!("{what}: {complaint}");
+        } else if status.code().is_some_and(|code| code != 0)
+            && let Some(last) = last_line(&log)
+        {
+            what = format!("{what}, after it said \"{last}\"");
         }
         member.end = Some(what.clone());
         let limit = match member.plan.on_exit {

@@ -90,8 +90,10 @@ pub(super) fn gather(
         } else {
             "to answer at"
         };
+        // Behind the names may stand who came and was turned away.
+        let (names, turned_away) = missing.split_at(missing.find(';').unwrap_or(missing.len()));
         console.progress(&format!(
-            "waiting for {missing} {role} {address} ({waited_s} s)"
+            "waiting for {names} {role} {address} ({waited_s} s){turned_away}"
         ));
         console.announce_up();
         signals.received().is_none()

@@ -26,9 +26,10 @@ pub(super) fn of_channels<'a>(
             .filter_map(|stage| counts.get(&(name, *stage)));
         let first = stages.next()?;
         let last = stages.next_back();
+        // Each process tells its count at a moment of its own; what was taken was published.
         Some(last.map_or_else(
             || format!("{name} {first}"),
-            |last| format!("{name} {first}→{last}"),
+            |last| format!("{name} {}→{last}", first.max(last)),
         ))
     });
     told.collect::<Vec<_>>().join(" | ")
@@ -68,13 +69,14 @@ mod tests {
             told("human/frame", "published", 9),
             told("egm/event", "recorded", 2),
             told("egm/right/feedback", "taken", 7),
+            told("egm/right/feedback", "published", 6),
             told("egm/right/command", "sent", 8),
             told("egm/right/command", "taken", 5),
             told("egm/right/command", "published", 8),
         ];
         assert_eq!(
             of_channels(&topology, progress.iter()),
-            "egm/right/command 8→5 | egm/right/feedback 7 | human/frame 9 | egm/event 2"
+            "egm/right/command 8→5 | egm/right/feedback 7→7 | human/frame 9 | egm/event 2"
         );
     }
 }

@@ -139,7 +139,7 @@ impl JointError {
             controller.rms(
                 (
                     "joint_error_controller_rad_rms",
-                    "joint error of the servo alone, without the network, RMS",
+                    "joint error of the servo alone, RMS",
                     "rad",
                 ),
                 CONTROLLER_PART,
@@ -148,7 +148,7 @@ impl JointError {
             controller.greatest(
                 (
                     "joint_error_controller_rad_max",
-                    "joint error of the servo alone, without the network, largest",
+                    "joint error of the servo alone, largest",
                     "rad",
                 ),
                 CONTROLLER_PART,

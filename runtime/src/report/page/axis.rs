@@ -22,6 +22,9 @@ enum Scale {
 
 /// Fewer values beside an axis do not show its scale.
 const TICKS_MIN: usize = 3;
+/// Room that words need along an upright axis, and along a level one.
+const LINE_PX: f64 = 13.0;
+const WORDS_PX: f64 = 46.0;
 
 impl Axis {
     /// From `low` to `high`; a span of nothing is widened so that there is something to draw in.
@@ -133,11 +136,34 @@ impl Axis {
         if ticks.len() >= TICKS_MIN {
             return ticks;
         }
-        let ticks = self.within_decades(unit, &[1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0]);
-        if ticks.len() >= TICKS_MIN {
-            return ticks;
+        let finer: [&[f64]; 2] = [
+            &[1.0, 2.0, 5.0],
+            &[1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0],
+        ];
+        for factors in finer {
+            let ticks = self.apart(self.within_decades(unit, factors));
+            if ticks.len() >= TICKS_MIN {
+                return ticks;
+            }
         }
         self.linear_ticks(unit)
+    }
+
+    /// Those of `ticks` whose words have room beside the one before.
+    fn apart(&self, ticks: Vec<(f64, String)>) -> Vec<(f64, String)> {
+        let is_upright = self.until_px < self.from_px;
+        let room_px = if is_upright { LINE_PX } else { WORDS_PX };
+        let mut last_px = f64::NEG_INFINITY;
+        let mut kept = ticks;
+        kept.retain(|(value, _)| {
+            let place_px = (self.at(*value) - self.from_px).abs();
+            let has_room = place_px - last_px >= room_px;
+            if has_room {
+                last_px = place_px;
+            }
+            has_room
+        });
+        kept
     }
 
     fn within_decades(&self, unit: Unit, wanted: &[f64]) -> Vec<(f64, String)> {
@@ -323,6 +349,20 @@ mod tests {
         assert!((Axis::nines(2.0, (100.0, 0.0)).at(0.99) - 0.0).abs() < 1e-6);
         assert!((Axis::nines(2.0, (100.0, 0.0)).at(0.0) - 100.0).abs() < 1e-6);
     }
+    #[test]
+    fn words_do_not_lie_on_each_other() {
+        // What a figure has room for, over half a decade and over one and a half.
+        for (low, high) in [(18e3, 110e3), (2e4, 7e5), (2e6, 9e6), (15e3, 95e3)] {
+            let axis = Axis::logarithmic((low, high), (110.0, 20.0));
+            let ticks = axis.ticks(Unit::Nanoseconds);
+            assert!(ticks.len() >= TICKS_MIN, "{low} to {high}: {ticks:?}");
+            for two in ticks.windows(2) {
+                let gap_px = (axis.at(two[0].0) - axis.at(two[1].0)).abs();
+                assert!(gap_px >= 12.0, "{low} to {high}: {two:?} {gap_px}");
+            }
+        }
+    }
+
     #[test]
     fn values_near_each_other_still_have_a_scale() {
         for (low, high) in [
