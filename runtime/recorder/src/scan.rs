@@ -13,7 +13,7 @@ use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOp
 use crate::lengths;
 
 /// Largest record, compressed or not: a bound on what a damaged length may ask for.
-pub(crate) const RECORD_BYTES_MAX: usize = 1 << 30;
+const RECORD_BYTES_MAX: usize = 1 << 30;
 /// Bytes before the body of a record: what it is, and its length.
 const RECORD_HEAD_BYTES: u64 = 9;
 /// Bytes of a chunk's header without the name of the compression.
@@ -284,13 +284,18 @@ fn parse(opcode: u8, body: &[u8]) -> Result<Record<'_>, String> {
     mcap::parse_record(opcode, body).map_err(|error| error.to_string())
 }
 
+/// Bytes of the header of this chunk's body; `None` when not even the length of the name is there.
+fn chunk_head_bytes(body: &[u8]) -> Option<usize> {
+    let name_bytes = body.get(COMPRESSION_AT..)?.first_chunk::<4>()?;
+    let name_bytes = usize::try_from(u32::from_le_bytes(*name_bytes)).ok()?;
+    CHUNK_HEAD_BYTES.checked_add(name_bytes)
+}
+
 /// A chunk's body without what may follow its records: the reader would take a record that goes on
 /// into that for one of them, and lose count.
 fn unpadded(body: &[u8]) -> &[u8] {
     let end = || {
-        let name_bytes = body.get(COMPRESSION_AT..)?.first_chunk::<4>()?;
-        let name_bytes = usize::try_from(u32::from_le_bytes(*name_bytes)).ok()?;
-        let head_bytes = CHUNK_HEAD_BYTES.checked_add(name_bytes)?;
+        let head_bytes = chunk_head_bytes(body)?;
         let size = body.get(head_bytes - 8..)?.first_chunk::<8>()?;
         head_bytes.checked_add(usize::try_from(u64::from_le_bytes(*size)).ok()?)
     };
@@ -309,13 +314,11 @@ fn framed(body: &[u8]) -> Vec<u8> {
 /// A chunk record that says of itself what is there of it; `None` when not even the name of the
 /// compression is.
 fn unfinished(body: &[u8]) -> Option<Vec<u8>> {
-    let name_bytes = body.get(COMPRESSION_AT..)?.first_chunk::<4>()?;
-    let name_bytes = usize::try_from(u32::from_le_bytes(*name_bytes)).ok()?;
-    let head_bytes = CHUNK_HEAD_BYTES.checked_add(name_bytes)?;
+    let head_bytes = chunk_head_bytes(body)?;
     let mut body = body.to_vec();
     let data_bytes = body.len().checked_sub(head_bytes)? as u64;
     // Uncompressed, the size is known as well; compressed, it is only not to stand in the way.
-    let uncompressed = if name_bytes == 0 {
+    let uncompressed = if head_bytes == CHUNK_HEAD_BYTES {
         data_bytes
     } else {
         u64::MAX

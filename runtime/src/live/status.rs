@@ -288,6 +288,10 @@ mod tests {
         assert_eq!(file.write(&status), None);
         assert_eq!(RunStatus::read(&folder).unwrap(), status);
         check_overruns(&folder, Instant::from_ns(status.written_ns));
+        status.phase = Phase::Ending;
+        assert_eq!(file.write(&status), None);
+        let at_the_end = overruns(&folder, Instant::from_ns(status.written_ns));
+        assert!(at_the_end.is_err(), "nobody tells any more: {at_the_end:?}");
         drop(file);
         assert!(RunStatus::read(&folder).is_err());
         fs::remove_dir_all(&folder).unwrap();

@@ -205,6 +205,21 @@ fn a_cut_link_is_silent_and_an_idle_one_is_not() {
 }
 
 #[test]
+fn of_a_producer_elsewhere_only_what_had_a_rhythm_can_be_silent() {
+    let mut unseen = account(true);
+    assert_eq!(unseen.figures("x", 9000 * MS)["rate_hz"], Value::Null);
+    for (count, state) in [(2, "up"), (100, "silent")] {
+        let mut account = account(true);
+        for sequence in 0..count {
+            account.take(&received(sequence, sequence.cast_signed() * 10 * MS));
+        }
+        let figures = account.figures("x", 9000 * MS);
+        assert_eq!(figures["link_state"], state, "{count} messages");
+        assert_eq!(figures["rate_hz"], 0.0);
+    }
+}
+
+#[test]
 fn shared_memory_has_one_segment_and_loses_nothing_that_we_know_of() {
     let mut account = account(false);
     account.take(&published(0, 0));
