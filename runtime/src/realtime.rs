@@ -213,6 +213,13 @@ pub fn apply(request: &RealtimeRequest) -> RealtimeGrant {
     grant
 }
 
+/// True when the calling thread runs before every normal task, under `SCHED_FIFO` or `SCHED_RR`: whether
+/// it asked for that or inherited it, and not when it asked in vain.
+pub fn has_realtime_priority() -> bool {
+    let policy = current_policy(OWN_THREAD) & !libc::SCHED_RESET_ON_FORK;
+    matches!(policy, libc::SCHED_FIFO | libc::SCHED_RR)
+}
+
 /// Schedules every thread of this process that is under `from` by `to`, those included that are
 /// started meanwhile, and says what the kernel made of it. Threads under any other policy stay as
 /// they are.

@@ -4,12 +4,16 @@
 //!
 //! An honest datagram that comes meanwhile waits for [`GATHERING`] and the thread's timer slack at
 //! most. A line on which little is refused, such as the copies that a network makes, is never left, nor
-//! is a thread that spins, which is woken by nobody.
+//! does a thread look away that spins, which is woken by nobody, or that has real-time priority. A normal
+//! thread pays for the processor time of its wake-ups with waits for its turn, which are longer than
+//! [`GATHERING`]; one with priority is never made to wait, so the look away would be all that it gets.
 
 use core::time::Duration;
 
 use hil_gateways::transport::sealed::REFUSED_PER_LOOK_MAX;
 use hil_models::time::Instant;
+
+use crate::realtime;
 
 /// How long a thread looks away: about the wake-up that it saves.
 pub(super) const GATHERING: Duration = Duration::from_micros(50);
@@ -21,6 +25,8 @@ const WINDOW: Duration = Duration::from_millis(1);
 /// The refusals of one socket, as its thread last saw them.
 #[derive(Debug)]
 pub(super) struct Gathering {
+    /// False for a thread that never looks away.
+    is_wanted: bool,
     refused_count: u64,
     /// When the window began in which refusals are counted.
     began: Instant,
@@ -32,9 +38,14 @@ pub(super) struct Gathering {
 }
 
 impl Gathering {
-    /// Of a socket on which nothing was refused yet.
-    pub(super) const fn new() -> Self {
+    /// Of a socket on which nothing was refused yet, for the calling thread as it is scheduled now.
+    pub(super) fn of_this_thread() -> Self {
+        Self::new(!realtime::has_realtime_priority())
+    }
+
+    const fn new(is_wanted: bool) -> Self {
         Self {
+            is_wanted,
             refused_count: 0,
             began: Instant::from_ns(i64::MIN),
             count: 0,
@@ -44,8 +55,11 @@ impl Gathering {
     }
 
     /// Until when to look away, at `now`, when `refused_count` datagrams were refused so far; `None` when
-    /// that is no flood, or so much at once that more may wait already.
+    /// that is no flood, or so much at once that more may wait already, or never to.
     pub(super) fn until(&mut self, now: Instant, refused_count: u64) -> Option<Instant> {
+        if !self.is_wanted {
+            return None;
+        }
         let new_count = refused_count.saturating_sub(self.refused_count);
         self.refused_count = refused_count;
         // Refusals of a time that the thread did not come here, as while it spins, are of any age.
@@ -69,11 +83,16 @@ impl Gathering {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::realtime::SchedulingPolicy;
 
-    /// What a thread does that looks every `every_us` and refuses `each` meanwhile, a thousand times:
-    /// how often it looks away.
+    /// What a normal thread does that looks every `every_us` and refuses `each` meanwhile, a thousand
+    /// times: how often it looks away.
     fn away_count(every_us: i64, each: u64) -> usize {
-        let mut gathering = Gathering::new();
+        away_count_of(true, every_us, each)
+    }
+
+    fn away_count_of(is_wanted: bool, every_us: i64, each: u64) -> usize {
+        let mut gathering = Gathering::new(is_wanted);
         let looks = (0..1000_u64).map(|look| {
             let now = Instant::from_ns(every_us * 1000 * look.cast_signed());
             let away = gathering.until(now, each * look);
@@ -93,8 +112,29 @@ mod tests {
     }
 
     #[test]
+    fn a_thread_with_real_time_priority_never_looks_away() {
+        assert_eq!(away_count_of(false, 10, 1), 0, "100,000 a second");
+        let is_wanted = |policy| {
+            let asking = std::thread::spawn(move || {
+                let grant = realtime::apply(&realtime::RealtimeRequest {
+                    policy,
+                    ..Default::default()
+                });
+                (grant.is_complete(), Gathering::of_this_thread().is_wanted)
+            });
+            asking.join().unwrap()
+        };
+        assert_eq!(is_wanted(SchedulingPolicy::Other), (true, true));
+        let (is_granted, is_wanted) = is_wanted(SchedulingPolicy::Fifo { priority: 1 });
+        assert_eq!(
+            is_wanted, !is_granted,
+            "what it is counts, not what it asked"
+        );
+    }
+
+    #[test]
     fn what_was_refused_while_nobody_looked_is_of_any_age() {
-        let mut gathering = Gathering::new();
+        let mut gathering = Gathering::new(true);
         let at = |us: i64| Instant::from_ns(us * 1000);
         assert_eq!(gathering.until(at(0), 0), None);
         assert_eq!(gathering.until(at(5_000), 12), None, "as after a spin");
