@@ -125,7 +125,8 @@ pub struct RunArgs {
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub overrides: Vec<String>,
 
-    /// Check the file, print what would run, start nothing.
+    /// Check the file, print what would run, start nothing; with --host also this machine's copy of
+    /// the key.
     #[arg(long)]
     pub check: bool,
 

@@ -10,7 +10,7 @@ use std::collections::BTreeMap;
 use std::env;
 use std::fs;
 use std::io::{self, ErrorKind, IsTerminal};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::{CommandFactory as _, Parser};
@@ -35,6 +35,7 @@ use crate::progress::Progress;
 use crate::registry::Registry;
 use crate::report::terminal::{self, Style};
 use crate::security::cli::KeyCommand;
+use crate::security::{KeyFileError, PreSharedKey};
 use crate::signals::{EXIT_INTERRUPTED, Signals};
 use crate::supervisor::{self, Outcome, PeerError, RunError, RunOptions, RunResult};
 use crate::topology::{self, HOST_VARIABLE, HostChoice, MachineIdentity, Topology, which_host};
@@ -215,7 +216,7 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
     }
     // A file is checked anywhere, also where none of its hosts is.
     if args.check && args.host.is_none() {
-        return show_check(path, &topology, console);
+        return show_check(path, &topology, None, console);
     }
     let hosts = match hosts_here(&topology, args.host.as_deref()) {
         Ok(hosts) => hosts,
@@ -225,7 +226,7 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
         }
     };
     if args.check {
-        return show_check(path, &topology, console);
+        return show_check(path, &topology, Some(&hosts), console);
     }
     let signals = match signals(console) {
         Ok(signals) => signals,
@@ -281,8 +282,28 @@ fn layouts(topology: &Topology, registry: &Registry) -> BTreeMap<String, &'stati
         .collect()
 }
 
-/// What the file comes to, or why no run of it can be what it says.
-fn show_check(path: &Path, topology: &Topology, console: &mut Console) -> u8 {
+/// The key that these hosts, which are this machine, would hold in a run with others.
+///
+/// # Errors
+/// When its file cannot be used here.
+fn key_here(
+    topology: &Topology,
+    hosts: &[String],
+) -> Result<Option<(PathBuf, PreSharedKey)>, KeyFileError> {
+    let is_shared = topology.is_between_hosts() && hosts.len() < topology.hosts().len();
+    let file = topology.security().key_file().filter(|_| is_shared);
+    file.map(|path| PreSharedKey::read(&path).map(|key| (path, key)))
+        .transpose()
+}
+
+/// What the file comes to, or why no run of it can be what it says; with `hosts`, which are this
+/// machine, also which key is here.
+fn show_check(
+    path: &Path,
+    topology: &Topology,
+    hosts: Option<&[String]>,
+    console: &mut Console,
+) -> u8 {
     if let Err(error) = check_emulation(topology) {
         console.error(&format!(
             "{}: the file is valid and can be simulated, but no gateway can keep its emulated \
@@ -301,11 +322,23 @@ fn show_check(path: &Path, topology: &Topology, console: &mut Console) -> u8 {
         let words = clock.describe();
         format!("\n# {words}, UDP ports {asking} and {answering}\n")
     });
+    let key = match hosts.map_or(Ok(None), |hosts| key_here(topology, hosts)) {
+        Ok(key) => key,
+        Err(error) => {
+            console.error(&error.to_string());
+            return exit::FORBIDDEN;
+        }
+    };
+    let key = key.map(|(file, key)| {
+        let (file, fingerprint) = (file.display(), key.fingerprint());
+        format!("\n# {file}: the key {fingerprint}, which the other hosts must have as well\n")
+    });
     console.result(&format!(
-        "# {}: the file is valid; it comes to\n\n{}{}",
+        "# {}: the file is valid; it comes to\n\n{}{}{}",
         path.display(),
         topology.to_toml(),
-        clock_paths.collect::<Vec<_>>().concat()
+        clock_paths.collect::<Vec<_>>().concat(),
+        key.unwrap_or_default()
     ));
     exit::RAN
 }

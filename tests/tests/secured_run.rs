@@ -110,23 +110,30 @@ fn a_key_that_others_can_read_is_refused_before_anything_starts() {
     let record = RunFolder::new("key-mode");
     let key = hop_key(record.path());
     fs::set_permissions(&key, Permissions::from_mode(0o644)).unwrap();
-    let run = |trial: &Trial| {
+    let start = |trial: &Trial, more: &[&str]| {
         let mut command = trial.command_here();
-        command.args(["--host", "robot-pc"]);
+        command.args(["--host", "robot-pc"]).args(more);
         ChildGuard::spawn(&mut command)
             .unwrap()
             .wait_within(LIMIT)
             .unwrap()
     };
-    let finished = run(&trial(&record));
-    assert_eq!(finished.status.code(), Some(77), "{}", finished.stderr);
     let path = key.display().to_string();
-    for words in [path.as_str(), "0644", "chmod 0600"] {
-        assert!(finished.stderr.contains(words), "{}", finished.stderr);
+    for check in [&[][..], &["--check"]] {
+        let finished = start(&trial(&record), check);
+        assert_eq!(finished.status.code(), Some(77), "{}", finished.stderr);
+        for words in [path.as_str(), "0644", "chmod 0600"] {
+            assert!(finished.stderr.contains(words), "{}", finished.stderr);
+        }
     }
+    fs::set_permissions(&key, Permissions::from_mode(0o600)).unwrap();
+    let checked = start(&trial(&record), &["--check"]);
+    checked.assert_success();
+    let fingerprint = PreSharedKey::read(&key).unwrap().fingerprint();
+    assert!(checked.stdout.contains(&fingerprint), "{}", checked.stdout);
     fs::remove_file(&key).unwrap();
     let gone = trial(&record).set(&format!("security.key=\"{}.gone\"", key.display()));
-    let finished = run(&gone);
+    let finished = start(&gone, &[]);
     assert_eq!(finished.status.code(), Some(77), "{}", finished.stderr);
     assert!(
         finished.stderr.contains("hil-runtime key new"),
