@@ -229,7 +229,7 @@ fn egress(
         sent: count,
         stop: Arc::clone(&around.stop),
         attention: Attention::default(),
-        gathering: Gathering::of_this_thread(),
+        gathering: Gathering::of_replies(),
         is_established,
     })
 }
@@ -266,7 +266,7 @@ fn ingress(
         stop: Arc::clone(&around.stop),
         foreign_count: 0,
         stray_count: 0,
-        gathering: Gathering::of_this_thread(),
+        gathering: Gathering::of_messages(),
         clock: KernelClock::read()?,
         response: None,
         buffer: vec![0; usize::from(u16::MAX)].into_boxed_slice(),

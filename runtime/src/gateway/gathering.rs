@@ -4,9 +4,12 @@
 //!
 //! An honest datagram that comes meanwhile waits for [`GATHERING`] and the thread's timer slack at
 //! most. A line on which little is refused, such as the copies that a network makes, is never left, nor
-//! does a thread look away that spins, which is woken by nobody, or that has real-time priority. A normal
-//! thread pays for the processor time of its wake-ups with waits for its turn, which are longer than
-//! [`GATHERING`]; one with priority is never made to wait, so the look away would be all that it gets.
+//! does a thread look away that spins, which is woken by nobody.
+//!
+//! Where the honest datagrams are the messages, neither does one with real-time priority. A normal thread
+//! pays for the processor time of its wake-ups with its turn, and waits for the next one longer than
+//! [`GATHERING`]; one with priority does not, so looking away would only make its messages late. The
+//! sending side gets replies on its socket and messages elsewhere, so it looks away as it likes.
 
 use core::time::Duration;
 
@@ -38,8 +41,14 @@ pub(super) struct Gathering {
 }
 
 impl Gathering {
-    /// Of a socket on which nothing was refused yet, for the calling thread as it is scheduled now.
-    pub(super) fn of_this_thread() -> Self {
+    /// Of a socket for replies on which nothing was refused yet.
+    pub(super) const fn of_replies() -> Self {
+        Self::new(true)
+    }
+
+    /// Of a socket for messages on which nothing was refused yet, for the calling thread as it is
+    /// scheduled now.
+    pub(super) fn of_messages() -> Self {
         Self::new(!realtime::has_realtime_priority())
     }
 
@@ -54,8 +63,8 @@ impl Gathering {
         }
     }
 
-    /// Until when to look away, at `now`, when `refused_count` datagrams were refused so far; `None` when
-    /// that is no flood, or so much at once that more may wait already, or never to.
+    /// Until when to look away, at `now`, when `refused_count` datagrams were refused so far; `None` for a
+    /// thread that never does, when that is no flood, or when so much came at once that more may wait.
     pub(super) fn until(&mut self, now: Instant, refused_count: u64) -> Option<Instant> {
         if !self.is_wanted {
             return None;
@@ -120,7 +129,7 @@ mod tests {
                     policy,
                     ..Default::default()
                 });
-                (grant.is_complete(), Gathering::of_this_thread().is_wanted)
+                (grant.is_complete(), Gathering::of_messages().is_wanted)
             });
             asking.join().unwrap()
         };
