@@ -271,6 +271,7 @@ fn an_interrupted_recorder_leaves_a_whole_file_and_names_what_runs() {
         .wait_within(LIMIT)
         .unwrap();
     assert_eq!(none.status.code(), Some(2), "{}", none.stderr);
+    assert!(none.stderr.contains("--wait"), "{}", none.stderr);
     let trial = Trial::shipped("shuttle-local.toml", folder.path())
         .set(&format!("name=\"{name}\""))
         .set("run.duration=\"5 s\"");

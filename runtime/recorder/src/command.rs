@@ -224,6 +224,7 @@ fn record_run(request: &Request, signals: &Signals, console: &mut Console) -> u8
             console.error(&error.to_string());
             return match error {
                 RecordError::Select(_)
+                | RecordError::NotYet(_)
                 | RecordError::Write(WriteError::Exists { .. } | WriteError::Unfinished { .. }) => {
                     exit::USAGE
                 }

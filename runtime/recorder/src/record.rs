@@ -45,6 +45,9 @@ pub(crate) enum RecordError {
     /// No run, or several.
     #[error(transparent)]
     Select(#[from] SelectError),
+    /// None that fits, and nobody asked to wait for one.
+    #[error("{0}; --wait waits for one to begin")]
+    NotYet(SelectError),
     /// The run cannot be watched.
     #[error(transparent)]
     Feed(#[from] FeedError),
@@ -185,6 +188,9 @@ fn find(request: &Request, look: Look<'_>) -> Result<LiveRun, RecordError> {
         match selected {
             Ok(run) => return Ok(run),
             Err(SelectError::NoneRuns | SelectError::NoSuch { .. }) if request.waits => {}
+            Err(error @ (SelectError::NoneRuns | SelectError::NoSuch { .. })) => {
+                return Err(RecordError::NotYet(error));
+            }
             Err(error) => return Err(error.into()),
         }
         if let Some(signal) = look(&nothing) {
