@@ -290,8 +290,8 @@ fn key_here(
     topology: &Topology,
     hosts: &[String],
 ) -> Result<Option<(PathBuf, PreSharedKey)>, KeyFileError> {
-    let is_shared = topology.is_between_hosts() && hosts.len() < topology.hosts().len();
-    let file = topology.security().key_file().filter(|_| is_shared);
+    let has_others = topology.has_hosts_beside(hosts.len());
+    let file = topology.security().key_file().filter(|_| has_others);
     file.map(|path| PreSharedKey::read(&path).map(|key| (path, key)))
         .transpose()
 }

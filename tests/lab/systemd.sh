@@ -144,7 +144,9 @@ share_key() {
     else
         pc "$1" hil-runtime key new "$key" && install --mode=600 "$PC_WORK/$1/root$key" "$PC_WORK/hop.key"
     fi &&
-        pc "$1" hil-runtime key check "$key" && pc "$1" chown hil: "$key"
+        pc "$1" hil-runtime key check "$key" && pc "$1" chown hil: "$key" &&
+        pc "$1" runuser -u hil -- hil-runtime --topology /etc/hil-runtime/split.toml --check --host "$1" |
+        grep "$key: the key"
 }
 
 is_waiting_and_up() {

@@ -106,7 +106,7 @@ fn hosts_with_other_keys_or_without_one_both_say_so_and_end() {
 }
 
 #[test]
-fn a_key_that_others_can_read_is_refused_before_anything_starts() {
+fn a_key_is_looked_at_before_anything_starts_and_by_a_check_of_its_host() {
     let record = RunFolder::new("key-mode");
     let key = hop_key(record.path());
     fs::set_permissions(&key, Permissions::from_mode(0o644)).unwrap();
@@ -119,6 +119,8 @@ fn a_key_that_others_can_read_is_refused_before_anything_starts() {
             .unwrap()
     };
     let path = key.display().to_string();
+    let anywhere = trial(&record).command_here().arg("--check").status();
+    assert!(anywhere.unwrap().success(), "a file is checked anywhere");
     for check in [&[][..], &["--check"]] {
         let finished = start(&trial(&record), check);
         assert_eq!(finished.status.code(), Some(77), "{}", finished.stderr);
@@ -131,15 +133,18 @@ fn a_key_that_others_can_read_is_refused_before_anything_starts() {
     checked.assert_success();
     let fingerprint = PreSharedKey::read(&key).unwrap().fingerprint();
     assert!(checked.stdout.contains(&fingerprint), "{}", checked.stdout);
+    let plain = trial(&record).set("security.hops=\"plain\"");
+    let unneeded = start(&plain, &["--check"]);
+    unneeded.assert_success();
+    assert!(!unneeded.stdout.contains(&fingerprint));
     fs::remove_file(&key).unwrap();
     let gone = trial(&record).set(&format!("security.key=\"{}.gone\"", key.display()));
-    let finished = start(&gone, &[]);
-    assert_eq!(finished.status.code(), Some(77), "{}", finished.stderr);
-    assert!(
-        finished.stderr.contains("hil-runtime key new"),
-        "{}",
-        finished.stderr
-    );
+    for check in [&[][..], &["--check"]] {
+        let finished = start(&gone, check);
+        assert_eq!(finished.status.code(), Some(77), "{}", finished.stderr);
+        let cure = "hil-runtime key new";
+        assert!(finished.stderr.contains(cure), "{}", finished.stderr);
+    }
 }
 
 #[test]

@@ -56,9 +56,7 @@ pub enum KeyFileError {
         mode: u32,
     },
     /// It belongs to somebody else, who could replace it.
-    #[error(
-        "key file {path}: belongs to user {owner}, allowed are root and user {user}, who runs this; run `chown {user} {path}`"
-    )]
+    #[error("{}", owner_words(.path, *.owner, *.user))]
     Owner {
         /// The file.
         path: PathBuf,
@@ -85,6 +83,21 @@ pub enum KeyFileError {
         /// The file.
         path: PathBuf,
     },
+}
+
+/// Root is not told to take a file away from the user whose service needs it.
+fn owner_words(path: &Path, owner: u32, user: u32) -> String {
+    let path = path.display();
+    if user == 0 {
+        return format!(
+            "key file {path}: belongs to user {owner}, and root, who runs this, uses none of others; \
+             run this as that user, with `runuser -u`, or `chown root {path}`"
+        );
+    }
+    format!(
+        "key file {path}: belongs to user {owner}, allowed are root and user {user}, who runs this; \
+         run `chown {user} {path}`"
+    )
 }
 
 /// The key of a group of hosts; never printed, overwritten when it goes.
@@ -222,7 +235,7 @@ fn parse(text: &str) -> Result<PreSharedKey, String> {
 #[cfg(test)]
 mod tests {
     use std::fs::{self, Permissions};
-    use std::os::unix::fs::PermissionsExt;
+    use std::os::unix::fs::{PermissionsExt, chown};
 
     use super::*;
 
@@ -270,11 +283,26 @@ mod tests {
         }
         fs::set_permissions(&path, Permissions::from_mode(0o400)).unwrap();
         assert!(PreSharedKey::read(&path).is_ok());
-        let data = fs::metadata(&path).unwrap();
-        if data.uid() != 0 {
-            let error = check_access(&path, &data, data.uid() + 1).unwrap_err();
-            assert!(error.to_string().contains("chown"), "{error}");
+        fs::remove_dir_all(folder).unwrap();
+    }
+
+    #[test]
+    fn a_file_of_another_user_is_refused_and_root_is_not_told_to_take_it_away() {
+        let folder = folder("owner");
+        let path = folder.join("hop.key");
+        PreSharedKey::create(&path).unwrap();
+        let own = fs::metadata(&path).unwrap().uid();
+        if own == 0 {
+            chown(&path, Some(998), None).unwrap();
+            let error = PreSharedKey::read(&path).unwrap_err().to_string();
+            assert!(error.contains("user 998"), "{error}");
+            assert!(error.contains("runuser -u"), "{error}");
         }
+        let data = fs::metadata(&path).unwrap();
+        let (owner, other) = (data.uid(), data.uid() + 1);
+        let error = check_access(&path, &data, other).unwrap_err().to_string();
+        let cure = format!("chown {other} {}", path.display());
+        assert!(owner == 0 || error.contains(&cure), "{error}");
         fs::remove_dir_all(folder).unwrap();
     }
 

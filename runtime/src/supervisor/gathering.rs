@@ -37,7 +37,7 @@ pub(super) fn read_key(
     topology: &Topology,
     hosts: &[&Host],
 ) -> Result<Option<PreSharedKey>, RunError> {
-    if !topology.is_between_hosts() || hosts.len() == topology.hosts().len() {
+    if !topology.has_hosts_beside(hosts.len()) {
         return Ok(None);
     }
     if let Some(text) = topology.unsaid_security() {

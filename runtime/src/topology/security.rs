@@ -100,6 +100,11 @@ impl Topology {
         self.hosts.len() > 1 && !self.is_all_local()
     }
 
+    /// True when a machine that is `here_count` of the hosts meets others over a network.
+    pub fn has_hosts_beside(&self, here_count: usize) -> bool {
+        self.is_between_hosts() && here_count < self.hosts.len()
+    }
+
     /// Why a run would be open to strangers without anybody having said that it may; `None` when its
     /// hops are sealed, said to be plain, or inside one host.
     pub fn unsaid_security(&self) -> Option<String> {
