@@ -11,5 +11,6 @@ mod observer;
 mod pace;
 mod process;
 pub mod status;
+pub(crate) mod status_file;
 mod tail;
 pub(crate) mod top;

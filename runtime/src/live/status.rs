@@ -4,14 +4,14 @@
 use std::collections::BTreeSet;
 use std::fs;
 use std::io;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::Duration;
 
 use hil_models::time::Instant;
 use serde::{Deserialize, Serialize};
 
 /// Name of the file.
-const FILE_NAME: &str = "status.json";
+pub(super) const FILE_NAME: &str = "status.json";
 /// Version of its layout. Within one, fields are only added.
 const STATUS_VERSION: u32 = 1;
 
@@ -219,57 +219,12 @@ pub fn overruns(folder: &Path, now: Instant) -> io::Result<Overruns> {
     Ok(Overruns { processes, hosts })
 }
 
-/// The file for as long as the run goes; it is removed when this is dropped.
-#[derive(Debug)]
-pub(crate) struct StatusFile {
-    path: PathBuf,
-    /// One complaint is enough.
-    has_complained: bool,
-}
-
-impl StatusFile {
-    /// That of the run in `folder`; writes nothing yet.
-    pub(crate) fn of(folder: &Path) -> Self {
-        Self {
-            path: folder.join(FILE_NAME),
-            has_complained: false,
-        }
-    }
-
-    /// Writes `status`, so that a reader finds it whole. Gives the complaint, once; what hindered it
-    /// may be over the next time.
-    pub(crate) fn write(&mut self, status: &RunStatus) -> Option<String> {
-        let new = self.path.with_extension("json.new");
-        let written = serde_json::to_string(status)
-            .map_err(io::Error::other)
-            .and_then(|text| fs::write(&new, text))
-            .and_then(|()| fs::rename(&new, &self.path));
-        let error = written.err()?;
-        if self.has_complained {
-            return None;
-        }
-        self.has_complained = true;
-        let path = self.path.display();
-        Some(format!(
-            "{path}: {error}; until it can be written, `hil-runtime top` does not see how the \
-             processes stand"
-        ))
-    }
-}
-
-impl Drop for StatusFile {
-    fn drop(&mut self) {
-        // Where it cannot be removed it only says how the run stood last.
-        let _is_gone = fs::remove_file(&self.path).is_ok();
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn a_status_is_read_as_written_and_goes_with_its_file() {
+    fn a_status_is_read_as_written() {
         let folder = std::env::temp_dir().join(format!("hil-status-{}", std::process::id()));
         fs::create_dir_all(&folder).unwrap();
         let process = ProcessStatus {
@@ -284,30 +239,21 @@ mod tests {
         let mut status = RunStatus::new(Phase::Running, 5, vec![process]);
         status.elsewhere = ["there", "nowhere"].map(elsewhere).to_vec();
         status.elsewhere[0].heard_ns = Some(status.written_ns);
-        let mut file = StatusFile::of(&folder);
-        assert_eq!(file.write(&status), None);
+        write(&folder, &status);
         assert_eq!(RunStatus::read(&folder).unwrap(), status);
         check_overruns(&folder, Instant::from_ns(status.written_ns));
         status.phase = Phase::Ending;
-        assert_eq!(file.write(&status), None);
+        write(&folder, &status);
         let at_the_end = overruns(&folder, Instant::from_ns(status.written_ns));
         assert!(at_the_end.is_err(), "nobody tells any more: {at_the_end:?}");
-        drop(file);
-        assert!(RunStatus::read(&folder).is_err());
-        fs::remove_dir_all(&folder).unwrap();
-        let mut nowhere = StatusFile::of(&folder);
-        assert!(
-            nowhere
-                .write(&status)
-                .is_some_and(|why| why.contains("status.json"))
-        );
-        assert_eq!(nowhere.write(&status), None, "one complaint is enough");
-        fs::create_dir_all(&folder).unwrap();
-        assert_eq!(nowhere.write(&status), None);
-        assert_eq!(RunStatus::read(&folder).unwrap(), status);
-        drop(nowhere);
         fs::remove_dir_all(&folder).unwrap();
     }
+
+    fn write(folder: &Path, status: &RunStatus) {
+        let text = serde_json::to_string(status).unwrap();
+        fs::write(folder.join(FILE_NAME), text).unwrap();
+    }
+
     fn elsewhere(name: &str) -> HostStatus {
         HostStatus {
             name: name.to_owned(),

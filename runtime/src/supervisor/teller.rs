@@ -13,7 +13,8 @@ use super::heartbeat::Heartbeats;
 use super::progress_line;
 use crate::clock::MonotonicClock;
 use crate::console::Console;
-use crate::live::status::{Phase, ProcessStatus, RunStatus, StatusFile};
+use crate::live::status::{Phase, ProcessStatus, RunStatus};
+use crate::live::status_file::StatusFile;
 use crate::topology::Topology;
 
 /// How often it tells.
@@ -58,7 +59,7 @@ impl Teller {
         let mut status = RunStatus::new(phase, duration_ns, processes.collect());
         status.elsewhere = elsewhere.status();
         status.start_ns = crew.started.map(Instant::as_ns);
-        if let Some(complaint) = self.file.write(&status) {
+        if let Some(complaint) = self.file.write(status) {
             console.warn(&complaint);
         }
         let Some(start) = crew.started.filter(|_| phase == Phase::Running) else {
