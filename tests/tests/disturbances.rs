@@ -1,8 +1,10 @@
 //! What a run does when the hosts or the network change beneath it: the cable, the address and the
 //! packet size of its link, a second supervisor that claims the same host, a host that never comes
-//! and one that goes for good, a record folder that is full. `docs/robustness.md` has the table.
+//! and one that goes for good, a record folder that is full or does not answer. `docs/robustness.md` has the table.
 #![allow(clippy::unwrap_used, clippy::print_stdout, reason = "tests")]
 
+use std::fs::{self, File};
+use std::io::Read;
 use std::process::Command;
 use std::thread;
 use std::time::Duration;
@@ -15,6 +17,8 @@ use hil_tests::lab::{INTERFACE, Lab};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::{RunFiles, Trial, load_average, wait_until};
 use nix::sys::signal::Signal;
+use nix::sys::stat::Mode;
+use nix::unistd::mkfifo;
 
 const HOSTS: [&str; 2] = ["control-pc", "robot-pc"];
 const CHANNELS: [&str; 2] = ["shuttle/command", "shuttle/status"];
@@ -213,6 +217,37 @@ fn a_host_that_never_comes_and_one_that_goes_for_good_are_named() {
         assert!(files[index].has_report());
         files[index].assert_nothing_left_on(lab.host(index));
     }
+}
+
+/// A pipe in the place of a file that the supervisor writes anew twice a second: whoever opens it to write
+/// waits for a reader, as for a disk that others write gigabytes to.
+#[test]
+fn a_disk_that_does_not_answer_makes_no_host_silent() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let record = RunFolder::new("slow-disk");
+    let trial = Trial::shipped("shuttle-split.toml", record.path())
+        .set("links.hop.port=48790")
+        .set("run.duration=\"10 min\"")
+        .set("run.peer_timeout=\"4 s\"");
+    let (mut hosts, files) = start(&lab, &trial);
+    let pipe = files[0].root().join("status.json.new");
+    wait_until(LIMIT, "a moment without the file", || {
+        mkfifo(&pipe, Mode::S_IRWXU).is_ok()
+    });
+    thread::sleep(Duration::from_secs(7));
+    wait_for_messages(&files, "more than the silence that is borne");
+    // The disk answers again.
+    let mut held_back = String::new();
+    let mut reader = File::open(&pipe).unwrap();
+    reader.read_to_string(&mut held_back).unwrap();
+    assert!(held_back.contains("\"phase\":\"running\""), "{held_back}");
+    let status = files[0].root().join("status.json");
+    wait_until(LIMIT, "the file itself", || {
+        fs::symlink_metadata(&status).is_ok_and(|data| data.is_file())
+    });
+    stopped(&lab, &mut hosts, &files);
 }
 
 #[test]
