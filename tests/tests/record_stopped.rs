@@ -54,14 +54,19 @@ fn played(folder: &RunFolder) -> Trial {
 
 /// Commands that came over the hop by now.
 fn arrived(files: &RunFiles) -> u64 {
-    let entries = fs::read_dir(files.root().join("records")).unwrap();
-    let paths = entries.map(|entry| entry.unwrap().path());
+    // The run's folder is there a moment before what is in it.
+    let entries = fs::read_dir(files.root().join("records"));
+    let paths = entries
+        .into_iter()
+        .flatten()
+        .map(|entry| entry.unwrap().path());
     let of_commands = paths.filter(|path| {
         let name = path.file_name().unwrap().to_string_lossy();
         name.starts_with("shuttle.command.ingress.")
     });
-    let counts = of_commands.map(|path| RecordFile::read(&path).unwrap().record_count());
-    counts.sum::<usize>() as u64
+    // So is a file before its header.
+    let counts = of_commands.filter_map(|path| RecordFile::read(&path).ok());
+    counts.map(|file| file.record_count()).sum::<usize>() as u64
 }
 
 /// What a file has of the channel, and says that it missed, of so many that were published on its host.
