@@ -63,10 +63,9 @@ def over_the_radio(channel, radio):
     unacked = sent["socket: radio_unacknowledged_count"]
     check(acked + unacked == datagrams > 0 and sent["socket: radio_unmatched_count"] == 0,
           f"one report per datagram: {datagrams} sent, {acked} acknowledged, {unacked} not")
-    kinds = {name[:-6]: count for name, count in acks.items() if name.endswith("_count")}
-    of_messages = kinds.pop("handed")
-    unreported = kinds["unreported_arrived"] + kinds["unreported_lost"]
-    check(sum(kinds.values()) == of_messages > 0 and unreported == 0,
+    kinds = {name: acks[name]["count"] for name in ("acknowledged", "unacknowledged", "unreported")}
+    of_messages = acks["handed_count"]
+    check(sum(kinds.values()) == of_messages > 0 and kinds["unreported"] == 0,
           f"each of {of_messages} messages has its report: "
           + ", ".join(f"{name} {count}" for name, count in kinds.items() if count))
     print(f"          access category: {facts.get('access category')}")

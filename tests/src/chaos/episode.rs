@@ -28,6 +28,9 @@ const FLOW_LIMIT: Duration = Duration::from_secs(20);
 /// stopping (three times 3 s), of exchanging records (20 s), and a slow machine.
 const END_LIMIT: Duration = Duration::from_secs(75);
 const COMMAND_LIMIT: Duration = Duration::from_secs(30);
+/// No file is opened for this long by a process that has all it needs.
+const SETTLED: Duration = Duration::from_millis(60);
+const SETTLE_LIMIT: Duration = Duration::from_millis(500);
 const POLL_INTERVAL: Duration = Duration::from_millis(2);
 /// Records of 40 bytes behind a header of 128: messages have been taken.
 const FLOWING_BYTES: u64 = 128 + 2 * 40;
@@ -162,8 +165,8 @@ pub fn play(plan: &Plan) -> Report {
             }
             thread::sleep(POLL_INTERVAL);
         }
-        let before = held(&stage);
         let flowing = Instant::now();
+        let before = held_once_settled(&stage);
         let rest = plan
             .injections
             .iter()
@@ -266,6 +269,30 @@ fn held(stage: &Stage) -> Vec<(String, Pid, Held)> {
                 found.push((format!("{name} on {host_name}"), process, held));
             }
         }
+    }
+    found
+}
+
+/// The same once nothing has been opened for a while: a gateway that was killed at the start may still be
+/// opening what it needs when messages flow again.
+fn held_once_settled(stage: &Stage) -> Vec<(String, Pid, Held)> {
+    let began = Instant::now();
+    let mut found = held(stage);
+    let mut since = began;
+    while since.elapsed() < SETTLED && began.elapsed() < SETTLE_LIMIT {
+        thread::sleep(POLL_INTERVAL);
+        let now = held(stage);
+        let is_same = now.len() == found.len()
+            && now
+                .iter()
+                .zip(&found)
+                .all(|((_, one, now), (_, other, then))| {
+                    one == other && now.file_count == then.file_count
+                });
+        if !is_same {
+            since = Instant::now();
+        }
+        found = now;
     }
     found
 }
