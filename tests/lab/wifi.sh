@@ -13,7 +13,7 @@
 #    message that arrived closes in the account, its stamp before the queue is labelled as the
 #    fallback it is, and each datagram has exactly one acknowledgement report of the radio.
 # 2. Over a cable that delays by 5 ms and loses 2 %, the one-way delay reads 5 ms within its bound
-#    and 0.02 lies inside the 99.9 % interval of the loss, both ways.
+#    and 0.02 lies inside the interval of the loss, both ways.
 #
 # Needs root (network namespaces are the PC's own, but its share keeps file owners), python3 and
 # what images.sh names. Took 5 to 10 minutes on two cores with a load of 15; the PC is given 15.

@@ -21,12 +21,8 @@ def check(holds, text):
     print(("  holds   " if holds else "  FAILED  ") + text)
 
 
-# A sound run is called unsound once in a thousand: at 95 % each way it would be one run of ten.
-Z_999 = 3.290527
-
-
-def wilson(successes, trials, z=Z_999):
-    """99.9 % interval of a share (Wilson 1927)."""
+def wilson(successes, trials, z=1.959964):
+    """95 % interval of a share (Wilson 1927)."""
     share, scale = successes / trials, 1 + z * z / trials
     spread = z * math.sqrt(share * (1 - share) / trials + z * z / (4 * trials * trials))
     centre = share + z * z / (2 * trials)
@@ -112,7 +108,7 @@ def over_the_cable(plain, channel):
     lost, total = account["fates"].get("lost_on_wire", 0), account["published_count"]
     low, high = wilson(lost, total)
     check(low <= TRUE_LOSS <= high,
-          f"{lost} of {total} lost, 99.9 % interval {100 * low:.2f} to {100 * high:.2f} % "
+          f"{lost} of {total} lost, 95 % interval {100 * low:.2f} to {100 * high:.2f} % "
           "(2 % asked for)")
     check_closing(account)
 
