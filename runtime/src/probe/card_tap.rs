@@ -10,7 +10,8 @@ use hil_gateways::transport::packet_ring::{PacketRing, RingCounters, RingSetting
 use hil_gateways::transport::ring_frame::StampSource;
 use hil_gateways::transport::timestamping::TimestampCapabilities;
 
-use super::live::{LiveError, Output, append, flow_list, told};
+use super::live::{LiveError, flow_list, told};
+use super::output::{Output, append};
 use crate::card_clock::guard::GuardedCard;
 
 /// Reads of the card's clock of which the narrowest counts.

@@ -1,20 +1,20 @@
 //! The live capture: rings looked into every few milliseconds, a pcapng file, a line of progress.
 //! It analyses nothing. Nothing waits for a packet, so that no sender pays for waking the probe.
 
-use std::fs::File;
-use std::io::{self, Seek, Write};
-use std::path::{Path, PathBuf};
+use std::io;
+use std::path::PathBuf;
 use std::thread;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use hil_gateways::capture::flow::FlowFilter;
-use hil_gateways::capture::writer::{self, PacketToWrite};
-use hil_gateways::capture::{CaptureInterface, Direction, link_type as link};
+use hil_gateways::capture::writer;
+use hil_gateways::capture::{CaptureInterface, Direction};
 use hil_gateways::transport::live_tap::{LiveTap, TapEngine};
 use hil_gateways::transport::packet_ring::{RingCounters, RingError, RingSettings, RingStamps};
-use hil_gateways::transport::ring_frame::{RingPacket, StampSource};
+use hil_gateways::transport::ring_frame::StampSource;
 
 use super::card_tap::{CardResult, CardTap};
+use super::output::{Output, append};
 use super::tap::{self, TapChoice};
 use crate::console::Console;
 use crate::signals::Signals;
@@ -23,9 +23,6 @@ use crate::signals::Signals;
 const LOOK_PERIOD: Duration = Duration::from_millis(20);
 /// Time between two lines of progress.
 const PROGRESS_PERIOD: Duration = Duration::from_secs(1);
-/// Bytes gathered before they are written.
-const WRITE_BYTES: usize = 1 << 18;
-
 /// What to capture.
 #[derive(Debug)]
 pub(super) struct Request {
@@ -109,7 +106,7 @@ pub(super) fn capture(
     let mut taps = open_taps(request, console)?;
     let start_ns = realtime_ns();
     let mut file = Output::create(&request.output, request.replaces)?;
-    describe(&mut file.buffer, request, &taps);
+    describe(file.buffer(), request, &taps);
     file.write_out()?;
     let began = Instant::now();
     let room = taps.iter().map(|tap| tap.ring.frame_count()).min();
@@ -135,7 +132,7 @@ pub(super) fn capture(
         if Instant::now() >= progress_due {
             progress_due += PROGRESS_PERIOD;
             file.write_out()?;
-            show(&mut taps, began.elapsed(), file.written_bytes, console)?;
+            show(&mut taps, began.elapsed(), file.written_bytes(), console)?;
         }
         thread::sleep(LOOK_PERIOD);
     };
@@ -148,17 +145,17 @@ pub(super) fn capture(
         let span = (start_ns, tap.gone_ns.unwrap_or(end_ns).max(start_ns));
         let counts = (matched_count, dropped_count);
         let comment = Some(tap.result.tapped.as_str());
-        writer::statistics(&mut file.buffer, index, span, counts, comment);
+        writer::statistics(file.buffer(), index, span, counts, comment);
         if let Some(card) = tap.card.take() {
             let index = tap_count + index;
-            tap.result.card = Some(card.finish(index, span, &mut file.buffer)?);
+            tap.result.card = Some(card.finish(index, span, file.buffer())?);
         }
     }
     file.finish()?;
     Ok(LiveResult {
         interfaces: taps.into_iter().map(|tap| tap.result).collect(),
         length: began.elapsed(),
-        file_bytes: file.written_bytes,
+        file_bytes: file.written_bytes(),
         ended_by,
     })
 }
@@ -245,7 +242,7 @@ fn drain(
     let stamps_departures = ring.engine() == TapEngine::Bpf;
     // A ring that fills as fast as it is emptied must not keep the others waiting.
     for _ in 0..ring.frame_count() {
-        let buffer = &mut file.buffer;
+        let buffer = file.buffer();
         let is_there = ring.next_packet(|packet| {
             let is_outbound = packet.direction == Direction::Outbound;
             result.outbound_count += u64::from(is_outbound);
@@ -289,37 +286,6 @@ fn watch(tap: &mut Tap, now_ns: u64, console: &mut Console) {
 fn is_there(index: Option<u32>) -> bool {
     let name = index.map(nix::net::if_::if_indextoname);
     name.is_some_and(|name| name.is_ok_and(|name| !name.is_empty()))
-}
-
-/// Puts a packet into the file as it was on the wire, with the VLAN tag the kernel took out.
-pub(super) fn append(
-    buffer: &mut Vec<u8>,
-    interface_index: u32,
-    packet: &RingPacket<'_>,
-    link_type: u16,
-) {
-    let is_ethernet = link_type == link::ETHERNET;
-    let mut whole = PacketToWrite {
-        interface_index,
-        stamp_ns: packet.stamp_ns,
-        original_bytes: packet.original_bytes,
-        direction: packet.direction,
-        data: [packet.data, &[]],
-    };
-    let Some((tag_type, tag)) = packet
-        .vlan
-        .filter(|_| is_ethernet && packet.data.len() >= 12)
-    else {
-        writer::packet(buffer, &whole);
-        return;
-    };
-    let (addresses, rest) = packet.data.split_at(12);
-    let mut head = addresses.to_vec();
-    head.extend_from_slice(&tag_type.to_be_bytes());
-    head.extend_from_slice(&tag.to_be_bytes());
-    whole.data = [&head, rest];
-    whole.original_bytes += 4;
-    writer::packet(buffer, &whole);
 }
 
 fn count(tap: &mut Tap) -> Result<(), LiveError> {
@@ -369,97 +335,6 @@ fn realtime_ns() -> u64 {
     since.map_or(0, |time| u64::try_from(time.as_nanos()).unwrap_or(u64::MAX))
 }
 
-pub(super) struct Output {
-    path: PathBuf,
-    file: File,
-    buffer: Vec<u8>,
-    written_bytes: u64,
-}
-
-impl Output {
-    fn create(path: &Path, replaces: bool) -> Result<Self, LiveError> {
-        let mut options = File::options();
-        options.write(true);
-        if replaces {
-            options.create(true).truncate(true);
-        } else {
-            options.create_new(true);
-        }
-        let path = path.to_owned();
-        match options.open(&path) {
-            Ok(file) => Ok(Self {
-                path,
-                file,
-                buffer: Vec::with_capacity(2 * WRITE_BYTES),
-                written_bytes: 0,
-            }),
-            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {
-                Err(LiveError::Exists { path })
-            }
-            Err(source) => Err(LiveError::File { path, source }),
-        }
-    }
-
-    /// What is to be written next.
-    pub(super) fn buffer(&mut self) -> &mut Vec<u8> {
-        &mut self.buffer
-    }
-
-    pub(super) fn write_if_full(&mut self) -> Result<(), LiveError> {
-        if self.buffer.len() < WRITE_BYTES {
-            return Ok(());
-        }
-        self.write_out()
-    }
-
-    /// Whole blocks only: where the disk fills up within one, that one is taken back.
-    fn write_out(&mut self) -> Result<(), LiveError> {
-        let outcome = self.file.write_all(&self.buffer);
-        if let Err(source) = outcome {
-            // Where writing failed cutting may fail too; the first error is the one to fix.
-            let _cut = self.cut_to_whole_blocks().is_ok();
-            return Err(self.failed(source));
-        }
-        self.written_bytes += self.buffer.len() as u64;
-        self.buffer.clear();
-        Ok(())
-    }
-
-    fn cut_to_whole_blocks(&mut self) -> io::Result<()> {
-        let there_bytes = self
-            .file
-            .stream_position()?
-            .saturating_sub(self.written_bytes);
-        let whole_bytes = whole_blocks(&self.buffer, there_bytes);
-        self.file.set_len(self.written_bytes + whole_bytes)
-    }
-
-    fn finish(&mut self) -> Result<(), LiveError> {
-        self.write_out()?;
-        self.file.sync_all().map_err(|source| self.failed(source))
-    }
-
-    fn failed(&self, source: io::Error) -> LiveError {
-        LiveError::File {
-            path: self.path.clone(),
-            source,
-        }
-    }
-}
-
-/// Bytes of the blocks in `buffer` that end within its first `there_bytes`.
-fn whole_blocks(buffer: &[u8], there_bytes: u64) -> u64 {
-    let mut whole = 0_usize;
-    while let Some(length) = buffer.get(whole + 4..whole + 8) {
-        let length = length.try_into().map_or(0, u32::from_le_bytes) as usize;
-        if length == 0 || (whole + length) as u64 > there_bytes {
-            break;
-        }
-        whole += length;
-    }
-    whole as u64
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -470,23 +345,5 @@ mod tests {
         assert!(loopback.is_some() && is_there(loopback));
         assert!(!is_there(Some(0x7fff_fff0)), "nothing has that number");
         assert!(!is_there(None));
-    }
-
-    #[test]
-    fn a_file_that_could_not_grow_is_cut_behind_its_last_whole_block() {
-        let mut buffer = Vec::new();
-        writer::begin(&mut buffer, "test", "none");
-        let head = buffer.len() as u64;
-        writer::statistics(&mut buffer, 0, (0, 1), (2, 3), None);
-        let all = buffer.len() as u64;
-        for (there, whole) in [
-            (0, 0),
-            (head - 1, 0),
-            (head, head),
-            (all - 1, head),
-            (all, all),
-        ] {
-            assert_eq!(whole_blocks(&buffer, there), whole, "{there} of {all}");
-        }
     }
 }

@@ -7,6 +7,7 @@ mod card_tap;
 mod compare;
 mod files;
 mod live;
+mod output;
 mod point_clocks;
 mod tap;
 
