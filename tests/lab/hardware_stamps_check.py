@@ -108,7 +108,7 @@ def probed_ptp(host):
 
     # Without the transmit stamps that the e1000e owes it, ptp4l falls silent.
     least = 20 if NIC == "igb" else 0
-    # The two rings are opened one after the other.
+    # The two rings begin, and end, one right after the other.
     check(arrived >= least and abs(counted(False) - arrived) <= 1,
           f"{host}: {arrived} arrivals, {counted(False)} in the kernel's part of the capture")
     check(counted(True) == stamped,

@@ -12,6 +12,7 @@ use hil_gateways::transport::timestamping::TimestampCapabilities;
 
 use super::live::{LiveError, flow_list, told};
 use super::output::{Output, append};
+use super::tap;
 use crate::card_clock::guard::GuardedCard;
 
 /// Reads of the card's clock of which the narrowest counts.
@@ -39,6 +40,8 @@ pub(super) struct CardResult {
 pub(super) struct CardTap {
     name: String,
     ring: PacketRing,
+    /// Packets heard before all taps were open.
+    early_count: u64,
     card: GuardedCard,
     clock: Result<(u32, CardClock), String>,
     start: Option<CardPair>,
@@ -66,6 +69,7 @@ impl CardTap {
         Ok(Self {
             name: name.to_owned(),
             ring: PacketRing::open(name, flows, &settings)?,
+            early_count: 0,
             result: CardResult {
                 granted: card.armed().describe(),
                 stamps_all_arrivals: card.armed().stamps_all_arrivals(),
@@ -75,6 +79,12 @@ impl CardTap {
             clock,
             start,
         })
+    }
+
+    /// Forgets what it heard before all taps were open.
+    pub(super) fn begin(&mut self) {
+        let Self { ring, .. } = self;
+        self.early_count = tap::discard(ring.frame_count(), || ring.next_packet(|_| ()));
     }
 
     /// The card in words, for the person who watches.
@@ -135,7 +145,7 @@ impl CardTap {
         buffer: &mut Vec<u8>,
     ) -> Result<CardResult, LiveError> {
         let end = self.clock.as_ref().ok().and_then(|(_, clock)| read(clock));
-        let counters = told(self.ring.counters(), &self.name)?;
+        let counters = told(self.ring.counters(), &self.name)?.without(self.early_count);
         let span = (on_card(from_ns, self.start), on_card(to_ns, end));
         let counts = (counters.matched_count, counters.dropped_count);
         let comment = format!(

@@ -90,6 +90,8 @@ pub(super) struct LiveResult {
 struct Tap {
     ring: LiveTap,
     card: Option<CardTap>,
+    /// Packets heard before all taps were open.
+    early_count: u64,
     /// Number of the interface when it was opened: names are given anew.
     index: Option<u32>,
     /// When the interface had gone, nanoseconds since 1970.
@@ -104,6 +106,7 @@ pub(super) fn capture(
     console: &mut Console,
 ) -> Result<LiveResult, LiveError> {
     let mut taps = open_taps(request, console)?;
+    begin(&mut taps);
     let start_ns = realtime_ns();
     let mut file = Output::create(&request.output, request.replaces)?;
     describe(file.buffer(), request, &taps);
@@ -190,6 +193,7 @@ fn open_taps(request: &Request, console: &mut Console) -> Result<Vec<Tap>, LiveE
         taps.push(Tap {
             ring,
             card,
+            early_count: 0,
             index,
             gone_ns: None,
             result: InterfaceResult {
@@ -200,6 +204,17 @@ fn open_taps(request: &Request, console: &mut Console) -> Result<Vec<Tap>, LiveE
         });
     }
     Ok(taps)
+}
+
+/// Lets all taps begin together. While a card is set up, behind a guard process of its own, the taps
+/// that are open already hear packets: kept, an interface's two parts would not be of the same packets.
+fn begin(taps: &mut [Tap]) {
+    for tap in taps {
+        tap.early_count = tap::discard(tap.ring.frame_count(), || tap.ring.next_packet(|_| ()));
+        if let Some(card) = &mut tap.card {
+            card.begin();
+        }
+    }
 }
 
 /// Interfaces first, then their cards in the same order.
@@ -289,7 +304,7 @@ fn is_there(index: Option<u32>) -> bool {
 }
 
 fn count(tap: &mut Tap) -> Result<(), LiveError> {
-    tap.result.counters = told(tap.ring.counters(), &tap.result.name)?;
+    tap.result.counters = told(tap.ring.counters(), &tap.result.name)?.without(tap.early_count);
     tap.result.step_count = tap.ring.step_count();
     Ok(())
 }
