@@ -11,6 +11,8 @@ use std::time::Duration;
 use hil_gateways::capture::Direction;
 use hil_gateways::capture::reader::{CaptureReader, Step};
 use hil_gateways::transport::bpf_tap::attached_programs;
+use hil_gateways::transport::live_tap::{LiveTap, TapEngine};
+use hil_gateways::transport::packet_ring::{RingSettings, RingStamps};
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::child::{ChildGuard, Finished};
 use hil_tests::lab::{INTERFACE, Lab, LabHost};
@@ -300,6 +302,48 @@ fn what_found_no_room_is_in_the_report_and_in_the_file() {
     println!("{kept} kept, {dropped} dropped");
     assert!(dropped > 1000 && kept > 100, "{file:#}");
     assert_eq!(kept + dropped, sent_count);
+}
+
+#[test]
+fn what_came_before_the_taps_begin_is_neither_kept_nor_counted() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let settings = RingSettings {
+        snap_bytes: 2048,
+        ring_bytes: 1 << 20,
+        stamps: RingStamps::Kernel,
+    };
+    let flows = ["udp:dport=7000".parse().unwrap()];
+    lab.host(0).on_network(|| {
+        let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).unwrap();
+        let send = |count: u64| {
+            for _ in 0..count {
+                // Nobody listens there, and an answer that says so is no fault.
+                let _refused = socket.send_to(b"", (lab.host(1).address(), 7000)).is_ok();
+            }
+        };
+        for engine in [TapEngine::Bpf, TapEngine::Packet] {
+            let mut tap = LiveTap::open(engine, INTERFACE, &flows, &settings).unwrap();
+            let said = |tap: &mut LiveTap| {
+                let counters = tap.counters().unwrap();
+                (counters.matched_count, counters.dropped_count)
+            };
+            // More than there is room for, then less.
+            for count in [2000, 30] {
+                let (matched, dropped) = said(&mut tap);
+                send(count);
+                let (matched_now, dropped_now) = said(&mut tap);
+                assert_eq!(matched_now - matched, count, "{engine}");
+                assert_eq!(dropped_now > dropped, count == 2000, "{engine}");
+                tap.begin().unwrap();
+                assert_eq!(said(&mut tap), (0, 0), "{engine}");
+            }
+            send(40);
+            let kept = (0..100).take_while(|_| tap.next_packet(|_| ())).count();
+            assert_eq!((kept, said(&mut tap)), (40, (40, 0)), "{engine}");
+        }
+    });
 }
 
 #[test]

@@ -135,17 +135,6 @@ pub struct RingCounters {
     pub dropped_count: u64,
 }
 
-impl RingCounters {
-    /// What was counted besides `early_count` packets that were taken out of the ring and discarded.
-    #[must_use]
-    pub fn without(self, early_count: u64) -> Self {
-        Self {
-            matched_count: self.matched_count.saturating_sub(early_count),
-            ..self
-        }
-    }
-}
-
 /// See the module documentation.
 #[derive(Debug)]
 pub struct PacketRing {

@@ -6,13 +6,13 @@ use hil_gateways::capture::flow::FlowFilter;
 use hil_gateways::capture::writer;
 use hil_gateways::capture::{CARD_CLOCK, CaptureInterface};
 use hil_gateways::transport::card_clock::{CardClock, CardPair};
-use hil_gateways::transport::packet_ring::{PacketRing, RingCounters, RingSettings, RingStamps};
+use hil_gateways::transport::live_tap::{LiveTap, TapEngine};
+use hil_gateways::transport::packet_ring::{RingCounters, RingSettings, RingStamps};
 use hil_gateways::transport::ring_frame::StampSource;
 use hil_gateways::transport::timestamping::TimestampCapabilities;
 
 use super::live::{LiveError, flow_list, told};
 use super::output::{Output, append};
-use super::tap;
 use crate::card_clock::guard::GuardedCard;
 
 /// Reads of the card's clock of which the narrowest counts.
@@ -39,12 +39,12 @@ pub(super) struct CardResult {
 #[derive(Debug)]
 pub(super) struct CardTap {
     name: String,
-    ring: PacketRing,
-    /// Packets heard before all taps were open.
-    early_count: u64,
+    ring: LiveTap,
     card: GuardedCard,
     clock: Result<(u32, CardClock), String>,
+    /// Its clock where the capture begins and where it ends.
     start: Option<CardPair>,
+    end: Option<CardPair>,
     result: CardResult,
 }
 
@@ -64,27 +64,42 @@ impl CardTap {
             stamps: RingStamps::Card,
             ..*settings
         };
-        let clock = open_clock(name);
-        let start = clock.as_ref().ok().and_then(|(_, clock)| read(clock));
         Ok(Self {
             name: name.to_owned(),
-            ring: PacketRing::open(name, flows, &settings)?,
-            early_count: 0,
+            // The card's stamps come with packets alone, not with programs.
+            ring: LiveTap::open(TapEngine::Packet, name, flows, &settings)?,
             result: CardResult {
                 granted: card.armed().describe(),
                 stamps_all_arrivals: card.armed().stamps_all_arrivals(),
                 ..CardResult::default()
             },
             card,
-            clock,
-            start,
+            clock: open_clock(name),
+            start: None,
+            end: None,
         })
     }
 
-    /// Forgets what it heard before all taps were open.
-    pub(super) fn begin(&mut self) {
-        let Self { ring, .. } = self;
-        self.early_count = tap::discard(ring.frame_count(), || ring.next_packet(|_| ()));
+    /// Reads the clock and forgets what was heard until now.
+    pub(super) fn begin(&mut self) -> Result<(), LiveError> {
+        self.start = self.read_clock();
+        told(self.ring.begin(), &self.name)
+    }
+
+    /// Takes over what was counted until now.
+    pub(super) fn count(&mut self) -> Result<(), LiveError> {
+        self.result.counters = told(self.ring.counters(), &self.name)?;
+        Ok(())
+    }
+
+    /// Reads the clock once more.
+    pub(super) fn end(&mut self) {
+        self.end = self.read_clock();
+    }
+
+    fn read_clock(&self) -> Option<CardPair> {
+        let (_, clock) = self.clock.as_ref().ok()?;
+        clock.read(READ_ATTEMPTS).ok()
     }
 
     /// The card in words, for the person who watches.
@@ -137,27 +152,28 @@ impl CardTap {
         Ok(())
     }
 
-    /// Writes what was counted between two instants of the system clock and puts the card back.
+    /// Writes what was counted last, between two instants of the system clock, and puts the card back.
     pub(super) fn finish(
         mut self,
         index: u32,
         (from_ns, to_ns): (u64, u64),
         buffer: &mut Vec<u8>,
-    ) -> Result<CardResult, LiveError> {
-        let end = self.clock.as_ref().ok().and_then(|(_, clock)| read(clock));
-        let counters = told(self.ring.counters(), &self.name)?.without(self.early_count);
-        let span = (on_card(from_ns, self.start), on_card(to_ns, end));
-        let counts = (counters.matched_count, counters.dropped_count);
+    ) -> CardResult {
+        let span = (on_card(from_ns, self.start), on_card(to_ns, self.end));
+        let RingCounters {
+            matched_count,
+            dropped_count,
+        } = self.result.counters;
         let comment = format!(
             "{} of {} arrivals were stamped by the card; at the end {}",
             self.result.stamped_count,
             self.result.stamped_count + self.result.unstamped_count,
-            words(end)
+            words(self.end)
         );
+        let counts = (matched_count, dropped_count);
         writer::statistics(buffer, index, span, counts, Some(&comment));
-        self.result.counters = counters;
         self.result.restoring = self.card.restore_in_words();
-        Ok(self.result)
+        self.result
     }
 }
 
@@ -166,10 +182,6 @@ fn open_clock(name: &str) -> Result<(u32, CardClock), String> {
     let index = claims.phc_index.ok_or("the interface names no clock")?;
     let clock = CardClock::open(index).map_err(|error| error.to_string())?;
     Ok((index, clock))
-}
-
-fn read(clock: &CardClock) -> Option<CardPair> {
-    clock.read(READ_ATTEMPTS).ok()
 }
 
 /// Where the card's clock stands, in words.

@@ -23,6 +23,7 @@ use crate::signals::Signals;
 const LOOK_PERIOD: Duration = Duration::from_millis(20);
 /// Time between two lines of progress.
 const PROGRESS_PERIOD: Duration = Duration::from_secs(1);
+
 /// What to capture.
 #[derive(Debug)]
 pub(super) struct Request {
@@ -90,8 +91,6 @@ pub(super) struct LiveResult {
 struct Tap {
     ring: LiveTap,
     card: Option<CardTap>,
-    /// Packets heard before all taps were open.
-    early_count: u64,
     /// Number of the interface when it was opened: names are given anew.
     index: Option<u32>,
     /// When the interface had gone, nanoseconds since 1970.
@@ -106,9 +105,9 @@ pub(super) fn capture(
     console: &mut Console,
 ) -> Result<LiveResult, LiveError> {
     let mut taps = open_taps(request, console)?;
-    begin(&mut taps);
-    let start_ns = realtime_ns();
     let mut file = Output::create(&request.output, request.replaces)?;
+    begin(&mut taps)?;
+    let start_ns = realtime_ns();
     describe(file.buffer(), request, &taps);
     file.write_out()?;
     let began = Instant::now();
@@ -127,6 +126,10 @@ pub(super) fn capture(
         let look_ns = realtime_ns();
         for (index, tap) in (0_u32..).zip(&mut taps) {
             drain(tap, (index, tap_count), &mut file)?;
+            if is_over {
+                // See `begin`.
+                drain(tap, (index, tap_count), &mut file)?;
+            }
             watch(tap, look_ns, console);
         }
         if is_over || taps.iter().all(|tap| tap.gone_ns.is_some()) {
@@ -139,21 +142,7 @@ pub(super) fn capture(
         }
         thread::sleep(LOOK_PERIOD);
     };
-    for (index, tap) in (0_u32..).zip(&mut taps) {
-        count(tap)?;
-        let RingCounters {
-            matched_count,
-            dropped_count,
-        } = tap.result.counters;
-        let span = (start_ns, tap.gone_ns.unwrap_or(end_ns).max(start_ns));
-        let counts = (matched_count, dropped_count);
-        let comment = Some(tap.result.tapped.as_str());
-        writer::statistics(file.buffer(), index, span, counts, comment);
-        if let Some(card) = tap.card.take() {
-            let index = tap_count + index;
-            tap.result.card = Some(card.finish(index, span, file.buffer())?);
-        }
-    }
+    conclude(&mut taps, (start_ns, end_ns), &mut file)?;
     file.finish()?;
     Ok(LiveResult {
         interfaces: taps.into_iter().map(|tap| tap.result).collect(),
@@ -193,7 +182,6 @@ fn open_taps(request: &Request, console: &mut Console) -> Result<Vec<Tap>, LiveE
         taps.push(Tap {
             ring,
             card,
-            early_count: 0,
             index,
             gone_ns: None,
             result: InterfaceResult {
@@ -208,13 +196,48 @@ fn open_taps(request: &Request, console: &mut Console) -> Result<Vec<Tap>, LiveE
 
 /// Lets all taps begin together. While a card is set up, behind a guard process of its own, the taps
 /// that are open already hear packets: kept, an interface's two parts would not be of the same packets.
-fn begin(taps: &mut [Tap]) {
-    for tap in taps {
-        tap.early_count = tap::discard(tap.ring.frame_count(), || tap.ring.next_packet(|_| ()));
-        if let Some(card) = &mut tap.card {
-            card.begin();
+/// What arrives between the looks into an interface's two rings is in one part only. The second look is
+/// into rings that are nearly empty, so that this is short; the card's ring is the later one here and the
+/// earlier one at the end, so that the card's part has no packet that the kernel's has not.
+fn begin(taps: &mut [Tap]) -> Result<(), LiveError> {
+    for _look in 0..2 {
+        for tap in &mut *taps {
+            told(tap.ring.begin(), &tap.result.name)?;
+            if let Some(card) = &mut tap.card {
+                card.begin()?;
+            }
         }
     }
+    Ok(())
+}
+
+/// Writes what was counted and puts the cards back. That takes a while, in which taps go on counting what
+/// is in no file: all are asked before.
+fn conclude(
+    taps: &mut [Tap],
+    (start_ns, end_ns): (u64, u64),
+    file: &mut Output,
+) -> Result<(), LiveError> {
+    for tap in &mut *taps {
+        count(tap)?;
+        tap.card.iter_mut().for_each(CardTap::end);
+    }
+    let tap_count = u32::try_from(taps.len()).unwrap_or(u32::MAX);
+    for (index, tap) in (0_u32..).zip(taps) {
+        let RingCounters {
+            matched_count,
+            dropped_count,
+        } = tap.result.counters;
+        let span = (start_ns, tap.gone_ns.unwrap_or(end_ns).max(start_ns));
+        let counts = (matched_count, dropped_count);
+        let comment = Some(tap.result.tapped.as_str());
+        writer::statistics(file.buffer(), index, span, counts, comment);
+        if let Some(card) = tap.card.take() {
+            let index = tap_count + index;
+            tap.result.card = Some(card.finish(index, span, file.buffer()));
+        }
+    }
+    Ok(())
 }
 
 /// Interfaces first, then their cards in the same order.
@@ -304,16 +327,16 @@ fn is_there(index: Option<u32>) -> bool {
 }
 
 fn count(tap: &mut Tap) -> Result<(), LiveError> {
-    tap.result.counters = told(tap.ring.counters(), &tap.result.name)?.without(tap.early_count);
+    tap.result.counters = told(tap.ring.counters(), &tap.result.name)?;
     tap.result.step_count = tap.ring.step_count();
+    if let Some(card) = &mut tap.card {
+        card.count()?;
+    }
     Ok(())
 }
 
 /// What the kernel counted, if it told.
-pub(super) fn told(
-    counters: io::Result<RingCounters>,
-    interface: &str,
-) -> Result<RingCounters, LiveError> {
+pub(super) fn told<T>(counters: io::Result<T>, interface: &str) -> Result<T, LiveError> {
     counters.map_err(|source| LiveError::Counters {
         interface: interface.to_owned(),
         source,

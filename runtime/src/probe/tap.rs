@@ -35,13 +35,6 @@ pub(super) fn open(
     Ok((tap, words, reason.is_some() || earlier_count > 0))
 }
 
-/// Discards the packets of a ring with room for `frame_count` that came until now, at most one turn of
-/// it; gives their count.
-pub(super) fn discard(frame_count: usize, mut next: impl FnMut() -> bool) -> u64 {
-    let discarded = (0..frame_count).take_while(|_| next());
-    discarded.count() as u64
-}
-
 fn in_words(engine: TapEngine, earlier_count: u32, reason: Option<&RingError>) -> String {
     match (engine, reason) {
         (TapEngine::Bpf, _) => format!(
@@ -84,19 +77,6 @@ mod tests {
         );
         let plain = in_words(TapEngine::Packet, 0, None);
         assert_eq!(plain, "tapped by a packet ring");
-    }
-
-    #[test]
-    fn discarding_ends_with_the_ring_empty_or_turned_once() {
-        for (there, room, expected) in [(0, 4, 0), (3, 4, 3), (9, 4, 4)] {
-            let mut left = there;
-            let next = || {
-                let is_there = left > 0;
-                left -= i32::from(is_there);
-                is_there
-            };
-            assert_eq!(discard(room, next), expected, "{there} in a ring of {room}");
-        }
     }
 
     #[test]
