@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used, clippy::print_stdout, reason = "tests")]
 
 use std::fs;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -55,18 +56,20 @@ fn played(folder: &RunFolder) -> Trial {
 /// Commands that came over the hop by now.
 fn arrived(files: &RunFiles) -> u64 {
     // The run's folder is there a moment before what is in it.
-    let entries = fs::read_dir(files.root().join("records"));
-    let paths = entries
-        .into_iter()
-        .flatten()
-        .map(|entry| entry.unwrap().path());
+    let entries = match fs::read_dir(files.root().join("records")) {
+        Ok(entries) => entries,
+        Err(error) if error.kind() == ErrorKind::NotFound => return 0,
+        Err(error) => panic!("{error}"),
+    };
+    let paths = entries.map(|entry| entry.unwrap().path());
     let of_commands = paths.filter(|path| {
         let name = path.file_name().unwrap().to_string_lossy();
         name.starts_with("shuttle.command.ingress.")
     });
-    // So is a file before its header.
-    let counts = of_commands.filter_map(|path| RecordFile::read(&path).ok());
-    counts.map(|file| file.record_count()).sum::<usize>() as u64
+    // So is a file before its header, which is written at once.
+    let begun = of_commands.filter(|path| fs::metadata(path).unwrap().len() > 0);
+    let counts = begun.map(|path| RecordFile::read(&path).unwrap().record_count());
+    counts.sum::<usize>() as u64
 }
 
 /// What a file has of the channel, and says that it missed, of so many that were published on its host.
