@@ -7,7 +7,7 @@ use std::process::Command;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use hil_models::measure::account::InterruptionFigures;
+use hil_models::measure::account::{InterruptionFigures, MessageFate};
 use hil_runtime::report::summary::{Outcome, RunSummary};
 use hil_tests::account::{account, assert_every_message_is_accounted_for, carried, describe};
 use hil_tests::binary::hil_runtime_binary;
@@ -185,6 +185,41 @@ fn check_recovery(summary: &RunSummary, process: &str) {
     };
     let figures = interruption(summary, loses, process);
     assert!(figures.lost_count > 0, "{loses}: {figures:?}");
+}
+
+#[test]
+fn a_sender_that_learns_late_of_a_killed_receiver_blames_no_wire() {
+    let _alone = alone();
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    // As behind a firewall: the kernel does not say that nobody listens, and the sender goes on with keys
+    // that the new gateway does not know.
+    let mut silence = lab.host(1).command("sh");
+    silence.args(["-c", "echo 1000000000 > /proc/sys/net/ipv4/icmp_ratelimit"]);
+    let mut silence = ChildGuard::spawn(&mut silence).unwrap();
+    silence.wait_within(LIMIT).unwrap().assert_success();
+    let record = RunFolder::new("kills-unheard");
+    let trial = Trial::shipped("split.toml", record.path()).set("run.duration=\"8 s\"");
+    let mut split = Split::start(lab, &trial);
+    let process = "gateway-hop-robot-pc";
+    split.kill(1, process);
+    for finished in split.finish() {
+        finished.assert_success();
+    }
+    split.assert_nothing_left();
+    for summary in split.summaries() {
+        assert_every_message_is_accounted_for(&summary);
+        let channel = "egm/right/command";
+        let figures = interruption(&summary, channel, process);
+        let said = describe(channel, account(&summary, channel));
+        println!("{said}; {figures:?}");
+        assert!(figures.lost_count > 0, "{said}");
+        // What is lost to a start that takes longer is put down to the network.
+        let is_long = figures.gap.is_none_or(|gap| gap.length_ns > 2_000_000_000);
+        let lost_count = account(&summary, channel).fates.of(MessageFate::LostOnWire);
+        assert!(lost_count == 0 || is_long, "{said}; {figures:?}");
+    }
 }
 
 #[test]

@@ -9,6 +9,7 @@ mod clocks;
 mod events;
 mod faces;
 mod figures;
+mod interruptions;
 pub(crate) mod link_changes;
 #[cfg(test)]
 mod memory_tests;

@@ -11,7 +11,7 @@ use std::time::Duration;
 use hil_models::link::condition::LinkConditionRecord;
 use hil_models::measure::account::{
     AccountContext, ChannelAccount, ChannelPath, ChannelRecords, FLIGHT_TIME_MAX, Interruption,
-    MessageStory, ORDER_TOLERANCE_NS, Outage, PathProcess, RunSpan, account, outages, stories,
+    MessageStory, ORDER_TOLERANCE_NS, Outage, RunSpan, account, outages, stories,
 };
 use hil_models::measure::card_clock::{CardClockRecord, CardTimeline};
 use hil_models::measure::radio::{
@@ -19,13 +19,12 @@ use hil_models::measure::radio::{
 };
 use hil_models::measure::record::{EgressRecord, IngressRecord, RoundTripRecord};
 use hil_models::run_log::RunLog;
-use hil_models::time::Instant;
 
 use super::AnalysisError;
 use super::channel_files::{ChannelFiles, Signs, all, widen};
 use super::clocks::HostClocks;
 use super::message_records::missing_count;
-use super::{link_changes, stalls};
+use super::{interruptions, link_changes, stalls};
 use crate::face::record::{FaceReceivedRecord, FaceSentRecord};
 use crate::process::launch::EmulationLaunch;
 use crate::radio::record::RadioRecord;
@@ -33,7 +32,6 @@ use crate::record::stored::{ReadFaults, StoredFile, StoredRecords, file_bytes, s
 use crate::record::{RecordFileError, RecordKind};
 use crate::report::summary::RecordedFigures;
 use crate::supervisor::RunResult;
-use crate::supervisor::plan::gateway_name;
 use crate::topology::{Channel, Topology};
 
 /// Share of the messages of an emulated link that are not under way for longer than is allowed for:
@@ -55,8 +53,8 @@ pub(crate) struct RunRecords {
     problems: Vec<String>,
     /// What went wrong later.
     faults: ReadFaults,
-    /// Processes on the way of each channel that were held up as the run ended, once asked for.
-    held_up: RefCell<BTreeMap<String, Vec<Interruption>>>,
+    /// Processes on the way of each channel that were not there or held up, once asked for.
+    interruptions: RefCell<BTreeMap<String, Vec<Interruption>>>,
 }
 
 impl RunRecords {
@@ -304,8 +302,7 @@ impl RunRecords {
     ) -> T {
         let nothing = ChannelFiles::default();
         let files = self.channels.get(&channel.name).unwrap_or(&nothing);
-        let mut interruptions = interruptions(topology, result, channel);
-        interruptions.extend(self.held_up((topology, result), channel));
+        let interruptions = self.interruptions((topology, result), channel);
         let span_of = |process: &str| {
             let (start, end) = *result.spans.get(&topology.process(process)?.host)?;
             Some(RunSpan { start, end })
@@ -355,14 +352,15 @@ impl RunRecords {
         ask(&records, &context)
     }
 
-    /// See [`stalls::at_end`], which reads what the channel published.
-    fn held_up(&self, run: (&Topology, &RunResult), channel: &Channel) -> Vec<Interruption> {
-        if let Some(known) = self.held_up.borrow().get(&channel.name) {
+    /// Both kinds read what the channel's processes left.
+    fn interruptions(&self, run: (&Topology, &RunResult), channel: &Channel) -> Vec<Interruption> {
+        if let Some(known) = self.interruptions.borrow().get(&channel.name) {
             return known.clone();
         }
-        let found = stalls::at_end(self, run, channel);
-        let mut held_up = self.held_up.borrow_mut();
-        held_up.insert(channel.name.clone(), found.clone());
+        let mut found = interruptions::noted(self, run, channel);
+        found.extend(stalls::at_end(self, run, channel));
+        let mut interruptions = self.interruptions.borrow_mut();
+        interruptions.insert(channel.name.clone(), found.clone());
         found
     }
 }
@@ -403,46 +401,4 @@ pub(super) fn each_file(
         }
     }
     Ok(problems)
-}
-
-/// The times in which a process on the channel's way was not there.
-fn interruptions(topology: &Topology, result: &RunResult, channel: &Channel) -> Vec<Interruption> {
-    let gateway = |process: &str| {
-        let host = &topology.process(process)?.host;
-        Some(gateway_name(channel.link.as_deref()?, host))
-    };
-    let places = [
-        (Some(channel.from.clone()), PathProcess::Producer),
-        (gateway(&channel.from), PathProcess::SendingGateway),
-        (
-            channel.to.as_deref().and_then(gateway),
-            PathProcess::ReceivingGateway,
-        ),
-        (channel.to.clone(), PathProcess::Consumer),
-    ];
-    let end_of = |host: &str| {
-        result
-            .spans
-            .get(host)
-            .map_or(Instant::from_ns(i64::MAX), |span| span.1)
-    };
-    let mut found = Vec::new();
-    for event in &result.events {
-        let Some(gap) = event.interruption else {
-            continue;
-        };
-        for (_, place) in places
-            .iter()
-            .filter(|(name, _)| name.as_ref() == Some(&event.process))
-        {
-            found.push(Interruption {
-                process: event.process.clone(),
-                place: *place,
-                from: gap.from,
-                until: gap.until.unwrap_or(end_of(&event.host)),
-                cause: event.what.clone(),
-            });
-        }
-    }
-    found
 }
