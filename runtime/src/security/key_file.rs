@@ -18,7 +18,7 @@ use super::random_bytes;
 const PREFIX: &str = "hil-psk-v1:";
 const KEY_BYTES: usize = 32;
 /// Longer than any key file.
-const FILE_BYTES_MAX: u64 = 1024;
+const FILE_BYTES_MAX: usize = 1024;
 
 /// Why a key file is refused. Each says what to do.
 #[derive(Debug, thiserror::Error)]
@@ -30,6 +30,24 @@ pub enum KeyFileError {
     Missing {
         /// The file.
         path: PathBuf,
+    },
+    /// Its folder is not there.
+    #[error("key file {path}: its folder is not there; make it with `mkdir -p {folder}`")]
+    NoFolder {
+        /// The file.
+        path: PathBuf,
+        /// The folder.
+        folder: PathBuf,
+    },
+    /// Who runs this program may not read it.
+    #[error(
+        "key file {path}: user {user}, who runs this, may not read it; run `chown {user} {path}`, or run this as its owner"
+    )]
+    Denied {
+        /// The file.
+        path: PathBuf,
+        /// Who runs this program.
+        user: u32,
     },
     /// It cannot be read or written.
     #[error("key file {path}: {source}")]
@@ -47,7 +65,7 @@ pub enum KeyFileError {
     },
     /// Others can read it.
     #[error(
-        "key file {path}: mode {mode:04o} lets others than its owner at the key, allowed are 0600 and 0400; run `chmod 0600 {path}`, and make a new key if strangers may have read this one"
+        "key file {path}: mode {mode:04o}, allowed are 0600 and 0400, for its owner alone; run `chmod 0600 {path}`, and make a new key if strangers may have read this one"
     )]
     Mode {
         /// The file.
@@ -114,6 +132,10 @@ impl PreSharedKey {
             io::ErrorKind::NotFound => KeyFileError::Missing {
                 path: path.to_owned(),
             },
+            io::ErrorKind::PermissionDenied => KeyFileError::Denied {
+                path: path.to_owned(),
+                user: geteuid().as_raw(),
+            },
             _ => KeyFileError::Io {
                 path: path.to_owned(),
                 source,
@@ -125,11 +147,12 @@ impl PreSharedKey {
         let file = options.map_err(failed)?;
         // Of the opened file, so that nobody can exchange it between the look and the reading.
         check_access(path, &file.metadata().map_err(failed)?, geteuid().as_raw())?;
-        let mut text = Zeroizing::new(String::with_capacity(64));
-        file.take(FILE_BYTES_MAX + 1)
-            .read_to_string(&mut text)
+        let mut bytes = Zeroizing::new(Vec::with_capacity(FILE_BYTES_MAX + 1));
+        file.take(FILE_BYTES_MAX as u64 + 1)
+            .read_to_end(&mut bytes)
             .map_err(failed)?;
-        parse(&text).map_err(|why| KeyFileError::Form {
+        let text = str::from_utf8(&bytes).map_err(|_place_would_tell| "is not text".to_owned());
+        text.and_then(parse).map_err(|why| KeyFileError::Form {
             path: path.to_owned(),
             why,
         })
@@ -143,6 +166,10 @@ impl PreSharedKey {
         let failed = |source: io::Error| match source.kind() {
             io::ErrorKind::AlreadyExists => KeyFileError::Exists {
                 path: path.to_owned(),
+            },
+            io::ErrorKind::NotFound => KeyFileError::NoFolder {
+                path: path.to_owned(),
+                folder: path.parent().map(Path::to_owned).unwrap_or_default(),
             },
             _ => KeyFileError::Io {
                 path: path.to_owned(),
@@ -210,6 +237,9 @@ fn parse(text: &str) -> Result<PreSharedKey, String> {
     let line = text.strip_suffix('\n').unwrap_or(text);
     if line.is_empty() {
         return Err("is empty".to_owned());
+    }
+    if line.ends_with('\r') {
+        return Err("ends its line as Windows does (CR LF)".to_owned());
     }
     if line.contains('\n') {
         return Err("has more than one line".to_owned());
@@ -325,6 +355,7 @@ mod tests {
             half,
             &good.repeat(2),
             &good.replace("v1", "v2"),
+            &good.replace('\n', "\r\n"),
             &zeros,
         ] {
             fs::write(&path, text).unwrap();
@@ -335,6 +366,13 @@ mod tests {
                 "{error}"
             );
         }
+        fs::write(&path, [0xff; 43]).unwrap();
+        let error = PreSharedKey::read(&path).unwrap_err().to_string();
+        assert!(error.contains("not text; expected one line"), "{error}");
+        let nowhere = folder.join("of/hop.key");
+        let error = PreSharedKey::create(&nowhere).unwrap_err().to_string();
+        let cure = format!("mkdir -p {}", folder.join("of").display());
+        assert!(error.contains(&cure), "{error}");
         fs::remove_dir_all(folder).unwrap();
     }
 }
