@@ -208,7 +208,7 @@ fn a_gateway_process_refuses_a_peer_that_shares_its_memory_and_says_why() {
     assert!(words.contains(REASON), "{words}");
     let (code, words) = ingress.end();
     assert_eq!(code, Some(0), "{words}");
-    assert!(words.contains("shared_domain"), "{words}");
+    assert!(words.contains("shared domain"), "{words}");
 }
 
 #[test]

@@ -15,7 +15,7 @@ macro_rules! refusals {
             /// All of them, in the order of checking where there is one.
             pub const ALL: &'static [Self] = &[$(Self::$variant),+];
 
-            /// Snake-case name, as reports print it.
+            /// In words, as reports print it.
             pub const fn name(self) -> &'static str {
                 match self { $(Self::$variant => $name,)+ }
             }
@@ -25,52 +25,52 @@ macro_rules! refusals {
 
 refusals! {
     /// Shorter than the fixed header.
-    TooShort => "too_short", "datagram is shorter than the 72-byte header";
+    TooShort => "too short", "datagram is shorter than the 72-byte header";
     /// Not a datagram of this protocol.
-    BadMagic => "bad_magic", "datagram does not start with the magic number";
+    BadMagic => "bad magic", "datagram does not start with the magic number";
     /// Another version of the protocol.
-    UnsupportedVersion => "unsupported_version", "protocol version is not 1";
+    UnsupportedVersion => "unsupported version", "protocol version is not 1";
     /// A kind this version does not know.
-    UnknownKind => "unknown_kind", "kind is outside 1 to 8";
+    UnknownKind => "unknown kind", "kind is outside 1 to 8";
     /// The header claims another length than this version's.
-    BadHeaderLength => "bad_header_length", "header length is not 72 bytes";
+    BadHeaderLength => "bad header length", "header length is not 72 bytes";
     /// A flag this version does not know.
-    UnknownFlags => "unknown_flags", "an unknown flag is set";
+    UnknownFlags => "unknown flags", "an unknown flag is set";
     /// Sealed, and this hop is plain.
-    AuthenticationNotConfigured => "authentication_not_configured",
+    AuthenticationNotConfigured => "authentication not configured",
         "datagram is sealed but this hop is plain";
     /// Bytes that must be zero are not.
-    ReservedNotZero => "reserved_not_zero", "a reserved field is not zero";
+    ReservedNotZero => "reserved not zero", "a reserved field is not zero";
     /// Fragment index, count and total length contradict each other or an earlier fragment.
-    FragmentInconsistent => "fragment_inconsistent", "fragment fields contradict each other";
+    FragmentInconsistent => "fragment inconsistent", "fragment fields contradict each other";
     /// Longer or shorter than its header says.
-    LengthMismatch => "length_mismatch", "datagram length differs from what its header says";
+    LengthMismatch => "length mismatch", "datagram length differs from what its header says";
     /// The body of a greeting, reply or exchange does not parse.
-    MalformedBody => "malformed_body", "body does not parse";
+    MalformedBody => "malformed body", "body does not parse";
     /// A kind that only the other direction carries.
-    UnexpectedKind => "unexpected_kind", "kind belongs to the other direction";
+    UnexpectedKind => "unexpected kind", "kind belongs to the other direction";
     /// The channel is not this bridge's.
-    UnknownChannel => "unknown_channel", "channel is not carried here";
+    UnknownChannel => "unknown channel", "channel is not carried here";
     /// It comes from another address than the one that greeted.
-    ForeignSource => "foreign_source", "source address is not the one that greeted";
+    ForeignSource => "foreign source", "source address is not the one that greeted";
     /// Its session has not greeted.
-    UnknownSession => "unknown_session", "session has not greeted";
+    UnknownSession => "unknown session", "session has not greeted";
     /// It belongs to a session, epoch, greeting or message that is over.
     Stale => "stale", "datagram belongs to something that is over";
     /// The two hosts disagree on the message type.
-    TypeMismatch => "type_mismatch", "message type differs from this host's";
+    TypeMismatch => "type mismatch", "message type differs from this host's";
     /// The two hosts disagree on the message's size or alignment.
-    SizeMismatch => "size_mismatch", "message size or alignment differs from this host's";
+    SizeMismatch => "size mismatch", "message size or alignment differs from this host's";
     /// Both ends of the channel lie in one shared-memory domain, so messages bypass the hop.
-    SharedDomain => "shared_domain", "both ends lie in one shared-memory domain";
+    SharedDomain => "shared domain", "both ends lie in one shared-memory domain";
     /// The message is larger than the channel's largest.
     Oversize => "oversize", "message is larger than the channel allows";
     /// Its stamps contradict each other or the clock.
-    ImplausibleStamp => "implausible_stamp", "stamps contradict each other or the clock";
+    ImplausibleStamp => "implausible stamp", "stamps contradict each other or the clock";
     /// Its sequence number is too far ahead of everything seen.
-    ImplausibleSequence => "implausible_sequence", "sequence number leaps too far ahead";
+    ImplausibleSequence => "implausible sequence", "sequence number leaps too far ahead";
     /// This fragment has arrived before.
-    DuplicateFragment => "duplicate_fragment", "fragment arrived before";
+    DuplicateFragment => "duplicate fragment", "fragment arrived before";
     /// A reply to nothing that was asked, or a second reply.
     Unsolicited => "unsolicited", "reply answers no open request";
 }
