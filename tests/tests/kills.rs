@@ -5,17 +5,20 @@
 use std::fs;
 use std::process::Command;
 use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::thread;
 use std::time::Duration;
 
 use hil_models::measure::account::{InterruptionFigures, MessageFate};
-use hil_runtime::report::summary::{Outcome, RunSummary};
+use hil_models::measure::record::IngressRecord;
+use hil_runtime::report::assessment::{Assessment, NetworkVerdict};
+use hil_runtime::report::summary::{NO_ROOM, Outcome, RunSummary};
 use hil_tests::account::{account, assert_every_message_is_accounted_for, carried, describe};
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::child::{ChildGuard, Finished};
 use hil_tests::lab::Lab;
 use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::{RunFiles, Trial, load_average, wait_until};
-use nix::sys::signal::Signal;
+use nix::sys::signal::{Signal, kill};
 
 const HOSTS: [&str; 2] = ["control-pc", "robot-pc"];
 const LIMIT: Duration = Duration::from_mins(1);
@@ -219,6 +222,56 @@ fn a_sender_that_learns_late_of_a_killed_receiver_blames_no_wire() {
         let is_long = figures.gap.is_none_or(|gap| gap.length_ns > 2_000_000_000);
         let lost_count = account(&summary, channel).fates.of(MessageFate::LostOnWire);
         assert!(lost_count == 0 || is_long, "{said}; {figures:?}");
+    }
+}
+
+#[test]
+fn a_receiver_that_stood_still_is_no_network_result() {
+    let _alone = alone();
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let record = RunFolder::new("kills-late");
+    let trial = Trial::shipped("shuttle-split.toml", record.path())
+        .set("run.duration=\"8 s\"")
+        .set("case.parameters.rate_hz=1000.0");
+    let mut hosts = [0, 1].map(|index| trial.start_on(lab.host(index)));
+    let files = HOSTS.map(|host| trial.folder(&format!("-{host}"), LIMIT));
+    let received = "shuttle.command.ingress.";
+    wait_until(LIMIT, "commands over the hop", || {
+        files[1].record_bytes(received) >= 500 * size_of::<IngressRecord>() as u64
+    });
+    let gateway = files[1].process("gateway-hop-robot-pc", 0).unwrap();
+    kill(gateway, Signal::SIGSTOP).unwrap();
+    thread::sleep(Duration::from_millis(1500));
+    kill(gateway, Signal::SIGCONT).unwrap();
+    for host in &mut hosts {
+        host.wait_within(RUN_LIMIT).unwrap().assert_success();
+    }
+    for files in &files {
+        let summary = files.summary();
+        assert_every_message_is_accounted_for(&summary);
+        let channel = "shuttle/command";
+        let said = describe(channel, account(&summary, channel));
+        let of_channel = summary.channels.iter().find(|one| one.name == channel);
+        let mut causes = of_channel.unwrap().refusals.iter();
+        let no_room = causes.find(|cause| cause.name == NO_ROOM).unwrap().count;
+        let lost = account(&summary, channel).fates.of(MessageFate::LostOnWire);
+        println!("{said}; {no_room} datagrams without room");
+        assert!(lost > 0 && lost <= no_room, "{lost} of {no_room}: {said}");
+        let assessment = Assessment::of(&summary);
+        assert!(
+            matches!(
+                assessment.network,
+                NetworkVerdict::ReceiverLate { .. } | NetworkVerdict::HostOverran { .. }
+            ),
+            "{assessment:?}"
+        );
+        let warnings = assessment.warnings.join("\n");
+        assert!(
+            warnings.contains(&format!("up to {lost} messages")),
+            "{warnings}"
+        );
     }
 }
 

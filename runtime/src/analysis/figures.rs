@@ -11,16 +11,15 @@ use super::records::RunRecords;
 use crate::realtime::GrantOutcome;
 use crate::report::emulation::EmulationFigures;
 use crate::report::summary::{
-    ChannelSummary, CountByName, DirectionSummary, Fact, LinkKind, Outcome, ProcessSummary,
-    RealtimeFacts, RunEvent, RunFacts,
+    ChannelSummary, CountByName, DirectionSummary, Fact, LinkKind, NO_ROOM, Outcome,
+    ProcessSummary, RealtimeFacts, RunEvent, RunFacts,
 };
 use crate::supervisor::event::{Event, ProcessStory};
 use crate::supervisor::{self, RunResult};
 use crate::topology::{Channel, Topology, Via};
 
-/// Datagrams that came while the socket's receive buffer was full, and how a report calls them.
+/// Datagrams that came while the socket's receive buffer was full; see [`NO_ROOM`].
 const NO_ROOM_COUNTER: &str = "socket: kernel_drop_count";
-const NO_ROOM: &str = "no room in the receive buffer";
 
 /// What a receiving gateway calls the datagrams that its emulated link had no room for.
 const OVERFLOW_COUNTER: &str = "socket: link_overflow_count";

@@ -106,6 +106,9 @@ fn spoilt(summary: &RunSummary) -> Option<&'static str> {
             Some("the host could not keep the emulated link")
         }
         NetworkVerdict::HostOverran { .. } => Some("the host overran: no network result"),
+        NetworkVerdict::ReceiverLate { .. } => {
+            Some("a receiving gateway was late: no network result")
+        }
         NetworkVerdict::RunFailed => Some("the run failed"),
         NetworkVerdict::EmulatedLink
         | NetworkVerdict::NoNetwork

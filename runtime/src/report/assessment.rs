@@ -6,7 +6,9 @@ use serde::{Deserialize, Serialize};
 
 use super::face::FaceSummary;
 use super::face_warnings;
-use super::summary::{ChannelSummary, Fact, LinkKind, Outcome, ProcessSummary, RunSummary};
+use super::summary::{
+    ChannelSummary, Fact, LinkKind, NO_ROOM, Outcome, ProcessSummary, RunSummary,
+};
 use super::terminal::{JOINT, grouped, percent};
 use crate::words::counted;
 
@@ -45,6 +47,12 @@ pub enum NetworkVerdict {
         /// The processes that did.
         processes: Vec<Overrun>,
     },
+    /// Receiving gateways were late, and their kernel dropped what found no room meanwhile: the run says
+    /// nothing about the network.
+    ReceiverLate {
+        /// The channels concerned.
+        channels: Vec<String>,
+    },
     /// A component left no report, so nobody can tell whether it kept its ticks.
     TicksUnknown,
 }
@@ -77,6 +85,7 @@ impl Assessment {
         let overruns: Vec<Overrun> = summary.processes.iter().filter_map(overrun).collect();
         let mut warnings: Vec<String> = overruns.iter().map(overrun_warning).collect();
         warnings.extend(summary.channels.iter().filter_map(emulation_warning));
+        warnings.extend(summary.channels.iter().filter_map(no_room_warning));
         warnings.extend(summary.warnings.iter().cloned());
         warnings.extend(summary.faces.iter().flat_map(face_warnings::face_warnings));
         warnings.extend(summary.processes.iter().flat_map(process_warnings));
@@ -117,6 +126,10 @@ fn verdict(summary: &RunSummary, overruns: Vec<Overrun>) -> NetworkVerdict {
         NetworkVerdict::EmulationNotKept {
             channels: unkept(summary),
         }
+    } else if !received_late(summary).is_empty() {
+        NetworkVerdict::ReceiverLate {
+            channels: received_late(summary),
+        }
     } else if summary.processes.iter().any(is_silent) || !summary.processes.iter().any(has_ticks) {
         NetworkVerdict::TicksUnknown
     } else if has(LinkKind::Emulated) {
@@ -138,6 +151,41 @@ fn unkept(summary: &RunSummary) -> Vec<String> {
     };
     let channels = summary.channels.iter().filter(is_unkept);
     channels.map(|channel| channel.name.clone()).collect()
+}
+
+/// The channels of which more than [`SKIPPED_TICK_RATIO_MAX`] of the messages may have been lost to the
+/// receiver's host: a gateway keeps no ticks that would tell that it was late.
+fn received_late(summary: &RunSummary) -> Vec<String> {
+    let is_late = |channel: &&ChannelSummary| {
+        let account = channel.account.as_ref();
+        let published_count = account.map_or(0, |account| account.published_count);
+        no_room_count(channel) as f64 > SKIPPED_TICK_RATIO_MAX * published_count as f64
+    };
+    let channels = summary.channels.iter().filter(is_late);
+    channels.map(|channel| channel.name.clone()).collect()
+}
+
+fn no_room_count(channel: &ChannelSummary) -> u64 {
+    let causes = channel.refusals.iter().filter(|one| one.name == NO_ROOM);
+    causes.map(|cause| cause.count).sum()
+}
+
+fn no_room_warning(channel: &ChannelSummary) -> Option<String> {
+    let count = Some(no_room_count(channel)).filter(|count| *count > 0)?;
+    let account = channel.account.as_ref();
+    let lost = account.map_or(0, |account| account.fates.of(MessageFate::LostOnWire));
+    let lost = match lost.min(count) {
+        0 => String::new(),
+        most => format!(
+            ", which may be what became of up to {} lost on the wire",
+            counted(most, "message")
+        ),
+    };
+    Some(format!(
+        "{}: {} had {NO_ROOM}, because the receiving gateway was late or more came than it could take{lost}",
+        channel.name,
+        counted(count, "datagram"),
+    ))
 }
 
 fn emulation_warning(channel: &ChannelSummary) -> Option<String> {

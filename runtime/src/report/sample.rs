@@ -15,8 +15,8 @@ use super::sample_events::{few_events, many_events, recorded_channel};
 use super::sample_network::network;
 use super::sample_records::Files;
 use super::summary::{
-    ChannelSummary, CountByName, DirectionSummary, Fact, LinkKind, Outcome, ProcessSummary,
-    RealtimeFacts, RunEvent, RunFacts, RunSummary, ScoreMetric, SummaryError,
+    ChannelSummary, CountByName, DirectionSummary, Fact, LinkKind, NO_ROOM, Outcome,
+    ProcessSummary, RealtimeFacts, RunEvent, RunFacts, RunSummary, ScoreMetric, SummaryError,
 };
 use super::terminal::{Style, render};
 
@@ -360,6 +360,34 @@ fn a_host_that_overran_is_not_a_network_result() {
     );
     summary.channels.truncate(0);
     assert_eq!(Assessment::of(&summary).network, NetworkVerdict::NoNetwork);
+}
+
+#[test]
+fn what_had_no_room_in_a_receive_buffer_is_not_put_down_to_the_network() {
+    let mut summary = full();
+    let account = summary.channels[0].account.as_mut();
+    account.unwrap().published_count = 5_000;
+    // 0.1 % of 5 000 messages is 5: at the limit it still counts, and is told.
+    for (count, is_result) in [(0, true), (5, true), (6, false)] {
+        let channel = &mut summary.channels[0];
+        channel.refusals = vec![CountByName {
+            name: NO_ROOM.to_owned(),
+            count,
+        }];
+        let name = channel.name.clone();
+        let assessment = Assessment::of(&summary);
+        let expected = if is_result {
+            NetworkVerdict::NetworkResult
+        } else {
+            NetworkVerdict::ReceiverLate {
+                channels: vec![name],
+            }
+        };
+        assert_eq!(assessment.network, expected, "{count}");
+        let text = render(&summary, 120, Style::Plain);
+        assert_eq!(text.contains("NOT a network result"), !is_result);
+        assert_eq!(text.contains("because the receiving gateway"), count > 0);
+    }
 }
 
 #[test]

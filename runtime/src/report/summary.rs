@@ -327,6 +327,9 @@ impl LinkKind {
     }
 }
 
+/// How a report calls datagrams that came while a socket's receive buffer was full: their receiver was late.
+pub const NO_ROOM: &str = "no room in the receive buffer";
+
 impl LinkKind {
     /// The words for a fate of a message on it: what an emulated link lost, no wire did.
     pub const fn fate_label(self, fate: MessageFate) -> &'static str {

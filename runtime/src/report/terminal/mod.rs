@@ -170,6 +170,11 @@ pub(crate) const fn outcome_words(outcome: Outcome) -> (Tone, &'static str) {
     }
 }
 
+fn no_result(why: &str) -> (Tone, String) {
+    let cure = "repeat on an idle host or at a lower rate";
+    (Tone::Bad, format!("NOT a network result{why}; {cure}"))
+}
+
 /// What a run says about a network, in words.
 pub(crate) fn network_words(verdict: &NetworkVerdict) -> (Tone, String) {
     let limit = percent(SKIPPED_TICK_RATIO_MAX);
@@ -186,12 +191,9 @@ pub(crate) fn network_words(verdict: &NetworkVerdict) -> (Tone, String) {
             (Tone::Good, text)
         }
         NetworkVerdict::EmulationNotKept { channels } => {
-            let text = format!(
-                "NOT a network result, nor one about the link model: the host could not keep the \
-                 emulated link of {}; repeat on an idle host or at a lower rate",
-                channels.join(", ")
-            );
-            (Tone::Bad, text)
+            let why =
+                ", nor one about the link model: the host could not keep the emulated link of";
+            no_result(&format!("{why} {}", channels.join(", ")))
         }
         NetworkVerdict::NoNetwork => {
             let text = "no channel went over a network; nothing here says anything about one";
@@ -219,12 +221,14 @@ pub(crate) fn network_words(verdict: &NetworkVerdict) -> (Tone, String) {
                 .iter()
                 .map(|overrun| overrun.skipped_tick_count)
                 .sum();
-            let text = format!(
-                "NOT a network result: the host overran ({} skipped ticks, more than {limit}); \
-                 repeat on an idle host or at a lower rate",
-                grouped(skipped)
-            );
-            (Tone::Bad, text)
+            let skipped = grouped(skipped);
+            no_result(&format!(
+                ": the host overran ({skipped} skipped ticks, more than {limit})"
+            ))
+        }
+        NetworkVerdict::ReceiverLate { channels } => {
+            let why = ": datagrams had no room in the receive buffer, their gateway was late with";
+            no_result(&format!("{why} {}", channels.join(", ")))
         }
         NetworkVerdict::TicksUnknown => {
             let text = "no verdict: a component left no count of its ticks";
