@@ -7,7 +7,7 @@ use hil_models::measure::account::{Interruption, PathProcess};
 use hil_models::measure::record::{IngressRecord, UNAVAILABLE};
 use hil_models::time::{Instant, duration_ns};
 
-use super::channel_files::all;
+use super::channel_files::{ChannelFiles, all};
 use super::records::RunRecords;
 use crate::supervisor::RunResult;
 use crate::supervisor::plan::gateway_name;
@@ -53,16 +53,22 @@ pub(super) fn noted(
             .iter()
             .filter(|(name, _)| name.as_ref() == Some(&event.process))
         {
-            let end = end_of(&event.host);
             let until = match gap.until {
                 Some(back) if *place == PathProcess::ReceivingGateway => {
+                    // It cannot be reached while it is away once more.
+                    let others = result
+                        .events
+                        .iter()
+                        .filter(|one| one.process == event.process);
+                    let later = others.filter_map(|one| Some(one.interruption?.from));
+                    let next = later.filter(|from| *from > gap.from).min();
+                    let end = end_of(&event.host);
+                    let latest = next.map_or(end, |next| next.min(end));
                     let files = records.channels.get(&channel.name);
-                    let received = all::<IngressRecord>(files.and_then(|one| one.ingress.as_ref()));
-                    let received_ns = received.map(|record| record.received_ns);
-                    works_again((event.at, back, end), received_ns)
+                    files.map_or(back, |files| reached(files, (event.at, back, latest)))
                 }
                 Some(back) => back,
-                None => end,
+                None => end_of(&event.host),
             };
             found.push(Interruption {
                 process: event.process.clone(),
@@ -76,13 +82,29 @@ pub(super) fn noted(
     found
 }
 
-/// When messages reached a gateway that was found dead at `dead` and is `back` since then: at once if it
-/// received some in between, no later than [`RECOVERY_MAX`] after, and not after the `end` of the run.
+/// See [`works_again`]; without the gateway's records, nobody knows what reached it.
+fn reached(files: &ChannelFiles, times: (Instant, Instant, Instant)) -> Instant {
+    if files.ingress.is_none() {
+        return times.1;
+    }
+    let messages = all::<IngressRecord>(files.ingress.as_ref());
+    // An emulated link holds a message back after it has reached the gateway.
+    let messages_ns = messages.map(|one| match one.emulated_ns {
+        UNAVAILABLE => one.received_ns,
+        taken_ns => taken_ns,
+    });
+    // So does a clock exchange that it answered reach it, on a channel that speaks seldom.
+    let exchanges_ns = files.round_trips.values().map(|one| one.t2_ns);
+    works_again(times, messages_ns.chain(exchanges_ns))
+}
+
+/// When messages reached a gateway that was found dead at `dead` and is `back` since then: at once if some did in
+/// between, no later than [`RECOVERY_MAX`] after, and not after `end`.
 fn works_again(
     (dead, back, end): (Instant, Instant, Instant),
-    received_ns: impl Iterator<Item = i64>,
+    reached_ns: impl Iterator<Item = i64>,
 ) -> Instant {
-    let of_successor = received_ns.filter(|at| *at != UNAVAILABLE && *at >= dead.as_ns());
+    let of_successor = reached_ns.filter(|at| *at != UNAVAILABLE && *at >= dead.as_ns());
     let latest_ns = back.as_ns().saturating_add(duration_ns(RECOVERY_MAX));
     let latest_ns = latest_ns.min(end.as_ns()).max(back.as_ns());
     let first_ns = of_successor.min().unwrap_or(latest_ns);
@@ -126,5 +148,12 @@ mod tests {
             let until = works_again((at(100), at(160), at(end_ms)), received);
             assert_eq!(until, at(expected_ms), "{what}");
         }
+    }
+
+    #[test]
+    fn without_the_gateways_records_it_is_back_when_its_supervisor_says_so() {
+        let times = [100, 160, 9_000].map(|ms| Instant::from_ns(ms * MS));
+        let [dead, back, end] = times;
+        assert_eq!(reached(&ChannelFiles::default(), (dead, back, end)), back);
     }
 }

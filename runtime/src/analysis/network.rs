@@ -2,7 +2,7 @@
 //! events, series and correlations, and to what came before each event of the score. Live runs
 //! and runs in virtual time come here alike; where passages come from is not known here.
 
-use std::collections::BTreeSet;
+use std::collections::BTreeMap;
 
 use hil_models::case_study::ErrorSeries;
 use hil_models::measure::account::{Side, passages};
@@ -73,8 +73,8 @@ pub(crate) struct NetworkBuilder {
     channels: Vec<ChannelNetwork>,
     events: Vec<TimedEvent>,
     bins: Vec<(String, NetworkBins)>,
-    /// Processes whose time without them is told already.
-    told: BTreeSet<(String, i64)>,
+    /// Processes whose time without them is told already, and where among the events it stands.
+    told: BTreeMap<(String, i64), Option<usize>>,
     /// Events and messages without a place on the run's axis.
     unplaced_event_count: u64,
     unplaced_message_count: u64,
@@ -105,23 +105,41 @@ impl NetworkBuilder {
         event: NetworkEvent,
         (duration_ns, place): (i64, &Place<'_>),
     ) {
-        if let NetworkEventKind::ProcessDown { process, .. } = &event.kind
-            && !self.told.insert((process.clone(), event.from.ns))
-        {
-            return;
-        }
+        let interruption = match &event.kind {
+            NetworkEventKind::ProcessDown { process, .. } => Some((process.clone(), event.from.ns)),
+            _ => None,
+        };
+        let told = interruption.as_ref().and_then(|key| self.told.get(key));
+        let told = told.copied();
         let side = event.from.side;
         let since_s = |ns: i64| Some(place(Moment { side, ns })? as f64 * 1e-9);
         let until_s = event.until_ns.map(since_s);
         let (Some(from_s), None | Some(Some(_))) = (since_s(event.from.ns), until_s) else {
-            self.unplaced_event_count += 1;
+            if told.is_none() {
+                self.unplaced_event_count += 1;
+                self.told.extend(interruption.map(|key| (key, None)));
+            }
             return;
         };
         let end_s = duration_ns as f64 * 1e-9;
+        let until_s = until_s.flatten().filter(|until_s| *until_s < end_s);
+        if let Some(index) = told {
+            // Each channel says when messages reached the process: it was there for the first.
+            if let Some(known) = index.map(|index| &mut self.events[index].until_s) {
+                *known = known
+                    .zip(until_s)
+                    .map(|(one, other)| one.min(other))
+                    .or(*known)
+                    .or(until_s);
+            }
+            return;
+        }
+        self.told
+            .extend(interruption.map(|key| (key, Some(self.events.len()))));
         self.events.push(TimedEvent {
             channel: channel.to_owned(),
             from_s,
-            until_s: until_s.flatten().filter(|until_s| *until_s < end_s),
+            until_s,
             kind: event.kind,
         });
     }
