@@ -25,7 +25,7 @@ macro_rules! refusals {
 
 refusals! {
     /// Shorter than the fixed header.
-    TooShort => "too short", "datagram is shorter than the 72-byte header";
+    TooShort => "shorter than the header", "datagram is shorter than the 72-byte header";
     /// Not a datagram of this protocol.
     BadMagic => "bad magic", "datagram does not start with the magic number";
     /// Another version of the protocol.
@@ -52,7 +52,7 @@ refusals! {
     /// The channel is not this bridge's.
     UnknownChannel => "unknown channel", "channel is not carried here";
     /// It comes from another address than the one that greeted.
-    ForeignSource => "foreign source", "source address is not the one that greeted";
+    ForeignSource => "source that did not greet", "source address is not the one that greeted";
     /// Its session has not greeted.
     UnknownSession => "unknown session", "session has not greeted";
     /// It belongs to a session, epoch, greeting or message that is over.
@@ -123,6 +123,18 @@ impl fmt::Debug for RefusalCounts {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::protocol::seal::SealRefusal;
+
+    #[test]
+    fn no_cause_of_the_seal_has_the_same_name() {
+        for refusal in Refusal::ALL {
+            let mut others = SealRefusal::ALL.iter();
+            assert!(
+                others.all(|other| other.name() != refusal.name()),
+                "{refusal:?}"
+            );
+        }
+    }
 
     #[test]
     fn every_refusal_has_its_own_counter_and_name() {
