@@ -220,7 +220,9 @@ fn conclude(
 ) -> Result<(), LiveError> {
     for tap in &mut *taps {
         count(tap)?;
-        tap.card.iter_mut().for_each(CardTap::end);
+    }
+    for card in taps.iter_mut().filter_map(|tap| tap.card.as_mut()) {
+        card.end();
     }
     let tap_count = u32::try_from(taps.len()).unwrap_or(u32::MAX);
     for (index, tap) in (0_u32..).zip(taps) {

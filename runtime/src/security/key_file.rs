@@ -39,9 +39,19 @@ pub enum KeyFileError {
         /// The folder.
         folder: PathBuf,
     },
+    /// Who runs this program may not make it.
+    #[error(
+        "key file {path}: user {user}, who runs this, may not make it there; run this as root or name another folder"
+    )]
+    NotMade {
+        /// The file.
+        path: PathBuf,
+        /// Who runs this program.
+        user: u32,
+    },
     /// Who runs this program may not read it.
     #[error(
-        "key file {path}: user {user}, who runs this, may not read it; run `chown {user} {path}`, or run this as its owner"
+        "key file {path}: user {user}, who runs this, may not reach it; run `chown {user} {path}` as root and let that user into its folder, or run this as its owner"
     )]
     Denied {
         /// The file.
@@ -166,6 +176,10 @@ impl PreSharedKey {
         let failed = |source: io::Error| match source.kind() {
             io::ErrorKind::AlreadyExists => KeyFileError::Exists {
                 path: path.to_owned(),
+            },
+            io::ErrorKind::PermissionDenied => KeyFileError::NotMade {
+                path: path.to_owned(),
+                user: geteuid().as_raw(),
             },
             io::ErrorKind::NotFound => KeyFileError::NoFolder {
                 path: path.to_owned(),
