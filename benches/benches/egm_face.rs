@@ -19,7 +19,7 @@ use hil_benches::gateway::notices::{announce, ended};
 use hil_benches::gateway::parties::{MachineTime, PRIORITY, claim, stolen_text};
 use hil_benches::gateway::verdict::Verdict;
 use hil_benches::{Case, Comparison, compare, json_line, table};
-use hil_runtime::clock::MonotonicClock;
+use hil_runtime::platform::clock::MonotonicClock;
 use hil_runtime::report::face::FaceSegment;
 use serde_json::json;
 

@@ -21,10 +21,10 @@ use hil_benches::gateway::verdict::Verdict;
 use hil_benches::{Case, Comparison, Row, compare, json_line, table};
 use hil_models::endpoint::InputPort;
 use hil_models::time::Instant;
-use hil_runtime::clock::MonotonicClock;
-use hil_runtime::gateway::direction::Direction;
-use hil_runtime::process::launch::DirectionLaunch;
-use hil_runtime::wait::WaitMode;
+use hil_runtime::engine::gateway::direction::Direction;
+use hil_runtime::platform::clock::MonotonicClock;
+use hil_runtime::platform::wait::WaitMode;
+use hil_runtime::rundir::launch::DirectionLaunch;
 use serde_json::json;
 
 const BENCH: &str = "gateway_stages";

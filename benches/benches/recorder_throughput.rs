@@ -16,9 +16,10 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use hil_models::message::Envelope;
-use hil_runtime::channel::{ChannelHolder, ChannelSettings, Domain, RawOutput, TypeInfo};
-use hil_runtime::clock::MonotonicClock;
-use hil_runtime::watch::{LIVE_VERSION, LiveChannel, LiveRun, Source, observer_depth};
+use hil_runtime::platform::clock::MonotonicClock;
+use hil_runtime::rundir::live_run::{LIVE_VERSION, LiveChannel, LiveRun, Source};
+use hil_runtime::shm::{ChannelHolder, ChannelSettings, Domain, RawOutput, TypeInfo};
+use hil_runtime::watch::observer_depth;
 use hil_tests::binary::hil_recorder_binary;
 use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::wait_until;

@@ -21,11 +21,11 @@ use hil_benches::{Case, Comparison, HostFacts, compare, json_line, pin_to_cpu, t
 use hil_models::endpoint::{InputPort, OutputPort};
 use hil_models::message::{Message, MessageType};
 use hil_models::time::Instant as HostInstant;
-use hil_runtime::channel::{
+use hil_runtime::platform::clock::MonotonicClock;
+use hil_runtime::shm::{
     ChannelHolder, ChannelSettings, Domain, DomainAddress, OutputSettings, ShmInput, ShmOutput,
     TypedInput, TypedOutput, Waiter,
 };
-use hil_runtime::clock::MonotonicClock;
 use iceoryx2::node::{Node, NodeBuilder};
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;

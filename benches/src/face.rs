@@ -16,18 +16,18 @@ use hil_models::endpoint::InputPort;
 use hil_models::message::MessageType;
 use hil_models::time::Instant;
 use hil_models::yumi::arm::{Arm, RIGHT_START_RAD};
-use hil_runtime::channel::{
+use hil_runtime::engine::face::OpenedArm;
+use hil_runtime::platform::clock::{MonotonicClock, Wake};
+use hil_runtime::platform::realtime::RealtimeRequest;
+use hil_runtime::platform::wait::WaitMode;
+use hil_runtime::report::face_figures::{FaceFigures, figures};
+use hil_runtime::rundir::face_launch::{ArmLaunch, FaceLaunch, FaceSettings};
+use hil_runtime::rundir::record::{RecordFile, Recorder};
+use hil_runtime::shm::{
     ChannelHolder, ChannelSettings, Domain, DomainAddress, OutputSettings, ShmInput, ShmOutput,
     Waiter,
 };
-use hil_runtime::clock::{MonotonicClock, Wake};
-use hil_runtime::face::OpenedArm;
-use hil_runtime::face::figures::{FaceFigures, figures};
-use hil_runtime::face::launch::{ArmLaunch, FaceLaunch, FaceSettings};
-use hil_runtime::realtime::RealtimeRequest;
-use hil_runtime::record::{RecordFile, Recorder};
 use hil_runtime::topology::{CardChannel, FaceKind, FaceSend, Timestamps};
-use hil_runtime::wait::WaitMode;
 
 use crate::gateway::hosts::{Hosts, Joint, Plan, SetupError};
 use crate::gateway::network::Network;

@@ -8,7 +8,7 @@ use hil_models::egm::messages::{
 };
 use hil_models::run_log::RunLog;
 use hil_models::yumi::JOINT_COUNT;
-use hil_runtime::record::{RecordFile, RecordKind};
+use hil_runtime::rundir::record::{RecordFile, RecordKind};
 
 use crate::trial::RunFiles;
 

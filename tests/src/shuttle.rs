@@ -7,7 +7,7 @@ use std::fs;
 use bytemuck::Pod;
 use hil_models::measure::record::{IngressRecord, UNAVAILABLE};
 use hil_models::trace::{Trace, wire};
-use hil_runtime::record::RecordFile;
+use hil_runtime::rundir::record::RecordFile;
 
 use crate::trial::RunFiles;
 

@@ -8,9 +8,9 @@ use std::process::Command;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use hil_runtime::channel::DomainAddress;
+use hil_runtime::engine::security::PreSharedKey;
 use hil_runtime::report::summary::RunSummary;
-use hil_runtime::security::PreSharedKey;
+use hil_runtime::shm::DomainAddress;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use serde_json::Value;

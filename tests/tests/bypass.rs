@@ -17,13 +17,13 @@ use hil_models::measure::account::MessageFate;
 use hil_models::message::{Envelope, MessageType};
 use hil_models::shuttle::ShuttleCommand;
 use hil_models::time::Instant;
-use hil_runtime::channel::{ChannelHolder, ChannelSettings, Domain};
-use hil_runtime::process::launch::{
+use hil_runtime::platform::realtime::RealtimeRequest;
+use hil_runtime::platform::wait::WaitMode;
+use hil_runtime::rundir::launch::{
     DirectionLaunch, GatewayLaunch, Side, SocketLaunch, Transport, write,
 };
-use hil_runtime::realtime::RealtimeRequest;
+use hil_runtime::shm::{ChannelHolder, ChannelSettings, Domain};
 use hil_runtime::topology::Timestamps;
-use hil_runtime::wait::WaitMode;
 use hil_tests::account::{account, assert_every_message_is_accounted_for};
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::run_folder::RunFolder;

@@ -9,9 +9,9 @@ use std::time::Duration;
 
 use hil_models::egm::messages::EgmCommand;
 use hil_models::measure::account::MessageFate;
-use hil_runtime::layout::hex;
-use hil_runtime::record::RecordFile;
 use hil_runtime::report::summary::Outcome;
+use hil_runtime::rundir::layout::hex;
+use hil_runtime::rundir::record::RecordFile;
 use hil_tests::account::{account, assert_accounts_close, assert_every_message_is_accounted_for};
 use hil_tests::binary::{hil_recorder_binary, hil_runtime_binary};
 use hil_tests::child::{ChildGuard, Finished};

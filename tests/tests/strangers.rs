@@ -22,7 +22,7 @@ use std::time::{Duration, Instant};
 
 use hil_models::measure::account::MessageFate;
 use hil_models::random::RandomStream;
-use hil_runtime::clock::MonotonicClock;
+use hil_runtime::platform::clock::MonotonicClock;
 use hil_runtime::report::summary::{DirectionSummary, RunSummary};
 use hil_tests::account::{account, assert_accounts_close};
 use hil_tests::attacker::{Attacker, Flood};

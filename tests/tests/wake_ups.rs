@@ -7,10 +7,10 @@ use std::time::Duration;
 
 use hil_models::message::MessageType;
 use hil_models::shuttle::ShuttleStatus;
-use hil_runtime::channel::{
+use hil_runtime::platform::clock::MonotonicClock;
+use hil_runtime::shm::{
     ChannelHolder, ChannelSettings, Domain, OutputSettings, TypedOutput, Waiter, Wake,
 };
-use hil_runtime::clock::MonotonicClock;
 use hil_tests::run_folder::RunFolder;
 use nix::errno::Errno;
 use nix::sys::socket::{MsgFlags, recv};

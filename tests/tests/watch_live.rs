@@ -6,7 +6,10 @@ use std::collections::BTreeMap;
 use std::thread;
 use std::time::Duration;
 
-use hil_runtime::watch::{Event, Feed, Origin, Poll, Source, running_runs, select};
+use hil_runtime::rundir::live_run::Source;
+use hil_runtime::rundir::select;
+use hil_runtime::rundir::select::running_runs;
+use hil_runtime::watch::{Event, Feed, Origin, Poll};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::{Trial, wait_until};
 

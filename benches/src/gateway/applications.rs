@@ -10,9 +10,9 @@ use std::time::Duration;
 use hil_models::endpoint::InputPort;
 use hil_models::message::Envelope;
 use hil_models::time::Instant;
-use hil_runtime::channel::DomainAddress;
-use hil_runtime::clock::{MonotonicClock, Wake};
-use hil_runtime::wait::{Pause, WaitMode, WaitStrategy};
+use hil_runtime::platform::clock::{MonotonicClock, Wake};
+use hil_runtime::platform::wait::{Pause, WaitMode, WaitStrategy};
+use hil_runtime::shm::DomainAddress;
 
 use super::hosts::{Joint, Loose, Plan, Ports, SetupError, greet};
 use super::parties::{Party, Usage, claim};

@@ -12,18 +12,19 @@ use std::time::{Duration, Instant};
 
 use hil_models::measure::record::{EgressRecord, IngressRecord};
 use hil_models::message::MessageType;
-use hil_runtime::channel::{
+use hil_runtime::engine::gateway::Surroundings;
+use hil_runtime::engine::gateway::direction;
+use hil_runtime::engine::gateway::direction::{Direction, Opened};
+use hil_runtime::platform::realtime::RealtimeRequest;
+use hil_runtime::platform::wait::WaitMode;
+use hil_runtime::rundir::launch::{DirectionLaunch, Side, SocketLaunch, Transport};
+use hil_runtime::rundir::pipe::RunStart;
+use hil_runtime::rundir::record::{RecordFile, RecordKind, RecordSink, Recorder};
+use hil_runtime::shm::{
     ChannelHolder, ChannelSettings, Domain, DomainAddress, OutputSettings, ShmInput, ShmOutput,
     Waiter,
 };
-use hil_runtime::gateway::Surroundings;
-use hil_runtime::gateway::direction::{self, Direction, Opened};
-use hil_runtime::process::launch::{DirectionLaunch, Side, SocketLaunch, Transport};
-use hil_runtime::process::pipe::RunStart;
-use hil_runtime::realtime::RealtimeRequest;
-use hil_runtime::record::{RecordFile, RecordKind, RecordSink, Recorder};
 use hil_runtime::topology::Timestamps;
-use hil_runtime::wait::WaitMode;
 
 use super::network::Network;
 

@@ -13,10 +13,10 @@ use hil_gateways::transport::udp::{UdpReceiver, UdpSender, UdpSettings};
 use hil_gateways::transport::{DatagramReceiver, DatagramSender};
 use hil_models::endpoint::InputPort;
 use hil_models::time::Instant;
-use hil_runtime::clock::MonotonicClock;
-use hil_runtime::gateway::direction::Direction;
-use hil_runtime::process::launch::DirectionLaunch;
-use hil_runtime::wait::WaitMode;
+use hil_runtime::engine::gateway::direction::Direction;
+use hil_runtime::platform::clock::MonotonicClock;
+use hil_runtime::platform::wait::WaitMode;
+use hil_runtime::rundir::launch::DirectionLaunch;
 use nix::poll::{PollFd, PollFlags, ppoll};
 use nix::sys::time::TimeSpec;
 

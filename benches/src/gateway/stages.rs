@@ -13,9 +13,9 @@ use hil_models::endpoint::InputPort;
 use hil_models::measure::record::{EgressRecord, IngressRecord};
 use hil_models::message::Envelope;
 use hil_models::time::Instant;
-use hil_runtime::channel::{Domain, RawInput, RawOutput};
-use hil_runtime::clock::MonotonicClock;
-use hil_runtime::record::RecordSink;
+use hil_runtime::platform::clock::MonotonicClock;
+use hil_runtime::rundir::record::RecordSink;
+use hil_runtime::shm::{Domain, RawInput, RawOutput};
 
 use super::hosts::{Hosts, Plan, Ports, SetupError};
 use super::side::EchoSide;
@@ -290,7 +290,7 @@ fn bridges(
 ) -> Result<(EgressBridge, IngressBridge), SetupError> {
     let size = u32::try_from(plan.size_bytes)?;
     let channel = ChannelIdentity::new(1, &plan.channel_of(0), plan.message().name, size, 8);
-    let clock_id = hil_runtime::channel::clock_id()?;
+    let clock_id = hil_runtime::shm::clock_id()?;
     let now = MonotonicClock::now();
     let mut egress = EgressBridge::new(EgressSettings {
         channel: channel.clone(),

@@ -4,8 +4,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use hil_models::measure::record::{EgressRecord, IngressRecord, UNAVAILABLE};
-use hil_runtime::manifest::Manifest;
-use hil_runtime::record::RecordKind;
+use hil_runtime::rundir::manifest::Manifest;
+use hil_runtime::rundir::record::RecordKind;
 
 use crate::run::Run;
 

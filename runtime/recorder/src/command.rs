@@ -5,11 +5,11 @@ use std::path::Path;
 use std::process::ExitCode;
 
 use clap::{CommandFactory as _, Parser};
-use hil_runtime::console::Console;
-use hil_runtime::documents;
-use hil_runtime::progress::Progress;
-use hil_runtime::signals::{EXIT_INTERRUPTED, Signals};
-use hil_runtime::words::counted_plainly;
+use hil_runtime::platform::console::Console;
+use hil_runtime::platform::documents;
+use hil_runtime::platform::progress::Progress;
+use hil_runtime::platform::signals::{EXIT_INTERRUPTED, Signals};
+use hil_runtime::platform::words::counted_plainly;
 
 use crate::cli::{Cli, Command, ServeOptions};
 use crate::convert::{ConvertError, convert};

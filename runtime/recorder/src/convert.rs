@@ -10,7 +10,7 @@ use std::time::Duration;
 use hil_models::link::condition::LinkConditionRecord;
 use hil_models::message::Envelope;
 use hil_models::trace::Trace;
-use hil_runtime::record::{RecordFile, RecordKind};
+use hil_runtime::rundir::record::{RecordFile, RecordKind};
 use prost::Message as _;
 
 use crate::clocks::Clocks;

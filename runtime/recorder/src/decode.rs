@@ -2,8 +2,8 @@
 //! where a field is reserved. The layout is the live channel's, and the file's schema must be the
 //! one that this layout gives, so that nothing is read as something else.
 
-use hil_runtime::layout::{LayoutFault, checked_element_bytes};
-use hil_runtime::manifest::{FieldDescription, KindDescription};
+use hil_runtime::rundir::layout::{LayoutFault, checked_element_bytes};
+use hil_runtime::rundir::manifest::{FieldDescription, KindDescription};
 use prost::encoding::{WireType, decode_key, decode_varint};
 
 use crate::schema::{self, Schema};
@@ -296,7 +296,7 @@ mod tests {
     use hil_models::fleet::messages::State;
     use hil_models::message::Message;
     use hil_models::random::RandomStream;
-    use hil_runtime::manifest::describe_fields;
+    use hil_runtime::rundir::manifest::describe_fields;
 
     fn pair<M: Message>() -> (Encoder, Decoder) {
         let fields = describe_fields(M::FIELDS);

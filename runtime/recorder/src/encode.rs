@@ -1,8 +1,8 @@
 //! Messages as they lie in memory, written as protobuf by their layout. Schemas are made in
 //! [`crate::schema`]; the two agree because both number fields by position.
 
-use hil_runtime::layout::{LayoutFault, checked_element_bytes};
-use hil_runtime::manifest::{FieldDescription, KindDescription};
+use hil_runtime::rundir::layout::{LayoutFault, checked_element_bytes};
+use hil_runtime::rundir::manifest::{FieldDescription, KindDescription};
 use prost::encoding::{WireType, encode_key, encode_varint};
 
 use crate::schema::{self, Schema};
@@ -123,7 +123,7 @@ mod tests {
     use bytemuck::Zeroable;
     use hil_models::egm::messages::{EgmArrival, EgmFeedback};
     use hil_models::message::Message;
-    use hil_runtime::manifest::describe_fields;
+    use hil_runtime::rundir::manifest::describe_fields;
     use prost::Message as _;
 
     #[derive(prost::Message)]

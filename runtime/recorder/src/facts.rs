@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use std::fs;
 
 use hil_models::yumi::description::Urdf;
-use hil_runtime::run_folder::RunFolder;
+use hil_runtime::rundir::run_folder::RunFolder;
 use mcap::Attachment;
 use serde_json::Value;
 

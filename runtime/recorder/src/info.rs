@@ -5,8 +5,8 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::path::Path;
 
-use hil_runtime::run_folder::utc_text;
-use hil_runtime::words::counted_plainly;
+use hil_runtime::platform::words::counted_plainly;
+use hil_runtime::rundir::run_folder::utc_text;
 use mcap::records::Record;
 use serde::Serialize;
 use std::time::{Duration, UNIX_EPOCH};

@@ -9,7 +9,8 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use hil_models::measure::record::IngressRecord;
-use hil_runtime::watch::{Record, Seen, Stage};
+use hil_runtime::rundir::live_run::Stage;
+use hil_runtime::watch::{Record, Seen};
 
 use crate::net::{self, Latencies, MessageLatency};
 use crate::newest::Newest;

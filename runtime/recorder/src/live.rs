@@ -8,7 +8,8 @@ use std::time::Instant;
 
 use hil_models::measure::record::UNAVAILABLE;
 use hil_models::message::Envelope;
-use hil_runtime::watch::{Event, Feed, Origin, Record, Seen, Source, WatchedChannel};
+use hil_runtime::rundir::live_run::Source;
+use hil_runtime::watch::{Event, Feed, Origin, Record, Seen, WatchedChannel};
 use prost::Message as _;
 
 use crate::conditions::Conditions;

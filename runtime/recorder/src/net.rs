@@ -7,7 +7,7 @@ use hil_models::measure::record::{
     EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE,
 };
 use hil_models::trace::{Trace, TraceFate, TraceRecord, UNAVAILABLE_NS, UNBOUNDED_NS};
-use hil_runtime::record::{RecordFile, RecordKind};
+use hil_runtime::rundir::record::{RecordFile, RecordKind};
 use prost_types::field_descriptor_proto::Type;
 
 use crate::schema::{self, OwnField, Schema};

@@ -13,7 +13,7 @@ use std::thread;
 use std::time::Duration;
 
 use clap::ValueEnum;
-use hil_runtime::realtime::{
+use hil_runtime::platform::realtime::{
     GrantOutcome, RealtimeGrantItem, RealtimeRequest, SchedulingPolicy, apply, move_threads,
 };
 

@@ -7,11 +7,11 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use hil_models::trace::{Trace, wire};
-use hil_runtime::manifest::{ChannelDescription, Manifest};
-use hil_runtime::record::{RecordFile, RecordKind};
+use hil_runtime::platform::words::counted_plainly;
 use hil_runtime::report::summary::RunSummary;
-use hil_runtime::run_folder::RunFolder;
-use hil_runtime::words::counted_plainly;
+use hil_runtime::rundir::manifest::{ChannelDescription, Manifest};
+use hil_runtime::rundir::record::{RecordFile, RecordKind};
+use hil_runtime::rundir::run_folder::RunFolder;
 use serde_json::Value;
 
 /// The kinds of records that end in a recording.

@@ -7,8 +7,9 @@
 
 use std::collections::BTreeSet;
 
-use hil_runtime::layout::{self, LayoutFault};
-use hil_runtime::manifest::{FieldDescription, KindDescription};
+use hil_runtime::rundir::layout;
+use hil_runtime::rundir::layout::LayoutFault;
+use hil_runtime::rundir::manifest::{FieldDescription, KindDescription};
 use prost::Message as _;
 use prost_types::field_descriptor_proto::{Label, Type};
 use prost_types::{
@@ -195,7 +196,7 @@ mod tests {
     use hil_models::egm::messages::EgmFeedback;
     use hil_models::fleet::messages::State;
     use hil_models::message::Message;
-    use hil_runtime::manifest::describe_fields;
+    use hil_runtime::rundir::manifest::describe_fields;
 
     fn descriptor(schema: &Schema) -> DescriptorProto {
         let set = FileDescriptorSet::decode(schema.data.as_slice()).unwrap();

@@ -4,7 +4,7 @@
 
 use super::network::Interfaces;
 use super::{Finding, StampCapabilityQuery};
-use crate::card_clock::probing::{CardProbe, Delivery};
+use crate::nic::card_clock::probing::{CardProbe, Delivery};
 
 /// Offsets above this are no matter of accuracy but of another time scale or an unset clock.
 const FOREIGN_OFFSET_NS: u64 = 1_000_000;

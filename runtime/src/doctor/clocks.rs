@@ -5,8 +5,8 @@ use std::hint::black_box;
 
 use super::Finding;
 use super::finding::Severity;
-use crate::clock::MonotonicClock;
-use crate::clock_discipline::{HostDiscipline, common_bound_ns};
+use crate::platform::clock::MonotonicClock;
+use crate::platform::clock_discipline::{HostDiscipline, common_bound_ns};
 
 /// A vDSO read stays below this on any PC of the last ten years.
 const READ_COST_NS_OK: f64 = 100.0;

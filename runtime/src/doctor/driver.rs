@@ -5,8 +5,8 @@ use nix::sys::socket::SockProtocol;
 
 use super::Finding;
 use super::finding::Severity;
-use crate::radio::conversation::Conversation;
-use crate::radio::netlink::{Attributes, encode_attributes, u32_at};
+use crate::nic::radio::conversation::Conversation;
+use crate::nic::radio::netlink::{Attributes, encode_attributes, u32_at};
 
 /// Numbers of `linux/ethtool_netlink.h`.
 const RINGS_GET: u8 = 15;

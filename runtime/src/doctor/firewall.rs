@@ -6,9 +6,9 @@ use nix::sys::socket::SockProtocol;
 
 use super::Finding;
 use super::plan::{Protocol, WantedPort};
-use crate::host_facts::{Fact, HostFiles};
-use crate::radio::conversation::Conversation;
-use crate::radio::netlink::{Attributes, u32_at};
+use crate::nic::radio::conversation::Conversation;
+use crate::nic::radio::netlink::{Attributes, u32_at};
+use crate::platform::host_facts::{Fact, HostFiles};
 
 /// `NFNL_SUBSYS_NFTABLES` and `NFT_MSG_GETCHAIN` of `linux/netfilter`.
 const GET_CHAINS: u16 = (10 << 8) | 4;
@@ -179,8 +179,8 @@ fn legacy_tables(files: &HostFiles) -> Fact<Vec<String>> {
 mod tests {
     use super::*;
     use crate::doctor::finding::Severity;
-    use crate::host_facts::FakeHost;
-    use crate::radio::netlink::encode_attributes;
+    use crate::nic::radio::netlink::encode_attributes;
+    use crate::platform::host_facts::FakeHost;
 
     fn chain(hook: u32, policy: u32, rules: u32) -> Option<Chain> {
         let hook = encode_attributes(&[(HOOK_NUMBER, &hook.to_be_bytes())]);

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use super::Finding;
 use super::network::has_device;
 use super::plan::Plan;
-use crate::host_facts::{Fact, HostFiles, format_cpu_list};
+use crate::platform::host_facts::{Fact, HostFiles, format_cpu_list};
 
 /// An interrupt of a card.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -192,7 +192,7 @@ mod tests {
     use super::*;
     use crate::doctor::finding::Severity;
     use crate::doctor::plan::Pin;
-    use crate::host_facts::FakeHost;
+    use crate::platform::host_facts::FakeHost;
 
     const TABLE: &str = "           CPU0       CPU1       CPU3\n\
         \x20 8:          1          0          0  IO-APIC   8-edge      rtc0\n\

@@ -4,7 +4,7 @@
 use super::Finding;
 use super::finding::Severity;
 use super::plan::Plan;
-use crate::host_facts::{
+use crate::platform::host_facts::{
     Fact, HostFiles, KernelOptions, PreemptionMode, RealtimeThrottle, boot_parameter, clocksource,
     format_cpu_list, has_fair_server, load_average, online_cpus, preemption, virtual_machine,
 };

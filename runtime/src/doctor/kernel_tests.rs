@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::doctor::plan::Pin;
-use crate::host_facts::FakeHost;
+use crate::platform::host_facts::FakeHost;
 
 type Look = fn(&HostFiles) -> Finding;
 

@@ -17,11 +17,11 @@ use serde::{Deserialize, Serialize};
 
 pub use self::claims::{Claim, Standing};
 pub use self::cyclictest::{CyclictestReport, CyclictestThread};
-use crate::host_facts::{
+use crate::platform::host_facts::{
     Fact, HostFiles, ProcessorTicks, RealtimeThrottle, format_cpu_list, load_average, online_cpus,
     virtual_machine,
 };
-use crate::progress::Stage;
+use crate::platform::progress::Stage;
 
 /// A busy poller holds its CPU at real-time priority; the kernel's own threads there wait this long at
 /// most.

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use super::latency::{LatencyRequest, Watch, measure};
 use super::*;
-use crate::host_facts::FakeHost;
+use crate::platform::host_facts::FakeHost;
 
 fn silent_query(_: &str) -> Result<StampCapabilities, String> {
     Err("no query in this test".to_owned())

@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 use super::Finding;
 use super::finding::Severity;
 use super::plan::Plan;
-use crate::host_facts::{Fact, HostFiles};
+use crate::platform::host_facts::{Fact, HostFiles};
 
 /// Bits of `SO_TIMESTAMPING` in `linux/net_tstamp.h`.
 const TX_HARDWARE: u32 = 1 << 0;
@@ -247,7 +247,7 @@ fn buffers(files: &HostFiles) -> Finding {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::host_facts::FakeHost;
+    use crate::platform::host_facts::FakeHost;
 
     const VETH: StampCapabilities = StampCapabilities {
         so_timestamping: 0x1a,

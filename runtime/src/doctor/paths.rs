@@ -6,7 +6,7 @@ use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
 use super::Finding;
 use super::network::Interfaces;
 use super::plan::{LinkLoad, Peer, Plan};
-use crate::host_facts::{Fact, HostFiles};
+use crate::platform::host_facts::{Fact, HostFiles};
 
 /// The discard port (RFC 863); nothing is sent to it.
 const ANY_PORT: u16 = 9;
@@ -224,7 +224,7 @@ mod tests {
     use super::*;
     use crate::doctor::finding::Severity;
     use crate::doctor::network::Interface;
-    use crate::host_facts::FakeHost;
+    use crate::platform::host_facts::FakeHost;
 
     fn present(entries: &[(&str, &str, u32)]) -> Interfaces {
         let mut found = Interfaces::new();

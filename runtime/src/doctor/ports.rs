@@ -5,7 +5,7 @@ use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 
 use super::Finding;
 use super::plan::{Protocol, WantedPort};
-use crate::host_facts::{Fact, HostFiles};
+use crate::platform::host_facts::{Fact, HostFiles};
 
 /// `TCP_LISTEN` in the socket tables.
 const LISTENING: &str = "0A";
@@ -71,7 +71,7 @@ fn list(wanted: &[WantedPort]) -> String {
         ports.sort_unstable();
         ports.dedup();
         (!ports.is_empty()).then(|| {
-            let ports = crate::host_facts::format_cpu_list(&ports);
+            let ports = crate::platform::host_facts::format_cpu_list(&ports);
             format!("{} {ports}", protocol.word())
         })
     });
@@ -158,7 +158,7 @@ mod tests {
 
     use super::*;
     use crate::doctor::finding::Severity;
-    use crate::host_facts::FakeHost;
+    use crate::platform::host_facts::FakeHost;
 
     const HEADER: &str = "sl local_address rem_address st tx_queue tr tm->when uid timeout inode";
 

@@ -11,8 +11,8 @@ use nix::sys::resource::Resource;
 use nix::unistd::{Uid, User};
 
 use super::Finding;
-use crate::host_facts::{CAP_IPC_LOCK, CAP_SYS_NICE, Fact, HostFiles, limit};
-use crate::realtime::{GrantOutcome, RealtimeRequest, SchedulingPolicy, apply};
+use crate::platform::host_facts::{CAP_IPC_LOCK, CAP_SYS_NICE, Fact, HostFiles, limit};
+use crate::platform::realtime::{GrantOutcome, RealtimeRequest, SchedulingPolicy, apply};
 
 /// A typical priority of a control loop, above the interrupt threads of `PREEMPT_RT`.
 const TRIED_PRIORITY: u8 = 80;
@@ -165,7 +165,7 @@ fn held(files: &HostFiles, capability: u32) -> &'static str {
 mod tests {
     use super::*;
     use crate::doctor::finding::Severity;
-    use crate::host_facts::FakeHost;
+    use crate::platform::host_facts::FakeHost;
 
     const UNLOCKED: (&str, &str) = (
         "/proc/self/status",

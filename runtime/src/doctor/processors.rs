@@ -5,7 +5,7 @@
 use super::Finding;
 use super::finding::Severity;
 use super::plan::Plan;
-use crate::host_facts::{
+use crate::platform::host_facts::{
     CPU_FOLDER, Fact, HostFiles, IsolatedCpus, KernelOptions, format_cpu_list, governors,
     online_cpus,
 };
@@ -226,7 +226,7 @@ fn siblings(files: &HostFiles, plan: &Plan) -> Finding {
 mod tests {
     use super::*;
     use crate::doctor::plan::Pin;
-    use crate::host_facts::FakeHost;
+    use crate::platform::host_facts::FakeHost;
 
     fn pinned(cpus: &[usize], spins: bool) -> Plan {
         let pins = cpus.iter().map(|cpu| Pin {

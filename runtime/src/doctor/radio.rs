@@ -3,8 +3,8 @@
 
 use super::Finding;
 use super::finding::Severity;
-use crate::radio::nl80211::Station;
-use crate::radio::socket::{RadioError, RadioSocket};
+use crate::nic::radio::nl80211::Station;
+use crate::nic::radio::socket::{RadioError, RadioSocket};
 
 /// Below this a datagram of 200 bytes is on the air for 270 us and more.
 const BITRATE_KBPS_MIN: u32 = 6_000;
@@ -77,7 +77,7 @@ fn bitrate(stations: &[Station]) -> (String, Option<u32>) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::radio::nl80211::{Generation, Rate};
+    use crate::nic::radio::nl80211::{Generation, Rate};
 
     fn station(kbps: Option<u32>) -> Station {
         Station {

@@ -57,7 +57,7 @@ impl DoctorReport {
         let mut text = String::new();
         let fact = |label: &str| {
             let found = self.host.find(label);
-            found.map_or_else(String::new, crate::host_facts::Fact::to_text)
+            found.map_or_else(String::new, crate::platform::host_facts::Fact::to_text)
         };
         push(
             &mut text,

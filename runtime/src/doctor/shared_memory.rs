@@ -11,8 +11,8 @@ use nix::unistd::{AccessFlags, access};
 
 use super::Finding;
 use super::finding::Severity;
-use crate::channel::{Domain, ForeignNodes};
-use crate::host_facts::{Fact, HostFiles};
+use crate::platform::host_facts::{Fact, HostFiles};
+use crate::shm::{Domain, ForeignNodes};
 
 /// Below this a handful of channels with large samples does not fit.
 const FREE_BYTES_MIN: u64 = 64 * 1024 * 1024;
@@ -247,7 +247,7 @@ fn runtime_folder(folders: &[PathBuf]) -> Finding {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::host_facts::FakeHost;
+    use crate::platform::host_facts::FakeHost;
 
     const MARK: &str = "/run/hil/abc/hil-domain";
     const SEGMENT: &str = "/dev/shm/h1a2b3c4d_one";

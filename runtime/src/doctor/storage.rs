@@ -8,7 +8,7 @@ use nix::unistd::{AccessFlags, Uid, access};
 
 use super::Finding;
 use super::finding::Severity;
-use crate::host_facts::{Fact, HostFiles};
+use crate::platform::host_facts::{Fact, HostFiles};
 
 const MEBIBYTE: u64 = 1024 * 1024;
 /// Below this a run of an hour does not fit.
@@ -230,7 +230,7 @@ fn judge(record_folder: &Path, disk: &Disk) -> Finding {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::host_facts::FakeHost;
+    use crate::platform::host_facts::FakeHost;
 
     const PERSON: u32 = 1000;
 

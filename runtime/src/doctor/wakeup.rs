@@ -3,7 +3,7 @@
 use super::Finding;
 use super::finding::Severity;
 use super::latency::LatencyReport;
-use crate::host_facts::Fact;
+use crate::platform::host_facts::Fact;
 
 /// A wake-up p99 below this leaves room for claims in tens of microseconds.
 const P99_NS_OK: i64 = 100_000;
@@ -57,7 +57,7 @@ mod tests {
 
     use super::super::latency::{LatencyRequest, Quantiles, Watch, measure};
     use super::*;
-    use crate::host_facts::FakeHost;
+    use crate::platform::host_facts::FakeHost;
 
     /// A real report, with the figures of this test in it.
     fn measured(p99_ns: Option<i64>) -> LatencyReport {

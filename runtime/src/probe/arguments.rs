@@ -7,7 +7,7 @@ use clap::{Args, Subcommand, ValueEnum};
 use hil_gateways::capture::flow::FlowFilter;
 
 use super::tap::TapChoice;
-use crate::cli::whole;
+use crate::cli::arguments::whole;
 
 const EXAMPLES: &str = "\
 Examples:

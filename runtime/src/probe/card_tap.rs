@@ -13,7 +13,7 @@ use hil_gateways::transport::timestamping::TimestampCapabilities;
 
 use super::live::{LiveError, flow_list, told};
 use super::output::{Output, append};
-use crate::card_clock::guard::GuardedCard;
+use crate::nic::card_clock::guard::GuardedCard;
 
 /// Reads of the card's clock of which the narrowest counts.
 const READ_ATTEMPTS: u32 = 10;

@@ -19,10 +19,10 @@ use serde::Serialize;
 
 use super::analyse::{Reading, quantiles};
 use super::point_clocks::WireClocks;
-use crate::progress::Stage;
-use crate::record::{RecordFile, RecordFileError, RecordKind};
+use crate::platform::progress::Stage;
 use crate::report::summary::{RunSummary, SummaryError};
-use crate::run_folder::RunFolder;
+use crate::rundir::record::{RecordFile, RecordFileError, RecordKind};
+use crate::rundir::run_folder::RunFolder;
 
 /// Why nothing could be compared.
 #[derive(Debug, thiserror::Error)]

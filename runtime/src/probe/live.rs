@@ -16,8 +16,8 @@ use hil_gateways::transport::ring_frame::StampSource;
 use super::card_tap::{CardResult, CardTap};
 use super::output::{Output, append};
 use super::tap::{self, TapChoice};
-use crate::console::Console;
-use crate::signals::Signals;
+use crate::platform::console::Console;
+use crate::platform::signals::Signals;
 
 /// Time between two looks into the rings.
 const LOOK_PERIOD: Duration = Duration::from_millis(20);

@@ -22,9 +22,9 @@ use hil_gateways::transport::packet_ring::{RingError, RingStamps};
 use self::analyse::{Reading, Report};
 use self::arguments::{LiveArgs, ProbeArgs, ProbeWork, ReadingArgs, Stamps};
 use self::live::{InterfaceResult, LiveError, LiveResult, Request};
-use crate::console::Console;
-use crate::progress::Progress;
-use crate::signals::{EXIT_INTERRUPTED, Signals};
+use crate::platform::console::Console;
+use crate::platform::progress::Progress;
+use crate::platform::signals::{EXIT_INTERRUPTED, Signals};
 
 /// Exit codes; the command's help lists them.
 mod exit {

@@ -10,7 +10,7 @@ use super::summary::{
     ChannelSummary, Fact, LinkKind, NO_ROOM, Outcome, ProcessSummary, RunSummary,
 };
 use super::terminal::{JOINT, grouped, percent};
-use crate::words::counted;
+use crate::platform::words::counted;
 
 /// Share of skipped ticks above which the host, not the network, shaped the run.
 pub const SKIPPED_TICK_RATIO_MAX: f64 = 0.001;

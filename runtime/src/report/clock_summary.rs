@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use hil_models::clock::ClockFigures;
 use serde::{Deserialize, Serialize};
 
-use crate::clock_discipline::HostDiscipline;
+use crate::platform::clock_discipline::HostDiscipline;
 use crate::topology::describe_end;
 
 /// The clocks of all hosts.

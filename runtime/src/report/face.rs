@@ -1,5 +1,5 @@
 //! What a summary says of the foreign programs that played a role through an EGM face. It holds
-//! figures; `crate::face::figures` computes them.
+//! figures; `crate::report::face_figures` computes them.
 
 use hil_models::measure::histogram::Distribution;
 use serde::{Deserialize, Serialize};

@@ -6,7 +6,7 @@ use hil_models::measure::network::{NetworkEventKind, NetworkFigures};
 use serde::{Deserialize, Serialize};
 
 use super::terminal::{JOINT, duration_s, grouped, seconds};
-use crate::words::plural;
+use crate::platform::words::plural;
 
 /// How long before an event of the score the network is looked at, seconds. The longest effect
 /// that is known of: a session that an outage ended takes that long to come back.

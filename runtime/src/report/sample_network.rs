@@ -11,7 +11,7 @@ use hil_models::time::{Alignment, Instant};
 
 use super::network::{Correlation, NetworkReport};
 use super::score_event::ScoreEvents;
-use crate::analysis::network::{AxisClocks, ChannelPassages, NetworkBuilder, RobotSeries};
+use crate::report::analysis::network::{AxisClocks, ChannelPassages, NetworkBuilder, RobotSeries};
 
 const MS: i64 = 1_000_000;
 const RUN_NS: i64 = 20_000 * MS;

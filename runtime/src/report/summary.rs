@@ -22,7 +22,7 @@ use super::link_change::LinkChange;
 use super::network::NetworkReport;
 use super::radio::RadioReport;
 use super::score_event::ScoreEvents;
-use crate::card_clock::figures::HardwareStamps;
+use crate::report::card_figures::HardwareStamps;
 
 /// Version of the `summary.json` layout.
 pub const SCHEMA_VERSION: u32 = 1;

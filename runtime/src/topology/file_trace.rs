@@ -7,7 +7,7 @@ use super::errors::Fault;
 use super::limits;
 use super::reader::Reader;
 use super::resolved::{duration, put};
-use crate::trace::source::{BaseFolder, NotedDelays, TraceSource};
+use crate::topology::trace_source::{BaseFolder, NotedDelays, TraceSource};
 
 const MATCHES: &[(&str, TraceMatch)] = &[
     ("index", TraceMatch::Index),

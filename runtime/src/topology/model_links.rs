@@ -8,7 +8,7 @@ use hil_models::link::spec::LinkSpec;
 use serde::{Deserialize, Serialize};
 
 use super::model::{Execution, OnExit, Topology, words};
-use crate::trace::source::{BaseFolder, TraceSource};
+use crate::topology::trace_source::{BaseFolder, TraceSource};
 
 /// One `[links.<name>]`.
 #[derive(Debug, Clone, PartialEq)]

@@ -9,9 +9,9 @@ use hil_models::message::Envelope;
 
 use super::feed::WatchedChannel;
 use super::follow::Batch;
-use crate::face::record::{FaceReceivedRecord, FaceSentRecord};
-use crate::radio::record::RadioRecord;
-use crate::record::RecordKind;
+use crate::rundir::face_record::{FaceReceivedRecord, FaceSentRecord};
+use crate::rundir::radio_record::RadioRecord;
+use crate::rundir::record::RecordKind;
 
 /// Something that happened in a run. Messages and records of one process and kind come in order;
 /// otherwise the order is roughly that of time, and what a process wrote comes up to 20 ms later.

@@ -7,13 +7,13 @@ use std::time::{Duration, Instant as WallInstant};
 
 use super::event::{Event, Origin, Record};
 use super::follow::{Batch, RecordFollower};
-use super::live::{LiveRun, Source};
 use super::passive::{PassiveCounters, PassiveReader};
 use super::shared::Shared;
 use super::since::Since;
-use crate::channel::{Domain, DomainError};
-use crate::clock::MonotonicClock;
-use crate::manifest::{ChannelDescription, Manifest};
+use crate::platform::clock::MonotonicClock;
+use crate::rundir::live_run::{LiveRun, Source};
+use crate::rundir::manifest::{ChannelDescription, Manifest};
+use crate::shm::{Domain, DomainError};
 
 /// Bytes of records given out per poll, and messages per channel read from shared memory.
 const POLL_BYTES_MAX: usize = 4 << 20;

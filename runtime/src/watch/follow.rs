@@ -12,8 +12,8 @@ use std::time::{Duration, Instant as WallInstant};
 use bytemuck::Pod;
 use hil_models::message::Envelope;
 
-use crate::record::RecordKind;
-use crate::record::file::{HEADER_BYTES, RecordHeader};
+use crate::rundir::record::RecordKind;
+use crate::rundir::record::file::{HEADER_BYTES, RecordHeader};
 
 /// How often it looks for new files: processes that start again write new ones.
 const LOOK_PERIOD: Duration = Duration::from_millis(100);

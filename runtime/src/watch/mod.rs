@@ -3,8 +3,9 @@
 //!
 //! Read in this order:
 //!
-//! 1. [`running_runs`] and [`select`]: which runs go on this host. Each supervisor announces its
-//!    run in a [`LiveRun`].
+//! 1. [`running_runs`](crate::rundir::select::running_runs) and
+//!    [`select`](crate::rundir::select::select): which runs go on this host. Each supervisor announces its
+//!    run in a [`LiveRun`](crate::rundir::live_run::LiveRun).
 //! 2. [`RecordFollower`]: what the processes of a run wrote into its folder since the last look.
 //! 3. [`PassiveReader`]: a channel read from shared memory, without a place in the run.
 //! 4. [`Feed`]: both of them as one stream of [`Event`]s, and what was missed.
@@ -14,25 +15,21 @@
 //! look, and costs the run nothing. Messages that nobody on this host records, of a user's own
 //! program or from another host, are read from shared memory from the moment one begins to look.
 
-mod announcement;
 mod event;
 mod feed;
 mod follow;
-mod live;
+pub mod link;
+pub mod live;
 mod passive;
 mod seen;
-mod select;
 mod shared;
 mod since;
 
 #[cfg(test)]
 mod tests;
 
-pub(crate) use announcement::{Announcement, source, withdraw_abandoned};
 pub use event::{Event, Origin, Record};
 pub use feed::{Feed, FeedError, Poll, WatchedChannel};
 pub use follow::{Batch, RecordFollower};
-pub use live::{LIVE_VERSION, LiveChannel, LiveRun, Source, Stage};
 pub use passive::{PassiveCounters, PassiveReader, observer_depth};
 pub use seen::Seen;
-pub use select::{SelectError, running_runs, running_runs_below, select, select_below};

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use hil_models::message::Envelope;
 
-use crate::channel::{ChannelError, Domain, InputCounters, RawInput, SequenceTracker};
+use crate::shm::{ChannelError, Domain, InputCounters, RawInput, SequenceTracker};
 
 /// Memory that the waiting messages of one observer may take, bytes. A writer's memory holds as
 /// many for each of its readers, so this is small.

@@ -4,7 +4,7 @@ use hil_models::measure::record::{IngressRecord, UNAVAILABLE};
 
 use super::passive::{PassiveCounters, PassiveReader, observer_depth};
 use super::seen::Seen;
-use crate::channel::ChannelError;
+use crate::shm::ChannelError;
 
 /// A channel that is read from shared memory.
 #[derive(Debug)]

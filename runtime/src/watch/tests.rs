@@ -11,10 +11,10 @@ use hil_models::message::Envelope;
 use hil_models::random::RandomStream;
 
 use super::*;
-use crate::channel::{ChannelHolder, ChannelSettings, Domain, RawOutput, TypeInfo};
-use crate::clock::MonotonicClock;
-use crate::record::RecordKind;
-use crate::record::file::RecordHeader;
+use crate::platform::clock::MonotonicClock;
+use crate::rundir::record::RecordKind;
+use crate::rundir::record::file::RecordHeader;
+use crate::shm::{ChannelHolder, ChannelSettings, Domain, RawOutput, TypeInfo};
 
 /// A folder of the test's own, and a short name for a domain below it.
 struct Place(PathBuf);

@@ -5,17 +5,17 @@ use std::path::Path;
 
 use hil_gateways::capture::flow::FlowFilter;
 use hil_models::measure::record::{IngressRecord, PublishedRecord};
-use hil_runtime::channel::DomainAddress;
-use hil_runtime::clock_discipline::{ChronyTracking, NtpVariables, PtpStatus};
-use hil_runtime::layout::{Decoder, Value};
-use hil_runtime::manifest::FieldDescription;
-use hil_runtime::radio;
-use hil_runtime::record::RecordFile;
-use hil_runtime::record::file::HEADER_BYTES;
-use hil_runtime::report::summary::RunSummary;
-use hil_runtime::supervisor::frame::{
+use hil_runtime::engine::supervisor::frame::{
     FRAME_BYTES_MAX, Frame, is_plain_record_name, read_frame, write_chunk, write_message,
 };
+use hil_runtime::nic::radio;
+use hil_runtime::platform::clock_discipline::{ChronyTracking, NtpVariables, PtpStatus};
+use hil_runtime::report::summary::RunSummary;
+use hil_runtime::rundir::layout::{Decoder, Value};
+use hil_runtime::rundir::manifest::FieldDescription;
+use hil_runtime::rundir::record::RecordFile;
+use hil_runtime::rundir::record::file::HEADER_BYTES;
+use hil_runtime::shm::DomainAddress;
 use hil_runtime::topology::read_duration;
 
 use crate::Verdict;

@@ -8,8 +8,8 @@ use std::path::Path;
 
 use hil_models::measure::account::MessageFate;
 use hil_models::measure::record::TakenRecord;
-use hil_runtime::record::{RecordFile, RecordKind};
 use hil_runtime::report::summary::{Outcome, RunSummary};
+use hil_runtime::rundir::record::{RecordFile, RecordKind};
 use nix::unistd::Pid;
 
 use super::episode::{Ends, HOSTS, Stage};
@@ -288,7 +288,7 @@ pub fn leftovers(stage: &Stage, host: usize) -> Vec<String> {
 mod tests {
     use super::*;
     use crate::run_folder::RunFolder;
-    use hil_runtime::record::file::RecordHeader;
+    use hil_runtime::rundir::record::file::RecordHeader;
 
     fn taken(epoch: u32, sequence: u64) -> TakenRecord {
         TakenRecord {

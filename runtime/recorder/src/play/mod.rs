@@ -10,11 +10,11 @@ use std::thread;
 use std::time::Duration;
 
 use hil_models::time::Instant;
-use hil_runtime::clock::{MonotonicClock, Wake};
-use hil_runtime::console::Console;
-use hil_runtime::manifest::ChannelDescription;
-use hil_runtime::signals::Signals;
-use hil_runtime::words::counted_plainly;
+use hil_runtime::platform::clock::{MonotonicClock, Wake};
+use hil_runtime::platform::console::Console;
+use hil_runtime::platform::signals::Signals;
+use hil_runtime::platform::words::counted_plainly;
+use hil_runtime::rundir::manifest::ChannelDescription;
 
 use schedule::{Punctuality, Schedule};
 pub(crate) use source::SourceError;

@@ -9,11 +9,13 @@ use std::thread;
 use std::time::{Duration, Instant as WallInstant};
 
 use hil_models::message::Envelope;
-use hil_runtime::channel::{Census, ChannelError, Domain, DomainError, RawOutput};
-use hil_runtime::clock::MonotonicClock;
-use hil_runtime::live::status::has_begun;
-use hil_runtime::manifest::{ChannelDescription, Manifest};
-use hil_runtime::watch::{self, LiveRun, SelectError};
+use hil_runtime::platform::clock::MonotonicClock;
+use hil_runtime::rundir::live_run::LiveRun;
+use hil_runtime::rundir::manifest::{ChannelDescription, Manifest};
+use hil_runtime::rundir::select::SelectError;
+use hil_runtime::rundir::status::has_begun;
+use hil_runtime::shm::{Census, ChannelError, Domain, DomainError, RawOutput};
+use hil_runtime::watch;
 use serde_json::Value;
 
 /// How long a writer that died may take to lose its place: supervisors look ten times a second.

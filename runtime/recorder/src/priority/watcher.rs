@@ -12,7 +12,7 @@ use std::sync::mpsc::{Sender, channel};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use hil_runtime::realtime::SchedulingPolicy;
+use hil_runtime::platform::realtime::SchedulingPolicy;
 
 use super::{Precedence, own};
 

@@ -23,11 +23,14 @@ use std::sync::Arc;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use hil_runtime::console::Console;
-use hil_runtime::progress::Progress;
-use hil_runtime::run_folder::RunFolder;
-use hil_runtime::signals::{EXIT_INTERRUPTED, Signals};
-use hil_runtime::watch::{FeedError, LiveRun, SelectError, select};
+use hil_runtime::platform::console::Console;
+use hil_runtime::platform::progress::Progress;
+use hil_runtime::platform::signals::{EXIT_INTERRUPTED, Signals};
+use hil_runtime::rundir::live_run::LiveRun;
+use hil_runtime::rundir::run_folder::RunFolder;
+use hil_runtime::rundir::select;
+use hil_runtime::rundir::select::SelectError;
+use hil_runtime::watch::FeedError;
 use tokio::runtime::Runtime;
 
 use crate::cli::ServeOptions;

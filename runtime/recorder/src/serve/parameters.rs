@@ -22,8 +22,8 @@ use foxglove::websocket::{
     SetParametersResponder,
 };
 use hil_models::link::condition::LinkCondition;
-use hil_runtime::link::{LinkDirection, RunLinks};
 use hil_runtime::topology::read_duration;
+use hil_runtime::watch::link::{LinkDirection, RunLinks};
 use serde_json::{Value, json};
 
 /// How often it is looked whether somebody else changed a link.

@@ -7,9 +7,9 @@ use hil_models::measure::record::{
     EgressRecord, IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE,
 };
 use hil_models::time::duration_ns;
-use hil_runtime::record::{RecordFile, RecordKind};
 use hil_runtime::report::assessment::Assessment;
 use hil_runtime::report::summary::RunSummary;
+use hil_runtime::rundir::record::{RecordFile, RecordKind};
 
 use super::source::{Progress, Source, Warning};
 use crate::clocks::Clocks;

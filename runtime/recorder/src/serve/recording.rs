@@ -7,8 +7,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use hil_runtime::console::Console;
-use hil_runtime::words::counted_plainly;
+use hil_runtime::platform::console::Console;
+use hil_runtime::platform::words::counted_plainly;
 
 use crate::priority::Precedence;
 use crate::record::{RecordError, Recorded, Request, Which, record};

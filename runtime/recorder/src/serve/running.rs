@@ -5,10 +5,13 @@ use std::io::{self, Read, Seek, SeekFrom};
 use std::path::Path;
 use std::time::Duration;
 
-use hil_runtime::clock::MonotonicClock;
-use hil_runtime::live::status::{self, Overruns};
+use hil_runtime::platform::clock::MonotonicClock;
 use hil_runtime::report::summary::RunSummary;
-use hil_runtime::watch::{self, Event, Feed, FeedError, LiveRun, Origin, Poll, Record};
+use hil_runtime::rundir::live_run::LiveRun;
+use hil_runtime::rundir::status;
+use hil_runtime::rundir::status::Overruns;
+use hil_runtime::watch;
+use hil_runtime::watch::{Event, Feed, FeedError, Origin, Poll, Record};
 
 use super::engine::REST;
 use super::playback::how_ended;

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use hil_runtime::live::status::Overruns;
+use hil_runtime::rundir::status::Overruns;
 
 use crate::view::LiveRecord;
 

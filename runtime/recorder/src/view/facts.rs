@@ -6,8 +6,8 @@ use std::time::Duration;
 use hil_models::fleet::Fleet;
 use hil_models::shuttle::Shuttle;
 use hil_models::teleoperation::Teleoperation;
-use hil_runtime::manifest::{ChannelDescription, FieldDescription, Manifest};
-use hil_runtime::registry::Registry;
+use hil_runtime::rundir::manifest::{ChannelDescription, FieldDescription, Manifest};
+use hil_runtime::topology::registry::Registry;
 use serde_json::{Value, json};
 
 use crate::clocks::Clocks;

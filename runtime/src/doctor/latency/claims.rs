@@ -4,7 +4,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{Gaps, LatencyReport, Quantiles};
-use crate::host_facts::Fact;
+use crate::platform::host_facts::Fact;
 
 /// Wake-ups beyond a quantile without which it is an anecdote.
 const BEYOND_MIN: u64 = 10;

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use serde::{Deserialize, Serialize};
 
 use super::{LOOK_PERIOD, LatencyRequest};
-use crate::host_facts::{Fact, format_cpu_list};
+use crate::platform::host_facts::{Fact, format_cpu_list};
 
 /// Bins of a microsecond each; what is longer is counted as one.
 const BIN_COUNT: usize = 20_000;

@@ -9,8 +9,8 @@ use hil_models::time::PeriodicTimer;
 use nix::sys::resource::{UsageWho, getrusage};
 
 use super::{Gaps, LatencyRequest, Quantiles, Wakeups, ns};
-use crate::clock::{MonotonicClock, Wake};
-use crate::realtime::{RealtimeGrant, RealtimeRequest, SchedulingPolicy, apply};
+use crate::platform::clock::{MonotonicClock, Wake};
+use crate::platform::realtime::{RealtimeGrant, RealtimeRequest, SchedulingPolicy, apply};
 
 /// Longer values make the histogram allocate; by then the measurement is spoilt anyway.
 const ROOM_NS: u64 = 10_000_000_000;

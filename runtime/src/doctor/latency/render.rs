@@ -6,7 +6,7 @@ use core::fmt::Write as _;
 use super::claims;
 use super::{CyclictestThread, Gaps, LatencyReport, Standing, Wakeups};
 use crate::doctor::render::{Tone, mark, wrapped};
-use crate::host_facts::Fact;
+use crate::platform::host_facts::Fact;
 
 impl LatencyReport {
     /// The measurement for a terminal.

@@ -9,7 +9,7 @@ use serde_json::Value;
 use super::material::{Found, Manifest, Material};
 use super::series::{self, Series};
 use crate::report::summary::{Fact, RunSummary};
-use crate::run_folder::RunFolder;
+use crate::rundir::run_folder::RunFolder;
 
 /// Largest series that is read, bytes: an hour of two arms is a tenth of it.
 const SERIES_BYTES_MAX: u64 = 1 << 30;

@@ -7,7 +7,7 @@ use hil_models::measure::card_clock::CardClockFigures;
 
 use super::canvas::{Canvas, INDENT, Tone};
 use super::units::{duration, grouped, percent};
-use crate::card_clock::figures::{CardSegment, CardSummary, ChannelStamps, HardwareStamps};
+use crate::report::card_figures::{CardSegment, CardSummary, ChannelStamps, HardwareStamps};
 
 pub(super) fn hardware_stamps(canvas: &mut Canvas, stamps: &HardwareStamps) {
     canvas.heading("Hardware stamps", "taken by the network cards");

@@ -10,8 +10,8 @@ use hil_models::measure::statistics::IntervalNs;
 use super::canvas::{Canvas, INDENT, Tone, bar, left, right};
 use super::clocks;
 use super::units::{duration, grouped, percent};
+use crate::platform::words::counted;
 use crate::report::summary::{ChannelSummary, CountByName, LinkKind, RecordedFigures};
-use crate::words::counted;
 
 /// Columns of a stage's name, of each of the four figures, and between figures and bar.
 const NAME_WIDTH: usize = 22;

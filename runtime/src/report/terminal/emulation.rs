@@ -7,7 +7,7 @@ use hil_models::measure::histogram::LatencySummary;
 use super::canvas::{Canvas, Tone};
 use super::units::{duration, grouped};
 use crate::report::emulation::EmulationFigures;
-use crate::report::replay::replay_words;
+use crate::report::trace_counts::replay_words;
 
 /// Columns of a label.
 const LABEL_WIDTH: usize = 18;

@@ -6,8 +6,8 @@ use hil_models::measure::account::MessageFate;
 
 use super::canvas::{Canvas, INDENT, Tone, shortened};
 use super::units::{duration_s, grouped, seconds};
+use crate::platform::words::counted;
 use crate::report::score_event::{ExplainedEvent, ExplainedMessage, ScoreEvents};
-use crate::words::counted;
 
 /// Events on the page, and messages of each; all of them are in the summary.
 const SHOWN_COUNT: usize = 12;

@@ -16,7 +16,7 @@ mod timeline;
 mod trace;
 mod units;
 
-pub(crate) use crate::words::counted;
+use crate::platform::words::counted;
 pub use canvas::Style;
 pub(crate) use canvas::{Tone, shortened, wrapped};
 pub(crate) use channel::closing_text;

@@ -8,15 +8,15 @@ use hil_models::layout::Field;
 use hil_models::message::Message;
 use hil_models::shuttle::{ShuttleCommand, ShuttleStatus};
 use hil_models::time::Instant;
-use hil_runtime::manifest::describe_fields;
-use hil_runtime::record::RecordKind;
-use hil_runtime::record::file::RecordHeader;
-use hil_runtime::report::summary::{Fact, Outcome, RunFacts, RunSummary};
-use hil_runtime::supervisor::elsewhere::HostTicks;
-use hil_runtime::supervisor::event::{Event, HostStory, Interruption, ProcessStory};
-use hil_runtime::supervisor::frame::{
+use hil_runtime::engine::supervisor::elsewhere::HostTicks;
+use hil_runtime::engine::supervisor::frame::{
     EndMeaning, PeerHello, PeerMessage, write_chunk, write_message,
 };
+use hil_runtime::report::summary::{Fact, Outcome, RunFacts, RunSummary};
+use hil_runtime::rundir::event::{Event, HostStory, Interruption, ProcessStory};
+use hil_runtime::rundir::manifest::describe_fields;
+use hil_runtime::rundir::record::RecordKind;
+use hil_runtime::rundir::record::file::RecordHeader;
 use hil_runtime::topology::load;
 use serde_json::json;
 
@@ -195,7 +195,7 @@ pub(crate) fn summaries() -> Vec<Seed> {
 pub(crate) fn radio_answers() -> Vec<Seed> {
     macro_rules! recorded {
         ($($name:literal),*) => {[$(
-            include_bytes!(concat!("../../../../runtime/src/radio/recorded/", $name, ".netlink"))
+            include_bytes!(concat!("../../../../runtime/src/nic/radio/recorded/", $name, ".netlink"))
                 .to_vec(),
         )*]};
     }

@@ -1,0 +1,270 @@
+//! The commands that need a case but no run: virtual time, tables, calibration, and the replay of
+//! a finished run.
+
+use std::io::IsTerminal;
+use std::path::Path;
+
+use crate::cli::arguments::{BatchArgs, CalibrateArgs};
+use crate::platform::console::Console;
+use crate::platform::progress::Progress;
+use crate::platform::signals::Signals;
+use crate::report::replay;
+use crate::report::simulate;
+use crate::report::study;
+use crate::report::study::{StudyEnd, StudyOptions, Wanted};
+use crate::rundir::run_folder::RunFolder;
+use crate::topology::registry::Registry;
+use crate::topology::{self, Topology, TopologyErrors};
+
+use super::{columns, exit, interrupted, load, signals};
+
+/// `simulate`, with its page or JSON and the folder for its files.
+pub(super) fn simulate(
+    (path, overrides): (&Path, &[String]),
+    json: bool,
+    output: Option<&Path>,
+    registry: &Registry,
+    console: &mut Console,
+) -> u8 {
+    let signals = match signals(console) {
+        Ok(signals) => signals,
+        Err(code) => return code,
+    };
+    // Virtual time does not look at signals.
+    let watch =
+        signals.end_program_unless_over("a run in virtual time is shown whole or not at all");
+    let Some(topology) = load(path, overrides, registry, console) else {
+        return exit::USAGE;
+    };
+    let progress = Progress::begin();
+    let outcome = output
+        .map_or(Ok(()), simulate::check_output)
+        .and_then(|()| {
+            simulate::simulate(&topology, registry, &mut |share| {
+                progress.show(console, Some(share), "in virtual time");
+            })
+        });
+    let simulated = match outcome {
+        Ok(simulated) => simulated,
+        Err(error) => {
+            console.error(&error.to_string());
+            return exit::USAGE;
+        }
+    };
+    let form = if json {
+        simulate::Form::Json
+    } else {
+        simulate::Form::Page(columns())
+    };
+    let text = simulated.render(form);
+    drop(watch);
+    console.result(&text);
+    let Some(folder) = output else {
+        return exit::RAN;
+    };
+    match simulated.write(folder) {
+        Ok(series) => {
+            let also = if series.is_empty() {
+                "; the case has no series".to_owned()
+            } else {
+                format!(" and the series {}", series.join(", "))
+            };
+            let folder = folder.display();
+            console.say(&format!(
+                "wrote to {folder}: report.txt, report.json, events.log{also}"
+            ));
+            exit::RAN
+        }
+        Err(error) => {
+            console.error(&error.to_string());
+            exit::FAILED
+        }
+    }
+}
+
+/// `tables`.
+pub(super) fn tables(
+    path: &Path,
+    overrides: &[String],
+    batch: BatchArgs,
+    registry: &Registry,
+) -> u8 {
+    let mut console = Console::new(batch.quiet);
+    // Before the preparation, which takes its time and must not end without a word.
+    let signals = match signals(&mut console) {
+        Ok(signals) => signals,
+        Err(code) => return code,
+    };
+    let topology = topology::load_case(path, overrides, registry.known());
+    let Some(topology) = loaded(topology, &mut console) else {
+        return exit::USAGE;
+    };
+    let work = (&topology, Wanted::Tables);
+    compute(work, batch, (registry, &signals, &mut console))
+}
+
+/// `calibrate`.
+pub(super) fn calibrate(args: CalibrateArgs, registry: &Registry) -> u8 {
+    let mut console = Console::new(args.batch.quiet);
+    let signals = match signals(&mut console) {
+        Ok(signals) => signals,
+        Err(code) => return code,
+    };
+    let (figure, value) = match wanted_figure(args.mlr, args.figure.as_deref()) {
+        Ok(wanted) => wanted,
+        Err(text) => {
+            console.error(&text);
+            return exit::USAGE;
+        }
+    };
+    let entry = match registry.find_by_prefix(&args.case) {
+        Ok(entry) => entry,
+        Err(error) => {
+            console.error(&error.to_string());
+            return exit::USAGE;
+        }
+    };
+    if entry.name != args.case {
+        console.say(&format!("{:?} is taken for case {}", args.case, entry.name));
+    }
+    let mut overrides = args.overrides;
+    overrides.extend(
+        args.seeds
+            .map(|count| format!("case.parameters.tables.seeds={count}")),
+    );
+    let known = registry.known();
+    let topology = match &args.topology {
+        Some(path) => topology::load_case(path, &overrides, known),
+        None => topology::case_by_name(entry.name, &overrides, known),
+    };
+    let Some(topology) = loaded(topology, &mut console) else {
+        return exit::USAGE;
+    };
+    let named = topology.case().map_or("no case", |case| case.name.as_str());
+    if named != entry.name {
+        let text = format!("the topology names {named}, not case {}", entry.name);
+        console.error(&text);
+        return exit::USAGE;
+    }
+    let wanted = Wanted::Calibration { figure, value };
+    compute(
+        (&topology, wanted),
+        args.batch,
+        (registry, &signals, &mut console),
+    )
+}
+
+/// The figure asked for, and its value.
+fn wanted_figure(mlr: Option<f64>, figure: Option<&str>) -> Result<(&str, f64), String> {
+    let (name, value) = match (mlr, figure) {
+        (Some(ratio), _) => ("mlr", ratio),
+        (None, Some(text)) => {
+            let (name, value) = text
+                .split_once('=')
+                .ok_or_else(|| format!("--figure {text} is not NAME=VALUE, e.g. mlr=0.008"))?;
+            let value = value
+                .trim()
+                .parse()
+                .map_err(|_error| format!("--figure {text}: {value:?} is not a number"))?;
+            (name.trim(), value)
+        }
+        (None, None) => return Err("no figure to calibrate for; see --mlr and --figure".to_owned()),
+    };
+    if value.is_finite() {
+        Ok((name, value))
+    } else {
+        Err(format!("{name} {value} is not a finite number"))
+    }
+}
+
+fn loaded(topology: Result<Topology, TopologyErrors>, console: &mut Console) -> Option<Topology> {
+    match topology {
+        Ok(topology) => Some(topology),
+        Err(errors) => {
+            console.faults(&errors.render(std::io::stderr().is_terminal()));
+            None
+        }
+    }
+}
+
+fn compute(
+    (topology, wanted): (&Topology, Wanted<'_>),
+    batch: BatchArgs,
+    (registry, signals, console): (&Registry, &Signals, &mut Console),
+) -> u8 {
+    let options = StudyOptions {
+        jobs: batch.jobs,
+        is_json: batch.json,
+        output: batch.output,
+    };
+    let batch = match study::batch_of(topology, registry, wanted) {
+        Ok(batch) => batch,
+        Err(error) => {
+            console.error(&error.to_string());
+            return exit::USAGE;
+        }
+    };
+    match study::run(batch.as_ref(), &options, signals, console) {
+        Ok(StudyEnd::Passed) => exit::RAN,
+        Ok(StudyEnd::Missed) => {
+            console
+                .error("a criterion is missed: the lines marked MISSED at the end of the tables");
+            exit::FAILED
+        }
+        Ok(StudyEnd::Interrupted) => interrupted(),
+        Err(error) => {
+            console.error(&error.to_string());
+            exit::FAILED
+        }
+    }
+}
+
+/// `replay`.
+pub(super) fn replay(run: &Path, json: bool, registry: &Registry, console: &mut Console) -> u8 {
+    let folder = RunFolder::existing(run);
+    let replayed = Progress::begin().during(console, "reading messages", |stage| {
+        replay::replay(&folder, registry, &|share, words| {
+            stage.tell(share, words);
+        })
+    });
+    let replayed = match replayed {
+        Ok(replayed) => replayed,
+        Err(error) => {
+            console.error(&error.to_string());
+            return exit::USAGE;
+        }
+    };
+    console.result(&if json {
+        replayed.json()
+    } else {
+        replayed.text()
+    });
+    if replayed.is_identical() {
+        exit::RAN
+    } else {
+        exit::FAILED
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_figure_has_a_name_and_a_finite_value() {
+        assert_eq!(wanted_figure(Some(0.008), None), Ok(("mlr", 0.008)));
+        assert_eq!(wanted_figure(None, Some("mlr = 0.5")), Ok(("mlr", 0.5)));
+        for (mlr, figure, expected) in [
+            (
+                None,
+                Some("mlr"),
+                "--figure mlr is not NAME=VALUE, e.g. mlr=0.008",
+            ),
+            (None, Some("mlr=x"), "--figure mlr=x: \"x\" is not a number"),
+            (Some(f64::NAN), None, "mlr NaN is not a finite number"),
+            (None, Some("a=inf"), "a inf is not a finite number"),
+        ] {
+            assert_eq!(wanted_figure(mlr, figure).unwrap_err(), expected);
+        }
+    }
+}

@@ -1,0 +1,5 @@
+//! Network cards with their clocks, and radios: what this host's interfaces are asked and told beside
+//! the messages. It carries no message itself.
+
+pub mod card_clock;
+pub mod radio;

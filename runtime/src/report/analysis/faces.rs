@@ -1,0 +1,97 @@
+//! From what the faces of a run recorded and reported to their part of the summary.
+
+use super::records::RunRecords;
+use crate::engine::supervisor::RunResult;
+use crate::report::face::FaceSummary;
+use crate::report::face_figures::figures;
+use crate::report::summary::{CountByName, Fact};
+use crate::rundir::pipe::FaceReport;
+use crate::topology::{
+    EgmFace, FaceKind, Process, Program, Topology, command_channel, feedback_channel,
+};
+use hil_models::egm::messages::Side;
+
+/// Every arm of every face, in the order of the topology.
+pub(super) fn face_summaries(
+    topology: &Topology,
+    result: &RunResult,
+    records: &RunRecords,
+) -> Vec<FaceSummary> {
+    let mut summaries = Vec::new();
+    for process in topology.processes() {
+        let Program::Egm { face, .. } = &process.program else {
+            continue;
+        };
+        for side in Side::BOTH {
+            if face.address(side).is_some() {
+                summaries.push(face_summary((process, face, side), result, records));
+            }
+        }
+    }
+    summaries
+}
+
+fn face_summary(
+    (process, face, side): (&Process, &EgmFace, Side),
+    result: &RunResult,
+    records: &RunRecords,
+) -> FaceSummary {
+    let (out, back) = match face.kind {
+        FaceKind::Robot => (feedback_channel(side), command_channel(side)),
+        FaceKind::Sensor => (command_channel(side), feedback_channel(side)),
+    };
+    let (sent, received) = records.of_face(out, back);
+    let figures = figures(face.kind, &sent, &received);
+    let report = report_of(result, &process.name, side);
+    let counters: Vec<CountByName> = report
+        .iter()
+        .flat_map(|report| &report.counters)
+        .map(|(name, count)| CountByName {
+            name: name.clone(),
+            count: *count,
+        })
+        .collect();
+    FaceSummary {
+        process: process.name.clone(),
+        host: process.host.clone(),
+        kind: face.kind.to_string(),
+        arm: side.word().to_owned(),
+        address: face
+            .address(side)
+            .map(|one| one.to_string())
+            .unwrap_or_default(),
+        peer_state: report.map_or_else(
+            || "unavailable: the face left no report".to_owned(),
+            |report| report.peer_state.clone(),
+        ),
+        cycle_ns: figures.cycle_ns,
+        answers: figures.answers,
+        segments: figures.segments,
+        refusals: refusals(&counters),
+        counters,
+        facts: report
+            .iter()
+            .flat_map(|report| &report.facts)
+            .map(|(label, value)| Fact::new(label.clone(), value.clone()))
+            .collect(),
+    }
+}
+
+fn refusals(counters: &[CountByName]) -> Vec<CountByName> {
+    let named = counters.iter().filter(|counter| counter.count > 0);
+    named
+        .filter_map(|counter| {
+            Some(CountByName {
+                name: counter.name.strip_prefix("refused: ")?.to_owned(),
+                count: counter.count,
+            })
+        })
+        .collect()
+}
+
+fn report_of<'a>(result: &'a RunResult, process: &str, side: Side) -> Option<&'a FaceReport> {
+    let mut stories = result.processes.iter();
+    let story = stories.find(|story| story.name == process)?;
+    let mut faces = story.report.as_ref()?.faces.iter();
+    faces.find(|face| face.arm == side.word())
+}

@@ -1,0 +1,264 @@
+//! The parts of a summary: from what the supervisor and the processes said to what a report shows.
+//! It draws up no account itself.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use hil_models::time::Instant;
+
+use super::axis::RunAxis;
+use super::records::RunRecords;
+use crate::engine::supervisor;
+use crate::engine::supervisor::RunResult;
+use crate::platform::realtime::GrantOutcome;
+use crate::report::emulation::EmulationFigures;
+use crate::report::summary::{
+    ChannelSummary, CountByName, DirectionSummary, Fact, LinkKind, NO_ROOM, Outcome,
+    ProcessSummary, RealtimeFacts, RunEvent, RunFacts,
+};
+use crate::rundir::event::{Event, ProcessStory};
+use crate::topology::{Channel, Topology, Via};
+
+/// Datagrams that came while the socket's receive buffer was full; see [`NO_ROOM`].
+const NO_ROOM_COUNTER: &str = "socket: kernel_drop_count";
+
+/// What a receiving gateway calls the datagrams that its emulated link had no room for.
+const OVERFLOW_COUNTER: &str = "socket: link_overflow_count";
+
+pub(super) fn run_facts(
+    topology: &Topology,
+    result: &RunResult,
+    topology_file: &Path,
+    command_line: &[String],
+) -> RunFacts {
+    let outcome = match &result.outcome {
+        supervisor::Outcome::Completed | supervisor::Outcome::EndedEarly(_) => Outcome::Completed,
+        supervisor::Outcome::Interrupted(_) | supervisor::Outcome::EndedByPeer(_) => {
+            Outcome::Stopped
+        }
+        supervisor::Outcome::Failed(_) | supervisor::Outcome::PeerLost(_) => Outcome::Failed,
+    };
+    let files = [
+        ("summary.json", "every figure of this report"),
+        (
+            "manifest.json",
+            "topology as resolved, versions, host, seed",
+        ),
+        (
+            "records/",
+            "one record per message and stage; layout in docs/run-folder.md",
+        ),
+        ("logs/", "what each process said on standard error"),
+        (
+            "events.log",
+            "what happened to the robot, one line each, with the outage before it",
+        ),
+    ];
+    RunFacts {
+        name: result.folder.name(),
+        case: topology
+            .case()
+            .map(|case| case.name.clone())
+            .unwrap_or_default(),
+        topology_file: topology_file.display().to_string(),
+        topology_hash: format!("{:016x}", topology.hash()),
+        seed: topology.run().seed,
+        security: result.security.clone(),
+        host: result.own_hosts.join(", "),
+        started: result.started.clone(),
+        starts_ns: result
+            .spans
+            .iter()
+            .map(|(host, (start, _))| (host.clone(), start.as_ns()))
+            .collect(),
+        duration_s: own_span(result).map_or(0.0, |(start, end)| end.seconds_since(start)),
+        outcome,
+        exit_reason: result.outcome.reason(),
+        folder: result.folder.root().display().to_string(),
+        files: files.map(|(name, what)| Fact::new(name, what)).to_vec(),
+        repeat_command: shell_words(command_line),
+    }
+}
+
+/// The run on the clock of this supervisor.
+fn own_span(result: &RunResult) -> Option<(Instant, Instant)> {
+    result.spans.get(result.own_hosts.first()?).copied()
+}
+
+/// What the kernel granted and refused, each item once with the threads it concerns.
+pub(super) fn realtime_facts(processes: &[ProcessStory]) -> RealtimeFacts {
+    let mut items: BTreeMap<(bool, String), Vec<String>> = BTreeMap::new();
+    let mut thread_count = 0;
+    for process in processes {
+        for (thread, grant) in process.report.iter().flat_map(|report| &report.realtime) {
+            thread_count += 1;
+            let who = if thread == "main" {
+                process.name.clone()
+            } else {
+                format!("{} ({thread})", process.name)
+            };
+            for item in &grant.items {
+                let is_refused = item.outcome != GrantOutcome::Granted;
+                items
+                    .entry((is_refused, item.to_string()))
+                    .or_default()
+                    .push(who.clone());
+            }
+        }
+    }
+    let mut facts = RealtimeFacts::default();
+    for ((is_refused, what), who) in items {
+        let who = if who.len() == thread_count {
+            format!("all {thread_count} measured threads")
+        } else {
+            who.join(", ")
+        };
+        let side = if is_refused {
+            &mut facts.refused
+        } else {
+            &mut facts.granted
+        };
+        side.push(Fact::new(what, who));
+    }
+    facts
+}
+
+/// A command line that a shell reads back as it was.
+fn shell_words(words: &[String]) -> String {
+    let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b"/._-=:@,+".contains(&byte);
+    let quoted = words.iter().map(|word| {
+        if !word.is_empty() && word.bytes().all(is_plain) {
+            word.clone()
+        } else {
+            format!("'{}'", word.replace('\'', r"'\''"))
+        }
+    });
+    quoted.collect::<Vec<_>>().join(" ")
+}
+
+pub(super) fn process_summary(process: &ProcessStory) -> ProcessSummary {
+    let report = process.report.as_ref();
+    // A gateway has no period of its own, and a component that messages drive has none either.
+    let ticking = report.filter(|report| report.ticks + report.skipped_ticks > 0);
+    ProcessSummary {
+        name: process.name.clone(),
+        host: process.host.clone(),
+        role: process.role.clone(),
+        exit: process.end.clone(),
+        restart_count: u64::from(process.restart_count),
+        preparation_s: report.and_then(|report| report.preparation_s),
+        tick_count: ticking.map(|report| report.ticks),
+        skipped_tick_count: ticking.map(|report| report.skipped_ticks),
+        cpu_time_s: report.map(|report| report.cpu_s),
+        voluntary_switch_count: report.map(|report| report.voluntary_switches),
+        involuntary_switch_count: report.map(|report| report.involuntary_switches),
+        malformed_count: report.map(|report| report.malformed_count),
+        outbox_drop_count: report.map(|report| report.outbox_dropped),
+        recorder_drop_count: report.map(|report| report.recorder_dropped),
+    }
+}
+
+pub(super) fn run_event(axis: &RunAxis<'_>, event: &Event) -> RunEvent {
+    let gap = event.interruption.map(|gap| match gap.until {
+        Some(until) => format!("away for {:.0} ms", until.seconds_since(gap.from) * 1e3),
+        None => "never came back".to_owned(),
+    });
+    RunEvent {
+        at_s: axis.shown_s(&event.host, event.at),
+        what: format!("{}: {}", event.process, event.what),
+        cause: gap.unwrap_or_default(),
+    }
+}
+
+pub(super) fn channel_summary(
+    topology: &Topology,
+    result: &RunResult,
+    channel: &Channel,
+    records: &RunRecords,
+) -> ChannelSummary {
+    let crossing = topology.crossing(channel);
+    let directions = directions(result, &channel.name);
+    let reports = result.processes.iter().flat_map(|one| &one.report);
+    let trace_replay = reports
+        .flat_map(|report| &report.directions)
+        .filter(|direction| direction.channel == channel.name)
+        .find_map(|direction| direction.replay);
+    let refusals = directions
+        .iter()
+        .flat_map(|direction| &direction.counters)
+        .filter(|counter| counter.count > 0)
+        .filter_map(|counter| {
+            // What the kernel dropped for want of room may have been anything, also a message.
+            let name = match counter.name.as_str() {
+                NO_ROOM_COUNTER => NO_ROOM,
+                name => name.strip_prefix("refused: ")?,
+            };
+            Some(CountByName {
+                name: name.to_owned(),
+                count: counter.count,
+            })
+        })
+        .collect();
+    let overflow_count = directions
+        .iter()
+        .flat_map(|direction| &direction.counters)
+        .find(|counter| counter.name == OVERFLOW_COUNTER)
+        .map(|counter| counter.count);
+    ChannelSummary {
+        name: channel.name.clone(),
+        from: channel.from.clone(),
+        to: channel.to.clone(),
+        link: match crossing.map(|crossing| &crossing.link.via) {
+            None if channel.is_recorded_only() => LinkKind::RecordOnly,
+            None | Some(Via::SharedMemory) => LinkKind::SharedMemory,
+            Some(Via::Udp(_)) => LinkKind::Udp,
+            Some(Via::Tcp(_)) => LinkKind::Tcp,
+            Some(Via::Emulated(..)) => LinkKind::Emulated,
+        },
+        account: (records.has(&channel.name) && !channel.is_recorded_only())
+            .then(|| records.account(topology, result, channel)),
+        outages: None,
+        emulation: EmulationFigures::of(records.arrivals(&channel.name), overflow_count),
+        trace_replay,
+        recorded: channel
+            .is_recorded_only()
+            .then(|| records.recorded(&channel.name))
+            .flatten(),
+        refusals,
+        directions,
+    }
+}
+
+fn directions(result: &RunResult, channel: &str) -> Vec<DirectionSummary> {
+    let mut found = Vec::new();
+    for process in &result.processes {
+        let Some(report) = &process.report else {
+            continue;
+        };
+        for direction in report
+            .directions
+            .iter()
+            .filter(|one| one.channel == channel)
+        {
+            found.push(DirectionSummary {
+                process: process.name.clone(),
+                direction: direction.direction.clone(),
+                peer_state: direction.peer_state.clone(),
+                counters: direction
+                    .counters
+                    .iter()
+                    .map(|(name, count)| CountByName {
+                        name: name.clone(),
+                        count: *count,
+                    })
+                    .collect(),
+                facts: direction
+                    .facts
+                    .iter()
+                    .map(|(label, value)| Fact::new(label.clone(), value.clone()))
+                    .collect(),
+            });
+        }
+    }
+    found
+}

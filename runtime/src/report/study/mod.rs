@@ -1,0 +1,199 @@
+//! `hil-runtime tables` and `calibrate`: a case's study in virtual time, on as many threads as
+//! there are processors. It starts no process, opens no socket and changes no figure: those come from the
+//! tasks alone, whatever the number of threads.
+
+mod pool;
+mod render;
+
+use std::fs;
+use std::num::NonZeroUsize;
+use std::path::{Path, PathBuf};
+use std::thread;
+use std::time::Duration;
+
+use hil_models::study::{Batch, StudyReport};
+
+use crate::platform::console::Console;
+use crate::platform::signals::Signals;
+use crate::topology::Topology;
+use crate::topology::registry::Registry;
+
+use self::pool::Pool;
+
+/// How to run a study and where to put its tables.
+#[derive(Debug, Clone)]
+pub(crate) struct StudyOptions {
+    /// Threads; all processors if left out.
+    pub(crate) jobs: Option<NonZeroUsize>,
+    /// Print JSON instead of tables.
+    pub(crate) is_json: bool,
+    /// Folder for the tables as files.
+    pub(crate) output: Option<PathBuf>,
+}
+
+/// How a study ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum StudyEnd {
+    /// Every criterion that could be judged is met.
+    Passed,
+    /// A criterion is missed.
+    Missed,
+    /// It was interrupted; what was complete is shown.
+    Interrupted,
+}
+
+/// What a study cost this machine.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Cost {
+    pub(crate) wall: Duration,
+    /// Processor time of all threads; `None` when the kernel does not tell.
+    pub(crate) processor: Option<Duration>,
+    pub(crate) jobs: usize,
+    pub(crate) task_count: usize,
+    pub(crate) ended_count: usize,
+}
+
+/// Why there are no tables.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum StudyError {
+    /// The topology names no case.
+    #[error("the topology names no case; only a case can be studied")]
+    NoCase,
+    /// The case has none.
+    #[error("case {case} has no tables")]
+    NoTables {
+        /// Its name.
+        case: String,
+    },
+    /// The case has no search for that figure.
+    #[error("case {case} cannot be calibrated for {figure}; {known}")]
+    NoCalibration {
+        /// Its name.
+        case: String,
+        /// The figure.
+        figure: String,
+        /// What it can be calibrated for, in words.
+        known: String,
+    },
+    /// The case refused its parameters, or the figure's value.
+    #[error("{message}")]
+    Case {
+        /// What it said.
+        message: String,
+    },
+    /// A file could not be written.
+    #[error("{}: {source}", path.display())]
+    Output {
+        /// Which.
+        path: PathBuf,
+        /// Why not.
+        source: std::io::Error,
+    },
+}
+
+/// What is wanted of a case.
+#[derive(Debug, Clone, Copy)]
+pub(crate) enum Wanted<'a> {
+    /// Its tables.
+    Tables,
+    /// The link parameters under which a figure comes out as a value.
+    Calibration {
+        /// The figure's name.
+        figure: &'a str,
+        /// Its value.
+        value: f64,
+    },
+}
+
+/// The study of the topology's case.
+pub(crate) fn batch_of(
+    topology: &Topology,
+    registry: &Registry,
+    wanted: Wanted<'_>,
+) -> Result<Box<dyn Batch>, StudyError> {
+    let refused = |message: String| StudyError::Case { message };
+    let made = registry
+        .make_case(topology)
+        .map_err(|error| refused(error.to_string()))?;
+    let (entry, case) = made.ok_or(StudyError::NoCase)?;
+    let name = || entry.name.to_owned();
+    match wanted {
+        Wanted::Tables => case
+            .study()
+            .map_err(|error| refused(error.to_string()))?
+            .ok_or_else(|| StudyError::NoTables { case: name() }),
+        Wanted::Calibration { figure, value } => case
+            .calibration(figure, value)
+            .map_err(|error| refused(error.to_string()))?
+            .ok_or_else(|| StudyError::NoCalibration {
+                case: name(),
+                figure: figure.to_owned(),
+                known: match entry.calibrated_figures {
+                    [] => "it has no calibration".to_owned(),
+                    figures => format!("there is {}", figures.join(", ")),
+                },
+            }),
+    }
+}
+
+/// Runs every task, prints the tables and writes them where asked.
+///
+/// # Errors
+/// When a file cannot be written; the tables are printed all the same.
+pub(crate) fn run(
+    batch: &dyn Batch,
+    options: &StudyOptions,
+    signals: &Signals,
+    console: &mut Console,
+) -> Result<StudyEnd, StudyError> {
+    let jobs = options
+        .jobs
+        .or_else(|| thread::available_parallelism().ok())
+        .map_or(1, NonZeroUsize::get)
+        .min(batch.task_count().max(1));
+    let pool = Pool::new(batch, jobs);
+    let (outcomes, cost) = pool.run(signals, console);
+    let report = batch.report(&outcomes);
+    let text = if options.is_json {
+        render::json(&report, &cost)
+    } else {
+        render::text(&report, &cost)
+    };
+    console.result(&text);
+    if let Some(folder) = &options.output {
+        write_files(folder, &report, &cost)?;
+        console.say(&format!("wrote the tables to {}", folder.display()));
+    }
+    if let Some(signal) = signals.received() {
+        console.warn(&format!(
+            "ended by {signal}: {} of {} tasks are in the tables",
+            cost.ended_count, cost.task_count
+        ));
+        return Ok(StudyEnd::Interrupted);
+    }
+    Ok(if report.is_passed() {
+        StudyEnd::Passed
+    } else {
+        StudyEnd::Missed
+    })
+}
+
+fn write_files(folder: &Path, report: &StudyReport, cost: &Cost) -> Result<(), StudyError> {
+    let at = |path: &Path| {
+        let path = path.to_owned();
+        move |source| StudyError::Output { path, source }
+    };
+    fs::create_dir_all(folder).map_err(at(folder))?;
+    let write = |name: String, text: String| {
+        let path = folder.join(name);
+        fs::write(&path, text).map_err(at(&path))
+    };
+    for table in &report.tables {
+        write(format!("{}.csv", table.name), render::csv(table))?;
+    }
+    write("report.json".to_owned(), render::json(report, cost))?;
+    write("report.txt".to_owned(), render::text(report, cost))
+}
+
+#[cfg(test)]
+mod tests;
