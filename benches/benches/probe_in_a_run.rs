@@ -1,11 +1,11 @@
 //! What a probe costs a whole run: the shuttle on two hosts with a switch between them, with its own
 //! processes and gateways, whose wire is in turns not tapped, tapped at a mirror port of the switch,
-//! and tapped on the hosts' own interfaces, by a packet ring and by eBPF programs. Not a test: it
-//! states the aim and whether it was met, or that the rounds were too few to tell, and ends with code 0.
+//! and tapped on the hosts' own interfaces. Not a test: it states the aim and whether it was met, or that
+//! the rounds were too few to tell, and ends with code 0.
 //!
 //! `cargo bench -p hil-benches --bench probe_in_a_run -- [--rounds N] [--turn SECONDS] [--rate HZ]
-//! [--set KEY=VALUE]...`, about 9 s a round. Namespaces and taps take root; without, it says what is missing. What the taps
-//! cost a bare hop, back to back, is measured by `probe_overhead`.
+//! [--set KEY=VALUE]...`, about 9 s a round. Namespaces and taps take root; without, it
+//! says what is missing.
 #![allow(clippy::print_stdout, reason = "a bench prints its result")]
 
 use std::process::ExitCode;
@@ -15,7 +15,6 @@ use hil_benches::gateway::hosts::SetupError;
 use hil_benches::gateway::network::Network;
 use hil_benches::gateway::tap::Drainer;
 use hil_benches::turns::{self, Arguments, Contest, wait_turn};
-use hil_gateways::transport::live_tap::TapEngine;
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::lab::INTERFACE;
 
@@ -31,11 +30,9 @@ enum Tap {
     Mirror,
     /// By packet rings on the hosts' own interfaces: every datagram's way leads through two.
     Hosts,
-    /// By eBPF programs there.
-    HostsBpf,
 }
 
-const TAPS: [Tap; 4] = [Tap::None, Tap::Mirror, Tap::Hosts, Tap::HostsBpf];
+const TAPS: [Tap; 3] = [Tap::None, Tap::Mirror, Tap::Hosts];
 const TAP_COUNT: usize = TAPS.len();
 
 impl Tap {
@@ -44,14 +41,6 @@ impl Tap {
             Self::None => "alone",
             Self::Mirror => "mirror",
             Self::Hosts => "hosts",
-            Self::HostsBpf => "hosts, bpf",
-        }
-    }
-
-    const fn engine(self) -> TapEngine {
-        match self {
-            Self::HostsBpf => TapEngine::Bpf,
-            _ => TapEngine::Packet,
         }
     }
 
@@ -60,19 +49,14 @@ impl Tap {
         match self {
             Self::None => Vec::new(),
             Self::Mirror => vec![(0, mirror)],
-            Self::Hosts | Self::HostsBpf => vec![(0, INTERFACE), (1, INTERFACE)],
+            Self::Hosts => vec![(0, INTERFACE), (1, INTERFACE)],
         }
     }
 }
 
 const CONTEST: Contest<TAP_COUNT> = Contest {
     bench: "probe_in_a_run",
-    kinds: [
-        TAPS[0].name(),
-        TAPS[1].name(),
-        TAPS[2].name(),
-        TAPS[3].name(),
-    ],
+    kinds: [TAPS[0].name(), TAPS[1].name(), TAPS[2].name()],
     aims: [1.02, 1.02],
     extra: Duration::from_secs(2),
 };
@@ -98,9 +82,8 @@ fn measure() -> Result<(), SetupError> {
     let mut tapped = Tapped::default();
     CONTEST.hold(&arguments, lab, &mut |kind, length| {
         let places = TAPS[kind].places(mirror);
-        let taps = (TAPS[kind].engine(), &*places);
         let (turn, counters) =
-            drainer.while_tapped_at(&network, taps, || wait_turn(GUARD, length))?;
+            drainer.while_tapped(&network, &places, || wait_turn(GUARD, length))?;
         tapped.matched_count += counters.matched_count;
         tapped.dropped_count += counters.dropped_count;
         Ok(turn)

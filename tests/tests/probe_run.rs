@@ -2,13 +2,16 @@
 //! two say of the wire must agree, though neither knows of the other.
 #![allow(clippy::unwrap_used, clippy::print_stdout, reason = "tests")]
 
+use std::net::{Ipv4Addr, UdpSocket};
 use std::path::Path;
 use std::process::Command;
 use std::time::Duration;
 
+use hil_gateways::capture::reader::{CaptureReader, Step};
+use hil_gateways::transport::packet_ring::{PacketRing, RingSettings, RingStamps};
 use hil_runtime::report::summary::Outcome;
 use hil_tests::binary::hil_runtime_binary;
-use hil_tests::child::ChildGuard;
+use hil_tests::child::{ChildGuard, Finished};
 use hil_tests::lab::{INTERFACE, Lab, LabHost};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::Trial;
@@ -22,13 +25,15 @@ const RUN_LIMIT: Duration = Duration::from_mins(2);
 /// match reaches. How near they are on a quiet machine is for `probe compare` to say.
 const MEDIAN_LIMIT_US: f64 = 100.0;
 
-fn start_probe(host: &LabHost, output: &Path) -> ChildGuard {
+fn start_probe(host: &LabHost, interface: &str, output: &Path, more: &str) -> ChildGuard {
     let mut command = host.command(hil_runtime_binary());
     command
-        .args(["probe", "--interface", INTERFACE, "--output"])
-        .arg(output);
+        .args(["probe", "--interface", interface, "--output"])
+        .arg(output)
+        .args(more.split_whitespace());
     let mut probe = ChildGuard::spawn(&mut command).unwrap();
-    probe.wait_for_output("probing eth0", START_LIMIT).unwrap();
+    let begun = format!("probing {interface}");
+    probe.wait_for_output(&begun, START_LIMIT).unwrap();
     probe
 }
 
@@ -51,7 +56,8 @@ fn probe_and_gateways_agree_on_every_datagram_and_on_the_time_on_the_wire() {
     let record = RunFolder::new("probe-run");
     std::fs::create_dir_all(record.path()).unwrap();
     let captures = HOSTS.map(|host| record.path().join(format!("{host}.pcapng")));
-    let mut probes = [0, 1].map(|index| start_probe(lab.host(index), &captures[index]));
+    let mut probes =
+        [0, 1].map(|index| start_probe(lab.host(index), INTERFACE, &captures[index], ""));
 
     let trial = Trial::shipped("shuttle-split.toml", record.path())
         // What is on the wire is looked at byte by byte.
@@ -140,11 +146,15 @@ fn check_comparisons_with_faults(run: &Path, captures: &[std::path::PathBuf; 2])
     }
 }
 
-fn ip(host: &LabHost, arguments: &str) -> String {
+fn try_ip(host: &LabHost, arguments: &str) -> Finished {
     let mut command = host.command("ip");
     command.args(arguments.split(' '));
     let mut child = ChildGuard::spawn(&mut command).unwrap();
-    let finished = child.wait_within(START_LIMIT).unwrap();
+    child.wait_within(START_LIMIT).unwrap()
+}
+
+fn ip(host: &LabHost, arguments: &str) -> String {
+    let finished = try_ip(host, arguments);
     finished.assert_success();
     finished.stdout
 }
@@ -311,4 +321,154 @@ fn what_cannot_be_tapped_or_read_is_refused_with_its_own_exit_code() {
             finished.stderr
         );
     }
+}
+
+#[test]
+fn tags_and_datagrams_in_pieces_are_captured_whole() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let record = RunFolder::new("probe-pieces");
+    std::fs::create_dir_all(record.path()).unwrap();
+    let host = lab.host(0);
+    ip(host, "link set lo up");
+    // Not every kernel has VLANs.
+    let has_vlans = [0, 1].map(|index| {
+        let host = lab.host(index);
+        let added = try_ip(host, "link add link eth0 name eth0.5 type vlan id 5");
+        if !added.status.success() {
+            return false;
+        }
+        let address = format!("address add 10.78.0.{}/24 dev eth0.5", index + 1);
+        ip(host, &address);
+        ip(host, "link set eth0.5 up");
+        true
+    });
+    let is_tagged = has_vlans == [true; 2];
+    println!("VLANs tried: {is_tagged}");
+    let outputs =
+        ["lo", INTERFACE].map(|name| (name, record.path().join(format!("{name}.pcapng"))));
+    let mut probes = outputs
+        .each_ref()
+        .map(|(name, output)| start_probe(host, name, output, ""));
+    host.on_network(|| {
+        let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).unwrap();
+        let receiver = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
+        for number in 0..50_u8 {
+            // Larger than the kernel puts into one piece: what the filter looks at is in another.
+            let mut payload = b"HILG".to_vec();
+            payload.resize(20_000, number);
+            let to = receiver.local_addr().unwrap();
+            socket.send_to(&payload, to).unwrap();
+            if is_tagged {
+                payload.truncate(100);
+                let peer = (Ipv4Addr::new(10, 78, 0, 2), 7000);
+                socket.send_to(&payload, peer).unwrap();
+            }
+        }
+    });
+    for probe in &mut probes {
+        probe.signal(Signal::SIGINT).unwrap();
+        probe.wait_within(START_LIMIT).unwrap().assert_success();
+    }
+    let lengths: Vec<u32> = packets(&outputs[0].1).iter().map(|one| one.0).collect();
+    assert_eq!(lengths, [20_042; 100], "fifty both ways");
+    let tag = [0x81, 0, 0, 5];
+    let on_wire = packets(&outputs[1].1);
+    let tagged = on_wire.iter().filter(|(_, data)| data[12..16] == tag);
+    assert_eq!(tagged.count(), if is_tagged { 50 } else { 0 });
+}
+
+/// Length on the wire and kept bytes of each packet of a capture.
+fn packets(path: &Path) -> Vec<(u32, Vec<u8>)> {
+    let mut reader = CaptureReader::default();
+    reader.feed(&std::fs::read(path).unwrap());
+    reader.end();
+    let mut found = Vec::new();
+    loop {
+        match reader.next_step() {
+            Step::Packet(packet) => found.push((packet.original_bytes, packet.data.to_vec())),
+            Step::Ended => return found,
+            other => panic!("{}: {other:?}", path.display()),
+        }
+    }
+}
+
+#[test]
+fn what_found_no_room_is_in_the_report_and_in_the_file() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let record = RunFolder::new("probe-room");
+    std::fs::create_dir_all(record.path()).unwrap();
+    let host = lab.host(0);
+    let output = record.path().join("full.pcapng");
+    let more = "--flow udp:dport=7000 --ring 1 --snap-length 2048";
+    let mut probe = start_probe(host, INTERFACE, &output, more);
+    probe.signal(Signal::SIGSTOP).unwrap();
+    let sent_count = 2000_u64;
+    host.on_network(|| {
+        let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).unwrap();
+        for _ in 0..sent_count {
+            // Nobody listens there, and an answer that says so is no fault.
+            let _refused = socket
+                .send_to(b"flood", (lab.host(1).address(), 7000))
+                .is_ok();
+        }
+    });
+    probe.signal(Signal::SIGCONT).unwrap();
+    probe.signal(Signal::SIGINT).unwrap();
+    let finished = probe.wait_within(START_LIMIT).unwrap();
+    assert_eq!(finished.status.code(), Some(1), "{finished:?}");
+    assert!(finished.stderr.contains("were dropped"), "{finished:?}");
+    let mut command = Command::new(hil_runtime_binary());
+    command.args(["probe", "analyse", "--flow", "udp:dport=7000", "--json"]);
+    let mut child = ChildGuard::spawn(command.arg(&output)).unwrap();
+    let report = child.wait_within(RUN_LIMIT).unwrap().stdout;
+    let report: Value = serde_json::from_str(&report).unwrap();
+    let file = &report["files"][0];
+    let [kept, dropped] = ["packet_count", "dropped_count"].map(|key| file[key].as_u64().unwrap());
+    println!("{kept} kept, {dropped} dropped");
+    assert!(dropped > 1000 && kept > 100, "{file:#}");
+    assert_eq!(kept + dropped, sent_count);
+}
+
+#[test]
+fn what_came_before_the_taps_begin_is_neither_kept_nor_counted() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let settings = RingSettings {
+        snap_bytes: 2048,
+        ring_bytes: 1 << 20,
+        stamps: RingStamps::Kernel,
+    };
+    let flows = ["udp:dport=7000".parse().unwrap()];
+    lab.host(0).on_network(|| {
+        let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).unwrap();
+        let send = |count: u64| {
+            for _ in 0..count {
+                // Nobody listens there, and an answer that says so is no fault.
+                let _refused = socket.send_to(b"", (lab.host(1).address(), 7000)).is_ok();
+            }
+        };
+        let mut tap = PacketRing::open(INTERFACE, &flows, &settings).unwrap();
+        let said = |tap: &mut PacketRing| {
+            let counters = tap.counters().unwrap();
+            (counters.matched_count, counters.dropped_count)
+        };
+        // More than there is room for, then less.
+        for count in [2000, 30] {
+            let (matched, dropped) = said(&mut tap);
+            send(count);
+            let (matched_now, dropped_now) = said(&mut tap);
+            assert_eq!(matched_now - matched, count);
+            assert_eq!(dropped_now > dropped, count == 2000);
+            tap.begin().unwrap();
+            assert_eq!(said(&mut tap), (0, 0));
+        }
+        send(40);
+        let kept = (0..100).take_while(|_| tap.next_packet(|_| ())).count();
+        assert_eq!((kept, said(&mut tap)), (40, (40, 0)));
+    });
 }

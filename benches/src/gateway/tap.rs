@@ -9,9 +9,7 @@ use std::time::Duration;
 
 use hil_gateways::capture::flow::FlowFilter;
 use hil_gateways::capture::writer::{self, PacketToWrite};
-use hil_gateways::transport::live_tap::{LiveTap, TapEngine};
-use hil_gateways::transport::packet_ring::{RingCounters, RingSettings, RingStamps};
-use hil_tests::lab::INTERFACE;
+use hil_gateways::transport::packet_ring::{PacketRing, RingCounters, RingSettings, RingStamps};
 
 use super::hosts::SetupError;
 use super::network::Network;
@@ -23,7 +21,7 @@ const LOOK_PERIOD: Duration = Duration::from_millis(20);
 /// it would inherit.
 #[derive(Debug)]
 pub struct Drainer {
-    rings: Sender<Vec<LiveTap>>,
+    rings: Sender<Vec<PacketRing>>,
     counts: Receiver<RingCounters>,
     is_wanted: Arc<AtomicBool>,
     thread: JoinHandle<()>,
@@ -32,7 +30,7 @@ pub struct Drainer {
 impl Drainer {
     /// Starts the thread; it sleeps until there are rings.
     pub fn start() -> Self {
-        let (rings, incoming) = channel::<Vec<LiveTap>>();
+        let (rings, incoming) = channel::<Vec<PacketRing>>();
         let (done, counts) = channel();
         let is_wanted = Arc::new(AtomicBool::new(false));
         let thread = thread::spawn({
@@ -65,28 +63,14 @@ impl Drainer {
         }
     }
 
-    /// Taps both hosts while `work` runs; gives what it gave, and what the kernel counted.
-    ///
-    /// # Errors
-    /// When a host cannot be tapped.
-    pub fn while_tapped<T>(
-        &self,
-        network: &Network,
-        engine: TapEngine,
-        work: impl FnOnce() -> T,
-    ) -> Result<(T, RingCounters), SetupError> {
-        let places = [(0, INTERFACE), (1, INTERFACE)];
-        self.while_tapped_at(network, (engine, &places), work)
-    }
-
     /// Taps interfaces of hosts while `work` runs; gives what it gave, and what the kernel counted.
     ///
     /// # Errors
     /// When one cannot be tapped.
-    pub fn while_tapped_at<T>(
+    pub fn while_tapped<T>(
         &self,
         network: &Network,
-        (engine, places): (TapEngine, &[(usize, &str)]),
+        places: &[(usize, &str)],
         work: impl FnOnce() -> T,
     ) -> Result<(T, RingCounters), SetupError> {
         let flows = [FlowFilter::hil()];
@@ -96,9 +80,9 @@ impl Drainer {
             stamps: RingStamps::Kernel,
         };
         let open = |(host, name): &(usize, &str)| {
-            network.on(*host, || LiveTap::open(engine, name, &flows, &settings))
+            network.on(*host, || PacketRing::open(name, &flows, &settings))
         };
-        let taps: Result<Vec<LiveTap>, _> = places.iter().map(open).collect();
+        let taps: Result<Vec<PacketRing>, _> = places.iter().map(open).collect();
         let taps = taps?;
         self.is_wanted.store(true, Ordering::Release);
         let sent = self.rings.send(taps);
@@ -115,7 +99,7 @@ impl Drainer {
     }
 }
 
-fn drain(ring: &mut LiveTap, file: &mut Vec<u8>) {
+fn drain(ring: &mut PacketRing, file: &mut Vec<u8>) {
     while ring.next_packet(|packet| {
         let packet = PacketToWrite {
             interface_index: 0,

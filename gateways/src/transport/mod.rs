@@ -15,9 +15,6 @@
 //! A refused send or a report of the network is a state the caller sees, never an exit.
 
 mod boxed;
-mod bpf_call;
-mod bpf_code;
-pub mod bpf_tap;
 pub mod card_arming;
 pub mod card_clock;
 pub mod clock_pair;
@@ -25,7 +22,6 @@ pub mod control;
 mod counters;
 pub mod emulated;
 pub mod interface;
-pub mod live_tap;
 pub mod packet_ring;
 mod packet_socket;
 pub mod probe;
@@ -34,7 +30,6 @@ pub mod radio;
 mod reply_stamps;
 pub mod ring_frame;
 pub mod sealed;
-mod tap_ring;
 pub mod tcp;
 pub mod timestamping;
 pub mod udp;
@@ -42,8 +37,6 @@ mod udp_receiver;
 pub mod udp_server;
 mod udp_socket;
 
-#[cfg(test)]
-mod bpf_tests;
 #[cfg(test)]
 mod conformance_tests;
 #[cfg(test)]

@@ -30,7 +30,7 @@ use crate::capture::program::compile;
 /// Smallest and largest ring, bytes.
 pub const RING_BYTES: core::ops::RangeInclusive<usize> = (1 << 16)..=(1 << 28);
 /// Fewest and most bytes kept of a packet.
-pub(super) const SNAP_BYTES: (usize, usize) = (64, 65_536);
+const SNAP_BYTES: (usize, usize) = (64, 65_536);
 /// The kernel gives the ring in pieces of this size.
 const BLOCK_BYTES: usize = 1 << 16;
 /// Room in a frame before the packet: the kernel's header and address, and what aligns them.
@@ -102,18 +102,6 @@ pub enum RingError {
         /// Largest.
         max: usize,
     },
-    /// The host does not do what an eBPF tap needs.
-    #[error("no eBPF tap on `{interface}`: {step}: {source}{hint}")]
-    Program {
-        /// Its name.
-        interface: String,
-        /// What was tried.
-        step: &'static str,
-        /// What the kernel said.
-        source: io::Error,
-        /// What that usually means, or nothing.
-        hint: &'static str,
-    },
     /// The kernel refused a step.
     #[error("cannot tap `{interface}`: {step}: {source}")]
     Refused {
@@ -126,7 +114,8 @@ pub enum RingError {
     },
 }
 
-/// What the kernel counted since the tap was opened.
+/// What the kernel counted since the account began: when the tap was opened, or at
+/// [`PacketRing::begin`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct RingCounters {
     /// Packets of the followed flows, dropped ones included.
@@ -144,7 +133,12 @@ pub struct PacketRing {
     frame_count: usize,
     next_index: usize,
     link_type: u16,
-    counters: RingCounters,
+    /// What the kernel counted since the tap was opened.
+    counted: RingCounters,
+    /// Of that, before the account began.
+    before: RingCounters,
+    /// Packets that [`Self::begin`] took out.
+    discarded_count: u64,
 }
 
 impl PacketRing {
@@ -223,7 +217,9 @@ impl PacketRing {
             frame_count,
             next_index: 0,
             link_type: link,
-            counters: RingCounters::default(),
+            counted: RingCounters::default(),
+            before: RingCounters::default(),
+            discarded_count: 0,
         })
     }
 
@@ -273,12 +269,39 @@ impl PacketRing {
         }
     }
 
-    /// What the kernel counted until now.
+    /// Discards the packets that it holds, at most one turn of the ring, and begins its account anew:
+    /// neither they nor what found no room until now is counted. For taps that are to begin together
+    /// and were opened one after the other.
     ///
     /// # Errors
-    /// When it does not say.
-    #[allow(unsafe_code, reason = "no crate wraps PACKET_STATISTICS")]
+    /// When the kernel does not say what it counted.
+    pub fn begin(&mut self) -> io::Result<()> {
+        let discarded = (0..self.frame_count).take_while(|_| self.next_packet(|_| ()));
+        self.discarded_count += discarded.count() as u64;
+        // Read when the ring has room again. What came since then is in it, and counts: hence the sum,
+        // and not what was matched until now.
+        let dropped_count = self.count()?.dropped_count;
+        self.before = RingCounters {
+            matched_count: self.discarded_count + dropped_count,
+            dropped_count,
+        };
+        Ok(())
+    }
+
+    /// What was counted since the account began.
+    ///
+    /// # Errors
+    /// When the kernel does not say.
     pub fn counters(&mut self) -> io::Result<RingCounters> {
+        let counted = self.count()?;
+        Ok(RingCounters {
+            matched_count: counted.matched_count - self.before.matched_count,
+            dropped_count: counted.dropped_count - self.before.dropped_count,
+        })
+    }
+
+    #[allow(unsafe_code, reason = "no crate wraps PACKET_STATISTICS")]
+    fn count(&mut self) -> io::Result<RingCounters> {
         let mut fresh = libc::tpacket_stats {
             tp_packets: 0,
             tp_drops: 0,
@@ -293,17 +316,13 @@ impl PacketRing {
             return Err(io::Error::last_os_error());
         }
         // Reading sets the kernel's counts to zero.
-        self.counters.matched_count += u64::from(fresh.tp_packets);
-        self.counters.dropped_count += u64::from(fresh.tp_drops);
-        Ok(self.counters)
+        self.counted.matched_count += u64::from(fresh.tp_packets);
+        self.counted.dropped_count += u64::from(fresh.tp_drops);
+        Ok(self.counted)
     }
 }
 
-pub(super) fn check(
-    what: &'static str,
-    value: usize,
-    (min, max): (usize, usize),
-) -> Result<(), RingError> {
+fn check(what: &'static str, value: usize, (min, max): (usize, usize)) -> Result<(), RingError> {
     if (min..=max).contains(&value) {
         return Ok(());
     }

@@ -1,6 +1,5 @@
-//! What both engines of a tap ask of a packet socket: to be bound to an interface, to tell its link
-//! layer and its state, to listen to frames of other addresses. A socket without a protocol hears no
-//! packet and is in no packet's way.
+//! What a tap asks of a packet socket: to be bound to an interface, to tell its link layer, to listen
+//! to frames of other addresses. A socket without a protocol hears no packet and is in no packet's way.
 //!
 //! `unsafe` is allowed here because `nix` opens such sockets only with a protocol, cannot make their
 //! addresses, and wraps few of their options.
@@ -109,40 +108,7 @@ pub(super) fn listen_to_all(socket: &OwnedFd, interface_index: c_uint) -> io::Re
     )
 }
 
-/// Whether the interface of a number is up, whatever it is called by now; `ENODEV` when it has gone.
-/// One of the same name that was made since has another number.
-pub(super) fn is_up(socket: &OwnedFd, interface_index: c_uint) -> io::Result<bool> {
-    let index = c_int::try_from(interface_index).map_err(io::Error::other)?;
-    match ask_is_up(socket, index) {
-        // It may have got another name between the two questions.
-        Err(error) if error.raw_os_error() == Some(libc::ENODEV) => ask_is_up(socket, index),
-        told => told,
-    }
-}
-
-#[allow(
-    unsafe_code,
-    reason = "nix lists all interfaces or none, and takes a missing one for one without a name"
-)]
-fn ask_is_up(socket: &OwnedFd, interface_index: c_int) -> io::Result<bool> {
-    let mut request = libc::ifreq {
-        ifr_name: [0; libc::IFNAMSIZ],
-        ifr_ifru: libc::__c_anonymous_ifr_ifru {
-            ifru_ifindex: interface_index,
-        },
-    };
-    // SAFETY: the kernel reads the number and writes the name of a live structure of its size.
-    let result = unsafe { libc::ioctl(socket.as_raw_fd(), libc::SIOCGIFNAME, &raw mut request) };
-    outcome(result)?;
-    // SAFETY: the kernel reads the name and writes the flags of a live structure of its size.
-    let result = unsafe { libc::ioctl(socket.as_raw_fd(), libc::SIOCGIFFLAGS, &raw mut request) };
-    outcome(result)?;
-    // SAFETY: the request that has just succeeded writes this field.
-    let flags = unsafe { request.ifr_ifru.ifru_flags };
-    Ok(c_int::from(flags) & libc::IFF_UP != 0)
-}
-
-pub(super) fn outcome(result: c_int) -> io::Result<()> {
+fn outcome(result: c_int) -> io::Result<()> {
     if result == 0 {
         Ok(())
     } else {

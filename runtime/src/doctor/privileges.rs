@@ -1,10 +1,9 @@
-//! What this process may ask of the kernel: real-time priority, locked memory and eBPF programs, tried
-//! and not just read from limits. The tries leave no trace: the priority is taken by a thread that
-//! ends, the lock is released again, and a program is attached nowhere.
+//! What this process may ask of the kernel: real-time priority and locked memory, tried and not just
+//! read from limits. The tries leave no trace: the priority is taken by a thread that ends, and the
+//! lock is released again.
 
 use std::thread;
 
-use hil_gateways::transport::bpf_tap;
 use nix::errno::Errno;
 use nix::sys::mman::{MlockAllFlags, mlockall, munlockall};
 use nix::sys::resource::Resource;
@@ -55,7 +54,6 @@ pub(super) fn examine(files: &HostFiles, rights: &Rights) -> Vec<Finding> {
     vec![
         fifo(files, rights.fifo.as_ref(), &rtprio.to_text()),
         memory_lock(files, &memlock.to_text(), try_lock),
-        tap(),
     ]
 }
 
@@ -141,15 +139,6 @@ fn memory_lock(
                 "91-hil.conf",
             ))
         }
-    }
-}
-
-/// What `hil-runtime probe` can tap an interface with.
-fn tap() -> Finding {
-    let id = "probe_tap";
-    match bpf_tap::is_granted() {
-        Ok(()) => Finding::ok(id, "eBPF programs granted"),
-        Err(error) => Finding::note(id, format!("a packet ring at most: {error}")),
     }
 }
 

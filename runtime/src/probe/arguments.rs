@@ -6,7 +6,6 @@ use std::time::Duration;
 use clap::{Args, Subcommand, ValueEnum};
 use hil_gateways::capture::flow::FlowFilter;
 
-use super::tap::TapChoice;
 use crate::cli::arguments::whole;
 
 const EXAMPLES: &str = "\
@@ -17,9 +16,6 @@ Examples:
       RTP through a bridge with two ports, known again by its sequence number
   hil-runtime probe -i eth0 -o card.pcapng --stamps card
       with the network card's own stamps of what arrives beside the kernel's
-  hil-runtime probe -i eth0 -o queued.pcapng --tap packet
-      by a packet ring: what leaves is stamped behind the queueing discipline
-      instead of before it
   ip netns exec robot hil-runtime probe -i eth0 -o robot.pcapng
       the same in another network namespace
   hil-runtime probe analyse here.pcapng there.pcapng
@@ -37,8 +33,8 @@ commas between:
 Exit codes: 0 done; 1 packets were dropped, an interface failed, a file has a
 fault, or the figures differ; 2 wrong arguments, nothing to read, or a capture
 without anything of the run; 69 no such interface; 78 the right to capture is
-missing (root or CAP_NET_RAW), --tap bpf cannot be had, or the card gives no
-stamps; 130 interrupted before --duration was over, the file is complete";
+missing (root or CAP_NET_RAW), or the card gives no stamps; 130 interrupted
+before --duration was over, the file is complete";
 
 const ANALYSE_EXAMPLES: &str = "\
 Examples:
@@ -98,9 +94,6 @@ pub(crate) struct LiveArgs {
     /// sets the card up (`CAP_NET_ADMIN`) and puts it back.
     #[arg(long, value_enum, default_value = "kernel")]
     pub(crate) stamps: Stamps,
-    /// What takes the packets.
-    #[arg(long, value_enum, default_value = "auto")]
-    pub(crate) tap: TapChoice,
     /// Print no progress.
     #[arg(long, short)]
     pub(crate) quiet: bool,

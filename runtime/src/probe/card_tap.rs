@@ -6,8 +6,7 @@ use hil_gateways::capture::flow::FlowFilter;
 use hil_gateways::capture::writer;
 use hil_gateways::capture::{CARD_CLOCK, CaptureInterface};
 use hil_gateways::transport::card_clock::{CardClock, CardPair};
-use hil_gateways::transport::live_tap::{LiveTap, TapEngine};
-use hil_gateways::transport::packet_ring::{RingCounters, RingSettings, RingStamps};
+use hil_gateways::transport::packet_ring::{PacketRing, RingCounters, RingSettings, RingStamps};
 use hil_gateways::transport::ring_frame::StampSource;
 use hil_gateways::transport::timestamping::TimestampCapabilities;
 
@@ -39,7 +38,7 @@ pub(super) struct CardResult {
 #[derive(Debug)]
 pub(super) struct CardTap {
     name: String,
-    ring: LiveTap,
+    ring: PacketRing,
     card: GuardedCard,
     clock: Result<(u32, CardClock), String>,
     /// Its clock where the capture begins and where it ends.
@@ -66,8 +65,7 @@ impl CardTap {
         };
         Ok(Self {
             name: name.to_owned(),
-            // The card's stamps come with packets alone, not with programs.
-            ring: LiveTap::open(TapEngine::Packet, name, flows, &settings)?,
+            ring: PacketRing::open(name, flows, &settings)?,
             result: CardResult {
                 granted: card.armed().describe(),
                 stamps_all_arrivals: card.armed().stamps_all_arrivals(),

@@ -9,13 +9,13 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use hil_gateways::capture::flow::FlowFilter;
 use hil_gateways::capture::writer;
 use hil_gateways::capture::{CaptureInterface, Direction};
-use hil_gateways::transport::live_tap::{LiveTap, TapEngine};
-use hil_gateways::transport::packet_ring::{RingCounters, RingError, RingSettings, RingStamps};
+use hil_gateways::transport::packet_ring::{
+    PacketRing, RingCounters, RingError, RingSettings, RingStamps,
+};
 use hil_gateways::transport::ring_frame::StampSource;
 
 use super::card_tap::{CardResult, CardTap};
 use super::output::{Output, append};
-use super::tap::{self, TapChoice};
 use crate::platform::console::Console;
 use crate::platform::signals::Signals;
 
@@ -37,7 +37,6 @@ pub(super) struct Request {
     pub(super) ring_bytes: usize,
     /// Whose stamps the file is to have, besides the kernel's.
     pub(super) stamps: RingStamps,
-    pub(super) tap: TapChoice,
 }
 
 /// Why a capture failed. What was written until then is a file of whole blocks.
@@ -62,15 +61,10 @@ pub(super) enum LiveError {
 #[derive(Debug, Clone, Default)]
 pub(super) struct InterfaceResult {
     pub(super) name: String,
-    /// What took the packets, in words.
-    pub(super) tapped: String,
     pub(super) inbound_count: u64,
     pub(super) outbound_count: u64,
-    /// Stamped by the tap itself, because the kernel had not yet; departures by eBPF, which are
-    /// always, are not counted.
+    /// Stamped by the tap itself, because the kernel had not yet.
     pub(super) late_stamp_count: u64,
-    /// How often the clock of the tap's own stamps was set anew.
-    pub(super) step_count: u64,
     pub(super) counters: RingCounters,
     /// The interface was taken down or has gone.
     pub(super) has_failed: bool,
@@ -89,7 +83,7 @@ pub(super) struct LiveResult {
 }
 
 struct Tap {
-    ring: LiveTap,
+    ring: PacketRing,
     card: Option<CardTap>,
     /// Number of the interface when it was opened: names are given anew.
     index: Option<u32>,
@@ -161,10 +155,7 @@ fn open_taps(request: &Request, console: &mut Console) -> Result<Vec<Tap>, LiveE
     let mut taps: Vec<Tap> = Vec::with_capacity(request.interfaces.len());
     for name in &request.interfaces {
         let index = nix::net::if_::if_nametoindex(name.as_str()).ok();
-        let (ring, tapped, is_news) = tap::open(request.tap, name, &request.flows, &settings)?;
-        if is_news {
-            console.say(&format!("{name}: {tapped}"));
-        }
+        let ring = PacketRing::open(name, &request.flows, &settings)?;
         let card = match request.stamps {
             RingStamps::Kernel => None,
             RingStamps::Card => {
@@ -186,7 +177,6 @@ fn open_taps(request: &Request, console: &mut Console) -> Result<Vec<Tap>, LiveE
             gone_ns: None,
             result: InterfaceResult {
                 name: name.clone(),
-                tapped,
                 ..InterfaceResult::default()
             },
         });
@@ -232,8 +222,7 @@ fn conclude(
         } = tap.result.counters;
         let span = (start_ns, tap.gone_ns.unwrap_or(end_ns).max(start_ns));
         let counts = (matched_count, dropped_count);
-        let comment = Some(tap.result.tapped.as_str());
-        writer::statistics(file.buffer(), index, span, counts, comment);
+        writer::statistics(file.buffer(), index, span, counts, None);
         if let Some(card) = tap.card.take() {
             let index = tap_count + index;
             tap.result.card = Some(card.finish(index, span, file.buffer()));
@@ -251,7 +240,6 @@ fn describe(buffer: &mut Vec<u8>, request: &Request, taps: &[Tap]) {
     for tap in taps {
         let interface = CaptureInterface {
             name: Some(tap.result.name.clone()),
-            description: Some(tap.result.tapped.clone()),
             link_type: tap.ring.link_type(),
             snap_bytes: request.snap_bytes,
             ..CaptureInterface::default()
@@ -279,7 +267,6 @@ fn drain(
     }
     let link_type = tap.ring.link_type();
     let Tap { ring, result, .. } = tap;
-    let stamps_departures = ring.engine() == TapEngine::Bpf;
     // A ring that fills as fast as it is emptied must not keep the others waiting.
     for _ in 0..ring.frame_count() {
         let buffer = file.buffer();
@@ -287,8 +274,7 @@ fn drain(
             let is_outbound = packet.direction == Direction::Outbound;
             result.outbound_count += u64::from(is_outbound);
             result.inbound_count += u64::from(!is_outbound);
-            let is_late = packet.source == StampSource::Tap && !(is_outbound && stamps_departures);
-            result.late_stamp_count += u64::from(is_late);
+            result.late_stamp_count += u64::from(packet.source == StampSource::Tap);
             append(buffer, index, packet, link_type);
         });
         if !is_there {
@@ -330,7 +316,6 @@ fn is_there(index: Option<u32>) -> bool {
 
 fn count(tap: &mut Tap) -> Result<(), LiveError> {
     tap.result.counters = told(tap.ring.counters(), &tap.result.name)?;
-    tap.result.step_count = tap.ring.step_count();
     if let Some(card) = &mut tap.card {
         card.count()?;
     }

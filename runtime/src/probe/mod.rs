@@ -9,7 +9,6 @@ mod files;
 mod live;
 mod output;
 mod point_clocks;
-mod tap;
 
 use core::fmt::Write as _;
 use std::fs;
@@ -207,7 +206,6 @@ fn capture(args: &LiveArgs) -> u8 {
             Stamps::Kernel => RingStamps::Kernel,
             Stamps::Card => RingStamps::Card,
         },
-        tap: args.tap,
         flows,
     };
     let signals = match Signals::install() {
@@ -226,8 +224,9 @@ fn capture(args: &LiveArgs) -> u8 {
                 LiveError::Ring(RingError::Size { .. } | RingError::LinkLayer { .. })
                 | LiveError::File { .. }
                 | LiveError::Exists { .. } => exit::USAGE,
-                LiveError::Ring(RingError::Rights { .. } | RingError::Program { .. })
-                | LiveError::Card { .. } => exit::HOST_UNFIT,
+                LiveError::Ring(RingError::Rights { .. }) | LiveError::Card { .. } => {
+                    exit::HOST_UNFIT
+                }
                 LiveError::Ring(RingError::Refused { .. }) | LiveError::Counters { .. } => {
                     exit::INTERNAL
                 }
@@ -240,20 +239,12 @@ fn capture(args: &LiveArgs) -> u8 {
 fn tell(text: &mut String, one: &InterfaceResult) {
     let _infallible = write!(
         text,
-        "{}: {} in, {} out, {} dropped by the kernel, {}",
-        one.name, one.inbound_count, one.outbound_count, one.counters.dropped_count, one.tapped
+        "{}: {} in, {} out, {} dropped by the kernel",
+        one.name, one.inbound_count, one.outbound_count, one.counters.dropped_count
     );
     if one.late_stamp_count > 0 {
         let late = one.late_stamp_count;
         let _infallible = write!(text, ", {late} stamped by the tap instead of in the stack");
-    }
-    if one.step_count > 0 {
-        let steps = one.step_count;
-        let _infallible = write!(
-            text,
-            ", {steps} changes of atomic time against the system clock: what left just before \
-             is stamped wrong by them"
-        );
     }
     if one.has_failed {
         text.push_str(", interrupted");

@@ -156,13 +156,6 @@ pub(super) const RIGHTS: &[Entry] = &[
         fix: "echo \"$USER - memlock unlimited\" > /etc/security/limits.d/91-hil.conf and log in again; in a unit \
               LimitMEMLOCK=infinity",
     },
-    Entry {
-        id: "probe_tap",
-        title: "Tap of the passive probe",
-        source: "tried: an eBPF program is loaded and attached nowhere",
-        why: "a packet ring in its place costs the watched hop more: microseconds per packet",
-        fix: "Linux 6.6 or newer, and sudo setcap cap_bpf,cap_net_admin,cap_net_raw+ep hil-runtime",
-    },
 ];
 
 pub(super) const MEMORY: &[Entry] = &[
