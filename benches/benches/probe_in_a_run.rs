@@ -4,8 +4,7 @@
 //! states the aim and whether it was met, or that the rounds were too few to tell, and ends with code 0.
 //!
 //! `cargo bench -p hil-benches --bench probe_in_a_run -- [--rounds N] [--turn SECONDS] [--rate HZ]
-//! [--set KEY=VALUE]...`, about 9 s a round. Namespaces and taps take root; without, it says what is missing. What the taps
-//! cost a bare hop, back to back, is measured by `probe_overhead`.
+//! [--set KEY=VALUE]...`, about 9 s a round. Namespaces and taps take root; without, it says what is missing.
 #![allow(clippy::print_stdout, reason = "a bench prints its result")]
 
 use std::process::ExitCode;

@@ -11,7 +11,6 @@ use hil_gateways::capture::flow::FlowFilter;
 use hil_gateways::capture::writer::{self, PacketToWrite};
 use hil_gateways::transport::live_tap::{LiveTap, TapEngine};
 use hil_gateways::transport::packet_ring::{RingCounters, RingSettings, RingStamps};
-use hil_tests::lab::INTERFACE;
 
 use super::hosts::SetupError;
 use super::network::Network;
@@ -63,20 +62,6 @@ impl Drainer {
             is_wanted,
             thread,
         }
-    }
-
-    /// Taps both hosts while `work` runs; gives what it gave, and what the kernel counted.
-    ///
-    /// # Errors
-    /// When a host cannot be tapped.
-    pub fn while_tapped<T>(
-        &self,
-        network: &Network,
-        engine: TapEngine,
-        work: impl FnOnce() -> T,
-    ) -> Result<(T, RingCounters), SetupError> {
-        let places = [(0, INTERFACE), (1, INTERFACE)];
-        self.while_tapped_at(network, (engine, &places), work)
     }
 
     /// Taps interfaces of hosts while `work` runs; gives what it gave, and what the kernel counted.
