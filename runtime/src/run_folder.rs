@@ -14,7 +14,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 /// | `summary.json` | every figure of the report |
 /// | `report.txt` | the report as printed |
 /// | `events.log` | what happened to the robot, one line each |
-/// | `series/*.csv` | what the case has to plot; `series/README.md` explains the columns |
+/// | `series/*.csv` | what the case has to plot; `series/series.json` explains the columns |
 /// | `report.json` | of a run in virtual time, every figure |
 /// | `traces/*.trace` | what each link did to every message; `hil-runtime trace` reads them |
 /// | `records/*.rec` | one fixed-size record per message and stage |

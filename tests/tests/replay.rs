@@ -190,32 +190,31 @@ fn assert_series_are_those_that_the_case_lists(folder: &Path) {
         "{found:?}"
     );
     listed.extend(networks);
-    listed.push("README.md".to_owned());
+    listed.push("series.json".to_owned());
     listed.sort();
     found.sort();
     assert_eq!(found, listed);
-    let readme = fs::read_to_string(folder.join("README.md")).unwrap();
-    for name in listed.iter().filter(|name| *name != "README.md") {
-        let table = fs::read_to_string(folder.join(name)).unwrap();
+    let list = fs::read(folder.join("series.json")).unwrap();
+    let list: Value = serde_json::from_slice(&list).unwrap();
+    for name in listed.iter().filter_map(|name| name.strip_suffix(".csv")) {
+        let table = fs::read_to_string(folder.join(format!("{name}.csv"))).unwrap();
         let mut lines = table.lines();
         let columns: Vec<_> = lines.next().unwrap().split(',').collect();
         let rows: Vec<_> = lines.map(|line| line.split(',').count()).collect();
         // Ten seconds of motion are two loops.
-        let fewest = match name.as_str() {
-            "motion-loops.csv" => 1,
+        let fewest = match name {
+            "motion-loops" => 1,
             // A row for each tenth of a second.
             name if name.starts_with("network-") => 50,
             _ => 1_000,
         };
         assert!(rows.len() >= fewest, "{name} has {} rows", rows.len());
         assert!(rows.iter().all(|count| *count == columns.len()), "{name}");
-        assert!(readme.contains(&format!("\n## {name}\n")), "{readme}");
-        for column in columns {
-            assert!(
-                readme.contains(&format!("\n| `{column}` | ")),
-                "{column}: {readme}"
-            );
-        }
+        let mut entries = list.as_array().unwrap().iter();
+        let entry = entries.find(|entry| entry["name"] == name);
+        let described = entry.unwrap_or_else(|| panic!("{name}: {list}"))["columns"].as_array();
+        let described = described.unwrap().iter().map(|column| &column["name"]);
+        assert!(described.eq(columns.iter()), "{name}: {list}");
     }
 }
 

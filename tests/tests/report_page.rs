@@ -145,6 +145,8 @@ fn a_run_without_summary_series_or_sense_still_becomes_a_page() {
     fs::write(&path, summary.to_string()).unwrap();
     fs::create_dir_all(folder.join("series")).unwrap();
     fs::write(folder.join("series/bad.csv"), "time_s,a\n0,1\n1,x\n").unwrap();
+    let list = r#"[{"name": "bad", "title": "", "notes": [], "row_count": 2, "columns": []}]"#;
+    fs::write(folder.join("series/series.json"), list).unwrap();
     let text = page(&[&folder], &output);
     assert!(!text.contains("<img") && text.contains("&lt;img"));
     assert!(text.contains("no records of this channel"));

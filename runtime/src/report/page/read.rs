@@ -10,6 +10,7 @@ use super::material::{Found, Manifest, Material};
 use super::series::{self, Series};
 use crate::report::summary::{Fact, RunSummary};
 use crate::run_folder::RunFolder;
+use crate::series::list;
 
 /// Largest series that is read, bytes: an hour of two arms is a tenth of it.
 const SERIES_BYTES_MAX: u64 = 1 << 30;
@@ -139,30 +140,19 @@ fn manifest_of(manifest: &Value, folder: &RunFolder) -> Manifest {
 }
 
 fn all_series(folder: &Path, problems: &mut Vec<String>) -> Vec<Series> {
-    let Ok(entries) = fs::read_dir(folder) else {
-        return Vec::new();
-    };
-    let readme = fs::read_to_string(folder.join("README.md")).unwrap_or_default();
-    let mut paths: Vec<_> = entries.flatten().map(|entry| entry.path()).collect();
-    paths.retain(|path| path.extension().is_some_and(|ending| ending == "csv"));
-    // As the README lists them, which is the case's order; then by name.
-    let place = |path: &Path| {
-        let name = path.file_name().unwrap_or_default().to_string_lossy();
-        let place = readme.find(&format!("## {name}"));
-        (place.unwrap_or(usize::MAX), name.into_owned())
-    };
-    paths.sort_by_key(|path| place(path));
+    let entries = list(folder).unwrap_or_else(|error| {
+        problems.push(format!("series/ cannot be read: {error}"));
+        Vec::new()
+    });
     let mut all = Vec::new();
-    for path in paths {
-        match one_series(&path) {
+    for entry in entries {
+        let file = format!("{}.csv", entry.name);
+        match one_series(&folder.join(&file)) {
             Ok(mut series) => {
-                series.describe(&readme);
+                series.describe(entry);
                 all.push(series);
             }
-            Err(text) => {
-                let name = path.file_name().unwrap_or_default().to_string_lossy();
-                problems.push(format!("series/{name} cannot be read: {text}"));
-            }
+            Err(text) => problems.push(format!("series/{file} cannot be read: {text}")),
         }
     }
     all
