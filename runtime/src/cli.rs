@@ -189,10 +189,6 @@ pub struct ReportArgs {
     /// The folders of the runs.
     #[arg(required = true, value_name = "RUN")]
     pub runs: Vec<PathBuf>,
-    /// Print summary.json as the run wrote it; --format json prints the data of a page instead, in a
-    /// layout of its own.
-    #[arg(long, conflicts_with_all = ["output", "format", "template", "figure"])]
-    pub json: bool,
     /// Write the report to this file (or figures to this folder) instead of printing it.
     #[arg(long, short, value_name = "FILE")]
     pub output: Option<PathBuf>,
