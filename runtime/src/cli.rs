@@ -259,10 +259,7 @@ pub enum Command {
         /// Change one value of the file; may be repeated.
         #[arg(long = "set", value_name = "KEY=VALUE")]
         overrides: Vec<String>,
-        /// Print JSON instead of a table.
-        #[arg(long)]
-        json: bool,
-        /// Also write report.txt, report.json, events.log and the case's series to this folder.
+        /// Also write the run's folder: summary.json, report.txt, events.log and the case's series.
         #[arg(long, short, value_name = "DIR")]
         output: Option<PathBuf>,
     },

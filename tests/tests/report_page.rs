@@ -170,7 +170,7 @@ fn virtual_time_becomes_a_page_and_every_other_form() {
     let output = record.join("report.html");
     let text = page(&[&teleoperation], &output);
     let source: Value =
-        serde_json::from_str(&fs::read_to_string(teleoperation.join("report.json")).unwrap())
+        serde_json::from_str(&fs::read_to_string(teleoperation.join("summary.json")).unwrap())
             .unwrap();
     let first = &source["network"]["channels"][0];
     assert!(text.contains(first["channel"].as_str().unwrap()));

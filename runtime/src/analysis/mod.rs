@@ -8,7 +8,7 @@ mod clock_path;
 mod clocks;
 mod events;
 mod faces;
-mod figures;
+pub(crate) mod figures;
 mod interruptions;
 pub(crate) mod link_changes;
 #[cfg(test)]

@@ -165,21 +165,6 @@ fn figures(
     Ok(())
 }
 
-/// A folder of `simulate` or `tables` has its report as it was printed.
-fn show_virtual(folder: &RunFolder, console: &mut Console) -> u8 {
-    let path = folder.report();
-    match fs::read_to_string(&path) {
-        Ok(text) => {
-            console.result(text.trim_end());
-            exit::RAN
-        }
-        Err(error) => {
-            console.error(&format!("{}: {error}", path.display()));
-            exit::USAGE
-        }
-    }
-}
-
 /// The report as the run printed it.
 fn show(run: &Path, console: &mut Console) -> u8 {
     let folder = RunFolder::existing(run);
@@ -193,8 +178,6 @@ fn show(run: &Path, console: &mut Console) -> u8 {
             let path = folder.summary();
             let text = if folder.manifest().is_file() {
                 "this run never began or was killed outright, so it left no summary".to_owned()
-            } else if folder.virtual_report().is_file() {
-                return show_virtual(&folder, console);
             } else {
                 format!("not a run's folder: {error}")
             };

@@ -21,7 +21,7 @@ const PRINTED_BYTES_MAX: usize = 200_000;
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum ReadError {
     /// Nothing in it is known.
-    #[error("{0}: no summary.json, report.json or manifest.json; not a run's folder")]
+    #[error("{0}: no summary.json or manifest.json; not a run's folder")]
     NoRun(String),
     /// A file is not what it should be.
     #[error("{path}: {text}")]
@@ -91,14 +91,7 @@ fn found(folder: &RunFolder) -> Result<Found, ReadError> {
         let summary = RunSummary::from_json(&text);
         let summary =
             summary.map_err(|error| file_error(&folder.summary(), &with_source(&error)))?;
-        return Ok(Found::Live(Box::new(summary)));
-    }
-    if let Some(text) = text_of(&folder.virtual_report())? {
-        let report = serde_json::from_str(&text);
-        let path = folder.virtual_report();
-        let report = report
-            .map_err(|error| file_error(&path, &format!("not a report of `simulate`: {error}")))?;
-        return Ok(Found::Virtual(Box::new(report)));
+        return Ok(Found::Ended(Box::new(summary)));
     }
     let path = folder.manifest();
     let Some(text) = text_of(&path)? else {
