@@ -99,8 +99,6 @@ fn the_doctor_measures_latency_with_counts_that_follow_from_the_time() {
         "{gaps}"
     );
     assert!(number(&gaps["look_count"]) > 1000, "{gaps}");
-    let cyclictest = latency["cyclictest"].as_object().unwrap();
-    assert!(cyclictest.contains_key("available") || cyclictest.contains_key("unavailable"));
     let claims = latency["claims"].as_array().unwrap();
     for id in [
         "median",
@@ -161,8 +159,4 @@ fn an_interrupted_measurement_gives_what_there_was_so_far() {
         "{latency}"
     );
     assert!(latency["gaps"].as_array().unwrap().is_empty());
-    assert!(
-        latency["cyclictest"]["unavailable"].is_string(),
-        "{latency}"
-    );
 }

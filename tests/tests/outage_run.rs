@@ -12,7 +12,7 @@ use hil_models::measure::account::MessageFate;
 use hil_models::measure::record::{IngressRecord, PublishedRecord};
 use hil_models::random::RandomStream;
 use hil_models::time::Instant;
-use hil_runtime::report::summary::LinkKind;
+use hil_runtime::report::summary::{LinkKind, RunSummary};
 use hil_tests::account::{account, assert_every_message_is_accounted_for, channel, describe};
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::run_folder::RunFolder;
@@ -71,14 +71,17 @@ fn a_live_run_loses_the_spans_that_virtual_time_loses() {
     assert!(outages.len() >= 4, "{outages:?}");
     let mut simulated = Command::new(hil_runtime_binary());
     simulated.arg("simulate").args(trial.arguments());
-    let output = simulated.arg("--json").output().unwrap();
+    let folder = record.join("simulated");
+    let output = simulated.arg("--output").arg(&folder).output().unwrap();
     assert!(output.status.success(), "{output:?}");
-    let virtual_time: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    let text = fs::read_to_string(folder.join("summary.json")).unwrap();
+    let virtual_time = RunSummary::from_json(&text).unwrap();
+    let simulated = serde_json::to_value(virtual_time.network.as_ref().unwrap()).unwrap();
     let live = serde_json::to_value(summary.network.as_ref().unwrap()).unwrap();
-    assert_the_error_follows_the_silence(&live, &virtual_time["network"]);
+    assert_the_error_follows_the_silence(&live, &simulated);
     for name in CHANNELS {
         assert_the_report_shows_what_preceded_what(&live, name);
-        assert_the_report_shows_what_preceded_what(&virtual_time["network"], name);
+        assert_the_report_shows_what_preceded_what(&simulated, name);
         let file = format!("series/network-{}.csv", name.replace('/', "-"));
         let table = fs::read_to_string(files.root().join(file)).unwrap();
         assert!(table.lines().count() > 100, "{table}");
@@ -97,10 +100,8 @@ fn a_live_run_loses_the_spans_that_virtual_time_loses() {
         }
         assert!(certain_count > 50, "{certain_count}");
         let lost_count = messages.iter().filter(|(_, has_come)| !has_come).count() as u64;
-        let counts = &virtual_time["channels"][name];
-        let count = |key: &str| counts[key].as_u64().unwrap();
-        let lost_virtually =
-            count("published_count") - count("taken_count") - count("in_flight_count");
+        let virtually = crate::account(&virtual_time, name);
+        let lost_virtually = virtually.fates.lost_count();
         let counters = channel(&summary, name).directions.iter();
         let emulated_count: u64 = counters
             .flat_map(|one| &one.counters)
@@ -113,7 +114,7 @@ fn a_live_run_loses_the_spans_that_virtual_time_loses() {
             lost_count,
             messages.len(),
             lost_virtually,
-            count("published_count"),
+            virtually.published_count,
             outages.len()
         );
         // One message at each end of each outage, and what was under way at the end.

@@ -303,7 +303,7 @@ fn what_cannot_be_tapped_or_read_is_refused_with_its_own_exit_code() {
         (
             vec!["-i", "lo", "-o", output, "--duration", "soon"],
             2,
-            "is no unit",
+            "no number before its unit",
         ),
     ] {
         let mut command = Command::new(hil_runtime_binary());

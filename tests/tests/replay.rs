@@ -8,6 +8,7 @@ use std::process::Command;
 use std::time::Duration;
 
 use hil_models::measure::account::MessageFate;
+use hil_runtime::report::summary::RunSummary;
 use hil_tests::account::account;
 use hil_tests::binary::{hil_runtime_binary, workspace_folder};
 use hil_tests::child::{ChildGuard, Finished};
@@ -144,8 +145,6 @@ fn a_run_in_virtual_time_leaves_the_same_files_but_no_records() {
     ];
     let simulated = run(&arguments);
     assert_code(&simulated, 0);
-    let wrote = "report.txt, report.json, events.log and the series";
-    assert!(simulated.stderr.contains(wrote), "{simulated:?}");
     let again = run(&arguments);
     assert_code(&again, 2);
     assert!(
@@ -164,10 +163,16 @@ fn a_run_in_virtual_time_leaves_the_same_files_but_no_records() {
         fs::read_to_string(output.join("report.txt")).unwrap(),
         simulated.stdout
     );
-    let document = fs::read_to_string(output.join("report.json")).unwrap();
-    let document: Value = serde_json::from_str(&document).unwrap();
-    let command = &document["outages"]["egm/right/command"];
-    assert!(command["outage_count"].as_u64().unwrap() > 20, "{document}");
+    let summary = fs::read_to_string(output.join("summary.json")).unwrap();
+    let summary = RunSummary::from_json(&summary).unwrap();
+    let channels = &mut summary.channels.iter();
+    let command = channels
+        .find(|one| one.name == "egm/right/command")
+        .unwrap();
+    assert!(
+        command.outages.as_ref().unwrap().outage_count > 20,
+        "{command:?}"
+    );
     assert!(output.join("events.log").is_file());
     assert_series_are_those_that_the_case_lists(&output.join("series"));
     assert_code(&replay(&output), 2);
@@ -190,32 +195,31 @@ fn assert_series_are_those_that_the_case_lists(folder: &Path) {
         "{found:?}"
     );
     listed.extend(networks);
-    listed.push("README.md".to_owned());
+    listed.push("series.json".to_owned());
     listed.sort();
     found.sort();
     assert_eq!(found, listed);
-    let readme = fs::read_to_string(folder.join("README.md")).unwrap();
-    for name in listed.iter().filter(|name| *name != "README.md") {
-        let table = fs::read_to_string(folder.join(name)).unwrap();
+    let list = fs::read(folder.join("series.json")).unwrap();
+    let list: Value = serde_json::from_slice(&list).unwrap();
+    for name in listed.iter().filter_map(|name| name.strip_suffix(".csv")) {
+        let table = fs::read_to_string(folder.join(format!("{name}.csv"))).unwrap();
         let mut lines = table.lines();
         let columns: Vec<_> = lines.next().unwrap().split(',').collect();
         let rows: Vec<_> = lines.map(|line| line.split(',').count()).collect();
         // Ten seconds of motion are two loops.
-        let fewest = match name.as_str() {
-            "motion-loops.csv" => 1,
+        let fewest = match name {
+            "motion-loops" => 1,
             // A row for each tenth of a second.
             name if name.starts_with("network-") => 50,
             _ => 1_000,
         };
         assert!(rows.len() >= fewest, "{name} has {} rows", rows.len());
         assert!(rows.iter().all(|count| *count == columns.len()), "{name}");
-        assert!(readme.contains(&format!("\n## {name}\n")), "{readme}");
-        for column in columns {
-            assert!(
-                readme.contains(&format!("\n| `{column}` | ")),
-                "{column}: {readme}"
-            );
-        }
+        let mut entries = list.as_array().unwrap().iter();
+        let entry = entries.find(|entry| entry["name"] == name);
+        let described = entry.unwrap_or_else(|| panic!("{name}: {list}"))["columns"].as_array();
+        let described = described.unwrap().iter().map(|column| &column["name"]);
+        assert!(described.eq(columns.iter()), "{name}: {list}");
     }
 }
 

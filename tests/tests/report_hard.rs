@@ -9,6 +9,7 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use hil_models::measure::account::{MessageFate, Stage};
+use hil_runtime::report::summary::RunSummary;
 use hil_tests::account::{account, assert_every_message_is_accounted_for};
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::browser::Browser;
@@ -124,14 +125,10 @@ fn a_run_of_a_million_messages_has_a_page_of_bounded_size() {
     let rest = [file.as_path(), Path::new("--output"), &folder];
     run(&[words.as_slice(), rest.as_slice()].concat()).assert_success();
     println!("simulated in {:?}", began.elapsed());
-    let report = fs::read_to_string(folder.join("report.json")).unwrap();
-    let report: serde_json::Value = serde_json::from_str(&report).unwrap();
-    let published = |name: &str| {
-        report["channels"][name]["published_count"]
-            .as_u64()
-            .unwrap()
-    };
-    let count: u64 = CHANNELS.iter().map(|name| published(name)).sum();
+    let summary = fs::read_to_string(folder.join("summary.json")).unwrap();
+    let summary = RunSummary::from_json(&summary).unwrap();
+    let published = |name: &&str| account(&summary, name).published_count;
+    let count: u64 = CHANNELS.iter().map(published).sum();
     assert!(count >= 990_000, "{count}");
     let output = record.join("page.html");
     let page = page(&folder, &output);

@@ -145,6 +145,8 @@ fn a_run_without_summary_series_or_sense_still_becomes_a_page() {
     fs::write(&path, summary.to_string()).unwrap();
     fs::create_dir_all(folder.join("series")).unwrap();
     fs::write(folder.join("series/bad.csv"), "time_s,a\n0,1\n1,x\n").unwrap();
+    let list = r#"[{"name": "bad", "title": "", "notes": [], "row_count": 2, "columns": []}]"#;
+    fs::write(folder.join("series/series.json"), list).unwrap();
     let text = page(&[&folder], &output);
     assert!(!text.contains("<img") && text.contains("&lt;img"));
     assert!(text.contains("no records of this channel"));
@@ -168,7 +170,7 @@ fn virtual_time_becomes_a_page_and_every_other_form() {
     let output = record.join("report.html");
     let text = page(&[&teleoperation], &output);
     let source: Value =
-        serde_json::from_str(&fs::read_to_string(teleoperation.join("report.json")).unwrap())
+        serde_json::from_str(&fs::read_to_string(teleoperation.join("summary.json")).unwrap())
             .unwrap();
     let first = &source["network"]["channels"][0];
     assert!(text.contains(first["channel"].as_str().unwrap()));

@@ -74,6 +74,8 @@ fn live(trial: &Trial, limit: Duration) -> RunFiles {
 
 /// `seconds` of virtual time over the traces of `files`, its messages matched by `matching`.
 fn replayed(trial: &Trial, files: &RunFiles, matching: &str, seconds: u64) -> Value {
+    let output_folder = RunFolder::new("trace-replayed");
+    let simulated = output_folder.join("simulated");
     let folder = files.root().join("traces");
     let replay = trial
         .clone()
@@ -85,10 +87,17 @@ fn replayed(trial: &Trial, files: &RunFiles, matching: &str, seconds: u64) -> Va
     simulate
         .arg("simulate")
         .args(replay.arguments())
-        .arg("--json");
+        .arg("--output")
+        .arg(&simulated);
     let output = simulate.output().unwrap();
     assert!(output.status.success(), "{}", text(&output.stderr));
-    serde_json::from_slice(&output.stdout).unwrap()
+    serde_json::from_slice(&fs::read(simulated.join("summary.json")).unwrap()).unwrap()
+}
+
+/// One channel of a summary.
+fn channel_of<'a>(summary: &'a Value, channel: &str) -> &'a Value {
+    let mut channels = summary["channels"].as_array().unwrap().iter();
+    channels.find(|one| one["name"] == channel).unwrap()
 }
 
 /// Equal counts for the same departures: every message that the live run published is met once, and
@@ -104,12 +113,12 @@ fn check_counts(files: &RunFiles, virtual_time: &Value, channel: &str, least_cou
     assert_eq!(trace.records.len() as u64, live.published_count);
     assert_eq!(counts.delivered_count, forwarded_count, "{channel}");
     assert!(live.published_count >= least_count, "{channel}");
-    let channels = &virtual_time["channels"][channel];
-    let count = |key: &str| channels[key].as_u64().unwrap();
-    let replay = &virtual_time["trace_replays"][channel];
+    let virtually = channel_of(virtual_time, channel);
+    let replay = &virtually["trace_replay"];
     let met = |key: &str| replay[key].as_u64().unwrap();
-    let published_count = count("published_count");
-    let lost_virtually = published_count - count("taken_count") - count("in_flight_count");
+    let published_count = virtually["account"]["published_count"].as_u64().unwrap();
+    let fates = &virtually["account"]["fates"];
+    let lost_virtually = fates["lost_on_wire"].as_u64().unwrap_or(0);
     println!(
         "{channel} by {}: live {} published, {forwarded_count} delivered, {} lost, {} unknown; in \
          virtual time {published_count} published, {} met a record, {} delivered, {} lost, {} \
@@ -161,7 +170,7 @@ fn check_counts(files: &RunFiles, virtual_time: &Value, channel: &str, least_cou
 /// often, and the n-th message of both meets the same.
 fn check_rare(files: &RunFiles, virtual_time: &Value, channel: &str) {
     let trace = trace_of(files, channel);
-    let replay = &virtual_time["trace_replays"][channel];
+    let replay = &channel_of(virtual_time, channel)["trace_replay"];
     println!("{channel}: {} live; {replay}", trace.records.len());
     let met = |key: &str| replay[key].as_u64().unwrap();
     let same_count = met("offered_count").min(trace.records.len() as u64);
@@ -177,7 +186,7 @@ fn check_rare(files: &RunFiles, virtual_time: &Value, channel: &str) {
 /// Of two scores with intervals, live and in virtual time, one lies in the interval of the other;
 /// gives how many there are, and the largest difference as a share of the live value.
 fn check_scores(summary: &RunSummary, virtual_time: &Value) -> (usize, f64) {
-    let simulated = virtual_time["score"]["metrics"].as_array().unwrap();
+    let simulated = virtual_time["score"].as_array().unwrap();
     let (mut compared_count, mut furthest) = (0, 0.0_f64);
     for metric in &summary.score {
         let other = simulated.iter().find(|one| one["name"] == metric.name);
@@ -223,7 +232,8 @@ fn a_live_shuttle_run_and_its_replay_agree() {
     for matching in ["index", "tick"] {
         let virtual_time = replayed(&trial, &files, matching, duration + LONGER_S);
         for channel in CHANNELS {
-            assert_eq!(virtual_time["trace_replays"][channel]["matching"], matching);
+            let replay = &channel_of(&virtual_time, channel)["trace_replay"];
+            assert_eq!(replay["matching"], matching);
             // Four in five of what a punctual process publishes.
             check_counts(&files, &virtual_time, channel, 80 * duration);
         }
@@ -273,7 +283,10 @@ fn a_live_teleoperation_run_and_its_replay_agree() {
         );
     }
     for channel in ["egm/right/command", "egm/left/command"] {
-        assert_eq!(by_tick["trace_replays"][channel]["matching"], "tick");
+        assert_eq!(
+            channel_of(&by_tick, channel)["trace_replay"]["matching"],
+            "tick"
+        );
         check_counts(&files, &by_tick, channel, 100 * duration);
     }
     for channel in RARE_CHANNELS {

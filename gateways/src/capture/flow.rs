@@ -10,6 +10,7 @@ use core::str::FromStr;
 use std::net::IpAddr;
 
 use hil_models::egm::wire;
+use hil_models::message::{FNV_OFFSET, fnv1a};
 use thiserror::Error;
 
 use super::link::UdpDatagram;
@@ -419,9 +420,6 @@ fn any(
     })
 }
 
-/// Fowler, Noll and Vo's hash 1a over 64 bits.
 fn hash(bytes: &[u8]) -> u64 {
-    bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
-        (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3)
-    })
+    fnv1a(FNV_OFFSET, bytes)
 }

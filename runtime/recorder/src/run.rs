@@ -37,10 +37,7 @@ pub(crate) enum RunError {
         source: io::Error,
     },
     /// Of a run in virtual time.
-    #[error(
-        "{path}: a folder of `simulate` or `tables` has no records; only a run's folder can be \
-         converted"
-    )]
+    #[error("{path}: a folder of `simulate` has no records; only a run's folder can be converted")]
     Virtual {
         /// The folder.
         path: PathBuf,
@@ -105,7 +102,7 @@ impl Run {
         goes_on: &mut dyn FnMut((f64, &str)) -> bool,
     ) -> Result<Self, RunError> {
         let folder = RunFolder::existing(path);
-        if !folder.records().is_dir() && folder.virtual_report().is_file() {
+        if !folder.records().is_dir() && folder.summary().is_file() {
             let path = path.to_owned();
             return Err(RunError::Virtual { path });
         }

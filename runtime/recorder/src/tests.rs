@@ -233,7 +233,7 @@ fn other_folders_and_files_are_named_as_such() {
     fs::remove_dir(folder.at("run/records")).unwrap();
     let error = folder.convert().unwrap_err();
     assert!(matches!(error, ConvertError::Run(RunError::Foreign { .. })));
-    fs::write(folder.at("run/report.json"), "{}").unwrap();
+    fs::write(folder.at("run/summary.json"), "{}").unwrap();
     let error = folder.convert().unwrap_err();
     assert!(matches!(error, ConvertError::Run(RunError::Virtual { .. })));
     assert!(!folder.at("run.mcap").exists());

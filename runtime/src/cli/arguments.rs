@@ -190,10 +190,6 @@ pub struct ReportArgs {
     /// The folders of the runs.
     #[arg(required = true, value_name = "RUN")]
     pub runs: Vec<PathBuf>,
-    /// Print summary.json as the run wrote it; --format json prints the data of a page instead, in a
-    /// layout of its own.
-    #[arg(long, conflicts_with_all = ["output", "format", "template", "figure"])]
-    pub json: bool,
     /// Write the report to this file (or figures to this folder) instead of printing it.
     #[arg(long, short, value_name = "FILE")]
     pub output: Option<PathBuf>,
@@ -264,10 +260,7 @@ pub enum Command {
         /// Change one value of the file; may be repeated.
         #[arg(long = "set", value_name = "KEY=VALUE")]
         overrides: Vec<String>,
-        /// Print JSON instead of a table.
-        #[arg(long)]
-        json: bool,
-        /// Also write report.txt, report.json, events.log and the case's series to this folder.
+        /// Also write the run's folder: summary.json, report.txt, events.log and the case's series.
         #[arg(long, short, value_name = "DIR")]
         output: Option<PathBuf>,
     },

@@ -81,12 +81,8 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
         Command::Simulate {
             topology,
             overrides,
-            json,
             output,
-        } => {
-            let file = (topology.as_path(), overrides.as_slice());
-            case_work::simulate(file, json, output.as_deref(), registry, console)
-        }
+        } => case_work::simulate(&topology, &overrides, output.as_deref(), registry, console),
         Command::Tables {
             topology,
             mut overrides,

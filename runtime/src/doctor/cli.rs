@@ -6,7 +6,7 @@ use std::time::Duration;
 use clap::Args;
 
 use crate::cli::arguments::whole;
-use crate::topology::parse_duration;
+use crate::topology::duration_within;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -18,9 +18,8 @@ Examples:
   hil-runtime doctor --strict && hil-runtime --topology split.toml
       run only on a host without warnings
   hil-runtime doctor --latency 30s --cpu 2,3
-      how late threads wake on two CPUs and what a busy poller loses there, with
-      cyclictest beside it when that is installed, and what figures in
-      microseconds this supports
+      how late threads wake on two CPUs and what a busy poller loses there, and
+      what figures in microseconds this supports
   hil-runtime doctor --json > robot-pc.json
   hil-runtime doctor --with robot-pc.json
       how far the clocks of two hosts may be apart
@@ -30,8 +29,8 @@ taken for ok), warning, error. docs/doctor.md explains every finding by its
 name, and the JSON.
 
 --latency TIME measures for TIME on all CPUs at once, then lets a busy poller
-spin for TIME, 10 s at most, on one CPU after the other, then runs cyclictest
-for TIME. Ctrl-C gives what there is so far.
+spin for TIME, 10 s at most, on one CPU after the other. Ctrl-C gives what there
+is so far.
 
 Exit codes:
   0    examined; without --strict whatever was found
@@ -63,7 +62,8 @@ pub struct DoctorArgs {
     #[arg(long)]
     pub json: bool,
     /// Measure wake-up latency and gaps for this long each, at least 100 ms.
-    #[arg(long, value_name = "TIME", value_parser = duration)]
+    #[arg(long, value_name = "TIME",
+          value_parser = duration_within(Duration::from_millis(100), Duration::from_hours(24)))]
     pub latency: Option<Duration>,
     /// CPUs to measure on; without it those the topology pins, else the isolated ones, else all.
     #[arg(long, value_name = "N", value_delimiter = ',', requires = "latency")]
@@ -74,47 +74,6 @@ pub struct DoctorArgs {
     pub priority: u8,
     /// From one wake-up to the next, 100 us to 1 s.
     #[arg(long, value_name = "TIME", default_value = "1ms", requires = "latency",
-          value_parser = period)]
+          value_parser = duration_within(Duration::from_micros(100), Duration::from_secs(1)))]
     pub period: Duration,
-}
-
-const DURATION_MIN: Duration = Duration::from_millis(100);
-const DURATION_MAX: Duration = Duration::from_hours(24);
-const PERIOD_MIN: Duration = Duration::from_micros(100);
-const PERIOD_MAX: Duration = Duration::from_secs(1);
-
-fn duration(text: &str) -> Result<Duration, String> {
-    within(text, (DURATION_MIN, DURATION_MAX), "100 ms to 24 h")
-}
-
-fn period(text: &str) -> Result<Duration, String> {
-    within(text, (PERIOD_MIN, PERIOD_MAX), "100 us to 1 s")
-}
-
-fn within(
-    text: &str,
-    (least, most): (Duration, Duration),
-    range: &str,
-) -> Result<Duration, String> {
-    let read = parse_duration(text)
-        .map_err(|error| format!("{error}; write a time such as `30 s`, {range}"))?;
-    if (least..=most).contains(&read) {
-        Ok(read)
-    } else {
-        Err(format!("is outside {range}"))
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn times_have_a_unit_and_a_range() {
-        assert_eq!(duration("30s"), Ok(Duration::from_secs(30)));
-        assert_eq!(period("1 ms"), Ok(Duration::from_millis(1)));
-        assert_eq!(duration("50 ms").unwrap_err(), "is outside 100 ms to 24 h");
-        assert_eq!(period("2 s").unwrap_err(), "is outside 100 us to 1 s");
-        assert!(duration("30").unwrap_err().contains("no unit"));
-    }
 }

@@ -1,9 +1,8 @@
-//! How late this host wakes a thread and how long it takes a busy poller's CPU away: measured, with
-//! `cyclictest` beside it where that is installed, and what figures in microseconds this allows. It is
-//! a measurement of the host as it is now, not a qualification.
+//! How late this host wakes a thread and how long it takes a busy poller's CPU away: measured, and
+//! what figures in microseconds this allows. It is a measurement of the host as it is now, not a
+//! qualification.
 
 mod claims;
-mod cyclictest;
 mod loops;
 mod render;
 
@@ -16,7 +15,6 @@ use nix::sys::mman::munlockall;
 use serde::{Deserialize, Serialize};
 
 pub use self::claims::{Claim, Standing};
-pub use self::cyclictest::{CyclictestReport, CyclictestThread};
 use crate::platform::host_facts::{
     Fact, HostFiles, ProcessorTicks, RealtimeThrottle, format_cpu_list, load_average, online_cpus,
     virtual_machine,
@@ -40,7 +38,7 @@ pub struct LatencyRequest {
     pub priority: u8,
     /// From one wake-up to the next.
     pub period: Duration,
-    /// Also measure the gaps of a busy poller, and run `cyclictest` where it is installed.
+    /// Also measure the gaps of a busy poller.
     pub is_thorough: bool,
 }
 
@@ -60,12 +58,11 @@ impl LatencyRequest {
     pub fn announcement(&self) -> String {
         let seconds = |duration: Duration| duration.as_secs_f64();
         format!(
-            "measuring on CPU {}: {} s of wake-ups, {} s of busy polling, {} s of cyclictest where it is \
-             installed; Ctrl-C gives what there is so far",
+            "measuring on CPU {}: {} s of wake-ups, {} s of busy polling; Ctrl-C gives what there is so \
+             far",
             format_cpu_list(&self.cpus),
             seconds(self.duration),
             seconds(self.spin_total()),
-            seconds(self.duration)
         )
     }
 
@@ -198,8 +195,6 @@ pub struct LatencyReport {
     pub wakeups: Vec<Wakeups>,
     /// One per CPU, in turn; empty in a brief measurement.
     pub gaps: Vec<Gaps>,
-    /// `cyclictest` on the same CPUs, or why not.
-    pub cyclictest: Fact<CyclictestReport>,
     /// What else went on.
     pub surroundings: Surroundings,
     /// What figures this host supports, each with its rule.
@@ -262,13 +257,13 @@ impl Steps<'_> {
 }
 
 /// Measures, for [`LatencyRequest::duration`] per part: wake-ups on all CPUs at once, then a busy
-/// poller on one CPU after the other, then `cyclictest`. A wish to stop ends it with what there is.
+/// poller on one CPU after the other. A wish to stop ends it with what there is.
 pub fn measure(request: &LatencyRequest, files: &HostFiles, watch: &Watch<'_>) -> LatencyReport {
     let was_locked = is_locked(files);
     let load_before = load_average(files).map(|(_, words)| words);
     let ticks_before = ProcessorTicks::read(files);
     let whole = if request.is_thorough {
-        request.duration + request.spin_total() + request.duration
+        request.duration + request.spin_total()
     } else {
         request.duration
     };
@@ -278,18 +273,11 @@ pub fn measure(request: &LatencyRequest, files: &HostFiles, watch: &Watch<'_>) -
         whole,
     };
     let wakeups = wakeups(request, &steps);
-    let (mut gaps, mut cyclictest) = (Vec::new(), Fact::Unavailable("not asked for".to_owned()));
+    let mut gaps = Vec::new();
     if request.is_thorough {
         let throttle = RealtimeThrottle::read(files);
         let throttle = throttle.available().copied().filter(|one| one.is_active());
         gaps = spin(request, files, &steps, throttle);
-        cyclictest = if (watch.is_stopped)() {
-            Fact::Unavailable("interrupted before it".to_owned())
-        } else {
-            cyclictest::run(request, &|| (watch.is_stopped)(), &|words| {
-                steps.tell(words);
-            })
-        };
     }
     // Only what this measurement locked is released.
     if !was_locked {
@@ -304,7 +292,6 @@ pub fn measure(request: &LatencyRequest, files: &HostFiles, watch: &Watch<'_>) -
         is_interrupted: (watch.is_stopped)(),
         wakeups,
         gaps,
-        cyclictest,
         surroundings: Surroundings {
             load_before,
             load_after: load_average(files).map(|(_, words)| words),
@@ -450,7 +437,6 @@ mod tests {
         assert!(report.is_interrupted);
         assert_eq!(report.wakeups.len(), 1);
         assert!(report.gaps.is_empty());
-        assert!(matches!(report.cyclictest, Fact::Unavailable(_)));
         let text = serde_json::to_string(&report).unwrap();
         assert_eq!(
             serde_json::from_str::<LatencyReport>(&text).unwrap(),

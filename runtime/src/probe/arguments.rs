@@ -6,7 +6,9 @@ use std::time::Duration;
 use clap::{Args, Subcommand, ValueEnum};
 use hil_gateways::capture::flow::FlowFilter;
 
+use super::tap::TapChoice;
 use crate::cli::arguments::whole;
+use crate::topology::duration_within;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -81,7 +83,7 @@ pub(crate) struct LiveArgs {
     #[arg(long, value_name = "FLOW")]
     pub(crate) flow: Vec<FlowFilter>,
     /// End after this time, e.g. 60s; otherwise with Ctrl-C.
-    #[arg(long, value_name = "TIME", value_parser = parse_duration)]
+    #[arg(long, value_name = "TIME", value_parser = time())]
     pub(crate) duration: Option<Duration>,
     /// Bytes kept of a packet; otherwise as many as the flows need to be known again.
     #[arg(long, value_name = "BYTES", value_parser = whole::<u32>(64, 65_536))]
@@ -151,53 +153,14 @@ pub(crate) struct ReadingArgs {
     #[arg(long, value_name = "FLOW")]
     pub(crate) flow: Vec<FlowFilter>,
     /// Farthest that two stamps of one datagram may lie apart, e.g. 5s.
-    #[arg(long, value_name = "TIME", default_value = "5s", value_parser = parse_duration)]
+    #[arg(long, value_name = "TIME", default_value = "5s", value_parser = time())]
     pub(crate) window: Duration,
     /// Print JSON.
     #[arg(long)]
     pub(crate) json: bool,
 }
 
-/// `60`, `60s`, `500ms`, `2min` or `1h`, with or without a space.
-fn parse_duration(text: &str) -> Result<Duration, String> {
-    let at = text
-        .find(|c: char| !(c.is_ascii_digit() || c == '.'))
-        .unwrap_or(text.len());
-    let (digits, unit) = text.split_at(at);
-    let seconds = match unit.trim() {
-        "s" | "" => 1.0,
-        "ms" => 1e-3,
-        "min" => 60.0,
-        "h" => 3600.0,
-        other => return Err(format!("`{other}` is no unit; use ms, s, min or h")),
-    };
-    let number: f64 = digits
-        .parse()
-        .map_err(|_unsaid| format!("`{text}` is no time; e.g. 60s"))?;
-    let whole = number * seconds;
-    if !(1e-3..=1e7).contains(&whole) {
-        return Err(format!("{text} is outside 1ms to 10000000s"));
-    }
-    Ok(Duration::from_secs_f64(whole))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn times_are_read_with_their_units_and_bounds() {
-        for (text, milliseconds) in [
-            ("60", 60_000),
-            ("1.5s", 1500),
-            ("500 ms", 500),
-            ("2min", 120_000),
-        ] {
-            let expected = Duration::from_millis(milliseconds);
-            assert_eq!(parse_duration(text), Ok(expected), "{text}");
-        }
-        for text in ["", "s", "-1s", "3 weeks", "0s", "1e9", "1.2.3s"] {
-            assert!(parse_duration(text).is_err(), "{text}");
-        }
-    }
+/// A time that a capture may take or stamps may lie apart.
+fn time() -> impl Fn(&str) -> Result<Duration, String> + Clone {
+    duration_within(Duration::from_millis(1), Duration::from_hours(2_400))
 }

@@ -27,6 +27,8 @@ const STAMPED_RATIO_MIN: f64 = 0.99;
 pub enum NetworkVerdict {
     /// The run did not take place as planned.
     RunFailed,
+    /// It took no time and crossed no network: link models took its messages.
+    VirtualTime,
     /// No channel went over a network.
     NoNetwork,
     /// No link of ours was a network, but a foreign program took part through a face.
@@ -112,6 +114,8 @@ fn verdict(summary: &RunSummary, overruns: Vec<Overrun>) -> NetworkVerdict {
     let has_ticks = |process: &ProcessSummary| process.tick_count.is_some();
     if summary.run.outcome == Outcome::Failed {
         NetworkVerdict::RunFailed
+    } else if summary.run.is_virtual {
+        NetworkVerdict::VirtualTime
     } else if ![LinkKind::Udp, LinkKind::Tcp, LinkKind::Emulated]
         .into_iter()
         .any(has)

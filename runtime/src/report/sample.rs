@@ -39,6 +39,7 @@ fn run_facts() -> RunFacts {
             Fact::new("summary.json", "everything in this report, for programs"),
             Fact::new("records/", "one fixed-size record per message and stage"),
         ],
+        is_virtual: false,
         repeat_command: "hil-runtime --topology deploy/topologies/split.toml --seed 42".to_owned(),
     }
 }

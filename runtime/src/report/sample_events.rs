@@ -145,6 +145,7 @@ pub(super) fn summary(channel: ChannelSummary) -> RunSummary {
         exit_reason: "as planned".to_owned(),
         folder: String::new(),
         files: Vec::<Fact>::new(),
+        is_virtual: false,
         repeat_command: String::new(),
     });
     summary.channels.push(channel);

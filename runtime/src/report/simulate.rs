@@ -2,49 +2,43 @@
 //! links. It starts no process and opens no socket.
 
 mod events;
-mod link_figures;
 mod network;
 mod watched;
 
-use core::fmt::Write;
 use std::collections::BTreeMap;
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use hil_models::case_study::Score;
 use hil_models::link::LinkModel;
-use hil_models::link::trace::{ReplayCounts, ReplayTally};
-use hil_models::measure::account::OutageFigures;
+use hil_models::link::trace::ReplayTally;
+use hil_models::measure::account::{
+    ChannelAccount, Closing, EndToEnd, FateCounts, Gaps, MessageFate, StampCoverage,
+};
+use hil_models::measure::histogram::Distribution;
 use hil_models::plot::PlotSeries;
-use hil_models::simulation::{Carrier, Simulation, SimulationError, SimulationResult};
+use hil_models::run_log::RunLog;
+use hil_models::simulation::{
+    Carrier, ChannelCounts, Simulation, SimulationError, SimulationResult,
+};
 use hil_models::time::Instant;
 
+use crate::report::analysis::figures::shell_words;
 use crate::report::analysis::outages::OutageStory;
-use crate::report::event_log;
-use crate::report::network::NetworkReport;
-use crate::report::score_event::ScoreEvents;
-use crate::report::summary::ScoreMetric;
-use crate::report::terminal::{self, Style};
-use crate::report::trace_counts::replay_words;
 use crate::rundir::launch::EmulationLaunch;
+use crate::topology::registry::{Case, Registry};
+use crate::report::event_log;
+use crate::report::summary::{
+    ChannelSummary, CountByName, DirectionSummary, Fact, LinkKind, Outcome, RecordedFigures,
+    RunFacts, RunSummary, ScoreMetric,
+};
+use crate::report::terminal::{self, Style, percent};
 use crate::rundir::run_folder::RunFolder;
 use crate::rundir::series;
-use crate::topology::registry::{Case, Registry};
-use crate::topology::{Crossing, Program, Topology};
+use crate::topology::{Channel, Crossing, Program, Topology};
 
-use self::link_figures::LinkFigures;
 use self::watched::Watch;
-
-/// What the outcome is rendered as.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Form {
-    /// One JSON object.
-    Json,
-    /// A page of so many columns.
-    Page(usize),
-}
 
 /// Why there is no outcome, or not all of its files.
 #[derive(Debug, thiserror::Error)]
@@ -63,30 +57,21 @@ pub(crate) enum SimulateError {
 /// A run in virtual time that is over.
 #[derive(Debug)]
 pub(crate) struct Simulated {
-    topology_name: String,
-    duration_s: f64,
-    seed: u64,
+    /// As of any run.
+    pub(crate) summary: RunSummary,
     case: Box<dyn Case>,
-    result: SimulationResult,
-    score: Score,
-    /// Of every channel that replays a trace, what it met.
-    replays: BTreeMap<String, ReplayTally>,
-    /// Of every channel that a link model carried.
-    outages: Vec<OutageStory>,
-    /// What each model was asked for and did, by channel.
-    links: Vec<(String, LinkFigures)>,
-    events: ScoreEvents,
-    /// `None` when no link model carried anything.
-    network: Option<NetworkReport>,
+    log: RunLog,
     network_series: Vec<PlotSeries>,
 }
 
-/// Runs the topology's case in virtual time; tells `watch` now and then which share of it is over.
+/// Runs the case of the topology in `file` in virtual time; tells `watch` now and then which share of
+/// it is over.
 ///
 /// # Errors
 /// When the topology has no case, or a link that only a real run shows.
 pub(crate) fn simulate(
     topology: &Topology,
+    file: &Path,
     registry: &Registry,
     watch: &mut dyn FnMut(f64),
 ) -> Result<Simulated, SimulateError> {
@@ -97,18 +82,22 @@ pub(crate) fn simulate(
     let no_case = "the topology names no case; only a case can be simulated";
     let (entry, case) = made.ok_or_else(|| refused(no_case.to_owned()))?;
     refuse_faces(topology).map_err(refused)?;
-    let mut watches = Vec::new();
+    let mut links = BTreeMap::new();
     let mut carriers: BTreeMap<String, Box<dyn Carrier>> = BTreeMap::new();
-    let mut replays = BTreeMap::new();
     for (name, emulation) in emulations(topology).map_err(refused)? {
         // Virtual time begins with the run.
         let link = emulation
             .model(&name)
             .map_err(|error| refused(error.to_string()))?;
-        replays.extend(link.replay_tally().map(|tally| (name.clone(), tally)));
+        let replay = link.replay_tally();
         let (carrier, watch) = Watch::over(link);
-        watches.push((name.clone(), emulation, watch));
-        carriers.insert(name, carrier);
+        carriers.insert(name.clone(), carrier);
+        let link = WatchedLink {
+            emulation,
+            replay,
+            watch,
+        };
+        links.insert(name, link);
     }
     let roles = entry
         .roles
@@ -121,39 +110,61 @@ pub(crate) fn simulate(
         .map_err(|error| refused(error.to_string()))?;
     let score = case.score(&result.log);
     let duration = topology.run().duration;
-    let links = watches.iter().map(|(name, emulation, watch)| {
-        let (words, loss_ratio) = (emulation.describe(), emulation.loss_ratio());
-        (name.clone(), watch.figures(&words, loss_ratio))
-    });
-    let links = links.collect();
-    let outages: Vec<_> = watches
+    let mut summary = RunSummary::new(run_facts(topology, file));
+    let outages: Vec<_> = links
         .iter()
-        .map(|(name, _, watch)| events::story(name.clone(), watch.outages(), duration))
+        .map(|(name, link)| events::story(name.clone(), link.watch.outages(), duration))
         .collect();
-    let mut events = events::explained(&score, entry.channels, &outages, &result.log);
-    let errors = case.errors(&result.log);
-    let watches = watches.into_iter().map(|(name, _, watch)| (name, watch));
+    let channels = topology.channels().iter();
+    summary.channels = channels
+        .map(|channel| {
+            let story = outages.iter().find(|story| story.channel == channel.name);
+            ChannelSummary {
+                outages: story.and_then(OutageStory::figures),
+                ..channel_summary(topology, channel, &result, links.get(&channel.name))
+            }
+        })
+        .collect();
+    summary.score = ScoreMetric::all_of(&score);
+    summary.score_events = events::explained(&score, entry.channels, &outages, &result.log);
+    let watches = links.into_iter().map(|(name, link)| (name, link.watch));
     let (network, network_series) = network::of_simulation(
         topology,
         watches.collect(),
         &result.log,
-        (errors, &mut events),
+        (case.errors(&result.log), &mut summary.score_events),
     )
     .unzip();
+    summary.network = network;
     Ok(Simulated {
-        topology_name: topology.name().to_owned(),
-        duration_s: duration.as_secs_f64(),
-        seed: topology.run().seed,
-        events,
-        network,
-        network_series: network_series.unwrap_or_default(),
+        summary,
         case,
-        result,
-        score,
-        replays,
-        outages,
-        links,
+        log: result.log,
+        network_series: network_series.unwrap_or_default(),
     })
+}
+
+fn run_facts(topology: &Topology, file: &Path) -> RunFacts {
+    let case = topology.case().map(|case| case.name.clone());
+    let command_line: Vec<String> = std::env::args().collect();
+    RunFacts {
+        name: topology.name().to_owned(),
+        case: case.unwrap_or_default(),
+        topology_file: file.display().to_string(),
+        topology_hash: format!("{:016x}", topology.hash()),
+        seed: topology.run().seed,
+        security: None,
+        is_virtual: true,
+        host: "none".to_owned(),
+        started: "virtual time".to_owned(),
+        starts_ns: BTreeMap::new(),
+        duration_s: topology.run().duration.as_secs_f64(),
+        outcome: Outcome::Completed,
+        exit_reason: "ran its full length in virtual time".to_owned(),
+        folder: "none; --output DIR writes one".to_owned(),
+        files: Vec::new(),
+        repeat_command: shell_words(&command_line),
+    }
 }
 
 /// Runs for `duration`; tells `watch` which share of it is over.
@@ -217,120 +228,157 @@ pub(crate) fn check_output(folder: &Path) -> Result<(), SimulateError> {
 }
 
 impl Simulated {
-    /// Counts, outages and score.
-    pub(crate) fn render(&self, form: Form) -> String {
-        match form {
-            Form::Json => self.json(),
-            Form::Page(columns) => self.page(columns, Style::Coloured),
-        }
-    }
-
-    /// Writes report, events and the case's series to `folder`; gives the names of the series.
+    /// Writes the run's folder: series, summary, events and report.
     ///
     /// # Errors
     /// Names the file that cannot be written.
-    pub(crate) fn write(&self, folder: &Path) -> Result<Vec<String>, SimulateError> {
+    pub(crate) fn write(&mut self, folder: &Path) -> Result<(), SimulateError> {
         let failed = |path: PathBuf, error: io::Error| {
             SimulateError::Output(format!("{}: {error}", path.display()))
         };
         fs::create_dir_all(folder).map_err(|error| failed(folder.to_owned(), error))?;
         let files = RunFolder::existing(folder);
-        let page = self.page(REPORT_FILE_WIDTH, Style::Plain);
-        let events = event_log::text(&self.topology_name, &self.events, &[]);
-        for (path, text) in [
-            (files.report(), page),
-            (files.virtual_report(), self.json()),
-            (files.events(), events),
-        ] {
+        let mut made = self.case.series(&self.log);
+        made.append(&mut self.network_series);
+        let names = series::write(&files.series(), made)
+            .map_err(|error| SimulateError::Output(error.to_string()))?;
+        let run = &mut self.summary.run;
+        run.folder = folder.display().to_string();
+        run.files = vec![
+            Fact::new("summary.json", "every figure of this report"),
+            Fact::new("events.log", "what happened to the robot, one line each"),
+        ];
+        if !names.is_empty() {
+            let what = format!("{}; columns in series/series.json", names.join(", "));
+            run.files.push(Fact::new("series/", what));
+        }
+        let summary = &self.summary;
+        let written = summary.write(&files.summary());
+        written.map_err(|error| SimulateError::Output(error.to_string()))?;
+        let page = terminal::render(summary, REPORT_FILE_WIDTH, Style::Plain);
+        let events = event_log::text(&summary.run.name, &summary.score_events, &[]);
+        for (path, text) in [(files.report(), page), (files.events(), events)] {
             fs::write(&path, text).map_err(|error| failed(path, error))?;
         }
-        let mut made = self.case.series(&self.result.log);
-        made.extend(self.network_series.iter().cloned());
-        series::write(&files.series(), made)
-            .map_err(|error| SimulateError::Output(error.to_string()))
+        Ok(())
     }
+}
 
-    fn page(&self, columns: usize, style: Style) -> String {
-        let mut text = format!(
-            "{} in virtual time: {} s, seed {}\n\n",
-            self.topology_name, self.duration_s, self.seed
-        );
-        for (name, counts) in &self.result.channels {
-            let lost = counts
-                .published_count
-                .saturating_sub(counts.taken_count + counts.in_flight_count);
-            let _infallible = writeln!(
-                text,
-                "  {name:<18} published {:>8}   taken {:>8}   lost {lost:>7}   in flight {:>4}",
-                counts.published_count, counts.taken_count, counts.in_flight_count
-            );
-        }
-        for (name, count) in &self.result.recorded_counts {
-            let _infallible = writeln!(text, "  {name:<18} recorded  {count:>8}");
-        }
-        if !self.links.is_empty() {
-            text.push_str("\nLink models, asked and done:\n");
-        }
-        for (name, figures) in &self.links {
-            text.push_str(&figures.page(name));
-        }
-        for (name, tally) in &self.replays {
-            let words = replay_words(&tally.counts());
-            let _infallible = writeln!(text, "  {name:<18} {words}");
-        }
-        for (name, figures) in self.outage_figures() {
-            text.push_str(&terminal::render_outages(name, &figures, columns, style));
-        }
-        text.push_str(&terminal::render_score(
-            &ScoreMetric::all_of(&self.score),
-            &self.events,
-            columns,
-            style,
-        ));
-        if let Some(report) = &self.network {
-            text.push_str(&terminal::render_network(
-                report,
-                &self.events,
-                columns,
-                style,
-            ));
-        }
-        text
+/// The account of one channel, with what virtual time lacks "unavailable".
+fn channel_summary(
+    topology: &Topology,
+    channel: &Channel,
+    result: &SimulationResult,
+    link: Option<&WatchedLink>,
+) -> ChannelSummary {
+    let recorded = result.recorded_counts.get(channel.name.as_str());
+    let counts = result.channels.get(channel.name.as_str());
+    let lost_count = link.map_or(0, |link| link.watch.lost_count());
+    ChannelSummary {
+        name: channel.name.clone(),
+        from: channel.from.clone(),
+        to: channel.to.clone(),
+        link: LinkKind::of(topology, channel),
+        account: counts.map(|counts| account(counts, lost_count)),
+        outages: None,
+        emulation: None,
+        trace_replay: link.and_then(|link| Some(link.replay.as_ref()?.counts())),
+        recorded: recorded.map(|count| RecordedFigures {
+            message_count: *count,
+            missing_count: 0,
+        }),
+        refusals: Vec::new(),
+        directions: link.map(WatchedLink::direction).into_iter().collect(),
     }
+}
 
-    fn json(&self) -> String {
-        let channels = self.result.channels.iter().map(|(name, counts)| {
-            let counts = serde_json::json!({
-                "published_count": counts.published_count,
-                "taken_count": counts.taken_count,
-                "in_flight_count": counts.in_flight_count,
-            });
-            ((*name).to_owned(), counts)
+fn account(counts: &ChannelCounts, lost_count: u64) -> ChannelAccount {
+    const REASON: &str = "virtual time notes what a link did, and no stage of a message";
+    let unavailable = || Distribution::unavailable(REASON);
+    let published_count = counts.published_count;
+    let in_flight_count = counts.in_flight_count.min(published_count - lost_count);
+    let mut fates = FateCounts::default();
+    for (fate, count) in [
+        (
+            MessageFate::Taken,
+            published_count - lost_count - in_flight_count,
+        ),
+        (MessageFate::LostOnWire, lost_count),
+        (MessageFate::InFlight, in_flight_count),
+    ] {
+        if count > 0 {
+            fates.add(fate, count);
+        }
+    }
+    ChannelAccount {
+        published_count,
+        published_unrecorded_count: Some(0),
+        producer_restart_count: 0,
+        fates,
+        reordered_count: None,
+        duplicated_count: None,
+        late_count: None,
+        segments: Vec::new(),
+        hardware_wire: None,
+        end_to_end: EndToEnd {
+            distribution: unavailable(),
+            bins: Vec::new(),
+            p50_interval: None,
+            p99_interval: None,
+            alignment_bound_ns: None,
+            bound: None,
+        },
+        closing: Closing::Unavailable {
+            reason: REASON.to_owned(),
+        },
+        coverage: StampCoverage::default(),
+        round_trip: unavailable(),
+        loss_bursts: Vec::new(),
+        gaps: Gaps {
+            between_taken: unavailable(),
+            longest: None,
+            longest_unattributed: None,
+            last_taken_to_run_end_ns: None,
+        },
+        interruptions: Vec::new(),
+    }
+}
+
+/// A link model under watch.
+struct WatchedLink {
+    emulation: EmulationLaunch,
+    replay: Option<ReplayTally>,
+    watch: Watch,
+}
+
+impl WatchedLink {
+    /// The model and its own counts, where a real run has its gateways.
+    fn direction(&self) -> DirectionSummary {
+        let mut facts = vec![Fact::new("model", self.emulation.describe())];
+        let ratio = self.emulation.loss_ratio();
+        facts.extend(ratio.map(|ratio| Fact::new("loss asked for", percent(ratio))));
+        let causes = self.watch.loss_causes();
+        let causes = causes.into_iter().flat_map(|causes| {
+            [
+                ("link_outage_lost_count", causes.outage_count),
+                ("link_chance_lost_count", causes.chance_count),
+                ("link_queue_lost_count", causes.queue_count),
+            ]
         });
-        let outages: BTreeMap<&str, OutageFigures> = self.outage_figures().collect();
-        let replays = self.replays.iter();
-        let replays: BTreeMap<&str, ReplayCounts> = replays
-            .map(|(name, tally)| (name.as_str(), tally.counts()))
-            .collect();
-        let document = serde_json::json!({
-            "name": self.topology_name,
-            "seed": self.seed,
-            "duration_s": self.duration_s,
-            "channels": channels.collect::<serde_json::Map<_, _>>(),
-            "recorded_counts": self.result.recorded_counts,
-            "links": self.links.iter().cloned().collect::<BTreeMap<_, _>>(),
-            "outages": outages,
-            "trace_replays": replays,
-            "score": self.score,
-            "score_events": self.events,
-            "network": self.network,
-        });
-        format!("{document:#}\n")
-    }
-
-    fn outage_figures(&self) -> impl Iterator<Item = (&str, OutageFigures)> {
-        let stories = self.outages.iter();
-        stories.filter_map(|story| Some((story.channel.as_str(), story.figures()?)))
+        let all = [("link_lost_count", self.watch.lost_count())];
+        let counters = all.into_iter().chain(causes);
+        DirectionSummary {
+            process: "simulate".to_owned(),
+            direction: "link model".to_owned(),
+            peer_state: "none, in virtual time".to_owned(),
+            counters: counters
+                .map(|(name, count)| CountByName {
+                    name: name.to_owned(),
+                    count,
+                })
+                .collect(),
+            facts,
+        }
     }
 }
 

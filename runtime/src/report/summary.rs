@@ -23,6 +23,7 @@ use super::network::NetworkReport;
 use super::radio::RadioReport;
 use super::score_event::ScoreEvents;
 use crate::report::card_figures::HardwareStamps;
+use crate::topology::{Channel, Topology, Via};
 
 /// Version of the `summary.json` layout.
 pub const SCHEMA_VERSION: u32 = 1;
@@ -189,6 +190,9 @@ pub struct RunFacts {
     /// How the hops between hosts were protected, in words; `None` when there were none.
     #[serde(default)]
     pub security: Option<String>,
+    /// True for a run in virtual time, which has no host, no process and no record.
+    #[serde(default)]
+    pub is_virtual: bool,
     /// The host that wrote this summary.
     pub host: String,
     /// Wall-clock time of the start, with its zone.
@@ -315,6 +319,20 @@ pub enum LinkKind {
 }
 
 impl LinkKind {
+    /// How `topology` carries `channel`.
+    pub(crate) fn of(topology: &Topology, channel: &Channel) -> Self {
+        match topology
+            .crossing(channel)
+            .map(|crossing| &crossing.link.via)
+        {
+            None if channel.is_recorded_only() => Self::RecordOnly,
+            None | Some(Via::SharedMemory) => Self::SharedMemory,
+            Some(Via::Udp(_)) => Self::Udp,
+            Some(Via::Tcp(_)) => Self::Tcp,
+            Some(Via::Emulated(..)) => Self::Emulated,
+        }
+    }
+
     /// The words a report prints.
     pub const fn label(self) -> &'static str {
         match self {

@@ -14,8 +14,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 /// | `summary.json` | every figure of the report |
 /// | `report.txt` | the report as printed |
 /// | `events.log` | what happened to the robot, one line each |
-/// | `series/*.csv` | what the case has to plot; `series/README.md` explains the columns |
-/// | `report.json` | of a run in virtual time, every figure |
+/// | `series/*.csv` | what the case has to plot; `series/series.json` explains the columns |
 /// | `traces/*.trace` | what each link did to every message; `hil-runtime trace` reads them |
 /// | `records/*.rec` | one fixed-size record per message and stage |
 /// | `cards/*.json` | what each component was told it is |
@@ -127,11 +126,6 @@ impl RunFolder {
     /// Every figure.
     pub fn summary(&self) -> PathBuf {
         self.root.join("summary.json")
-    }
-
-    /// Every figure of a run in virtual time, in place of [`Self::summary`].
-    pub fn virtual_report(&self) -> PathBuf {
-        self.root.join("report.json")
     }
 
     /// What happened to the robot, line by line.

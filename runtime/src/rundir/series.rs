@@ -1,5 +1,5 @@
-//! A case's series as files: one CSV file each and a README.md that says what their columns are.
-//! It computes no number and draws no plot.
+//! A case's series as files: one CSV file each and a list that says what their columns are. It
+//! computes no number and draws no plot.
 
 use std::collections::BTreeSet;
 use std::fs::{self, File};
@@ -7,9 +7,53 @@ use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
 use hil_models::plot::PlotSeries;
+use serde::{Deserialize, Serialize};
 
-/// The file that documents the others.
-const README: &str = "README.md";
+/// The file that lists the others.
+const LIST: &str = "series.json";
+
+/// A series without its numbers.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct SeriesEntry {
+    /// The file's name without its ending.
+    pub(crate) name: String,
+    /// What it shows, one line.
+    pub(crate) title: String,
+    /// How it was made; one line each.
+    pub(crate) notes: Vec<String>,
+    /// Rows of its file, below the one that names the columns.
+    pub(crate) row_count: usize,
+    /// The columns of its file.
+    pub(crate) columns: Vec<SeriesColumn>,
+}
+
+/// One column.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct SeriesColumn {
+    /// Snake-case name with unit suffix, as in the first line of the file.
+    pub(crate) name: String,
+    /// Its unit; `1` for a ratio or a number.
+    pub(crate) unit: String,
+    /// What it is, in words.
+    pub(crate) label: String,
+}
+
+impl SeriesEntry {
+    fn of(series: &PlotSeries) -> Self {
+        let columns = series.columns.iter().map(|column| SeriesColumn {
+            name: column.name.to_owned(),
+            unit: column.unit.to_owned(),
+            label: column.label.to_owned(),
+        });
+        Self {
+            name: series.name.clone(),
+            title: series.title.clone(),
+            notes: series.notes.clone(),
+            row_count: series.rows().count(),
+            columns: columns.collect(),
+        }
+    }
+}
 
 /// Why a series could not be written.
 #[derive(Debug, thiserror::Error)]
@@ -65,27 +109,29 @@ pub(crate) fn write(folder: &Path, series: Vec<PlotSeries>) -> Result<Vec<String
         return Ok(Vec::new());
     }
     fs::create_dir_all(folder).map_err(at(folder))?;
-    let path = folder.join(README);
-    let mut readme = BufWriter::new(File::create(&path).map_err(at(&path))?);
-    readme.write_all(HEADING.as_bytes()).map_err(at(&path))?;
-    let mut names = Vec::new();
+    let mut entries = Vec::new();
     for one in series {
-        describe(&mut readme, &one).map_err(at(&path))?;
+        entries.push(SeriesEntry::of(&one));
         let file = folder.join(format!("{}.csv", one.name));
         write_table(&file, &one).map_err(at(&file))?;
-        names.push(one.name);
     }
-    readme.flush().map_err(at(&path))?;
-    Ok(names)
+    let path = folder.join(LIST);
+    let text = serde_json::to_string_pretty(&entries).map_err(|error| at(&path)(error.into()))?;
+    fs::write(&path, text + "\n").map_err(at(&path))?;
+    Ok(entries.into_iter().map(|entry| entry.name).collect())
 }
 
-const HEADING: &str = "\
-# Series
-
-One file per series: comma-separated values (RFC 4180), the first line names the columns. Numbers
-are written so that reading them back gives the same number; an empty field is one that does not
-exist. Units are SI and radians unless the table says otherwise.
-";
+/// The list of the series in `folder`, in the order of the case; none where there is no list.
+///
+/// # Errors
+/// When there is one that cannot be read.
+pub(crate) fn list(folder: &Path) -> io::Result<Vec<SeriesEntry>> {
+    match fs::read_to_string(folder.join(LIST)) {
+        Ok(text) => Ok(serde_json::from_str(&text)?),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(Vec::new()),
+        Err(error) => Err(error),
+    }
+}
 
 fn at(path: &Path) -> impl Fn(io::Error) -> SeriesError + use<> {
     let path = path.to_owned();
@@ -130,25 +176,6 @@ fn write_table(path: &Path, series: &PlotSeries) -> io::Result<()> {
     out.flush()
 }
 
-fn describe(out: &mut impl Write, series: &PlotSeries) -> io::Result<()> {
-    let row_count = series.rows().count();
-    writeln!(out, "\n## {}.csv\n\n{}.", series.name, series.title)?;
-    writeln!(out, "{row_count} rows.\n")?;
-    writeln!(out, "| column | unit | what it is |\n|---|---|---|")?;
-    for column in &series.columns {
-        let cell = |text: &str| text.replace('|', "\\|");
-        let (name, unit, label) = (column.name, cell(column.unit), cell(column.label));
-        writeln!(out, "| `{name}` | {unit} | {label} |")?;
-    }
-    if !series.notes.is_empty() {
-        writeln!(out)?;
-    }
-    for note in &series.notes {
-        writeln!(out, "- {note}")?;
-    }
-    Ok(())
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -173,7 +200,7 @@ mod tests {
     }
 
     #[test]
-    fn a_series_becomes_a_table_and_a_section_of_the_readme() {
+    fn a_series_becomes_a_table_and_an_entry_of_the_list() {
         let folder = folder("table");
         let third = 1.0 / 3.0;
         let values = vec![0.0, 1e-9, 0.004, f64::NAN, third, -2.5];
@@ -186,16 +213,17 @@ mod tests {
         );
         let last = text.lines().nth(3).unwrap().split(',').next().unwrap();
         assert_eq!(last.parse::<f64>().unwrap().to_bits(), third.to_bits());
-        let readme = fs::read_to_string(folder.join(README)).unwrap();
-        for line in [
-            "## tool.csv",
-            "Tool position over time.",
-            "3 rows.",
-            "| `tool_y_m` | m | \\|y\\| of the tool |",
-            "- right arm, every cycle",
-        ] {
-            assert!(readme.lines().any(|one| one == line), "{line} in {readme}");
-        }
+        let entries = list(&folder).unwrap();
+        assert_eq!(entries.len(), 1);
+        assert_eq!(entries[0].title, "Tool position over time");
+        assert_eq!(entries[0].row_count, 3);
+        assert_eq!(entries[0].notes, ["right arm, every cycle"]);
+        let column = &entries[0].columns[1];
+        assert_eq!(
+            (column.name.as_str(), column.unit.as_str()),
+            ("tool_y_m", "m")
+        );
+        assert_eq!(column.label, "|y| of the tool");
         fs::remove_dir_all(folder).unwrap();
     }
 

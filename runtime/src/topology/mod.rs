@@ -60,7 +60,7 @@ pub use model_links::{Emulation, Gateway, Hop, Link, Timestamps, Via};
 pub use schema::schema;
 pub use security::{Hops, Security};
 
-pub(crate) use units::parse_duration;
+pub(crate) use units::duration_within;
 
 use check::Needs;
 use errors::Place;
@@ -68,7 +68,7 @@ use layers::Layers;
 
 /// A duration as topology files write it, such as `40 s`; `None` when it is none.
 pub fn read_duration(text: &str) -> Option<std::time::Duration> {
-    parse_duration(text).ok()
+    units::parse_duration(text).ok()
 }
 
 /// Reads the topology file at `path` and all it extends, lays the `overrides` (each

@@ -3,6 +3,7 @@
 
 use core::time::Duration;
 
+use hil_models::message::{FNV_OFFSET, fnv1a};
 use serde::Serialize;
 use toml::{Table, Value};
 
@@ -70,10 +71,9 @@ impl Topology {
     /// # Panics
     /// Never: tables with string keys can be written as TOML.
     pub fn hash(&self) -> u64 {
-        let step = |hash: u64, byte: u8| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3);
         let text = toml::to_string(&self.resolved_with(false));
         let text = text.expect("tables with string keys can be written as TOML");
-        text.bytes().fold(0xcbf2_9ce4_8422_2325, step)
+        fnv1a(FNV_OFFSET, text.as_bytes())
     }
 
     fn resolved_run(&self) -> Table {

@@ -60,6 +60,23 @@ pub(crate) fn parse_duration(text: &str) -> Result<Duration, DurationError> {
     to_duration(whole, fraction, unit_ns)
 }
 
+/// Reads a duration from `least` to `most` for the command line, and says the range when it is none.
+pub(crate) fn duration_within(
+    least: Duration,
+    most: Duration,
+) -> impl Fn(&str) -> Result<Duration, String> + Clone {
+    move |text| {
+        let range = format!("{} to {}", format_duration(least), format_duration(most));
+        let read = parse_duration(text);
+        let read = read.map_err(|error| format!("{error}; a time such as `1 s`, {range}"))?;
+        if (least..=most).contains(&read) {
+            Ok(read)
+        } else {
+            Err(format!("is outside {range}"))
+        }
+    }
+}
+
 /// `whole.fraction` times `unit_ns`, in integers so that `0.1 ms` is exact.
 fn to_duration(whole: &str, fraction: &str, unit_ns: u128) -> Result<Duration, DurationError> {
     let fraction = fraction.trim_end_matches('0');
@@ -120,6 +137,18 @@ mod tests {
             assert_eq!(duration, Duration::from_nanos(ns), "{text}");
             assert_eq!(parse_duration(&format_duration(duration)), Ok(duration));
         }
+    }
+
+    #[test]
+    fn a_duration_outside_its_range_is_refused_with_it() {
+        let period = duration_within(Duration::from_micros(100), Duration::from_hours(1));
+        assert_eq!(period("1 ms"), Ok(Duration::from_millis(1)));
+        assert_eq!(period("2 h").unwrap_err(), "is outside 100 us to 1 h");
+        let why = period("30").unwrap_err();
+        assert!(
+            why.contains("no unit") && why.contains("100 us to 1 h"),
+            "{why}"
+        );
     }
 
     #[test]

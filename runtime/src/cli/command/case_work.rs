@@ -7,21 +7,21 @@ use std::path::Path;
 use crate::cli::arguments::{BatchArgs, CalibrateArgs};
 use crate::platform::console::Console;
 use crate::platform::progress::Progress;
-use crate::platform::signals::Signals;
-use crate::report::replay;
-use crate::report::simulate;
-use crate::report::study;
-use crate::report::study::{StudyEnd, StudyOptions, Wanted};
-use crate::rundir::run_folder::RunFolder;
 use crate::topology::registry::Registry;
+use crate::report::replay;
+use crate::report::terminal::{self, Style};
+use crate::rundir::run_folder::RunFolder;
+use crate::platform::signals::Signals;
+use crate::report::simulate;
+use crate::report::study::{self, StudyEnd, StudyOptions, Wanted};
 use crate::topology::{self, Topology, TopologyErrors};
 
 use super::{columns, exit, interrupted, load, signals};
 
-/// `simulate`, with its page or JSON and the folder for its files.
+/// `simulate`, with its report and the run's folder.
 pub(super) fn simulate(
-    (path, overrides): (&Path, &[String]),
-    json: bool,
+    file: &Path,
+    overrides: &[String],
     output: Option<&Path>,
     registry: &Registry,
     console: &mut Console,
@@ -33,48 +33,30 @@ pub(super) fn simulate(
     // Virtual time does not look at signals.
     let watch =
         signals.end_program_unless_over("a run in virtual time is shown whole or not at all");
-    let Some(topology) = load(path, overrides, registry, console) else {
+    let Some(topology) = load(file, overrides, registry, console) else {
         return exit::USAGE;
     };
     let progress = Progress::begin();
     let outcome = output
         .map_or(Ok(()), simulate::check_output)
         .and_then(|()| {
-            simulate::simulate(&topology, registry, &mut |share| {
+            simulate::simulate(&topology, file, registry, &mut |share| {
                 progress.show(console, Some(share), "in virtual time");
             })
         });
-    let simulated = match outcome {
+    let mut simulated = match outcome {
         Ok(simulated) => simulated,
         Err(error) => {
             console.error(&error.to_string());
             return exit::USAGE;
         }
     };
-    let form = if json {
-        simulate::Form::Json
-    } else {
-        simulate::Form::Page(columns())
-    };
-    let text = simulated.render(form);
+    let written = output.map_or(Ok(()), |folder| simulated.write(folder));
+    let page = terminal::render(&simulated.summary, columns(), Style::Coloured);
     drop(watch);
-    console.result(&text);
-    let Some(folder) = output else {
-        return exit::RAN;
-    };
-    match simulated.write(folder) {
-        Ok(series) => {
-            let also = if series.is_empty() {
-                "; the case has no series".to_owned()
-            } else {
-                format!(" and the series {}", series.join(", "))
-            };
-            let folder = folder.display();
-            console.say(&format!(
-                "wrote to {folder}: report.txt, report.json, events.log{also}"
-            ));
-            exit::RAN
-        }
+    console.result(&page);
+    match written {
+        Ok(()) => exit::RAN,
         Err(error) => {
             console.error(&error.to_string());
             exit::FAILED

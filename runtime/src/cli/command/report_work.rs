@@ -33,7 +33,7 @@ pub(super) fn report(args: &ReportArgs, console: &mut Console) -> u8 {
         || args.figure.is_some();
     if !is_file {
         if let [run] = args.runs.as_slice() {
-            return show(run, args.json, console);
+            return show(run, console);
         }
         console.error("several runs need --output or --format, e.g. -o report.html");
         return exit::USAGE;
@@ -165,27 +165,8 @@ fn figures(
     Ok(())
 }
 
-/// A folder of `simulate` or `tables` has its report as it was printed, and every figure as JSON.
-fn show_virtual(folder: &RunFolder, json: bool, console: &mut Console) -> u8 {
-    let path = if json {
-        folder.virtual_report()
-    } else {
-        folder.report()
-    };
-    match fs::read_to_string(&path) {
-        Ok(text) => {
-            console.result(text.trim_end());
-            exit::RAN
-        }
-        Err(error) => {
-            console.error(&format!("{}: {error}", path.display()));
-            exit::USAGE
-        }
-    }
-}
-
 /// The report as the run printed it.
-fn show(run: &Path, json: bool, console: &mut Console) -> u8 {
+fn show(run: &Path, console: &mut Console) -> u8 {
     let folder = RunFolder::existing(run);
     let progress = Progress::begin();
     let text = progress.during(console, "reading the summary", |_| {
@@ -197,8 +178,6 @@ fn show(run: &Path, json: bool, console: &mut Console) -> u8 {
             let path = folder.summary();
             let text = if folder.manifest().is_file() {
                 "this run never began or was killed outright, so it left no summary".to_owned()
-            } else if folder.virtual_report().is_file() {
-                return show_virtual(&folder, json, console);
             } else {
                 format!("not a run's folder: {error}")
             };
@@ -206,10 +185,6 @@ fn show(run: &Path, json: bool, console: &mut Console) -> u8 {
             return exit::USAGE;
         }
     };
-    if json {
-        console.result(&text);
-        return exit::RAN;
-    }
     let page = progress.during(console, "laying out the report", |_| {
         let summary = RunSummary::from_json(&text)?;
         Ok::<_, SummaryError>(terminal::render(&summary, columns(), Style::Coloured))

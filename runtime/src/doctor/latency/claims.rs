@@ -296,7 +296,6 @@ mod tests {
                 }),
             }],
             gaps: Vec::new(),
-            cyclictest: Fact::Unavailable("not in this test".to_owned()),
             surroundings: Surroundings {
                 load_before: unknown(),
                 load_after: unknown(),

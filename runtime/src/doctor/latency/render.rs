@@ -4,7 +4,7 @@
 use core::fmt::Write as _;
 
 use super::claims;
-use super::{CyclictestThread, Gaps, LatencyReport, Standing, Wakeups};
+use super::{Gaps, LatencyReport, Standing, Wakeups};
 use crate::doctor::render::{Tone, mark, wrapped};
 use crate::platform::host_facts::Fact;
 
@@ -48,22 +48,8 @@ impl LatencyReport {
         for one in &self.wakeups {
             push(text, &wakeup_row(one));
         }
-        if let Fact::Available(other) = &self.cyclictest {
-            for one in &other.threads {
-                push(text, &cyclictest_row(one));
-            }
-        }
         for line in self.scheduling() {
             push_hanging(text, "  ", &line);
-        }
-        match &self.cyclictest {
-            Fact::Available(other) => {
-                // It differs in two things, and a reader of both rows must know.
-                let differs = "it keeps CPUs from deep sleep (/dev/cpu_dma_latency) and counts no instant that \
-                               passed while it was late; ours does neither";
-                push_hanging(text, "  ", &format!("{}: {differs}", other.command));
-            }
-            Fact::Unavailable(reason) => push_hanging(text, "  ", &format!("cyclictest: {reason}")),
         }
     }
 
@@ -242,16 +228,6 @@ fn wakeup_row(one: &Wakeups) -> String {
         &place(one.cpu),
         [&count, &skipped, &preempted, &p50, &p99, &p999, &max],
     )
-}
-
-fn cyclictest_row(one: &CyclictestThread) -> String {
-    let word = |us: Option<u64>| us.map_or("beyond".to_owned(), |us| us.to_string());
-    let [p50, p99, p999] = [one.p50_us, one.p99_us, one.p999_us].map(word);
-    let (count, max) = (one.count.to_string(), one.max_us.to_string());
-    let name = one.cpu.map_or("cyclictest".to_owned(), |cpu| {
-        format!("cyclictest CPU {cpu}")
-    });
-    row(&name, [&count, NONE, NONE, &p50, &p99, &p999, &max])
 }
 
 fn gap_row(one: &Gaps) -> String {

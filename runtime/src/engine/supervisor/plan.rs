@@ -9,6 +9,7 @@ use std::time::Duration;
 use hil_models::egm::messages::Side as ArmSide;
 use hil_models::egm::parameters::{ControllerSettings, EgmParameters};
 use hil_models::link::condition::order_channel;
+use hil_models::message::{FNV_OFFSET, fnv1a};
 use nix::unistd::{AccessFlags, Uid, access};
 
 use super::clock_path;
@@ -382,10 +383,8 @@ fn wait_mode(wait: Wait) -> WaitMode {
 /// stay under 108 bytes. `run` is the whole path of the run folder: runs that record into
 /// different folders may bear one name.
 pub(crate) fn domain_root(base: Option<&PathBuf>, run: &str, host: &str) -> PathBuf {
-    let mut hash: u64 = 0xcbf2_9ce4_8422_2325;
-    for byte in run.bytes().chain([0]).chain(host.bytes()) {
-        hash = (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3);
-    }
+    let run = fnv1a(FNV_OFFSET, run.as_bytes());
+    let hash = fnv1a(fnv1a(run, &[0]), host.as_bytes());
     domain_base(base).join(format!("{:012x}", hash & 0xffff_ffff_ffff))
 }
 

@@ -17,7 +17,8 @@ use crate::report::summary::{
     ProcessSummary, RealtimeFacts, RunEvent, RunFacts,
 };
 use crate::rundir::event::{Event, ProcessStory};
-use crate::topology::{Channel, Topology, Via};
+use crate::engine::supervisor::{self, RunResult};
+use crate::topology::{Channel, Topology};
 
 /// Datagrams that came while the socket's receive buffer was full; see [`NO_ROOM`].
 const NO_ROOM_COUNTER: &str = "socket: kernel_drop_count";
@@ -64,6 +65,7 @@ pub(super) fn run_facts(
         topology_hash: format!("{:016x}", topology.hash()),
         seed: topology.run().seed,
         security: result.security.clone(),
+        is_virtual: false,
         host: result.own_hosts.join(", "),
         started: result.started.clone(),
         starts_ns: result
@@ -124,7 +126,7 @@ pub(super) fn realtime_facts(processes: &[ProcessStory]) -> RealtimeFacts {
 }
 
 /// A command line that a shell reads back as it was.
-fn shell_words(words: &[String]) -> String {
+pub(crate) fn shell_words(words: &[String]) -> String {
     let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b"/._-=:@,+".contains(&byte);
     let quoted = words.iter().map(|word| {
         if !word.is_empty() && word.bytes().all(is_plain) {
@@ -176,7 +178,6 @@ pub(super) fn channel_summary(
     channel: &Channel,
     records: &RunRecords,
 ) -> ChannelSummary {
-    let crossing = topology.crossing(channel);
     let directions = directions(result, &channel.name);
     let reports = result.processes.iter().flat_map(|one| &one.report);
     let trace_replay = reports
@@ -208,13 +209,7 @@ pub(super) fn channel_summary(
         name: channel.name.clone(),
         from: channel.from.clone(),
         to: channel.to.clone(),
-        link: match crossing.map(|crossing| &crossing.link.via) {
-            None if channel.is_recorded_only() => LinkKind::RecordOnly,
-            None | Some(Via::SharedMemory) => LinkKind::SharedMemory,
-            Some(Via::Udp(_)) => LinkKind::Udp,
-            Some(Via::Tcp(_)) => LinkKind::Tcp,
-            Some(Via::Emulated(..)) => LinkKind::Emulated,
-        },
+        link: LinkKind::of(topology, channel),
         account: (records.has(&channel.name) && !channel.is_recorded_only())
             .then(|| records.account(topology, result, channel)),
         outages: None,

@@ -8,7 +8,7 @@ mod clock_path;
 mod clocks;
 mod events;
 mod faces;
-mod figures;
+pub(crate) mod figures;
 mod interruptions;
 pub(crate) mod link_changes;
 #[cfg(test)]
@@ -189,7 +189,7 @@ fn write_series(
     match series::write(&result.folder.series(), made) {
         Ok(names) if names.is_empty() => {}
         Ok(names) => {
-            let what = format!("{}; columns in series/README.md", names.join(", "));
+            let what = format!("{}; columns in series/series.json", names.join(", "));
             summary.run.files.push(Fact::new("series/", what));
         }
         Err(error) => summary

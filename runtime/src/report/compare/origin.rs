@@ -111,6 +111,7 @@ fn spoilt(summary: &RunSummary) -> Option<&'static str> {
         }
         NetworkVerdict::RunFailed => Some("the run failed"),
         NetworkVerdict::EmulatedLink
+        | NetworkVerdict::VirtualTime
         | NetworkVerdict::NoNetwork
         | NetworkVerdict::ForeignProgram
         | NetworkVerdict::NoForeignProgram

@@ -25,17 +25,11 @@ pub(super) struct Sources<'a> {
     pub(super) link: Option<LinkKind>,
     pub(super) network: Option<&'a NetworkFigures>,
     pub(super) outages: Option<&'a OutageFigures>,
-    /// Of virtual time: published, taken, in flight.
-    pub(super) virtual_counts: Option<(u64, u64, u64)>,
-    /// Of virtual time: arrived twice, overtaken.
-    pub(super) virtual_order: Option<(u64, u64)>,
 }
 
 const BOOTSTRAP: &str = "95 % by block bootstrap, as successive delays are correlated";
 const NO_ACCOUNT: &str = "no records of this channel";
 const NO_NETWORK: &str = "no figures of a network under this channel";
-const VIRTUAL: &str =
-    "virtual time has no account of stamps; the link model's delay is the network's";
 
 /// Figures and tables of a channel.
 pub(super) fn fill(channel: &mut Channel, sources: &Sources<'_>) {
@@ -72,11 +66,9 @@ fn counts(sources: &Sources<'_>) -> Vec<Figure> {
     let account = sources.account;
     let live = |of: fn(&ChannelAccount) -> u64| account.map(of);
     let taken = |account: &ChannelAccount| account.fates.of(MessageFate::Taken);
-    let virtual_of = |of: fn((u64, u64, u64)) -> u64| sources.virtual_counts.map(of);
-    let published = live(|one| one.published_count).or_else(|| virtual_of(|(all, _, _)| all));
-    let delivered = live(taken).or_else(|| virtual_of(|(_, taken, _)| taken));
-    let lost_virtual = virtual_of(|(all, taken, flying)| all.saturating_sub(taken + flying));
-    let lost = live(|one| one.fates.lost_count()).or(lost_virtual);
+    let published = live(|one| one.published_count);
+    let delivered = live(taken);
+    let lost = live(|one| one.fates.lost_count());
     let is_total_known = account.is_none_or(|one| one.published_unrecorded_count.is_some());
     let published_method = if is_total_known {
         "every sequence number up to the highest seen"
@@ -136,17 +128,14 @@ fn order(sources: &Sources<'_>) -> Vec<Figure> {
     let late = account.and_then(|one| one.late_count);
     let duplicated = account
         .and_then(|one| one.duplicated_count)
-        .or_else(|| sources.network.and_then(|one| one.duplicated_count))
-        .or_else(|| sources.virtual_order.map(|(twice, _)| twice));
+        .or_else(|| sources.network.and_then(|one| one.duplicated_count));
     let by_network = || Some(sources.network?.order.measured()?.reordered_count);
     let reordered = account
         .and_then(|one| one.reordered_count)
-        .or_else(by_network)
-        .or_else(|| sources.virtual_order.map(|(_, overtaken)| overtaken));
-    let late_reason = if account.is_none() { VIRTUAL } else { reason };
+        .or_else(by_network);
     let mut figures = Vec::new();
     for (name, label, found, reason) in [
-        ("late", "too late for the gateway", late, late_reason),
+        ("late", "too late for the gateway", late, reason),
         ("duplicated", "duplicated", duplicated, reason),
         ("reordered", "reordered", reordered, reason),
     ] {
@@ -206,9 +195,7 @@ fn unavailable_quantiles((prefix, words): (&str, &str), reason: &str) -> Vec<Fig
 fn end_to_end(sources: &Sources<'_>) -> Vec<Figure> {
     let names = ("", "published → taken");
     let Some(account) = sources.account else {
-        let is_virtual = sources.virtual_counts.is_some();
-        let reason = if is_virtual { VIRTUAL } else { NO_ACCOUNT };
-        return unavailable_quantiles(names, reason);
+        return unavailable_quantiles(names, NO_ACCOUNT);
     };
     let whole = &account.end_to_end;
     match &whole.distribution {

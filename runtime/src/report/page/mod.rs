@@ -19,7 +19,7 @@ mod template;
 #[cfg(test)]
 mod tests;
 mod timeline;
-mod virtual_run;
+mod unfinished;
 mod words;
 pub(crate) mod write;
 

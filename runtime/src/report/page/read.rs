@@ -10,6 +10,7 @@ use super::material::{Found, Manifest, Material};
 use super::series::{self, Series};
 use crate::report::summary::{Fact, RunSummary};
 use crate::rundir::run_folder::RunFolder;
+use crate::rundir::series::list;
 
 /// Largest series that is read, bytes: an hour of two arms is a tenth of it.
 const SERIES_BYTES_MAX: u64 = 1 << 30;
@@ -20,7 +21,7 @@ const PRINTED_BYTES_MAX: usize = 200_000;
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum ReadError {
     /// Nothing in it is known.
-    #[error("{0}: no summary.json, report.json or manifest.json; not a run's folder")]
+    #[error("{0}: no summary.json or manifest.json; not a run's folder")]
     NoRun(String),
     /// A file is not what it should be.
     #[error("{path}: {text}")]
@@ -90,14 +91,7 @@ fn found(folder: &RunFolder) -> Result<Found, ReadError> {
         let summary = RunSummary::from_json(&text);
         let summary =
             summary.map_err(|error| file_error(&folder.summary(), &with_source(&error)))?;
-        return Ok(Found::Live(Box::new(summary)));
-    }
-    if let Some(text) = text_of(&folder.virtual_report())? {
-        let report = serde_json::from_str(&text);
-        let path = folder.virtual_report();
-        let report = report
-            .map_err(|error| file_error(&path, &format!("not a report of `simulate`: {error}")))?;
-        return Ok(Found::Virtual(Box::new(report)));
+        return Ok(Found::Ended(Box::new(summary)));
     }
     let path = folder.manifest();
     let Some(text) = text_of(&path)? else {
@@ -139,30 +133,19 @@ fn manifest_of(manifest: &Value, folder: &RunFolder) -> Manifest {
 }
 
 fn all_series(folder: &Path, problems: &mut Vec<String>) -> Vec<Series> {
-    let Ok(entries) = fs::read_dir(folder) else {
-        return Vec::new();
-    };
-    let readme = fs::read_to_string(folder.join("README.md")).unwrap_or_default();
-    let mut paths: Vec<_> = entries.flatten().map(|entry| entry.path()).collect();
-    paths.retain(|path| path.extension().is_some_and(|ending| ending == "csv"));
-    // As the README lists them, which is the case's order; then by name.
-    let place = |path: &Path| {
-        let name = path.file_name().unwrap_or_default().to_string_lossy();
-        let place = readme.find(&format!("## {name}"));
-        (place.unwrap_or(usize::MAX), name.into_owned())
-    };
-    paths.sort_by_key(|path| place(path));
+    let entries = list(folder).unwrap_or_else(|error| {
+        problems.push(format!("series/ cannot be read: {error}"));
+        Vec::new()
+    });
     let mut all = Vec::new();
-    for path in paths {
-        match one_series(&path) {
+    for entry in entries {
+        let file = format!("{}.csv", entry.name);
+        match one_series(&folder.join(&file)) {
             Ok(mut series) => {
-                series.describe(&readme);
+                series.describe(entry);
                 all.push(series);
             }
-            Err(text) => {
-                let name = path.file_name().unwrap_or_default().to_string_lossy();
-                problems.push(format!("series/{name} cannot be read: {text}"));
-            }
+            Err(text) => problems.push(format!("series/{file} cannot be read: {text}")),
         }
     }
     all

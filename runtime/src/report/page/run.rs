@@ -8,7 +8,7 @@ use super::events::{correlation, network_events, score_events};
 use super::material::{Found, Material};
 use super::paper;
 use super::timeline;
-use super::virtual_run::{unfinished, virtual_time};
+use super::unfinished::unfinished;
 use super::words::{UNAVAILABLE, count};
 use crate::platform::words::counted;
 use crate::report::assessment::Assessment;
@@ -35,18 +35,16 @@ pub(super) const METHOD: [&str; 3] = [
 pub(super) fn of(material: &Material, index: usize, steps: usize) -> Run {
     let key = format!("run-{}", index + 1);
     let mut run = match &material.found {
-        Found::Live(summary) => live(&key, summary),
-        Found::Virtual(report) => virtual_time(&key, report, &material.folder),
+        Found::Ended(summary) => live(&key, summary),
         Found::Unfinished(manifest) => unfinished(&key, manifest, &material.folder),
     };
     let (network, events) = match &material.found {
-        Found::Live(summary) => (summary.network.as_ref(), &summary.score_events),
-        Found::Virtual(report) => (report.network.as_ref(), &report.score_events),
+        Found::Ended(summary) => (summary.network.as_ref(), &summary.score_events),
         Found::Unfinished(_) => (None, &ScoreEvents::default()),
     };
     let changes = match &material.found {
-        Found::Live(summary) => summary.link_changes.as_slice(),
-        Found::Virtual(_) | Found::Unfinished(_) => &[],
+        Found::Ended(summary) => summary.link_changes.as_slice(),
+        Found::Unfinished(_) => &[],
     };
     if let Some(report) = network {
         run.drawings.push(timeline::over_run(
@@ -89,7 +87,7 @@ fn live(key: &str, summary: &RunSummary) -> Run {
         key: key.to_owned(),
         name: facts.name.clone(),
         case: facts.case.clone(),
-        kind: "live",
+        kind: if facts.is_virtual { "virtual" } else { "live" },
         outcome: Verdict {
             tone: tone.word(),
             word: word.to_owned(),
@@ -244,7 +242,6 @@ fn live_channel(key: &str, one: &ChannelSummary, summary: &RunSummary) -> Channe
         link: Some(one.link),
         network: network.map(|network| &network.figures),
         outages: one.outages.as_ref(),
-        ..Sources::default()
     };
     channel::fill(&mut channel, &sources);
     channel.notes.extend(notes(one));

@@ -3,24 +3,18 @@
 
 use serde::Serialize;
 
+use crate::series::{SeriesColumn, SeriesEntry};
+
 /// A table of numbers with named columns.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(crate) struct Series {
     /// The file's name without its ending.
     pub(crate) name: String,
-    /// What it shows, from the folder's `README.md`; empty when that does not say.
+    /// What it shows, from the folder's list; empty when that does not say.
     pub(crate) title: String,
     pub(crate) columns: Vec<SeriesColumn>,
     /// Rows; each has a value or none per column.
     pub(crate) rows: Vec<Vec<Option<f64>>>,
-}
-
-/// One column.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub(crate) struct SeriesColumn {
-    pub(crate) name: String,
-    pub(crate) unit: String,
-    pub(crate) label: String,
 }
 
 /// Reads RFC 4180 as this program writes it: no quotes, one number or nothing per field.
@@ -65,23 +59,16 @@ pub(crate) fn parse(name: &str, text: &str) -> Result<Series, String> {
 }
 
 impl Series {
-    /// Puts titles, units and labels of the folder's `README.md` beside the columns.
-    pub(crate) fn describe(&mut self, readme: &str) {
-        let heading = format!("## {}.csv", self.name);
-        let own = readme.lines().skip_while(|line| *line != heading).skip(1);
-        for line in own.take_while(|line| !line.starts_with("## ")) {
-            if self.title.is_empty() && !line.is_empty() {
-                line.trim_end_matches('.').clone_into(&mut self.title);
-            }
-            let mut cells = line.split('|').map(str::trim).skip(1);
-            let (Some(name), Some(unit), Some(label)) = (cells.next(), cells.next(), cells.next())
-            else {
-                continue;
-            };
-            let name = name.trim_matches('`');
-            if let Some(column) = self.columns.iter_mut().find(|one| one.name == name) {
-                unit.clone_into(&mut column.unit);
-                label.clone_into(&mut column.label);
+    /// Puts what the folder's list says of it beside the columns.
+    pub(crate) fn describe(&mut self, entry: SeriesEntry) {
+        self.title = entry.title;
+        for described in entry.columns {
+            let column = self
+                .columns
+                .iter_mut()
+                .find(|one| one.name == described.name);
+            if let Some(column) = column {
+                *column = described;
             }
         }
     }
@@ -193,17 +180,6 @@ mod tests {
             assert_eq!(parse("x", text).unwrap_err(), expected);
         }
         assert!(parse("x", "a,b\n").unwrap().rows.is_empty());
-    }
-
-    #[test]
-    fn a_readme_gives_titles_units_and_labels() {
-        let readme = "# S\n\n## y.csv\n\nOther.\n\n## x.csv\n\nWhat it is.\n2 rows.\n\n| column | unit | \
-                      what it is |\n|---|---|---|\n| `time_s` | s | time |\n| `a` | rad | joint |\n";
-        let mut series = parse("x", "time_s,a\n").unwrap();
-        series.describe(readme);
-        assert_eq!(series.title, "What it is");
-        assert_eq!(series.columns[1].unit, "rad");
-        assert_eq!(series.columns[1].label, "joint");
     }
 
     #[test]

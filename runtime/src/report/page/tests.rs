@@ -14,7 +14,7 @@ const HOSTILE: &str = "</script><script>alert(1)</script>\"'><img src=x onerror=
 fn material(summary: RunSummary) -> Material {
     Material {
         folder: "swing".to_owned(),
-        found: Found::Live(Box::new(summary)),
+        found: Found::Ended(Box::new(summary)),
         series: Vec::new(),
         printed: Some("as printed <b>\u{1b}[2J".to_owned()),
         problems: Vec::new(),

@@ -5,14 +5,12 @@ use std::cell::RefCell;
 use std::rc::Rc;
 
 use hil_gateways::protocol::wire;
-use hil_models::link::LinkModel;
+use hil_models::link::{LinkModel, LossCauses};
 use hil_models::measure::account::{Outage, OutageFinder};
 use hil_models::measure::network::{Crossing, Passage};
 use hil_models::message::Envelope;
 use hil_models::simulation::Carrier;
 use hil_models::time::Instant;
-
-use super::link_figures::{LinkFigures, LinkTally};
 
 /// What a link model did, to be asked for when it is done.
 #[derive(Debug, Clone)]
@@ -21,7 +19,8 @@ pub(super) struct Watch(Rc<RefCell<Seen>>);
 #[derive(Debug, Default)]
 struct Seen {
     outages: OutageFinder,
-    tally: LinkTally,
+    lost_count: u64,
+    causes: Option<LossCauses>,
     passages: Vec<Passage>,
     duplicated_count: u64,
 }
@@ -37,14 +36,19 @@ impl Watch {
         (Box::new(watched), watch)
     }
 
-    /// What was lost so far.
+    /// What was lost in a row so far.
     pub(super) fn outages(&self) -> Vec<Outage> {
         core::mem::take(&mut self.0.borrow_mut().outages).finish()
     }
 
-    /// What the model, which `model` describes, did so far.
-    pub(super) fn figures(&self, model: &str, requested_loss_ratio: Option<f64>) -> LinkFigures {
-        self.0.borrow().tally.figures(model, requested_loss_ratio)
+    /// Messages that were lost so far.
+    pub(super) fn lost_count(&self) -> u64 {
+        self.0.borrow().lost_count
+    }
+
+    /// What they were lost to; `None` when the model does not tell.
+    pub(super) fn loss_causes(&self) -> Option<LossCauses> {
+        self.0.borrow().causes
     }
 
     /// The way of every message so far, and how many copies came on top.
@@ -76,7 +80,8 @@ impl Carrier for Watched {
             deliver(at, *envelope, payload);
         }
         let mut seen = self.watch.0.borrow_mut();
-        seen.tally.count(now, fate, self.link.loss_causes());
+        seen.lost_count += u64::from(fate.arrival().is_none());
+        seen.causes = self.link.loss_causes();
         seen.duplicated_count += u64::from(fate.second_arrival().is_some());
         seen.passages.push(passage(now, envelope, fate.arrival()));
         let published_ns = Some(now.as_ns());
@@ -146,6 +151,7 @@ mod tests {
         assert_eq!((passages.len(), duplicated_count), (30, 0));
         assert_eq!(passages[9].delay_ns, Some(3_000_000));
         assert_eq!(passages[10].crossing, Crossing::LostByNetwork);
+        assert_eq!(watch.lost_count(), 10);
         let outages = watch.outages();
         assert_eq!(outages.len(), 1);
         let found = outages[0];

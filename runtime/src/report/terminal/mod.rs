@@ -23,15 +23,13 @@ pub(crate) use channel::closing_text;
 pub(crate) use trace::{render_fit, render_trace, render_trace_plots};
 pub(crate) use units::{JOINT, duration, duration_s, figure, grouped, percent, seconds};
 
-use hil_models::measure::account::OutageFigures;
-
 use canvas::{Canvas, INDENT};
 
 use super::assessment::{Assessment, NetworkVerdict, SKIPPED_TICK_RATIO_MAX};
 use super::link_change::LinkChange;
 use super::network::NetworkReport;
 use super::score_event::ScoreEvents;
-use super::summary::{Outcome, RunSummary, ScoreMetric};
+use super::summary::{Outcome, RunSummary};
 
 /// The report of a run as text of at most `width_columns` columns (clamped to 80..=120).
 pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> String {
@@ -70,19 +68,6 @@ pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> Strin
     canvas.finish()
 }
 
-/// The figures and events of a score alone, as [`render`] shows them.
-pub fn render_score(
-    score: &[ScoreMetric],
-    events: &ScoreEvents,
-    width_columns: usize,
-    style: Style,
-) -> String {
-    let mut canvas = Canvas::new(width_columns, style);
-    tables::score(&mut canvas, score);
-    events::score_events(&mut canvas, events);
-    canvas.finish()
-}
-
 /// The network of a run and how the robot stood to it.
 fn network_sections(
     canvas: &mut Canvas,
@@ -92,33 +77,6 @@ fn network_sections(
     timeline::timeline(canvas, &report.timeline, changes);
     network::what_preceded_what(canvas, report, events);
     network::network(canvas, report);
-}
-
-/// The network of a run alone, as [`render`] shows it.
-pub fn render_network(
-    report: &NetworkReport,
-    events: &ScoreEvents,
-    width_columns: usize,
-    style: Style,
-) -> String {
-    let mut canvas = Canvas::new(width_columns, style);
-    network_sections(&mut canvas, report, (events, &[]));
-    canvas.finish()
-}
-
-/// The outages of one channel alone, as [`render`] shows them; nothing where there were none.
-pub fn render_outages(
-    channel: &str,
-    figures: &OutageFigures,
-    width_columns: usize,
-    style: Style,
-) -> String {
-    let mut canvas = Canvas::new(width_columns, style);
-    if figures.outage_count > 0 {
-        canvas.heading(&format!("Channel {channel}"), "");
-        outages::outages(&mut canvas, figures);
-    }
-    canvas.finish()
 }
 
 fn title(canvas: &mut Canvas, summary: &RunSummary) {
@@ -182,6 +140,10 @@ pub(crate) fn network_words(verdict: &NetworkVerdict) -> (Tone, String) {
         NetworkVerdict::RunFailed => {
             let text = "no verdict: the run failed";
             (Tone::Caution, text.to_owned())
+        }
+        NetworkVerdict::VirtualTime => {
+            let text = "virtual time: a result about the link models, not about a network";
+            (Tone::Plain, text.to_owned())
         }
         NetworkVerdict::EmulatedLink => {
             let text = format!(

@@ -1,6 +1,10 @@
 //! The command line of `hil-runtime link`: definitions only.
 
+use std::time::Duration;
+
 use clap::{ArgGroup, Args, Subcommand};
+
+use crate::topology::duration_within;
 
 const SHOW_EXAMPLES: &str = "\
 Examples:
@@ -71,8 +75,9 @@ pub struct SetArgs {
     /// The link, or one direction of it: LINK.forward, LINK.backward.
     pub link: String,
     /// How long every message is under way, with its unit, at most 60 s.
-    #[arg(long, value_name = "TIME")]
-    pub delay: Option<String>,
+    #[arg(long, value_name = "TIME",
+          value_parser = duration_within(Duration::ZERO, Duration::from_mins(1)))]
+    pub delay: Option<Duration>,
     /// Share of the messages that is lost, each by itself, 0 to 1.
     #[arg(long, value_name = "RATIO", allow_negative_numbers = true)]
     pub loss: Option<f64>,

@@ -10,7 +10,6 @@ use super::cli::{LinkCommand, RunChoice, SetArgs};
 use super::{Confirmed, LinkDirection, LinkError, RunLinks};
 use crate::platform::clock::MonotonicClock;
 use crate::platform::console::Console;
-use crate::topology::parse_duration;
 use crate::watch;
 
 /// How it ended; the caller knows the exit codes.
@@ -72,15 +71,8 @@ fn condition(args: &SetArgs) -> Outcome<LinkCondition> {
     if args.cut {
         return Ok(LinkCondition::Cut);
     }
-    let delay = args.delay.as_deref().map(|text| {
-        parse_duration(text).map_err(|error| {
-            refused(format!(
-                "--delay {text}: {error}; such as 50ms, at most 60 s"
-            ))
-        })
-    });
     let condition = LinkCondition::Fixed {
-        delay: delay.transpose()?.unwrap_or(Duration::ZERO),
+        delay: args.delay.unwrap_or(Duration::ZERO),
         loss_ratio: args.loss.unwrap_or(0.0),
     };
     condition.check().map_err(refused)?;

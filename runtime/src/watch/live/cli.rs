@@ -5,6 +5,7 @@ use std::time::Duration;
 use clap::{Args, Subcommand};
 
 use crate::cli::arguments::whole;
+use crate::topology::duration_within;
 
 const CHANNEL_EXAMPLES: &str = "\
 Examples:
@@ -81,7 +82,7 @@ pub enum ChannelCommand {
         #[arg(long)]
         json: bool,
         /// How long to count messages for the rates.
-        #[arg(long, value_name = "TIME", value_parser = window, default_value = "1s")]
+        #[arg(long, value_name = "TIME", value_parser = window(), default_value = "1s")]
         window: Duration,
     },
     /// Rate, gaps, jitter and missing numbers of a channel.
@@ -117,7 +118,7 @@ pub struct WindowArgs {
     #[arg(long)]
     pub json: bool,
     /// How long a window is, e.g. '1 s' or '500 ms'.
-    #[arg(long, value_name = "TIME", value_parser = window, default_value = "1s")]
+    #[arg(long, value_name = "TIME", value_parser = window(), default_value = "1s")]
     pub window: Duration,
 }
 
@@ -157,64 +158,11 @@ pub struct TopArgs {
     #[arg(long)]
     pub json: bool,
     /// How often to look, and how long figures reach back.
-    #[arg(long, value_name = "TIME", value_parser = window, default_value = "1s")]
+    #[arg(long, value_name = "TIME", value_parser = window(), default_value = "1s")]
     pub window: Duration,
 }
 
-/// Shortest and longest window: below it nothing has been written yet, above it nobody waits.
-const WINDOW_MIN: Duration = Duration::from_millis(100);
-const WINDOW_MAX: Duration = Duration::from_mins(10);
-
-/// A window as topologies write times: a number and `ms`, `s` or `min`.
-fn window(text: &str) -> Result<Duration, String> {
-    let bounds = "a window is 100 ms to 10 min, e.g. '1 s'";
-    let digits = text.trim_end_matches(|c: char| c.is_ascii_alphabetic());
-    let (number, unit) = (digits.trim(), text[digits.len()..].trim());
-    let scale_s = match unit {
-        "ms" => 1e-3,
-        "s" => 1.0,
-        "min" => 60.0,
-        _ => return Err(format!("{text:?} has no unit of ms, s or min; {bounds}")),
-    };
-    let value: f64 = number
-        .parse()
-        .map_err(|_error| format!("{number:?} is not a number; {bounds}"))?;
-    let seconds = value * scale_s;
-    let range = WINDOW_MIN.as_secs_f64()..=WINDOW_MAX.as_secs_f64();
-    if !range.contains(&seconds) {
-        return Err(format!("{text} is out of range; {bounds}"));
-    }
-    Ok(Duration::from_secs_f64(seconds))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_window_has_a_number_a_unit_and_bounds() {
-        for (text, expected) in [
-            ("1s", 1000),
-            ("0.5 s", 500),
-            ("250 ms", 250),
-            ("10 min", 600_000),
-        ] {
-            assert_eq!(window(text), Ok(Duration::from_millis(expected)), "{text}");
-        }
-        for (text, words) in [
-            ("1", "no unit"),
-            ("1 h", "no unit"),
-            ("x s", "not a number"),
-            ("10 ms", "out of range"),
-            ("11 min", "out of range"),
-            ("-1 s", "out of range"),
-            ("nan s", "out of range"),
-        ] {
-            let why = window(text).unwrap_err();
-            assert!(
-                why.contains(words) && why.contains("100 ms"),
-                "{text}: {why}"
-            );
-        }
-    }
+/// A window: below the least nothing has been written yet, above the most nobody waits.
+fn window() -> impl Fn(&str) -> Result<Duration, String> + Clone {
+    duration_within(Duration::from_millis(100), Duration::from_mins(10))
 }

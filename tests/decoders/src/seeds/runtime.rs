@@ -184,6 +184,7 @@ pub(crate) fn summaries() -> Vec<Seed> {
         exit_reason: "as planned".to_owned(),
         folder: "runs/1".to_owned(),
         files: vec![Fact::new("records", "all")],
+        is_virtual: false,
         repeat_command: "hil-runtime --topology a.toml".to_owned(),
     });
     let text = summary.to_json().expect("plain facts").into_bytes();
