@@ -85,11 +85,6 @@ impl Running {
         Ok((running, facts))
     }
 
-    /// True when nothing is lost by looking late.
-    pub(crate) fn waits(&self) -> bool {
-        self.feed.waits()
-    }
-
     /// The topology with every default spelled out.
     pub(crate) const fn topology(&self) -> &serde_json::Value {
         &self.feed.manifest().topology
