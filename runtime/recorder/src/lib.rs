@@ -2,7 +2,7 @@
 //! program of its own so that the real-time binary carries none of what this needs.
 //!
 //! Read in this order: `run` and `clocks`, what there is and when it was; `schema` and
-//! `encode`, what a message looks like; `topics` and `net`, what is made of it; `writer`,
+//! `encode`, what a message looks like; `topics`, `net` and `channel`, what is made of it; `writer`,
 //! the file; `convert`, all of them together. While a run goes, `live` makes the same topics of
 //! its events for any `sink`, and `record` puts them into files; `pace` keeps it out of the run's
 //! way. `scan` reads files as far as their `lengths` hold, for `recover`; `play` feeds what `decode`
@@ -10,6 +10,7 @@
 //!
 //! The program is [`run()`]; nothing else is for other crates but [`decoders`], for tests.
 
+mod channel;
 mod cli;
 mod clocks;
 mod command;

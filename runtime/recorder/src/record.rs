@@ -407,16 +407,11 @@ impl LiveRecording {
             "exit_reason".to_owned(),
             "recorded while it went".to_owned(),
         );
-        let manifest = self.feed.manifest();
-        let json =
-            |value: &serde_json::Value| Words::from([("json".to_owned(), value.to_string())]);
-        let (topology, host) = (json(&manifest.topology), json(&manifest.host_facts));
         self.told_clocks = self.topics.clocks().words();
         let file = self.files.open();
         file.describe("hil.clocks", self.told_clocks.clone())?;
         file.describe("hil.run", words)?;
-        file.describe("hil.topology", topology)?;
-        file.describe("hil.host_facts", host)?;
+        facts::describe_manifest(file, self.feed.manifest())?;
         facts::attach_robot(file, self.topics.messages())
     }
 
@@ -432,12 +427,8 @@ impl LiveRecording {
             ("unordered_latency_count", self.topics.unordered_count()),
             ("problem_count", self.problems.count),
         ];
-        let mut words: Words = numbers
-            .iter()
-            .map(|(key, count)| ((*key).to_owned(), count.to_string()))
-            .collect();
-        let version = env!("CARGO_PKG_VERSION").to_owned();
-        words.insert("recorder_version".to_owned(), version);
+        let names = self.topics.names();
+        let mut words = facts::recording_words(&numbers, &self.problems.words, names);
         words.insert("mode".to_owned(), "live".to_owned());
         words.insert("ended".to_owned(), how.to_owned());
         for (channel, count) in self.topics.missed(&self.feed, self.is_silent) {
@@ -445,12 +436,6 @@ impl LiveRecording {
         }
         for (channel, count) in self.topics.earlier(&self.feed) {
             words.insert(format!("before {channel}"), count.to_string());
-        }
-        for (problem, number) in self.problems.words.iter().zip(1..) {
-            words.insert(format!("gap_{number:04}"), problem.clone());
-        }
-        for (given, wanted) in &self.topics.names().changed {
-            words.insert(format!("renamed {given}"), format!("{wanted} was taken"));
         }
         let clocks = self.topics.clocks().words();
         let channels = self.topics.channel_words();

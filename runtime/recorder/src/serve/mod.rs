@@ -188,9 +188,9 @@ fn first(
             let folder = folder.to_owned();
             return Err(ServeError::Over { folder });
         }
-        let how = (options.speed, options.repeats);
         let progress = Progress::begin();
-        let read = Playback::read(folder, how, &mut |(share, path)| {
+        let (speed, repeats) = (options.speed, options.repeats);
+        let read = Playback::read(folder, speed, repeats, &mut |share, path| {
             progress.show(console, Some(share), &format!("reading {path}"));
             signals.received().is_none()
         });
