@@ -12,7 +12,7 @@ use hil_runtime::rundir::record::{RecordFile, RecordKind};
 /// What belongs to a moment, nanoseconds from it on: a killed process goes on dying for a while.
 const NEAR_NS: Range<i64> = -10_000_000..250_000_000;
 /// Largest ratio of the medians. Generous: this is to notice that the run waits for what was done to
-/// something else, and no measurement; `cargo bench -p hil-benches --bench recorder_on_off` is one.
+/// something else, and no measurement.
 const RATIO_MAX: f64 = 5.0;
 /// Fewer messages around the moments would say nothing.
 const COUNT_MIN: usize = 100;

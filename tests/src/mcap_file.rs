@@ -97,14 +97,25 @@ pub fn counts(file: &Path) -> BTreeMap<String, u64> {
         .collect()
 }
 
-/// What `hil-recorder info` says of a file.
+/// What the file says of itself: its metadata, by record and key.
 ///
 /// # Panics
-/// When it says nothing.
-pub fn info(file: &Path) -> Value {
-    let shown = recorder(&["info", "--json"], &[file]);
-    assert_code(&shown, 0);
-    serde_json::from_slice(&shown.stdout).unwrap_or_default()
+/// When the file is not whole.
+pub fn metadata(file: &Path) -> BTreeMap<String, BTreeMap<String, String>> {
+    let read = || -> Result<_, Box<dyn std::error::Error>> {
+        let bytes = fs::read(file)?;
+        let mut found = BTreeMap::new();
+        for record in mcap::read::LinearReader::new(&bytes)? {
+            if let mcap::records::Record::Metadata(one) = record? {
+                found.insert(one.name, one.metadata);
+            }
+        }
+        Ok(found)
+    };
+    match read() {
+        Ok(found) => found,
+        Err(error) => panic!("{}: {error}", file.display()),
+    }
 }
 
 /// What the Python packages make of the file; `None`, with the reason printed, where none is named.

@@ -54,8 +54,7 @@ fn starved_ns(process: &ChildGuard) -> i64 {
 
 /// Starts a recorder and kills it after so long.
 fn record_and_kill(run: &str, file: &Path, after: Duration) -> Killed {
-    // One that gives way may not come to its first word while others keep the host busy.
-    let mut child = record(&[run, "--priority", "normal"], file);
+    let mut child = record(&[run], file);
     let partial = partial(file);
     // It says so after its first flush: from then on a kill loses a second, not all there was before.
     wait_until(LIMIT, "the first words of a recorder", || {

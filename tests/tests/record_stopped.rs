@@ -13,7 +13,7 @@ use hil_tests::account::{account, describe};
 use hil_tests::binary::hil_recorder_binary;
 use hil_tests::child::ChildGuard;
 use hil_tests::lab::Lab;
-use hil_tests::mcap_file::{assert_code, info, partial, read_back, recorder};
+use hil_tests::mcap_file::{assert_code, metadata, partial, read_back, recorder};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::shuttle::CHANNELS;
 use hil_tests::split::Split;
@@ -74,9 +74,9 @@ fn arrived(files: &RunFiles) -> u64 {
 
 /// What a file has of the channel, and says that it missed, of so many that were published on its host.
 fn check(file: &Path, summary: &RunSummary, here: u64) {
-    let words = &info(file)["metadata"]["hil.recording"];
+    let words = &metadata(file)["hil.recording"];
     let said = |key: &str| -> u64 {
-        let text = words[format!("{key} {CHANNEL}")].as_str();
+        let text = words.get(&format!("{key} {CHANNEL}"));
         text.map_or(0, |text| text.parse().unwrap())
     };
     let (missed, before) = (said("missed"), said("before"));

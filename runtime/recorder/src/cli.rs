@@ -6,16 +6,12 @@ use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand};
 
-use crate::priority::Priority;
-
 const EXAMPLES: &str = "\
 Examples:
   hil-recorder convert runs/teleop-local-20261121-101500 -o run.mcap
       a run's folder as one file for Lichtblick, Foxglove, PlotJuggler or Python
   hil-recorder record -o run.mcap
       the run that goes on this host, while it goes
-  hil-recorder info run.mcap
-      topics, counts, times, and what the file says of its run
   hil-recorder recover broken.mcap -o whole.mcap
       a whole file of what a killed writer left
   hil-recorder serve
@@ -86,15 +82,6 @@ Each loss is said with the byte at which it begins, here and in the new file
 under `hil.recovery`. The exit code is 0 when there is a new file, whatever was
 lost.";
 
-const INFO_EXAMPLES: &str = "\
-Examples:
-  hil-recorder info run.mcap
-  hil-recorder info run.mcap --json | jq '.metadata[\"hil.run\"].seed'
-
-A broken file is shown as far as it goes, with where the damage begins; what
-`recover` makes of it is whole. The metadata are described in
-docs/recordings.md.";
-
 const PLAY_EXAMPLES: &str = "\
 Examples:
   hil-recorder play run.mcap --only human/frame --loop
@@ -163,15 +150,9 @@ pub(crate) enum Command {
         /// Begin another file when one is larger, e.g. 1GiB; looked at with every flush.
         #[arg(long, value_name = "SIZE", value_parser = size)]
         split_size: Option<u64>,
-        /// Begin another file when one was written for longer, e.g. 10min.
-        #[arg(long, value_name = "TIME", value_parser = time)]
-        split_time: Option<Duration>,
         /// What a kill of the recorder may lose at most, 100ms to 60s.
         #[arg(long, value_name = "TIME", value_parser = flush, default_value = "1s")]
         flush: Duration,
-        /// How it stands against what it records.
-        #[arg(long, value_enum, default_value_t = Priority::Idle)]
-        priority: Priority,
         /// Replace files that exist.
         #[arg(long)]
         force: bool,
@@ -191,16 +172,6 @@ pub(crate) enum Command {
         /// Replace the file if it exists.
         #[arg(long)]
         force: bool,
-    },
-    /// Print topics, counts, times and metadata of an MCAP file, whole or broken.
-    #[command(after_help = INFO_EXAMPLES)]
-    Info {
-        /// The file.
-        #[arg(value_name = "FILE")]
-        file: PathBuf,
-        /// As JSON, with every value in full.
-        #[arg(long)]
-        json: bool,
     },
     /// Write manual pages and completions for a package to this folder.
     #[command(hide = true)]
@@ -263,9 +234,6 @@ pub(crate) struct ServeOptions {
     /// per run, which is made if it is not there and the name ends in `/`.
     #[arg(long, value_name = "FILE")]
     pub(crate) record: Option<PathBuf>,
-    /// How the server, and the recorder in it, stand against a run that goes on.
-    #[arg(long, value_enum, default_value_t = Priority::Idle)]
-    pub(crate) priority: Priority,
     /// Leave out /scene and /tf of the file, and the work that drawing them takes.
     #[arg(long, requires = "record")]
     pub(crate) no_scene: bool,

@@ -7,6 +7,7 @@ use hil_models::measure::record::{EgressRecord, IngressRecord, UNAVAILABLE};
 use hil_runtime::rundir::manifest::Manifest;
 use hil_runtime::rundir::record::RecordKind;
 
+use crate::facts::Words;
 use crate::run::Run;
 
 /// Where a host's relation to real time comes from.
@@ -59,7 +60,34 @@ pub(crate) struct Clocks {
 }
 
 /// Stands for the host of a channel that no manifest tells of.
-const UNKNOWN_HOST: &str = "(unknown host)";
+pub(crate) const UNKNOWN_HOST: &str = "(unknown host)";
+
+/// The recording's time of an instant on a clock with this offset; `None` before that clock's origin.
+pub(crate) fn at(offset_ns: i64, monotonic_ns: i64) -> Option<u64> {
+    if monotonic_ns == UNAVAILABLE {
+        return None;
+    }
+    u64::try_from(monotonic_ns.checked_add(offset_ns)?).ok()
+}
+
+/// What a recording says of all clocks.
+pub(crate) fn words(has_one_clock: Option<bool>) -> Words {
+    let log_time = "instant of publication on the clock of the producer's host, plus offset_ns of \
+                    that host; hosts are not aligned with each other";
+    let one_clock = has_one_clock.map_or("unknown".to_owned(), |is_one| is_one.to_string());
+    Words::from([
+        ("log_time".to_owned(), log_time.to_owned()),
+        ("has_one_clock".to_owned(), one_clock),
+    ])
+}
+
+/// What a recording says of the clock of `host`.
+pub(crate) fn host_words(host: &str, basis: Basis, offset_ns: Option<i64>, words: &mut Words) {
+    words.insert(format!("{host}/basis"), basis.words().to_owned());
+    if let Some(offset_ns) = offset_ns {
+        words.insert(format!("{host}/offset_ns"), offset_ns.to_string());
+    }
+}
 
 impl Clocks {
     /// What the run noted of them.
@@ -128,12 +156,12 @@ impl Clocks {
     /// that clock's origin.
     pub(crate) fn time_ns(&self, channel: &str, monotonic_ns: i64) -> Option<u64> {
         let offset_ns = self.hosts.get(self.host_of(channel))?.offset_ns;
-        Self::at(offset_ns, monotonic_ns)
+        at(offset_ns, monotonic_ns)
     }
 
     /// The same of an instant on the clock of `host`.
     pub(crate) fn host_time_ns(&self, host: &str, monotonic_ns: i64) -> Option<u64> {
-        Self::at(self.hosts.get(host)?.offset_ns, monotonic_ns)
+        at(self.hosts.get(host)?.offset_ns, monotonic_ns)
     }
 
     /// From the monotonic clock of `host` to the recording's times, nanoseconds; 0 where no relation
@@ -141,13 +169,6 @@ impl Clocks {
     pub(crate) fn offset_ns(&self, host: Option<&str>) -> i64 {
         let clock = self.hosts.get(host.unwrap_or(UNKNOWN_HOST));
         clock.map_or(0, |clock| clock.offset_ns)
-    }
-
-    fn at(offset_ns: i64, monotonic_ns: i64) -> Option<u64> {
-        if monotonic_ns == UNAVAILABLE {
-            return None;
-        }
-        u64::try_from(monotonic_ns.checked_add(offset_ns)?).ok()
     }
 
     /// Every host with its clock, those that stamped nothing left out.

@@ -14,15 +14,12 @@ use hil_runtime::platform::words::counted_plainly;
 use crate::cli::{Cli, Command, ServeOptions};
 use crate::convert::{ConvertError, convert};
 use crate::ending::Ending;
-use crate::info::info;
 use crate::play::{PlayEnd, PlayError, PlayOptions, SourceError, TargetError, play};
-use crate::priority::Precedence;
 use crate::record::{Progress as RecordProgress, RecordError, Request, Which, record};
 use crate::recover::{RecoverError, loss_words, recover};
 use crate::scan::ScanError;
 use crate::scene::Scenery;
 use crate::serve::{ServeError, serve};
-use crate::split::Split;
 use crate::writer::{WriteError, check_target, partial};
 
 /// Exit codes, as `--help` lists them; those of `hil-runtime`.
@@ -67,9 +64,7 @@ fn work(command: Command, signals: &Signals, console: &mut Console) -> u8 {
             below,
             from_now,
             split_size,
-            split_time,
             flush,
-            priority,
             force,
             no_scene,
         } => {
@@ -79,10 +74,9 @@ fn work(command: Command, signals: &Signals, console: &mut Console) -> u8 {
                 waits: wait,
                 below,
                 from_now,
-                split: Split::at(split_size, split_time),
+                split_bytes: split_size,
                 flush,
                 force,
-                precedence: Precedence::new(priority),
                 scenery: Scenery::of(no_scene),
             };
             record_run(&request, signals, console)
@@ -96,7 +90,6 @@ fn work(command: Command, signals: &Signals, console: &mut Console) -> u8 {
             unless_refused(checked, console)
                 .unwrap_or_else(|console| recover_file((&broken, &output), signals, console))
         }
-        Command::Info { file, json } => show(&file, json, signals, console),
         Command::Documents { folder } => write_documents(&folder, console),
         Command::Serve(options) => serve_run(&options, signals, console),
         Command::Play {
@@ -140,13 +133,6 @@ fn unless_refused(
             Ok(exit::USAGE)
         }
     }
-}
-
-/// How much of the file at `path` is read by byte `offset`.
-fn show_read(progress: Progress, console: &mut Console, (path, offset): (&Path, u64)) {
-    let size_bytes = fs::metadata(path).map_or(0, |file| file.len());
-    let share = (size_bytes > 0).then(|| offset as f64 / size_bytes as f64);
-    progress.show(console, share, &format!("{} MiB read", offset >> 20));
 }
 
 fn serve_run(options: &ServeOptions, signals: &Signals, console: &mut Console) -> u8 {
@@ -284,8 +270,10 @@ fn progress_words(progress: &RecordProgress<'_>) -> String {
 
 fn recover_file((broken, output): (&Path, &Path), signals: &Signals, console: &mut Console) -> u8 {
     let progress = Progress::begin();
+    let size_bytes = fs::metadata(broken).map_or(0, |file| file.len());
     let recovered = recover(broken, output, &mut |offset| {
-        show_read(progress, console, (broken, offset));
+        let share = (size_bytes > 0).then(|| offset as f64 / size_bytes as f64);
+        progress.show(console, share, &format!("{} MiB read", offset >> 20));
         signals.received()
     });
     let recovered = match recovered {
@@ -318,38 +306,6 @@ fn recover_file((broken, output): (&Path, &Path), signals: &Signals, console: &m
         recovered.span_s()
     ));
     exit::DONE
-}
-
-fn show(file: &Path, json: bool, signals: &Signals, console: &mut Console) -> u8 {
-    let progress = Progress::begin();
-    let found = info(file, &mut |offset| {
-        show_read(progress, console, (file, offset));
-        signals.received()
-    });
-    match found {
-        Ok(Ok(info)) if json => match serde_json::to_string_pretty(&info) {
-            Ok(text) => {
-                console.result(&format!("{text}\n"));
-                exit::DONE
-            }
-            Err(error) => {
-                console.error(&error.to_string());
-                exit::INTERNAL
-            }
-        },
-        Ok(Ok(info)) => {
-            console.result(&info.text());
-            exit::DONE
-        }
-        Ok(Err(signal)) => {
-            console.error(&format!("ended by {signal}"));
-            interrupted()
-        }
-        Err(error) => {
-            console.error(&error.to_string());
-            exit::USAGE
-        }
-    }
 }
 
 fn play_file(options: &PlayOptions, signals: &Signals, console: &mut Console) -> u8 {

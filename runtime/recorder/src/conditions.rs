@@ -72,7 +72,7 @@ fn condition_schema() -> Schema {
 }
 
 impl OrderedCondition {
-    fn of((link, direction): (&str, &str), record: &LinkConditionRecord) -> Self {
+    fn of(link: &str, direction: &str, record: &LinkConditionRecord) -> Self {
         let (condition, delay_ns, loss_ratio) = match record.condition() {
             Some(LinkCondition::Topology) => ("topology", None, None),
             Some(LinkCondition::Fixed { loss_ratio, .. }) => {
@@ -143,20 +143,15 @@ impl Conditions {
         Some(&self.directions.get(channel)?.host)
     }
 
-    /// Lets `sink` hear now of the topic of orders recorded under `channel`; how many topics that is.
+    /// Lets `sink` hear now of the topic of orders recorded under `channel`.
     ///
     /// # Errors
     /// When it has no room for it.
-    pub(crate) fn declare<S: Sink>(
-        &mut self,
-        channel: &str,
-        sink: &mut S,
-    ) -> Result<usize, S::Error> {
-        let Some(direction) = self.directions.get_mut(channel) else {
-            return Ok(0);
-        };
-        direction.topic.declare(sink)?;
-        Ok(1)
+    pub(crate) fn declare<S: Sink>(&mut self, channel: &str, sink: &mut S) -> Result<(), S::Error> {
+        if let Some(direction) = self.directions.get_mut(channel) {
+            direction.topic.declare(sink)?;
+        }
+        Ok(())
     }
 
     /// Writes an order recorded under `channel`, in force from `at_ns` of the recording's axis.
@@ -166,13 +161,14 @@ impl Conditions {
     pub(crate) fn write<S: Sink>(
         &mut self,
         channel: &str,
-        (at_ns, record): (u64, &LinkConditionRecord),
+        at_ns: u64,
+        record: &LinkConditionRecord,
         sink: &mut S,
     ) -> Result<(), S::Error> {
         let Some(direction) = self.directions.get_mut(channel) else {
             return Ok(());
         };
-        let ordered = OrderedCondition::of((&direction.link, &direction.way), record);
+        let ordered = OrderedCondition::of(&direction.link, &direction.way, record);
         let at = Stamp::new(at_ns, record.number);
         direction.topic.write(sink, at, &ordered.encode_to_vec())
     }
@@ -188,7 +184,7 @@ mod tests {
     fn an_order_says_what_it_asked_for_and_why_it_was_refused() {
         let mut record = LinkConditionRecord::zeroed();
         (record.kind, record.delay_ns, record.loss_ratio) = (1, 40_000_000, 0.2);
-        let ordered = OrderedCondition::of(("hop", "forward"), &record);
+        let ordered = OrderedCondition::of("hop", "forward", &record);
         assert_eq!(
             (ordered.condition.as_str(), ordered.is_in_force),
             ("fixed", true)
@@ -198,14 +194,14 @@ mod tests {
             (Some(40_000_000), Some(0.2))
         );
         (record.kind, record.outcome) = (2, 2);
-        let ordered = OrderedCondition::of(("hop", "forward"), &record);
+        let ordered = OrderedCondition::of("hop", "forward", &record);
         assert_eq!(
             (ordered.condition.as_str(), ordered.loss_ratio),
             ("cut", Some(1.0))
         );
         assert!(!ordered.is_in_force && ordered.refusal.contains("too little room"));
         (record.kind, record.outcome) = (9, 9);
-        let ordered = OrderedCondition::of(("hop", "forward"), &record);
+        let ordered = OrderedCondition::of("hop", "forward", &record);
         assert_eq!(ordered.condition, "unknown");
         assert!(!ordered.is_in_force && !ordered.refusal.is_empty());
     }

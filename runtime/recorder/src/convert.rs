@@ -1,8 +1,6 @@
 //! A finished run's folder as one recording. Everything is put on one axis of time, the instants of
 //! publication; what each topic looks like is decided in the modules it calls.
 
-mod beside;
-
 use std::path::Path;
 use std::thread;
 use std::time::Duration;
@@ -11,17 +9,16 @@ use hil_models::link::condition::LinkConditionRecord;
 use hil_models::message::Envelope;
 use hil_models::trace::Trace;
 use hil_runtime::rundir::record::{RecordFile, RecordKind};
-use prost::Message as _;
 
+use crate::channel::{ChannelTopics, Typed, Wanted, typed};
 use crate::clocks::Clocks;
 use crate::conditions::Conditions;
-use crate::encode::Encoder;
 use crate::facts;
-use crate::net::{self, Latencies, LinkDecision, MessageLatency};
+use crate::net::{self, Latencies, MessageId};
 use crate::run::{Run, RunError};
 use crate::scene::{Heard, Scene, Scenery};
-use crate::schema::{self, Schema};
-use crate::topics::{self, Names, View, topic_of};
+use crate::sink::Topic;
+use crate::topics::{self, Names};
 use crate::writer::{Recording, Stamp, WriteError};
 
 /// How often it looks whether something that takes its time is done.
@@ -56,33 +53,23 @@ pub(crate) struct Converted {
     pub(crate) words: Vec<String>,
 }
 
-/// One channel of the run, and its topics.
-pub(crate) struct ChannelTopics {
-    /// The channel.
-    pub(crate) name: String,
-    /// Its message, where the manifest names it.
-    pub(crate) message: Option<String>,
-    /// Its topic and how it is written; `None` when no message of it was recorded.
-    pub(crate) own: Option<(u16, Encoder)>,
-    /// Why its messages are kept as bytes, if they are.
-    pub(crate) untyped: Option<String>,
-    views: Vec<(View, u16)>,
-    latency: Option<u16>,
-    link: Option<u16>,
-}
-
 /// Something to write, before it is encoded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum What {
     Message { file: usize, index: usize },
-    Latency { key: (u32, u64) },
+    Latency { message: MessageId },
     Link { trace: usize, index: usize },
     Condition { file: usize, index: usize },
     Event { index: usize },
 }
 
-/// Its place: time, then the channel, so that the order is the same each time.
-type Item = (u64, usize, What);
+/// Something and its place: by time, then the channel, so that the order is the same each time.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+struct Item {
+    at_ns: u64,
+    channel: usize,
+    what: What,
+}
 
 /// Converts the run at `from` to the file `to`, with its scene if that is wanted; `look` hears how
 /// far it is, in words, and gives the signal that came.
@@ -96,7 +83,7 @@ pub(crate) fn convert(
     look: &mut dyn FnMut(Option<f64>, &str) -> Option<&'static str>,
 ) -> Result<Converted, ConvertError> {
     let mut stopped = None;
-    let mut run = Run::read(from, &mut |(share, path)| {
+    let mut run = Run::read(from, &mut |share, path| {
         stopped = look(Some(share), &format!("reading {path}"));
         stopped.is_none()
     })?;
@@ -136,14 +123,14 @@ pub(crate) fn convert(
         mut recording,
         channels,
         message_count,
-        topic_count,
         names,
         ..
     } = conversion;
     facts::write(&mut recording, &run, &clocks, &channels, &names)?;
+    let topic_count = recording.topic_count();
     let written_count = recording.finish()?;
     let untyped = channels.iter().filter_map(|channel| {
-        let why = channel.untyped.as_ref()?;
+        let why = channel.untyped()?;
         Some(format!("{}: kept as bytes: {why}", channel.name))
     });
     let mut words = run.gaps.words.clone();
@@ -161,143 +148,95 @@ struct Conversion {
     recording: Recording,
     channels: Vec<ChannelTopics>,
     names: Names,
-    events: Option<u16>,
+    events: Topic,
     scene: Option<Scene>,
     conditions: Conditions,
     latencies: Vec<Latencies>,
-    topic_count: usize,
     message_count: u64,
     timeless_count: u64,
-    buffer: Vec<u8>,
 }
 
 impl Conversion {
     /// Opens the file and declares every topic in it.
     fn begin(to: &Path, run: &Run, clocks: &Clocks, scenery: Scenery) -> Result<Self, WriteError> {
-        let mut conversion = Self {
-            recording: Recording::create(to)?,
-            channels: Vec::new(),
-            names: Names::default(),
-            events: None,
-            scene: None,
-            conditions: Conditions::default(),
-            latencies: Vec::new(),
-            topic_count: 0,
-            message_count: 0,
-            timeless_count: 0,
-            buffer: Vec::new(),
-        };
-        // Before the run's own names, so that these keep theirs.
-        let names = run.channels();
-        for name in &names {
-            let channel = conversion.own_topic(run, name)?;
-            conversion.channels.push(channel);
-        }
-        for index in 0..names.len() {
-            conversion.derived_topics(run, clocks, index)?;
-        }
-        let events = run.summary.as_ref().map(|one| &one.score_events.events);
-        if events.is_some_and(|events| !events.is_empty()) {
-            let schema = topics::event_schema();
-            conversion.events = Some(conversion.topic("/score/events".to_owned(), &schema, &[])?);
-        }
-        conversion.begin_conditions(run)?;
-        if scenery.is_drawn() {
-            conversion.begin_scene(run)?;
-        }
-        // Descriptions of topics in a chunk of their own: damage to a message cannot take them along.
-        conversion.recording.flush()?;
-        Ok(conversion)
-    }
-
-    fn topic(
-        &mut self,
-        wanted: String,
-        schema: &Schema,
-        metadata: &[(&str, &str)],
-    ) -> Result<u16, WriteError> {
-        let topic = self.names.claim(wanted);
-        let pairs = metadata.iter();
-        let pairs = pairs.map(|(key, value)| ((*key).to_owned(), (*value).to_owned()));
-        self.topic_count += 1;
-        self.recording.add_topic(&topic, schema, &pairs.collect())
-    }
-
-    fn own_topic(&mut self, run: &Run, name: &str) -> Result<ChannelTopics, WriteError> {
-        let described = run.described(name);
-        let message = described.map(|one| one.message.clone());
-        let mut files = run.files.iter();
-        let is_recorded = files.any(|file| is_of(file, name, RecordKind::Message));
-        let mut channel = ChannelTopics {
-            name: name.to_owned(),
-            message,
-            own: None,
-            untyped: None,
-            views: Vec::new(),
-            latency: None,
-            link: None,
-        };
-        if !is_recorded {
-            return Ok(channel);
-        }
-        let typed = typed_encoder(run, name);
-        let (encoder, schema) = typed.unwrap_or_else(|why| {
-            channel.untyped = Some(why);
-            (Encoder::Opaque, schema::opaque())
+        let mut recording = Recording::create(to)?;
+        let mut names = Names::default();
+        let recorded = run.channels();
+        let wanted = recorded.iter().map(|name| Wanted {
+            name,
+            described: run.described(name),
+            typed: typed_as_recorded(run, name),
         });
-        let message = channel.message.clone().unwrap_or_default();
-        let size = described.map_or(String::new(), |one| one.size_bytes.to_string());
-        let metadata = [
-            ("channel", name),
-            ("message", &message),
-            ("size_bytes", &size),
-            (
-                "clock_host",
-                described
-                    .and_then(|one| one.from_host.as_deref())
-                    .unwrap_or_default(),
-            ),
-        ];
-        let topic = self.topic(topic_of(name), &schema, &metadata)?;
-        channel.own = Some((topic, encoder));
-        Ok(channel)
-    }
-
-    /// The topics that are made of a channel's messages and records.
-    fn derived_topics(
-        &mut self,
-        run: &Run,
-        clocks: &Clocks,
-        index: usize,
-    ) -> Result<(), WriteError> {
-        let name = self.channels[index].name.clone();
-        let metadata = [("channel", name.as_str())];
-        let described = run
-            .described(&name)
-            .filter(|_| self.channels[index].own.is_some());
-        if let Some(one) = described {
-            for view in View::of(&one.message, one.size_bytes) {
-                let wanted = format!("{}{}", view.prefix(), topic_of(&name));
-                let topic = self.topic(wanted, &view.schema(), &metadata)?;
-                self.channels[index].views.push((*view, topic));
+        let mut channels = ChannelTopics::of_all(wanted.collect(), &mut names);
+        for channel in &mut channels {
+            let mut files = run.files.iter();
+            if files.any(|file| is_of(file, &channel.name, RecordKind::Message)) {
+                channel.own.declare(&mut recording)?;
             }
         }
-        let trace = trace_of(run, &name).map(|(_, trace)| trace);
-        let files = run.files.iter();
-        let files = files.filter(|file| file.header.channel == name);
-        let compares = clocks.has_one_clock == Some(true);
-        let latencies = net::latencies(&files, trace, compares);
-        let base = format!("/net{}", topic_of(&name));
-        if !latencies.is_empty() {
-            let wanted = format!("{base}/latency");
-            let topic = self.topic(wanted, &net::latency_schema(), &metadata)?;
-            self.channels[index].latency = Some(topic);
+        let mut latencies = Vec::new();
+        for channel in &mut channels {
+            if channel.own.is_declared() {
+                channel.declare_views(&mut recording)?;
+            }
+            let trace = trace_of(run, &channel.name).map(|(_, trace)| trace);
+            let files = run.files.iter();
+            let files = files.filter(|file| file.header.channel == channel.name);
+            let joined = net::latencies(&files, trace, clocks.has_one_clock == Some(true));
+            if !joined.is_empty() {
+                channel.latency.declare(&mut recording)?;
+            }
+            latencies.push(joined);
+            if trace.is_some() {
+                channel.link.declare(&mut recording)?;
+            }
         }
-        self.latencies.push(latencies);
-        if trace.is_some() {
-            let topic = self.topic(format!("{base}/link"), &net::decision_schema(), &metadata)?;
-            self.channels[index].link = Some(topic);
+        let events = names.claim("/score/events".to_owned());
+        let mut events = Topic::new(events, topics::event_schema(), &[]);
+        let told = run.summary.as_ref().map(|one| &one.score_events.events);
+        if told.is_some_and(|events| !events.is_empty()) {
+            events.declare(&mut recording)?;
         }
+        let mut conditions = Conditions::of(run.topology(), &mut names);
+        for file in run.files.iter().filter(|file| is_order_file(file)) {
+            conditions.declare(&file.header.channel, &mut recording)?;
+        }
+        let mut scene = scenery.is_drawn().then(|| {
+            let case = &run.topology()["case"];
+            Scene::new(case["name"].as_str(), &case["parameters"], &mut names)
+        });
+        if let Some(scene) = &mut scene {
+            let recorded = channels.iter().filter(|channel| channel.own.is_declared());
+            let messages = recorded.filter_map(|channel| channel.message.as_deref());
+            scene.declare(messages, &mut recording)?;
+        }
+        // Descriptions of topics in a chunk of their own: damage to a message cannot take them along.
+        recording.flush()?;
+        Ok(Self {
+            recording,
+            channels,
+            names,
+            events,
+            scene,
+            conditions,
+            latencies,
+            message_count: 0,
+            timeless_count: 0,
+        })
+    }
+
+    /// False while something is being made that the pictures need.
+    fn is_ready(&mut self) -> bool {
+        self.scene.as_mut().is_none_or(Scene::is_ready)
+    }
+
+    /// Draws the last of the scene, and says why it lacks its ground, if it does.
+    fn finish_scene(&mut self, run: &mut Run) -> Result<(), WriteError> {
+        let Some(scene) = &mut self.scene else {
+            return Ok(());
+        };
+        scene.finish(&mut self.recording)?;
+        run.gaps.words.extend(scene.problem().map(str::to_owned));
         Ok(())
     }
 
@@ -306,7 +245,11 @@ impl Conversion {
         let mut items = Vec::new();
         let mut timeless_count = 0;
         let mut put = |at_ns: Option<u64>, channel, what| match at_ns {
-            Some(at_ns) => items.push((at_ns, channel, what)),
+            Some(at_ns) => items.push(Item {
+                at_ns,
+                channel,
+                what,
+            }),
             None => timeless_count += 1,
         };
         for (channel, topics) in self.channels.iter().enumerate() {
@@ -321,9 +264,9 @@ impl Conversion {
                     put(at_ns, channel, What::Message { file, index });
                 }
             }
-            for (key, one) in &self.latencies[channel] {
+            for (message, one) in &self.latencies[channel] {
                 let at_ns = one.published_ns.and_then(|ns| clocks.time_ns(name, ns));
-                put(at_ns, channel, What::Latency { key: *key });
+                put(at_ns, channel, What::Latency { message: *message });
             }
             if let Some((trace, whole)) = trace_of(run, name) {
                 for index in 0..whole.records.len() {
@@ -354,97 +297,80 @@ impl Conversion {
         items
     }
 
-    fn write(&mut self, run: &mut Run, (at_ns, channel, what): Item) -> Result<(), WriteError> {
-        self.buffer.clear();
-        match what {
+    fn write(&mut self, run: &mut Run, item: Item) -> Result<(), WriteError> {
+        let (at_ns, recording) = (item.at_ns, &mut self.recording);
+        match item.what {
             What::Message { file, index } => {
-                return self.write_message(run, (at_ns, channel), (file, index));
+                let Some((envelope, payload)) = run.files[file].message(index) else {
+                    return Ok(());
+                };
+                let topics = &mut self.channels[item.channel];
+                let at = Stamp::new(at_ns, envelope.sequence);
+                if !topics.write_message(at, payload, recording)? {
+                    run.gaps.misfit_count += 1;
+                    return Ok(());
+                }
+                self.message_count += 1;
+                if let Some((scene, message)) = self.scene.as_mut().zip(topics.message.as_deref()) {
+                    let heard = Heard {
+                        channel: &topics.name,
+                        message,
+                        payload,
+                        at_ns,
+                        published_ns: envelope.published_ns,
+                    };
+                    scene.take(&heard, recording)?;
+                }
             }
-            What::Latency { key } => {
-                let one: Option<&MessageLatency> = self.latencies[channel].get(&key);
-                if let Some((topic, one)) = self.channels[channel].latency.zip(one) {
-                    one.encode_raw(&mut self.buffer);
-                    self.recording
-                        .write(topic, Stamp::new(at_ns, key.1), &self.buffer)?;
+            What::Latency { message } => {
+                if let Some(stamps) = self.latencies[item.channel].get(&message) {
+                    self.channels[item.channel].write_latency(at_ns, stamps, recording)?;
                 }
             }
             What::Link { trace, index } => {
                 let record = &run.traces[trace].records[index];
-                if let Some(topic) = self.channels[channel].link {
-                    LinkDecision::of(record).encode_raw(&mut self.buffer);
-                    let at = Stamp::new(at_ns, record.sequence);
-                    self.recording.write(topic, at, &self.buffer)?;
-                }
+                self.channels[item.channel].write_decision(at_ns, record, recording)?;
             }
             What::Condition { file, index } => {
                 let file = &run.files[file];
                 if let Some(record) = file.record::<LinkConditionRecord>(index) {
-                    let one = (at_ns, &record);
-                    self.conditions
-                        .write(&file.header.channel, one, &mut self.recording)?;
+                    let channel = &file.header.channel;
+                    self.conditions.write(channel, at_ns, &record, recording)?;
                 }
             }
             What::Event { index } => {
                 let events = run.summary.as_ref().map(|one| &one.score_events.events);
                 let event = events.and_then(|events| events.get(index));
-                let line = event.and_then(|event| topics::event_line(event, at_ns));
-                if let Some((topic, line)) = self.events.zip(line) {
+                if let Some(line) = event.and_then(|event| topics::event_line(event, at_ns)) {
                     let at = Stamp::new(at_ns, index as u64);
-                    self.recording.write(topic, at, &line)?;
+                    self.events.write(recording, at, &line)?;
                 }
             }
         }
         Ok(())
     }
-
-    fn write_message(
-        &mut self,
-        run: &mut Run,
-        (at_ns, channel): (u64, usize),
-        (file, index): (usize, usize),
-    ) -> Result<(), WriteError> {
-        let topics = &self.channels[channel];
-        let message = run.files[file].message(index);
-        let Some(((topic, encoder), (envelope, payload))) = topics.own.as_ref().zip(message) else {
-            return Ok(());
-        };
-        let at = Stamp::new(at_ns, envelope.sequence);
-        if !encoder.encode(payload, &mut self.buffer) {
-            run.gaps.misfit_count += 1;
-            return Ok(());
-        }
-        self.recording.write(*topic, at, &self.buffer)?;
-        self.message_count += 1;
-        for (view, topic) in &topics.views {
-            if let Some(shown) = view.show(&topics.name, at_ns, payload) {
-                self.recording.write(*topic, at, &shown)?;
-            }
-        }
-        let Some((scene, message)) = self.scene.as_mut().zip(topics.message.as_deref()) else {
-            return Ok(());
-        };
-        let heard = Heard::of((&topics.name, message), at_ns, (&envelope, payload));
-        scene.take(&heard, &mut self.recording)
-    }
 }
 
-/// How the messages of a channel are written field by field, or why they cannot be.
-fn typed_encoder(run: &Run, channel: &str) -> Result<(Encoder, Schema), String> {
+/// How the messages of a channel are written, if their size in the record files is that of the
+/// manifest.
+fn typed_as_recorded(run: &Run, channel: &str) -> Typed {
     let described = run.described(channel);
-    let one = described.ok_or("the manifest does not tell of this channel")?;
-    let files = run.files.iter();
-    let mut files = files.filter(|file| is_of(file, channel, RecordKind::Message));
-    let expected = one.size_bytes.saturating_add(size_of::<Envelope>());
-    let other = files.find(|file| file.header.record_bytes as usize != expected);
-    if let Some(other) = other {
-        let (message, size) = (&one.message, one.size_bytes);
-        let found = (other.header.record_bytes as usize).saturating_sub(size_of::<Envelope>());
-        return Err(format!(
-            "{message} has {size} bytes by the manifest, and {found} by its record file"
-        ));
+    if let Some(one) = described {
+        let mut files = run.files.iter();
+        let expected = one.size_bytes.saturating_add(size_of::<Envelope>());
+        let other = files.find(|file| {
+            is_of(file, channel, RecordKind::Message)
+                && file.header.record_bytes as usize != expected
+        });
+        if let Some(other) = other {
+            let (message, size) = (&one.message, one.size_bytes);
+            let found = (other.header.record_bytes as usize).saturating_sub(size_of::<Envelope>());
+            return Err(format!(
+                "{message} has {size} bytes by the manifest, and {found} by its record file"
+            ));
+        }
     }
-    Encoder::typed(&one.message, &one.fields, one.size_bytes)
-        .map_err(|fault| format!("{}: {fault}", one.message))
+    typed(described)
 }
 
 fn is_of(file: &RecordFile, channel: &str, kind: RecordKind) -> bool {

@@ -6,12 +6,13 @@ use std::collections::BTreeMap;
 use std::fs;
 
 use hil_models::yumi::description::Urdf;
+use hil_runtime::rundir::manifest::Manifest;
 use hil_runtime::rundir::run_folder::RunFolder;
 use mcap::Attachment;
 use serde_json::Value;
 
-use crate::clocks::Clocks;
-use crate::convert::ChannelTopics;
+use crate::channel::ChannelTopics;
+use crate::clocks::{self, Clocks};
 use crate::run::Run;
 use crate::scene::is_of_arms;
 use crate::topics::Names;
@@ -62,14 +63,11 @@ pub(crate) fn write(
 ) -> Result<(), WriteError> {
     recording.describe("hil.run", run_words(run))?;
     if let Some(manifest) = &run.manifest {
-        let topology = ("json".to_owned(), manifest.topology.to_string());
-        recording.describe("hil.topology", Words::from([topology]))?;
-        let host = ("json".to_owned(), manifest.host_facts.to_string());
-        recording.describe("hil.host_facts", Words::from([host]))?;
+        describe_manifest(recording, manifest)?;
     }
     recording.describe("hil.clocks", clock_words(run, clocks))?;
-    recording.describe("hil.channels", channel_words(channels))?;
-    recording.describe("hil.recording", recording_words(run, names))?;
+    recording.describe("hil.channels", ChannelTopics::words(channels.iter()))?;
+    recording.describe("hil.recording", gap_words(run, names))?;
     attach(recording, &run.folder)?;
     let messages = channels.iter().filter_map(|one| one.message.as_deref());
     attach_robot(recording, messages)
@@ -105,48 +103,22 @@ pub(crate) fn run_words(run: &Run) -> Words {
 }
 
 fn clock_words(run: &Run, clocks: &Clocks) -> Words {
-    let mut words = Words::new();
-    let mut put = |key: String, value: String| words.insert(key, value);
-    put(
-        "log_time".to_owned(),
-        "instant of publication on the clock of the producer's host, plus offset_ns of that host; \
-         hosts are not aligned with each other"
-            .to_owned(),
-    );
-    let one_clock = clocks.has_one_clock;
-    put(
-        "has_one_clock".to_owned(),
-        one_clock.map_or_else(|| "unknown".to_owned(), |is_one| is_one.to_string()),
-    );
+    let mut words = clocks::words(clocks.has_one_clock);
     for (host, clock) in clocks.hosts() {
-        put(format!("{host}/basis"), clock.basis.words().to_owned());
-        put(format!("{host}/offset_ns"), clock.offset_ns.to_string());
+        clocks::host_words(host, clock.basis, Some(clock.offset_ns), &mut words);
         if let Some((lowest, highest)) = clock.noted_ns {
-            put(format!("{host}/offset_lowest_ns"), lowest.to_string());
-            put(format!("{host}/offset_highest_ns"), highest.to_string());
+            words.insert(format!("{host}/offset_lowest_ns"), lowest.to_string());
+            words.insert(format!("{host}/offset_highest_ns"), highest.to_string());
         }
     }
     let section = run.summary.as_ref().and_then(|one| one.clocks.as_ref());
     if let Some(text) = section.and_then(|section| serde_json::to_string(section).ok()) {
-        put("alignment_json".to_owned(), text);
+        words.insert("alignment_json".to_owned(), text);
     }
     words
 }
 
-fn channel_words(channels: &[ChannelTopics]) -> Words {
-    let describe = |channel: &ChannelTopics| {
-        let message = channel.message.as_deref().unwrap_or("unknown message");
-        let how = match (&channel.own, &channel.untyped) {
-            (None, _) => "no message was recorded".to_owned(),
-            (Some(_), None) => "typed".to_owned(),
-            (Some(_), Some(why)) => format!("kept as bytes: {why}"),
-        };
-        (channel.name.clone(), format!("{message}; {how}"))
-    };
-    channels.iter().map(describe).collect()
-}
-
-fn recording_words(run: &Run, names: &Names) -> Words {
+fn gap_words(run: &Run, names: &Names) -> Words {
     let gaps = &run.gaps;
     let counts = [
         ("unreadable_file_count", gaps.unreadable_file_count),
@@ -155,22 +127,44 @@ fn recording_words(run: &Run, names: &Names) -> Words {
         ("misfit_message_count", gaps.misfit_count),
         ("timeless_record_count", gaps.timeless_count),
     ];
-    let mut words: Words = counts
-        .iter()
-        .map(|(key, count)| ((*key).to_owned(), count.to_string()))
-        .collect();
-    let version = env!("CARGO_PKG_VERSION").to_owned();
-    words.insert("recorder_version".to_owned(), version);
+    let mut words = recording_words(&counts, &gaps.words, names);
     for (channel, count) in &gaps.missing {
         words.insert(format!("missing {channel}"), count.to_string());
     }
-    for (gap, number) in gaps.words.iter().zip(1..) {
+    words
+}
+
+/// What a recording says of itself: counts, gaps in words, and topics that could not have the name
+/// that they should.
+pub(crate) fn recording_words(counts: &[(&str, u64)], gaps: &[String], names: &Names) -> Words {
+    let counts = counts.iter();
+    let counts = counts.map(|(key, count)| ((*key).to_owned(), count.to_string()));
+    let mut words: Words = counts.collect();
+    let version = env!("CARGO_PKG_VERSION").to_owned();
+    words.insert("recorder_version".to_owned(), version);
+    for (gap, number) in gaps.iter().zip(1..) {
         words.insert(format!("gap_{number:04}"), gap.clone());
     }
     for (given, wanted) in &names.changed {
         words.insert(format!("renamed {given}"), format!("{wanted} was taken"));
     }
     words
+}
+
+/// What was run, and on what.
+///
+/// # Errors
+/// When the file cannot be written.
+pub(crate) fn describe_manifest(
+    recording: &mut Recording,
+    manifest: &Manifest,
+) -> Result<(), WriteError> {
+    let (topology, host) = (&manifest.topology, &manifest.host_facts);
+    for (name, value) in [("hil.topology", topology), ("hil.host_facts", host)] {
+        let json = ("json".to_owned(), value.to_string());
+        recording.describe(name, Words::from([json]))?;
+    }
+    Ok(())
 }
 
 /// The description of the robot, if any of `messages` is about its arms.

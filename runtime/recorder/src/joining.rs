@@ -8,11 +8,9 @@
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-use hil_models::measure::record::IngressRecord;
-use hil_runtime::rundir::live_run::Stage;
-use hil_runtime::watch::{Record, Seen};
+use hil_runtime::rundir::{Record, Seen, Stage};
 
-use crate::net::{self, Latencies, MessageLatency};
+use crate::net::{self, Latencies, MessageId, MessageLatency, Noted};
 use crate::newest::Newest;
 
 /// How much later a message must have been published, at every stage here, for those before it to be
@@ -28,8 +26,6 @@ const WAITING_MAX: usize = 1 << 16;
 /// Stages there are.
 const STAGES: usize = 4;
 
-type Key = (u32, u64);
-
 /// Joins the stamps of one channel.
 #[derive(Debug, Default)]
 pub(crate) struct Joining {
@@ -37,7 +33,7 @@ pub(crate) struct Joining {
     wanted: u8,
     waiting: Latencies,
     /// The same by instant of publication, nanoseconds.
-    order: BTreeMap<(i64, Key), First>,
+    order: BTreeMap<(i64, MessageId), First>,
     /// The newest publication of which each stage has told.
     newest: [Newest; STAGES],
     given: Seen,
@@ -82,24 +78,14 @@ impl Joining {
 
     /// Takes a stamp that came `now`, of a process of this host or of another one.
     pub(crate) fn take(&mut self, record: &Record, is_of_this_host: bool, now: Instant) {
-        let (stage, key, published_ns) = match record {
-            Record::Published(one) => (
-                Stage::Published,
-                (one.epoch, one.sequence),
-                one.published_ns,
-            ),
-            Record::Taken(one) => (Stage::Taken, (one.epoch, one.sequence), one.published_ns),
-            Record::Egress(one) => (Stage::Sent, (one.epoch, one.sequence), one.published_ns),
-            // A second copy says nothing of the way of the first.
-            Record::Ingress(one) if one.flags & IngressRecord::DUPLICATE == 0 => {
-                (Stage::Received, (one.epoch, one.sequence), one.published_ns)
-            }
-            _ => return,
+        let Some(noted) = Noted::of(record) else {
+            return;
         };
+        let (stage, key, published_ns) = (noted.stage, noted.message, noted.published_ns);
         if is_of_this_host {
             self.newest[place(stage)].take(published_ns);
         }
-        if self.given.contains(key.0, key.1) {
+        if self.given.contains(key.epoch, key.sequence) {
             // The others bring the publication stamp along.
             let is_late = is_of_this_host && stage != Stage::Published;
             self.late_count += u64::from(is_late);
@@ -112,16 +98,10 @@ impl Joining {
             };
             self.order.insert((published_ns, key), first);
         }
-        match record {
-            Record::Published(one) => net::published(&mut self.waiting, one),
-            Record::Taken(one) => net::taken(&mut self.waiting, one),
-            Record::Egress(one) => net::sent(&mut self.waiting, one),
-            Record::Ingress(one) => net::received(&mut self.waiting, one),
-            _ => {}
-        }
+        net::join(&mut self.waiting, key, record);
     }
 
-    fn is_whole(&self, key: &Key) -> bool {
+    fn is_whole(&self, key: &MessageId) -> bool {
         let message = self.waiting.get(key);
         message.is_some_and(|one| self.wanted != 0 && has(one) & self.wanted == self.wanted)
     }
@@ -164,7 +144,7 @@ impl Joining {
         let is_behind = newest_ns.is_some_and(|newest_ns| published_ns < newest_ns);
         self.unordered_count += u64::from(is_behind && first.is_of_this_host);
         self.newest_given.take(published_ns);
-        self.given.insert(key.0, key.1);
+        self.given.insert(key.epoch, key.sequence);
         self.waiting.remove(&key)
     }
 }

@@ -2,14 +2,15 @@
 //! program of its own so that the real-time binary carries none of what this needs.
 //!
 //! Read in this order: `run` and `clocks`, what there is and when it was; `schema` and
-//! `encode`, what a message looks like; `topics` and `net`, what is made of it; `writer`,
+//! `encode`, what a message looks like; `topics`, `net` and `channel`, what is made of it; `writer`,
 //! the file; `convert`, all of them together. While a run goes, `live` makes the same topics of
-//! its events for any `sink`, and `record` puts them into files; `priority` and `pace` keep
-//! it out of the run's way. `scan` reads files as far as their `lengths` hold, for `recover` and `info`; `play` feeds what `decode`
+//! its events for any `sink`, and `record` puts them into files; `pace` keeps it out of the run's
+//! way. `scan` reads files as far as their `lengths` hold, for `recover`; `play` feeds what `decode`
 //! makes of them into a run. `view` is the state of a run that goes on, `serve` shows it.
 //!
 //! The program is [`run()`]; nothing else is for other crates but [`decoders`], for tests.
 
+mod channel;
 mod cli;
 mod clocks;
 mod command;
@@ -21,7 +22,6 @@ mod disk;
 mod encode;
 mod ending;
 mod facts;
-mod info;
 mod joining;
 mod lengths;
 mod live;
@@ -30,7 +30,6 @@ mod net;
 mod newest;
 mod pace;
 mod play;
-mod priority;
 mod record;
 mod recover;
 mod run;

@@ -1,44 +1,34 @@
 //! What becomes of a run's events while it goes: topics and their messages, the same as
 //! [`crate::convert`] makes of the folder afterwards. Where they go is the [`Sink`]'s.
 
-mod beside;
-
 use std::collections::BTreeMap;
 use std::time::Instant;
 
+use hil_models::link::condition::LinkConditionRecord;
 use hil_models::measure::record::UNAVAILABLE;
 use hil_models::message::Envelope;
-use hil_runtime::rundir::live_run::Source;
-use hil_runtime::watch::{Event, Feed, Origin, Record, Seen, WatchedChannel};
-use prost::Message as _;
+use hil_runtime::rundir::{Event, Feed, Origin, Record, Seen, Source, WatchedChannel};
 
+use crate::channel::{ChannelTopics, Wanted, typed};
 use crate::conditions::Conditions;
-use crate::encode::Encoder;
+use crate::facts::Words;
 use crate::joining::Joining;
 use crate::live_clocks::LiveClocks;
-use crate::net::{self, LinkDecision, MessageLatency};
+use crate::net::{self, MessageLatency};
 use crate::run::Run;
 use crate::scene::waiting::LiveScene;
 use crate::scene::{Heard, Scene, Scenery};
-use crate::schema;
 use crate::sink::{Sink, Topic};
-use crate::topics::{self, Names, View, topic_of};
+use crate::topics::{self, Names};
 use crate::writer::Stamp;
 
 /// One channel and what is made of it.
 #[derive(Debug)]
-struct ChannelTopics {
+struct LiveChannel {
+    topics: ChannelTopics,
     /// Host of its producer; empty when the manifest does not tell.
     host: String,
     receiving_host: String,
-    message: String,
-    own: Topic,
-    encoder: Encoder,
-    /// Why its messages are kept as bytes, if they are.
-    untyped: Option<String>,
-    views: Vec<(View, Topic)>,
-    latency: Topic,
-    link: Topic,
     joining: Joining,
     written: Seen,
     /// Messages that were to come, by what the processes noted.
@@ -51,13 +41,12 @@ struct ChannelTopics {
 /// The topics of a run that goes.
 #[derive(Debug)]
 pub(crate) struct LiveTopics {
-    channels: BTreeMap<String, ChannelTopics>,
+    channels: BTreeMap<String, LiveChannel>,
     names: Names,
     events: Topic,
     conditions: Conditions,
     scene: Option<LiveScene>,
     clocks: LiveClocks,
-    buffer: Vec<u8>,
     counts: Counts,
 }
 
@@ -79,16 +68,19 @@ impl LiveTopics {
     /// to draw one is not worked out.
     pub(crate) fn of(feed: &Feed, scenery: Scenery) -> Self {
         let mut names = Names::default();
-        let mut channels: BTreeMap<String, ChannelTopics> = BTreeMap::new();
-        // Before the derived names, so that the run's own keep theirs.
-        let own: Vec<(&WatchedChannel, String)> = feed
-            .channels()
-            .map(|channel| (channel, names.claim(topic_of(&channel.description.name))))
+        let wanted = feed.channels().map(|channel| {
+            let described = Some(&channel.description);
+            Wanted {
+                name: &channel.description.name,
+                described,
+                typed: typed(described),
+            }
+        });
+        let topics = ChannelTopics::of_all(wanted.collect(), &mut names);
+        let channels = feed.channels().zip(topics);
+        let channels = channels
+            .map(|(channel, topics)| (topics.name.clone(), LiveChannel::of(feed, channel, topics)))
             .collect();
-        for (channel, topic) in own {
-            let name = channel.description.name.clone();
-            channels.insert(name, ChannelTopics::of(feed, channel, topic, &mut names));
-        }
         let events = names.claim("/score/events".to_owned());
         let topology = &feed.manifest().topology;
         let conditions = Conditions::of(topology, &mut names);
@@ -104,7 +96,6 @@ impl LiveTopics {
             conditions,
             scene,
             clocks: LiveClocks::of(feed),
-            buffer: Vec::new(),
             counts: Counts::default(),
         }
     }
@@ -126,7 +117,7 @@ impl LiveTopics {
                 payload,
             } => {
                 let name = channel.description.name.as_str();
-                self.message(name, *origin, (envelope, payload), sink)
+                self.message(name, *origin, envelope, payload, sink)
             }
             Event::Record {
                 channel,
@@ -143,7 +134,8 @@ impl LiveTopics {
         &mut self,
         name: &str,
         origin: Origin,
-        (envelope, payload): (&Envelope, &[u8]),
+        envelope: &Envelope,
+        payload: &[u8],
         sink: &mut S,
     ) -> Result<(), S::Error> {
         let Some(channel) = self.channels.get_mut(name) else {
@@ -153,28 +145,27 @@ impl LiveTopics {
             self.counts.timeless_count += 1;
             return Ok(());
         };
-        self.buffer.clear();
-        if !channel.encoder.encode(payload, &mut self.buffer) {
+        let at = Stamp::new(at_ns, envelope.sequence);
+        if !channel.topics.write_message(at, payload, sink)? {
             self.counts.misfit_count += 1;
             return Ok(());
         }
-        let at = Stamp::new(at_ns, envelope.sequence);
-        channel.own.write(sink, at, &self.buffer)?;
         channel.note_written(envelope);
         self.counts.message_count += 1;
-        if origin != Origin::OtherHost {
-            self.counts.newest_ns = self.counts.newest_ns.max(at_ns);
-        }
-        for (view, topic) in &mut channel.views {
-            if let Some(shown) = view.show(name, at_ns, payload) {
-                topic.write(sink, at, &shown)?;
-            }
-        }
         // What another host sends at the end was long ago: the pictures of that time are drawn.
-        let is_news = origin != Origin::OtherHost;
-        if let Some(scene) = self.scene.as_mut().filter(|_| is_news) {
-            let channel = (name, channel.message.as_str());
-            scene.take(&Heard::of(channel, at_ns, (envelope, payload)), sink)?;
+        if origin == Origin::OtherHost {
+            return Ok(());
+        }
+        self.counts.newest_ns = self.counts.newest_ns.max(at_ns);
+        if let Some((scene, message)) = self.scene.as_mut().zip(channel.topics.message.as_deref()) {
+            let heard = Heard {
+                channel: name,
+                message,
+                payload,
+                at_ns,
+                published_ns: envelope.published_ns,
+            };
+            scene.take(&heard, sink)?;
         }
         Ok(())
     }
@@ -221,14 +212,9 @@ impl LiveTopics {
             return Ok(());
         };
         if self.clocks.compares() || channel.host == channel.receiving_host {
-            let ends = one.taken_ns.zip(one.published_ns);
-            one.delay_ns = ends.and_then(|(taken, published)| taken.checked_sub(published));
+            one.compare_ends();
         }
-        self.buffer.clear();
-        one.encode_raw(&mut self.buffer);
-        channel
-            .latency
-            .write(sink, Stamp::new(at_ns, one.sequence), &self.buffer)
+        channel.topics.write_latency(at_ns, &one, sink)
     }
 
     /// Nothing more is to be read by `now`: gives out the stamps of messages that were held for long
@@ -297,10 +283,7 @@ impl LiveTopics {
                     self.counts.timeless_count += 1;
                     continue;
                 };
-                self.buffer.clear();
-                LinkDecision::of(record).encode_raw(&mut self.buffer);
-                let at = Stamp::new(at_ns, record.sequence);
-                channel.link.write(sink, at, &self.buffer)?;
+                channel.topics.write_decision(at_ns, record, sink)?;
             }
         }
         let Some(summary) = &run.summary else {
@@ -337,7 +320,7 @@ impl LiveTopics {
     /// Messages that should be there and are not, by channel. `is_silent` says that all records of
     /// the run have come, so that what is not there will not come.
     pub(crate) fn missed(&self, feed: &Feed, is_silent: bool) -> BTreeMap<String, u64> {
-        let of = |name: &String, channel: &ChannelTopics| {
+        let of = |name: &String, channel: &LiveChannel| {
             let unseen_count = feed.missed_count(name);
             if is_silent && channel.due.count() > 0 {
                 channel.outstanding_count
@@ -355,7 +338,7 @@ impl LiveTopics {
     /// Messages that were published before anybody looked, by channel: of own programs, whose
     /// messages nobody records.
     pub(crate) fn earlier(&self, feed: &Feed) -> BTreeMap<String, u64> {
-        let of = |name: &String, channel: &ChannelTopics| {
+        let of = |name: &String, channel: &LiveChannel| {
             let counters = feed.counters(name).filter(|_| channel.is_from_memory)?;
             (counters.earlier_count > 0).then(|| (name.clone(), counters.earlier_count))
         };
@@ -381,60 +364,72 @@ impl LiveTopics {
 
     /// The names of the messages, a channel each.
     pub(crate) fn messages(&self) -> impl Iterator<Item = &str> {
-        self.channels.values().map(|one| one.message.as_str())
+        self.channels
+            .values()
+            .filter_map(|one| one.topics.message.as_deref())
     }
 
     /// By channel: its message, and whether it is typed.
-    pub(crate) fn channel_words(&self) -> BTreeMap<String, String> {
-        let describe = |(name, channel): (&String, &ChannelTopics)| {
-            let how = match &channel.untyped {
-                _ if channel.written.count() == 0 => "no message was recorded".to_owned(),
-                None => "typed".to_owned(),
-                Some(why) => format!("kept as bytes: {why}"),
-            };
-            (name.clone(), format!("{}; {how}", channel.message))
+    pub(crate) fn channel_words(&self) -> Words {
+        ChannelTopics::words(self.channels.values().map(|one| &one.topics))
+    }
+
+    /// Nothing more has come for now: draws the scene as far as it is known.
+    ///
+    /// # Errors
+    /// When the sink cannot take it.
+    pub(crate) fn draw<S: Sink>(&mut self, sink: &mut S) -> Result<(), S::Error> {
+        self.scene
+            .as_mut()
+            .map_or(Ok(()), |scene| scene.settle(sink))
+    }
+
+    /// False while something is being made that the scene waits for.
+    pub(crate) fn is_scene_ready(&mut self) -> bool {
+        self.scene.as_mut().is_none_or(LiveScene::is_ready)
+    }
+
+    /// Nothing more will come: draws the rest of the scene; what it lacks.
+    ///
+    /// # Errors
+    /// When the sink cannot take it.
+    pub(crate) fn finish_scene<S: Sink>(&mut self, sink: &mut S) -> Result<Vec<String>, S::Error> {
+        let Some(scene) = &mut self.scene else {
+            return Ok(Vec::new());
         };
-        self.channels.iter().map(describe).collect()
+        scene.finish(sink)?;
+        Ok(scene.problems())
+    }
+
+    /// An order to an emulated link.
+    ///
+    /// # Errors
+    /// When the sink cannot take it.
+    fn condition<S: Sink>(
+        &mut self,
+        name: &str,
+        record: &LinkConditionRecord,
+        sink: &mut S,
+    ) -> Result<(), S::Error> {
+        let host = self.conditions.host_of(name);
+        let at_ns = host.and_then(|host| self.clocks.time_ns(host, record.from_ns));
+        let Some(at_ns) = at_ns else {
+            self.counts.timeless_count += 1;
+            return Ok(());
+        };
+        self.conditions.write(name, at_ns, record, sink)
     }
 }
 
-impl ChannelTopics {
-    fn of(feed: &Feed, channel: &WatchedChannel, topic: String, names: &mut Names) -> Self {
+impl LiveChannel {
+    fn of(feed: &Feed, channel: &WatchedChannel, topics: ChannelTopics) -> Self {
         let one = &channel.description;
-        let (name, message) = (one.name.as_str(), one.message.as_str());
-        let host = one.from_host.clone().unwrap_or_default();
-        let mut untyped = None;
-        let typed = Encoder::typed(message, &one.fields, one.size_bytes);
-        let (encoder, schema) = typed.unwrap_or_else(|fault| {
-            untyped = Some(format!("{message}: {fault}"));
-            (Encoder::Opaque, schema::opaque())
-        });
-        let size = one.size_bytes.to_string();
-        let metadata = [
-            ("channel", name),
-            ("message", message),
-            ("size_bytes", &size),
-            ("clock_host", &host),
-        ];
-        let own = Topic::new(topic, schema, &metadata);
-        let metadata = [("channel", name)];
-        let mut derived =
-            |wanted: String, schema| Topic::new(names.claim(wanted), schema, &metadata);
-        let views = View::of(message, one.size_bytes).iter();
-        let views = views.map(|view| {
-            let wanted = format!("{}{}", view.prefix(), topic_of(name));
-            (*view, derived(wanted, view.schema()))
-        });
-        let views = views.collect();
-        let base = format!("/net{}", topic_of(name));
-        let announced = feed.run().channels.iter().find(|one| one.name == name);
+        let mut announced = feed.run().channels.iter();
+        let announced = announced.find(|announced| announced.name == one.name);
         Self {
-            own,
-            encoder,
-            untyped,
-            views,
-            latency: derived(format!("{base}/latency"), net::latency_schema()),
-            link: derived(format!("{base}/link"), net::decision_schema()),
+            topics,
+            host: one.from_host.clone().unwrap_or_default(),
+            receiving_host: one.to_host.clone().unwrap_or_default(),
             joining: Joining::new(announced.map_or(&[], |one| &one.noted)),
             written: Seen::default(),
             due: Seen::default(),
@@ -446,9 +441,6 @@ impl ChannelTopics {
                     ..
                 })
             ),
-            receiving_host: one.to_host.clone().unwrap_or_default(),
-            message: message.to_owned(),
-            host,
         }
     }
 

@@ -7,7 +7,8 @@ use hil_models::measure::record::UNAVAILABLE;
 use hil_models::message::Envelope;
 use hil_runtime::watch::Feed;
 
-use crate::clocks::Basis;
+use crate::clocks::{self, Basis, UNKNOWN_HOST, at};
+use crate::facts::Words;
 use crate::net::MessageLatency;
 
 /// The clocks of a run that goes.
@@ -109,39 +110,18 @@ impl LiveClocks {
     }
 
     /// What a recording says of them.
-    pub(crate) fn words(&self) -> BTreeMap<String, String> {
-        let log_time = "instant of publication on the clock of the producer's host, plus offset_ns \
-                        of that host; hosts are not aligned with each other";
-        let one_clock = self.has_one_clock;
-        let one_clock = one_clock.map_or_else(|| "unknown".to_owned(), |is_one| is_one.to_string());
-        let mut words = BTreeMap::from([
-            ("log_time".to_owned(), log_time.to_owned()),
-            ("has_one_clock".to_owned(), one_clock),
-        ]);
+    pub(crate) fn words(&self) -> Words {
+        let mut words = clocks::words(self.has_one_clock);
         for (host, basis) in &self.chosen {
-            let host = if host.is_empty() {
-                "(unknown host)"
-            } else {
-                host
-            };
-            words.insert(format!("{host}/basis"), basis.words().to_owned());
             let offset_ns = match basis {
                 Basis::Arrival => self.noted_ns.get(host).copied(),
                 _ => Some(self.own_offset_ns.unwrap_or(0)),
             };
-            if let Some(offset_ns) = offset_ns {
-                words.insert(format!("{host}/offset_ns"), offset_ns.to_string());
-            }
+            let host = if host.is_empty() { UNKNOWN_HOST } else { host };
+            clocks::host_words(host, *basis, offset_ns, &mut words);
         }
         words
     }
-}
-
-fn at(offset_ns: i64, monotonic_ns: i64) -> Option<u64> {
-    if monotonic_ns == UNAVAILABLE {
-        return None;
-    }
-    u64::try_from(monotonic_ns.checked_add(offset_ns)?).ok()
 }
 
 #[cfg(test)]

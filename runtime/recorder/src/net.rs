@@ -3,11 +3,10 @@
 
 use std::collections::BTreeMap;
 
-use hil_models::measure::record::{
-    EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE,
-};
+use hil_models::measure::record::{FollowUpRecord, IngressRecord, UNAVAILABLE};
 use hil_models::trace::{Trace, TraceFate, TraceRecord, UNAVAILABLE_NS, UNBOUNDED_NS};
 use hil_runtime::rundir::record::{RecordFile, RecordKind};
+use hil_runtime::rundir::{Record, Stage};
 use prost_types::field_descriptor_proto::Type;
 
 use crate::schema::{self, OwnField, Schema};
@@ -185,8 +184,79 @@ fn stamp(ns: i64) -> Option<i64> {
     (ns != UNAVAILABLE).then_some(ns)
 }
 
-/// The stamps of the messages of one channel, by start and number.
-pub(crate) type Latencies = BTreeMap<(u32, u64), MessageLatency>;
+/// Which message of a channel: the start of its producer, and its number since then.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) struct MessageId {
+    /// The start.
+    pub(crate) epoch: u32,
+    /// The number.
+    pub(crate) sequence: u64,
+}
+
+/// Of which message a record tells, and from where.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Noted {
+    /// Who noted it.
+    pub(crate) stage: Stage,
+    /// The message.
+    pub(crate) message: MessageId,
+    /// When the message was published, on its producer's clock.
+    pub(crate) published_ns: i64,
+    /// When this was noted, on the clock of its process.
+    pub(crate) at_ns: i64,
+}
+
+impl Noted {
+    /// What `record` tells of; `None` of no single message, and of a second copy, which says nothing
+    /// of the way of the first.
+    pub(crate) fn of(record: &Record) -> Option<Self> {
+        let (stage, epoch, sequence, published_ns, at_ns) = match record {
+            Record::Published(one) => {
+                let at_ns = one.published_ns;
+                (Stage::Published, one.epoch, one.sequence, at_ns, at_ns)
+            }
+            Record::Egress(one) => {
+                let (published_ns, at_ns) = (one.published_ns, one.taken_ns);
+                (Stage::Sent, one.epoch, one.sequence, published_ns, at_ns)
+            }
+            Record::Ingress(one) if one.flags & IngressRecord::DUPLICATE == 0 => {
+                let (published_ns, at_ns) = (one.published_ns, one.received_ns);
+                (
+                    Stage::Received,
+                    one.epoch,
+                    one.sequence,
+                    published_ns,
+                    at_ns,
+                )
+            }
+            Record::Taken(one) => {
+                let (published_ns, at_ns) = (one.published_ns, one.taken_ns);
+                (Stage::Taken, one.epoch, one.sequence, published_ns, at_ns)
+            }
+            _ => return None,
+        };
+        Some(Self {
+            stage,
+            message: MessageId { epoch, sequence },
+            published_ns,
+            at_ns,
+        })
+    }
+}
+
+/// The records of a file that tell of single messages, in order.
+pub(crate) fn records(file: &RecordFile) -> Box<dyn Iterator<Item = Record> + '_> {
+    match file.header.kind {
+        RecordKind::Published => Box::new(file.records().map(Record::Published)),
+        RecordKind::Taken => Box::new(file.records().map(Record::Taken)),
+        RecordKind::Egress => Box::new(file.records().map(Record::Egress)),
+        RecordKind::Ingress => Box::new(file.records().map(Record::Ingress)),
+        _ => Box::new(core::iter::empty()),
+    }
+}
+
+/// The stamps of the messages of one channel.
+pub(crate) type Latencies = BTreeMap<MessageId, MessageLatency>;
 
 /// Joins the record files of one channel. `has_one_clock` says that stamps of both ends compare.
 pub(crate) fn latencies<'a>(
@@ -195,21 +265,14 @@ pub(crate) fn latencies<'a>(
     has_one_clock: bool,
 ) -> Latencies {
     let mut joined = Latencies::new();
-    for file in files.clone() {
-        match file.header.kind {
-            RecordKind::Published => file.records().for_each(|one| published(&mut joined, &one)),
-            RecordKind::Taken => file.records().for_each(|one| taken(&mut joined, &one)),
-            RecordKind::Egress => file.records().for_each(|one| sent(&mut joined, &one)),
-            RecordKind::Ingress => file.records().for_each(|one| received(&mut joined, &one)),
-            _ => {}
+    for record in files.clone().flat_map(records) {
+        if let Some(noted) = Noted::of(&record) {
+            join(&mut joined, noted.message, &record);
         }
     }
     follow_up(&mut joined, files);
     if has_one_clock {
-        for one in joined.values_mut() {
-            let ends = one.taken_ns.zip(one.published_ns);
-            one.delay_ns = ends.and_then(|(taken, published)| taken.checked_sub(published));
-        }
+        joined.values_mut().for_each(MessageLatency::compare_ends);
     }
     if let Some(trace) = trace {
         add_link_delays(&mut joined, trace);
@@ -217,72 +280,56 @@ pub(crate) fn latencies<'a>(
     joined
 }
 
-fn entry(joined: &mut Latencies, epoch: u32, sequence: u64) -> &mut MessageLatency {
-    joined
-        .entry((epoch, sequence))
-        .or_insert_with(|| MessageLatency {
-            sequence,
-            epoch,
-            ..MessageLatency::default()
-        })
+/// Puts a record of `message` beside the others of it.
+pub(crate) fn join(joined: &mut Latencies, message: MessageId, record: &Record) {
+    let one = joined.entry(message);
+    one.or_insert_with(|| MessageLatency::new(message))
+        .note(record);
 }
 
-/// Puts a record beside the others of its message.
-pub(crate) fn published(joined: &mut Latencies, record: &PublishedRecord) {
-    entry(joined, record.epoch, record.sequence).note_published(record);
-}
-
-/// Puts a record beside the others of its message.
-pub(crate) fn taken(joined: &mut Latencies, record: &TakenRecord) {
-    entry(joined, record.epoch, record.sequence).note_taken(record);
-}
-
-/// Puts a record beside the others of its message.
-pub(crate) fn sent(joined: &mut Latencies, record: &EgressRecord) {
-    entry(joined, record.epoch, record.sequence).note_sent(record);
-}
-
-/// Puts a record beside the others of its message.
-pub(crate) fn received(joined: &mut Latencies, record: &IngressRecord) {
-    // A second copy says nothing of the way of the first.
-    if record.flags & IngressRecord::DUPLICATE != 0 {
-        return;
-    }
-    entry(joined, record.epoch, record.sequence).note_received(record);
-}
-
-/// What each record says of its message, in whatever order they come.
 impl MessageLatency {
-    /// The producer's.
-    pub(crate) fn note_published(&mut self, record: &PublishedRecord) {
-        self.published_ns = stamp(record.published_ns);
+    /// Of a message of which nothing is known yet.
+    pub(crate) fn new(message: MessageId) -> Self {
+        Self {
+            sequence: message.sequence,
+            epoch: message.epoch,
+            ..Self::default()
+        }
     }
 
-    /// The consumer's.
-    pub(crate) fn note_taken(&mut self, record: &TakenRecord) {
-        self.published_ns = self.published_ns.or(stamp(record.published_ns));
-        self.taken_ns = stamp(record.taken_ns);
+    /// Takes what a record says of the message; they come in whatever order.
+    pub(crate) fn note(&mut self, record: &Record) {
+        match record {
+            Record::Published(one) => self.published_ns = stamp(one.published_ns),
+            Record::Taken(one) => {
+                self.published_ns = self.published_ns.or(stamp(one.published_ns));
+                self.taken_ns = stamp(one.taken_ns);
+            }
+            Record::Egress(one) => {
+                self.published_ns = self.published_ns.or(stamp(one.published_ns));
+                self.gateway_taken_ns = stamp(one.taken_ns);
+                self.handed_ns = stamp(one.handed_ns);
+                self.tx_realtime_ns = stamp(one.tx_software_ns);
+                self.tx_card_ns = stamp(one.tx_hardware_ns);
+                self.sender_realtime_offset_ns = stamp(one.realtime_offset_ns);
+            }
+            Record::Ingress(one) => {
+                self.published_ns = self.published_ns.or(stamp(one.published_ns));
+                self.handed_ns = self.handed_ns.or(stamp(one.handed_ns));
+                self.rx_card_ns = stamp(one.rx_hardware_ns);
+                self.rx_realtime_ns = stamp(one.rx_software_ns);
+                self.received_ns = stamp(one.received_ns);
+                self.forwarded_ns = stamp(one.forwarded_ns);
+                self.receiver_realtime_offset_ns = stamp(one.realtime_offset_ns);
+            }
+            _ => {}
+        }
     }
 
-    /// The sending gateway's.
-    pub(crate) fn note_sent(&mut self, record: &EgressRecord) {
-        self.published_ns = self.published_ns.or(stamp(record.published_ns));
-        self.gateway_taken_ns = stamp(record.taken_ns);
-        self.handed_ns = stamp(record.handed_ns);
-        self.tx_realtime_ns = stamp(record.tx_software_ns);
-        self.tx_card_ns = stamp(record.tx_hardware_ns);
-        self.sender_realtime_offset_ns = stamp(record.realtime_offset_ns);
-    }
-
-    /// The receiving gateway's, of the first copy.
-    pub(crate) fn note_received(&mut self, record: &IngressRecord) {
-        self.published_ns = self.published_ns.or(stamp(record.published_ns));
-        self.handed_ns = self.handed_ns.or(stamp(record.handed_ns));
-        self.rx_card_ns = stamp(record.rx_hardware_ns);
-        self.rx_realtime_ns = stamp(record.rx_software_ns);
-        self.received_ns = stamp(record.received_ns);
-        self.forwarded_ns = stamp(record.forwarded_ns);
-        self.receiver_realtime_offset_ns = stamp(record.realtime_offset_ns);
+    /// Works out the delay from end to end, as both read one clock.
+    pub(crate) fn compare_ends(&mut self) {
+        let ends = self.taken_ns.zip(self.published_ns);
+        self.delay_ns = ends.and_then(|(taken, published)| taken.checked_sub(published));
     }
 }
 
@@ -298,8 +345,9 @@ fn follow_up<'a>(joined: &mut Latencies, files: &(impl Iterator<Item = &'a Recor
     }
     for file in of_kind(RecordKind::FollowUp) {
         for record in file.records::<FollowUpRecord>() {
-            let epoch = epochs.get(&(record.session, record.sequence));
-            let one = epoch.and_then(|epoch| joined.get_mut(&(*epoch, record.sequence)));
+            let sequence = record.sequence;
+            let epoch = epochs.get(&(record.session, sequence)).copied();
+            let one = epoch.and_then(|epoch| joined.get_mut(&MessageId { epoch, sequence }));
             let Some(one) = one.filter(|one| one.tx_realtime_ns.is_none()) else {
                 continue;
             };
@@ -319,9 +367,10 @@ fn add_link_delays(joined: &mut Latencies, trace: &Trace) {
         if record.fate == TraceFate::Unknown {
             continue;
         }
-        let epoch = starts.get(usize::from(record.start));
-        let key = epoch.map(|epoch| (*epoch, record.sequence));
-        if let Some(one) = key.and_then(|key| joined.get_mut(&key)) {
+        let sequence = record.sequence;
+        let epoch = starts.get(usize::from(record.start)).copied();
+        let message = epoch.map(|epoch| MessageId { epoch, sequence });
+        if let Some(one) = message.and_then(|message| joined.get_mut(&message)) {
             one.link_delay_ns = record.delay();
             one.link_delay_bound_ns = bound_ns(record);
         }

@@ -16,10 +16,9 @@ use hil_runtime::watch::{Event, Feed, FeedError, Poll};
 use crate::facts::{self, Words};
 use crate::live::LiveTopics;
 use crate::pace::Pace;
-use crate::priority::{Looks, Precedence};
 use crate::run::Run;
 use crate::scene::Scenery;
-use crate::split::{Files, Split, prepare, target};
+use crate::split::{Files, prepare, target};
 use crate::writer::WriteError;
 
 /// How long a recorder with nothing to do sleeps when it reads shared memory, whose buffers are short,
@@ -90,14 +89,12 @@ pub(crate) struct Request {
     pub(crate) below: Option<PathBuf>,
     /// Leave out what is recorded already.
     pub(crate) from_now: bool,
-    /// When to begin another file.
-    pub(crate) split: Split,
+    /// Begin another file when one is larger than this, bytes.
+    pub(crate) split_bytes: Option<u64>,
     /// What a kill may lose at most.
     pub(crate) flush: Duration,
     /// Replace files that exist.
     pub(crate) force: bool,
-    /// How it stands against what it records.
-    pub(crate) precedence: Precedence,
     /// Draw the scene.
     pub(crate) scenery: Scenery,
 }
@@ -147,20 +144,17 @@ pub(crate) type Look<'a> = &'a mut dyn FnMut(&Progress<'_>) -> Option<&'static s
 /// When there is no run to record or no file can be written; what was written is beside its place
 /// then.
 pub(crate) fn record(request: &Request, look: Look<'_>) -> Result<Recorded, RecordError> {
-    prepare(&request.output, request.split, request.force)?;
+    prepare(&request.output, request.split_bytes, request.force)?;
     let run = find(request, look)?;
     let target = target(&request.output, &run.name);
     let mut feed = Feed::open(run)?;
     if request.from_now {
         feed.skip_to_now();
     }
-    let looks = Looks::begin(late_max(request.flush), &request.precedence);
-    request.precedence.settle(feed.waits());
-    let files = Files::begin(&target, request.split, request.force)?;
+    let files = Files::begin(&target, request.split_bytes, request.force)?;
     let topics = LiveTopics::of(&feed, request.scenery);
-    let precedence = request.precedence.clone();
-    let mut recording = LiveRecording::begin((feed, topics), files, precedence)?;
-    let signal = recording.run((request.flush, looks), look)?;
+    let mut recording = LiveRecording::begin(feed, topics, files)?;
+    let signal = recording.run(request.flush, look)?;
     recording.finish(signal)
 }
 
@@ -201,17 +195,19 @@ fn find(request: &Request, look: Look<'_>) -> Result<LiveRun, RecordError> {
     }
 }
 
-/// For how long a look may be kept waiting, if what a kill loses is to stay below `flush`: half of that
-/// goes by between two looks, and up to another quarter in the rings of the run's processes.
-fn late_max(flush: Duration) -> Duration {
-    flush / 4
+/// What went wrong: the first problems in words, all of them counted.
+#[derive(Debug, Default)]
+struct Problems {
+    words: Vec<String>,
+    count: u64,
 }
 
-/// Keeps a problem, and counts it.
-fn note((problems, count): (&mut Vec<String>, &mut u64), text: &str) {
-    *count += 1;
-    if problems.len() < PROBLEMS_MAX {
-        problems.push(text.to_owned());
+impl Problems {
+    fn note(&mut self, text: &str) {
+        self.count += 1;
+        if self.words.len() < PROBLEMS_MAX {
+            self.words.push(text.to_owned());
+        }
     }
 }
 
@@ -222,29 +218,21 @@ struct LiveRecording {
     /// All records of the run have come.
     is_silent: bool,
     has_summary: bool,
-    problems: Vec<String>,
-    problem_count: u64,
+    problems: Problems,
     /// What the open file says of the clocks.
     told_clocks: Words,
-    precedence: Precedence,
 }
 
 impl LiveRecording {
-    fn begin(
-        (feed, topics): (Feed, LiveTopics),
-        files: Files,
-        precedence: Precedence,
-    ) -> Result<Self, WriteError> {
+    fn begin(feed: Feed, topics: LiveTopics, files: Files) -> Result<Self, WriteError> {
         let mut recording = Self {
             topics,
             feed,
             files,
             is_silent: false,
             has_summary: false,
-            problems: Vec::new(),
-            problem_count: 0,
+            problems: Problems::default(),
             told_clocks: Words::new(),
-            precedence,
         };
         recording.describe_run()?;
         recording.files.flush()?;
@@ -252,11 +240,7 @@ impl LiveRecording {
     }
 
     /// Records until the run ends or a signal comes, which it gives back.
-    fn run(
-        &mut self,
-        (flush, mut looks): (Duration, Looks),
-        look: Look<'_>,
-    ) -> Result<Option<&'static str>, WriteError> {
+    fn run(&mut self, flush: Duration, look: Look<'_>) -> Result<Option<&'static str>, WriteError> {
         // A message waits for the ring of its process, for the next look, and for the flush.
         let flush_period = flush / 2;
         let mut pace = Pace::of(&self.feed, PAUSE, LONG_PAUSE.min(flush_period));
@@ -295,7 +279,6 @@ impl LiveRecording {
             if polled == Poll::Idle {
                 thread::sleep(pace.after(self.feed.take_fill_ratio()));
             }
-            looks.judge();
         }
     }
 
@@ -318,14 +301,13 @@ impl LiveRecording {
             is_silent,
             has_summary,
             problems,
-            problem_count,
             ..
         } = self;
         topics.clocks().learn(feed.has_one_clock());
         let mut failed = None;
         let polled = feed.poll(&mut |event| {
             match &event {
-                Event::Problem(text) => note((problems, problem_count), text),
+                Event::Problem(text) => problems.note(text),
                 Event::Silent => *is_silent = true,
                 Event::Ended { has_summary: has } => *has_summary = *has,
                 Event::Message { .. } | Event::Record { .. } => {}
@@ -367,7 +349,7 @@ impl LiveRecording {
     fn finish(mut self, signal: Option<&'static str>) -> Result<Recorded, RecordError> {
         self.await_scene();
         for problem in self.topics.finish_scene(&mut self.files)? {
-            note((&mut self.problems, &mut self.problem_count), &problem);
+            self.problems.note(&problem);
         }
         let mut run = Run::without_records(self.feed.run().run_folder());
         if self.has_summary {
@@ -397,13 +379,12 @@ impl LiveRecording {
         facts::attach(self.files.open(), &run.folder)?;
         let counts = self.topics.counts();
         let missed = self.topics.missed(&self.feed, self.is_silent);
-        let mut words = self.problems.clone();
-        words.extend(self.precedence.warning());
+        let mut words = self.problems.words.clone();
         if self.has_summary {
             words.extend(run.gaps.words.iter().cloned());
         }
         let has_gaps = !missed.is_empty()
-            || counts.misfit_count + counts.timeless_count + self.problem_count > 0
+            || counts.misfit_count + counts.timeless_count + self.problems.count > 0
             || (self.has_summary && run.gaps.is_any());
         let topic_count = self.files.topic_count();
         let (paths, written_count) = self.files.finish()?;
@@ -427,16 +408,11 @@ impl LiveRecording {
             "exit_reason".to_owned(),
             "recorded while it went".to_owned(),
         );
-        let manifest = self.feed.manifest();
-        let json =
-            |value: &serde_json::Value| Words::from([("json".to_owned(), value.to_string())]);
-        let (topology, host) = (json(&manifest.topology), json(&manifest.host_facts));
         self.told_clocks = self.topics.clocks().words();
         let file = self.files.open();
         file.describe("hil.clocks", self.told_clocks.clone())?;
         file.describe("hil.run", words)?;
-        file.describe("hil.topology", topology)?;
-        file.describe("hil.host_facts", host)?;
+        facts::describe_manifest(file, self.feed.manifest())?;
         facts::attach_robot(file, self.topics.messages())
     }
 
@@ -450,28 +426,17 @@ impl LiveRecording {
             ("timeless_record_count", counts.timeless_count),
             ("late_record_count", self.topics.late_count()),
             ("unordered_latency_count", self.topics.unordered_count()),
-            ("problem_count", self.problem_count),
+            ("problem_count", self.problems.count),
         ];
-        let mut words: Words = numbers
-            .iter()
-            .map(|(key, count)| ((*key).to_owned(), count.to_string()))
-            .collect();
-        let version = env!("CARGO_PKG_VERSION").to_owned();
-        words.insert("recorder_version".to_owned(), version);
+        let names = self.topics.names();
+        let mut words = facts::recording_words(&numbers, &self.problems.words, names);
         words.insert("mode".to_owned(), "live".to_owned());
         words.insert("ended".to_owned(), how.to_owned());
-        words.insert("priority".to_owned(), self.precedence.to_string());
         for (channel, count) in self.topics.missed(&self.feed, self.is_silent) {
             words.insert(format!("missed {channel}"), count.to_string());
         }
         for (channel, count) in self.topics.earlier(&self.feed) {
             words.insert(format!("before {channel}"), count.to_string());
-        }
-        for (problem, number) in self.problems.iter().zip(1..) {
-            words.insert(format!("gap_{number:04}"), problem.clone());
-        }
-        for (given, wanted) in &self.topics.names().changed {
-            words.insert(format!("renamed {given}"), format!("{wanted} was taken"));
         }
         let clocks = self.topics.clocks().words();
         let channels = self.topics.channel_words();

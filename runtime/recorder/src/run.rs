@@ -99,7 +99,7 @@ impl Run {
     /// When it is no run's folder.
     pub(crate) fn read(
         path: &Path,
-        goes_on: &mut dyn FnMut((f64, &str)) -> bool,
+        goes_on: &mut dyn FnMut(f64, &str) -> bool,
     ) -> Result<Self, RunError> {
         let folder = RunFolder::existing(path);
         if !folder.records().is_dir() && folder.summary().is_file() {
@@ -113,7 +113,7 @@ impl Run {
         let mut read_bytes = 0;
         for path in paths {
             let share = read_bytes as f64 / all_bytes.max(1) as f64;
-            if !goes_on((share, &path.display().to_string())) {
+            if !goes_on(share, &path.display().to_string()) {
                 break;
             }
             read_bytes += size(&path);

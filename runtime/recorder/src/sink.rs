@@ -22,6 +22,11 @@ pub(crate) trait Sink {
         metadata: &BTreeMap<String, String>,
     ) -> Result<u16, Self::Error>;
 
+    /// False while nobody would look at a message of this topic.
+    fn wants(&self, _topic: u16) -> bool {
+        true
+    }
+
     /// A message of a topic.
     ///
     /// # Errors
@@ -49,6 +54,16 @@ impl Topic {
             metadata: pairs.collect(),
             number: None,
         }
+    }
+
+    /// True once a sink has heard of it.
+    pub(crate) const fn is_declared(&self) -> bool {
+        self.number.is_some()
+    }
+
+    /// False while nobody would look at a message of it.
+    pub(crate) fn is_wanted<S: Sink>(&self, sink: &S) -> bool {
+        self.number.is_none_or(|number| sink.wants(number))
     }
 
     /// Its number in `sink`, which hears of it now if it has not before.

@@ -6,7 +6,6 @@ use std::fs;
 use std::panic::resume_unwind;
 use std::path::{Path, PathBuf};
 use std::thread::{self, JoinHandle};
-use std::time::{Duration, Instant};
 
 use crate::schema::Schema;
 use crate::sink::Sink;
@@ -18,32 +17,12 @@ const CLOSING_MAX: usize = 2;
 /// Names that are tried for one file.
 const NUMBERS_MAX: usize = 10_000;
 
-/// When to begin another file.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub(crate) struct Split {
-    /// Larger than this, bytes.
-    pub(crate) size_bytes: Option<u64>,
-    /// Written for longer than this.
-    pub(crate) time: Option<Duration>,
-}
-
-impl Split {
-    /// Above this size in bytes or after this time, whichever comes first.
-    pub(crate) const fn at(size_bytes: Option<u64>, time: Option<Duration>) -> Self {
-        Self { size_bytes, time }
-    }
-
-    const fn is_any(&self) -> bool {
-        self.size_bytes.is_some() || self.time.is_some()
-    }
-
-    /// The first file of a recording called `target`.
-    fn first(&self, target: &Path) -> PathBuf {
-        if self.is_any() {
-            numbered(target, 1)
-        } else {
-            target.to_owned()
-        }
+/// The first file of a recording called `target`, which may be split.
+fn first(target: &Path, split_bytes: Option<u64>) -> PathBuf {
+    if split_bytes.is_some() {
+        numbered(target, 1)
+    } else {
+        target.to_owned()
     }
 }
 
@@ -85,9 +64,13 @@ pub(crate) fn another(output: &Path, number: usize) -> PathBuf {
 ///
 /// # Errors
 /// When it may not, in the words that the recording itself would end with.
-pub(crate) fn prepare(output: &Path, split: Split, may_replace: bool) -> Result<(), WriteError> {
+pub(crate) fn prepare(
+    output: &Path,
+    split_bytes: Option<u64>,
+    may_replace: bool,
+) -> Result<(), WriteError> {
     if !is_folder(output) {
-        return check_live_target(&split.first(output), may_replace);
+        return check_live_target(&first(output, split_bytes), may_replace);
     }
     fs::create_dir_all(output).map_err(|source| WriteError::Io {
         path: output.to_owned(),
@@ -154,10 +137,9 @@ impl Drop for Closing {
 /// Files of one recording, one open at a time.
 pub(crate) struct Files {
     target: PathBuf,
-    split: Split,
+    split_bytes: Option<u64>,
     may_replace: bool,
     open: Recording,
-    begun: Instant,
     topics: Vec<KnownTopic>,
     done: Vec<PathBuf>,
     done_bytes: u64,
@@ -181,17 +163,16 @@ impl Files {
     /// When it exists and may not be replaced, or cannot be written.
     pub(crate) fn begin(
         target: &Path,
-        split: Split,
+        split_bytes: Option<u64>,
         may_replace: bool,
     ) -> Result<Self, WriteError> {
-        let first = split.first(target);
+        let first = first(target, split_bytes);
         check_target(&first, Path::new(""), may_replace)?;
         Ok(Self {
             target: target.to_owned(),
-            split,
+            split_bytes,
             may_replace,
             open: Recording::create_live(&first)?,
-            begun: Instant::now(),
             topics: Vec::new(),
             done: Vec::new(),
             done_bytes: 0,
@@ -211,13 +192,9 @@ impl Files {
     pub(crate) fn flush(&mut self) -> Result<bool, WriteError> {
         self.open.flush()?;
         let size_bytes = self.open.size_bytes();
-        let is_large = self.split.size_bytes.is_some_and(|most| size_bytes >= most);
-        let is_old = self
-            .split
-            .time
-            .is_some_and(|most| self.begun.elapsed() >= most);
+        let is_large = self.split_bytes.is_some_and(|most| size_bytes >= most);
         // A file without a message would say nothing that the next one does not.
-        Ok((is_large || is_old) && self.open.message_count() > 0)
+        Ok(is_large && self.open.message_count() > 0)
     }
 
     /// Begins the next file and completes the one that was open meanwhile; waits when the disk is
@@ -236,7 +213,6 @@ impl Files {
         self.done.push(finished.path().to_owned());
         let closing = thread::spawn(move || finished.finish());
         self.closing.files.push_back(closing);
-        self.begun = Instant::now();
         for topic in &mut self.topics {
             topic.number = None;
         }
@@ -314,6 +290,7 @@ mod tests {
     use std::fs;
     use std::sync::Arc;
     use std::sync::atomic::{AtomicBool, Ordering};
+    use std::time::Duration;
 
     #[test]
     fn each_run_of_a_server_gets_a_file_of_its_own() {
@@ -334,10 +311,7 @@ mod tests {
     fn every_file_of_a_split_recording_is_whole_by_itself() {
         let folder = std::env::temp_dir().join(format!("hil-split-{}", std::process::id()));
         fs::create_dir_all(&folder).unwrap();
-        let split = Split {
-            size_bytes: Some(1),
-            time: None,
-        };
+        let split = Some(1);
         let mut files = Files::begin(&folder.join("a.mcap"), split, false).unwrap();
         let nothing = BTreeMap::new();
         let topic = files.add_topic("/a", &schema::opaque(), &nothing).unwrap();
@@ -375,7 +349,7 @@ mod tests {
     fn where_a_recording_goes_is_looked_at_before_there_is_one() {
         let folder = std::env::temp_dir().join(format!("hil-prepare-{}", std::process::id()));
         fs::create_dir_all(&folder).unwrap();
-        let one = Split::default();
+        let one = None;
         let named = |name: &str| folder.join(name);
         // Only `/` at the end says that what is not there is to be a folder.
         let absent = named("new/deep/");

@@ -101,6 +101,7 @@ pub(crate) struct Recording {
     partial: PathBuf,
     path: PathBuf,
     message_count: u64,
+    topic_count: usize,
     /// What is not completed stays beside the place where it was to go.
     is_live: bool,
     length: Arc<AtomicU64>,
@@ -211,6 +212,7 @@ impl Recording {
             partial,
             path: path.to_owned(),
             message_count: 0,
+            topic_count: 0,
             is_live,
             length: file.length(),
         };
@@ -234,6 +236,11 @@ impl Recording {
     /// Messages so far.
     pub(crate) const fn message_count(&self) -> u64 {
         self.message_count
+    }
+
+    /// Topics so far.
+    pub(crate) const fn topic_count(&self) -> usize {
+        self.topic_count
     }
 
     /// Size of the file, bytes; what is not compressed yet is not in it.
@@ -283,6 +290,7 @@ impl Recording {
         schema: &Schema,
         metadata: &BTreeMap<String, String>,
     ) -> Result<u16, WriteError> {
+        self.topic_count += 1;
         self.with(|writer| {
             let schema = writer.add_schema(&schema.name, "protobuf", &schema.data)?;
             writer.add_channel(schema, topic, "protobuf", metadata)

@@ -2,8 +2,6 @@
 //! refused. It decides nothing: a refusal is listed with its reason and cure, and the caller (or
 //! the reader of the run's report) judges. Also here: the kernel calls `nix` lacks.
 
-use std::fs;
-use std::io;
 use std::time::Duration;
 
 use core_affinity::CoreId;
@@ -33,11 +31,6 @@ pub enum SchedulingPolicy {
         /// 1 (lowest) to 99. Kernel threads for interrupts run at 50 on `PREEMPT_RT`.
         priority: u8,
     },
-    /// `SCHED_IDLE`: runs when no normal task of its control group wants the CPU, and never
-    /// interrupts one by waking up. For what must not be felt by what it looks at.
-    Idle,
-    /// `SCHED_BATCH`: as the normal one, but never interrupts a task by waking up.
-    Batch,
 }
 
 impl SchedulingPolicy {
@@ -46,8 +39,6 @@ impl SchedulingPolicy {
         match self {
             Self::Other => (libc::SCHED_OTHER, 0),
             Self::Fifo { priority } => (libc::SCHED_FIFO | libc::SCHED_RESET_ON_FORK, priority),
-            Self::Idle => (libc::SCHED_IDLE, 0),
-            Self::Batch => (libc::SCHED_BATCH, 0),
         }
     }
 }
@@ -57,16 +48,12 @@ impl std::fmt::Display for SchedulingPolicy {
         match self {
             Self::Other => f.write_str("SCHED_OTHER"),
             Self::Fifo { priority } => write!(f, "SCHED_FIFO {priority}"),
-            Self::Idle => f.write_str("SCHED_IDLE"),
-            Self::Batch => f.write_str("SCHED_BATCH"),
         }
     }
 }
 
 /// The calling thread, in the kernel's numbers.
 const OWN_THREAD: libc::pid_t = 0;
-/// Rounds in which threads may still appear that are not moved yet.
-const MOVES_MAX: usize = 32;
 
 /// What a thread asks of the kernel.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -216,53 +203,8 @@ pub fn apply(request: &RealtimeRequest) -> RealtimeGrant {
 /// True when the calling thread runs before every normal task, under `SCHED_FIFO` or `SCHED_RR`: whether
 /// it asked for that or inherited it, and not when it asked in vain.
 pub fn has_realtime_priority() -> bool {
-    let policy = current_policy(OWN_THREAD) & !libc::SCHED_RESET_ON_FORK;
+    let policy = current_policy() & !libc::SCHED_RESET_ON_FORK;
     matches!(policy, libc::SCHED_FIFO | libc::SCHED_RR)
-}
-
-/// Schedules every thread of this process that is under `from` by `to`, those included that are
-/// started meanwhile, and says what the kernel made of it. Threads under any other policy stay as
-/// they are.
-pub fn move_threads(from: SchedulingPolicy, to: SchedulingPolicy) -> RealtimeGrantItem {
-    let mut grant = RealtimeGrant::default();
-    let result = move_all(from.of_kernel().0, to.of_kernel());
-    grant.add(RealtimeItem::Scheduling, to.to_string(), result);
-    grant.items.remove(0)
-}
-
-fn move_all(from: libc::c_int, to: (libc::c_int, u8)) -> Result<(), Refusal> {
-    // A thread that was not moved yet may have started another one: until none is left.
-    for _ in 0..MOVES_MAX {
-        let threads = thread_numbers().map_err(|error| {
-            let errno = error.raw_os_error().map_or(Errno::EIO, Errno::from_raw);
-            Refusal::new(errno, "/proc/self/task cannot be read", "mount /proc")
-        })?;
-        let is_from = |thread: &libc::pid_t| {
-            let policy = current_policy(*thread);
-            policy >= 0 && policy & !libc::SCHED_RESET_ON_FORK == from & !libc::SCHED_RESET_ON_FORK
-        };
-        let mut is_moved = false;
-        for thread in threads.into_iter().filter(is_from) {
-            match set_scheduler(thread, to.0, to.1) {
-                Ok(()) => is_moved = true,
-                // It has ended.
-                Err(Errno::ESRCH) => {}
-                Err(errno) => return Err(explain(errno, to)),
-            }
-        }
-        if !is_moved {
-            return Ok(());
-        }
-    }
-    let fix = "try again when the process starts fewer threads";
-    Err(Refusal::new(Errno::EAGAIN, "new threads kept coming", fix))
-}
-
-fn thread_numbers() -> io::Result<Vec<libc::pid_t>> {
-    let entries = fs::read_dir("/proc/self/task")?;
-    let names = entries.map(|entry| Ok(entry?.file_name().to_string_lossy().parse().ok()));
-    let numbers: io::Result<Vec<Option<libc::pid_t>>> = names.collect();
-    Ok(numbers?.into_iter().flatten().collect())
 }
 
 fn pin_to(cpu: usize) -> Result<(), Refusal> {
@@ -321,9 +263,9 @@ fn set_timer_slack(slack: Duration) -> Result<(), Refusal> {
 }
 
 fn schedule(policy: libc::c_int, priority: u8) -> Result<(), Refusal> {
-    let set = set_scheduler(OWN_THREAD, policy, priority);
+    let set = set_scheduler(policy, priority);
     set.map_err(|errno| explain(errno, (policy, priority)))?;
-    let actual = current_policy(OWN_THREAD);
+    let actual = current_policy();
     if actual & !libc::SCHED_RESET_ON_FORK == policy & !libc::SCHED_RESET_ON_FORK {
         return Ok(());
     }
@@ -333,7 +275,7 @@ fn schedule(policy: libc::c_int, priority: u8) -> Result<(), Refusal> {
 
 fn explain(errno: Errno, (policy, priority): (libc::c_int, u8)) -> Refusal {
     match policy {
-        libc::SCHED_OTHER | libc::SCHED_IDLE | libc::SCHED_BATCH => explain_raising(errno),
+        libc::SCHED_OTHER => explain_raising(errno),
         _ => explain_scheduling(errno, priority, &HostFiles::of_this_host()),
     }
 }
@@ -371,19 +313,19 @@ fn explain_scheduling(errno: Errno, priority: u8, files: &HostFiles) -> Refusal 
 }
 
 #[allow(unsafe_code, reason = "nix has no sched_setscheduler")]
-fn set_scheduler(thread: libc::pid_t, policy: libc::c_int, priority: u8) -> Result<(), Errno> {
+fn set_scheduler(policy: libc::c_int, priority: u8) -> Result<(), Errno> {
     let parameters = libc::sched_param {
         sched_priority: i32::from(priority),
     };
     // SAFETY: the pointer is to a live, fully initialised `sched_param` that the call only reads.
-    let code = unsafe { libc::sched_setscheduler(thread, policy, &raw const parameters) };
+    let code = unsafe { libc::sched_setscheduler(OWN_THREAD, policy, &raw const parameters) };
     Errno::result(code).map(drop)
 }
 
 #[allow(unsafe_code, reason = "nix has no sched_getscheduler")]
-fn current_policy(thread: libc::pid_t) -> libc::c_int {
-    // SAFETY: the call takes no pointer; of a thread that has ended it gives -1.
-    unsafe { libc::sched_getscheduler(thread) }
+fn current_policy() -> libc::c_int {
+    // SAFETY: the call takes no pointer.
+    unsafe { libc::sched_getscheduler(OWN_THREAD) }
 }
 
 /// What the kernel knows about how `CLOCK_REALTIME` is steered.

@@ -17,7 +17,7 @@ use foxglove::messages::{
 };
 use hil_models::egm::messages::{EgmCommand, EgmFeedback};
 use hil_models::fleet::messages::{Mission, State, Truth};
-use hil_models::message::{Envelope, Message};
+use hil_models::message::Message;
 use prost::Message as _;
 use serde_json::Value;
 
@@ -77,23 +77,6 @@ pub(crate) struct Heard<'a> {
     pub(crate) at_ns: u64,
     /// When it was published, on its producer's clock.
     pub(crate) published_ns: i64,
-}
-
-impl<'a> Heard<'a> {
-    /// A message of a channel, which goes by its name and that of its messages.
-    pub(crate) const fn of(
-        (channel, message): (&'a str, &'a str),
-        at_ns: u64,
-        (envelope, payload): (&Envelope, &'a [u8]),
-    ) -> Self {
-        Self {
-            channel,
-            message,
-            payload,
-            at_ns,
-            published_ns: envelope.published_ns,
-        }
-    }
 }
 
 /// True when messages of this name say anything of a scene.
@@ -183,27 +166,22 @@ impl Scene {
         &mut self,
         messages: impl Iterator<Item = &'a str>,
         sink: &mut S,
-    ) -> Result<usize, S::Error> {
+    ) -> Result<(), S::Error> {
         let (mut has_fleet, mut has_arms) = (false, false);
         for message in messages {
             has_fleet |= message == State::NAME && self.fleet.is_some();
             has_arms |= is_of_arms(message);
         }
-        let mut wanted = Vec::new();
         if has_fleet || has_arms {
-            wanted.push(&mut self.moving);
+            self.moving.declare(sink)?;
         }
         if has_fleet {
-            wanted.push(&mut self.ground);
+            self.ground.declare(sink)?;
         }
         if has_arms {
-            wanted.push(&mut self.frames);
+            self.frames.declare(sink)?;
         }
-        let count = wanted.len();
-        for topic in wanted {
-            topic.declare(sink)?;
-        }
-        Ok(count)
+        Ok(())
     }
 
     /// Takes a message, after the pictures that are due before it. Messages come in order of time.
@@ -230,16 +208,11 @@ impl Scene {
         if is_fleets {
             if let Some(fleet) = &mut self.fleet {
                 let offset_ns = at_ns.saturating_sub(heard.published_ns);
-                fleet.take(heard.message, heard.payload, (at_ns, offset_ns));
+                fleet.take(heard.message, heard.payload, at_ns, offset_ns);
             }
         } else {
-            let Heard {
-                channel,
-                message,
-                payload,
-                ..
-            } = *heard;
-            self.arms.take(channel, message, payload, at_ns);
+            self.arms
+                .take(heard.channel, heard.message, heard.payload, at_ns);
         }
         Ok(())
     }

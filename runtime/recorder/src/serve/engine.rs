@@ -10,11 +10,11 @@ use serde_json::{Value, json};
 
 use super::parameters::Links;
 use super::recording::{Recording, Target};
-use super::source::{Progress, Source};
+use super::source::{Progress, Source, Warning};
 use super::viewers::Viewers;
+use crate::view::Body;
 use crate::view::facts::RunFacts;
 use crate::view::state::RunState;
-use crate::view::{Body, LiveRecord};
 
 /// Between two pictures of robots and arms.
 const PICTURE_PERIOD: Duration = Duration::from_millis(50);
@@ -57,7 +57,7 @@ pub(crate) struct Shown {
     /// Its folder and resolved topology, if it goes on: its links can be changed.
     pub(crate) links: Option<(PathBuf, Value)>,
     /// What became known of what is amiss, once a second.
-    warnings: Vec<Value>,
+    warnings: Vec<Warning>,
     /// Ticks skipped, by process, and of which hosts they are known, as often.
     overruns: [Value; 2],
 }
@@ -81,10 +81,12 @@ impl Shown {
     }
 
     fn look_for_warnings(&mut self) {
-        let own = self.state.problem().map(|what| (None, what.to_owned()));
-        let warnings = self.source.warnings().into_iter().chain(own);
-        let warnings = warnings.map(|(process, what)| json!({ "process": process, "what": what }));
-        self.warnings = warnings.collect();
+        self.warnings = self.source.warnings();
+        let own = self.state.problem();
+        self.warnings.extend(own.map(|what| Warning {
+            process: None,
+            what: what.to_owned(),
+        }));
         let overruns = self.source.overruns();
         let overruns = overruns.map(|all| [json!(all.processes), json!(all.hosts)]);
         self.overruns = overruns.unwrap_or_default();
@@ -199,7 +201,7 @@ impl Engine {
         let is_last = read(shown, &mut self.viewers, &mut self.due, console);
         let now_ns = shown.source.now_ns();
         let due = &mut self.due;
-        pictures(shown, &mut self.viewers, due, (now_ns, is_last));
+        pictures(shown, &mut self.viewers, due, now_ns, is_last);
         if is_due(&mut self.due.run, RUN_PERIOD) {
             shown.look_for_warnings();
             if let Some(recording) = &mut self.recording {
@@ -227,7 +229,9 @@ fn read(shown: &mut Shown, viewers: &mut Viewers, due: &mut Due, console: &mut C
     }
     let progress = source.poll(&mut |record| {
         state.take(record);
-        hand_on(state, viewers, record);
+        if let Body::Message(payload) = &record.body {
+            viewers.message(record.channel, record.at_ns, payload);
+        }
     });
     for problem in source.take_problems() {
         console.warn(&problem);
@@ -252,12 +256,7 @@ fn read(shown: &mut Shown, viewers: &mut Viewers, due: &mut Due, console: &mut C
     false
 }
 
-fn pictures(
-    shown: &mut Shown,
-    viewers: &mut Viewers,
-    due: &mut Due,
-    (now_ns, is_last): (i64, bool),
-) {
+fn pictures(shown: &mut Shown, viewers: &mut Viewers, due: &mut Due, now_ns: i64, is_last: bool) {
     let is_over = shown.state.is_over();
     let state = &mut shown.state;
     if let Some(map) = state.new_map() {
@@ -336,15 +335,4 @@ fn realtime_ns() -> i64 {
     since.map_or(0, |since| {
         i64::try_from(since.as_nanos()).unwrap_or(i64::MAX)
     })
-}
-
-/// Hands a message on to those who look at its topic.
-fn hand_on(state: &RunState, viewers: &mut Viewers, record: &LiveRecord) {
-    let Body::Message(payload) = &record.body else {
-        return;
-    };
-    if let Some(channel) = state.facts.channels.get(record.channel) {
-        let name = channel.name.as_str();
-        viewers.message((record.channel, name), record.at_ns, payload);
-    }
 }

@@ -34,9 +34,8 @@ use hil_runtime::watch::FeedError;
 use tokio::runtime::Runtime;
 
 use crate::cli::ServeOptions;
-use crate::priority::{Looks, Precedence};
 use crate::scene::Scenery;
-use crate::split::{Split, prepare};
+use crate::split::prepare;
 use crate::writer::WriteError;
 use access::{Access, NO_ORIGIN, Refusal};
 use engine::{Engine, Showing, Shown};
@@ -47,8 +46,6 @@ use recording::Target;
 use running::Running;
 use viewers::Viewers;
 
-/// Pictures that come so much later than they should show that others leave it no processor time.
-const LATE_MAX: Duration = Duration::from_millis(500);
 /// Between two looks for a run that begins.
 const WAIT_PERIOD: Duration = Duration::from_millis(300);
 
@@ -120,11 +117,9 @@ pub(crate) fn serve(
     console: &mut Console,
 ) -> Result<i32, ServeError> {
     if let Some(output) = &options.record {
-        prepare(output, Split::default(), false)?;
+        prepare(output, None, false)?;
     }
-    let precedence = Precedence::new(options.priority);
-    let mut looks = Looks::begin(LATE_MAX, &precedence);
-    let shown = first(options, &precedence, signals, console)?;
+    let shown = first(options, signals, console)?;
     if signals.received().is_some() {
         return Ok(EXIT_INTERRUPTED);
     }
@@ -135,30 +130,24 @@ pub(crate) fn serve(
         .enable_all()
         .build()?;
     let access = Arc::new(admitted(options));
-    let (viewers, front) = open(options, &runtime, (&links, &access), console)?;
-    let mut engine = Engine::new(viewers, links, target(options, &precedence));
+    let (viewers, front) = open(options, &runtime, &links, &access, console)?;
+    let mut engine = Engine::new(viewers, links, target(options));
     match shown {
         Some(shown) => engine.show(shown, console),
         None => console.say("no run goes on here; waiting for one"),
     }
     let mut looked = Instant::now();
     let mut said = None;
-    let mut is_precedence_said = false;
     while signals.received().is_none() {
         if options.wait && looked.elapsed() >= WAIT_PERIOD {
             looked = Instant::now();
-            show_next(options, (&mut engine, &precedence), &mut said, console);
+            show_next(options, &mut engine, &mut said, console);
         }
         engine.round(console);
         for words in access.take_unsaid() {
             console.warn(&words);
         }
         thread::sleep(engine.rest());
-        looks.judge();
-        if let Some(words) = precedence.warning().filter(|_| !is_precedence_said) {
-            console.warn(&words);
-            is_precedence_said = true;
-        }
     }
     let (viewers, is_recorded) = engine.into_viewers(console);
     viewers.end(runtime.handle());
@@ -172,11 +161,10 @@ pub(crate) fn serve(
 }
 
 /// Where what is shown is recorded, if it is.
-fn target(options: &ServeOptions, precedence: &Precedence) -> Option<Target> {
+fn target(options: &ServeOptions) -> Option<Target> {
     let path = options.record.clone()?;
     Some(Target {
         path,
-        precedence: precedence.clone(),
         scenery: Scenery::of(options.no_scene),
     })
 }
@@ -184,7 +172,6 @@ fn target(options: &ServeOptions, precedence: &Precedence) -> Option<Target> {
 /// What is shown first; `None` when it has to be waited for.
 fn first(
     options: &ServeOptions,
-    precedence: &Precedence,
     signals: &Signals,
     console: &mut Console,
 ) -> Result<Option<Shown>, ServeError> {
@@ -204,9 +191,9 @@ fn first(
             let folder = folder.to_owned();
             return Err(ServeError::Over { folder });
         }
-        let how = (options.speed, options.repeats);
         let progress = Progress::begin();
-        let read = Playback::read(folder, how, &mut |(share, path)| {
+        let (speed, repeats) = (options.speed, options.repeats);
+        let read = Playback::read(folder, speed, repeats, &mut |share, path| {
             progress.show(console, Some(share), &format!("reading {path}"));
             signals.received().is_none()
         });
@@ -218,7 +205,7 @@ fn first(
         return Ok(Some(Shown::new(facts, source, Some(options.speed), None)));
     }
     match select(wanted) {
-        Ok(run) => Ok(Some(watch(run, precedence)?)),
+        Ok(run) => Ok(Some(watch(run)?)),
         Err(error) if options.wait && is_none_yet(&error) => Ok(None),
         Err(error) => Err(error.into()),
     }
@@ -241,11 +228,9 @@ const fn is_none_yet(error: &SelectError) -> bool {
     matches!(error, SelectError::NoneRuns | SelectError::NoSuch { .. })
 }
 
-fn watch(run: LiveRun, precedence: &Precedence) -> Result<Shown, ServeError> {
+fn watch(run: LiveRun) -> Result<Shown, ServeError> {
     let folder = run.folder.clone();
     let (running, facts) = Running::open(run)?;
-    // Before anything is worked out for it.
-    precedence.settle(running.waits());
     let topology = running.topology().clone();
     let links = Some((folder, topology));
     Ok(Shown::new(facts, Box::new(running), None, links))
@@ -255,7 +240,7 @@ fn watch(run: LiveRun, precedence: &Precedence) -> Result<Shown, ServeError> {
 /// was said last of why none can be chosen.
 fn show_next(
     options: &ServeOptions,
-    (engine, precedence): (&mut Engine, &Precedence),
+    engine: &mut Engine,
     said: &mut Option<String>,
     console: &mut Console,
 ) {
@@ -281,7 +266,7 @@ fn show_next(
         return;
     }
     let name = run.name.clone();
-    match watch(run, precedence) {
+    match watch(run) {
         Ok(shown) => {
             console.say(&format!("showing {name}"));
             engine.show(shown, console);
@@ -305,7 +290,8 @@ fn gives_way(showing: Showing<'_>, name: &str) -> bool {
 fn open(
     options: &ServeOptions,
     runtime: &Runtime,
-    (links, access): (&Links, &Arc<Access>),
+    links: &Links,
+    access: &Arc<Access>,
     console: &mut Console,
 ) -> Result<(Viewers, Front), ServeError> {
     let runtime = runtime.handle();

@@ -3,16 +3,15 @@
 use std::path::Path;
 use std::time::Instant;
 
-use hil_models::measure::record::{
-    EgressRecord, IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE,
-};
+use hil_models::measure::record::UNAVAILABLE;
 use hil_models::time::duration_ns;
 use hil_runtime::report::assessment::Assessment;
 use hil_runtime::report::summary::RunSummary;
-use hil_runtime::rundir::record::{RecordFile, RecordKind};
+use hil_runtime::rundir::{Record, Stage};
 
 use super::source::{Progress, Source, Warning};
 use crate::clocks::Clocks;
+use crate::net::{self, Noted};
 use crate::run::{Run, RunError};
 use crate::view::facts::RunFacts;
 use crate::view::{Body, LiveRecord};
@@ -47,7 +46,7 @@ struct Step {
 #[derive(Debug)]
 enum What {
     Message { file: usize, index: usize },
-    Other(Body),
+    Record(Record),
 }
 
 impl Playback {
@@ -58,8 +57,9 @@ impl Playback {
     /// When it is no run's folder.
     pub(crate) fn read(
         path: &Path,
-        (speed, repeats): (f64, bool),
-        goes_on: &mut dyn FnMut((f64, &str)) -> bool,
+        speed: f64,
+        repeats: bool,
+        goes_on: &mut dyn FnMut(f64, &str) -> bool,
     ) -> Result<(Self, RunFacts), RunError> {
         let run = Run::read(path, goes_on)?;
         let clocks = Clocks::of(&run);
@@ -74,7 +74,7 @@ impl Playback {
         let mut steps = Vec::new();
         for (index, file) in run.files.iter().enumerate() {
             if let Some((channel, described)) = facts.channel(&file.header.channel) {
-                plan((index, file), (channel, described.offsets_ns), &mut steps);
+                plan(index, file, channel, described.offsets_ns, &mut steps);
             }
         }
         steps.sort_by_key(|step| step.at_ns);
@@ -134,7 +134,7 @@ impl Source for Playback {
             };
             self.next += 1;
             let body = match &step.what {
-                What::Other(body) => Some(body.clone()),
+                What::Record(record) => Some(Body::Record(*record)),
                 What::Message { file, index } => self.run.files[*file]
                     .message(*index)
                     .map(|(_, payload)| Body::Message(payload.to_vec())),
@@ -168,14 +168,21 @@ impl Source for Playback {
             return Vec::new();
         };
         let warnings = Assessment::of(summary).warnings.into_iter();
-        warnings.map(|what| (None, what)).collect()
+        warnings
+            .map(|what| Warning {
+                process: None,
+                what,
+            })
+            .collect()
     }
 }
 
-/// Adds what is in `file` to the steps; what has no time is left out.
+/// Adds what is in `file`, the `number`th, to the steps; what has no time is left out.
 fn plan(
-    (number, file): (usize, &RecordFile),
-    (channel, offsets_ns): (usize, [i64; 2]),
+    number: usize,
+    file: &RecordFile,
+    channel: usize,
+    offsets_ns: [i64; 2],
     steps: &mut Vec<Step>,
 ) {
     let [sender, receiver] = offsets_ns;
@@ -188,38 +195,24 @@ fn plan(
             });
         }
     };
-    match file.header.kind {
-        RecordKind::Message => {
-            for index in 0..file.record_count() {
-                if let Some((envelope, _)) = file.message(index) {
-                    let what = What::Message {
-                        file: number,
-                        index,
-                    };
-                    add(envelope.published_ns, sender, what);
-                }
+    if file.header.kind == RecordKind::Message {
+        for index in 0..file.record_count() {
+            if let Some((envelope, _)) = file.message(index) {
+                let what = What::Message {
+                    file: number,
+                    index,
+                };
+                add(envelope.published_ns, sender, what);
             }
         }
-        RecordKind::Published => {
-            for one in file.records::<PublishedRecord>() {
-                add(one.published_ns, sender, What::Other(Body::Published(one)));
-            }
+    }
+    for record in net::records(file) {
+        if let Some(noted) = Noted::of(&record) {
+            let offset_ns = match noted.stage {
+                Stage::Published | Stage::Sent => sender,
+                Stage::Received | Stage::Taken => receiver,
+            };
+            add(noted.at_ns, offset_ns, What::Record(record));
         }
-        RecordKind::Taken => {
-            for one in file.records::<TakenRecord>() {
-                add(one.taken_ns, receiver, What::Other(Body::Taken(one)));
-            }
-        }
-        RecordKind::Egress => {
-            for one in file.records::<EgressRecord>() {
-                add(one.taken_ns, sender, What::Other(Body::Egress(one)));
-            }
-        }
-        RecordKind::Ingress => {
-            for one in file.records::<IngressRecord>() {
-                add(one.received_ns, receiver, What::Other(Body::Ingress(one)));
-            }
-        }
-        _ => {}
     }
 }

@@ -10,10 +10,9 @@ use std::time::Duration;
 use hil_runtime::platform::console::Console;
 use hil_runtime::platform::words::counted_plainly;
 
-use crate::priority::Precedence;
 use crate::record::{RecordError, Recorded, Request, Which, record};
 use crate::scene::Scenery;
-use crate::split::{Split, another};
+use crate::split::another;
 
 /// What a kill may lose at most.
 const FLUSH: Duration = Duration::from_secs(1);
@@ -23,8 +22,6 @@ const FLUSH: Duration = Duration::from_secs(1);
 pub(super) struct Target {
     /// The file, or the folder that files are written into.
     pub(super) path: PathBuf,
-    /// How the whole process stands against the run.
-    pub(super) precedence: Precedence,
     /// Draw the scene.
     pub(super) scenery: Scenery,
 }
@@ -34,7 +31,6 @@ pub(super) struct Target {
 pub(super) struct Recording {
     /// The file, or the folder that it is written into.
     pub(super) path: PathBuf,
-    precedence: Precedence,
     /// No file came of it.
     pub(super) has_failed: bool,
     thread: Option<JoinHandle<Result<Recorded, RecordError>>>,
@@ -52,10 +48,9 @@ impl Recording {
             waits: false,
             below: None,
             from_now: false,
-            split: Split::default(),
+            split_bytes: None,
             flush: FLUSH,
             force: false,
-            precedence: target.precedence.clone(),
             scenery: target.scenery,
         };
         let stop = Arc::new(AtomicBool::new(false));
@@ -67,7 +62,6 @@ impl Recording {
         });
         Self {
             path,
-            precedence: target.precedence.clone(),
             has_failed: false,
             thread: Some(thread),
             stop,
@@ -100,13 +94,7 @@ impl Recording {
             )),
             Ok(Err(error)) => console.error(&format!("nothing is recorded: {error}")),
             Ok(Ok(recorded)) => {
-                // The server says by itself how it stands.
-                let said = self.precedence.warning();
-                for words in recorded
-                    .words
-                    .iter()
-                    .filter(|one| said.as_ref() != Some(*one))
-                {
+                for words in &recorded.words {
                     console.warn(words);
                 }
                 let files = recorded.paths.iter().map(|path| path.display().to_string());

@@ -7,16 +7,13 @@ use std::time::Duration;
 
 use hil_runtime::platform::clock::MonotonicClock;
 use hil_runtime::report::summary::RunSummary;
-use hil_runtime::rundir::live_run::LiveRun;
-use hil_runtime::rundir::status;
-use hil_runtime::rundir::status::Overruns;
-use hil_runtime::watch;
-use hil_runtime::watch::{Event, Feed, FeedError, Origin, Poll, Record};
+use hil_runtime::rundir::{self, Event, Feed, FeedError, LiveRun, Origin, Poll};
 
 use super::engine::REST;
 use super::playback::how_ended;
 use super::source::{Progress, Source, Warning};
 use crate::clocks::Clocks;
+use crate::net::Noted;
 use crate::pace::Pace;
 use crate::view::facts::RunFacts;
 use crate::view::{Body, LiveRecord};
@@ -35,7 +32,8 @@ const LOG_END_BYTES: u64 = 64 * 1024;
 pub(crate) struct Running {
     feed: Feed,
     pace: Pace,
-    facts: Names,
+    /// The channels in the order of the facts.
+    channels: Vec<String>,
     /// From this host's monotonic clock to the axis, nanoseconds.
     offset_ns: i64,
     is_silent: bool,
@@ -44,9 +42,6 @@ pub(crate) struct Running {
     /// As they were told last: the supervisor takes them away with the run's end.
     overruns: Option<Overruns>,
 }
-
-/// The channels in the order of the facts.
-type Names = Vec<String>;
 
 impl Running {
     /// Begins to watch `run`.
@@ -76,7 +71,7 @@ impl Running {
         facts.has_one_clock = facts.hosts.iter().all(is_here) || feed.has_one_clock() == Some(true);
         let names = facts.channels.iter().map(|channel| channel.name.clone());
         let running = Self {
-            facts: names.collect(),
+            channels: names.collect(),
             pace: Pace::of(&feed, MEMORY_REST, REST),
             feed,
             offset_ns,
@@ -86,11 +81,6 @@ impl Running {
             overruns: None,
         };
         Ok((running, facts))
-    }
-
-    /// True when nothing is lost by looking late.
-    pub(crate) fn waits(&self) -> bool {
-        self.feed.waits()
     }
 
     /// The topology with every default spelled out.
@@ -118,7 +108,7 @@ impl Source for Running {
     fn poll(&mut self, take: &mut dyn FnMut(&LiveRecord)) -> Progress {
         let Self {
             feed,
-            facts,
+            channels,
             offset_ns,
             is_silent,
             problems,
@@ -126,7 +116,7 @@ impl Source for Running {
         } = self;
         let (offset_ns, mut has_summary) = (*offset_ns, None);
         let now_ns = MonotonicClock::now().as_ns();
-        let place = |name: &str| facts.iter().position(|known| known == name);
+        let place = |name: &str| channels.iter().position(|known| known == name);
         let mut give = |channel: &str, own_ns: Option<i64>, body: Body| {
             if let Some(channel) = place(channel) {
                 // Of another host's clock nothing is known but that it was before now.
@@ -161,8 +151,8 @@ impl Source for Running {
                     record,
                     ..
                 } => {
-                    if let Some((own_ns, body)) = body_of(record) {
-                        give(channel, Some(own_ns), body);
+                    if let Some(noted) = Noted::of(&record) {
+                        give(channel, Some(noted.at_ns), Body::Record(record));
                     }
                 }
                 Event::Record { .. } => {}
@@ -187,7 +177,7 @@ impl Source for Running {
     }
 
     fn missed_count(&self) -> Option<u64> {
-        let missed = self.facts.iter().map(|name| {
+        let missed = self.channels.iter().map(|name| {
             let is_shared = self.feed.counters(name).is_some();
             is_shared.then(|| self.feed.missed_count(name))
         });
@@ -236,7 +226,10 @@ impl Source for Running {
                 .collect();
             let last = lines.len().saturating_sub(LINES_MAX);
             for line in &lines[last..] {
-                warnings.push((process.clone(), (*line).to_owned()));
+                warnings.push(Warning {
+                    process: process.clone(),
+                    what: (*line).to_owned(),
+                });
             }
         }
         warnings
@@ -253,15 +246,4 @@ fn end_of(path: &Path) -> io::Result<String> {
     let text = String::from_utf8_lossy(&bytes);
     let whole_lines = text.split_once('\n').filter(|_| begin > 0);
     Ok(whole_lines.map_or(&*text, |(_, rest)| rest).to_owned())
-}
-
-/// What of a record is shown, and when it was on the clock of its process.
-fn body_of(record: Record) -> Option<(i64, Body)> {
-    Some(match record {
-        Record::Published(one) => (one.published_ns, Body::Published(one)),
-        Record::Taken(one) => (one.taken_ns, Body::Taken(one)),
-        Record::Egress(one) => (one.taken_ns, Body::Egress(one)),
-        Record::Ingress(one) => (one.received_ns, Body::Ingress(one)),
-        _ => return None,
-    })
 }

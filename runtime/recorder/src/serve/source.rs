@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use hil_runtime::rundir::status::Overruns;
+use serde::Serialize;
 
 use crate::view::LiveRecord;
 
@@ -17,8 +18,14 @@ pub(crate) enum Progress {
     Ended(String),
 }
 
-/// What is amiss: with which process, where that is known, and what.
-pub(crate) type Warning = (Option<String>, String);
+/// Something that is amiss.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub(crate) struct Warning {
+    /// With which process, where that is known.
+    pub(crate) process: Option<String>,
+    /// What.
+    pub(crate) what: String,
+}
 
 /// A run's records as they come.
 pub(crate) trait Source {

@@ -13,16 +13,17 @@ use foxglove::{
     ChannelBuilder, Context, FoxgloveError, PartialMetadata, RawChannel, SinkId, WebSocketServer,
     WebSocketServerHandle,
 };
-use prost::Message as _;
 use serde_json::{Value, json};
 use tokio::runtime::Handle;
 
 use super::front::hidden_address;
-use crate::encode::Encoder;
-use crate::net::{self, MessageLatency};
-use crate::schema::{self, Schema};
-use crate::topics::{Names, View, topic_of};
-use crate::view::facts::{ChannelFacts, RunFacts};
+use crate::channel::{ChannelTopics, Wanted, typed};
+use crate::net::MessageLatency;
+use crate::schema::Schema;
+use crate::sink::Sink;
+use crate::topics::Names;
+use crate::view::facts::RunFacts;
+use crate::writer::Stamp;
 
 /// Messages that wait for one viewer at most; then its oldest go.
 const WAITING_MAX: usize = 512;
@@ -70,23 +71,54 @@ struct Live {
     number: u64,
 }
 
-/// The topics of one of the run's channels.
-struct Topics {
-    own: Option<(Arc<RawChannel>, Encoder)>,
-    views: Vec<(View, Arc<RawChannel>)>,
-    latency: Option<Arc<RawChannel>>,
+/// Topics of the run's channels as the socket has them, by number.
+struct Offered {
+    context: Arc<Context>,
+    topics: Vec<Arc<RawChannel>>,
+}
+
+impl Sink for Offered {
+    type Error = FoxgloveError;
+
+    fn add_topic(
+        &mut self,
+        topic: &str,
+        schema: &Schema,
+        _metadata: &BTreeMap<String, String>,
+    ) -> Result<u16, FoxgloveError> {
+        let number = u16::try_from(self.topics.len());
+        let full = |_| FoxgloveError::ValueError("too many topics".to_owned());
+        let number = number.map_err(full)?;
+        let schema = foxglove::Schema::new(&schema.name, "protobuf", schema.data.clone());
+        let channel = ChannelBuilder::new(topic)
+            .schema(schema)
+            .message_encoding("protobuf")
+            .context(&self.context)
+            .build_raw()?;
+        self.topics.push(channel);
+        Ok(number)
+    }
+
+    fn wants(&self, topic: u16) -> bool {
+        self.topics[usize::from(topic)].has_sinks()
+    }
+
+    fn write(&mut self, topic: u16, at: Stamp, data: &[u8]) -> Result<(), FoxgloveError> {
+        let stamp = PartialMetadata::with_log_time(at.log_ns);
+        self.topics[usize::from(topic)].log_with_meta(data, stamp);
+        Ok(())
+    }
 }
 
 /// All viewers.
 pub(crate) struct Viewers {
-    context: Arc<Context>,
     server: WebSocketServerHandle,
     /// Where the library listens.
     address: SocketAddr,
     live: BTreeMap<&'static str, Live>,
-    channels: Vec<Topics>,
+    channels: Vec<ChannelTopics>,
+    offered: Offered,
     subscribed: Receiver<(SinkId, String)>,
-    buffer: Vec<u8>,
 }
 
 impl Viewers {
@@ -125,13 +157,15 @@ impl Viewers {
             .context(&context);
         let server = runtime.block_on(server.start())?;
         Ok(Self {
-            context,
             address: SocketAddr::new(ip.into(), server.port()),
             server,
             live,
             channels: Vec::new(),
+            offered: Offered {
+                context,
+                topics: Vec::new(),
+            },
             subscribed,
-            buffer: Vec::new(),
         })
     }
 
@@ -151,103 +185,54 @@ impl Viewers {
     /// # Errors
     /// When a topic cannot be offered.
     pub(crate) fn offer(&mut self, facts: &RunFacts) -> Result<Vec<String>, FoxgloveError> {
-        for topics in self.channels.drain(..) {
-            let views = topics.views.into_iter().map(|(_, channel)| channel);
-            let own = topics.own.map(|(channel, _)| channel);
-            for channel in own.into_iter().chain(views).chain(topics.latency) {
-                channel.close();
-            }
+        for channel in self.offered.topics.drain(..) {
+            channel.close();
         }
+        self.channels.clear();
         let mut names = Names::default();
         for topic in LIVE_TOPICS {
             names.claim(topic.to_owned());
         }
+        let wanted = facts.channels.iter().map(|one| Wanted {
+            name: &one.name,
+            described: one.described.as_ref(),
+            typed: typed(one.described.as_ref()),
+        });
         let mut words = Vec::new();
-        for facts in &facts.channels {
-            let topics = self.topics_of(facts, &mut names, &mut words)?;
-            self.channels.push(topics);
+        for mut channel in ChannelTopics::of_all(wanted.collect(), &mut names) {
+            channel.own.declare(&mut self.offered)?;
+            channel.declare_views(&mut self.offered)?;
+            let is_taken = facts
+                .channel(&channel.name)
+                .is_some_and(|(_, one)| one.is_taken());
+            if is_taken {
+                channel.latency.declare(&mut self.offered)?;
+            }
+            if let Some(why) = channel.untyped() {
+                words.push(format!("{}: shown as bytes: {why}", channel.name));
+            }
+            self.channels.push(channel);
         }
         Ok(words)
     }
 
-    fn topics_of(
-        &self,
-        facts: &ChannelFacts,
-        names: &mut Names,
-        words: &mut Vec<String>,
-    ) -> Result<Topics, FoxgloveError> {
-        let message = facts
-            .message
-            .as_deref()
-            .unwrap_or("message of unknown type");
-        let typed = Encoder::typed(message, &facts.fields, facts.size_bytes);
-        let (encoder, schema) = typed.unwrap_or_else(|fault| {
-            words.push(format!(
-                "{}: shown as bytes: {message}: {fault}",
-                facts.name
-            ));
-            (Encoder::Opaque, schema::opaque())
-        });
-        let base = topic_of(&facts.name);
-        let channel = self.topic(names.claim(base.clone()), schema)?;
-        let mut views = Vec::new();
-        for view in View::of(message, facts.size_bytes) {
-            let topic = names.claim(format!("{}{base}", view.prefix()));
-            views.push((*view, self.topic(topic, view.schema())?));
-        }
-        let latency = if facts.via == "record" {
-            None
-        } else {
-            let topic = names.claim(format!("/net{base}/latency"));
-            Some(self.topic(topic, net::latency_schema())?)
-        };
-        Ok(Topics {
-            own: Some((channel, encoder)),
-            views,
-            latency,
-        })
-    }
-
-    fn topic(&self, name: String, schema: Schema) -> Result<Arc<RawChannel>, FoxgloveError> {
-        let schema = foxglove::Schema::new(schema.name, "protobuf", schema.data);
-        ChannelBuilder::new(name)
-            .schema(schema)
-            .message_encoding("protobuf")
-            .context(&self.context)
-            .build_raw()
-    }
-
     /// A message of the channel with this place, published at `at_ns` on the axis of a recording.
-    pub(crate) fn message(&mut self, (place, name): (usize, &str), at_ns: i64, payload: &[u8]) {
-        let Some(topics) = self.channels.get(place) else {
-            return;
-        };
-        let at_ns = u64::try_from(at_ns).unwrap_or(0);
-        let stamp = PartialMetadata::with_log_time(at_ns);
-        if let Some((channel, encoder)) = &topics.own
-            && channel.has_sinks()
-        {
-            self.buffer.clear();
-            if encoder.encode(payload, &mut self.buffer) {
-                channel.log_with_meta(&self.buffer, stamp);
-            }
-        }
-        for (view, channel) in &topics.views {
-            if channel.has_sinks()
-                && let Some(shown) = view.show(name, at_ns, payload)
-            {
-                channel.log_with_meta(&shown, stamp);
-            }
+    pub(crate) fn message(&mut self, place: usize, at_ns: i64, payload: &[u8]) {
+        if let Some(topics) = self.channels.get_mut(place) {
+            let at = Stamp::new(u64::try_from(at_ns).unwrap_or(0), 0);
+            // What is declared takes everything.
+            let _is_shown = topics.write_message(at, payload, &mut self.offered).is_ok();
         }
     }
 
     /// Stamps of a message of the channel with this place.
     pub(crate) fn latency(&mut self, place: usize, at_ns: i64, stamps: &MessageLatency) {
-        let topics = self.channels.get(place);
-        let channel = topics.and_then(|topics| topics.latency.as_ref());
-        if let Some(channel) = channel.filter(|channel| channel.has_sinks()) {
-            let stamp = PartialMetadata::with_log_time(u64::try_from(at_ns).unwrap_or(0));
-            channel.log_with_meta(&stamps.encode_to_vec(), stamp);
+        let topics = self.channels.get_mut(place);
+        if let Some(topics) = topics.filter(|topics| topics.latency.is_declared()) {
+            let at_ns = u64::try_from(at_ns).unwrap_or(0);
+            // What is declared takes everything.
+            let shown = topics.write_latency(at_ns, stamps, &mut self.offered);
+            let _is_shown = shown.is_ok();
         }
     }
 

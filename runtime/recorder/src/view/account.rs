@@ -3,13 +3,14 @@
 
 use std::collections::BTreeMap;
 
+use hil_runtime::watch::{Record, Stage};
 use serde_json::{Value, json};
 
 use super::facts::ChannelFacts;
-use super::join::{Joined, LINK_SEGMENTS, LOCAL_SEGMENTS};
+use super::join::{Joined, LINK_SEGMENTS, LOCAL_SEGMENTS, Way};
 use super::window::{Recent, Samples, WINDOW_NS};
 use super::{Body, LiveRecord, seconds};
-use crate::net::MessageLatency;
+use crate::net::{MessageId, MessageLatency, Noted};
 
 /// A message that has not arrived so long after it was handed over counts as lost.
 const LOST_AFTER_NS: i64 = 1_000_000_000;
@@ -27,17 +28,13 @@ const LISTED_MAX: usize = 64;
 /// Single messages shown each time that messages are settled, ten times a second.
 const SHOWN_MAX: usize = 5;
 
-/// A producer's start and the number of a message.
-type Key = (u32, u64);
-
 /// One channel.
 #[derive(Debug)]
 pub(crate) struct Account {
-    has_link: bool,
-    has_one_clock: bool,
+    way: Way,
     is_by_message: bool,
-    under_way: BTreeMap<Key, Joined>,
-    lost: BTreeMap<Key, i64>,
+    under_way: BTreeMap<MessageId, Joined>,
+    lost: BTreeMap<MessageId, i64>,
     /// Per start of the producer, the highest number that arrived.
     newest: BTreeMap<u32, u64>,
     /// Lost since they were last told, with their publication.
@@ -88,8 +85,10 @@ impl Account {
             LOCAL_SEGMENTS.len()
         };
         Self {
-            has_link,
-            has_one_clock,
+            way: Way {
+                has_link,
+                has_one_clock,
+            },
             is_by_message: channel.is_by_message,
             under_way: BTreeMap::new(),
             lost: BTreeMap::new(),
@@ -109,49 +108,39 @@ impl Account {
 
     /// Stamps of both ends compare from now on.
     pub(crate) const fn compare_clocks(&mut self) {
-        self.has_one_clock = true;
+        self.way.has_one_clock = true;
     }
 
     /// Takes a record of the channel.
     pub(crate) fn take(&mut self, record: &LiveRecord) {
         let at_ns = record.at_ns;
-        match &record.body {
-            Body::Message(_) => {
-                if self.is_by_message {
-                    count(&mut self.counts.published);
-                    self.rate.add(at_ns, 1);
-                }
-            }
-            Body::Published(one) => {
+        let Body::Record(record) = &record.body else {
+            if self.is_by_message {
                 count(&mut self.counts.published);
                 self.rate.add(at_ns, 1);
-                self.update((one.epoch, one.sequence), at_ns, &|joined| {
-                    joined.published(one);
-                });
             }
-            Body::Taken(one) => {
-                count(&mut self.counts.taken);
-                self.update((one.epoch, one.sequence), at_ns, &|joined| {
-                    joined.taken(one);
-                });
+            return;
+        };
+        let Some(noted) = Noted::of(record) else {
+            return;
+        };
+        match noted.stage {
+            Stage::Published => {
+                count(&mut self.counts.published);
+                self.rate.add(at_ns, 1);
             }
-            Body::Egress(one) => {
+            Stage::Taken => count(&mut self.counts.taken),
+            Stage::Sent => {
                 count(&mut self.counts.sent);
                 self.left_ns = Some(at_ns);
-                self.update((one.epoch, one.sequence), at_ns, &|joined| joined.sent(one));
             }
-            Body::Ingress(one) => {
-                if one.flags & hil_models::measure::record::IngressRecord::DUPLICATE != 0 {
-                    return;
-                }
-                let key = (one.epoch, one.sequence);
-                self.arrive(key, at_ns);
-                self.update(key, at_ns, &|joined| joined.received(one));
-            }
+            Stage::Received => self.arrive(noted.message, at_ns),
         }
+        self.update(noted.message, at_ns, record);
     }
 
-    fn arrive(&mut self, (epoch, sequence): Key, at_ns: i64) {
+    fn arrive(&mut self, message: MessageId, at_ns: i64) {
+        let MessageId { epoch, sequence } = message;
         count(&mut self.counts.received);
         if self.counts.published.is_none() {
             self.rate.add(at_ns, 1);
@@ -161,7 +150,7 @@ impl Account {
             self.period_ns += (gap_ns - self.period_ns) / 8;
         }
         self.arrived_ns = Some(at_ns);
-        if self.lost.remove(&(epoch, sequence)).is_some() {
+        if self.lost.remove(&message).is_some() {
             self.counts.lost = self.counts.lost.saturating_sub(1);
             self.untold.retain(|(number, _)| *number != sequence);
         }
@@ -172,8 +161,8 @@ impl Account {
         // Where nobody here saw them leave, the numbers passed over are all that tells of them.
         if self.counts.sent.is_none() {
             let from = newest.saturating_add(1).max(sequence.saturating_sub(1000));
-            for number in from..sequence {
-                let key = (epoch, number);
+            for sequence in from..sequence {
+                let key = MessageId { epoch, sequence };
                 self.under_way
                     .entry(key)
                     .or_insert_with(|| Joined::new(key, at_ns));
@@ -181,18 +170,15 @@ impl Account {
         }
     }
 
-    fn update(&mut self, key: Key, at_ns: i64, change: &dyn Fn(&mut Joined)) {
-        let joined = self.under_way.entry(key);
-        let joined = joined.or_insert_with(|| Joined::new(key, at_ns));
-        change(joined);
+    fn update(&mut self, message: MessageId, at_ns: i64, record: &Record) {
+        let joined = self.under_way.entry(message);
+        let joined = joined.or_insert_with(|| Joined::new(message, at_ns));
+        joined.note(record);
         let (segments, whole) = (&mut self.segments, &mut self.whole);
-        joined.news(
-            (self.has_link, self.has_one_clock),
-            &mut |segment, length_ns| {
-                let samples = segment.and_then(|index| segments.get_mut(index));
-                samples.unwrap_or(whole).add(at_ns, length_ns);
-            },
-        );
+        joined.news(self.way, &mut |segment, length_ns| {
+            let samples = segment.and_then(|index| segments.get_mut(index));
+            samples.unwrap_or(whole).add(at_ns, length_ns);
+        });
         if self.under_way.len() > UNDER_WAY_MAX {
             self.under_way.pop_first();
             self.counts.forgotten += 1;
@@ -203,7 +189,7 @@ impl Account {
     pub(crate) fn settle(&mut self, now_ns: i64) {
         let due_ns = now_ns - LOST_AFTER_NS;
         let old = self.under_way.iter();
-        let old: Vec<Key> = old
+        let old: Vec<MessageId> = old
             .filter(|(_, joined)| joined.first_ns <= due_ns)
             .map(|(key, _)| *key)
             .collect();
@@ -215,7 +201,7 @@ impl Account {
                 self.counts.lost += 1;
                 self.window_lost.add(now_ns, 1);
                 self.lost.insert(key, now_ns);
-                self.untold.push((key.1, joined.stamps.published_ns));
+                self.untold.push((key.sequence, joined.stamps.published_ns));
             }
             if self.shown.len() < SHOWN_MAX {
                 self.shown.push(joined.stamps);
@@ -227,13 +213,13 @@ impl Account {
         }
     }
 
-    fn is_lost(&self, key: Key, joined: &Joined) -> bool {
-        if !self.has_link || joined.has_arrived() || self.counts.received.is_none() {
+    fn is_lost(&self, key: MessageId, joined: &Joined) -> bool {
+        if !self.way.has_link || joined.has_arrived() || self.counts.received.is_none() {
             return false;
         }
-        let newest = self.newest.get(&key.0);
+        let newest = self.newest.get(&key.epoch);
         joined.has_left()
-            || newest.is_some_and(|newest| *newest > key.1 && self.counts.sent.is_none())
+            || newest.is_some_and(|newest| *newest > key.sequence && self.counts.sent.is_none())
     }
 
     /// Stamps of some messages whose way is over, since the last call.
@@ -269,7 +255,7 @@ impl Account {
 
     /// The channel's entry in `/live/channels`.
     pub(crate) fn figures(&mut self, name: &str, now_ns: i64) -> Value {
-        let names: &[&str] = if self.has_link {
+        let names: &[&str] = if self.way.has_link {
             &LINK_SEGMENTS
         } else {
             &LOCAL_SEGMENTS
@@ -288,11 +274,11 @@ impl Account {
             figures["name"] = json!("published-taken");
             figures
         });
-        let can_tell = self.has_link && self.counts.received.is_some();
+        let can_tell = self.way.has_link && self.counts.received.is_some();
         let window_lost = self.window_lost.count(now_ns);
         let silent_ns = self
             .arrived_ns
-            .filter(|_| self.has_link)
+            .filter(|_| self.way.has_link)
             .map(|ns| now_ns - ns);
         let counts = &self.counts;
         // What no process here has to do with has no rate here.
@@ -311,14 +297,14 @@ impl Account {
             "window_lost_count": can_tell.then_some(window_lost),
             "segments": segments,
             "one_way": one_way,
-            "clock_bound_us": self.has_one_clock.then_some(0.0),
+            "clock_bound_us": self.way.has_one_clock.then_some(0.0),
             "link_state": self.link_state(now_ns),
             "silent_s": silent_ns.map(|ns| seconds(ns.max(0))),
         })
     }
 
     fn link_state(&self, now_ns: i64) -> &'static str {
-        let Some(arrived_ns) = self.arrived_ns.filter(|_| self.has_link) else {
+        let Some(arrived_ns) = self.arrived_ns.filter(|_| self.way.has_link) else {
             let waits = self.left_ns.is_some() && self.counts.received.is_some();
             return if waits { "silent" } else { "none" };
         };

@@ -24,17 +24,17 @@ fn record(at_ns: i64, body: Body) -> LiveRecord {
 }
 
 fn published(sequence: u64, at_ns: i64) -> LiveRecord {
-    let body = Body::Published(PublishedRecord {
+    let body = Body::Record(Record::Published(PublishedRecord {
         sequence,
         published_ns: at_ns,
         epoch: 1,
         reserved: 0,
-    });
+    }));
     record(at_ns, body)
 }
 
 fn sent(sequence: u64, at_ns: i64) -> LiveRecord {
-    let body = Body::Egress(EgressRecord {
+    let body = Body::Record(Record::Egress(EgressRecord {
         sequence,
         published_ns: at_ns - 10_000,
         taken_ns: at_ns - 5_000,
@@ -46,12 +46,12 @@ fn sent(sequence: u64, at_ns: i64) -> LiveRecord {
         session: 0,
         flags: 0,
         fragment_count: 1,
-    });
+    }));
     record(at_ns, body)
 }
 
 fn received(sequence: u64, at_ns: i64) -> LiveRecord {
-    let body = Body::Ingress(IngressRecord {
+    let body = Body::Record(Record::Ingress(IngressRecord {
         sequence,
         published_ns: at_ns - MS,
         handed_ns: at_ns - MS,
@@ -66,19 +66,19 @@ fn received(sequence: u64, at_ns: i64) -> LiveRecord {
         session: 0,
         flags: 0,
         fragment_count: 1,
-    });
+    }));
     record(at_ns, body)
 }
 
 fn taken(sequence: u64, at_ns: i64) -> LiveRecord {
-    let body = Body::Taken(TakenRecord {
+    let body = Body::Record(Record::Taken(TakenRecord {
         sequence,
         published_ns: at_ns - 2 * MS,
         forwarded_ns: at_ns - 1000,
         taken_ns: at_ns,
         epoch: 1,
         reserved: 0,
-    });
+    }));
     record(at_ns, body)
 }
 

@@ -6,7 +6,7 @@ use std::time::Duration;
 use hil_models::fleet::Fleet;
 use hil_models::shuttle::Shuttle;
 use hil_models::teleoperation::Teleoperation;
-use hil_runtime::rundir::manifest::{ChannelDescription, FieldDescription, Manifest};
+use hil_runtime::rundir::manifest::{ChannelDescription, Manifest};
 use hil_runtime::topology::registry::Registry;
 use serde_json::{Value, json};
 
@@ -42,12 +42,8 @@ pub(crate) struct RunFacts {
 pub(crate) struct ChannelFacts {
     /// Name.
     pub(crate) name: String,
-    /// Its message.
-    pub(crate) message: Option<String>,
-    /// Size of one.
-    pub(crate) size_bytes: usize,
-    /// How a message lies in memory.
-    pub(crate) fields: Vec<FieldDescription>,
+    /// What the manifest says of it.
+    pub(crate) described: Option<ChannelDescription>,
     /// Process that publishes, and the one that takes.
     pub(crate) ends: [Option<String>; 2],
     /// Their hosts.
@@ -60,6 +56,19 @@ pub(crate) struct ChannelFacts {
     pub(crate) is_by_message: bool,
     /// From the monotonic clocks of the two hosts to the recording's axis, nanoseconds.
     pub(crate) offsets_ns: [i64; 2],
+}
+
+impl ChannelFacts {
+    /// Its message, where the manifest names it.
+    pub(crate) fn message(&self) -> Option<&str> {
+        self.described.as_ref().map(|one| one.message.as_str())
+    }
+
+    /// False where the manifest says that nobody takes its messages: they are recorded only.
+    pub(crate) fn is_taken(&self) -> bool {
+        let described = self.described.as_ref();
+        described.is_none_or(|one| one.to_host.is_some())
+    }
 }
 
 /// A link.
@@ -144,9 +153,7 @@ impl RunFacts {
         };
         ChannelFacts {
             name: one.name.clone(),
-            message: Some(one.message.clone()),
-            size_bytes: one.size_bytes,
-            fields: one.fields.clone(),
+            described: Some(one.clone()),
             ends: self.ends(&one.name, topology),
             hosts: [one.from_host.clone(), one.to_host.clone()],
             via: via.to_owned(),
@@ -187,8 +194,8 @@ impl RunFacts {
         let channels = self.channels.iter();
         let listed = channels.map(|one| {
             json!({
-                "name": one.name, "message": one.message,
-                "size_bytes": one.message.as_ref().map(|_| one.size_bytes),
+                "name": one.name, "message": one.message(),
+                "size_bytes": one.described.as_ref().map(|described| described.size_bytes),
                 "from": one.ends[0], "to": one.ends[1],
                 "from_host": one.hosts[0], "to_host": one.hosts[1],
                 "via": one.via, "link": one.link,

@@ -93,7 +93,7 @@ impl FleetView {
     }
 
     /// Takes a message; `offset_ns` leads from its producer's clock to the axis.
-    pub(crate) fn take(&mut self, message: &str, payload: &[u8], (at_ns, offset_ns): (i64, i64)) {
+    pub(crate) fn take(&mut self, message: &str, payload: &[u8], at_ns: i64, offset_ns: i64) {
         match message {
             State::NAME => {
                 if let Some(state) = read::<State>(payload).filter(State::is_sound) {

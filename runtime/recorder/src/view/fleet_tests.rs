@@ -45,8 +45,8 @@ fn tell(view: &mut FleetView, robot: u32, (x_m, y_m): (f64, f64), index: i32, at
         phase: Phase::Driving as u8,
         ..State::default()
     };
-    view.take(Mission::NAME, bytemuck::bytes_of(&mission), (at_ns, 0));
-    view.take(State::NAME, bytemuck::bytes_of(&state), (at_ns, 0));
+    view.take(Mission::NAME, bytemuck::bytes_of(&mission), at_ns, 0);
+    view.take(State::NAME, bytemuck::bytes_of(&state), at_ns, 0);
 }
 
 #[test]
@@ -117,7 +117,7 @@ fn the_referee_judges_where_the_truth_is_recorded() {
             kind: TruthKind::MissionStarted as u32,
             ..Truth::zeroed()
         };
-        view.take(Truth::NAME, bytemuck::bytes_of(&truth), (0, 0));
+        view.take(Truth::NAME, bytemuck::bytes_of(&truth), 0, 0);
     }
     let early = view.picture(S / 2, 0);
     assert_eq!(
@@ -135,7 +135,7 @@ fn the_referee_judges_where_the_truth_is_recorded() {
 fn nonsense_is_not_shown() {
     let (mut view, _) = view();
     tell(&mut view, 0, (f64::NAN, 0.0), 3, 0);
-    view.take(State::NAME, &[1, 2, 3], (0, 0));
+    view.take(State::NAME, &[1, 2, 3], 0, 0);
     assert_eq!(view.picture(0, 0)["robots"], json!([]));
     tell(&mut view, 0, (0.0, 0.0), i32::MAX, 0);
     assert_eq!(

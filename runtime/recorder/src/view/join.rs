@@ -1,9 +1,10 @@
 //! The stages of one message as its records come in, in any order, and which of the way's segments
 //! they complete. The stages are those of the account of a finished run.
 
-use hil_models::measure::record::{EgressRecord, IngressRecord, PublishedRecord, TakenRecord};
+use hil_models::measure::record::EgressRecord;
+use hil_runtime::watch::Record;
 
-use crate::net::MessageLatency;
+use crate::net::{MessageId, MessageLatency};
 
 /// The segments of a channel over a link, in order.
 pub(crate) const LINK_SEGMENTS: [&str; 7] = [
@@ -18,6 +19,15 @@ pub(crate) const LINK_SEGMENTS: [&str; 7] = [
 
 /// The only segment of a channel that stays in shared memory.
 pub(crate) const LOCAL_SEGMENTS: [&str; 1] = ["published-taken"];
+
+/// What decides which lengths a channel's stamps give.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Way {
+    /// It crosses a link.
+    pub(crate) has_link: bool,
+    /// Stamps of both ends compare.
+    pub(crate) has_one_clock: bool,
+}
 
 /// One message on its way.
 #[derive(Debug, Clone, Default)]
@@ -37,39 +47,24 @@ const WHOLE: usize = 15;
 
 impl Joined {
     /// A message first heard of at `at_ns`.
-    pub(crate) fn new(key: (u32, u64), at_ns: i64) -> Self {
-        let stamps = MessageLatency {
-            sequence: key.1,
-            epoch: key.0,
-            ..MessageLatency::default()
-        };
+    pub(crate) fn new(message: MessageId, at_ns: i64) -> Self {
         Self {
-            stamps,
+            stamps: MessageLatency::new(message),
             first_ns: at_ns,
             ..Self::default()
         }
     }
 
-    /// It was published.
-    pub(crate) fn published(&mut self, record: &PublishedRecord) {
-        self.stamps.note_published(record);
-    }
-
-    /// It was taken.
-    pub(crate) fn taken(&mut self, record: &TakenRecord) {
-        self.stamps.note_taken(record);
-    }
-
-    /// It was sent.
-    pub(crate) fn sent(&mut self, record: &EgressRecord) {
-        self.stamps.note_sent(record);
-        self.is_refused = record.flags & EgressRecord::REFUSED_BY_KERNEL != 0;
-    }
-
-    /// It arrived, for the first time.
-    pub(crate) fn received(&mut self, record: &IngressRecord) {
-        self.stamps.note_received(record);
-        self.has_ingress = true;
+    /// Takes a record of it; of its arrivals only the first.
+    pub(crate) fn note(&mut self, record: &Record) {
+        self.stamps.note(record);
+        match record {
+            Record::Egress(one) => {
+                self.is_refused = one.flags & EgressRecord::REFUSED_BY_KERNEL != 0;
+            }
+            Record::Ingress(_) => self.has_ingress = true,
+            _ => {}
+        }
     }
 
     /// True when it reached the other gateway, or its consumer said so.
@@ -84,12 +79,11 @@ impl Joined {
 
     /// Hears of each segment whose two ends are known now and were not before: its place among
     /// [`LINK_SEGMENTS`] or [`LOCAL_SEGMENTS`], `None` for the whole way, and its length.
-    /// `has_one_clock` says that stamps of both ends compare.
-    pub(crate) fn news(
-        &mut self,
-        (has_link, has_one_clock): (bool, bool),
-        hear: &mut dyn FnMut(Option<usize>, i64),
-    ) {
+    pub(crate) fn news(&mut self, way: Way, hear: &mut dyn FnMut(Option<usize>, i64)) {
+        let Way {
+            has_link,
+            has_one_clock,
+        } = way;
         let one = &self.stamps;
         let mut counted = self.counted;
         let mut offer = |bit: usize, length_ns: Option<i64>| {

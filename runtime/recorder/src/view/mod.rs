@@ -17,7 +17,7 @@ mod sections;
 pub(crate) mod state;
 mod window;
 
-use hil_models::measure::record::{EgressRecord, IngressRecord, PublishedRecord, TakenRecord};
+use hil_runtime::watch::Record;
 
 /// Something that a process of the run recorded.
 #[derive(Debug, Clone)]
@@ -35,14 +35,8 @@ pub(crate) struct LiveRecord {
 pub(crate) enum Body {
     /// A message itself.
     Message(Vec<u8>),
-    /// Its producer published it.
-    Published(PublishedRecord),
-    /// Its consumer took it.
-    Taken(TakenRecord),
-    /// The sending gateway handed it to the link.
-    Egress(EgressRecord),
-    /// The receiving gateway got it.
-    Ingress(IngressRecord),
+    /// What became of one on its way.
+    Record(Record),
 }
 
 /// To the millimetre, or to the thousandth of whatever else: enough for a picture, half the bytes.

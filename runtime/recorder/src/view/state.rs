@@ -93,11 +93,11 @@ impl RunState {
         self.accounts[record.channel].take(record);
         if let Body::Message(payload) = &record.body {
             self.read_count += 1;
-            let message = channel.message.as_deref().unwrap_or_default();
+            let message = channel.message().unwrap_or_default();
             self.arms
                 .take(&channel.name, message, payload, record.at_ns);
             if let Some(fleet) = &mut self.fleet {
-                fleet.take(message, payload, (record.at_ns, channel.offsets_ns[0]));
+                fleet.take(message, payload, record.at_ns, channel.offsets_ns[0]);
             }
         }
     }

@@ -3,6 +3,7 @@
 
 use std::collections::VecDeque;
 
+use hil_models::measure::histogram::LatencySummary;
 use serde_json::{Value, json};
 
 /// How far back figures look, nanoseconds.
@@ -53,7 +54,6 @@ pub(crate) struct Samples {
     values: VecDeque<(i64, i64)>,
     /// True once there was one: whether this host has the two stages at all.
     pub(crate) is_available: bool,
-    sorted: Vec<i64>,
 }
 
 impl Samples {
@@ -72,18 +72,14 @@ impl Samples {
         while self.values.front().is_some_and(|(at, _)| *at <= oldest_ns) {
             self.values.pop_front();
         }
-        self.sorted.clear();
-        self.sorted
-            .extend(self.values.iter().map(|(_, value)| value));
-        self.sorted.sort_unstable();
-        let at = |percent: usize| {
-            let rank = (percent * self.sorted.len()).div_ceil(100);
-            let value = self.sorted.get(rank.saturating_sub(1));
-            value.map(|ns| microseconds(*ns))
-        };
+        let values: Vec<i64> = self.values.iter().map(|(_, value)| *value).collect();
+        let summary = LatencySummary::of_samples(&values);
+        let of =
+            |figure: fn(&LatencySummary) -> i64| summary.as_ref().map(figure).map(microseconds);
         json!({
-            "p50_us": at(50), "p99_us": at(99), "max_us": at(100),
-            "count": self.sorted.len(), "is_available": self.is_available,
+            "p50_us": of(|one| one.p50_ns), "p99_us": of(|one| one.p99_ns),
+            "max_us": of(|one| one.max_ns),
+            "count": values.len(), "is_available": self.is_available,
         })
     }
 }

@@ -58,8 +58,7 @@ fn fifo_is_granted_and_seen_in_force_or_refused_with_a_cure() {
         policy,
         ..RealtimeRequest::default()
     };
-    let (grant, actual) =
-        apply_in_scratch_thread(request, |grant| (grant, current_policy(OWN_THREAD)));
+    let (grant, actual) = apply_in_scratch_thread(request, |grant| (grant, current_policy()));
     assert_eq!(grant.items.len(), 1);
     assert_eq!(grant.is_complete(), actual & libc::SCHED_FIFO != 0);
     if let Some(refusal) = grant.refusals().next() {
@@ -76,7 +75,7 @@ fn a_child_thread_does_not_inherit_the_priority() {
         ..RealtimeRequest::default()
     };
     let child_policy = apply_in_scratch_thread(request, |_| {
-        thread::spawn(|| current_policy(OWN_THREAD)).join().unwrap()
+        thread::spawn(|| current_policy()).join().unwrap()
     });
     assert_eq!(child_policy, libc::SCHED_OTHER);
 }
@@ -111,39 +110,6 @@ fn what_lets_a_thread_up_again_is_said_as_systemd_reads_it() {
         "needs CAP_SYS_NICE or LimitNICE=+0 in the unit"
     );
     assert!(refusal.reason.starts_with("RLIMIT_NICE is "));
-}
-
-#[test]
-fn threads_are_moved_with_those_that_they_start_and_others_stay() {
-    let policy = SchedulingPolicy::Idle;
-    let request = RealtimeRequest {
-        policy,
-        ..RealtimeRequest::default()
-    };
-    // No other test of this crate has a thread under this policy.
-    let (item, before, after) = apply_in_scratch_thread(request, move |_| {
-        let (say, hear) = std::sync::mpsc::channel();
-        let (go, wait) = std::sync::mpsc::channel::<()>();
-        let child = thread::spawn(move || {
-            say.send(current_policy(OWN_THREAD)).unwrap();
-            let _is_told = wait.recv().is_ok();
-            current_policy(OWN_THREAD)
-        });
-        let before = hear.recv().unwrap();
-        let item = move_threads(policy, SchedulingPolicy::Other);
-        drop(go);
-        let after = child.join().unwrap();
-        (item, before, [after, current_policy(OWN_THREAD)])
-    });
-    assert_eq!(before, libc::SCHED_IDLE);
-    match item.outcome {
-        GrantOutcome::Granted => assert_eq!(after, [libc::SCHED_OTHER; 2]),
-        // Without the right to it.
-        GrantOutcome::Refused { error, .. } => assert!(error.starts_with("EPERM"), "{error}"),
-    }
-    let stays = SchedulingPolicy::Fifo { priority: 1 };
-    let item = move_threads(stays, SchedulingPolicy::Other);
-    assert_eq!(item.outcome, GrantOutcome::Granted, "there is none");
 }
 
 #[test]

@@ -1,0 +1,197 @@
+//! One channel of a run as topics: its messages, what viewers make of them, the stamps of each, and
+//! the verdicts of its link. When each was is decided by whoever reads the run.
+
+use hil_models::trace::TraceRecord;
+use hil_runtime::manifest::ChannelDescription;
+use prost::Message as _;
+
+use crate::encode::Encoder;
+use crate::facts::Words;
+use crate::net::{self, LinkDecision, MessageLatency};
+use crate::schema::{self, Schema};
+use crate::sink::{Sink, Topic};
+use crate::topics::{Names, View, topic_of};
+use crate::writer::Stamp;
+
+/// How the messages of a channel are written field by field, with their schema; or why they cannot
+/// be.
+pub(crate) type Typed = Result<(Encoder, Schema), String>;
+
+/// By what the manifest says of a channel.
+pub(crate) fn typed(described: Option<&ChannelDescription>) -> Typed {
+    let one = described.ok_or("the manifest does not tell of this channel")?;
+    Encoder::typed(&one.message, &one.fields, one.size_bytes)
+        .map_err(|fault| format!("{}: {fault}", one.message))
+}
+
+/// A channel that is to have topics.
+#[derive(Debug)]
+pub(crate) struct Wanted<'a> {
+    /// The channel.
+    pub(crate) name: &'a str,
+    /// What the manifest says of it.
+    pub(crate) described: Option<&'a ChannelDescription>,
+    /// How its messages are written.
+    pub(crate) typed: Typed,
+}
+
+/// A channel and its topics, each of which appears with its first message unless it is declared.
+#[derive(Debug)]
+pub(crate) struct ChannelTopics {
+    /// The channel.
+    pub(crate) name: String,
+    /// Its message, where the manifest names it.
+    pub(crate) message: Option<String>,
+    /// Its messages.
+    pub(crate) own: Topic,
+    encoder: Encoder,
+    untyped: Option<String>,
+    views: Vec<(View, Topic)>,
+    /// The stamps of each message.
+    pub(crate) latency: Topic,
+    /// The verdicts of its link.
+    pub(crate) link: Topic,
+    buffer: Vec<u8>,
+}
+
+impl ChannelTopics {
+    /// The topics of all channels of a run.
+    pub(crate) fn of_all(wanted: Vec<Wanted<'_>>, names: &mut Names) -> Vec<Self> {
+        // Before the derived names, so that the run's own keep theirs.
+        let own = wanted.iter().map(|one| names.claim(topic_of(one.name)));
+        let own: Vec<String> = own.collect();
+        let both = wanted.into_iter().zip(own);
+        both.map(|(one, own)| Self::of(one, own, names)).collect()
+    }
+
+    fn of(wanted: Wanted<'_>, own: String, names: &mut Names) -> Self {
+        let (name, described) = (wanted.name, wanted.described);
+        let mut untyped = None;
+        let (encoder, schema) = wanted.typed.unwrap_or_else(|why| {
+            untyped = Some(why);
+            (Encoder::Opaque, schema::opaque())
+        });
+        let message = described.map_or("", |one| &one.message);
+        let size = described.map_or(String::new(), |one| one.size_bytes.to_string());
+        let host = described.and_then(|one| one.from_host.as_deref());
+        let metadata = [
+            ("channel", name),
+            ("message", message),
+            ("size_bytes", &size),
+            ("clock_host", host.unwrap_or_default()),
+        ];
+        let own = Topic::new(own, schema, &metadata);
+        let base = topic_of(name);
+        let mut derived =
+            |wanted: String, schema| Topic::new(names.claim(wanted), schema, &[("channel", name)]);
+        let views = described.map_or(&[][..], |one| View::of(message, one.size_bytes));
+        let views = views.iter().map(|view| {
+            let wanted = format!("{}{base}", view.prefix());
+            (*view, derived(wanted, view.schema()))
+        });
+        Self {
+            name: name.to_owned(),
+            message: described.map(|one| one.message.clone()),
+            own,
+            encoder,
+            untyped,
+            views: views.collect(),
+            latency: derived(format!("/net{base}/latency"), net::latency_schema()),
+            link: derived(format!("/net{base}/link"), net::decision_schema()),
+            buffer: Vec::new(),
+        }
+    }
+
+    /// Lets `sink` hear now of the topics that are made of the messages.
+    ///
+    /// # Errors
+    /// When it has no room for them.
+    pub(crate) fn declare_views<S: Sink>(&mut self, sink: &mut S) -> Result<(), S::Error> {
+        for (_, topic) in &mut self.views {
+            topic.declare(sink)?;
+        }
+        Ok(())
+    }
+
+    /// Writes a message and what viewers make of it; false when its size is not that of the channel,
+    /// and it was left out.
+    ///
+    /// # Errors
+    /// When the sink cannot take it.
+    pub(crate) fn write_message<S: Sink>(
+        &mut self,
+        at: Stamp,
+        payload: &[u8],
+        sink: &mut S,
+    ) -> Result<bool, S::Error> {
+        if self.own.is_wanted(sink) {
+            self.buffer.clear();
+            if !self.encoder.encode(payload, &mut self.buffer) {
+                return Ok(false);
+            }
+            self.own.write(sink, at, &self.buffer)?;
+        }
+        for (view, topic) in &mut self.views {
+            if topic.is_wanted(sink)
+                && let Some(shown) = view.show(&self.name, at.log_ns, payload)
+            {
+                topic.write(sink, at, &shown)?;
+            }
+        }
+        Ok(true)
+    }
+
+    /// Writes the stamps of a message.
+    ///
+    /// # Errors
+    /// When the sink cannot take them.
+    pub(crate) fn write_latency<S: Sink>(
+        &mut self,
+        at_ns: u64,
+        stamps: &MessageLatency,
+        sink: &mut S,
+    ) -> Result<(), S::Error> {
+        if !self.latency.is_wanted(sink) {
+            return Ok(());
+        }
+        self.buffer.clear();
+        stamps.encode_raw(&mut self.buffer);
+        let at = Stamp::new(at_ns, stamps.sequence);
+        self.latency.write(sink, at, &self.buffer)
+    }
+
+    /// Writes what the link did to a message.
+    ///
+    /// # Errors
+    /// When the sink cannot take it.
+    pub(crate) fn write_decision<S: Sink>(
+        &mut self,
+        at_ns: u64,
+        record: &TraceRecord,
+        sink: &mut S,
+    ) -> Result<(), S::Error> {
+        self.buffer.clear();
+        LinkDecision::of(record).encode_raw(&mut self.buffer);
+        let at = Stamp::new(at_ns, record.sequence);
+        self.link.write(sink, at, &self.buffer)
+    }
+
+    /// Why its messages are kept as bytes, if there are any that are.
+    pub(crate) fn untyped(&self) -> Option<&str> {
+        self.untyped.as_deref().filter(|_| self.own.is_declared())
+    }
+
+    /// Of each channel its message, and whether it is typed.
+    pub(crate) fn words<'a>(channels: impl Iterator<Item = &'a Self>) -> Words {
+        let describe = |channel: &Self| {
+            let message = channel.message.as_deref().unwrap_or("unknown message");
+            let how = match channel.untyped() {
+                _ if !channel.own.is_declared() => "no message was recorded".to_owned(),
+                None => "typed".to_owned(),
+                Some(why) => format!("kept as bytes: {why}"),
+            };
+            (channel.name.clone(), format!("{message}; {how}"))
+        };
+        channels.map(describe).collect()
+    }
+}
