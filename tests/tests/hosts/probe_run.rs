@@ -1,0 +1,313 @@
+//! The probe beside a real run: two hosts, one tap in each, and the gateways' own account. What the
+//! two say of the wire must agree, though neither knows of the other.
+
+use std::path::Path;
+use std::process::Command;
+use std::time::Duration;
+
+use hil_runtime::report::summary::Outcome;
+use hil_tests::binary::hil_runtime_binary;
+use hil_tests::child::ChildGuard;
+use hil_tests::lab::{INTERFACE, Lab, LabHost};
+use hil_tests::run_folder::RunFolder;
+use hil_tests::trial::Trial;
+use nix::sys::signal::Signal;
+use serde_json::Value;
+
+const HOSTS: [&str; 2] = ["control-pc", "robot-pc"];
+const START_LIMIT: Duration = Duration::from_mins(1);
+const RUN_LIMIT: Duration = Duration::from_mins(2);
+/// Farthest that the medians of both may lie apart, microseconds: what only a wrong stamp or a wrong
+/// match reaches. How near they are on a quiet machine is for `probe compare` to say.
+const MEDIAN_LIMIT_US: f64 = 100.0;
+
+fn start_probe(host: &LabHost, output: &Path) -> ChildGuard {
+    let mut command = host.command(hil_runtime_binary());
+    command
+        .args(["probe", "--interface", INTERFACE, "--output"])
+        .arg(output);
+    let mut probe = ChildGuard::spawn(&mut command).unwrap();
+    probe.wait_for_output("probing eth0", START_LIMIT).unwrap();
+    probe
+}
+
+/// Runs the binary and gives what it printed as JSON, and its exit code.
+fn json(arguments: &[&Path]) -> (Value, Option<i32>) {
+    let mut command = Command::new(hil_runtime_binary());
+    command.arg("probe").args(arguments).arg("--json");
+    let mut child = ChildGuard::spawn(&mut command).unwrap();
+    let finished = child.wait_within(RUN_LIMIT).unwrap();
+    let value = serde_json::from_str(&finished.stdout);
+    let value = value.unwrap_or_else(|error| panic!("{error}: {finished:?}"));
+    (value, finished.status.code())
+}
+
+#[test]
+fn probe_and_gateways_agree_on_every_datagram_and_on_the_time_on_the_wire() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let record = RunFolder::new("probe-run");
+    std::fs::create_dir_all(record.path()).unwrap();
+    let captures = HOSTS.map(|host| record.path().join(format!("{host}.pcapng")));
+    let mut probes = [0, 1].map(|index| start_probe(lab.host(index), &captures[index]));
+
+    let trial = Trial::shipped("shuttle-split.toml", record.path())
+        // What is on the wire is looked at byte by byte.
+        .plain()
+        .set("run.duration=\"8 s\"")
+        // Often enough that neither tap nor driver runs from cold caches each time.
+        .set("case.parameters.rate_hz=1000.0");
+    let mut hosts = [0, 1].map(|index| trial.start_on(lab.host(index)));
+    let files = HOSTS.map(|host| trial.folder(&format!("-{host}"), START_LIMIT));
+    for host in &mut hosts {
+        host.wait_within(RUN_LIMIT).unwrap().assert_success();
+    }
+    for probe in &mut probes {
+        probe.signal(Signal::SIGINT).unwrap();
+        let finished = probe.wait_within(START_LIMIT).unwrap();
+        finished.assert_success();
+        print!("{}", finished.stdout);
+    }
+    assert_eq!(files[0].summary().run.outcome, Outcome::Completed);
+
+    let arguments = [
+        Path::new("compare"),
+        files[0].root(),
+        &captures[0],
+        &captures[1],
+        Path::new("--limit"),
+        Path::new("100"),
+    ];
+    let (comparison, code) = json(&arguments);
+    println!("{comparison:#}");
+    assert_eq!(comparison["clocks"], "one", "two namespaces of one machine");
+    let channels = comparison["channels"].as_array().unwrap();
+    assert_eq!(
+        channels.len(),
+        2,
+        "both channels of the case cross the wire"
+    );
+    for channel in channels {
+        for counts in ["sent", "received", "data_sent", "data_received"] {
+            let counts = &channel[counts];
+            assert_eq!(counts["gateway"], counts["probe"], "{channel:#}");
+            assert!(counts["probe"].as_u64().unwrap() > 100, "{channel:#}");
+        }
+        let p50_us = |what: &str| channel[what]["p50_ns"].as_f64().unwrap() * 1e-3;
+        println!(
+            "{}: medians {} us by the gateways, {} us by the probe",
+            channel["channel"],
+            p50_us("gateway_wire"),
+            p50_us("probe_wire")
+        );
+        let apart_us = (p50_us("probe_wire") - p50_us("gateway_wire")).abs();
+        assert!(
+            apart_us <= MEDIAN_LIMIT_US,
+            "{apart_us} us apart: {channel:#}"
+        );
+    }
+    assert_eq!(code, Some(0));
+
+    check_analysis(&captures);
+    check_cut(&captures);
+    check_comparisons_with_faults(files[0].root(), &captures);
+}
+
+/// A capture with a fault, and one of another time, beside the run.
+fn check_comparisons_with_faults(run: &Path, captures: &[std::path::PathBuf; 2]) {
+    let bytes = std::fs::read(&captures[0]).unwrap();
+    let cut = captures[0].with_extension("tail.pcapng");
+    std::fs::write(&cut, &bytes[..bytes.len() - 1]).unwrap();
+    // Its section and interface, and no packet.
+    let block = |at: usize| u32::from_le_bytes(bytes[at + 4..at + 8].try_into().unwrap()) as usize;
+    let empty = captures[0].with_extension("empty.pcapng");
+    std::fs::write(&empty, &bytes[..block(0) + block(block(0))]).unwrap();
+    for (file, code, words) in [
+        (&cut, 1, "cut short"),
+        (&empty, 2, "holds no message of the run"),
+    ] {
+        let mut command = Command::new(hil_runtime_binary());
+        command
+            .args(["probe", "compare", "--limit", "100"])
+            .arg(run);
+        command.arg(file).arg(&captures[1]);
+        let mut child = ChildGuard::spawn(&mut command).unwrap();
+        let finished = child.wait_within(RUN_LIMIT).unwrap();
+        assert_eq!(finished.status.code(), Some(code), "{finished:?}");
+        assert!(finished.stderr.contains(words), "{finished:?}");
+    }
+}
+
+fn ip(host: &LabHost, arguments: &str) -> String {
+    let mut command = host.command("ip");
+    command.args(arguments.split(' '));
+    let mut child = ChildGuard::spawn(&mut command).unwrap();
+    let finished = child.wait_within(START_LIMIT).unwrap();
+    finished.assert_success();
+    finished.stdout
+}
+
+#[test]
+fn an_interface_that_goes_ends_the_capture_with_a_whole_file_and_its_own_exit_code() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let folder = RunFolder::new("probe-gone");
+    std::fs::create_dir_all(folder.path()).unwrap();
+    let output = folder.path().join("gone.pcapng");
+    let host = lab.host(0);
+    let start = |name: &str, more: &[&str]| {
+        let mut command = host.command(hil_runtime_binary());
+        command.args(["probe", "--interface", name, "--output"]);
+        command.arg(&output).args(more);
+        ChildGuard::spawn(&mut command).unwrap()
+    };
+    ip(host, "link add gone0 type veth peer name gone1");
+    ip(host, "link set gone0 up");
+    let mut probe = start("gone0", &[]);
+    probe.wait_for_output("probing gone0", START_LIMIT).unwrap();
+    // The card passes frames of other addresses as long as the probe runs.
+    assert!(ip(host, "-d link show gone0").contains("promiscuity 1"));
+    ip(host, "link del gone0");
+    let finished = probe.wait_within(START_LIMIT).unwrap();
+    assert_eq!(finished.status.code(), Some(1), "{finished:?}");
+    assert!(finished.stderr.contains("gone0: "), "{finished:?}");
+    assert!(finished.stderr.contains("it has gone"), "{finished:?}");
+    let (report, code) = json(&[Path::new("analyse"), &output]);
+    assert_eq!(
+        (code, &report["files"][0]["dropped_count"]),
+        (Some(0), &0.into())
+    );
+
+    // The file stays unless told otherwise, and a tap leaves nothing behind.
+    let before = std::fs::read(&output).unwrap();
+    let finished = start(INTERFACE, &[]).wait_within(START_LIMIT).unwrap();
+    assert_eq!(finished.status.code(), Some(2), "{finished:?}");
+    assert!(
+        finished.stderr.contains("exists; say --force"),
+        "{finished:?}"
+    );
+    assert_eq!(std::fs::read(&output).unwrap(), before);
+    let more = ["--force", "--duration", "100ms"];
+    let finished = start(INTERFACE, &more).wait_within(START_LIMIT).unwrap();
+    finished.assert_success();
+    assert_ne!(std::fs::read(&output).unwrap(), before);
+    let link = ip(host, &format!("-d link show {INTERFACE}"));
+    assert!(link.contains("promiscuity 0"), "{link}");
+}
+
+/// What the captures say on their own.
+fn check_analysis(captures: &[std::path::PathBuf; 2]) {
+    let (report, code) = json(&[Path::new("analyse"), &captures[0], &captures[1]]);
+    assert_eq!(code, Some(0), "{:#}", report["files"]);
+    for file in report["files"].as_array().unwrap() {
+        assert_eq!(file["dropped_count"], 0, "{file:#}");
+    }
+    let joins = report["joins"].as_array().unwrap();
+    assert!(
+        joins.len() >= 8,
+        "two channels, each with messages, greetings, exchanges: {joins:#?}"
+    );
+    for joined in joins {
+        // Two files of which nothing is said may be of two machines.
+        assert_eq!(joined["clocks"], "unknown");
+        assert_eq!(joined["delay_bound_ns"], Value::Null);
+        let figures = &joined["figures"];
+        assert_eq!(figures["order"], "packet_direction");
+        for count in [
+            "lost_count",
+            "duplicated_count",
+            "unexplained_count",
+            "edge_count",
+        ] {
+            assert_eq!(figures[count], 0, "{count}: {joined:#}");
+        }
+        assert_eq!(figures["first_count"], figures["second_count"]);
+    }
+    let one_clock = Path::new("--one-clock");
+    let (report, _) = json(&[Path::new("analyse"), &captures[0], &captures[1], one_clock]);
+    assert_eq!(report["joins"][0]["clocks"], "declared_one");
+    assert_eq!(report["joins"][0]["delay_bound_ns"], 0);
+}
+
+/// A capture cut off in the middle keeps what was there and is told apart by exit code and offset.
+fn check_cut(captures: &[std::path::PathBuf; 2]) {
+    let bytes = std::fs::read(&captures[0]).unwrap();
+    let cut = captures[0].with_extension("cut.pcapng");
+    std::fs::write(&cut, &bytes[..=bytes.len() / 2]).unwrap();
+    let (report, code) = json(&[Path::new("analyse"), &cut]);
+    assert_eq!(code, Some(1));
+    let file = &report["files"][0];
+    assert!(file["packet_count"].as_u64().unwrap() > 100, "{file:#}");
+    let fault = file["faults"][0].as_str().unwrap();
+    assert!(
+        fault.contains("byte ") && fault.contains("cut short"),
+        "{fault}"
+    );
+}
+
+#[test]
+fn what_cannot_be_tapped_or_read_is_refused_with_its_own_exit_code() {
+    let folder = RunFolder::new("probe-refusals");
+    std::fs::create_dir_all(folder.path()).unwrap();
+    let foreign = folder.path().join("foreign.pcap");
+    std::fs::write(&foreign, "this is no capture").unwrap();
+    let output = folder.path().join("never.pcapng");
+    let output = output.to_str().unwrap();
+    for (arguments, code, words) in [
+        (
+            vec!["analyse", foreign.to_str().unwrap()],
+            2,
+            "byte 0: not a capture",
+        ),
+        (vec!["analyse", "/nonexistent.pcap"], 2, "/nonexistent.pcap"),
+        (
+            vec!["compare", "/nonexistent", foreign.to_str().unwrap()],
+            2,
+            "/nonexistent",
+        ),
+        (
+            vec!["-i", "hil-none0", "-o", output],
+            69,
+            "no interface `hil-none0`",
+        ),
+        (
+            vec!["-i", "lo", "-o", output, "--stamps", "card"],
+            78,
+            "the card of lo gives no stamps",
+        ),
+        (vec!["-i", "lo"], 2, "--output"),
+        (vec!["-o", output], 2, "--interface"),
+        (
+            vec!["-i", "lo", "-i", "lo", "-o", output],
+            2,
+            "--interface lo is given twice",
+        ),
+        (
+            vec!["-i", "lo", "-o", output, "--flow", "udp"],
+            2,
+            "would follow every datagram",
+        ),
+        (
+            vec!["-i", "lo", "-o", output, "--duration", "soon"],
+            2,
+            "is no unit",
+        ),
+    ] {
+        let mut command = Command::new(hil_runtime_binary());
+        command.arg("probe").args(&arguments);
+        let mut child = ChildGuard::spawn(&mut command).unwrap();
+        let finished = child.wait_within(START_LIMIT).unwrap();
+        assert_eq!(
+            finished.status.code(),
+            Some(code),
+            "{arguments:?}: {finished:?}"
+        );
+        assert!(
+            finished.stderr.contains(words),
+            "{arguments:?}: {}",
+            finished.stderr
+        );
+    }
+}
