@@ -119,6 +119,7 @@ fn split_here(record: &RunFolder) -> Trial {
         .set("hosts.control-pc.address=\"127.0.0.1\"")
         .set("hosts.robot-pc.address=\"127.0.0.2\"")
         .set(&format!("hosts.control-pc.control_port={port}"))
+        .on_own_ports(&["hop"])
 }
 
 fn start_as(trial: &Trial, host: &str) -> ChildGuard {

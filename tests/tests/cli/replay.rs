@@ -30,10 +30,11 @@ fn assert_code(finished: &Finished, code: i32) {
     assert_eq!(finished.status.code(), Some(code), "{finished:?}");
 }
 
-/// A finished run behind an emulated link that loses every tenth message. Only one test may ask for
-/// it: two at once would want the same ports.
+/// A finished run behind an emulated link that loses every tenth message.
 fn finished_run(record: &RunFolder) -> RunFiles {
-    let trial = Trial::shipped("emulated.toml", record.path()).set("run.duration=\"5 s\"");
+    let trial = Trial::shipped("emulated.toml", record.path())
+        .on_own_ports(&["hop"])
+        .set("run.duration=\"5 s\"");
     let mut child = trial.start_here();
     child.wait_within(LIMIT).unwrap().assert_success();
     trial.folder("", LIMIT)

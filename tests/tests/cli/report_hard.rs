@@ -48,9 +48,8 @@ fn page(folder: &Path, output: &Path) -> String {
     text.replace('\u{a0}', " ")
 }
 
-fn live(record: &RunFolder, (name, port, keys): (&str, u16, &str)) -> RunFiles {
-    let keys = format!("port = {port}\n{keys}");
-    let file = record.write("live.toml", &emulated_shuttle(name, &keys));
+fn live(record: &RunFolder, name: &str, keys: &str) -> RunFiles {
+    let file = record.write("live.toml", &emulated_shuttle(name, keys));
     let trial = Trial::of(&file, &record.join("runs")).set("run.duration=\"3 s\"");
     let mut child = trial.start_here();
     child.wait_within(LIMIT).unwrap().assert_success();
@@ -62,7 +61,7 @@ fn live(record: &RunFolder, (name, port, keys): (&str, u16, &str)) -> RunFiles {
 #[test]
 fn a_run_in_which_nothing_arrives_says_so_and_makes_up_no_delay() {
     let record = RunFolder::new("report-nothing");
-    let files = live(&record, ("nothing", 7871, "loss_ratio = 1.0"));
+    let files = live(&record, "nothing", "loss_ratio = 1.0");
     let summary = files.summary();
     for name in CHANNELS {
         let account = account(&summary, name);
@@ -84,7 +83,7 @@ fn a_run_in_which_nothing_arrives_says_so_and_makes_up_no_delay() {
 fn a_run_without_stamps_has_its_delays_and_names_what_it_lacks() {
     let record = RunFolder::new("report-unstamped");
     let keys = "delay = \"2 ms\"\ntimestamps = \"off\"";
-    let files = live(&record, ("unstamped", 7881, keys));
+    let files = live(&record, "unstamped", keys);
     let summary = files.summary();
     for name in CHANNELS {
         let account = account(&summary, name);

@@ -68,7 +68,7 @@ fn channels_of_a_running_run_are_listed_counted_shown_and_timed() {
     let record = RunFolder::new("terminal-channel");
     let trial = Trial::shipped("emulated.toml", record.path())
         .set("run.duration=\"10 min\"")
-        .set("links.hop.port=7480");
+        .on_own_ports(&["hop"]);
     let going = running(&trial);
     let run_folder = folder_of(&going.1);
     let run_folder = run_folder.as_str();
@@ -218,7 +218,7 @@ fn top_shows_processes_channels_links_and_clocks_of_a_running_run() {
     let record = RunFolder::new("terminal-top");
     let trial = Trial::shipped("emulated.toml", record.path())
         .set("run.duration=\"10 min\"")
-        .set("links.hop.port=7500");
+        .on_own_ports(&["hop"]);
     let going = running(&trial);
     let run_folder = folder_of(&going.1);
     let top = |more: &[&str]| run(&[&["top", &run_folder][..], more].concat());

@@ -98,9 +98,7 @@ fn cable_address_and_packet_size_change_under_a_run_and_it_goes_on() {
         return;
     };
     let record = RunFolder::new("disturbed");
-    let trial = Trial::shipped("shuttle-split.toml", record.path())
-        .set("links.hop.port=48770")
-        .set("run.duration=\"10 min\"");
+    let trial = Trial::shipped("shuttle-split.toml", record.path()).set("run.duration=\"10 min\"");
     let (mut hosts, files) = start(&lab, &trial);
     let robot = lab.host(1);
 
@@ -148,7 +146,6 @@ fn a_gateway_that_comes_back_while_the_path_is_away_waits_for_it() {
     };
     let record = RunFolder::new("path-away");
     let trial = Trial::shipped("shuttle-split.toml", record.path())
-        .set("links.hop.port=48790")
         .set("run.duration=\"10 min\"")
         // The supervisors' connection leads over the same cable.
         .set("run.peer_timeout=\"60 s\"");
@@ -186,7 +183,6 @@ fn a_host_that_never_comes_and_one_that_goes_for_good_are_named() {
     };
     let record = RunFolder::new("gone");
     let trial = Trial::shipped("shuttle-split.toml", record.path())
-        .set("links.hop.port=48780")
         .set("run.duration=\"10 min\"")
         .set("run.peer_timeout=\"2 s\"");
 
@@ -227,7 +223,6 @@ fn a_disk_that_does_not_answer_makes_no_host_silent() {
     };
     let record = RunFolder::new("slow-disk");
     let trial = Trial::shipped("shuttle-split.toml", record.path())
-        .set("links.hop.port=48790")
         .set("run.duration=\"10 min\"")
         .set("run.peer_timeout=\"4 s\"");
     let (mut hosts, files) = start(&lab, &trial);

@@ -3,7 +3,6 @@
 
 use std::fs;
 use std::process::Command;
-use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::Duration;
 
@@ -28,13 +27,6 @@ const RECOVERY_AIM_NS: i64 = 1_000_000_000;
 const RECOVERY_MAX_NS: i64 = 3_000_000_000;
 /// Records of 32 bytes: half a second of commands.
 const FLOWING_BYTES: u64 = 60 * 32;
-
-/// A recovery is a time: the runs of this file would disturb each other.
-static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
-
-fn alone() -> MutexGuard<'static, ()> {
-    ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner)
-}
 
 /// A split run that has begun.
 struct Split {
@@ -115,7 +107,6 @@ fn interruption<'a>(
 
 #[test]
 fn killed_gateways_and_components_come_back_and_their_loss_is_put_down_to_them() {
-    let _alone = alone();
     let Some(lab) = Lab::two_hosts_or_skip() else {
         return;
     };
@@ -191,7 +182,6 @@ fn check_recovery(summary: &RunSummary, process: &str) {
 
 #[test]
 fn a_sender_that_learns_late_of_a_killed_receiver_blames_no_wire() {
-    let _alone = alone();
     let Some(lab) = Lab::two_hosts_or_skip() else {
         return;
     };
@@ -226,7 +216,6 @@ fn a_sender_that_learns_late_of_a_killed_receiver_blames_no_wire() {
 
 #[test]
 fn a_receiver_that_stood_still_is_no_network_result() {
-    let _alone = alone();
     let Some(lab) = Lab::two_hosts_or_skip() else {
         return;
     };
@@ -276,7 +265,6 @@ fn a_receiver_that_stood_still_is_no_network_result() {
 
 #[test]
 fn a_killed_robot_ends_the_run_on_both_hosts_with_a_complete_report() {
-    let _alone = alone();
     let Some(lab) = Lab::two_hosts_or_skip() else {
         return;
     };
@@ -314,7 +302,6 @@ fn a_killed_robot_ends_the_run_on_both_hosts_with_a_complete_report() {
 
 #[test]
 fn a_killed_supervisor_takes_its_processes_along_and_the_other_host_says_who_vanished() {
-    let _alone = alone();
     let Some(lab) = Lab::two_hosts_or_skip() else {
         return;
     };
@@ -379,7 +366,6 @@ fn kill_supervisor(lab: Lab, victim: usize) -> Lab {
 
 #[test]
 fn an_interrupted_host_ends_the_run_on_both_with_complete_reports() {
-    let _alone = alone();
     let Some(lab) = Lab::two_hosts_or_skip() else {
         return;
     };
@@ -405,7 +391,6 @@ fn an_interrupted_host_ends_the_run_on_both_with_complete_reports() {
 
 #[test]
 fn a_process_that_dies_too_often_ends_the_run() {
-    let _alone = alone();
     let record = RunFolder::new("too-often");
     let trial = Trial::shipped("shuttle-local.toml", record.path())
         .set("run.duration=\"10 min\"")

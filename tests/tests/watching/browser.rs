@@ -200,9 +200,7 @@ fn the_live_page_shows_a_fleet_and_changes_its_links() {
     let trial = Trial::shipped("fleet-emulated.toml", folder.path())
         .set("name=\"shown-fleet\"")
         .set("case.parameters.fleets=2")
-        .set("run.duration=\"10 min\"")
-        .set("links.commands.port=48700")
-        .set("links.states.port=48710");
+        .set("run.duration=\"10 min\"");
     let mut shown = Shown::start(&trial, folder, host);
     let root = trial.folder("", LIMIT).root().to_owned();
     let mut page = browser.page(DESKTOP.0, DESKTOP.1);
@@ -424,15 +422,14 @@ fn reports_of_fleet_and_arms_open_without_a_complaint() {
     let trial = Trial::shipped("fleet-emulated.toml", fleet.path())
         .set("case.parameters.fleets=1")
         .set("run.duration=\"6 s\"")
-        .set("links.commands.port=48720")
-        .set("links.states.port=48730");
+        .on_own_ports(&["commands", "states"]);
     let page = fleet.join("report.html");
     made_report(&trial, &page);
     look_at_report(&mut browser, &page, "report-fleet");
     let arms = RunFolder::new("browser-report-arms");
     let trial = Trial::shipped("emulated.toml", arms.path())
         .set("run.duration=\"6 s\"")
-        .set("links.hop.port=48740");
+        .on_own_ports(&["hop"]);
     let page = arms.join("report.html");
     made_report(&trial, &page);
     look_at_report(&mut browser, &page, "report-arms");

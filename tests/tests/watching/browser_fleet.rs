@@ -295,9 +295,7 @@ fn stale_robots_are_grey_collisions_marked_and_sections_of_the_passers_colour() 
         .set("case.parameters.robot.tracker=\"legacy-rk4\"")
         .set("case.parameters.robot.step_inflation=true")
         .set("case.parameters.robot.inflation_delay_ms=3000.0")
-        .set("run.duration=\"10 min\"")
-        .set("links.commands.port=48750")
-        .set("links.states.port=48760");
+        .set("run.duration=\"10 min\"");
     let shown = Shown::start(&trial, folder, host);
     let mut page = browser.page(DESKTOP.0, DESKTOP.1);
     page.go(&shown.address);

@@ -231,8 +231,7 @@ fn a_fleet_is_seen_driving_and_its_link_is_changed() {
     let trial = Trial::shipped("fleet-emulated.toml", folder.path())
         .set("run.duration=\"45 s\"")
         .set("case.parameters.fleets=1")
-        .set("links.commands.port=7860")
-        .set("links.states.port=7870");
+        .on_own_ports(&["commands", "states"]);
     let mut child = trial.start_here();
     let name = name_of(&trial);
     let record = folder.path().join("live.mcap");

@@ -104,7 +104,7 @@ fn a_run_becomes_a_file_that_others_read() {
     let folder = RunFolder::new("mcap");
     let trial = Trial::shipped("emulated.toml", folder.path())
         .set("run.duration=\"3 s\"")
-        .set("links.hop.port=48611");
+        .on_own_ports(&["hop"]);
     let run = run(&trial);
     let file = folder.join("run.mcap");
     assert_code(&convert(run.root(), &file), 0);
@@ -260,8 +260,7 @@ fn a_fleets_file_has_a_scene_whose_robots_move() {
     let trial = Trial::shipped("fleet-emulated.toml", folder.path())
         .set("run.duration=\"8 s\"")
         .set("case.parameters.fleets=2")
-        .set("links.commands.port=48631")
-        .set("links.states.port=48641");
+        .on_own_ports(&["commands", "states"]);
     let run = run(&trial);
     let (file, bare) = (folder.join("run.mcap"), folder.join("bare.mcap"));
     assert_code(&convert(run.root(), &file), 0);

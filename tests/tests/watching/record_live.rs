@@ -133,7 +133,7 @@ fn a_live_file_holds_what_convert_makes_of_the_folder_whole_or_split() {
         .set(&format!("name=\"{name}\""))
         .set("run.duration=\"4 s\"")
         .set("links.hop.reordering={ ratio = 0.2, hold = \"40 ms\" }")
-        .set("links.hop.port=48721");
+        .on_own_ports(&["hop"]);
     let output = RunFolder::new("live-files");
     let (whole, parts) = (output.join("live.mcap"), output.join("part.mcap"));
     let mut recorders = [

@@ -258,7 +258,7 @@ fn two_supervisors_with_one_domain_folder_keep_their_memory_apart() {
         .set("hosts.control-pc.address=\"127.0.0.1\"")
         .set("hosts.robot-pc.address=\"127.0.0.2\"")
         .set(&format!("hosts.control-pc.control_port={control_port}"))
-        .set("links.hop.port=7460");
+        .on_own_ports(&["hop"]);
     let mut hosts = ["control-pc", "robot-pc"].map(|host| {
         let mut command = trial.command_here();
         command.arg("--host").arg(host);

@@ -28,7 +28,9 @@ const CONFIDENCE: f64 = 0.999;
 #[test]
 fn an_emulated_link_loses_and_delays_what_it_was_told_to() {
     let record = RunFolder::new("emulated");
-    let trial = Trial::shipped("emulated.toml", record.path()).set("run.duration=\"6 s\"");
+    let trial = Trial::shipped("emulated.toml", record.path())
+        .on_own_ports(&["hop"])
+        .set("run.duration=\"6 s\"");
     let mut child = trial.start_here();
     child.wait_within(LIMIT).unwrap().assert_success();
     let files = trial.folder("", LIMIT);

@@ -48,8 +48,8 @@ fn done(arguments: &[&str], run: &Path) -> String {
 }
 
 /// Starts a run over an emulated link of 5 ms and waits until messages pass.
-fn started(record: &RunFolder, (name, port): (&str, u16), more: &str) -> (Trial, ChildGuard) {
-    let keys = format!("port = {port}\ndelay = \"5 ms\"\n{more}");
+fn started(record: &RunFolder, name: &str, more: &str) -> (Trial, ChildGuard) {
+    let keys = format!("delay = \"5 ms\"\n{more}");
     let topology = record.write("live.toml", &emulated_shuttle(name, &keys));
     let trial = Trial::of(&topology, &record.join("runs"));
     let child = trial.start_here();
@@ -88,7 +88,7 @@ fn a_change_holds_for_messages_received_from_then_on_and_the_report_names_it() {
     let record = RunFolder::new("live-link");
     // It may have to be built first, and the run would not wait.
     let recorder_binary = hil_recorder_binary();
-    let (trial, mut child) = started(&record, ("live-link", 7811), "");
+    let (trial, mut child) = started(&record, "live-link", "");
     let files = trial.folder("", LIMIT);
     wait_for_messages(&files);
     let live = record.join("live.mcap");
@@ -300,7 +300,7 @@ fn check_report(files: &RunFiles) {
 fn whoever_gives_orders_may_die_and_a_restarted_gateway_keeps_the_condition() {
     let record = RunFolder::new("live-link-kill");
     let gateway = "[links.hop.gateway]\non_exit = \"restart\"";
-    let (trial, mut child) = started(&record, ("live-link-kill", 7821), gateway);
+    let (trial, mut child) = started(&record, "live-link-kill", gateway);
     let files = trial.folder("", LIMIT);
     wait_for_messages(&files);
     for step in 0..12 {

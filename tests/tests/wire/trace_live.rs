@@ -57,8 +57,8 @@ fn written(folder: &Path, channel: &str, misses: bool) -> Trace {
 }
 
 /// A live run over the traces in `traces`, matched by `matching`.
-fn live(record: &RunFolder, matching: &str, port: u16) -> RunFiles {
-    let link = format!("port = {port}\ntrace = {{ folder = \"traces\", match = \"{matching}\" }}");
+fn live(record: &RunFolder, matching: &str) -> RunFiles {
+    let link = format!("trace = {{ folder = \"traces\", match = \"{matching}\" }}");
     let topology = record.write("live.toml", &emulated_shuttle("live", &link));
     let trial =
         Trial::of(&topology, &record.join("runs")).set(&format!("run.duration=\"{RUN_S} s\""));
@@ -93,7 +93,7 @@ fn live_the_nth_message_meets_the_nth_record_and_the_report_counts_it() {
     let record = RunFolder::new("trace-live-index");
     fs::create_dir(record.join("traces")).unwrap();
     let traces = CHANNELS.map(|name| written(&record.join("traces"), name, false));
-    let files = live(&record, "index", 7731);
+    let files = live(&record, "index");
     for (name, trace) in CHANNELS.into_iter().zip(traces) {
         let counts = counts(&files, name);
         assert_eq!(counts.matching, TraceMatch::Index);
@@ -230,7 +230,7 @@ fn live_by_tick_nobody_hears_at_a_tick_that_has_no_record() {
     let record = RunFolder::new("trace-live-tick");
     fs::create_dir(record.join("traces")).unwrap();
     let traces = CHANNELS.map(|name| written(&record.join("traces"), name, true));
-    let files = live(&record, "tick", 7741);
+    let files = live(&record, "tick");
     for (name, trace) in CHANNELS.into_iter().zip(traces) {
         let counts = counts(&files, name);
         assert_eq!(counts.matching, TraceMatch::Tick);

@@ -255,8 +255,7 @@ fn a_live_teleoperation_run_and_its_replay_agree() {
     let trial = Trial::shipped("outages.toml", record.path())
         .set(&format!("run.duration=\"{duration} s\""))
         .set("run.seed=11")
-        // The other test of this file runs beside this one.
-        .set("links.hop.port=7701")
+        .on_own_ports(&["hop"])
         .set("links.hop.outages.mean=\"400 ms\"")
         .set("links.hop.outages.per_hour=900");
     let limit = Duration::from_secs(60 + 2 * duration);
