@@ -26,7 +26,7 @@ const RUN_LIMIT: Duration = Duration::from_mins(6);
 
 /// Lengthens the runs.
 const SECONDS_VARIABLE: &str = "HIL_FLEET_SECONDS";
-const SECONDS_IN_GATE: u64 = 18;
+const SECONDS_IN_GATE: u64 = 12;
 
 /// The three checkers of the referee.
 const COLLISIONS: [&str; 3] = [
@@ -193,7 +193,9 @@ fn assert_losses_are_explained(summary: &RunSummary) {
 #[test]
 fn an_interrupted_fleet_leaves_its_report() {
     let record = RunFolder::new("fleet-stop");
-    let trial = Trial::shipped("fleet-emulated.toml", record.path()).set("run.duration=\"10 min\"");
+    let trial = Trial::shipped("fleet-emulated.toml", record.path())
+        .on_own_ports(&["commands", "states"])
+        .set("run.duration=\"10 min\"");
     let mut child = trial.start_here();
     let files = trial.folder("", START_LIMIT);
     wait_until(START_LIMIT, "a few hundred states", || {

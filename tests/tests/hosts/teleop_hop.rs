@@ -1,7 +1,6 @@
 //! The teleoperated arms over a real hop between two hosts: nothing is lost on Ethernet, and over a
 //! link with outages each lost loop stands beside the outage that made it.
 
-use std::env;
 use std::time::Duration;
 
 use hil_models::link::outages::{Outage, OutageSchedule, Outages};
@@ -24,21 +23,15 @@ const OUTAGES: Outages = Outages {
     buffered: false,
 };
 
-/// How long each run lasts; a minute shows more than the gate has time for.
-fn seconds() -> u32 {
-    let asked = env::var("HIL_TELEOP_SECONDS").ok();
-    asked.and_then(|text| text.parse().ok()).unwrap_or(20)
-}
-
-/// Runs the shipped split topology on two hosts with `settings`; gives both hosts' files.
-fn split(record: &RunFolder, settings: &[String]) -> Option<[RunFiles; 2]> {
+/// Runs the shipped split topology on two hosts for `seconds` with `settings`; gives both hosts' files.
+fn split(record: &RunFolder, seconds: u32, settings: &[String]) -> Option<[RunFiles; 2]> {
     let lab = Lab::two_hosts_or_skip()?;
-    let duration = format!("run.duration=\"{} s\"", seconds());
+    let duration = format!("run.duration=\"{seconds} s\"");
     let trial = Trial::shipped("split.toml", record.path()).set(&duration);
     let trial = settings.iter().fold(trial, |trial, one| trial.set(one));
     let mut hosts = [0, 1].map(|index| trial.start_on(lab.host(index)));
     let files = HOSTS.map(|host| trial.folder(&format!("-{host}"), LIMIT));
-    let limit = LIMIT * 2 + Duration::from_secs(u64::from(seconds()));
+    let limit = LIMIT * 2 + Duration::from_secs(u64::from(seconds));
     for host in &mut hosts {
         host.wait_within(limit).unwrap().assert_success();
     }
@@ -58,8 +51,19 @@ fn figure(summary: &RunSummary, name: &str) -> f64 {
 
 #[test]
 fn over_ethernet_no_loop_is_lost_and_no_session_trips() {
+    lose_nothing(10, 1.0);
+}
+
+#[test]
+#[ignore = "takes a minute"]
+fn over_ethernet_no_loop_is_lost_at_full_length() {
+    lose_nothing(60, 9.0);
+}
+
+/// A run of `seconds` over Ethernet in which `loops_min` loops of the motion and more are sent.
+fn lose_nothing(seconds: u32, loops_min: f64) {
     let record = RunFolder::new("teleop-ethernet");
-    let Some(files) = split(&record, &[]) else {
+    let Some(files) = split(&record, seconds, &[]) else {
         return;
     };
     for files in &files {
@@ -68,7 +72,7 @@ fn over_ethernet_no_loop_is_lost_and_no_session_trips() {
         assert_every_message_is_accounted_for(&summary);
         assert_accounts_close(&summary);
         println!("{}", describe(COMMAND, account(&summary, COMMAND)));
-        assert!(figure(&summary, "motion_loops_sent_count") >= 3.0);
+        assert!(figure(&summary, "motion_loops_sent_count") >= loops_min);
         assert!(figure(&summary, "motion_loss_ratio").abs() < 1e-12);
         assert!(figure(&summary, "egm_trip_count").abs() < 1e-12);
     }
@@ -94,14 +98,15 @@ fn fitting_seed(run_s: f64) -> (u64, Outage) {
 #[test]
 fn a_lost_loop_stands_beside_the_outage_that_made_it() {
     let record = RunFolder::new("teleop-outages");
-    let (seed, outage) = fitting_seed(f64::from(seconds()));
+    let seconds = 16;
+    let (seed, outage) = fitting_seed(f64::from(seconds));
     let settings = [
         format!("run.seed={seed}"),
         "links.hop.via=\"emulated\"".to_owned(),
         format!("links.hop.outages.mean=\"{} s\"", OUTAGES.mean_s),
         format!("links.hop.outages.per_hour={}", OUTAGES.per_hour),
     ];
-    let Some(files) = split(&record, &settings) else {
+    let Some(files) = split(&record, seconds, &settings) else {
         return;
     };
     let length_s = outage.end.seconds_since(outage.begin);

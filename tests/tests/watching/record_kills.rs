@@ -165,13 +165,24 @@ fn lost_of(
 }
 
 #[test]
-fn ten_killed_recorders_lose_what_was_not_flushed_and_the_run_nothing() {
+fn killed_recorders_lose_what_was_not_flushed_and_the_run_nothing() {
+    kill_recorders(2, 16);
+}
+
+#[test]
+#[ignore = "takes most of a minute"]
+fn ten_killed_recorders_at_full_length() {
+    kill_recorders(5, 30);
+}
+
+/// Kills `count` recorders and as many beside them, one after the other, in a run of `seconds`.
+fn kill_recorders(count: usize, seconds: u32) {
     let folder = RunFolder::new("live-kills");
     let output = RunFolder::new("live-killed");
     let name = format!("kills-{}", std::process::id());
     let trial = Trial::shipped("local.toml", folder.path())
         .set(&format!("name=\"{name}\""))
-        .set("run.duration=\"30 s\"");
+        .set(&format!("run.duration=\"{seconds} s\""));
     let mut child = trial.start_here();
     let files = trial.folder("", LIMIT);
     wait_until(LIMIT, "the first records", || {
@@ -188,7 +199,7 @@ fn ten_killed_recorders_lose_what_was_not_flushed_and_the_run_nothing() {
                     let after = Duration::from_millis(500 + random.next_u64() % 1000);
                     record_and_kill(name, &output.join(format!("{series}-{index}.mcap")), after)
                 };
-                (0..5).map(one).collect::<Vec<Killed>>()
+                (0..count).map(one).collect::<Vec<Killed>>()
             })
         });
         let series = series.into_iter();
