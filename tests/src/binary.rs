@@ -12,10 +12,11 @@ use serde_json::Value;
 pub const BINARY_VARIABLE: &str = "HIL_RUNTIME_BINARY";
 /// The same of the recorder.
 pub const RECORDER_VARIABLE: &str = "HIL_RECORDER_BINARY";
+/// The folder of the target folder in which both have been built for this run of the tests.
+const BUILT_VARIABLE: &str = "HIL_PROGRAMS_BUILT";
 
-/// The `hil-runtime` binary: the one named by `HIL_RUNTIME_BINARY`, else freshly built by cargo.
-///
-/// Cargo is asked once per process and finds the work done by `cargo test --workspace` already.
+/// The `hil-runtime` binary: the one named by `HIL_RUNTIME_BINARY`, else the one that was built for this run of
+/// the tests, else freshly built by cargo, which is asked once per process.
 ///
 /// # Panics
 /// When the named file does not exist, or the build fails; with cargo's words.
@@ -42,8 +43,19 @@ fn locate(package: &str, variable: &str, named: Option<OsString>) -> Result<Path
     match named {
         Some(path) if Path::new(&path).is_file() => Ok(PathBuf::from(path)),
         Some(path) => Err(format!("{variable} names {}, no file", path.display())),
-        None => build(package),
+        None => match built_already(package) {
+            Some(path) => Ok(path),
+            None => build(package),
+        },
     }
+}
+
+/// Tests lie in `<target>/<profile>/deps`, programs a folder above.
+fn built_already(package: &str) -> Option<PathBuf> {
+    let test = env::current_exe().ok()?;
+    let folder = test.ancestors().nth(2)?;
+    let is_built = env::var_os(BUILT_VARIABLE)?.as_os_str() == folder.file_name()?;
+    is_built.then(|| folder.join(package))
 }
 
 /// The folder with the workspace's `Cargo.toml`.

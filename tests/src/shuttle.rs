@@ -9,6 +9,7 @@ use hil_models::measure::record::{IngressRecord, UNAVAILABLE};
 use hil_models::trace::{Trace, wire};
 use hil_runtime::rundir::record::RecordFile;
 
+use crate::ports::own_ports;
 use crate::trial::RunFiles;
 
 /// The channels that cross the link.
@@ -19,8 +20,9 @@ pub const PERIOD_NS: i64 = 10_000_000;
 pub const SEED: u64 = 4;
 
 /// A topology called `name` of both channels over the emulated link `hop`, which `link` describes:
-/// keys of `[links.hop]` and tables below it. It runs for 12 s.
+/// keys of `[links.hop]` and tables below it. It runs for 12 s, on ports that no other test has.
 pub fn emulated_shuttle(name: &str, link: &str) -> String {
+    let port = own_ports();
     format!(
         r#"
 version = 1
@@ -35,6 +37,7 @@ channels."shuttle/status".link = "hop"
 [links.hop]
 via = "emulated"
 between = ["control-pc", "robot-pc"]
+port = {port}
 {link}
 "#
     )

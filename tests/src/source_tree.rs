@@ -1,5 +1,5 @@
-//! Rust source as text for the tidy tests: which part of a file is code, which is comment, and how
-//! long its functions are. It is a scanner and no parser: macros are taken as they stand.
+//! Rust source as text for the tidy tests: which part of a file is code and which is comment or literal.
+//! It is a scanner and no parser: macros are taken as they stand.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -11,77 +11,17 @@ use crate::binary::workspace_folder;
 pub struct SourceFile {
     /// The path below the workspace folder, with `/` between its parts.
     pub path: String,
-    /// The whole text.
-    pub text: String,
     /// The text with comments and the contents of literals blanked out.
     pub code: String,
-    /// The text with everything but comments blanked out.
-    pub comments: String,
-}
-
-/// A function with the lines of its body that are neither blank nor comment.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct FunctionLength {
-    /// The function's name.
-    pub name: String,
-    /// Line of the `fn`, from 1.
-    pub line: usize,
-    /// Lines of code in the body, braces not counted.
-    pub line_count: usize,
 }
 
 impl SourceFile {
     /// A file of this text.
     pub fn new(path: &str, text: &str) -> Self {
-        let classes = classify(text);
-        let keep = |wanted: Class| blank_except(text, &classes, wanted);
         Self {
             path: path.to_owned(),
-            text: text.to_owned(),
-            code: keep(Class::Code),
-            comments: keep(Class::Comment),
+            code: code_of(text),
         }
-    }
-
-    /// Whether the file lies in `folder`, or is it.
-    pub fn is_under(&self, folder: &str) -> bool {
-        Path::new(&self.path).starts_with(folder)
-    }
-
-    /// Lines of the code, from 1, in which `word` occurs with no letter, digit or `_` beside it.
-    pub fn lines_with_word(&self, word: &str) -> Vec<usize> {
-        lines_with_word(&self.code, word)
-    }
-
-    /// The functions with a body.
-    pub fn functions(&self) -> Vec<FunctionLength> {
-        let code = self.code.as_str();
-        let mut functions = Vec::new();
-        let mut offset = 0;
-        while let Some(found) = find_word(&code[offset..], "fn") {
-            let start = offset + found;
-            offset = start + 2;
-            let name: String = code[offset..]
-                .trim_start()
-                .chars()
-                .take_while(|c| is_word(*c))
-                .collect();
-            let Some(open) = body_start(&code[offset..]).map(|open| offset + open) else {
-                continue;
-            };
-            // `fn(u32) -> u32` is a type and has neither name nor body of its own.
-            if name.is_empty() {
-                continue;
-            }
-            let end = open + matching_brace(&code[open..]);
-            let body = &code[open + 1..end];
-            functions.push(FunctionLength {
-                name,
-                line: code[..start].matches('\n').count() + 1,
-                line_count: body.lines().filter(|line| !line.trim().is_empty()).count(),
-            });
-        }
-        functions
     }
 }
 
@@ -145,81 +85,40 @@ fn find_word(text: &str, word: &str) -> Option<usize> {
         })
 }
 
-/// Where the body after a signature opens; `None` for a declaration that ends in `;`.
-fn body_start(signature: &str) -> Option<usize> {
-    let mut depth = 0_i32;
-    for (index, character) in signature.char_indices() {
-        match character {
-            '(' | '[' => depth += 1,
-            ')' | ']' => depth -= 1,
-            '{' if depth == 0 => return Some(index),
-            ';' | ',' | '}' | '=' if depth <= 0 && ends_signature(character, depth) => return None,
-            _ => {}
-        }
-    }
-    None
-}
-
-/// A `;` ends a declaration; a closing bracket too many ends the type the `fn` was part of.
-fn ends_signature(character: char, depth: i32) -> bool {
-    character == ';' || depth < 0
-}
-
-/// The offset of the brace that closes the one at the start of `code`.
-fn matching_brace(code: &str) -> usize {
-    let mut depth = 0_i32;
-    for (index, character) in code.char_indices() {
-        match character {
-            '{' => depth += 1,
-            '}' => depth -= 1,
-            _ => {}
-        }
-        if depth == 0 {
-            return index;
-        }
-    }
-    code.len()
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Class {
-    Code,
-    Comment,
-    Literal,
-}
-
-/// The class of every byte of `text`.
-fn classify(text: &str) -> Vec<Class> {
+/// `text` with its comments and literals blanked out, line by line as before.
+fn code_of(text: &str) -> String {
     let bytes = text.as_bytes();
-    let mut classes = vec![Class::Code; bytes.len()];
+    let mut is_code = vec![true; bytes.len()];
     let mut index = 0;
     while index < bytes.len() {
-        let (class, length) = token_at(bytes, index);
-        classes[index..index + length].fill(class);
-        index += length;
+        let blank = blank_length(bytes, index);
+        is_code[index..index + blank].fill(false);
+        index += blank.max(1);
     }
-    classes
+    let keep = |(index, character): (usize, char)| {
+        let is_kept = character == '\n' || is_code[index];
+        if is_kept { character } else { ' ' }
+    };
+    text.char_indices().map(keep).collect()
 }
 
-/// The class and length of the comment, literal or single byte at `index`.
-fn token_at(bytes: &[u8], index: usize) -> (Class, usize) {
+/// The length of the comment or literal that begins at `index`; 0 for code.
+fn blank_length(bytes: &[u8], index: usize) -> usize {
     let rest = &bytes[index..];
     let is_inside_word = index > 0 && is_word(char::from(bytes[index - 1]));
     match rest {
-        [b'/', b'/', ..] => (Class::Comment, length_until(rest, b"\n")),
-        [b'/', b'*', ..] => (Class::Comment, block_comment_length(rest)),
-        [b'"', ..] => (Class::Literal, quoted_length(rest, b'"')),
-        [b'r', b'"' | b'#', ..] if !is_inside_word => raw_string(rest),
-        [b'b', b'r', b'"' | b'#', ..] if !is_inside_word => {
-            let (class, length) = raw_string(&rest[1..]);
-            (class, length + 1)
-        }
+        [b'/', b'/', ..] => length_until(rest, b"\n"),
+        [b'/', b'*', ..] => block_comment_length(rest),
+        [b'"', ..] => quoted_length(rest, b'"'),
+        [b'r', b'"' | b'#', ..] if !is_inside_word => raw_string_length(rest),
+        [b'b', b'r', b'"' | b'#', ..] if !is_inside_word => match raw_string_length(&rest[1..]) {
+            0 => 0,
+            length => length + 1,
+        },
         // A quote opens a character when one closes right behind it, otherwise a lifetime.
-        [b'\'', b'\\', ..] => (Class::Literal, quoted_length(rest, b'\'')),
-        [b'\'', ..] if character_length(rest).is_some() => {
-            (Class::Literal, character_length(rest).unwrap_or(1))
-        }
-        _ => (Class::Code, 1),
+        [b'\'', b'\\', ..] => quoted_length(rest, b'\''),
+        [b'\'', ..] => character_length(rest).unwrap_or(0),
+        _ => 0,
     }
 }
 
@@ -257,17 +156,17 @@ fn quoted_length(rest: &[u8], quote: u8) -> usize {
     rest.len()
 }
 
-fn raw_string(rest: &[u8]) -> (Class, usize) {
+/// 0 for a raw identifier, `r#name`.
+fn raw_string_length(rest: &[u8]) -> usize {
     let hashes = rest[1..].iter().take_while(|byte| **byte == b'#').count();
     if rest.get(1 + hashes) != Some(&b'"') {
-        // `r#name` is a raw identifier.
-        return (Class::Code, 1);
+        return 0;
     }
     let mut end = vec![b'"'];
     end.resize(1 + hashes, b'#');
     let opening = hashes + 2;
     let length = opening + length_until(&rest[opening..], &end) + end.len();
-    (Class::Literal, length.min(rest.len()))
+    length.min(rest.len())
 }
 
 /// Length of `'x'`, with `x` of one to four bytes.
@@ -279,17 +178,6 @@ fn character_length(rest: &[u8]) -> Option<usize> {
         _ => 4,
     };
     (rest.get(1 + width) == Some(&b'\'')).then_some(width + 2)
-}
-
-fn blank_except(text: &str, classes: &[Class], wanted: Class) -> String {
-    let keep = |(index, character): (usize, char)| {
-        if character == '\n' || classes[index] == wanted {
-            character
-        } else {
-            ' '
-        }
-    };
-    text.char_indices().map(keep).collect()
 }
 
 #[cfg(test)]
@@ -321,46 +209,19 @@ mod tests {
     }
 
     #[test]
-    fn comments_keep_their_lines() {
-        let file = SourceFile::new("x.rs", "let a = \"no\"; // yes\n/* and\nthis */ b");
-        assert_eq!(lines_with_word(&file.comments, "yes"), [1]);
-        assert_eq!(lines_with_word(&file.comments, "this"), [3]);
-        assert!(lines_with_word(&file.comments, "no").is_empty());
-    }
-
-    #[test]
     fn words_are_found_whole() {
-        let file = SourceFile::new("x.rs", "unsafe_code\nunsafe {}\nstd::io::Write\nstd::io2");
-        assert_eq!(file.lines_with_word("unsafe"), [2]);
-        assert_eq!(file.lines_with_word("std::io::"), [3]);
-        assert_eq!(file.lines_with_word("std::io"), [3]);
-    }
-
-    #[test]
-    fn function_lengths_leave_out_blanks_and_comments() {
-        let text = "impl A {\n    fn long<T: Fn(u8) -> [u8; 4]>(&self) -> [u8; 4]\n    where T: B {\n\
-                    \n        // why\n        if x { y() }\n        \"}\";\n    }\n    fn none(&self);\n\
-                    fn one() { 1 } }\nlet f: fn(u8) -> u8 = g;\n";
-        let functions = SourceFile::new("x.rs", text).functions();
-        let found: Vec<(&str, usize, usize)> = functions
-            .iter()
-            .map(|f| (f.name.as_str(), f.line, f.line_count))
-            .collect();
-        assert_eq!(found, [("long", 2, 2), ("one", 10, 1)]);
+        let text = code("unsafe_code\nunsafe {}\n// unsafe\nstd::io::Write\nstd::io2");
+        assert_eq!(lines_with_word(&text, "unsafe"), [2]);
+        assert_eq!(lines_with_word(&text, "std::io::"), [4]);
+        assert_eq!(lines_with_word(&text, "std::io"), [4]);
     }
 
     #[test]
     fn this_workspace_is_found_whole() {
         let files = workspace_sources();
-        for path in [
-            "models/src/time.rs",
-            "runtime/src/main.rs",
-            "tests/src/source_tree.rs",
-        ] {
-            assert!(
-                files.iter().any(|file| file.path == path),
-                "{path} is missing"
-            );
+        for folder in ["models/", "gateways/", "runtime/", "tests/src/", "benches/"] {
+            let mut paths = files.iter().map(|file| &file.path);
+            assert!(paths.any(|path| path.starts_with(folder)), "{folder}");
         }
     }
 }

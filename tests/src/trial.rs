@@ -18,6 +18,7 @@ use serde_json::Value;
 use crate::binary::{hil_runtime_binary, workspace_folder};
 use crate::child::ChildGuard;
 use crate::lab::LabHost;
+use crate::ports::own_ports;
 
 /// How often a waiting test looks.
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
@@ -61,6 +62,14 @@ impl Trial {
     pub fn set(mut self, setting: &str) -> Self {
         self.settings.push(setting.to_owned());
         self
+    }
+
+    /// The same with these links on ports that no other test has, for runs in the network of this machine.
+    #[must_use]
+    pub fn on_own_ports(self, links: &[&str]) -> Self {
+        let set =
+            |trial: Self, link: &&str| trial.set(&format!("links.{link}.port={}", own_ports()));
+        links.iter().fold(self, set)
     }
 
     /// The arguments of the binary.

@@ -3,7 +3,6 @@
 
 use std::fs;
 use std::process::{self, Command};
-use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use nix::sys::signal::{Signal, kill};
@@ -11,6 +10,7 @@ use nix::unistd::Pid;
 
 use super::SETUP_LIMIT;
 use crate::child;
+use crate::machine_lock::machine_lock;
 
 const NAMESPACE_FOLDER: &str = "/run/netns";
 const PREFIX: &str = "hil-lab";
@@ -33,10 +33,7 @@ pub(super) fn ip(arguments: &[&str]) -> Result<(), String> {
 
 pub(super) fn add(name: &str) -> Result<(), String> {
     // The first namespace of a machine makes the folder a shared mount; two at once may stack it.
-    static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
-    let _guard = ONE_AT_A_TIME
-        .lock()
-        .unwrap_or_else(std::sync::PoisonError::into_inner);
+    let _held = machine_lock("namespaces");
     ip(&["netns", "add", name])
 }
 

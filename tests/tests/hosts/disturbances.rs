@@ -1,0 +1,275 @@
+//! What a run does when the hosts or the network change beneath it: the cable, the address and the
+//! packet size of its link, a second supervisor that claims the same host, a host that never comes
+//! and one that goes for good, a record folder that is full or does not answer. `docs/robustness.md` has the table.
+
+use std::fs::{self, File};
+use std::io::Read;
+use std::process::Command;
+use std::thread;
+use std::time::Duration;
+
+use hil_models::measure::account::MessageFate;
+use hil_runtime::report::summary::{Outcome, RunSummary};
+use hil_tests::account::{account, assert_every_message_is_accounted_for, describe};
+use hil_tests::child::{ChildGuard, Finished};
+use hil_tests::lab::{INTERFACE, Lab};
+use hil_tests::run_folder::RunFolder;
+use hil_tests::trial::{RunFiles, Trial, load_average, wait_until};
+use nix::sys::signal::Signal;
+use nix::sys::stat::Mode;
+use nix::unistd::mkfifo;
+
+const HOSTS: [&str; 2] = ["control-pc", "robot-pc"];
+const CHANNELS: [&str; 2] = ["shuttle/command", "shuttle/status"];
+const LIMIT: Duration = Duration::from_mins(1);
+const RUN_LIMIT: Duration = Duration::from_mins(2);
+/// How long a disturbance lasts: below the least silence after which a peer counts as gone.
+const DISTURBED: Duration = Duration::from_millis(1200);
+/// Exit codes, as `--help` lists them.
+const FAILED: i32 = 1;
+const PEER_ABSENT: i32 = 69;
+/// Below the length of a shuttle command's datagram, above what the kernel takes for IPv4.
+const TINY_MTU: u16 = 80;
+
+fn code(finished: &Finished) -> i32 {
+    let code = finished.status.code();
+    code.unwrap_or_else(|| panic!("{finished:?}"))
+}
+
+/// Starts `trial` on both hosts and waits until messages flow both ways.
+fn start(lab: &Lab, trial: &Trial) -> ([ChildGuard; 2], [RunFiles; 2]) {
+    let hosts = [0, 1].map(|index| trial.start_on(lab.host(index)));
+    let files = HOSTS.map(|host| trial.folder(&format!("-{host}"), LIMIT));
+    wait_for_messages(&files, "the begin of the run");
+    (hosts, files)
+}
+
+/// Waits until either end takes messages that were not there yet.
+fn wait_for_messages(files: &[RunFiles; 2], after: &str) {
+    let taken = || {
+        let commands = files[1].record_bytes("shuttle.command.taken.");
+        let statuses = files[0].record_bytes("shuttle.status.taken.");
+        [commands, statuses]
+    };
+    let before = taken();
+    // What still lay in a queue may come at once; half a second's messages come only over the link.
+    wait_until(LIMIT, &format!("messages both ways after {after}"), || {
+        let now = taken();
+        (0..2).all(|way| now[way] >= before[way] + 50 * 32)
+    });
+}
+
+/// Stops the run from its first host; every message of it has a fate, and nothing is left.
+fn stopped(lab: &Lab, hosts: &mut [ChildGuard; 2], files: &[RunFiles; 2]) -> [RunSummary; 2] {
+    hosts[0].signal(Signal::SIGTERM).unwrap();
+    for host in hosts {
+        host.wait_within(RUN_LIMIT).unwrap();
+    }
+    [0, 1].map(|index| {
+        let summary = files[index].summary();
+        assert_eq!(summary.run.outcome, Outcome::Stopped);
+        assert_every_message_is_accounted_for(&summary);
+        for channel in CHANNELS {
+            let said = describe(channel, account(&summary, channel));
+            println!("{}: {said}; load {}", HOSTS[index], load_average());
+        }
+        files[index].assert_nothing_left_on(lab.host(index));
+        summary
+    })
+}
+
+/// What neither the consumer took nor a newer message replaced.
+fn missing(summary: &RunSummary, channel: &str) -> u64 {
+    let fates = &account(summary, channel).fates;
+    [
+        MessageFate::RefusedByKernel,
+        MessageFate::LostOnWire,
+        MessageFate::SupersededAtInput,
+        MessageFate::SupersededAtConsumer,
+    ]
+    .into_iter()
+    .map(|fate| fates.of(fate))
+    .sum()
+}
+
+#[test]
+fn cable_address_and_packet_size_change_under_a_run_and_it_goes_on() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let record = RunFolder::new("disturbed");
+    let trial = Trial::shipped("shuttle-split.toml", record.path()).set("run.duration=\"10 min\"");
+    let (mut hosts, files) = start(&lab, &trial);
+    let robot = lab.host(1);
+
+    robot.set_link(INTERFACE, "down");
+    thread::sleep(DISTURBED);
+    robot.set_link(INTERFACE, "up");
+    wait_for_messages(&files, "the cable was out");
+
+    robot.take_address();
+    thread::sleep(DISTURBED);
+    robot.give_address();
+    wait_for_messages(&files, "the address was gone");
+
+    for index in [0, 1] {
+        lab.host(index).set_mtu(TINY_MTU);
+    }
+    thread::sleep(DISTURBED);
+    for index in [0, 1] {
+        lab.host(index).set_mtu(1500);
+    }
+    wait_for_messages(&files, "the packets were to be small");
+
+    // A second supervisor that says it is the robot's host: the run has its two hosts already.
+    let second = trial.clone().set("run.start_timeout=\"1 s\"");
+    let mut double = second.start_on(robot);
+    let double = double.wait_within(RUN_LIMIT).unwrap();
+    assert_eq!(code(&double), PEER_ABSENT, "{double:?}");
+    wait_for_messages(&files, "a second robot-pc");
+    let mut double = second.start_on(lab.host(0));
+    let double = double.wait_within(RUN_LIMIT).unwrap();
+    assert_eq!(code(&double), PEER_ABSENT, "{double:?}");
+    wait_for_messages(&files, "a second control-pc");
+
+    for summary in stopped(&lab, &mut hosts, &files) {
+        for channel in CHANNELS {
+            assert!(missing(&summary, channel) > 0, "{channel} felt nothing");
+        }
+    }
+}
+
+#[test]
+fn a_gateway_that_comes_back_while_the_path_is_away_waits_for_it() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let record = RunFolder::new("path-away");
+    let trial = Trial::shipped("shuttle-split.toml", record.path())
+        .set("run.duration=\"10 min\"")
+        // The supervisors' connection leads over the same cable.
+        .set("run.peer_timeout=\"60 s\"");
+    let (mut hosts, files) = start(&lab, &trial);
+    let robot = lab.host(1);
+    for instance in [0, 1] {
+        let is_cable = instance == 0;
+        if is_cable {
+            robot.set_link(INTERFACE, "down");
+        } else {
+            robot.set_mtu(TINY_MTU);
+        }
+        files[1].kill_process("gateway-hop-robot-pc", instance, LIMIT);
+        wait_until(LIMIT, "that it waits", || {
+            let told = hosts[1].stderr_so_far();
+            told.matches("waiting for the link").count() > usize::from(!is_cable)
+        });
+        if is_cable {
+            robot.set_link(INTERFACE, "up");
+        } else {
+            robot.set_mtu(1500);
+        }
+        wait_for_messages(&files, "a gateway came back without a path");
+    }
+    for summary in stopped(&lab, &mut hosts, &files) {
+        let mut events = summary.events.iter();
+        assert!(events.any(|event| event.what.contains("waiting for the link")));
+    }
+}
+
+#[test]
+fn a_host_that_never_comes_and_one_that_goes_for_good_are_named() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let record = RunFolder::new("gone");
+    let trial = Trial::shipped("shuttle-split.toml", record.path())
+        .set("run.duration=\"10 min\"")
+        .set("run.peer_timeout=\"2 s\"");
+
+    // In a folder of its own: runs that did not come about leave one too.
+    let absent = RunFolder::new("never-came");
+    let alone =
+        Trial::shipped("shuttle-split.toml", absent.path()).set("run.start_timeout=\"1 s\"");
+    for index in [0, 1] {
+        let mut child = alone.start_on(lab.host(index));
+        let finished = child.wait_within(RUN_LIMIT).unwrap();
+        assert_eq!(code(&finished), PEER_ABSENT, "{finished:?}");
+        let words = format!("{} did not appear within 1 s", HOSTS[1 - index]);
+        assert!(finished.stderr.contains(&words), "{finished:?}");
+        assert!(lab.host(index).shared_memory_leftovers().is_empty());
+    }
+
+    let (mut hosts, files) = start(&lab, &trial);
+    lab.host(1).set_link(INTERFACE, "down");
+    for index in [0, 1] {
+        let finished = hosts[index].wait_within(RUN_LIMIT).unwrap();
+        assert_eq!(code(&finished), PEER_ABSENT, "{finished:?}");
+        let summary = files[index].summary();
+        assert_eq!(summary.run.outcome, Outcome::Failed);
+        let words = format!("{} has been silent for 2 s", HOSTS[1 - index]);
+        let reason = &summary.run.exit_reason;
+        assert!(reason.contains(&words), "{reason}");
+        assert!(files[index].has_report());
+        files[index].assert_nothing_left_on(lab.host(index));
+    }
+}
+
+/// A pipe in the place of a file that the supervisor writes anew twice a second: whoever opens it to write
+/// waits for a reader, as for a disk that others write gigabytes to.
+#[test]
+fn a_disk_that_does_not_answer_makes_no_host_silent() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let record = RunFolder::new("slow-disk");
+    let trial = Trial::shipped("shuttle-split.toml", record.path())
+        .set("run.duration=\"10 min\"")
+        .set("run.peer_timeout=\"4 s\"");
+    let (mut hosts, files) = start(&lab, &trial);
+    let pipe = files[0].root().join("status.json.new");
+    wait_until(LIMIT, "a moment without the file", || {
+        mkfifo(&pipe, Mode::S_IRWXU).is_ok()
+    });
+    thread::sleep(Duration::from_secs(7));
+    wait_for_messages(&files, "more than the silence that is borne");
+    // The disk answers again.
+    let mut held_back = String::new();
+    let mut reader = File::open(&pipe).unwrap();
+    reader.read_to_string(&mut held_back).unwrap();
+    assert!(held_back.contains("\"phase\":\"running\""), "{held_back}");
+    let status = files[0].root().join("status.json");
+    wait_until(LIMIT, "the file itself", || {
+        fs::symlink_metadata(&status).is_ok_and(|data| data.is_file())
+    });
+    stopped(&lab, &mut hosts, &files);
+}
+
+#[test]
+fn a_full_disk_ends_the_run_and_says_so() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    // Small enough to be full within seconds, on a file system of the host's own.
+    let host = lab.host(0);
+    let made = host
+        .command("sh")
+        .args([
+            "-c",
+            "mkdir /run/small && mount -t tmpfs -o size=256k tmpfs /run/small",
+        ])
+        .status();
+    assert!(made.unwrap().success());
+    let topology = hil_tests::trial::shipped_topology("shuttle-local.toml");
+    let mut command: Command = host.command(hil_tests::binary::hil_runtime_binary());
+    command.arg("--topology").arg(topology);
+    command.args(["--set", "run.record=\"/run/small\""]);
+    command.args(["--set", "run.duration=\"10 min\""]);
+    let mut child = ChildGuard::spawn(&mut command).unwrap();
+    let finished = child.wait_within(RUN_LIMIT).unwrap();
+    println!("{finished:?}");
+    assert_eq!(code(&finished), FAILED, "{finished:?}");
+    let said = format!("{}{}", finished.stdout, finished.stderr);
+    assert!(said.contains("No space left on device"), "{said}");
+    assert!(said.contains("/run/small"), "{said}");
+    assert!(host.shared_memory_leftovers().is_empty());
+}

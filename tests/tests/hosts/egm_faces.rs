@@ -1,0 +1,194 @@
+//! Our controller drives our robot as two strangers would: each run knows the other only by the
+//! robot maker's datagrams, sensor face on one host, robot face on the other.
+
+use std::time::Duration;
+
+use hil_models::egm::messages::{EgmEventKind, Side};
+use hil_models::yumi::Joints;
+use hil_models::yumi::arm::Arm;
+use hil_runtime::report::face::FaceSummary;
+use hil_runtime::report::summary::{Outcome, RunSummary};
+use hil_tests::account::assert_account_closes;
+use hil_tests::arms::{Arms, of_kind};
+use hil_tests::lab::{ADDRESSES, Lab};
+use hil_tests::run_folder::RunFolder;
+use hil_tests::trial::{Trial, load_average};
+
+const LIMIT: Duration = Duration::from_mins(2);
+const SECOND_NS: i64 = 1_000_000_000;
+/// Lag of the control law at a gain of 20/s, four cycles until a motion is measured, and one of
+/// them until a command is used.
+const LAG_NS: i64 = 70_000_000;
+/// Joints that swing less say nothing about following.
+const SWING_DEG_MIN: f64 = 1.0;
+
+/// Times the tool went to one side and back, by what it did between a quarter and three quarters
+/// of its way.
+fn loops(arm: &Arm, joints: impl Iterator<Item = Joints>) -> u32 {
+    let sides: Vec<f64> = joints.map(|q_rad| arm.tool(&q_rad).translation.y).collect();
+    let low = sides.iter().copied().fold(f64::INFINITY, f64::min);
+    let high = sides.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    let (mut count, mut is_up) = (0, false);
+    for side in sides {
+        let share = (side - low) / (high - low);
+        if is_up && share < 0.25 {
+            is_up = false;
+        } else if !is_up && share > 0.75 {
+            is_up = true;
+            count += 1;
+        }
+    }
+    count
+}
+
+fn face<'a>(summary: &'a RunSummary, arm: &str) -> &'a FaceSummary {
+    let mut faces = summary.faces.iter();
+    let found = faces.find(|face| face.arm == arm);
+    found.unwrap_or_else(|| panic!("no face of the {arm} arm"))
+}
+
+fn count(face: &FaceSummary, name: &str) -> u64 {
+    let mut counters = face.counters.iter();
+    let found = counters.find(|counter| counter.name == name);
+    found
+        .unwrap_or_else(|| panic!("{name} is not counted"))
+        .count
+}
+
+fn p99_us(face: &FaceSummary, name: &str) -> f64 {
+    let mut segments = face.segments.iter();
+    let found = segments.find(|segment| segment.name == name);
+    let figures = found.and_then(|segment| segment.distribution.measured());
+    figures
+        .unwrap_or_else(|| panic!("{name} is unavailable"))
+        .p99_ns as f64
+        * 1e-3
+}
+
+/// What the controller's host and the robot's host must have recorded of one arm.
+fn assert_driven((here, there): (&Arms, &Arms), side: Side, arm: &Arm) {
+    let story = there.story(side);
+    println!("{story}");
+    // The robot may time out before its sensor is there, and surely when it has gone.
+    let arrivals = there.arrivals_ns(side);
+    let (first, last) = (arrivals[0], *arrivals.last().unwrap());
+    let events = there.events(side);
+    let mut ended = of_kind(&events, EgmEventKind::Ended);
+    assert!(
+        !ended.any(|event| (first..last).contains(&event.at_ns)),
+        "{story}"
+    );
+
+    // Both hosts read one clock here.
+    let window = (first + 5 * SECOND_NS, last);
+    let is_inside = |at: &i64| (window.0..window.1).contains(at);
+    let commanded = here
+        .commands(side)
+        .into_iter()
+        .filter(|(at, _)| is_inside(at));
+    let commanded = loops(arm, commanded.map(|(_, one)| one.position_rad));
+    let moved = here
+        .feedbacks(side)
+        .into_iter()
+        .filter(|(at, _)| is_inside(&(at - LAG_NS)));
+    let moved = loops(arm, moved.map(|(_, one)| one.measured_rad));
+    println!("{} arm: {moved} of {commanded} loops", side.word());
+    assert!(commanded >= 3, "{commanded} loops were asked for");
+    assert_eq!(
+        moved,
+        commanded,
+        "{} arm; load {}",
+        side.word(),
+        load_average()
+    );
+    for (place, follow) in here.follow(side, window, LAG_NS).iter().enumerate() {
+        println!("{} arm, chain place {place}: {follow:?}", side.word());
+        if follow.commanded_deg >= SWING_DEG_MIN {
+            assert!(
+                (follow.gain - 1.0).abs() < 0.05,
+                "place {place}: {follow:?}"
+            );
+        }
+    }
+}
+
+#[test]
+fn our_controller_drives_our_robot_over_nothing_but_the_makers_datagrams() {
+    let Some(lab) = Lab::two_hosts_or_skip() else {
+        return;
+    };
+    let folder = RunFolder::new("faces");
+    let (here, there) = (folder.join("sensor"), folder.join("robot"));
+    let sensor = Trial::shipped("egm-robot.toml", &here)
+        .set("run.duration=\"30 s\"")
+        .set("case.parameters.left_arm=\"mirror\"");
+    let address = ADDRESSES[0];
+    let robot = Trial::shipped("egm-client.toml", &there)
+        .set("run.duration=\"24 s\"")
+        .set("case.parameters.egm.preset=\"paper\"")
+        .set("case.parameters.egm.arms=\"both\"")
+        .set(&format!("processes.client.egm.right=\"{address}:6510\""))
+        .set(&format!("processes.client.egm.left=\"{address}:6511\""));
+    let mut sensor_run = sensor.start_on(lab.host(0));
+    let sensor_files = sensor.folder("", LIMIT);
+    let mut robot_run = robot.start_on(lab.host(1));
+    let robot_files = robot.folder("", LIMIT);
+    for run in [&mut robot_run, &mut sensor_run] {
+        run.wait_within(LIMIT).unwrap().assert_success();
+    }
+    println!(
+        "{}\n{}",
+        sensor_files.read("report.txt"),
+        robot_files.read("report.txt")
+    );
+
+    let (here, there) = (Arms::of(&sensor_files), Arms::of(&robot_files));
+    for (side, arm) in [(Side::Right, Arm::right()), (Side::Left, Arm::left())] {
+        assert_driven((&here, &there), side, &arm);
+    }
+    judge([&sensor_files.summary(), &robot_files.summary()]);
+    sensor_files.assert_nothing_left_on(lab.host(0));
+    robot_files.assert_nothing_left_on(lab.host(1));
+}
+
+/// What both reports must say of their faces.
+fn judge([sensor, robot]: [&RunSummary; 2]) {
+    for (summary, kind, way) in [
+        (sensor, "EGM sensor face", ["feedback", "command"]),
+        (robot, "EGM robot face", ["command", "feedback"]),
+    ] {
+        assert_eq!(summary.run.outcome, Outcome::Completed);
+        for arm in ["right", "left"] {
+            for what in ["command", "feedback"] {
+                assert_account_closes(summary, &format!("egm/{arm}/{what}"));
+            }
+            let face = face(summary, arm);
+            assert_eq!(face.kind, kind);
+            let ratio = face.answers.ratio().unwrap();
+            println!("{kind}, {arm} arm: {ratio} answered within the cycle");
+            let [back, out] = way;
+            let inward = p99_us(face, &format!("{back} in all: RX stamp → published"));
+            let outward = p99_us(face, &format!("{out} in all: published → TX stamp"));
+            println!("{kind}, {arm} arm: p99 {inward:.0} us in, {outward:.0} us out");
+            assert!(
+                face.cycle_ns
+                    .is_some_and(|cycle_ns| (3_900_000..4_100_000).contains(&cycle_ns))
+            );
+            assert_eq!(face.refusals, [], "{arm}");
+            assert_eq!(count(face, "socket: kernel_drop_count"), 0);
+        }
+    }
+    let right = face(sensor, "right");
+    let sent = count(right, "datagrams encoded") as f64;
+    let attended = right.answers.attended_count as f64;
+    assert!(
+        sent >= 0.95 * attended,
+        "{sent} answers to {attended} messages"
+    );
+    assert_eq!(count(right, "changes of the robot's address"), 0);
+    assert!(
+        right.peer_state.contains(&ADDRESSES[1].to_string()),
+        "{}",
+        right.peer_state
+    );
+}

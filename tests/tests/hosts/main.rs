@@ -1,0 +1,25 @@
+//! Runs between two hosts, each a network namespace with memory of its own: accounts, kills, cables, clocks, keys,
+//! probes. Without the rights for that they say so and are skipped; in CI they fail.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::disallowed_methods,
+    clippy::print_stdout,
+    reason = "tests"
+)]
+
+mod chaos;
+mod clock_path;
+mod clock_run;
+mod disturbances;
+mod egm_faces;
+mod fleet;
+mod hardware_stamps;
+mod kills;
+mod probe_run;
+mod secured_run;
+mod soak;
+mod split_run;
+mod strangers;
+mod tcp_run;
+mod teleop_hop;

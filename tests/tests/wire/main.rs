@@ -1,0 +1,21 @@
+//! What the programs put on the wire of one machine and what links make of it: codecs, captures, emulated links,
+//! traces, and programs of others.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::print_stderr,
+    clippy::cast_precision_loss,
+    clippy::cast_possible_truncation,
+    clippy::print_stdout,
+    reason = "tests"
+)]
+
+mod bypass;
+mod dissector;
+mod egm_clients;
+mod emulated_run;
+mod live_links;
+mod outage_run;
+mod trace_live;
+mod trace_replay;
+mod wake_ups;
