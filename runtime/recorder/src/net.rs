@@ -6,7 +6,8 @@ use std::collections::BTreeMap;
 use hil_models::measure::record::{FollowUpRecord, IngressRecord, UNAVAILABLE};
 use hil_models::trace::{Trace, TraceFate, TraceRecord, UNAVAILABLE_NS, UNBOUNDED_NS};
 use hil_runtime::rundir::record::{RecordFile, RecordKind};
-use hil_runtime::rundir::{Record, Stage};
+use hil_runtime::rundir::live_run::Stage;
+use hil_runtime::watch::Record;
 use prost_types::field_descriptor_proto::Type;
 
 use crate::schema::{self, OwnField, Schema};

@@ -7,7 +7,8 @@ use std::time::Duration;
 
 use hil_runtime::platform::clock::MonotonicClock;
 use hil_runtime::report::summary::RunSummary;
-use hil_runtime::rundir::{self, Event, Feed, FeedError, LiveRun, Origin, Poll};
+use hil_runtime::rundir::live_run::LiveRun;
+use hil_runtime::watch::{self, Event, Feed, FeedError, Origin, Poll};
 
 use super::engine::REST;
 use super::playback::how_ended;
