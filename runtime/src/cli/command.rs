@@ -26,10 +26,9 @@ use crate::engine::process::{component, own_program};
 use crate::engine::security::cli::KeyCommand;
 use crate::engine::security::{KeyFileError, PreSharedKey};
 use crate::engine::supervisor;
-use crate::engine::supervisor::{Outcome, PeerError, RunError, RunOptions, RunResult};
+use crate::engine::supervisor::{PeerError, RunError, RunOptions};
 use crate::nic::card_clock::guard;
 use crate::platform::console::Console;
-use crate::platform::documents;
 use crate::platform::progress::Progress;
 use crate::platform::signals::{EXIT_INTERRUPTED, Signals};
 use crate::probe;
@@ -39,8 +38,11 @@ use crate::report::compare;
 use crate::report::compare::cli::CompareArgs;
 use crate::report::terminal::{self, Style};
 use crate::report::trace;
+use crate::rundir::run_result::{Outcome, RunResult};
+use crate::topology::documents;
 use crate::topology::emulation_room::check_emulation;
 use crate::topology::registry::Registry;
+use crate::topology::trace_source;
 use crate::topology::{self, HOST_VARIABLE, HostChoice, MachineIdentity, Topology, which_host};
 use crate::watch::link;
 use crate::watch::link::cli::LinkCommand;
@@ -214,7 +216,7 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
     let Some(topology) = load(path, &args.overrides, registry, console) else {
         return exit::USAGE;
     };
-    if let Err(error) = trace::source::check(&topology) {
+    if let Err(error) = trace_source::check(&topology) {
         console.error(&error.to_string());
         return exit::USAGE;
     }

@@ -11,7 +11,7 @@ use anstyle::{AnsiColor, Style};
 use nix::sys::stat::fstat;
 
 use crate::platform::systemd::ServiceManager;
-use crate::report::terminal::shortened;
+use crate::platform::text::shortened;
 
 /// Progress lines where they cannot be redrawn.
 const PLAIN_PERIOD: Duration = Duration::from_secs(5);

@@ -1,5 +1,5 @@
 //! What kind of host a run happened on: a list of labelled facts for the run's manifest. It is a
-//! description, not a judgement; [`crate::doctor`] judges.
+//! description, not a judgement.
 
 mod files;
 mod kernel;

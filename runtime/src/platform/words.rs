@@ -1,6 +1,6 @@
 //! Numbers with their nouns, as people say them.
 
-use crate::report::terminal::grouped;
+use crate::platform::text::grouped;
 
 /// `1 message`, `12,345 messages`.
 pub fn counted(count: u64, what: &str) -> String {

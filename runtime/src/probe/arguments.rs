@@ -7,7 +7,7 @@ use clap::{Args, Subcommand, ValueEnum};
 use hil_gateways::capture::flow::FlowFilter;
 
 use super::tap::TapChoice;
-use crate::cli::arguments::whole;
+use crate::platform::argument::whole;
 
 const EXAMPLES: &str = "\
 Examples:

@@ -5,7 +5,8 @@ use hil_models::measure::correlation::PairCorrelation;
 use hil_models::measure::network::{NetworkEventKind, NetworkFigures};
 use serde::{Deserialize, Serialize};
 
-use super::terminal::{JOINT, duration_s, grouped, seconds};
+use super::terminal::{JOINT, duration_s, seconds};
+use crate::platform::text::grouped;
 use crate::platform::words::plural;
 
 /// How long before an event of the score the network is looked at, seconds. The longest effect

@@ -28,9 +28,9 @@ use crate::report::score_event::ScoreEvents;
 use crate::report::summary::ScoreMetric;
 use crate::report::terminal::{self, Style};
 use crate::report::trace_counts::replay_words;
-use crate::rundir::launch::EmulationLaunch;
 use crate::rundir::run_folder::RunFolder;
 use crate::rundir::series;
+use crate::topology::emulation::EmulationLaunch;
 use crate::topology::registry::{Case, Registry};
 use crate::topology::{Crossing, Program, Topology};
 

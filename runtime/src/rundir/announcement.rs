@@ -9,9 +9,9 @@ use std::time::SystemTime;
 
 use nix::fcntl::{Flock, FlockArg};
 
+use crate::platform::domain_address::DomainAddress;
 use crate::rundir::live_run::{LIVE_VERSION, LiveChannel, LiveRun, Source, Stage, start_ticks};
 use crate::rundir::run_folder::{RunFolder, utc_text};
-use crate::shm::DomainAddress;
 use crate::topology::{Channel, Program, Topology};
 
 /// A run that is announced for as long as this lives.

@@ -6,8 +6,8 @@ use std::collections::BTreeMap;
 use hil_models::time::Instant;
 use serde::{Deserialize, Serialize};
 
-use crate::nic::card_clock::CardStory;
 use crate::platform::clock_discipline::HostDiscipline;
+use crate::rundir::card_story::CardStory;
 use crate::rundir::pipe::ProcessReport;
 
 /// One thing that happened.

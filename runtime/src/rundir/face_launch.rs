@@ -20,7 +20,7 @@ pub struct FaceLaunch {
     pub process: String,
     /// How often it was restarted before.
     pub instance: u32,
-    /// The host's shared memory, a [`DomainAddress`](crate::shm::DomainAddress).
+    /// The host's shared memory, a [`DomainAddress`](crate::platform::domain_address::DomainAddress).
     pub domain: String,
     /// Folder for record files.
     pub records: PathBuf,

@@ -11,9 +11,9 @@ use nix::errno::Errno;
 use nix::fcntl::{Flock, FlockArg};
 use serde::{Deserialize, Serialize};
 
+use crate::platform::domain_address::{DomainAddress, DomainAddressError};
 use crate::rundir::manifest::Manifest;
 use crate::rundir::run_folder::RunFolder;
-use crate::shm::{DomainAddress, DomainError};
 
 /// Version of the layout of `live.json`. Within one, fields are only added.
 pub const LIVE_VERSION: u32 = 1;
@@ -122,7 +122,7 @@ impl LiveRun {
     ///
     /// # Errors
     /// When the announcement holds no address that is one.
-    pub fn domain(&self, host: &str) -> Result<DomainAddress, DomainError> {
+    pub fn domain(&self, host: &str) -> Result<DomainAddress, DomainAddressError> {
         let address = self.domains.get(host).map_or("", String::as_str);
         address.parse()
     }

@@ -6,12 +6,10 @@ use std::fs;
 use std::io;
 use std::time::SystemTime;
 
-use hil_gateways::transport::clock_pair::ClockPair;
 use hil_models::layout::{Field, FieldKind, RESERVED};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use crate::engine::supervisor::RunOptions;
 use crate::platform::host_facts::HostFacts;
 use crate::rundir::run_folder::{RunFolder, utc_text};
 use crate::topology::Topology;
@@ -19,32 +17,41 @@ use crate::topology::Topology;
 /// Version of the layout of `manifest.json`. Within one, fields are only added.
 pub const MANIFEST_VERSION: u32 = 1;
 
-/// Reads of the two clocks of which the narrowest counts.
-const CLOCK_READS: u32 = 5;
+/// What a supervisor knows of the run that it is about to begin.
+#[derive(Debug)]
+pub struct ManifestContent<'a> {
+    /// What is run.
+    pub topology: &'a Topology,
+    /// Names of the hosts that run here.
+    pub hosts: &'a [String],
+    /// The command line.
+    pub command_line: &'a [String],
+    /// The fields of the channels whose messages are known, by channel.
+    pub layouts: &'a BTreeMap<String, &'static [Field]>,
+    /// What the machine is.
+    pub facts: &'a HostFacts,
+    /// Real-time minus monotonic clock, nanoseconds; `None` when it cannot be read.
+    pub realtime_minus_monotonic_ns: Option<i64>,
+}
 
-/// Writes what `topology` is about to run as.
+/// Writes the manifest of a run into its folder.
 ///
 /// # Errors
 /// When the file cannot be written.
-pub(crate) fn write(
-    topology: &Topology,
-    options: &RunOptions,
-    folder: &RunFolder,
-    facts: &HostFacts,
-) -> io::Result<()> {
-    let clocks = ClockPair::read(CLOCK_READS).ok();
+pub fn write(content: &ManifestContent<'_>, folder: &RunFolder) -> io::Result<()> {
+    let topology = content.topology;
     let manifest = json!({
         "schema_version": MANIFEST_VERSION,
-        "program": { "name": env!("CARGO_PKG_NAME"), "version": env!("CARGO_PKG_VERSION") },
-        "command_line": options.command_line,
+        "program": { "name": "hil-runtime", "version": env!("CARGO_PKG_VERSION") },
+        "command_line": content.command_line,
         "created": utc_text(SystemTime::now()),
-        "hosts_here": options.hosts,
+        "hosts_here": content.hosts,
         "topology_hash": format!("{:016x}", topology.hash()),
         "topology": topology.resolved(),
         "seed": topology.run().seed,
-        "host_facts": facts,
-        "channels": describe_channels(topology, &options.layouts),
-        "realtime_minus_monotonic_ns": clocks.map(|pair| pair.offset_ns),
+        "host_facts": content.facts,
+        "channels": describe_channels(topology, content.layouts),
+        "realtime_minus_monotonic_ns": content.realtime_minus_monotonic_ns,
     });
     let text = serde_json::to_string_pretty(&manifest).map_err(io::Error::other)?;
     fs::write(folder.manifest(), text)

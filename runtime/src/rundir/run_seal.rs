@@ -8,7 +8,7 @@ use hil_gateways::protocol::seal::{Association, Initiator, Responder, Rotation, 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use zeroize::Zeroizing;
 
-use crate::engine::security::random_bytes;
+use crate::platform::random::random_bytes;
 use crate::rundir::launch::DirectionLaunch;
 
 /// Secret and cipher of one run.

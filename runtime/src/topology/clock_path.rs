@@ -9,7 +9,7 @@ use super::limits;
 use super::model::{Host, Topology};
 use super::reader::Reader;
 use super::tree::join;
-use crate::rundir::record::file::CHANNEL_NAME_BYTES_MAX;
+use crate::topology::CHANNEL_NAME_BYTES_MAX;
 
 /// Where a host exchanges clocks, beside the address of the link under test.
 #[derive(Debug, Clone, PartialEq, Eq)]

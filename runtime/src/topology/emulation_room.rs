@@ -8,8 +8,8 @@ use hil_gateways::protocol::wire;
 use hil_models::case_study::ParameterError;
 use hil_models::link::spec::LinkSpec;
 
-use crate::rundir::launch::{EmulationError, EmulationLaunch};
 use crate::topology::Topology;
+use crate::topology::emulation::{EmulationError, EmulationLaunch};
 
 /// Datagrams there is room for whatever the link does: bursts.
 const BURST_COUNT: usize = 1024;

@@ -39,9 +39,10 @@ use nix::poll::{PollFd, PollFlags, ppoll};
 use nix::sys::time::TimeSpec;
 
 use crate::platform::clock::MonotonicClock;
-use crate::rundir::launch::{DirectionLaunch, EmulationError, LaunchError};
+use crate::rundir::launch::{DirectionLaunch, LaunchError};
 use crate::rundir::record::RecordFileError;
 use crate::shm::{ChannelError, Domain, DomainError, clock_id};
+use crate::topology::emulation::EmulationError;
 
 /// Why a gateway cannot go on.
 #[derive(Debug, thiserror::Error)]

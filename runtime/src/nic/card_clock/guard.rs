@@ -12,6 +12,7 @@ use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
+use clap::Args;
 use hil_gateways::transport::card_arming::{
     ArmedCard, CardControl, InterfaceCard, describe_setting,
 };
@@ -19,7 +20,6 @@ use hil_gateways::transport::timestamping::HardwareStamping;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM};
 use signal_hook::flag;
 
-use crate::cli::arguments::CardGuardArgs;
 use crate::platform::console::Console;
 
 /// What the guard says once no signal ends it any more.
@@ -157,6 +157,23 @@ pub(crate) enum GuardError {
         former: String,
         reason: String,
     },
+}
+
+/// How a network card was found, in the kernel's numbers (`struct hwtstamp_config`).
+#[derive(Debug, Args)]
+pub struct CardGuardArgs {
+    /// Its interface.
+    #[arg(long)]
+    pub interface: String,
+    /// `flags`.
+    #[arg(long, allow_negative_numbers = true)]
+    pub flags: i32,
+    /// `tx_type`.
+    #[arg(long, allow_negative_numbers = true)]
+    pub transmit_type: i32,
+    /// `rx_filter`.
+    #[arg(long, allow_negative_numbers = true)]
+    pub receive_filter: i32,
 }
 
 /// What the process of a guard does until its program is gone or lets it go.

@@ -19,9 +19,9 @@ use hil_gateways::transport::clock_pair::ClockPair;
 use hil_gateways::transport::interface::interface_with_address;
 use hil_gateways::transport::timestamping::TimestampCapabilities;
 use hil_models::measure::card_clock::CardClockRecord;
-use serde::{Deserialize, Serialize};
 
 use self::guard::GuardedCard;
+use crate::rundir::card_story::CardStory;
 use crate::rundir::record::{RecordKind, RecordSink, Recorder};
 use crate::topology::{Host, Program, Timestamps, Topology, Via};
 
@@ -33,42 +33,6 @@ const READ_ATTEMPTS: u32 = 5;
 const RING_RECORDS: usize = 256;
 /// Who writes the records of the cards, in their file names.
 const WRITER: &str = "supervisor";
-
-/// What became of one card, in words for the report.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct CardStory {
-    /// The host of the topology.
-    pub host: String,
-    /// Its interface.
-    pub interface: String,
-    /// Number N of the card's clock `/dev/ptpN`; `None` when it has none.
-    pub phc_index: Option<u32>,
-    /// What the driver claims to stamp.
-    pub claims: String,
-    /// What was asked for and granted, or why the card could not be armed.
-    pub arming: String,
-    /// It was armed.
-    pub is_armed: bool,
-    /// It stamps every arriving datagram.
-    pub stamps_all_arrivals: bool,
-    /// How it was set up before, and whether that was put back.
-    pub restoring: String,
-    /// How its clock was read, or why not.
-    pub clock: String,
-    /// Reads of its clock that failed.
-    pub failed_read_count: u64,
-}
-
-impl CardStory {
-    /// Name of the card's records, and of the card in the report.
-    pub fn name(&self) -> String {
-        card_name(&self.host, &self.interface)
-    }
-}
-
-pub(crate) fn card_name(host: &str, interface: &str) -> String {
-    format!("{host}/{interface}")
-}
 
 #[derive(Debug)]
 struct WatchedCard {

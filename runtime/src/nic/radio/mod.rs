@@ -10,6 +10,7 @@ pub mod category;
 pub(crate) mod conversation;
 pub(crate) mod netlink;
 pub(crate) mod nl80211;
+mod noting;
 pub(crate) mod sampler;
 pub(crate) mod socket;
 

@@ -3,20 +3,7 @@
 
 use super::netlink::{Attributes, u16_at, u32_at};
 
-/// `NL80211_CMD_*`.
-pub(crate) mod command {
-    pub(crate) const GET_INTERFACE: u8 = 5;
-    pub(crate) const GET_STATION: u8 = 17;
-    pub(crate) const NEW_STATION: u8 = 19;
-    pub(crate) const DEL_STATION: u8 = 20;
-    pub(crate) const DEAUTHENTICATE: u8 = 39;
-    pub(crate) const DISASSOCIATE: u8 = 40;
-    pub(crate) const CONNECT: u8 = 46;
-    pub(crate) const ROAM: u8 = 47;
-    pub(crate) const DISCONNECT: u8 = 48;
-    pub(crate) const GET_POWER_SAVE: u8 = 62;
-    pub(crate) const NOTIFY_CQM: u8 = 64;
-}
+use crate::rundir::radio_record::command;
 
 /// `NL80211_ATTR_*`.
 pub(crate) mod attribute {

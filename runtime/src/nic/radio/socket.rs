@@ -10,7 +10,9 @@ use nix::sys::socket::{MsgFlags, SockProtocol, recv};
 
 use super::conversation::{Conversation, netlink_socket};
 use super::netlink::{Answer, Answers, Attributes};
-use super::nl80211::{self, Happening, Station, Wireless, attribute, command};
+use super::nl80211;
+use super::nl80211::{Happening, Station, Wireless, attribute};
+use crate::rundir::radio_record::command;
 
 /// The longest event of the kernel: it fills pages of 32 KiB at most.
 const EVENT_BYTES: usize = 65_536;

@@ -8,8 +8,6 @@ use hil_models::time::Instant;
 
 use super::axis::RunAxis;
 use super::records::RunRecords;
-use crate::engine::supervisor;
-use crate::engine::supervisor::RunResult;
 use crate::platform::realtime::GrantOutcome;
 use crate::report::emulation::EmulationFigures;
 use crate::report::summary::{
@@ -17,6 +15,7 @@ use crate::report::summary::{
     ProcessSummary, RealtimeFacts, RunEvent, RunFacts,
 };
 use crate::rundir::event::{Event, ProcessStory};
+use crate::rundir::run_result::{self, RunResult};
 use crate::topology::{Channel, Topology, Via};
 
 /// Datagrams that came while the socket's receive buffer was full; see [`NO_ROOM`].
@@ -32,11 +31,11 @@ pub(super) fn run_facts(
     command_line: &[String],
 ) -> RunFacts {
     let outcome = match &result.outcome {
-        supervisor::Outcome::Completed | supervisor::Outcome::EndedEarly(_) => Outcome::Completed,
-        supervisor::Outcome::Interrupted(_) | supervisor::Outcome::EndedByPeer(_) => {
+        run_result::Outcome::Completed | run_result::Outcome::EndedEarly(_) => Outcome::Completed,
+        run_result::Outcome::Interrupted(_) | run_result::Outcome::EndedByPeer(_) => {
             Outcome::Stopped
         }
-        supervisor::Outcome::Failed(_) | supervisor::Outcome::PeerLost(_) => Outcome::Failed,
+        run_result::Outcome::Failed(_) | run_result::Outcome::PeerLost(_) => Outcome::Failed,
     };
     let files = [
         ("summary.json", "every figure of this report"),

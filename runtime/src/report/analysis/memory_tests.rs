@@ -20,18 +20,17 @@ use hil_models::shuttle::{Shuttle, ShuttleCommand, ShuttleStatus};
 use hil_models::time::Instant;
 
 use super::conclude;
-use crate::engine::supervisor::{Outcome, RunResult};
 use crate::platform::host_facts::HostFacts;
 use crate::rundir::record::RecordKind;
 use crate::rundir::record::file::RecordHeader;
 use crate::rundir::run_folder::RunFolder;
+use crate::rundir::run_result::{Outcome, RunResult};
 use crate::topology::registry::Registry;
 use crate::topology::{self, Topology};
 
 /// Says to a process of this test which run to conclude.
 const FOLDER_VARIABLE: &str = "HIL_TEST_CONCLUDE_FOLDER";
-const THIS_TEST: &str =
-    "analysis::memory_tests::memory_does_not_grow_with_the_run_as_its_records_do";
+const THIS_TEST: &str = "memory_does_not_grow_with_the_run_as_its_records_do";
 
 /// Before the figure in what such a process says.
 const PEAK: &str = "peak bytes: ";
@@ -372,8 +371,9 @@ fn peak_of(folder: &Path, count: i64) -> u64 {
     let root = folder.join(format!("run-{count}"));
     write_run(&root, count);
     fs::write(root.join("count"), count.to_string()).unwrap();
+    let (_, module) = module_path!().split_once("::").unwrap();
     let done = Command::new(env::current_exe().unwrap())
-        .args(["--exact", THIS_TEST, "--nocapture"])
+        .args(["--exact", &format!("{module}::{THIS_TEST}"), "--nocapture"])
         .env(FOLDER_VARIABLE, &root)
         .output()
         .unwrap();

@@ -36,11 +36,11 @@ use figures::{channel_summary, process_summary, realtime_facts, run_event, run_f
 use outages::OutageStory;
 use records::RunRecords;
 
-use crate::engine::supervisor::RunResult;
 use crate::report::event_log;
 use crate::report::summary::{Fact, RunSummary, ScoreMetric, SummaryError};
 use crate::report::terminal::{self, Style};
 use crate::report::trace::capture;
+use crate::rundir::run_result::RunResult;
 use crate::rundir::series;
 use crate::topology::Topology;
 use crate::topology::registry::{Case, CaseError, Registry};

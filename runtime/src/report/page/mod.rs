@@ -30,7 +30,8 @@ use clap::ValueEnum;
 
 use self::data::{Drawing, Page, Run, SCHEMA_VERSION, Table};
 use self::material::Material;
-use super::terminal::{JOINT, grouped};
+use super::terminal::JOINT;
+use crate::platform::text::grouped;
 
 pub(crate) use self::template::TemplateError;
 

@@ -7,8 +7,9 @@ use super::material::{Manifest, VirtualCounts, VirtualReport};
 use super::paper;
 use super::run::{METHOD, score};
 use super::words::UNAVAILABLE;
+use crate::platform::text::grouped;
 use crate::report::summary::Fact;
-use crate::report::terminal::{duration, grouped, percent, seconds};
+use crate::report::terminal::{duration, percent, seconds};
 
 /// A run of `simulate`.
 pub(super) fn virtual_time(key: &str, report: &VirtualReport, folder: &str) -> Run {

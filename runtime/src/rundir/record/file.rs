@@ -25,12 +25,11 @@ use hil_models::run_log::RunLog;
 
 use crate::rundir::face_record::{FaceReceivedRecord, FaceSentRecord};
 use crate::rundir::radio_record::RadioRecord;
+use crate::topology::CHANNEL_NAME_BYTES_MAX;
 
 const MAGIC: &[u8; 8] = b"HILREC01";
 /// Size of the file header.
 pub const HEADER_BYTES: usize = 128;
-/// Longest channel name a record file can carry.
-pub const CHANNEL_NAME_BYTES_MAX: usize = 96;
 
 /// What a record file holds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
