@@ -33,7 +33,7 @@ use crate::platform::progress::Progress;
 use crate::platform::signals::{EXIT_INTERRUPTED, Signals};
 use crate::probe;
 use crate::report::analysis;
-use crate::report::analysis::Concluded;
+use crate::report::analysis::{AnalysisError, Concluded};
 use crate::report::compare;
 use crate::report::compare::cli::CompareArgs;
 use crate::report::terminal::{self, Style};
@@ -102,7 +102,7 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
         Command::Calibrate(args) => case_work::calibrate(args, registry),
         Command::Replay(args) if play_work::is_recording(&args) => play_work::play(&args, console),
         Command::Replay(args) => case_work::replay(&args.run, args.json, registry, console),
-        Command::Report(args) => report_work::report(&args, console),
+        Command::Report(args) => report_work::report(&args, registry, console),
         Command::Compare(args) => compare(&args, console),
         Command::Trace { command } => match trace::work::work(command, columns(), console) {
             trace::work::End::Done => exit::RAN,
@@ -241,6 +241,7 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
     let options = RunOptions {
         hosts,
         domain_root: args.domain_root.clone(),
+        topology_file: path.clone(),
         command_line: env::args().collect(),
         layouts: layouts(&topology, registry),
     };
@@ -254,7 +255,16 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
             };
             let origin = (path.as_path(), options.command_line.as_slice());
             let concluded = Progress::begin().during(console, "drawing up the account", |_| {
-                analysis::conclude(&topology, &result, registry, origin)
+                let written = result.write().map_err(AnalysisError::from);
+                let analysed = written.and_then(|()| analysis::analyse(&result.folder, registry));
+                // What the folder cannot give back, because its disk is full, is still in memory.
+                analysed.or_else(|error| {
+                    let concluded = analysis::conclude(&topology, &result, registry, origin)?;
+                    Ok::<_, AnalysisError>(Concluded {
+                        unwritten: concluded.unwritten.or(Some(error)),
+                        ..concluded
+                    })
+                })
             });
             match concluded {
                 Ok(Concluded { summary, unwritten }) => {

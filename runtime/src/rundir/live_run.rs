@@ -132,8 +132,7 @@ impl LiveRun {
     /// # Errors
     /// When `manifest.json` cannot be read.
     pub fn manifest(&self) -> io::Result<Manifest> {
-        let text = fs::read_to_string(self.run_folder().manifest())?;
-        serde_json::from_str(&text).map_err(io::Error::other)
+        Manifest::read(&self.run_folder())
     }
 
     /// True while the supervisor says that the run goes: it takes the word back when all

@@ -4,6 +4,7 @@
 use std::collections::BTreeMap;
 use std::fs;
 use std::io;
+use std::path::Path;
 use std::time::SystemTime;
 
 use hil_models::layout::{Field, FieldKind, RESERVED};
@@ -12,7 +13,7 @@ use serde_json::{Value, json};
 
 use crate::platform::host_facts::HostFacts;
 use crate::rundir::run_folder::{RunFolder, utc_text};
-use crate::topology::Topology;
+use crate::topology::{self, KnownCases, Topology, TopologyErrors};
 
 /// Version of the layout of `manifest.json`. Within one, fields are only added.
 pub const MANIFEST_VERSION: u32 = 1;
@@ -22,6 +23,8 @@ pub const MANIFEST_VERSION: u32 = 1;
 pub struct ManifestContent<'a> {
     /// What is run.
     pub topology: &'a Topology,
+    /// The file that it was read from.
+    pub topology_file: &'a Path,
     /// Names of the hosts that run here.
     pub hosts: &'a [String],
     /// The command line.
@@ -46,7 +49,8 @@ pub fn write(content: &ManifestContent<'_>, folder: &RunFolder) -> io::Result<()
         "command_line": content.command_line,
         "created": utc_text(SystemTime::now()),
         "hosts_here": content.hosts,
-        "topology_hash": format!("{:016x}", topology.hash()),
+        "topology_file": content.topology_file.display().to_string(),
+        "topology_hash": topology_hash(topology),
         "topology": topology.resolved(),
         "seed": topology.run().seed,
         "host_facts": content.facts,
@@ -73,6 +77,9 @@ pub struct Manifest {
     /// Hosts of the topology that ran on the machine that wrote this.
     #[serde(default)]
     pub hosts_here: Vec<String>,
+    /// The file that the topology was read from, as the command line names it.
+    #[serde(default)]
+    pub topology_file: String,
     /// Hash of the topology.
     #[serde(default)]
     pub topology_hash: String,
@@ -92,6 +99,59 @@ pub struct Manifest {
     /// nanoseconds; `None` when it was not read.
     #[serde(default)]
     pub realtime_minus_monotonic_ns: Option<i64>,
+}
+
+/// A topology that a manifest does not give back.
+#[derive(Debug, thiserror::Error)]
+pub enum ManifestTopologyError {
+    /// It is no table of TOML.
+    #[error("its topology cannot be read: {0}")]
+    Table(String),
+    /// It is no topology that this program can run.
+    #[error("its topology cannot be read: {0}")]
+    Topology(#[from] TopologyErrors),
+    /// It is one, but not the one that ran.
+    #[error("its topology has hash {found}, and {wanted} ran")]
+    Hash {
+        /// Of the topology that was read.
+        found: String,
+        /// Of the one that ran.
+        wanted: String,
+    },
+}
+
+impl Manifest {
+    /// That of the run in `folder`.
+    ///
+    /// # Errors
+    /// When the file cannot be read.
+    pub fn read(folder: &RunFolder) -> io::Result<Self> {
+        let text = fs::read_to_string(folder.manifest())?;
+        serde_json::from_str(&text).map_err(io::Error::other)
+    }
+
+    /// The topology that ran, with the cases that the program knows.
+    ///
+    /// # Errors
+    /// When the program does not read it as the one that ran.
+    pub fn read_topology(&self, known: &KnownCases) -> Result<Topology, ManifestTopologyError> {
+        let table = toml::Table::deserialize(&self.topology)
+            .map_err(|error| ManifestTopologyError::Table(error.to_string()))?;
+        let text = toml::to_string(&table)
+            .map_err(|error| ManifestTopologyError::Table(error.to_string()))?;
+        let topology = topology::parse(&self.topology_file, &text, &[], known)?;
+        let found = topology_hash(&topology);
+        if found != self.topology_hash {
+            let wanted = self.topology_hash.clone();
+            return Err(ManifestTopologyError::Hash { found, wanted });
+        }
+        Ok(topology)
+    }
+}
+
+/// The hash of `topology` as a manifest writes it.
+fn topology_hash(topology: &Topology) -> String {
+    format!("{:016x}", topology.hash())
 }
 
 /// Name and version of a program.

@@ -1,8 +1,14 @@
-//! How a run ended, and everything it knows before any figure is computed.
+//! How a run ended, and everything it knows before any figure is computed: `result.json` in the run's
+//! folder. With the manifest and the records beside it, every figure can be computed again.
 
 use std::collections::BTreeMap;
+use std::fs;
+use std::io;
+use std::path::PathBuf;
+use std::time::Duration;
 
 use hil_models::time::Instant;
+use serde::{Deserialize, Serialize};
 
 use super::card_story::CardStory;
 use super::event::{Event, ProcessStory};
@@ -10,8 +16,14 @@ use super::run_folder::RunFolder;
 use crate::platform::clock_discipline::HostDiscipline;
 use crate::platform::host_facts::HostFacts;
 
+/// What `result.json` says it is.
+pub const RUN_RESULT_FORMAT: &str = "hil-run-result";
+/// Version of the layout of `result.json`. Within one, fields are only added.
+pub const RUN_RESULT_VERSION: u32 = 1;
+
 /// How a run ended.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Outcome {
     /// The planned time passed.
     Completed,
@@ -51,9 +63,10 @@ impl Outcome {
 }
 
 /// Everything a finished run knows, before any figure is computed.
-#[derive(Debug)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RunResult {
-    /// Where its files are.
+    /// Where its files are: not in the file, which lies there.
+    #[serde(skip)]
     pub folder: RunFolder,
     /// How it ended.
     pub outcome: Outcome,
@@ -80,9 +93,112 @@ pub struct RunResult {
     pub problems: Vec<String>,
     /// Facts of this host.
     pub facts: HostFacts,
+    /// The longest delay of each trace that a link replayed, by channel.
+    pub trace_delays: BTreeMap<String, Duration>,
+}
+
+/// `result.json` cannot be read or written.
+#[derive(Debug, thiserror::Error)]
+pub enum RunResultError {
+    /// The file cannot be read or written.
+    #[error("{path}: {source}")]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// It does not say what it should.
+    #[error("{path}: {source}")]
+    Content {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        source: serde_json::Error,
+    },
+    /// It is another file, or of another version.
+    #[error(
+        "{path}: format {format:?} version {version}; this program reads {RUN_RESULT_FORMAT:?} \
+         version {RUN_RESULT_VERSION}"
+    )]
+    Version {
+        /// The file.
+        path: PathBuf,
+        /// What it says it is.
+        format: String,
+        /// Its version.
+        version: u32,
+    },
+}
+
+/// The file: its kind and version, and beside them the fields of the result.
+#[derive(Serialize)]
+struct Written<'a> {
+    format: &'static str,
+    version: u32,
+    #[serde(flatten)]
+    result: &'a RunResult,
+}
+
+/// The part of the file that says whether the rest can be read.
+#[derive(Deserialize)]
+struct Head {
+    format: String,
+    version: u32,
 }
 
 impl RunResult {
+    /// Writes it into the run's folder, so that a reader finds it whole or not at all.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn write(&self) -> Result<(), RunResultError> {
+        let path = self.folder.result();
+        let written = Written {
+            format: RUN_RESULT_FORMAT,
+            version: RUN_RESULT_VERSION,
+            result: self,
+        };
+        let text = match serde_json::to_string_pretty(&written) {
+            Ok(text) => text,
+            Err(source) => return Err(RunResultError::Content { path, source }),
+        };
+        let new = path.with_extension("json.new");
+        let done = fs::write(&new, text).and_then(|()| fs::rename(&new, &path));
+        done.map_err(|source| RunResultError::Io { path, source })
+    }
+
+    /// Reads that of the run in `folder`.
+    ///
+    /// # Errors
+    /// When it is not there, not of this version, or damaged.
+    pub fn read(folder: &RunFolder) -> Result<Self, RunResultError> {
+        let path = folder.result();
+        let text = match fs::read_to_string(&path) {
+            Ok(text) => text,
+            Err(source) => return Err(RunResultError::Io { path, source }),
+        };
+        let head = match serde_json::from_str::<Head>(&text) {
+            Ok(head) => head,
+            Err(source) => return Err(RunResultError::Content { path, source }),
+        };
+        if head.format != RUN_RESULT_FORMAT || head.version != RUN_RESULT_VERSION {
+            let Head { format, version } = head;
+            return Err(RunResultError::Version {
+                path,
+                format,
+                version,
+            });
+        }
+        match serde_json::from_str::<Self>(&text) {
+            Ok(result) => Ok(Self {
+                folder: folder.clone(),
+                ..result
+            }),
+            Err(source) => Err(RunResultError::Content { path, source }),
+        }
+    }
+
     /// True when records are missing, or something could not be taken down: the report is not
     /// what the run should have left.
     pub fn has_gaps(&self) -> bool {

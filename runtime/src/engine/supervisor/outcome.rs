@@ -23,6 +23,8 @@ pub struct RunOptions {
     pub hosts: Vec<String>,
     /// Folder for shared-memory domains, if not the default.
     pub domain_root: Option<PathBuf>,
+    /// The topology file, for the manifest.
+    pub topology_file: PathBuf,
     /// The command line, for the manifest.
     pub command_line: Vec<String>,
     /// The fields of the channels whose messages are known, by channel, for the manifest.

@@ -32,6 +32,7 @@ use crate::rundir::run_folder::{RunFolder, utc_text};
 use crate::rundir::run_result::{Outcome, RunResult};
 use crate::rundir::status::Phase;
 use crate::shm::clock_id;
+use crate::topology::emulation::EmulationLaunch;
 use crate::topology::emulation_room::check_emulation;
 use crate::topology::{Host, Topology};
 
@@ -78,6 +79,7 @@ pub fn run(
     };
     let content = ManifestContent {
         topology,
+        topology_file: &options.topology_file,
         hosts: &options.hosts,
         command_line: &options.command_line,
         layouts: &options.layouts,
@@ -132,6 +134,17 @@ pub fn run(
     let span = (start, MonotonicClock::now());
     session.stop(&outcome);
     Ok(session.conclude(folder, outcome, span, (started, facts)))
+}
+
+/// The longest delay of each trace that a link of `topology` replays, by channel: known since before
+/// the run began.
+fn trace_delays(topology: &Topology) -> BTreeMap<String, Duration> {
+    let seed = topology.run().seed;
+    let delays = topology.crossings().filter_map(|crossing| {
+        let trace = EmulationLaunch::of(&crossing, seed)?.trace?;
+        Some((crossing.channel.name.clone(), trace.delay_max().ok()?))
+    });
+    delays.collect()
 }
 
 pub(super) fn is_here(host: &Host, hosts: &[&Host]) -> bool {
@@ -456,6 +469,7 @@ impl Session<'_> {
             own_hosts,
             problems,
             facts,
+            trace_delays: trace_delays(self.topology),
         }
     }
 

@@ -19,8 +19,9 @@ use hil_models::random::RandomStream;
 use hil_models::shuttle::{Shuttle, ShuttleCommand, ShuttleStatus};
 use hil_models::time::Instant;
 
-use super::conclude;
+use super::{analyse, conclude};
 use crate::platform::host_facts::HostFacts;
+use crate::rundir::manifest::{self, ManifestContent};
 use crate::rundir::record::RecordKind;
 use crate::rundir::record::file::RecordHeader;
 use crate::rundir::run_folder::RunFolder;
@@ -328,6 +329,7 @@ fn result(root: &Path, count: i64) -> RunResult {
         own_hosts: vec!["control-pc".to_owned()],
         problems: Vec::new(),
         facts: HostFacts::default(),
+        trace_delays: BTreeMap::new(),
     }
 }
 
@@ -382,6 +384,36 @@ fn peak_of(folder: &Path, count: i64) -> u64 {
     assert!(done.status.success(), "{said}{complaint}");
     let peak = said.lines().find_map(|line| line.split_once(PEAK));
     peak.unwrap().1.trim().parse().unwrap()
+}
+
+#[test]
+fn the_folder_alone_gives_the_same_summary() {
+    let root = env::temp_dir().join(format!("hil-analyse-{}", std::process::id()));
+    let count = 2_000;
+    write_run(&root, count);
+    let registry = registry();
+    let topology = topology(&registry);
+    let result = result(&root, count);
+    let command_line = ["hil-runtime".to_owned(), "-t".to_owned()];
+    let file = Path::new("long.toml");
+    let content = ManifestContent {
+        topology: &topology,
+        topology_file: file,
+        hosts: &result.own_hosts,
+        command_line: &command_line,
+        layouts: &BTreeMap::new(),
+        facts: &result.facts,
+        realtime_minus_monotonic_ns: None,
+    };
+    manifest::write(&content, &result.folder).unwrap();
+    result.write().unwrap();
+    assert_eq!(RunResult::read(&result.folder).unwrap(), result);
+    let from_memory = conclude(&topology, &result, &registry, (file, &command_line)).unwrap();
+    fs::remove_file(result.folder.summary()).unwrap();
+    let from_folder = analyse(&result.folder, &registry).unwrap();
+    assert_eq!(from_folder.summary, from_memory.summary);
+    assert!(result.folder.summary().is_file() && from_folder.unwritten.is_none());
+    fs::remove_dir_all(root).unwrap();
 }
 
 #[test]

@@ -329,9 +329,13 @@ impl RunRecords {
             .map(|crossing| link_changes::longest_delay(topology, self, crossing));
         let delay = crossing
             .and_then(|crossing| EmulationLaunch::of(&crossing, topology.run().seed))
-            .map(|emulation| {
-                let delay = emulation.flight_time(FLIGHT_QUANTILE);
-                delay.expect("a run begins when its traces were read, and what was read is noted")
+            .map(|emulation| match emulation.trace {
+                // A run begins when its traces were read, and what was read is in its result.
+                Some(_) => {
+                    let noted = result.trace_delays.get(&channel.name);
+                    noted.copied().unwrap_or_default()
+                }
+                None => emulation.spec.flight_time(FLIGHT_QUANTILE),
             });
         let round_trips = files.round_trips.values();
         let round_trips_ns: Vec<i64> = round_trips.map(RoundTripRecord::rtt_ns).collect();
