@@ -13,7 +13,7 @@ pub fn counted_plainly(count: u64, what: &str) -> String {
 }
 
 /// `what` of so many.
-pub(crate) fn plural(count: u64, what: &str) -> String {
+pub fn plural(count: u64, what: &str) -> String {
     let ending = if count == 1 { "" } else { "s" };
     format!("{what}{ending}")
 }

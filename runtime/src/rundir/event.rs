@@ -71,7 +71,7 @@ pub struct HostStory {
 }
 
 /// Who steers the system clock, by host.
-pub(crate) fn disciplines(stories: &[HostStory]) -> BTreeMap<String, HostDiscipline> {
+pub fn disciplines(stories: &[HostStory]) -> BTreeMap<String, HostDiscipline> {
     let told = stories.iter().flat_map(|story| {
         let discipline = story.discipline.as_ref();
         let hosts = story.hosts.iter();

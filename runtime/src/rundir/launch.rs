@@ -7,7 +7,6 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use hil_models::link::LinkModel;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 

@@ -174,7 +174,7 @@ fn is_locked(root: &Path) -> bool {
 
 /// When process `pid` began, in clock ticks since boot; `None` when it is gone or only waits to be
 /// cleaned up.
-pub(crate) fn start_ticks(pid: u32) -> Option<u64> {
+pub fn start_ticks(pid: u32) -> Option<u64> {
     let stat = fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
     // The name before the last bracket may hold anything. Behind it: state, then the parent, field 4.
     let (_, rest) = stat.rsplit_once(')')?;

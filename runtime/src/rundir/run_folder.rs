@@ -92,7 +92,7 @@ impl RunFolder {
     ///
     /// # Errors
     /// When the folder cannot be read.
-    pub(crate) fn record_files(&self) -> io::Result<Vec<(PathBuf, u64)>> {
+    pub fn record_files(&self) -> io::Result<Vec<(PathBuf, u64)>> {
         let mut files = Vec::new();
         for entry in fs::read_dir(self.records())? {
             let (entry, path) = entry.map(|entry| (entry.metadata(), entry.path()))?;

@@ -1,7 +1,6 @@
 //! The shared memory of one run on one host: an iceoryx2 domain of its own, so that runs side by
 //! side cannot see each other and everything a dead run left behind can be thrown away.
 
-use core::str::FromStr;
 use std::fs::{self, DirBuilder, File};
 use std::io;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt};
@@ -107,7 +106,7 @@ impl Domain {
     }
 
     /// The prefix of the domain whose root is, or was, `root_path`; `None` where there is none.
-    pub(crate) fn prefix_at(root_path: &Path) -> Option<String> {
+    pub fn prefix_at(root_path: &Path) -> Option<String> {
         let prefix = fs::read_to_string(root_path.join(MARKER)).ok()?;
         is_prefix(&prefix).then_some(prefix)
     }

@@ -54,10 +54,8 @@ pub enum DomainError {
 }
 
 impl DomainError {
-    pub(crate) fn io(
-        operation: &'static str,
-        path: impl Into<PathBuf>,
-    ) -> impl FnOnce(io::Error) -> Self {
+    /// For an operation on `path` that the system refused.
+    pub fn io(operation: &'static str, path: impl Into<PathBuf>) -> impl FnOnce(io::Error) -> Self {
         let path = path.into();
         move |source| Self::Io {
             operation,
@@ -133,7 +131,8 @@ pub enum ChannelError {
 impl ChannelError {
     // Cold, so that the paths which may fail stay short where they do not.
     #[cold]
-    pub(crate) fn refused(channel: &str, operation: &'static str, reason: &dyn Debug) -> Self {
+    /// For an operation that iceoryx2 refused.
+    pub fn refused(channel: &str, operation: &'static str, reason: &dyn Debug) -> Self {
         let name = format!("{reason:?}");
         Self::Refused {
             channel: channel.to_owned(),

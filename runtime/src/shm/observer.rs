@@ -16,3 +16,16 @@ pub fn observer_depth(size_bytes: usize) -> usize {
     let each = size_bytes.saturating_add(size_of::<Envelope>());
     (WAITING_BYTES_MAX / each).clamp(DEPTH_MIN, DEPTH_MAX)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_observer_has_room_for_many_small_messages_and_for_some_large_ones() {
+        assert_eq!(observer_depth(8), DEPTH_MAX);
+        assert_eq!(observer_depth(192), 1024);
+        assert_eq!(observer_depth(8 << 10), 31);
+        assert_eq!(observer_depth(usize::MAX), DEPTH_MIN);
+    }
+}

@@ -60,7 +60,7 @@ impl ClockPath<'_> {
 }
 
 /// `10.78.0.1 (eth1)`.
-pub(crate) fn describe_end(address: &str, interface: Option<&str>) -> String {
+pub fn describe_end(address: &str, interface: Option<&str>) -> String {
     interface.map_or_else(
         || address.to_owned(),
         |interface| format!("{address} ({interface})"),

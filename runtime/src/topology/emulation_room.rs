@@ -107,7 +107,7 @@ impl EmulationRoom {
 ///
 /// # Errors
 /// The first link for which they cannot, or a trace that cannot be read.
-pub(crate) fn check_emulation(topology: &Topology) -> Result<(), EmulationError> {
+pub fn check_emulation(topology: &Topology) -> Result<(), EmulationError> {
     for crossing in topology.crossings() {
         if let Some(emulation) = EmulationLaunch::of(&crossing, topology.run().seed) {
             emulation.room(crossing.channel.message.size_bytes)?;

@@ -46,8 +46,8 @@ mod units;
 use std::path::Path;
 
 pub use card::{CardChannel, ProcessCard};
-pub(crate) use check_face::{command_channel, feedback_channel};
-pub(crate) use clock_path::describe_end;
+pub use check_face::{command_channel, feedback_channel};
+pub use clock_path::describe_end;
 pub use clock_path::{ClockEnd, ClockPath};
 pub use errors::{Fault, Location, TopologyError, TopologyErrors};
 pub use face::{EgmFace, FaceKind, FaceSend};
@@ -64,7 +64,7 @@ pub use names::{CHANNEL_NAME_BYTES_MAX, clock_process_name, gateway_name};
 pub use schema::schema;
 pub use security::{Hops, Security};
 
-pub(crate) use units::parse_duration;
+pub use units::parse_duration;
 
 use check::Needs;
 use errors::Place;

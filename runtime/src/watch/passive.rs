@@ -95,16 +95,3 @@ impl PassiveReader {
         }
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn an_observer_has_room_for_many_small_messages_and_for_some_large_ones() {
-        assert_eq!(observer_depth(8), DEPTH_MAX);
-        assert_eq!(observer_depth(192), 1024);
-        assert_eq!(observer_depth(8 << 10), 31);
-        assert_eq!(observer_depth(usize::MAX), DEPTH_MIN);
-    }
-}

@@ -100,11 +100,11 @@ pub enum GatewayError {
 /// What a direction's thread needs from the process around it.
 #[derive(Debug)]
 pub struct Surroundings {
-    pub(crate) domain: Domain,
-    pub(crate) session: u32,
-    pub(crate) fingerprint: [u8; 16],
+    pub domain: Domain,
+    pub session: u32,
+    pub fingerprint: [u8; 16],
     pub(crate) clock_id: u64,
-    pub(crate) stop: Arc<AtomicBool>,
+    pub stop: Arc<AtomicBool>,
 }
 
 impl Surroundings {
@@ -122,7 +122,8 @@ impl Surroundings {
         })
     }
 
-    pub(crate) fn identity(launch: &DirectionLaunch) -> ChannelIdentity {
+    /// What the other end of the channel of `launch` must agree on.
+    pub fn identity(launch: &DirectionLaunch) -> ChannelIdentity {
         ChannelIdentity::new(
             launch.channel_id,
             &launch.channel,

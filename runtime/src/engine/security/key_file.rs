@@ -216,7 +216,7 @@ impl PreSharedKey {
     }
 
     /// The bytes, for the handshake.
-    pub(crate) fn expose(&self) -> &[u8; KEY_BYTES] {
+    pub fn expose(&self) -> &[u8; KEY_BYTES] {
         &self.0
     }
 }

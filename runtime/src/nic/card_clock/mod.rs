@@ -5,8 +5,8 @@
 //! The supervisor does this and not a gateway, because a card belongs to its host: two links may
 //! use one card. A supervisor that is killed outright cannot put it back; then its guard does.
 
-pub(crate) mod guard;
-pub(crate) mod probing;
+pub mod guard;
+pub mod probing;
 
 use std::path::Path;
 use std::sync::Arc;
@@ -42,7 +42,7 @@ struct WatchedCard {
 
 /// The cards of this supervisor's hosts, armed and watched until [`CardWatch::finish`].
 #[derive(Debug, Default)]
-pub(crate) struct CardWatch {
+pub struct CardWatch {
     cards: Vec<WatchedCard>,
     recorder: Option<Recorder>,
     stop: Arc<AtomicBool>,
@@ -63,7 +63,7 @@ impl CardWatch {
     /// Arms the cards that `topology` asks for on `hosts` and begins to read their clocks into
     /// `records`. What cannot be done is part of the story and ends no run. Call it from a thread
     /// of normal priority: the reading thread inherits it.
-    pub(crate) fn start(topology: &Topology, hosts: &[&Host], records: &Path) -> Self {
+    pub fn start(topology: &Topology, hosts: &[&Host], records: &Path) -> Self {
         let mut watch = Self {
             cards: Vec::new(),
             recorder: None,
@@ -137,7 +137,7 @@ impl CardWatch {
 
     /// Reads the clocks a last time, puts the cards back as they were, and gives their stories
     /// and what went wrong with the records.
-    pub(crate) fn finish(mut self) -> (Vec<CardStory>, Vec<String>) {
+    pub fn finish(mut self) -> (Vec<CardStory>, Vec<String>) {
         self.stop.store(true, Ordering::Release);
         if let Some(sampling) = self.sampling.take() {
             sampling.thread().unpark();

@@ -7,12 +7,12 @@
 //! - [`category`]: which access category a mark leads to.
 
 pub mod category;
-pub(crate) mod conversation;
-pub(crate) mod netlink;
-pub(crate) mod nl80211;
+pub mod conversation;
+pub mod netlink;
+pub mod nl80211;
 mod noting;
-pub(crate) mod sampler;
-pub(crate) mod socket;
+pub mod sampler;
+pub mod socket;
 
 use netlink::{Answer, Answers};
 

@@ -36,7 +36,7 @@ struct Tally {
 
 /// A sampler at work.
 #[derive(Debug)]
-pub(crate) struct Sampler {
+pub struct Sampler {
     interface: String,
     hears_events: bool,
     thread: JoinHandle<Tally>,
@@ -47,7 +47,7 @@ impl Sampler {
     ///
     /// # Errors
     /// When the system gives no thread.
-    pub(crate) fn start(
+    pub fn start(
         interface: String,
         mut socket: RadioSocket,
         mut sink: RecordSink,
@@ -77,7 +77,7 @@ impl Sampler {
     }
 
     /// Waits for its end; says what it did, in words.
-    pub(crate) fn finish(self) -> (String, String) {
+    pub fn finish(self) -> (String, String) {
         let label = "radio samples".to_owned();
         let Ok(tally) = self.thread.join() else {
             return (label, "unavailable: the sampler panicked".to_owned());

@@ -49,7 +49,7 @@ use crate::topology::registry::{Case, CaseError, Registry};
 
 /// Why no summary could be made.
 #[derive(Debug, thiserror::Error)]
-pub(crate) enum AnalysisError {
+pub enum AnalysisError {
     #[error("records folder {folder}: {source}")]
     Folder { folder: PathBuf, source: io::Error },
     #[error(transparent)]
@@ -71,10 +71,10 @@ pub(crate) enum AnalysisError {
 
 /// The account of a finished run.
 #[derive(Debug)]
-pub(crate) struct Concluded {
-    pub(crate) summary: RunSummary,
+pub struct Concluded {
+    pub summary: RunSummary,
     /// Why the run folder lacks it, e.g. because its disk is full; it can be shown all the same.
-    pub(crate) unwritten: Option<AnalysisError>,
+    pub unwritten: Option<AnalysisError>,
 }
 
 /// Draws up the summary of the finished run in `folder` from nothing but the files there, and writes

@@ -21,7 +21,8 @@ pub use canvas::Style;
 pub(crate) use canvas::{Tone, wrapped};
 pub(crate) use channel::closing_text;
 pub(crate) use trace::{render_fit, render_trace, render_trace_plots};
-pub(crate) use units::{JOINT, duration, duration_s, figure, percent, seconds};
+pub use units::{JOINT, duration, percent};
+pub(crate) use units::{duration_s, figure, seconds};
 
 use hil_models::measure::account::OutageFigures;
 

@@ -2,10 +2,10 @@
 //! Number and unit are joined by [`JOINT`], so that no line breaks between them.
 
 /// Stands for a blank at which a line must not break; a page turns it into one.
-pub(crate) const JOINT: char = '\u{a0}';
+pub const JOINT: char = '\u{a0}';
 
 /// A duration in the unit that leaves one to three digits before the point.
-pub(crate) fn duration(ns: i64) -> String {
+pub fn duration(ns: i64) -> String {
     let magnitude = ns.unsigned_abs();
     let sign = if ns < 0 { "-" } else { "" };
     let (scale, unit) = match magnitude {
@@ -46,7 +46,7 @@ fn three_digits(value: f64) -> String {
 }
 
 /// A ratio as per cent. Nothing but all rounds to 100 %, nothing but none to 0 %.
-pub(crate) fn percent(ratio: f64) -> String {
+pub fn percent(ratio: f64) -> String {
     let value = 100.0 * ratio;
     if ratio > 0.0 && value < 0.01 {
         return format!("<0.01{JOINT}%");

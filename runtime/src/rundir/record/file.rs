@@ -196,11 +196,7 @@ impl RecordHeader {
     ///
     /// # Errors
     /// When it exists or cannot be written, or the channel name is too long.
-    pub(crate) fn create(
-        &self,
-        folder: &Path,
-        writer: &str,
-    ) -> Result<(PathBuf, File), RecordFileError> {
+    pub fn create(&self, folder: &Path, writer: &str) -> Result<(PathBuf, File), RecordFileError> {
         let path = folder.join(self.file_name(writer));
         let bytes = self.encode(&path)?;
         let made =
@@ -220,7 +216,7 @@ impl RecordHeader {
     }
 
     /// Reads a header off the beginning of a file.
-    pub(crate) fn decode(path: &Path, bytes: &[u8]) -> Result<Self, RecordFileError> {
+    pub fn decode(path: &Path, bytes: &[u8]) -> Result<Self, RecordFileError> {
         let Some(header) = bytes.first_chunk::<HEADER_BYTES>() else {
             return Err(malformed(
                 path,
