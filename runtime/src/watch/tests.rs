@@ -16,7 +16,7 @@ use crate::rundir::announcement::withdraw_abandoned;
 use crate::rundir::live_run::{LIVE_VERSION, LiveChannel, LiveRun, Source, start_ticks};
 use crate::rundir::record::RecordKind;
 use crate::rundir::record::file::RecordHeader;
-use crate::rundir::select::{SelectError, running_runs_below, select, select_below};
+use crate::rundir::select::{SelectError, running_runs_below, select};
 use crate::shm::{ChannelHolder, ChannelSettings, Domain, RawOutput, TypeInfo, observer_depth};
 
 /// A folder of the test's own, and a short name for a domain below it.

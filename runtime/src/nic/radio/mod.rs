@@ -3,7 +3,7 @@
 //!
 //! - `netlink`, `nl80211`: the messages, as bytes; `conversation`: question and answer.
 //! - `socket`: asking and listening; `sampler`: doing so ten times a second.
-//! - [`record`]: what is written down.
+//! - `noting`: what is written down, as [`RadioRecord`](crate::rundir::radio_record::RadioRecord)s.
 //! - [`category`]: which access category a mark leads to.
 
 pub mod category;
