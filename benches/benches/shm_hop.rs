@@ -22,9 +22,10 @@ use hil_models::endpoint::{InputPort, OutputPort};
 use hil_models::message::{Message, MessageType};
 use hil_models::time::Instant as HostInstant;
 use hil_runtime::platform::clock::MonotonicClock;
+use hil_runtime::platform::domain_address::DomainAddress;
 use hil_runtime::shm::{
-    ChannelHolder, ChannelSettings, Domain, DomainAddress, OutputSettings, ShmInput, ShmOutput,
-    TypedInput, TypedOutput, Waiter,
+    ChannelHolder, ChannelSettings, Domain, OutputSettings, ShmInput, ShmOutput, TypedInput,
+    TypedOutput, Waiter,
 };
 use iceoryx2::node::{Node, NodeBuilder};
 use iceoryx2::port::listener::Listener;

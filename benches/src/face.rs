@@ -18,14 +18,14 @@ use hil_models::time::Instant;
 use hil_models::yumi::arm::{Arm, RIGHT_START_RAD};
 use hil_runtime::engine::face::OpenedArm;
 use hil_runtime::platform::clock::{MonotonicClock, Wake};
+use hil_runtime::platform::domain_address::DomainAddress;
 use hil_runtime::platform::realtime::RealtimeRequest;
 use hil_runtime::platform::wait::WaitMode;
 use hil_runtime::report::face_figures::{FaceFigures, figures};
 use hil_runtime::rundir::face_launch::{ArmLaunch, FaceLaunch, FaceSettings};
 use hil_runtime::rundir::record::{RecordFile, Recorder};
 use hil_runtime::shm::{
-    ChannelHolder, ChannelSettings, Domain, DomainAddress, OutputSettings, ShmInput, ShmOutput,
-    Waiter,
+    ChannelHolder, ChannelSettings, Domain, OutputSettings, ShmInput, ShmOutput, Waiter,
 };
 use hil_runtime::topology::{CardChannel, FaceKind, FaceSend, Timestamps};
 

@@ -7,7 +7,7 @@
 //! use hil_models::shuttle::Shuttle;
 //!
 //! fn main() -> std::process::ExitCode {
-//!     hil_runtime::Runtime::new().case::<Shuttle>().run()
+//!     hil_runtime::cli::Runtime::new().case::<Shuttle>().run()
 //! }
 //! ```
 //!

@@ -11,8 +11,8 @@ use hil_models::endpoint::InputPort;
 use hil_models::message::Envelope;
 use hil_models::time::Instant;
 use hil_runtime::platform::clock::{MonotonicClock, Wake};
+use hil_runtime::platform::domain_address::DomainAddress;
 use hil_runtime::platform::wait::{Pause, WaitMode, WaitStrategy};
-use hil_runtime::shm::DomainAddress;
 
 use super::hosts::{Joint, Loose, Plan, Ports, SetupError, greet};
 use super::parties::{Party, Usage, claim};

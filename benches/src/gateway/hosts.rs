@@ -15,14 +15,14 @@ use hil_models::message::MessageType;
 use hil_runtime::engine::gateway::Surroundings;
 use hil_runtime::engine::gateway::direction;
 use hil_runtime::engine::gateway::direction::{Direction, Opened};
+use hil_runtime::platform::domain_address::DomainAddress;
 use hil_runtime::platform::realtime::RealtimeRequest;
 use hil_runtime::platform::wait::WaitMode;
 use hil_runtime::rundir::launch::{DirectionLaunch, Side, SocketLaunch, Transport};
 use hil_runtime::rundir::pipe::RunStart;
 use hil_runtime::rundir::record::{RecordFile, RecordKind, RecordSink, Recorder};
 use hil_runtime::shm::{
-    ChannelHolder, ChannelSettings, Domain, DomainAddress, OutputSettings, ShmInput, ShmOutput,
-    Waiter,
+    ChannelHolder, ChannelSettings, Domain, OutputSettings, ShmInput, ShmOutput, Waiter,
 };
 use hil_runtime::topology::Timestamps;
 

@@ -6,10 +6,10 @@ use std::process::ExitCode;
 
 use clap::{CommandFactory as _, Parser};
 use hil_runtime::platform::console::Console;
-use hil_runtime::platform::documents;
 use hil_runtime::platform::progress::Progress;
 use hil_runtime::platform::signals::{EXIT_INTERRUPTED, Signals};
 use hil_runtime::platform::words::counted_plainly;
+use hil_runtime::topology::documents;
 
 use crate::cli::{Cli, Command, ServeOptions};
 use crate::convert::{ConvertError, convert};

@@ -7,6 +7,7 @@ use clap::{ArgGroup, Args, Parser, Subcommand};
 
 use crate::doctor::cli::DoctorArgs;
 use crate::engine::security::cli::KeyCommand;
+use crate::nic::card_clock::guard::CardGuardArgs;
 use crate::probe::arguments::ProbeArgs;
 use crate::report::compare::cli as compare_cli;
 use crate::report::compare::cli::CompareArgs;
@@ -229,23 +230,6 @@ pub struct ReplayArgs {
     pub into: Option<String>,
 }
 
-/// How a network card was found, in the kernel's numbers (`struct hwtstamp_config`).
-#[derive(Debug, Args)]
-pub struct CardGuardArgs {
-    /// Its interface.
-    #[arg(long)]
-    pub interface: String,
-    /// `flags`.
-    #[arg(long, allow_negative_numbers = true)]
-    pub flags: i32,
-    /// `tx_type`.
-    #[arg(long, allow_negative_numbers = true)]
-    pub transmit_type: i32,
-    /// `rx_filter`.
-    #[arg(long, allow_negative_numbers = true)]
-    pub receive_filter: i32,
-}
-
 /// Everything but a run.
 #[derive(Debug, Subcommand)]
 pub enum Command {
@@ -394,36 +378,49 @@ pub enum Command {
     },
 }
 
-/// Reads a whole number from `least` to `most`, and says the range in words when it is none.
-pub(crate) fn whole<T>(least: u64, most: u64) -> impl Fn(&str) -> Result<T, String> + Clone
-where
-    T: TryFrom<u64>,
-{
-    move |text| {
-        let number = text.parse::<u64>().ok();
-        let number = number.filter(|number| (least..=most).contains(number));
-        number
-            .and_then(|number| T::try_from(number).ok())
-            .ok_or_else(|| match most {
-                u64::MAX => format!("must be a whole number, {least} or more"),
-                _ => format!("must be a whole number from {least} to {most}"),
-            })
-    }
-}
-
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
+    use clap::CommandFactory as _;
+
     use super::*;
+    use crate::topology::documents::write;
 
     #[test]
-    fn a_whole_number_outside_its_range_is_refused_with_it() {
-        let port = whole::<u16>(1, 99);
-        assert_eq!((port("1"), port("99")), (Ok(1), Ok(99)));
-        for text in ["0", "100", "-1", "1.5", "", "many"] {
-            let why = port(text).unwrap_err();
-            assert_eq!(why, "must be a whole number from 1 to 99", "{text}");
+    fn every_command_that_help_shows_has_a_page_with_exit_codes() {
+        let folder = std::env::temp_dir().join(format!("hil-documents-{}", std::process::id()));
+        let written = write(Cli::command(), &folder).unwrap();
+        let names: Vec<String> = written
+            .iter()
+            .map(|path| path.file_name().unwrap().to_string_lossy().into_owned())
+            .collect();
+        for name in [
+            "hil-runtime.1",
+            "hil-runtime-doctor.1",
+            "hil-runtime-trace-fit.1",
+            "hil-runtime.bash",
+            "_hil-runtime",
+            "hil-runtime.fish",
+        ] {
+            assert!(names.iter().any(|one| one == name), "{name}: {names:?}");
         }
-        let why = whole::<u64>(1, u64::MAX)("0").unwrap_err();
-        assert_eq!(why, "must be a whole number, 1 or more");
+        for hidden in ["component", "gateway", "become", "help"] {
+            let hidden = format!("hil-runtime-{hidden}.1");
+            assert!(!names.contains(&hidden), "{hidden}");
+        }
+        let pages = written
+            .iter()
+            .filter(|path| path.starts_with(folder.join("man1")));
+        for path in pages {
+            let text = fs::read_to_string(path).unwrap();
+            let (_, codes) = text.split_once("EXIT STATUS").unwrap_or_default();
+            assert!(
+                codes.contains("doctor \\-\\-strict"),
+                "{}: {text}",
+                path.display()
+            );
+        }
+        fs::remove_dir_all(folder).unwrap();
     }
 }

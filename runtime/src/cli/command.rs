@@ -26,21 +26,23 @@ use crate::engine::process::{component, own_program};
 use crate::engine::security::cli::KeyCommand;
 use crate::engine::security::{KeyFileError, PreSharedKey};
 use crate::engine::supervisor;
-use crate::engine::supervisor::{Outcome, PeerError, RunError, RunOptions, RunResult};
+use crate::engine::supervisor::{PeerError, RunError, RunOptions};
 use crate::nic::card_clock::guard;
 use crate::platform::console::Console;
-use crate::platform::documents;
 use crate::platform::progress::Progress;
 use crate::platform::signals::{EXIT_INTERRUPTED, Signals};
 use crate::probe;
 use crate::report::analysis;
-use crate::report::analysis::Concluded;
+use crate::report::analysis::{AnalysisError, Concluded};
 use crate::report::compare;
 use crate::report::compare::cli::CompareArgs;
 use crate::report::terminal::{self, Style};
 use crate::report::trace;
+use crate::rundir::run_result::{Outcome, RunResult};
+use crate::topology::documents;
 use crate::topology::emulation_room::check_emulation;
 use crate::topology::registry::Registry;
+use crate::topology::trace_source;
 use crate::topology::{self, HOST_VARIABLE, HostChoice, MachineIdentity, Topology, which_host};
 use crate::watch::link;
 use crate::watch::link::cli::LinkCommand;
@@ -96,7 +98,7 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
         Command::Calibrate(args) => case_work::calibrate(args, registry),
         Command::Replay(args) if play_work::is_recording(&args) => play_work::play(&args, console),
         Command::Replay(args) => case_work::replay(&args.run, args.json, registry, console),
-        Command::Report(args) => report_work::report(&args, console),
+        Command::Report(args) => report_work::report(&args, registry, console),
         Command::Compare(args) => compare(&args, console),
         Command::Trace { command } => match trace::work::work(command, columns(), console) {
             trace::work::End::Done => exit::RAN,
@@ -210,7 +212,7 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
     let Some(topology) = load(path, &args.overrides, registry, console) else {
         return exit::USAGE;
     };
-    if let Err(error) = trace::source::check(&topology) {
+    if let Err(error) = trace_source::check(&topology) {
         console.error(&error.to_string());
         return exit::USAGE;
     }
@@ -235,6 +237,7 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
     let options = RunOptions {
         hosts,
         domain_root: args.domain_root.clone(),
+        topology_file: path.clone(),
         command_line: env::args().collect(),
         layouts: layouts(&topology, registry),
     };
@@ -248,7 +251,16 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
             };
             let origin = (path.as_path(), options.command_line.as_slice());
             let concluded = Progress::begin().during(console, "drawing up the account", |_| {
-                analysis::conclude(&topology, &result, registry, origin)
+                let written = result.write().map_err(AnalysisError::from);
+                let analysed = written.and_then(|()| analysis::analyse(&result.folder, registry));
+                // What the folder cannot give back, because its disk is full, is still in memory.
+                analysed.or_else(|error| {
+                    let concluded = analysis::conclude(&topology, &result, registry, origin)?;
+                    Ok::<_, AnalysisError>(Concluded {
+                        unwritten: concluded.unwritten.or(Some(error)),
+                        ..concluded
+                    })
+                })
             });
             match concluded {
                 Ok(Concluded { summary, unwritten }) => {

@@ -40,9 +40,9 @@ use self::latency::LatencyReport;
 pub use self::network::{StampCapabilities, StampCapabilityQuery};
 pub use self::plan::{LinkLoad, Peer, Pin, Plan, Protocol, WantedPort};
 use self::privileges::Rights;
-use crate::engine::supervisor::domain_base_candidates;
 use crate::nic::card_clock::probing::probe_card;
 use crate::platform::clock_discipline::HostDiscipline;
+use crate::platform::domain_address::domain_base_candidates;
 use crate::platform::host_facts::{HostFacts, HostFiles};
 use crate::shm::ForeignNodes;
 

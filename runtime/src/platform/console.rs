@@ -11,7 +11,7 @@ use anstyle::{AnsiColor, Style};
 use nix::sys::stat::fstat;
 
 use crate::platform::systemd::ServiceManager;
-use crate::report::terminal::shortened;
+use crate::platform::text::shortened;
 
 /// Progress lines where they cannot be redrawn.
 const PLAIN_PERIOD: Duration = Duration::from_secs(5);
@@ -110,7 +110,7 @@ impl Console {
 
     /// From now on the service manager that started this process hears how it stands, if there is one
     /// that wants to. For the main process of a service only.
-    pub(crate) fn serve(&mut self) {
+    pub fn serve(&mut self) {
         match ServiceManager::of_this_process() {
             Ok(service) => self.service = service,
             Err(error) => self.warn(&format!(
@@ -120,7 +120,7 @@ impl Console {
     }
 
     /// Tells the service manager that the service is up, and lives.
-    pub(crate) fn announce_up(&mut self) {
+    pub fn announce_up(&mut self) {
         if let Some(service) = &mut self.service {
             service.up();
             service.alive();
@@ -128,14 +128,14 @@ impl Console {
     }
 
     /// Tells the service manager that it lives.
-    pub(crate) fn announce_alive(&mut self) {
+    pub fn announce_alive(&mut self) {
         if let Some(service) = &mut self.service {
             service.alive();
         }
     }
 
     /// Tells the service manager that the service is ending.
-    pub(crate) fn announce_ending(&mut self) {
+    pub fn announce_ending(&mut self) {
         if let Some(service) = &mut self.service {
             service.stopping();
             service.status("ending the run");
@@ -203,7 +203,7 @@ impl Console {
     }
 
     /// Says faults that are already laid out, such as those of a file.
-    pub(crate) fn faults(&mut self, text: &str) {
+    pub fn faults(&mut self, text: &str) {
         match self.listener {
             Listener::Journal => self.line(Weight::Error, text.trim_end()),
             // They have colours of their own.

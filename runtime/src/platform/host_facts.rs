@@ -1,6 +1,7 @@
 //! What kind of host a run happened on: a list of labelled facts for the run's manifest. It is a
-//! description, not a judgement; [`crate::doctor`] judges.
+//! description, not a judgement.
 
+mod fake;
 mod files;
 mod kernel;
 mod processors;
@@ -9,15 +10,14 @@ use nix::sys::resource::{RLIM_INFINITY, Resource, getrlimit};
 use nix::sys::utsname::uname;
 use serde::{Deserialize, Serialize};
 
+pub use self::fake::FakeHost;
 pub use self::files::HostFiles;
-#[cfg(test)]
-pub(crate) use self::files::fake::FakeHost;
-pub(crate) use self::files::{CAP_IPC_LOCK, CAP_SYS_NICE, format_cpu_list};
-pub(crate) use self::kernel::{
+pub use self::files::{CAP_IPC_LOCK, CAP_SYS_NICE, format_cpu_list};
+pub use self::kernel::{
     KernelOptions, PreemptionMode, RealtimeThrottle, boot_parameter, clocksource, has_fair_server,
     kernel_release, preemption, virtual_machine,
 };
-pub(crate) use self::processors::{
+pub use self::processors::{
     CPU_FOLDER, governors, isolated_or_online, load_average, online_cpus, refuse_absent,
 };
 pub use self::processors::{IsolatedCpus, ProcessorTicks};
@@ -41,11 +41,13 @@ impl<T> Fact<T> {
         }
     }
 
-    pub(crate) fn map<U>(self, change: impl FnOnce(T) -> U) -> Fact<U> {
+    /// The answer changed; a reason stays.
+    pub fn map<U>(self, change: impl FnOnce(T) -> U) -> Fact<U> {
         self.and_then(|value| Fact::Available(change(value)))
     }
 
-    pub(crate) fn and_then<U>(self, change: impl FnOnce(T) -> Fact<U>) -> Fact<U> {
+    /// What follows from the answer; a reason stays.
+    pub fn and_then<U>(self, change: impl FnOnce(T) -> Fact<U>) -> Fact<U> {
         match self {
             Self::Available(value) => change(value),
             Self::Unavailable(reason) => Fact::Unavailable(reason),
@@ -187,7 +189,8 @@ pub(crate) fn soft_limit(resource: Resource) -> Fact<u64> {
     }
 }
 
-pub(crate) fn limit(resource: Resource, unit: &str) -> Fact<String> {
+/// The limit of this process on `resource`, in `unit`.
+pub fn limit(resource: Resource, unit: &str) -> Fact<String> {
     soft_limit(resource).map(|soft| {
         if soft == RLIM_INFINITY {
             "unlimited".to_owned()

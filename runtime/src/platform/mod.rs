@@ -1,14 +1,17 @@
 //! The machine under a run: clocks, waiting, real-time settings, facts of the host, the terminal.
 //! It knows nothing of topologies and runs.
 
+pub mod argument;
 pub mod clock;
 pub mod clock_discipline;
 pub mod console;
-pub mod documents;
+pub mod domain_address;
 pub mod host_facts;
 pub mod progress;
+pub mod random;
 pub mod realtime;
 pub mod signals;
 pub mod systemd;
+pub mod text;
 pub mod wait;
 pub mod words;

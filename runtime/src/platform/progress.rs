@@ -132,7 +132,7 @@ impl Drop for OverOnDrop<'_> {
 }
 
 /// ` 42 %  0:13, about 0:18 left  words`.
-pub(crate) fn line(share: Option<f64>, elapsed: Duration, words: &str) -> String {
+pub fn line(share: Option<f64>, elapsed: Duration, words: &str) -> String {
     let elapsed_s = elapsed.as_secs_f64();
     let passed = clock_text(elapsed_s);
     let Some(share) = share.map(|share| share.clamp(0.0, 1.0)) else {

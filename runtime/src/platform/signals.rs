@@ -61,7 +61,7 @@ impl Signals {
 
     /// From now until the watch is dropped a signal ends the program with
     /// [`EXIT_INTERRUPTED`] and a line with the reason: for work that does not look at signals.
-    pub(crate) fn end_program_unless_over(&self, why: &'static str) -> EndWatch {
+    pub fn end_program_unless_over(&self, why: &'static str) -> EndWatch {
         let is_over = Arc::new(AtomicBool::new(false));
         let (signals, over) = (self.clone(), Arc::clone(&is_over));
         thread::spawn(move || {

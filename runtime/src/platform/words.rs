@@ -1,6 +1,6 @@
 //! Numbers with their nouns, as people say them.
 
-use crate::report::terminal::grouped;
+use crate::platform::text::grouped;
 
 /// `1 message`, `12,345 messages`.
 pub fn counted(count: u64, what: &str) -> String {
@@ -13,7 +13,7 @@ pub fn counted_plainly(count: u64, what: &str) -> String {
 }
 
 /// `what` of so many.
-pub(crate) fn plural(count: u64, what: &str) -> String {
+pub fn plural(count: u64, what: &str) -> String {
     let ending = if count == 1 { "" } else { "s" };
     format!("{what}{ending}")
 }

@@ -61,10 +61,10 @@ Exit code 1 when counts differ, or medians lie farther apart than --limit.";
 pub struct ProbeArgs {
     /// What to do, if not to capture.
     #[command(subcommand)]
-    pub(crate) work: Option<ProbeWork>,
+    pub work: Option<ProbeWork>,
     /// Capture.
     #[command(flatten)]
-    pub(crate) live: LiveArgs,
+    pub live: LiveArgs,
 }
 
 /// Arguments of a live capture.

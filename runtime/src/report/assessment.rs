@@ -9,7 +9,8 @@ use super::face_warnings;
 use super::summary::{
     ChannelSummary, Fact, LinkKind, NO_ROOM, Outcome, ProcessSummary, RunSummary,
 };
-use super::terminal::{JOINT, grouped, percent};
+use super::terminal::{JOINT, percent};
+use crate::platform::text::grouped;
 use crate::platform::words::counted;
 
 /// Share of skipped ticks above which the host, not the network, shaped the run.

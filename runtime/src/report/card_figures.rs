@@ -10,7 +10,7 @@ use hil_models::measure::record::{EgressRecord, IngressRecord, UNAVAILABLE};
 use hil_models::time::RemoteInstant;
 use serde::{Deserialize, Serialize};
 
-use crate::nic::card_clock::CardStory;
+use crate::rundir::card_story::CardStory;
 
 /// Everything the cards of a run say.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]

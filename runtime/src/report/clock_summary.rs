@@ -46,7 +46,7 @@ impl ClockRung {
     }
 
     /// The same, where some of the exchanges may have come over a clock path.
-    pub(crate) const fn words(self, has_path_exchanges: bool) -> &'static str {
+    pub const fn words(self, has_path_exchanges: bool) -> &'static str {
         match self {
             Self::Exchanges if has_path_exchanges => {
                 "exchanges over the clock path, and beside the data"

@@ -5,7 +5,7 @@ use hil_models::egm::wire::Cause;
 
 use super::face::FaceSummary;
 use super::summary::CountByName;
-use super::terminal::grouped;
+use crate::platform::text::grouped;
 
 /// The warnings of one arm, most important first.
 pub(super) fn face_warnings(face: &FaceSummary) -> Vec<String> {

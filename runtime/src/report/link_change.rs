@@ -48,11 +48,7 @@ pub enum ChangedTo {
 
 impl LinkChange {
     /// From what the gateway wrote; `at_s` is its instant on the axis of the run.
-    pub(crate) fn of(
-        (link, way): (&str, Way),
-        record: &LinkConditionRecord,
-        at_s: Option<f64>,
-    ) -> Self {
+    pub fn of((link, way): (&str, Way), record: &LinkConditionRecord, at_s: Option<f64>) -> Self {
         let to = match record.condition() {
             Some(LinkCondition::Topology) => ChangedTo::Topology,
             Some(LinkCondition::Fixed { delay, loss_ratio }) if loss_ratio.is_finite() => {
@@ -88,7 +84,7 @@ impl LinkChange {
     }
 
     /// What happened, without the time.
-    pub(crate) fn what(&self) -> String {
+    pub fn what(&self) -> String {
         let (link, way) = (&self.link, self.way.word());
         let to = match self.to {
             ChangedTo::Topology => "as the topology says again".to_owned(),
@@ -111,7 +107,7 @@ impl LinkChange {
     }
 
     /// The time, as people write it.
-    pub(crate) fn time(&self) -> String {
+    pub fn time(&self) -> String {
         self.at_s.map_or_else(
             || "at an unknown time".to_owned(),
             |at_s| format!("at{JOINT}{}", seconds(at_s)),

@@ -14,7 +14,7 @@ pub mod face_figures;
 mod face_warnings;
 pub mod link_change;
 pub mod network;
-pub(crate) mod page;
+pub mod page;
 pub mod radio;
 pub mod replay;
 pub mod score_event;

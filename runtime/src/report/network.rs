@@ -5,7 +5,8 @@ use hil_models::measure::correlation::PairCorrelation;
 use hil_models::measure::network::{NetworkEventKind, NetworkFigures};
 use serde::{Deserialize, Serialize};
 
-use super::terminal::{JOINT, duration_s, grouped, seconds};
+use super::terminal::{JOINT, duration_s, seconds};
+use crate::platform::text::grouped;
 use crate::platform::words::plural;
 
 /// How long before an event of the score the network is looked at, seconds. The longest effect
@@ -108,7 +109,7 @@ impl TimedEvent {
     }
 
     /// In words, without its time.
-    pub(crate) fn words(&self) -> String {
+    pub fn words(&self) -> String {
         let length = match self.until_s {
             Some(until_s) => format!(" for {}", duration_s(until_s - self.from_s)),
             None => " to the end".to_owned(),
@@ -200,7 +201,7 @@ pub struct ForegoingEvent {
 
 impl ForegoingEvent {
     /// `event`, which was over for `over_for_s` at `at_s`.
-    pub(crate) fn of(event: &TimedEvent, at_s: f64, over_for_s: f64) -> Self {
+    pub fn of(event: &TimedEvent, at_s: f64, over_for_s: f64) -> Self {
         let when = if event.until_s.is_none_or(|until_s| until_s >= at_s) {
             // Within the clocks' bound it may seem to have begun after.
             let for_s = (at_s - event.from_s).max(0.0);
@@ -324,7 +325,7 @@ impl CorrelationTests {
 
 impl TestedPair {
     /// The pair in words, of `count` pairs and `shuffle_count` turns.
-    pub(crate) fn words(&self, count: usize, shuffle_count: u64) -> String {
+    pub fn words(&self, count: usize, shuffle_count: u64) -> String {
         let (robot, network, channel) = (&self.robot, &self.network, &self.channel);
         let by = duration_s(self.lag_s.abs());
         let how = match self.correlation.lag_bins {

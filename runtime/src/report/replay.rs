@@ -9,11 +9,12 @@ use hil_models::replay::Replay;
 use serde::Deserialize;
 use serde_json::{Value, json};
 
+use crate::platform::text::grouped;
 use crate::platform::words::counted;
 use crate::report::analysis::AnalysisError;
 use crate::report::analysis::message_records::{MessageRecords, missing_count};
 use crate::report::summary::RunSummary;
-use crate::report::terminal::{grouped, wrapped};
+use crate::report::terminal::wrapped;
 use crate::rundir::run_folder::RunFolder;
 use crate::topology::registry::{CaseEntry, CaseError, Registry};
 

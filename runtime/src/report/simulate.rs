@@ -26,17 +26,14 @@ use hil_models::time::Instant;
 
 use crate::report::analysis::figures::shell_words;
 use crate::report::analysis::outages::OutageStory;
-use crate::rundir::launch::EmulationLaunch;
 use crate::topology::registry::{Case, Registry};
 use crate::report::event_log;
-use crate::report::summary::{
-    ChannelSummary, CountByName, DirectionSummary, Fact, LinkKind, Outcome, RecordedFigures,
-    RunFacts, RunSummary, ScoreMetric,
-};
-use crate::report::terminal::{self, Style, percent};
+use crate::report::summary::{ChannelSummary, CountByName, DirectionSummary, Fact, LinkKind, Outcome, RecordedFigures, RunFacts, RunSummary, ScoreMetric};
+use crate::report::terminal::{Style, percent, self};
 use crate::rundir::run_folder::RunFolder;
 use crate::rundir::series;
 use crate::topology::{Channel, Crossing, Program, Topology};
+use crate::topology::emulation::EmulationLaunch;
 
 use self::watched::Watch;
 

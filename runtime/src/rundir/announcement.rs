@@ -9,14 +9,14 @@ use std::time::SystemTime;
 
 use nix::fcntl::{Flock, FlockArg};
 
+use crate::platform::domain_address::DomainAddress;
 use crate::rundir::live_run::{LIVE_VERSION, LiveChannel, LiveRun, Source, Stage, start_ticks};
 use crate::rundir::run_folder::{RunFolder, utc_text};
-use crate::shm::DomainAddress;
 use crate::topology::{Channel, Program, Topology};
 
 /// A run that is announced for as long as this lives.
 #[derive(Debug)]
-pub(crate) struct Announcement {
+pub struct Announcement {
     run: LiveRun,
     folders: Vec<PathBuf>,
 }
@@ -25,7 +25,7 @@ impl Announcement {
     /// Announces the run of `topology` in `folder`; `domains` are the hosts that run here with the
     /// addresses of their shared memory, `processes` what runs here; `has_one_clock` as far as it is
     /// known before all hosts have begun.
-    pub(crate) fn make(
+    pub fn make(
         topology: &Topology,
         folder: &RunFolder,
         domains: BTreeMap<String, String>,
@@ -69,7 +69,7 @@ impl Announcement {
     }
 
     /// Says how the clocks of the run's hosts stand to each other.
-    pub(crate) fn say_clock(&mut self, has_one_clock: bool) -> io::Result<()> {
+    pub fn say_clock(&mut self, has_one_clock: bool) -> io::Result<()> {
         self.run.has_one_clock = Some(has_one_clock);
         self.write()
     }
@@ -86,7 +86,7 @@ impl Announcement {
     }
 
     /// Takes it back: there will be no further message, and all records are in the folder.
-    pub(crate) fn withdraw(self) {
+    pub fn withdraw(self) {
         drop(self);
     }
 }
@@ -103,7 +103,7 @@ impl Drop for Announcement {
 /// Takes back what a killed supervisor said in the domain's folder `root`; what a living one says
 /// stays. Before anybody locks the folder to clear it away: with the announcement in it, observers
 /// would take who does for its supervisor.
-pub(crate) fn withdraw_abandoned(root: &Path) {
+pub fn withdraw_abandoned(root: &Path) {
     let announced = path(root);
     if !announced.exists() {
         return;

@@ -6,8 +6,8 @@ use std::collections::BTreeMap;
 use hil_models::time::Instant;
 use serde::{Deserialize, Serialize};
 
-use crate::nic::card_clock::CardStory;
 use crate::platform::clock_discipline::HostDiscipline;
+use crate::rundir::card_story::CardStory;
 use crate::rundir::pipe::ProcessReport;
 
 /// One thing that happened.
@@ -71,7 +71,7 @@ pub struct HostStory {
 }
 
 /// Who steers the system clock, by host.
-pub(crate) fn disciplines(stories: &[HostStory]) -> BTreeMap<String, HostDiscipline> {
+pub fn disciplines(stories: &[HostStory]) -> BTreeMap<String, HostDiscipline> {
     let told = stories.iter().flat_map(|story| {
         let discipline = story.discipline.as_ref();
         let hosts = story.hosts.iter();

@@ -20,7 +20,7 @@ pub struct FaceLaunch {
     pub process: String,
     /// How often it was restarted before.
     pub instance: u32,
-    /// The host's shared memory, a [`DomainAddress`](crate::shm::DomainAddress).
+    /// The host's shared memory, a [`DomainAddress`](crate::platform::domain_address::DomainAddress).
     pub domain: String,
     /// Folder for record files.
     pub records: PathBuf,
@@ -62,7 +62,7 @@ pub struct FaceSettings {
 
 impl FaceSettings {
     /// [`FaceSettings::axes`] in the words of the protocol.
-    pub(crate) const fn axes(&self) -> Axes {
+    pub const fn axes(&self) -> Axes {
         match self.axes {
             6 => Axes::Six,
             _ => Axes::Seven,
@@ -70,7 +70,7 @@ impl FaceSettings {
     }
 
     /// [`FaceSettings::robotware`] in the words of the protocol.
-    pub(crate) const fn robotware(&self) -> RobotWare {
+    pub const fn robotware(&self) -> RobotWare {
         match self.robotware {
             6 => RobotWare::Six,
             _ => RobotWare::Seven,

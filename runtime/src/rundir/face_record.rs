@@ -29,7 +29,7 @@ impl FaceSentRecord {
     pub const REFUSED_BY_KERNEL: u64 = 1 << 1;
 
     /// When it left, real-time clock: the kernel's stamp, or else when it was handed over.
-    pub(crate) fn left_ns(&self) -> i64 {
+    pub fn left_ns(&self) -> i64 {
         if self.tx_software_ns == UNAVAILABLE {
             self.handed_ns.saturating_add(self.realtime_offset_ns)
         } else {
@@ -54,7 +54,7 @@ pub struct FaceReceivedRecord {
 
 impl FaceReceivedRecord {
     /// When it came, real-time clock: the kernel's stamp, or else when it was received.
-    pub(crate) fn came_ns(&self) -> i64 {
+    pub fn came_ns(&self) -> i64 {
         if self.rx_software_ns == UNAVAILABLE {
             self.received_ns.saturating_add(self.realtime_offset_ns)
         } else {

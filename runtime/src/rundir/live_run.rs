@@ -11,9 +11,9 @@ use nix::errno::Errno;
 use nix::fcntl::{Flock, FlockArg};
 use serde::{Deserialize, Serialize};
 
+use crate::platform::domain_address::{DomainAddress, DomainAddressError};
 use crate::rundir::manifest::Manifest;
 use crate::rundir::run_folder::RunFolder;
-use crate::shm::{DomainAddress, DomainError};
 
 /// Version of the layout of `live.json`. Within one, fields are only added.
 pub const LIVE_VERSION: u32 = 1;
@@ -122,7 +122,7 @@ impl LiveRun {
     ///
     /// # Errors
     /// When the announcement holds no address that is one.
-    pub fn domain(&self, host: &str) -> Result<DomainAddress, DomainError> {
+    pub fn domain(&self, host: &str) -> Result<DomainAddress, DomainAddressError> {
         let address = self.domains.get(host).map_or("", String::as_str);
         address.parse()
     }
@@ -132,8 +132,7 @@ impl LiveRun {
     /// # Errors
     /// When `manifest.json` cannot be read.
     pub fn manifest(&self) -> io::Result<Manifest> {
-        let text = fs::read_to_string(self.run_folder().manifest())?;
-        serde_json::from_str(&text).map_err(io::Error::other)
+        Manifest::read(&self.run_folder())
     }
 
     /// True while the supervisor says that the run goes: it takes the word back when all
@@ -175,7 +174,7 @@ fn is_locked(root: &Path) -> bool {
 
 /// When process `pid` began, in clock ticks since boot; `None` when it is gone or only waits to be
 /// cleaned up.
-pub(crate) fn start_ticks(pid: u32) -> Option<u64> {
+pub fn start_ticks(pid: u32) -> Option<u64> {
     let stat = fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
     // The name before the last bracket may hold anything. Behind it: state, then the parent, field 4.
     let (_, rest) = stat.rsplit_once(')')?;

@@ -4,47 +4,58 @@
 use std::collections::BTreeMap;
 use std::fs;
 use std::io;
+use std::path::Path;
 use std::time::SystemTime;
 
-use hil_gateways::transport::clock_pair::ClockPair;
 use hil_models::layout::{Field, FieldKind, RESERVED};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use crate::engine::supervisor::RunOptions;
 use crate::platform::host_facts::HostFacts;
 use crate::rundir::run_folder::{RunFolder, utc_text};
-use crate::topology::Topology;
+use crate::topology::{self, KnownCases, Topology, TopologyErrors};
 
 /// Version of the layout of `manifest.json`. Within one, fields are only added.
 pub const MANIFEST_VERSION: u32 = 1;
 
-/// Reads of the two clocks of which the narrowest counts.
-const CLOCK_READS: u32 = 5;
+/// What a supervisor knows of the run that it is about to begin.
+#[derive(Debug)]
+pub struct ManifestContent<'a> {
+    /// What is run.
+    pub topology: &'a Topology,
+    /// The file that it was read from.
+    pub topology_file: &'a Path,
+    /// Names of the hosts that run here.
+    pub hosts: &'a [String],
+    /// The command line.
+    pub command_line: &'a [String],
+    /// The fields of the channels whose messages are known, by channel.
+    pub layouts: &'a BTreeMap<String, &'static [Field]>,
+    /// What the machine is.
+    pub facts: &'a HostFacts,
+    /// Real-time minus monotonic clock, nanoseconds; `None` when it cannot be read.
+    pub realtime_minus_monotonic_ns: Option<i64>,
+}
 
-/// Writes what `topology` is about to run as.
+/// Writes the manifest of a run into its folder.
 ///
 /// # Errors
 /// When the file cannot be written.
-pub(crate) fn write(
-    topology: &Topology,
-    options: &RunOptions,
-    folder: &RunFolder,
-    facts: &HostFacts,
-) -> io::Result<()> {
-    let clocks = ClockPair::read(CLOCK_READS).ok();
+pub fn write(content: &ManifestContent<'_>, folder: &RunFolder) -> io::Result<()> {
+    let topology = content.topology;
     let manifest = json!({
         "schema_version": MANIFEST_VERSION,
-        "program": { "name": env!("CARGO_PKG_NAME"), "version": env!("CARGO_PKG_VERSION") },
-        "command_line": options.command_line,
+        "program": { "name": "hil-runtime", "version": env!("CARGO_PKG_VERSION") },
+        "command_line": content.command_line,
         "created": utc_text(SystemTime::now()),
-        "hosts_here": options.hosts,
-        "topology_hash": format!("{:016x}", topology.hash()),
+        "hosts_here": content.hosts,
+        "topology_file": content.topology_file.display().to_string(),
+        "topology_hash": topology_hash(topology),
         "topology": topology.resolved(),
         "seed": topology.run().seed,
-        "host_facts": facts,
-        "channels": describe_channels(topology, &options.layouts),
-        "realtime_minus_monotonic_ns": clocks.map(|pair| pair.offset_ns),
+        "host_facts": content.facts,
+        "channels": describe_channels(topology, content.layouts),
+        "realtime_minus_monotonic_ns": content.realtime_minus_monotonic_ns,
     });
     let text = serde_json::to_string_pretty(&manifest).map_err(io::Error::other)?;
     fs::write(folder.manifest(), text)
@@ -66,6 +77,9 @@ pub struct Manifest {
     /// Hosts of the topology that ran on the machine that wrote this.
     #[serde(default)]
     pub hosts_here: Vec<String>,
+    /// The file that the topology was read from, as the command line names it.
+    #[serde(default)]
+    pub topology_file: String,
     /// Hash of the topology.
     #[serde(default)]
     pub topology_hash: String,
@@ -85,6 +99,59 @@ pub struct Manifest {
     /// nanoseconds; `None` when it was not read.
     #[serde(default)]
     pub realtime_minus_monotonic_ns: Option<i64>,
+}
+
+/// A topology that a manifest does not give back.
+#[derive(Debug, thiserror::Error)]
+pub enum ManifestTopologyError {
+    /// It is no table of TOML.
+    #[error("its topology cannot be read: {0}")]
+    Table(String),
+    /// It is no topology that this program can run.
+    #[error("its topology cannot be read: {0}")]
+    Topology(#[from] TopologyErrors),
+    /// It is one, but not the one that ran.
+    #[error("its topology has hash {found}, and {wanted} ran")]
+    Hash {
+        /// Of the topology that was read.
+        found: String,
+        /// Of the one that ran.
+        wanted: String,
+    },
+}
+
+impl Manifest {
+    /// That of the run in `folder`.
+    ///
+    /// # Errors
+    /// When the file cannot be read.
+    pub fn read(folder: &RunFolder) -> io::Result<Self> {
+        let text = fs::read_to_string(folder.manifest())?;
+        serde_json::from_str(&text).map_err(io::Error::other)
+    }
+
+    /// The topology that ran, with the cases that the program knows.
+    ///
+    /// # Errors
+    /// When the program does not read it as the one that ran.
+    pub fn read_topology(&self, known: &KnownCases) -> Result<Topology, ManifestTopologyError> {
+        let table = toml::Table::deserialize(&self.topology)
+            .map_err(|error| ManifestTopologyError::Table(error.to_string()))?;
+        let text = toml::to_string(&table)
+            .map_err(|error| ManifestTopologyError::Table(error.to_string()))?;
+        let topology = topology::parse(&self.topology_file, &text, &[], known)?;
+        let found = topology_hash(&topology);
+        if found != self.topology_hash {
+            let wanted = self.topology_hash.clone();
+            return Err(ManifestTopologyError::Hash { found, wanted });
+        }
+        Ok(topology)
+    }
+}
+
+/// The hash of `topology` as a manifest writes it.
+fn topology_hash(topology: &Topology) -> String {
+    format!("{:016x}", topology.hash())
 }
 
 /// Name and version of a program.

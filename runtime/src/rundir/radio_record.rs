@@ -4,16 +4,43 @@
 use bytemuck::{Pod, Zeroable};
 use hil_models::measure::record::UNAVAILABLE;
 
-use crate::nic::radio::nl80211::{Happening, Rate, Station};
-
 /// A signal that is not known.
-pub(crate) const NO_SIGNAL: i32 = i32::MIN;
+pub const NO_SIGNAL: i32 = i32::MIN;
 /// A rate, reason or scheme that is not known.
-pub(crate) const NO_RATE: u32 = u32::MAX;
-pub(crate) const NO_CODE: u16 = u16::MAX;
-pub(crate) const NO_BYTE: u8 = u8::MAX;
+pub const NO_RATE: u32 = u32::MAX;
+/// A reason that is not known.
+pub const NO_CODE: u16 = u16::MAX;
+/// A scheme that is not known.
+pub const NO_BYTE: u8 = u8::MAX;
 /// [`RadioRecord::event`] of a sample.
-pub(crate) const SAMPLE: u8 = 0;
+pub const SAMPLE: u8 = 0;
+
+/// Values of [`RadioRecord::event`] and commands of the wireless subsystem: `NL80211_CMD_*` of
+/// `linux/nl80211.h`.
+pub mod command {
+    /// `NL80211_CMD_GET_INTERFACE`.
+    pub const GET_INTERFACE: u8 = 5;
+    /// `NL80211_CMD_GET_STATION`.
+    pub const GET_STATION: u8 = 17;
+    /// `NL80211_CMD_NEW_STATION`.
+    pub const NEW_STATION: u8 = 19;
+    /// `NL80211_CMD_DEL_STATION`.
+    pub const DEL_STATION: u8 = 20;
+    /// `NL80211_CMD_DEAUTHENTICATE`.
+    pub const DEAUTHENTICATE: u8 = 39;
+    /// `NL80211_CMD_DISASSOCIATE`.
+    pub const DISASSOCIATE: u8 = 40;
+    /// `NL80211_CMD_CONNECT`.
+    pub const CONNECT: u8 = 46;
+    /// `NL80211_CMD_ROAM`.
+    pub const ROAM: u8 = 47;
+    /// `NL80211_CMD_DISCONNECT`.
+    pub const DISCONNECT: u8 = 48;
+    /// `NL80211_CMD_GET_POWER_SAVE`.
+    pub const GET_POWER_SAVE: u8 = 62;
+    /// `NL80211_CMD_NOTIFY_CQM`.
+    pub const NOTIFY_CQM: u8 = 64;
+}
 
 /// A rate as recorded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
@@ -76,39 +103,8 @@ pub struct RadioRecord {
 const _: () = assert!(size_of::<RadioRecord>() == 112);
 
 impl RadioRecord {
-    /// A sample of `station`.
-    pub(crate) fn sample(at_ns: i64, station: &Station) -> Self {
-        let count = |word: Option<u32>| word.map_or(UNAVAILABLE, i64::from);
-        let signal = |dbm: Option<i8>| dbm.map_or(NO_SIGNAL, i32::from);
-        Self {
-            rx_packets: count(station.rx_packets),
-            tx_packets: count(station.tx_packets),
-            tx_retries: count(station.tx_retries),
-            tx_failed: count(station.tx_failed),
-            beacon_losses: count(station.beacon_losses),
-            inactive_ms: count(station.inactive_ms),
-            connected_s: count(station.connected_s),
-            signal_dbm: signal(station.signal_dbm),
-            signal_average_dbm: signal(station.signal_average_dbm),
-            transmit: station.transmit.map_or(RateRecord::NONE, RateRecord::from),
-            receive: station.receive.map_or(RateRecord::NONE, RateRecord::from),
-            mac: station.mac,
-            event: SAMPLE,
-            ..Self::nothing(at_ns)
-        }
-    }
-
-    /// An event.
-    pub(crate) fn happening(at_ns: i64, happening: &Happening) -> Self {
-        Self {
-            mac: happening.mac.unwrap_or_default(),
-            event: happening.command,
-            code: happening.code.unwrap_or(NO_CODE),
-            ..Self::nothing(at_ns)
-        }
-    }
-
-    const fn nothing(at_ns: i64) -> Self {
+    /// A record of `at_ns` in which nothing is known.
+    pub const fn nothing(at_ns: i64) -> Self {
         Self {
             at_ns,
             rx_packets: UNAVAILABLE,
@@ -132,7 +128,8 @@ impl RadioRecord {
 }
 
 impl RateRecord {
-    const NONE: Self = Self {
+    /// A rate of which nothing is known.
+    pub const NONE: Self = Self {
         kbps: NO_RATE,
         width_mhz: 0,
         generation: 0,
@@ -142,7 +139,7 @@ impl RateRecord {
     };
 
     /// How it is modulated, in words; `None` when no rate is known.
-    pub(crate) fn modulation(&self) -> Option<String> {
+    pub fn modulation(&self) -> Option<String> {
         if self.kbps == NO_RATE && self.mcs == NO_BYTE {
             return None;
         }
@@ -165,18 +162,5 @@ impl RateRecord {
         let words = format!(", {} MHz", self.width_mhz);
         text.push_str(&words);
         Some(text)
-    }
-}
-
-impl From<Rate> for RateRecord {
-    fn from(rate: Rate) -> Self {
-        Self {
-            kbps: rate.kbps.unwrap_or(NO_RATE),
-            width_mhz: rate.width_mhz,
-            generation: rate.generation as u8,
-            mcs: rate.mcs.unwrap_or(NO_BYTE),
-            stream_count: rate.stream_count.unwrap_or(NO_BYTE),
-            reserved: [0; 3],
-        }
     }
 }

@@ -11,6 +11,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 /// | path | content |
 /// |---|---|
 /// | `manifest.json` | resolved topology, layouts of messages, versions, host facts, seed |
+/// | `result.json` | how the run ended and what its processes said, before any figure |
 /// | `summary.json` | every figure of the report |
 /// | `report.txt` | the report as printed |
 /// | `events.log` | what happened to the robot, one line each |
@@ -20,7 +21,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 /// | `cards/*.json` | what each component was told it is |
 /// | `launch/*.json` | how each process was started here |
 /// | `logs/*.log` | standard error of each process |
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct RunFolder {
     root: PathBuf,
 }
@@ -90,7 +91,7 @@ impl RunFolder {
     ///
     /// # Errors
     /// When the folder cannot be read.
-    pub(crate) fn record_files(&self) -> io::Result<Vec<(PathBuf, u64)>> {
+    pub fn record_files(&self) -> io::Result<Vec<(PathBuf, u64)>> {
         let mut files = Vec::new();
         for entry in fs::read_dir(self.records())? {
             let (entry, path) = entry.map(|entry| (entry.metadata(), entry.path()))?;
@@ -121,6 +122,11 @@ impl RunFolder {
     /// What ran.
     pub fn manifest(&self) -> PathBuf {
         self.root.join("manifest.json")
+    }
+
+    /// How it ended, before any figure.
+    pub fn result(&self) -> PathBuf {
+        self.root.join("result.json")
     }
 
     /// Every figure.

@@ -8,7 +8,7 @@ use hil_gateways::protocol::seal::{Association, Initiator, Responder, Rotation, 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use zeroize::Zeroizing;
 
-use crate::engine::security::random_bytes;
+use crate::platform::random::random_bytes;
 use crate::rundir::launch::DirectionLaunch;
 
 /// Secret and cipher of one run.
@@ -84,7 +84,7 @@ impl RunSeal {
     ///
     /// # Errors
     /// As [`RunSeal::fresh`].
-    pub(crate) fn initiator(&self, launch: &DirectionLaunch) -> io::Result<Initiator> {
+    pub fn initiator(&self, launch: &DirectionLaunch) -> io::Result<Initiator> {
         let salt = random_bytes()?;
         Ok(Initiator::new(
             &self.association(launch),
@@ -97,7 +97,7 @@ impl RunSeal {
     ///
     /// # Errors
     /// As [`RunSeal::fresh`].
-    pub(crate) fn responder(&self, launch: &DirectionLaunch) -> io::Result<Responder> {
+    pub fn responder(&self, launch: &DirectionLaunch) -> io::Result<Responder> {
         let seed = Zeroizing::new(random_bytes::<32>()?);
         Ok(Responder::new(
             &self.association(launch),
@@ -109,19 +109,19 @@ impl RunSeal {
 
 /// Whether this processor has instructions for AES and for the multiplication of GCM.
 #[cfg(target_arch = "x86_64")]
-pub(crate) fn has_fast_aes() -> bool {
+pub fn has_fast_aes() -> bool {
     std::arch::is_x86_feature_detected!("aes") && std::arch::is_x86_feature_detected!("pclmulqdq")
 }
 
 /// Whether this processor has instructions for AES and for the multiplication of GCM.
 #[cfg(target_arch = "aarch64")]
-pub(crate) fn has_fast_aes() -> bool {
+pub fn has_fast_aes() -> bool {
     std::arch::is_aarch64_feature_detected!("aes")
         && std::arch::is_aarch64_feature_detected!("pmull")
 }
 
 /// The cipher that is fast on every host; either is safe on any.
-pub(crate) fn suite_for(all_have_fast_aes: bool) -> Suite {
+pub fn suite_for(all_have_fast_aes: bool) -> Suite {
     if all_have_fast_aes {
         Suite::Aes256Gcm
     } else {

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::engine::supervisor::domain_base_candidates;
+use crate::platform::domain_address::domain_base_candidates;
 use crate::rundir::live_run::LiveRun;
 
 /// Why no run could be chosen.

@@ -17,50 +17,50 @@ const STATUS_VERSION: u32 = 1;
 
 /// How the run stands.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub(crate) struct RunStatus {
+pub struct RunStatus {
     /// [`STATUS_VERSION`] of the writer.
     schema_version: u32,
     /// How far it is.
-    pub(crate) phase: Phase,
+    pub phase: Phase,
     /// When it was written, on the host's monotonic clock.
-    pub(crate) written_ns: i64,
+    pub written_ns: i64,
     /// When the run began, on the host's monotonic clock; `None` before.
-    pub(crate) start_ns: Option<i64>,
+    pub start_ns: Option<i64>,
     /// How long it is to be.
-    pub(crate) duration_ns: u64,
+    pub duration_ns: u64,
     /// What runs here.
-    pub(crate) processes: Vec<ProcessStatus>,
+    pub processes: Vec<ProcessStatus>,
     /// What the other hosts of the run said.
     #[serde(default)]
-    pub(crate) elsewhere: Vec<HostStatus>,
+    pub elsewhere: Vec<HostStatus>,
 }
 
 /// What another host said of its processes.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub(crate) struct HostStatus {
+pub struct HostStatus {
     /// Its name.
-    pub(crate) name: String,
+    pub name: String,
     /// When it last said something, on this host's monotonic clock; `None` when it never did.
-    pub(crate) heard_ns: Option<i64>,
+    pub heard_ns: Option<i64>,
     /// Its processes.
-    pub(crate) processes: Vec<TickStatus>,
+    pub processes: Vec<TickStatus>,
     /// Processes that skipped ticks and are not among them.
-    pub(crate) left_out_count: usize,
+    pub left_out_count: usize,
 }
 
 /// The ticks of a process of another host.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub(crate) struct TickStatus {
+pub struct TickStatus {
     /// Its name in the topology.
-    pub(crate) name: String,
+    pub name: String,
     /// As [`ProcessStatus::skipped_tick_count`].
-    pub(crate) skipped_tick_count: Option<u64>,
+    pub skipped_tick_count: Option<u64>,
 }
 
 /// How far a run is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub(crate) enum Phase {
+pub enum Phase {
     /// Its processes make themselves ready.
     Starting,
     /// It runs.
@@ -71,7 +71,7 @@ pub(crate) enum Phase {
 
 impl Phase {
     /// The word for it.
-    pub(crate) const fn word(self) -> &'static str {
+    pub const fn word(self) -> &'static str {
         match self {
             Self::Starting => "starting",
             Self::Running => "running",
@@ -82,26 +82,26 @@ impl Phase {
 
 /// How one process stands.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub(crate) struct ProcessStatus {
+pub struct ProcessStatus {
     /// Its name in the topology.
-    pub(crate) name: String,
+    pub name: String,
     /// Its host.
-    pub(crate) host: String,
+    pub host: String,
     /// Its role, or what else it is.
-    pub(crate) role: String,
+    pub role: String,
     /// `starting`, `running`, or how it ended.
-    pub(crate) state: String,
+    pub state: String,
     /// `None` while it does not run.
-    pub(crate) pid: Option<u32>,
+    pub pid: Option<u32>,
     /// How often it was started again.
-    pub(crate) restart_count: u32,
+    pub restart_count: u32,
     /// Ticks of its timer that passed without it; `None` for what has no timer, or has not said.
-    pub(crate) skipped_tick_count: Option<u64>,
+    pub skipped_tick_count: Option<u64>,
 }
 
 impl RunStatus {
     /// The status of a run that is to last `duration_ns`.
-    pub(crate) fn new(phase: Phase, duration_ns: u64, processes: Vec<ProcessStatus>) -> Self {
+    pub fn new(phase: Phase, duration_ns: u64, processes: Vec<ProcessStatus>) -> Self {
         Self {
             schema_version: STATUS_VERSION,
             phase,
@@ -117,7 +117,7 @@ impl RunStatus {
     ///
     /// # Errors
     /// When there is none, or not one that this program can read.
-    pub(crate) fn read(folder: &Path) -> io::Result<Self> {
+    pub fn read(folder: &Path) -> io::Result<Self> {
         let text = fs::read_to_string(folder.join(FILE_NAME))?;
         serde_json::from_str(&text).map_err(io::Error::other)
     }

@@ -12,7 +12,7 @@ use super::status::{FILE_NAME, RunStatus};
 
 /// The file for as long as the run goes; it is removed when this is dropped.
 #[derive(Debug)]
-pub(crate) struct StatusFile {
+pub struct StatusFile {
     path: PathBuf,
     desk: Arc<Desk>,
     /// `None` when it could not be started.
@@ -51,7 +51,7 @@ impl Desk {
 
 impl StatusFile {
     /// That of the run in `folder`; writes nothing yet.
-    pub(crate) fn of(folder: &Path) -> Self {
+    pub fn of(folder: &Path) -> Self {
         let path = folder.join(FILE_NAME);
         let desk = Arc::new(Desk::default());
         let (theirs, file) = (Arc::clone(&desk), path.clone());
@@ -66,7 +66,7 @@ impl StatusFile {
 
     /// Has `status` written, so that a reader finds it whole, unless a newer one comes before the disk
     /// has time for it. Gives the complaint about an earlier one, once; what hindered it may be over.
-    pub(crate) fn write(&self, status: RunStatus) -> Option<String> {
+    pub fn write(&self, status: RunStatus) -> Option<String> {
         let mut tray = self.desk.tray();
         tray.next = Some(status);
         let complaint = tray.complaint.take();

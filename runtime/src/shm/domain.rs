@@ -1,8 +1,6 @@
 //! The shared memory of one run on one host: an iceoryx2 domain of its own, so that runs side by
 //! side cannot see each other and everything a dead run left behind can be thrown away.
 
-use core::fmt;
-use core::str::FromStr;
 use std::fs::{self, DirBuilder, File};
 use std::io;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt};
@@ -24,12 +22,9 @@ use super::identity::{Fnv128, SHARED_MEMORY_DIRECTORY, fingerprint};
 use super::members;
 use super::sequence::OPEN_WITHIN;
 use crate::platform::clock::MonotonicClock;
-
-/// Longest root path: a listener's socket below it must fit into the 107 bytes of a Unix socket
-/// address, with our 10-byte prefix, up to 33 digits of port id and iceoryx2's `.event`.
-pub const ROOT_PATH_LENGTH_MAX: usize = 107 - 1 - PREFIX_LENGTH - 33 - ".event".len();
-
-const PREFIX_LENGTH: usize = "h0123abcd_".len();
+use crate::platform::domain_address::{
+    DomainAddress, DomainAddressError, checked_root_path, is_prefix,
+};
 
 /// File in the root path that says whose it is; its content is the prefix of the run.
 const MARKER: &str = "hil-domain";
@@ -37,58 +32,6 @@ const MARKER: &str = "hil-domain";
 /// Ended writers of a channel whose unread samples a reader keeps; at least the samples a reader may
 /// borrow.
 const ENDED_WRITERS_MAX: usize = 4;
-
-/// How a process finds its domain: hand it over as one argument or environment variable.
-///
-/// ```
-/// use hil_runtime::shm::DomainAddress;
-///
-/// let address: DomainAddress = "h0123abcd_@/run/hil/trial-7".parse()?;
-/// assert_eq!(address.root_path().to_str(), Some("/run/hil/trial-7"));
-/// assert_eq!(address.to_string(), "h0123abcd_@/run/hil/trial-7");
-/// # Ok::<(), hil_runtime::shm::DomainError>(())
-/// ```
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct DomainAddress {
-    root_path: PathBuf,
-    prefix: String,
-}
-
-impl DomainAddress {
-    /// Directory of the run's sockets and service files.
-    pub fn root_path(&self) -> &Path {
-        &self.root_path
-    }
-
-    /// What the names of the run's files in `/dev/shm` begin with.
-    pub fn prefix(&self) -> &str {
-        &self.prefix
-    }
-}
-
-impl fmt::Display for DomainAddress {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}@{}", self.prefix, self.root_path.display())
-    }
-}
-
-impl FromStr for DomainAddress {
-    type Err = DomainError;
-
-    fn from_str(text: &str) -> Result<Self, DomainError> {
-        let malformed = || DomainError::MalformedAddress {
-            address: text.to_owned(),
-        };
-        let (prefix, root_path) = text.split_once('@').ok_or_else(malformed)?;
-        if !is_prefix(prefix) {
-            return Err(malformed());
-        }
-        Ok(Self {
-            root_path: checked_root_path(Path::new(root_path))?,
-            prefix: prefix.to_owned(),
-        })
-    }
-}
 
 /// Membership of this process in the domain of a run.
 ///
@@ -139,11 +82,7 @@ impl Domain {
         let marker = root_path.join(MARKER);
         match fs::read_to_string(&marker) {
             Ok(prefix) if is_prefix(&prefix) => {
-                let stale = DomainAddress {
-                    root_path: root_path.clone(),
-                    prefix,
-                };
-                delete_files(&stale);
+                delete_files(&DomainAddress::new(root_path.clone(), prefix));
             }
             Ok(_) => delete_below(&root_path),
             Err(_) => {
@@ -156,7 +95,7 @@ impl Domain {
         }
         let prefix = fresh_prefix(&root_path)?;
         fs::write(&marker, &prefix).map_err(DomainError::io("write", &marker))?;
-        let mut domain = Self::join(DomainAddress { root_path, prefix }, None)?;
+        let mut domain = Self::join(DomainAddress::new(root_path, prefix), None)?;
         domain.lock = Some(lock);
         Ok(domain)
     }
@@ -167,7 +106,7 @@ impl Domain {
     }
 
     /// The prefix of the domain whose root is, or was, `root_path`; `None` where there is none.
-    pub(crate) fn prefix_at(root_path: &Path) -> Option<String> {
+    pub fn prefix_at(root_path: &Path) -> Option<String> {
         let prefix = fs::read_to_string(root_path.join(MARKER)).ok()?;
         is_prefix(&prefix).then_some(prefix)
     }
@@ -177,7 +116,7 @@ impl Domain {
     /// # Errors
     /// When the root path does not exist here or iceoryx2 refuses, e.g. for another user's domain.
     pub fn open(address: &DomainAddress) -> Result<Self, DomainError> {
-        let marker = address.root_path.join(MARKER);
+        let marker = address.root_path().join(MARKER);
         fs::metadata(&marker).map_err(DomainError::io("find the run's", &marker))?;
         Self::join(address.clone(), None)
     }
@@ -187,7 +126,7 @@ impl Domain {
     /// # Errors
     /// As [`Domain::open`].
     pub fn observe(address: &DomainAddress) -> Result<Self, DomainError> {
-        let marker = address.root_path.join(MARKER);
+        let marker = address.root_path().join(MARKER);
         fs::metadata(&marker).map_err(DomainError::io("find the run's", &marker))?;
         Self::join(address.clone(), Some(members::observer_name()))
     }
@@ -203,7 +142,7 @@ impl Domain {
             .signal_handling_mode(SignalHandlingMode::Disabled)
             .create::<ipc::Service>()
             .map_err(|error| DomainError::Node {
-                root_path: address.root_path.clone(),
+                root_path: address.root_path().to_owned(),
                 reason: explain(&format!("{error:?}")),
             })?;
         Ok(Self {
@@ -234,7 +173,7 @@ impl Domain {
     /// # Errors
     /// When the root path, `/dev/shm` or `/proc` cannot be inspected.
     pub fn fingerprint(&self) -> Result<[u8; 16], DomainError> {
-        fingerprint(&self.address.root_path, &self.address.prefix)
+        fingerprint(self.address.root_path(), self.address.prefix())
     }
 
     /// Frees what dead processes of this domain held. Readers hear of a dead writer, and a
@@ -242,7 +181,7 @@ impl Domain {
     /// launcher calls it about ten times a second.
     pub fn cleanup_dead_nodes(&self) -> Cleanup {
         // iceoryx2 0.10 waits without end for a file to get a length.
-        if !is_clear_of_lengthless_files(&self.address.prefix) {
+        if !is_clear_of_lengthless_files(self.address.prefix()) {
             return Cleanup {
                 is_postponed: true,
                 ..Cleanup::default()
@@ -287,14 +226,14 @@ impl Domain {
         };
         let live_member_count = members::living(&self.config).process_count;
         delete_files(&self.address);
-        let root_path = &self.address.root_path;
+        let root_path = self.address.root_path();
         // The directory goes while the lock is held, so that the next launcher starts clean.
         // Failure shows in `remained`.
         let _is_gone = fs::remove_dir(root_path).is_ok();
         drop(lock);
-        let mut remained = shared_memory_files(&self.address.prefix);
+        let mut remained = shared_memory_files(self.address.prefix());
         if root_path.exists() {
-            remained.push(root_path.clone());
+            remained.push(root_path.to_owned());
         }
         Removal {
             live_member_count,
@@ -332,13 +271,15 @@ fn node_of(node: Option<&Node<ipc::Service>>) -> &Node<ipc::Service> {
 }
 
 fn configuration(address: &DomainAddress) -> Result<Config, DomainError> {
-    let unusable = || DomainError::UnusableRootPath {
-        root_path: address.root_path.clone(),
+    let unusable = || {
+        DomainError::Address(DomainAddressError::UnusableRootPath {
+            root_path: address.root_path().to_owned(),
+        })
     };
-    let root_path = format!("{}/", address.root_path.display());
+    let root_path = format!("{}/", address.root_path().display());
     let mut config = Config::default();
     config.global.prefix =
-        FileName::new(address.prefix.as_bytes()).map_err(|_refused_character| unusable())?;
+        FileName::new(address.prefix().as_bytes()).map_err(|_refused_character| unusable())?;
     let root_path =
         IceoryxPath::new(root_path.as_bytes()).map_err(|_refused_character| unusable())?;
     config.global.set_root_path(&root_path);
@@ -351,24 +292,6 @@ fn configuration(address: &DomainAddress) -> Result<Config, DomainError> {
     let reading = &mut config.defaults.publish_subscribe;
     reading.subscriber_expired_connection_buffer = ENDED_WRITERS_MAX;
     Ok(config)
-}
-
-fn checked_root_path(root_path: &Path) -> Result<PathBuf, DomainError> {
-    let is_plain = |text: &str| {
-        text.bytes()
-            .all(|byte| byte.is_ascii_alphanumeric() || b"/._-".contains(&byte))
-    };
-    let text = root_path.to_str().map(|text| text.trim_end_matches('/'));
-    let root_path = root_path.to_owned();
-    match text {
-        Some(text) if root_path.is_absolute() && !text.is_empty() && is_plain(text) => {
-            if text.len() > ROOT_PATH_LENGTH_MAX {
-                return Err(DomainError::RootPathTooLong { root_path });
-            }
-            Ok(PathBuf::from(text))
-        }
-        _ => Err(DomainError::UnusableRootPath { root_path }),
-    }
 }
 
 /// Makes the directory and takes the launcher's lock on it.
@@ -407,15 +330,6 @@ fn lock_directory(root_path: &Path) -> Result<Flock<File>, DomainError> {
     Err(DomainError::Locked {
         root_path: root_path.to_owned(),
     })
-}
-
-fn is_prefix(text: &str) -> bool {
-    text.len() == PREFIX_LENGTH
-        && text.starts_with('h')
-        && text.ends_with('_')
-        && text[1..PREFIX_LENGTH - 1]
-            .bytes()
-            .all(|byte| matches!(byte, b'0'..=b'9' | b'a'..=b'f'))
 }
 
 /// A prefix no file in `/dev/shm` has. Hosts emulated on one machine may share `/dev/shm` and use
@@ -469,10 +383,10 @@ fn is_clear_of_lengthless_files(prefix: &str) -> bool {
 
 /// Deletes a run's shared memory, then all below its root path. What refuses is found by looking.
 fn delete_files(address: &DomainAddress) {
-    for file in shared_memory_files(&address.prefix) {
+    for file in shared_memory_files(address.prefix()) {
         let _is_gone = fs::remove_file(file).is_ok();
     }
-    delete_below(&address.root_path);
+    delete_below(address.root_path());
 }
 
 /// Empties the root path; the marker goes last, so that an interrupted removal is resumed.

@@ -7,26 +7,14 @@ use std::path::PathBuf;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use super::domain::ROOT_PATH_LENGTH_MAX;
+use crate::platform::domain_address::DomainAddressError;
 
 /// A domain could not be created, opened or removed.
 #[derive(Debug, thiserror::Error)]
 pub enum DomainError {
-    /// The root path is relative, not UTF-8 or holds a component iceoryx2 refuses.
-    #[error("root path {} is not an absolute path of plain characters", .root_path.display())]
-    UnusableRootPath {
-        /// The path given.
-        root_path: PathBuf,
-    },
-    /// The sockets below the root path would not fit into a Unix socket address.
-    #[error(
-        "root path {} has {} characters, at most {ROOT_PATH_LENGTH_MAX} fit",
-        .root_path.display(), .root_path.as_os_str().len()
-    )]
-    RootPathTooLong {
-        /// The path given.
-        root_path: PathBuf,
-    },
+    /// Its address cannot be used.
+    #[error(transparent)]
+    Address(#[from] DomainAddressError),
     /// Another launcher holds the lock.
     #[error(
         "root path {} is in use by a run that is still alive; let it end or name this run differently",
@@ -44,12 +32,6 @@ pub enum DomainError {
     ForeignDirectory {
         /// The path given.
         root_path: PathBuf,
-    },
-    /// A domain address that does not parse.
-    #[error("domain address {address:?} is not of the form h0123abcd_@/root/path")]
-    MalformedAddress {
-        /// The text given.
-        address: String,
     },
     /// The operating system refused.
     #[error("cannot {operation} {}", .path.display())]
@@ -72,10 +54,8 @@ pub enum DomainError {
 }
 
 impl DomainError {
-    pub(crate) fn io(
-        operation: &'static str,
-        path: impl Into<PathBuf>,
-    ) -> impl FnOnce(io::Error) -> Self {
+    /// For an operation on `path` that the system refused.
+    pub fn io(operation: &'static str, path: impl Into<PathBuf>) -> impl FnOnce(io::Error) -> Self {
         let path = path.into();
         move |source| Self::Io {
             operation,
@@ -151,7 +131,8 @@ pub enum ChannelError {
 impl ChannelError {
     // Cold, so that the paths which may fail stay short where they do not.
     #[cold]
-    pub(crate) fn refused(channel: &str, operation: &'static str, reason: &dyn Debug) -> Self {
+    /// For an operation that iceoryx2 refused.
+    pub fn refused(channel: &str, operation: &'static str, reason: &dyn Debug) -> Self {
         let name = format!("{reason:?}");
         Self::Refused {
             channel: channel.to_owned(),

@@ -46,13 +46,13 @@ pub(super) fn living(config: &Config) -> Members {
 
 /// Nodes of iceoryx2's default domain, which runs do not use: those of other programs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub(crate) struct ForeignNodes {
+pub struct ForeignNodes {
     /// Living programs.
-    pub(crate) living: u64,
+    pub living: u64,
     /// Programs that ended without leaving.
-    pub(crate) dead: u64,
+    pub dead: u64,
     /// Those of other users, of which nothing can be said.
-    pub(crate) hidden: u64,
+    pub hidden: u64,
 }
 
 impl ForeignNodes {
@@ -60,7 +60,7 @@ impl ForeignNodes {
     ///
     /// # Errors
     /// When the list cannot be read.
-    pub(crate) fn list() -> Result<Self, String> {
+    pub fn list() -> Result<Self, String> {
         set_log_level(LogLevel::Warn);
         let mut found = Self::default();
         let listed = Node::<ipc::Service>::list(&Config::default(), |state| {

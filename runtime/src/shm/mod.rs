@@ -4,7 +4,7 @@
 //! Read in this order:
 //!
 //! 1. [`Domain`]: the shared memory of one run on one host. The launcher creates it, every other
-//!    process opens it by its [`DomainAddress`].
+//!    process opens it by its [`DomainAddress`](crate::platform::domain_address::DomainAddress).
 //! 2. [`ChannelHolder`]: the launcher creates every channel and holds it open, because a process
 //!    killed while *creating* an iceoryx2 service wedges that service for good.
 //! 3. [`ShmOutput`] and [`ShmInput`]: the ports of a role, typed at run time. [`TypedOutput`] and
@@ -27,6 +27,7 @@ mod error;
 mod holder;
 mod identity;
 mod members;
+mod observer;
 mod raw;
 mod sequence;
 mod shm;
@@ -37,14 +38,15 @@ mod wake;
 mod tests;
 
 pub use census::Census;
-pub use domain::{Cleanup, Domain, DomainAddress, ROOT_PATH_LENGTH_MAX, Removal};
+pub use domain::{Cleanup, Domain, Removal};
 pub use error::{ChannelError, DomainError};
 pub use holder::{ChannelHolder, ChannelSettings};
 pub use identity::clock_id;
-pub(crate) use members::ForeignNodes;
+pub use members::ForeignNodes;
+pub use observer::observer_depth;
 pub use raw::{ENVELOPE_TYPE_NAME, RawInput, RawOutput};
 pub use sequence::{InputCounters, OutputSettings, Stamp};
-pub(crate) use sequence::{SequenceTracker, Sequencer};
+pub use sequence::{SequenceTracker, Sequencer};
 pub use shm::{ShmInput, ShmOutput, TypedInput, TypedOutput};
 pub use type_info::TypeInfo;
 pub use wake::{WAITER_CHANNELS_MAX, Waiter, Wake};

@@ -47,18 +47,19 @@ impl fmt::Debug for OutputSettings {
 
 /// Hands out the envelopes of one writer.
 #[derive(Debug)]
-pub(crate) struct Sequencer {
+pub struct Sequencer {
     settings: OutputSettings,
     next: u64,
 }
 
 impl Sequencer {
-    pub(crate) const fn new(settings: OutputSettings) -> Self {
+    /// A sequence that begins as `settings` say.
+    pub const fn new(settings: OutputSettings) -> Self {
         Self { settings, next: 0 }
     }
 
     /// The envelope of the next sample, stamped as late as possible.
-    pub(crate) fn envelope(&self, now: Instant) -> Envelope {
+    pub fn envelope(&self, now: Instant) -> Envelope {
         Envelope {
             sequence: self.next,
             published_ns: self.settings.stamp.map_or(now, |stamp| stamp()).as_ns(),
@@ -68,11 +69,12 @@ impl Sequencer {
     }
 
     /// The sample went out.
-    pub(crate) fn advance(&mut self) {
+    pub fn advance(&mut self) {
         self.next += 1;
     }
 
-    pub(crate) const fn sent_count(&self) -> u64 {
+    /// Messages numbered so far.
+    pub const fn sent_count(&self) -> u64 {
         self.next
     }
 }
@@ -98,7 +100,7 @@ pub struct InputCounters {
 
 /// Follows one writer through its restarts.
 #[derive(Debug, Default)]
-pub(crate) struct SequenceTracker {
+pub struct SequenceTracker {
     counters: InputCounters,
     current: Option<(u32, u64)>,
     previous_epoch: Option<u32>,
@@ -109,7 +111,7 @@ impl SequenceTracker {
     ///
     /// The first sample ever only sets the count: what was sent before a late joiner came is not
     /// missed. After a restart counting begins at 0, as the reader was there all along.
-    pub(crate) fn accept(&mut self, envelope: &Envelope) -> bool {
+    pub fn accept(&mut self, envelope: &Envelope) -> bool {
         let Envelope {
             sequence, epoch, ..
         } = *envelope;
@@ -142,7 +144,8 @@ impl SequenceTracker {
         true
     }
 
-    pub(crate) const fn counters(&self) -> InputCounters {
+    /// What came, and what did not.
+    pub const fn counters(&self) -> InputCounters {
         self.counters
     }
 }

@@ -13,7 +13,7 @@ use super::model::{Case, Process, Program};
 use super::tree::{Table, Value, join};
 
 /// The channel with the commands to one arm, by its name in every case.
-pub(crate) const fn command_channel(side: Side) -> &'static str {
+pub const fn command_channel(side: Side) -> &'static str {
     match side {
         Side::Right => "egm/right/command",
         Side::Left => "egm/left/command",
@@ -21,7 +21,7 @@ pub(crate) const fn command_channel(side: Side) -> &'static str {
 }
 
 /// The channel with the feedback of one arm, by its name in every case.
-pub(crate) const fn feedback_channel(side: Side) -> &'static str {
+pub const fn feedback_channel(side: Side) -> &'static str {
     match side {
         Side::Right => "egm/right/feedback",
         Side::Left => "egm/left/feedback",

@@ -9,7 +9,7 @@ use super::limits;
 use super::model::{Host, Topology};
 use super::reader::Reader;
 use super::tree::join;
-use crate::rundir::record::file::CHANNEL_NAME_BYTES_MAX;
+use crate::topology::CHANNEL_NAME_BYTES_MAX;
 
 /// Where a host exchanges clocks, beside the address of the link under test.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -60,7 +60,7 @@ impl ClockPath<'_> {
 }
 
 /// `10.78.0.1 (eth1)`.
-pub(crate) fn describe_end(address: &str, interface: Option<&str>) -> String {
+pub fn describe_end(address: &str, interface: Option<&str>) -> String {
     interface.map_or_else(
         || address.to_owned(),
         |interface| format!("{address} ({interface})"),

@@ -8,8 +8,8 @@ use hil_gateways::protocol::wire;
 use hil_models::case_study::ParameterError;
 use hil_models::link::spec::LinkSpec;
 
-use crate::rundir::launch::{EmulationError, EmulationLaunch};
 use crate::topology::Topology;
+use crate::topology::emulation::{EmulationError, EmulationLaunch};
 
 /// Datagrams there is room for whatever the link does: bursts.
 const BURST_COUNT: usize = 1024;
@@ -107,7 +107,7 @@ impl EmulationRoom {
 ///
 /// # Errors
 /// The first link for which they cannot, or a trace that cannot be read.
-pub(crate) fn check_emulation(topology: &Topology) -> Result<(), EmulationError> {
+pub fn check_emulation(topology: &Topology) -> Result<(), EmulationError> {
     for crossing in topology.crossings() {
         if let Some(emulation) = EmulationLaunch::of(&crossing, topology.run().seed) {
             emulation.room(crossing.channel.message.size_bytes)?;

@@ -15,6 +15,8 @@ mod check;
 mod check_channels;
 mod check_face;
 mod clock_path;
+pub mod documents;
+pub mod emulation;
 pub mod emulation_room;
 mod errors;
 mod face;
@@ -29,6 +31,7 @@ mod layers;
 mod limits;
 mod model;
 mod model_links;
+mod names;
 mod reader;
 pub mod registry;
 mod resolved;
@@ -43,9 +46,9 @@ mod units;
 use std::path::Path;
 
 pub use card::{CardChannel, ProcessCard};
-pub(crate) use check_face::{command_channel, feedback_channel};
+pub use check_face::{command_channel, feedback_channel};
+pub use clock_path::describe_end;
 pub use clock_path::{ClockEnd, ClockPath};
-pub(crate) use clock_path::{describe_end, end_name};
 pub use errors::{Fault, Location, TopologyError, TopologyErrors};
 pub use face::{EgmFace, FaceKind, FaceSend};
 pub use host::{HOST_VARIABLE, HostChoice, HostError, MachineIdentity, which_host};
@@ -57,6 +60,7 @@ pub use model::{
     Process, Program, Run, Scheduling, Topology, Wait,
 };
 pub use model_links::{Emulation, Gateway, Hop, Link, Timestamps, Via};
+pub use names::{CHANNEL_NAME_BYTES_MAX, clock_process_name, gateway_name};
 pub use schema::schema;
 pub use security::{Hops, Security};
 

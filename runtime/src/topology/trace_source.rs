@@ -13,8 +13,12 @@ use hil_models::trace::wire::{self, Decoded};
 use hil_models::trace::{Trace, csv, fault::TraceFault};
 use serde::{Deserialize, Serialize};
 
-use crate::report::trace::capture::file_name;
 use crate::topology::Topology;
+
+/// The file of `channel` in a folder of traces.
+pub fn file_name(channel: &str) -> String {
+    format!("{}.trace", channel.replace('/', "."))
+}
 
 /// `[links.<name>.trace]`: paths are as written, relative to the topology file.
 #[derive(Debug, Clone, PartialEq, Eq)]

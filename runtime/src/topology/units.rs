@@ -38,7 +38,7 @@ pub(crate) enum DurationError {
 }
 
 /// Reads `20 s`, `4ms`, `1.5 us`.
-pub(crate) fn parse_duration(text: &str) -> Result<Duration, DurationError> {
+pub fn parse_duration(text: &str) -> Result<Duration, DurationError> {
     let text = text.trim();
     let end = text
         .find(|letter: char| !letter.is_ascii_digit() && letter != '.')

@@ -243,7 +243,9 @@ impl Feed {
                 continue;
             }
             let address = self.run.domain(&shared.host);
-            let domain = address.and_then(|address| Domain::observe(&address));
+            let domain = address
+                .map_err(DomainError::Address)
+                .and_then(|address| Domain::observe(&address));
             let domain = domain.map_err(|source| FeedError::Domain {
                 run: self.run.name.clone(),
                 source,

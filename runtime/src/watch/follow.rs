@@ -170,7 +170,7 @@ impl RecordFollower {
     }
 
     /// What the files at hand hold, and of which channels, also where nothing came from them yet.
-    pub(crate) fn headers(&self) -> impl Iterator<Item = &RecordHeader> {
+    pub fn headers(&self) -> impl Iterator<Item = &RecordHeader> {
         self.files.iter().filter_map(|one| one.header.as_ref())
     }
 

@@ -31,5 +31,5 @@ mod tests;
 pub use event::{Event, Origin, Record};
 pub use feed::{Feed, FeedError, Poll, WatchedChannel};
 pub use follow::{Batch, RecordFollower};
-pub use passive::{PassiveCounters, PassiveReader, observer_depth};
+pub use passive::{PassiveCounters, PassiveReader};
 pub use seen::Seen;

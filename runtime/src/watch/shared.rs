@@ -2,9 +2,10 @@
 
 use hil_models::measure::record::{IngressRecord, UNAVAILABLE};
 
-use super::passive::{PassiveCounters, PassiveReader, observer_depth};
+use super::passive::{PassiveCounters, PassiveReader};
 use super::seen::Seen;
 use crate::shm::ChannelError;
+use crate::shm::observer_depth;
 
 /// A channel that is read from shared memory.
 #[derive(Debug)]

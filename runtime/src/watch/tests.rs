@@ -12,9 +12,12 @@ use hil_models::random::RandomStream;
 
 use super::*;
 use crate::platform::clock::MonotonicClock;
+use crate::rundir::announcement::withdraw_abandoned;
+use crate::rundir::live_run::{LIVE_VERSION, LiveChannel, LiveRun, Source, start_ticks};
 use crate::rundir::record::RecordKind;
 use crate::rundir::record::file::RecordHeader;
-use crate::shm::{ChannelHolder, ChannelSettings, Domain, RawOutput, TypeInfo};
+use crate::rundir::select::{SelectError, running_runs_below, select};
+use crate::shm::{ChannelHolder, ChannelSettings, Domain, RawOutput, TypeInfo, observer_depth};
 
 /// A folder of the test's own, and a short name for a domain below it.
 struct Place(PathBuf);
@@ -209,7 +212,7 @@ fn announced(place: &Place) -> (Domain, Vec<ChannelHolder>, LiveRun) {
         topology: "made-up".to_owned(),
         folder: place.run(),
         pid: std::process::id(),
-        pid_start_ticks: live::start_ticks(std::process::id()),
+        pid_start_ticks: start_ticks(std::process::id()),
         since: String::new(),
         has_one_clock: Some(true),
         domains: BTreeMap::from([("b".to_owned(), domain.address().to_string())]),

@@ -10,12 +10,12 @@ use hil_runtime::engine::supervisor::frame::{
 };
 use hil_runtime::nic::radio;
 use hil_runtime::platform::clock_discipline::{ChronyTracking, NtpVariables, PtpStatus};
+use hil_runtime::platform::domain_address::DomainAddress;
 use hil_runtime::report::summary::RunSummary;
 use hil_runtime::rundir::layout::{Decoder, Value};
 use hil_runtime::rundir::manifest::FieldDescription;
 use hil_runtime::rundir::record::RecordFile;
 use hil_runtime::rundir::record::file::HEADER_BYTES;
-use hil_runtime::shm::DomainAddress;
 use hil_runtime::topology::read_duration;
 
 use crate::Verdict;

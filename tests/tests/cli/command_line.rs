@@ -415,7 +415,9 @@ fn an_own_program_is_told_its_card_and_its_channels_and_is_asked_to_stop() {
     let told = fs::read_to_string(record.join("told")).unwrap();
     let (domain, mood) = told.trim().split_once(' ').unwrap();
     assert!(
-        domain.parse::<hil_runtime::shm::DomainAddress>().is_ok(),
+        domain
+            .parse::<hil_runtime::platform::domain_address::DomainAddress>()
+            .is_ok(),
         "{domain}"
     );
     assert_eq!(mood, "good");

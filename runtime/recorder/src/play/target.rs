@@ -12,10 +12,10 @@ use hil_models::message::Envelope;
 use hil_runtime::platform::clock::MonotonicClock;
 use hil_runtime::rundir::live_run::LiveRun;
 use hil_runtime::rundir::manifest::{ChannelDescription, Manifest};
+use hil_runtime::rundir::select;
 use hil_runtime::rundir::select::SelectError;
 use hil_runtime::rundir::status::has_begun;
 use hil_runtime::shm::{Census, ChannelError, Domain, DomainError, RawOutput};
-use hil_runtime::watch;
 use serde_json::Value;
 
 /// How long a writer that died may take to lose its place: supervisors look ten times a second.
@@ -104,7 +104,7 @@ impl Target {
         let card = env::var_os("HIL_CARD").map(PathBuf::from);
         let (run, is_ours) = match (into, card) {
             (None, Some(card)) => (run_of_card(&card)?, true),
-            (into, _) => (watch::select(into)?, false),
+            (into, _) => (select::select(into)?, false),
         };
         let manifest = run.manifest().map_err(|source| TargetError::Manifest {
             run: run.name.clone(),
@@ -150,7 +150,7 @@ impl Target {
     /// The shared memory of the producer's host of `channel`.
     pub(crate) fn domain(&self, channel: &ChannelDescription) -> Result<Domain, TargetError> {
         let host = channel.from_host.as_deref().unwrap_or_default();
-        let address = self.run.domain(host)?;
+        let address = self.run.domain(host).map_err(DomainError::Address)?;
         Ok(if self.is_ours {
             Domain::open(&address)?
         } else {

@@ -8,7 +8,8 @@ use std::time::Duration;
 use hil_runtime::platform::clock::MonotonicClock;
 use hil_runtime::report::summary::RunSummary;
 use hil_runtime::rundir::live_run::LiveRun;
-use hil_runtime::watch::{self, Event, Feed, FeedError, Origin, Poll};
+use hil_runtime::watch::{Event, Feed, FeedError, Origin, Poll, self};
+use hil_runtime::rundir::live_run::Source;
 
 use super::engine::REST;
 use super::playback::how_ended;
@@ -62,7 +63,7 @@ impl Running {
             // A foreign program keeps no records of what it publishes.
             channel.is_by_message |= matches!(
                 source,
-                Some(watch::Source::SharedMemory {
+                Some(Source::SharedMemory {
                     is_forwarded: false,
                     ..
                 })

@@ -6,11 +6,13 @@ use std::path::{Path, PathBuf};
 use crate::cli::arguments::ReportArgs;
 use crate::platform::console::Console;
 use crate::platform::progress::Progress;
+use crate::report::analysis;
 use crate::report::page::material::Material;
 use crate::report::page::{self, Format, read, write};
 use crate::report::summary::{RunSummary, SummaryError};
 use crate::report::terminal::{self, Style};
 use crate::rundir::run_folder::RunFolder;
+use crate::topology::registry::Registry;
 
 use super::{columns, exit};
 
@@ -26,14 +28,14 @@ fn failed(text: impl core::fmt::Display) -> Refusal {
 }
 
 /// `report`.
-pub(super) fn report(args: &ReportArgs, console: &mut Console) -> u8 {
+pub(super) fn report(args: &ReportArgs, registry: &Registry, console: &mut Console) -> u8 {
     let is_file = args.output.is_some()
         || args.format.is_some()
         || args.template.is_some()
         || args.figure.is_some();
     if !is_file {
         if let [run] = args.runs.as_slice() {
-            return show(run, console);
+            return show(run, registry, console);
         }
         console.error("several runs need --output or --format, e.g. -o report.html");
         return exit::USAGE;
@@ -166,8 +168,19 @@ fn figures(
 }
 
 /// The report as the run printed it.
-fn show(run: &Path, console: &mut Console) -> u8 {
+fn show(run: &Path, registry: &Registry, console: &mut Console) -> u8 {
     let folder = RunFolder::existing(run);
+    if !folder.summary().is_file() && folder.result().is_file() {
+        // The run ended, and what was to draw up its account did not come to that.
+        let root = run.canonicalize().unwrap_or_else(|_error| run.to_owned());
+        let analysed = Progress::begin().during(console, "drawing up the account", |_| {
+            analysis::analyse(&RunFolder::existing(&root), registry)
+        });
+        if let Some(error) = analysed.map_or_else(Some, |concluded| concluded.unwritten) {
+            console.error(&error.to_string());
+            return exit::FAILED;
+        }
+    }
     let progress = Progress::begin();
     let text = progress.during(console, "reading the summary", |_| {
         fs::read_to_string(folder.summary())

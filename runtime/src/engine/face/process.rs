@@ -29,7 +29,7 @@ use crate::rundir::face_launch::{ArmLaunch, FaceLaunch};
 use crate::rundir::launch::read;
 use crate::rundir::pipe::{FaceReport, FromProcess, Orders, ProcessReport, say};
 use crate::rundir::record::Recorder;
-use crate::shm::Domain;
+use crate::shm::{Domain, DomainError};
 use crate::topology::{FaceKind, Timestamps};
 
 const PROGRESS_PERIOD: Duration = Duration::from_millis(250);
@@ -51,7 +51,9 @@ pub(crate) fn run(launch: &Path) -> Result<(), FaceError> {
 fn prepare_and_live(path: &Path) -> Result<(), FaceError> {
     let orders = Orders::listen().map_err(GatewayError::Thread)?;
     let launch: Arc<FaceLaunch> = Arc::new(read(path)?);
-    let domain = Arc::new(Domain::open(&launch.domain.parse()?)?);
+    let domain = Arc::new(Domain::open(
+        &launch.domain.parse().map_err(DomainError::Address)?,
+    )?);
     let gate = Arc::new(Gate::default());
     // Held until the end, so that the kernel never switches receive stamps off in between.
     let armed = arm_and_describe(probe_settings(&launch));

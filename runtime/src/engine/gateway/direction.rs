@@ -136,7 +136,7 @@ impl Opened {
     }
 
     /// How often its connections come and go, if it is one that connects.
-    pub(crate) fn tally(&self) -> Option<Arc<ConnectionTally>> {
+    pub fn tally(&self) -> Option<Arc<ConnectionTally>> {
         self.socket.tally.clone()
     }
 

@@ -8,7 +8,7 @@ use hil_models::link::trace::ReplayTally;
 use hil_models::link::{Fate, LinkModel, LossCauses, MessageNumber};
 use hil_models::time::Instant;
 
-use crate::rundir::launch::{EmulationError, EmulationLaunch};
+use crate::topology::emulation::{EmulationError, EmulationLaunch};
 use crate::topology::emulation_room::EmulationRoom;
 
 /// Changes that may wait at a time for the thread to see them.

@@ -39,9 +39,10 @@ use nix::poll::{PollFd, PollFlags, ppoll};
 use nix::sys::time::TimeSpec;
 
 use crate::platform::clock::MonotonicClock;
-use crate::rundir::launch::{DirectionLaunch, EmulationError, LaunchError};
+use crate::rundir::launch::{DirectionLaunch, LaunchError};
 use crate::rundir::record::RecordFileError;
 use crate::shm::{ChannelError, Domain, DomainError, clock_id};
+use crate::topology::emulation::EmulationError;
 
 /// Why a gateway cannot go on.
 #[derive(Debug, thiserror::Error)]
@@ -99,11 +100,11 @@ pub enum GatewayError {
 /// What a direction's thread needs from the process around it.
 #[derive(Debug)]
 pub struct Surroundings {
-    pub(crate) domain: Domain,
-    pub(crate) session: u32,
-    pub(crate) fingerprint: [u8; 16],
+    pub domain: Domain,
+    pub session: u32,
+    pub fingerprint: [u8; 16],
     pub(crate) clock_id: u64,
-    pub(crate) stop: Arc<AtomicBool>,
+    pub stop: Arc<AtomicBool>,
 }
 
 impl Surroundings {
@@ -121,7 +122,8 @@ impl Surroundings {
         })
     }
 
-    pub(crate) fn identity(launch: &DirectionLaunch) -> ChannelIdentity {
+    /// What the other end of the channel of `launch` must agree on.
+    pub fn identity(launch: &DirectionLaunch) -> ChannelIdentity {
         ChannelIdentity::new(
             launch.channel_id,
             &launch.channel,

@@ -29,7 +29,7 @@ use crate::rundir::pipe::{
     ChannelProgress, DirectionReport, FromProcess, Orders, ProcessReport, say,
 };
 use crate::rundir::record::Recorder;
-use crate::shm::Domain;
+use crate::shm::{Domain, DomainError};
 
 const PROGRESS_PERIOD: Duration = Duration::from_millis(250);
 /// How often orders and threads are looked at.
@@ -61,7 +61,7 @@ fn prepare_and_live(path: &Path) -> Result<(), GatewayError> {
         return Err(GatewayError::SecretMissing);
     }
     let seal = seal.flatten();
-    let domain = Domain::open(&launch.domain.parse()?)?;
+    let domain = Domain::open(&launch.domain.parse().map_err(DomainError::Address)?)?;
     let surroundings = Arc::new(Surroundings::new(domain)?);
     warn_of_shared_cpus(&launch);
     let mut recorder = Recorder::new(&launch.records, &launch.process, launch.instance);

@@ -25,12 +25,11 @@ use super::stamp_plan::StampPlan;
 use crate::nic::radio::category;
 use crate::platform::clock::MonotonicClock;
 use crate::platform::host_facts::{HostFiles, kernel_release};
-use crate::rundir::launch::{
-    DirectionLaunch, EmulationError, EmulationLaunch, Side, SocketLaunch, Transport,
-};
+use crate::rundir::launch::{DirectionLaunch, Side, SocketLaunch, Transport};
 use crate::rundir::pipe::RunStart;
 use crate::rundir::run_seal::RunSeal;
 use crate::topology::Timestamps;
+use crate::topology::emulation::{EmulationError, EmulationLaunch};
 use crate::topology::emulation_room::EmulationRoom;
 
 /// IP and UDP headers of a datagram.

@@ -87,7 +87,7 @@ fn prepare_and_live(path: &Path, registry: &Registry) -> Result<(), ComponentErr
     let progress = counts.report_progress()?;
 
     // Everything below runs on this thread, which from here on is the measured one.
-    let domain = Domain::open(&launch.domain.parse()?)?;
+    let domain = Domain::open(&launch.domain.parse().map_err(DomainError::Address)?)?;
     let mut waiter = open_waiter(&domain, &card, launch.wait)?;
     let endpoint = connect(role, &domain, &card, launch.wait, (sinks, &counts))?;
     warn_of_spinning(&launch);

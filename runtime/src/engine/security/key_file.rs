@@ -12,7 +12,7 @@ use base64::engine::general_purpose::STANDARD;
 use nix::unistd::geteuid;
 use zeroize::{Zeroize, Zeroizing};
 
-use super::random_bytes;
+use crate::platform::random::random_bytes;
 
 /// What the line begins with.
 const PREFIX: &str = "hil-psk-v1:";
@@ -216,7 +216,7 @@ impl PreSharedKey {
     }
 
     /// The bytes, for the handshake.
-    pub(crate) fn expose(&self) -> &[u8; KEY_BYTES] {
+    pub fn expose(&self) -> &[u8; KEY_BYTES] {
         &self.0
     }
 }

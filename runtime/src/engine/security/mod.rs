@@ -7,19 +7,6 @@ pub mod cli;
 pub(crate) mod greeting;
 pub mod key_file;
 
-use std::fs::File;
-use std::io::{self, Read};
-
 pub(crate) use channel::{SecureReader, SecureWriter};
 pub(crate) use greeting::TimedStream;
 pub use key_file::{KeyFileError, PreSharedKey};
-
-/// `N` bytes that nobody can guess.
-///
-/// # Errors
-/// When the system gives none.
-pub(crate) fn random_bytes<const N: usize>() -> io::Result<[u8; N]> {
-    let mut bytes = [0; N];
-    File::open("/dev/urandom")?.read_exact(&mut bytes)?;
-    Ok(bytes)
-}

@@ -7,7 +7,8 @@ use super::plan::{ProcessKind, ProcessPlan};
 use crate::platform::realtime::RealtimeRequest;
 use crate::platform::wait::WaitMode;
 use crate::rundir::launch::{DirectionLaunch, Side, SocketLaunch, Transport};
-use crate::topology::{ClockPath, Host, OnExit, Timestamps, Topology, end_name};
+use crate::topology::clock_process_name;
+use crate::topology::{ClockPath, Host, OnExit, Timestamps, Topology};
 
 /// Name of the message type that a clock path announces and never sends.
 const MESSAGE: &str = "hil.ClockPath.v1";
@@ -19,16 +20,6 @@ const PATH_MTU_BYTES: usize = 576;
 const RESTART_LIMIT: u32 = 3;
 /// How long a run waits for the first exchanges; it begins without them rather than not at all.
 const READY_WITHIN_MAX: Duration = Duration::from_secs(2);
-
-/// Name of the process at the end of `path` on `host`.
-pub(crate) fn process_name(path: &ClockPath<'_>, host: &str) -> String {
-    let other = if path.from.name == host {
-        &path.to.name
-    } else {
-        &path.from.name
-    };
-    end_name(host, other)
-}
 
 /// The ends of clock paths on `host`.
 pub(super) fn on<'a>(
@@ -45,7 +36,7 @@ pub(super) fn on<'a>(
             return None;
         };
         Some(ProcessPlan {
-            name: process_name(&path, &host.name),
+            name: clock_process_name(&path, &host.name),
             host: host.name.clone(),
             kind: ProcessKind::ClockPath {
                 directions: vec![direction(&path, host, side)],

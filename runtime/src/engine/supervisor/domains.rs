@@ -12,9 +12,9 @@ use hil_models::link::condition::{LinkOrder, ORDER_TYPE_NAME};
 use super::plan::{HostPlan, domain_base, domain_root};
 use crate::engine::gateway::link_control::ORDERS_MAX;
 use crate::rundir::announcement::withdraw_abandoned;
+use crate::shm::observer_depth;
 use crate::shm::{ChannelError, ChannelHolder, ChannelSettings, Domain, DomainError, TypeInfo};
 use crate::topology::Channel;
-use crate::watch::observer_depth;
 
 /// Writers at a time: one, and its successor while the dead one is not cleaned up yet.
 const WRITERS_MAX: usize = 2;

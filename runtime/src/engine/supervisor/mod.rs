@@ -22,6 +22,5 @@ mod teller;
 
 pub use domains::{DomainsError, sweep};
 pub use meet::PeerError;
-pub use outcome::{Outcome, RunError, RunOptions, RunResult};
-pub(crate) use plan::domain_base_candidates;
+pub use outcome::{RunError, RunOptions};
 pub use session::run;

@@ -6,20 +6,15 @@ use std::io;
 use std::path::PathBuf;
 
 use hil_models::layout::Field;
-use hil_models::time::Instant;
 
 use super::crew::CrewError;
 use super::domains::DomainsError;
 use super::frame::{EndMeaning, PeerMessage};
 use super::meet::PeerError;
 use crate::engine::security::KeyFileError;
-use crate::nic::card_clock::CardStory;
-use crate::platform::clock_discipline::HostDiscipline;
-use crate::platform::host_facts::HostFacts;
-use crate::rundir::event::{Event, ProcessStory};
-use crate::rundir::launch::EmulationError;
-use crate::rundir::run_folder::RunFolder;
+use crate::rundir::run_result::Outcome;
 use crate::shm::DomainError;
+use crate::topology::emulation::EmulationError;
 
 /// What the command line asks of a run beyond the topology.
 #[derive(Debug, Clone, Default)]
@@ -28,6 +23,8 @@ pub struct RunOptions {
     pub hosts: Vec<String>,
     /// Folder for shared-memory domains, if not the default.
     pub domain_root: Option<PathBuf>,
+    /// The topology file, for the manifest.
+    pub topology_file: PathBuf,
     /// The command line, for the manifest.
     pub command_line: Vec<String>,
     /// The fields of the channels whose messages are known, by channel, for the manifest.
@@ -80,99 +77,15 @@ impl From<CrewError> for RunError {
     }
 }
 
-/// How a run ended.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Outcome {
-    /// The planned time passed.
-    Completed,
-    /// A process ended by itself without a fault.
-    EndedEarly(String),
-    /// The user ended it.
-    Interrupted(String),
-    /// A process failed and its policy ended the run.
-    Failed(String),
-    /// Another host ended it.
-    EndedByPeer(String),
-    /// Another host vanished.
-    PeerLost(String),
-}
-
-impl Outcome {
-    /// In words.
-    pub fn text(&self) -> String {
-        match self {
-            Self::Completed => "completed as planned".to_owned(),
-            Self::EndedEarly(text) => format!("ended early: {text}"),
-            Self::Interrupted(by) => format!("interrupted by {by}"),
-            Self::Failed(text) => format!("failed: {text}"),
-            Self::EndedByPeer(text) => format!("ended by another host: {text}"),
-            Self::PeerLost(text) => format!("another host vanished: {text}"),
-        }
-    }
-
-    /// Why it ended so, to be said after a word for how.
-    pub fn reason(&self) -> String {
-        match self {
-            Self::Completed => "as planned".to_owned(),
-            Self::Failed(text) => text.clone(),
-            other => other.text(),
-        }
-    }
-
-    /// How the other hosts are to take it.
-    pub(super) fn meaning(&self) -> EndMeaning {
-        match self {
-            Self::Completed => EndMeaning::Planned,
-            Self::EndedEarly(_) => EndMeaning::Early,
-            Self::Interrupted(_) | Self::Failed(_) | Self::EndedByPeer(_) | Self::PeerLost(_) => {
-                EndMeaning::Broken
-            }
-        }
-    }
-}
-
-/// Everything a finished run knows, before any figure is computed.
-#[derive(Debug)]
-pub struct RunResult {
-    /// Where its files are.
-    pub folder: RunFolder,
-    /// How it ended.
-    pub outcome: Outcome,
-    /// Start and end of the run on each host, on that host's own monotonic clock.
-    pub spans: BTreeMap<String, (Instant, Instant)>,
-    /// When it started, as people write it.
-    pub started: String,
-    /// What happened, on all hosts.
-    pub events: Vec<Event>,
-    /// How the processes of all hosts fared.
-    pub processes: Vec<ProcessStory>,
-    /// What became of the network cards of all hosts; empty unless hardware stamps were asked
-    /// for.
-    pub cards: Vec<CardStory>,
-    /// True when all hosts read one clock.
-    pub has_one_clock: bool,
-    /// How the hops between hosts are protected, in words; `None` when there are none.
-    pub security: Option<String>,
-    /// Who steers each host's system clock, of the hosts that told.
-    pub disciplines: BTreeMap<String, HostDiscipline>,
-    /// Hosts that ran here.
-    pub own_hosts: Vec<String>,
-    /// What spoils the completeness of the report.
-    pub problems: Vec<String>,
-    /// Facts of this host.
-    pub facts: HostFacts,
-}
-
-impl RunResult {
-    /// True when records are missing, or something could not be taken down: the report is not
-    /// what the run should have left.
-    pub fn has_gaps(&self) -> bool {
-        let reports = self
-            .processes
-            .iter()
-            .filter_map(|process| process.report.as_ref());
-        let mut failures = reports.flat_map(|report| &report.recorder_failures);
-        !self.problems.is_empty() || failures.next().is_some()
+/// How the other hosts are to take `outcome`.
+pub(super) fn meaning(outcome: &Outcome) -> EndMeaning {
+    match outcome {
+        Outcome::Completed => EndMeaning::Planned,
+        Outcome::EndedEarly(_) => EndMeaning::Early,
+        Outcome::Interrupted(_)
+        | Outcome::Failed(_)
+        | Outcome::EndedByPeer(_)
+        | Outcome::PeerLost(_) => EndMeaning::Broken,
     }
 }
 

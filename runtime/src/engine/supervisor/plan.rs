@@ -10,19 +10,22 @@ use hil_models::egm::messages::Side as ArmSide;
 use hil_models::egm::parameters::{ControllerSettings, EgmParameters};
 use hil_models::link::condition::order_channel;
 use hil_models::message::{FNV_OFFSET, fnv1a};
-use nix::unistd::{AccessFlags, Uid, access};
+use nix::unistd::{AccessFlags, access};
 
 use super::clock_path;
+use crate::platform::domain_address::domain_base_candidates;
 use crate::platform::realtime::{RealtimeRequest, SchedulingPolicy};
 use crate::platform::wait::WaitMode;
+use crate::rundir::announcement;
 use crate::rundir::face_launch::{ArmLaunch, FaceSettings};
-use crate::rundir::launch::{DirectionLaunch, EmulationLaunch, Side, SocketLaunch, Transport};
+use crate::rundir::launch::{DirectionLaunch, Side, SocketLaunch, Transport};
 use crate::rundir::live_run::Source;
+use crate::topology::emulation::EmulationLaunch;
+use crate::topology::gateway_name;
 use crate::topology::{
     CardChannel, Channel, Crossing, EgmFace, Execution, FaceKind, Host, OnExit, Process,
     ProcessCard, Program, Scheduling, Topology, Via, Wait, command_channel, feedback_channel,
 };
-use crate::watch;
 
 /// Everything one supervisor is responsible for.
 #[derive(Debug)]
@@ -131,7 +134,7 @@ pub(crate) fn plan(topology: &Topology, hosts: &[&Host]) -> Plan {
                     .any(|process| process.host == host.name)
         });
         let observed = topology.channels().iter().filter(|channel| {
-            let source = watch::source(topology, channel, &is_here);
+            let source = announcement::source(topology, channel, &is_here);
             matches!(source, Some(Source::SharedMemory { host: at, .. }) if at == host.name)
         });
         HostPlan {
@@ -166,11 +169,6 @@ fn order_channels(topology: &Topology, host: &Host) -> BTreeSet<String> {
         .filter_map(|crossing| EmulationLaunch::of(&crossing, seed))
         .map(|emulation| order_channel(&emulation.link, emulation.way))
         .collect()
-}
-
-/// What the gateway process of `link` on `host` is called, in reports and in record files.
-pub(crate) fn gateway_name(link: &str, host: &str) -> String {
-    format!("gateway-{link}-{host}")
 }
 
 fn component(topology: &Topology, process: &Process) -> ProcessPlan {
@@ -401,16 +399,6 @@ fn default_domain_base() -> PathBuf {
     let mut candidates = domain_base_candidates();
     let last = candidates.pop().unwrap_or_default();
     candidates.into_iter().find(is_usable).unwrap_or(last)
-}
-
-/// Where domains lie by default: `/run/hil`, else the user's own runtime folder, else a folder of
-/// the user's own among the temporary ones.
-pub(crate) fn domain_base_candidates() -> Vec<PathBuf> {
-    let runtime_folder =
-        std::env::var_os("XDG_RUNTIME_DIR").map(|path| PathBuf::from(path).join("hil"));
-    let own = std::env::temp_dir().join(format!("hil-{}", Uid::current()));
-    let candidates = [Some(PathBuf::from("/run/hil")), runtime_folder, Some(own)];
-    candidates.into_iter().flatten().collect()
 }
 
 #[cfg(test)]

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use std::thread;
 use std::time::{Duration, Instant as WallInstant, SystemTime};
 
+use hil_gateways::transport::clock_pair::ClockPair;
 use hil_models::time::Instant;
 
 use super::crew::{self, Crew, Verdict};
@@ -13,7 +14,8 @@ use super::elsewhere::{Elsewhere, greeting, own_ticks};
 use super::exchange::exchange;
 use super::frame::{Frame, PeerMessage};
 use super::gathering::{gather, read_key};
-use super::outcome::{Heard, Outcome, RunError, RunOptions, RunResult};
+use super::outcome::meaning;
+use super::outcome::{Heard, RunError, RunOptions};
 use super::peer::{Peer, PeerEvent};
 use super::plan::{ProcessPlan, plan};
 use super::teller::Teller;
@@ -25,13 +27,17 @@ use crate::platform::host_facts::HostFacts;
 use crate::platform::signals::Signals;
 use crate::rundir::announcement::Announcement;
 use crate::rundir::event::{Event, HostStory, ProcessStory, disciplines};
-use crate::rundir::manifest;
+use crate::rundir::manifest::{self, ManifestContent};
 use crate::rundir::run_folder::{RunFolder, utc_text};
+use crate::rundir::run_result::{Outcome, RunResult};
 use crate::rundir::status::Phase;
 use crate::shm::clock_id;
+use crate::topology::emulation::EmulationLaunch;
 use crate::topology::emulation_room::check_emulation;
 use crate::topology::{Host, Topology};
 
+/// Reads of the two clocks of which the narrowest counts.
+const CLOCK_READS: u32 = 5;
 /// How often the supervisor looks after everything.
 const WATCH_PERIOD: Duration = Duration::from_millis(5);
 /// How often the memory of dead processes is freed: short against the second in which a
@@ -71,7 +77,16 @@ pub fn run(
         folder: folder.root().to_owned(),
         source,
     };
-    manifest::write(topology, options, &folder, &facts).map_err(unwritable)?;
+    let content = ManifestContent {
+        topology,
+        topology_file: &options.topology_file,
+        hosts: &options.hosts,
+        command_line: &options.command_line,
+        layouts: &options.layouts,
+        facts: &facts,
+        realtime_minus_monotonic_ns: ClockPair::read(CLOCK_READS).ok().map(|pair| pair.offset_ns),
+    };
+    manifest::write(&content, &folder).map_err(unwritable)?;
     let run = folder.root().to_string_lossy();
     let domains = Domains::create(&plan.hosts, options.domain_root.as_ref(), &run)?;
     console.say(&format!("run folder {}", folder.root().display()));
@@ -119,6 +134,17 @@ pub fn run(
     let span = (start, MonotonicClock::now());
     session.stop(&outcome);
     Ok(session.conclude(folder, outcome, span, (started, facts)))
+}
+
+/// The longest delay of each trace that a link of `topology` replays, by channel: known since before
+/// the run began.
+fn trace_delays(topology: &Topology) -> BTreeMap<String, Duration> {
+    let seed = topology.run().seed;
+    let delays = topology.crossings().filter_map(|crossing| {
+        let trace = EmulationLaunch::of(&crossing, seed)?.trace?;
+        Some((crossing.channel.name.clone(), trace.delay_max().ok()?))
+    });
+    delays.collect()
 }
 
 pub(super) fn is_here(host: &Host, hosts: &[&Host]) -> bool {
@@ -349,7 +375,7 @@ impl Session<'_> {
     fn stop(&mut self, outcome: &Outcome) {
         self.tell(Phase::Ending);
         let reason = outcome.text();
-        let meaning = outcome.meaning();
+        let meaning = meaning(outcome);
         self.say_to_all(&PeerMessage::Stop { reason, meaning });
         self.crew.stop(STOP_PATIENCE, ProcessPlan::is_component);
         self.say_to_all(&PeerMessage::Quiet);
@@ -443,6 +469,7 @@ impl Session<'_> {
             own_hosts,
             problems,
             facts,
+            trace_delays: trace_delays(self.topology),
         }
     }
 

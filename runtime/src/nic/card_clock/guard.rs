@@ -12,6 +12,7 @@ use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
+use clap::Args;
 use hil_gateways::transport::card_arming::{
     ArmedCard, CardControl, InterfaceCard, describe_setting,
 };
@@ -19,7 +20,6 @@ use hil_gateways::transport::timestamping::HardwareStamping;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM};
 use signal_hook::flag;
 
-use crate::cli::arguments::CardGuardArgs;
 use crate::platform::console::Console;
 
 /// What the guard says once no signal ends it any more.
@@ -29,7 +29,7 @@ const RELEASED: u8 = b'r';
 
 /// A card that stamps, and that comes back as it was found whatever becomes of this program.
 #[derive(Debug)]
-pub(crate) struct GuardedCard<C: CardControl = InterfaceCard> {
+pub struct GuardedCard<C: CardControl = InterfaceCard> {
     // Before the guard: it is put back first, and the guard let go afterwards.
     armed: ArmedCard<C>,
     guard: Option<Guard>,
@@ -41,7 +41,7 @@ impl GuardedCard {
     ///
     /// # Errors
     /// In words, when the card cannot be armed or guarded; it is left as it was.
-    pub(crate) fn arm(interface: &str, is_guarded: bool) -> Result<Self, String> {
+    pub fn arm(interface: &str, is_guarded: bool) -> Result<Self, String> {
         let card = InterfaceCard {
             interface: interface.to_owned(),
         };
@@ -70,12 +70,13 @@ impl<C: CardControl> GuardedCard<C> {
         Ok(Self { armed, guard })
     }
 
-    pub(crate) const fn armed(&self) -> &ArmedCard<C> {
+    /// The card.
+    pub const fn armed(&self) -> &ArmedCard<C> {
         &self.armed
     }
 
     /// Puts the card back as it was, and says what it was and whether that came about.
-    pub(crate) fn restore_in_words(&mut self) -> String {
+    pub fn restore_in_words(&mut self) -> String {
         let told = self.armed.restore_in_words();
         self.guard = None;
         told
@@ -157,6 +158,23 @@ pub(crate) enum GuardError {
         former: String,
         reason: String,
     },
+}
+
+/// How a network card was found, in the kernel's numbers (`struct hwtstamp_config`).
+#[derive(Debug, Args)]
+pub struct CardGuardArgs {
+    /// Its interface.
+    #[arg(long)]
+    pub interface: String,
+    /// `flags`.
+    #[arg(long, allow_negative_numbers = true)]
+    pub flags: i32,
+    /// `tx_type`.
+    #[arg(long, allow_negative_numbers = true)]
+    pub transmit_type: i32,
+    /// `rx_filter`.
+    #[arg(long, allow_negative_numbers = true)]
+    pub receive_filter: i32,
 }
 
 /// What the process of a guard does until its program is gone or lets it go.

@@ -5,8 +5,8 @@
 //! The supervisor does this and not a gateway, because a card belongs to its host: two links may
 //! use one card. A supervisor that is killed outright cannot put it back; then its guard does.
 
-pub(crate) mod guard;
-pub(crate) mod probing;
+pub mod guard;
+pub mod probing;
 
 use std::path::Path;
 use std::sync::Arc;
@@ -19,9 +19,9 @@ use hil_gateways::transport::clock_pair::ClockPair;
 use hil_gateways::transport::interface::interface_with_address;
 use hil_gateways::transport::timestamping::TimestampCapabilities;
 use hil_models::measure::card_clock::CardClockRecord;
-use serde::{Deserialize, Serialize};
 
 use self::guard::GuardedCard;
+use crate::rundir::card_story::CardStory;
 use crate::rundir::record::{RecordKind, RecordSink, Recorder};
 use crate::topology::{Host, Program, Timestamps, Topology, Via};
 
@@ -34,42 +34,6 @@ const RING_RECORDS: usize = 256;
 /// Who writes the records of the cards, in their file names.
 const WRITER: &str = "supervisor";
 
-/// What became of one card, in words for the report.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct CardStory {
-    /// The host of the topology.
-    pub host: String,
-    /// Its interface.
-    pub interface: String,
-    /// Number N of the card's clock `/dev/ptpN`; `None` when it has none.
-    pub phc_index: Option<u32>,
-    /// What the driver claims to stamp.
-    pub claims: String,
-    /// What was asked for and granted, or why the card could not be armed.
-    pub arming: String,
-    /// It was armed.
-    pub is_armed: bool,
-    /// It stamps every arriving datagram.
-    pub stamps_all_arrivals: bool,
-    /// How it was set up before, and whether that was put back.
-    pub restoring: String,
-    /// How its clock was read, or why not.
-    pub clock: String,
-    /// Reads of its clock that failed.
-    pub failed_read_count: u64,
-}
-
-impl CardStory {
-    /// Name of the card's records, and of the card in the report.
-    pub fn name(&self) -> String {
-        card_name(&self.host, &self.interface)
-    }
-}
-
-pub(crate) fn card_name(host: &str, interface: &str) -> String {
-    format!("{host}/{interface}")
-}
-
 #[derive(Debug)]
 struct WatchedCard {
     story: CardStory,
@@ -78,7 +42,7 @@ struct WatchedCard {
 
 /// The cards of this supervisor's hosts, armed and watched until [`CardWatch::finish`].
 #[derive(Debug, Default)]
-pub(crate) struct CardWatch {
+pub struct CardWatch {
     cards: Vec<WatchedCard>,
     recorder: Option<Recorder>,
     stop: Arc<AtomicBool>,
@@ -99,7 +63,7 @@ impl CardWatch {
     /// Arms the cards that `topology` asks for on `hosts` and begins to read their clocks into
     /// `records`. What cannot be done is part of the story and ends no run. Call it from a thread
     /// of normal priority: the reading thread inherits it.
-    pub(crate) fn start(topology: &Topology, hosts: &[&Host], records: &Path) -> Self {
+    pub fn start(topology: &Topology, hosts: &[&Host], records: &Path) -> Self {
         let mut watch = Self {
             cards: Vec::new(),
             recorder: None,
@@ -173,7 +137,7 @@ impl CardWatch {
 
     /// Reads the clocks a last time, puts the cards back as they were, and gives their stories
     /// and what went wrong with the records.
-    pub(crate) fn finish(mut self) -> (Vec<CardStory>, Vec<String>) {
+    pub fn finish(mut self) -> (Vec<CardStory>, Vec<String>) {
         self.stop.store(true, Ordering::Release);
         if let Some(sampling) = self.sampling.take() {
             sampling.thread().unpark();

@@ -22,18 +22,18 @@ const LINK_HOSTS: Ipv4Addr = Ipv4Addr::new(224, 0, 0, 1);
 
 /// What a card showed; each in words where it did not.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct CardProbe {
+pub struct CardProbe {
     /// Its clock against the real-time clock.
-    pub(crate) clock: Result<CardPair, String>,
+    pub clock: Result<CardPair, String>,
     /// How it was found to be set up.
-    pub(crate) setting: Result<String, String>,
+    pub setting: Result<String, String>,
     /// Whether transmit stamps of the card came back.
-    pub(crate) tx_hardware: Result<Delivery, String>,
+    pub tx_hardware: Result<Delivery, String>,
 }
 
 /// What became of the stamps of the probe.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Delivery {
+pub enum Delivery {
     /// They came.
     Delivered,
     /// The driver advertises them, and none came in time.
@@ -44,7 +44,7 @@ pub(crate) enum Delivery {
 
 /// Looks at the card behind `interface` with the clock `/dev/ptp<phc_index>`. Sends datagrams to
 /// the discard port of all hosts of the link, for half a second at most.
-pub(crate) fn probe_card(interface: &str, phc_index: u32) -> CardProbe {
+pub fn probe_card(interface: &str, phc_index: u32) -> CardProbe {
     let clock = CardClock::open(phc_index).and_then(|clock| clock.read(READ_ATTEMPTS));
     let setting = HardwareStamping::query(interface);
     CardProbe {

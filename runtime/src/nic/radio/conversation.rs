@@ -22,7 +22,7 @@ const ANSWER_WAIT: Duration = Duration::from_millis(200);
 
 /// A socket to ask over.
 #[derive(Debug)]
-pub(crate) struct Conversation {
+pub struct Conversation {
     socket: OwnedFd,
     sequence: u32,
     buffer: Box<[u8]>,
@@ -33,7 +33,7 @@ impl Conversation {
     ///
     /// # Errors
     /// When the kernel does not have the protocol.
-    pub(crate) fn open(protocol: SockProtocol) -> io::Result<Self> {
+    pub fn open(protocol: SockProtocol) -> io::Result<Self> {
         Ok(Self {
             socket: netlink_socket(protocol, 0)?,
             sequence: 0,
@@ -46,11 +46,7 @@ impl Conversation {
     ///
     /// # Errors
     /// When it does not answer.
-    pub(crate) fn family(
-        &mut self,
-        name: &[u8],
-        group: &[u8],
-    ) -> io::Result<Option<(u16, Option<u32>)>> {
+    pub fn family(&mut self, name: &[u8], group: &[u8]) -> io::Result<Option<(u16, Option<u32>)>> {
         let asked = self.ask(
             (CONTROL_FAMILY, control::GET_FAMILY),
             false,
@@ -68,7 +64,7 @@ impl Conversation {
     ///
     /// # Errors
     /// What the kernel refused with, or that it did not answer in time.
-    pub(crate) fn ask<T>(
+    pub fn ask<T>(
         &mut self,
         (family, command): (u16, u8),
         is_dump: bool,

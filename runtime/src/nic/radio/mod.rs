@@ -3,15 +3,16 @@
 //!
 //! - `netlink`, `nl80211`: the messages, as bytes; `conversation`: question and answer.
 //! - `socket`: asking and listening; `sampler`: doing so ten times a second.
-//! - [`record`]: what is written down.
+//! - `noting`: what is written down, as [`RadioRecord`](crate::rundir::radio_record::RadioRecord)s.
 //! - [`category`]: which access category a mark leads to.
 
 pub mod category;
-pub(crate) mod conversation;
-pub(crate) mod netlink;
-pub(crate) mod nl80211;
-pub(crate) mod sampler;
-pub(crate) mod socket;
+pub mod conversation;
+pub mod netlink;
+pub mod nl80211;
+mod noting;
+pub mod sampler;
+pub mod socket;
 
 use netlink::{Answer, Answers};
 

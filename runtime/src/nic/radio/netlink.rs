@@ -56,7 +56,7 @@ impl Request<'_> {
 }
 
 /// Attributes one after the other, as a message or another attribute holds them: number and content.
-pub(crate) fn encode_attributes(attributes: &[(u16, &[u8])]) -> Vec<u8> {
+pub fn encode_attributes(attributes: &[(u16, &[u8])]) -> Vec<u8> {
     let mut bytes = Vec::new();
     for (number, content) in attributes {
         let length = u16::try_from(ATTRIBUTE_BYTES + content.len())
@@ -129,18 +129,18 @@ impl<'a> Iterator for Answers<'a> {
 
 /// Attributes one after the other: number and content. Ends where the bytes stop making sense.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Attributes<'a> {
+pub struct Attributes<'a> {
     rest: &'a [u8],
 }
 
 impl<'a> Attributes<'a> {
     /// Those inside the content of an attribute.
-    pub(crate) const fn nested(content: &'a [u8]) -> Self {
+    pub const fn nested(content: &'a [u8]) -> Self {
         Self { rest: content }
     }
 
     /// The content of the first with this number.
-    pub(crate) fn find(self, number: u16) -> Option<&'a [u8]> {
+    pub fn find(self, number: u16) -> Option<&'a [u8]> {
         self.into_iter()
             .find_map(|(one, content)| (one == number).then_some(content))
     }
@@ -177,7 +177,8 @@ pub(crate) fn u16_at(bytes: &[u8], offset: usize) -> Option<u16> {
     Some(u16::from_ne_bytes(*bytes.get(offset..)?.first_chunk()?))
 }
 
-pub(crate) fn u32_at(bytes: &[u8], offset: usize) -> Option<u32> {
+/// The number at `offset` of `bytes`, in the order of this host.
+pub fn u32_at(bytes: &[u8], offset: usize) -> Option<u32> {
     Some(u32::from_ne_bytes(*bytes.get(offset..)?.first_chunk()?))
 }
 

@@ -3,20 +3,7 @@
 
 use super::netlink::{Attributes, u16_at, u32_at};
 
-/// `NL80211_CMD_*`.
-pub(crate) mod command {
-    pub(crate) const GET_INTERFACE: u8 = 5;
-    pub(crate) const GET_STATION: u8 = 17;
-    pub(crate) const NEW_STATION: u8 = 19;
-    pub(crate) const DEL_STATION: u8 = 20;
-    pub(crate) const DEAUTHENTICATE: u8 = 39;
-    pub(crate) const DISASSOCIATE: u8 = 40;
-    pub(crate) const CONNECT: u8 = 46;
-    pub(crate) const ROAM: u8 = 47;
-    pub(crate) const DISCONNECT: u8 = 48;
-    pub(crate) const GET_POWER_SAVE: u8 = 62;
-    pub(crate) const NOTIFY_CQM: u8 = 64;
-}
+use crate::rundir::radio_record::command;
 
 /// `NL80211_ATTR_*`.
 pub(crate) mod attribute {
@@ -86,23 +73,23 @@ impl Wireless {
 
 /// One rate of a radio (`NL80211_RATE_INFO_*`).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub(crate) struct Rate {
+pub struct Rate {
     /// Bits on the air, kbit/s.
-    pub(crate) kbps: Option<u32>,
+    pub kbps: Option<u32>,
     /// How it is modulated.
-    pub(crate) generation: Generation,
+    pub generation: Generation,
     /// Modulation and coding scheme.
-    pub(crate) mcs: Option<u8>,
+    pub mcs: Option<u8>,
     /// Spatial streams, where the generation tells them apart from the scheme.
-    pub(crate) stream_count: Option<u8>,
+    pub stream_count: Option<u8>,
     /// Channel width, MHz; 20 where the kernel names no other.
-    pub(crate) width_mhz: u16,
+    pub width_mhz: u16,
 }
 
 /// A generation of IEEE 802.11, by the attribute its rates come in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[repr(u8)]
-pub(crate) enum Generation {
+pub enum Generation {
     /// Up to 802.11g.
     #[default]
     Legacy = 0,
@@ -158,24 +145,36 @@ impl Rate {
 /// What an interface knows of one peer station (`NL80211_STA_INFO_*`). `None` where the driver does
 /// not say.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub(crate) struct Station {
-    pub(crate) mac: [u8; 6],
-    pub(crate) signal_dbm: Option<i8>,
-    pub(crate) signal_average_dbm: Option<i8>,
-    pub(crate) transmit: Option<Rate>,
-    pub(crate) receive: Option<Rate>,
-    pub(crate) inactive_ms: Option<u32>,
-    pub(crate) connected_s: Option<u32>,
-    pub(crate) rx_packets: Option<u32>,
-    pub(crate) tx_packets: Option<u32>,
-    pub(crate) tx_retries: Option<u32>,
-    pub(crate) tx_failed: Option<u32>,
-    pub(crate) beacon_losses: Option<u32>,
+pub struct Station {
+    /// Its address.
+    pub mac: [u8; 6],
+    /// Signal of the newest packet.
+    pub signal_dbm: Option<i8>,
+    /// The driver's moving average of the signal.
+    pub signal_average_dbm: Option<i8>,
+    /// The newest rate sent with.
+    pub transmit: Option<Rate>,
+    /// The newest rate received with.
+    pub receive: Option<Rate>,
+    /// Since anything was heard of it.
+    pub inactive_ms: Option<u32>,
+    /// Since it associated.
+    pub connected_s: Option<u32>,
+    /// Packets received of it.
+    pub rx_packets: Option<u32>,
+    /// Packets sent to it.
+    pub tx_packets: Option<u32>,
+    /// Frames sent again.
+    pub tx_retries: Option<u32>,
+    /// Packets given up.
+    pub tx_failed: Option<u32>,
+    /// Beacons missed so often that the driver counted a loss.
+    pub beacon_losses: Option<u32>,
 }
 
 impl Station {
     /// The station of a `NEW_STATION` message.
-    pub(crate) fn decode(attributes: Attributes<'_>) -> Option<Self> {
+    pub fn decode(attributes: Attributes<'_>) -> Option<Self> {
         let mut station = Self {
             mac: mac(attributes)?,
             ..Self::default()

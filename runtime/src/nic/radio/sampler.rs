@@ -9,9 +9,9 @@ use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use super::nl80211::Station;
+use super::noting;
 use super::socket::RadioSocket;
 use crate::platform::clock::MonotonicClock;
-use crate::rundir::radio_record::RadioRecord;
 use crate::rundir::record::RecordSink;
 
 /// Time between two samples.
@@ -36,7 +36,7 @@ struct Tally {
 
 /// A sampler at work.
 #[derive(Debug)]
-pub(crate) struct Sampler {
+pub struct Sampler {
     interface: String,
     hears_events: bool,
     thread: JoinHandle<Tally>,
@@ -47,7 +47,7 @@ impl Sampler {
     ///
     /// # Errors
     /// When the system gives no thread.
-    pub(crate) fn start(
+    pub fn start(
         interface: String,
         mut socket: RadioSocket,
         mut sink: RecordSink,
@@ -77,7 +77,7 @@ impl Sampler {
     }
 
     /// Waits for its end; says what it did, in words.
-    pub(crate) fn finish(self) -> (String, String) {
+    pub fn finish(self) -> (String, String) {
         let label = "radio samples".to_owned();
         let Ok(tally) = self.thread.join() else {
             return (label, "unavailable: the sampler panicked".to_owned());
@@ -123,7 +123,7 @@ fn look(socket: &mut RadioSocket, sink: &mut RecordSink, tally: &mut Tally) {
     let at_ns = MonotonicClock::now().as_ns();
     let heard = socket.happenings(|happening| {
         tally.event_count += 1;
-        sink.push(&RadioRecord::happening(at_ns, &happening));
+        sink.push(&noting::happening(at_ns, &happening));
     });
     match heard {
         Ok(overrun_count) => tally.overrun_count += overrun_count,
@@ -133,7 +133,7 @@ fn look(socket: &mut RadioSocket, sink: &mut RecordSink, tally: &mut Tally) {
         Ok(stations) => {
             tally.sample_count += 1;
             tally.left_out_count += stations.len().saturating_sub(STATION_COUNT_MAX) as u64;
-            let note = |station: &Station| sink.push(&RadioRecord::sample(at_ns, station));
+            let note = |station: &Station| sink.push(&noting::sample(at_ns, station));
             stations.iter().take(STATION_COUNT_MAX).for_each(note);
         }
         Err(error) => {

@@ -10,13 +10,15 @@ use nix::sys::socket::{MsgFlags, SockProtocol, recv};
 
 use super::conversation::{Conversation, netlink_socket};
 use super::netlink::{Answer, Answers, Attributes};
-use super::nl80211::{self, Happening, Station, Wireless, attribute, command};
+use super::nl80211;
+use super::nl80211::{Happening, Station, Wireless, attribute};
+use crate::rundir::radio_record::command;
 
 /// The longest event of the kernel: it fills pages of 32 KiB at most.
 const EVENT_BYTES: usize = 65_536;
 /// A way to ask the wireless subsystem about one interface.
 #[derive(Debug)]
-pub(crate) struct RadioSocket {
+pub struct RadioSocket {
     requests: Conversation,
     events: Option<OwnedFd>,
     family: u16,
@@ -26,7 +28,7 @@ pub(crate) struct RadioSocket {
 
 /// Why an interface cannot be asked about.
 #[derive(Debug, thiserror::Error)]
-pub(crate) enum RadioError {
+pub enum RadioError {
     /// There is no such interface.
     #[error("interface {0} does not exist")]
     NoInterface(String),
@@ -46,7 +48,7 @@ impl RadioSocket {
     ///
     /// # Errors
     /// When it is not wireless, or cannot be asked.
-    pub(crate) fn open(interface: &str) -> Result<(Self, Wireless), RadioError> {
+    pub fn open(interface: &str) -> Result<(Self, Wireless), RadioError> {
         let failed = |source: io::Error| RadioError::Io {
             interface: interface.to_owned(),
             source,
@@ -88,7 +90,7 @@ impl RadioSocket {
     ///
     /// # Errors
     /// When the interface is gone or the kernel does not answer.
-    pub(crate) fn stations(&mut self) -> io::Result<Vec<Station>> {
+    pub fn stations(&mut self) -> io::Result<Vec<Station>> {
         let index = self.ifindex.to_ne_bytes();
         let attributes: [(u16, &[u8]); 1] = [(attribute::IFINDEX, &index)];
         self.ask(command::GET_STATION, true, &attributes, |_, attributes| {
@@ -100,7 +102,7 @@ impl RadioSocket {
     ///
     /// # Errors
     /// When the driver does not say (`EOPNOTSUPP`).
-    pub(crate) fn is_power_save_on(&mut self) -> io::Result<bool> {
+    pub fn is_power_save_on(&mut self) -> io::Result<bool> {
         let index = self.ifindex.to_ne_bytes();
         let attributes: [(u16, &[u8]); 1] = [(attribute::IFINDEX, &index)];
         let found = self.ask(

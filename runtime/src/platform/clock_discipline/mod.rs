@@ -50,7 +50,7 @@ impl HostDiscipline {
     ///
     /// # Errors
     /// When even the kernel does not say.
-    pub(crate) fn gather() -> Result<Self, String> {
+    pub fn gather() -> Result<Self, String> {
         let kernel = clock_discipline().map_err(|errno| format!("adjtimex: {errno}"))?;
         let mut found = Self {
             is_kernel_synchronised: kernel.is_synchronised,
@@ -162,7 +162,7 @@ impl HostDiscipline {
 
     /// The worse of what was found before and after a run.
     #[must_use]
-    pub(crate) fn worse(self, later: Self) -> Self {
+    pub fn worse(self, later: Self) -> Self {
         let is_same = self.reference == later.reference;
         let bound_ns = self.bound_ns.zip(later.bound_ns).filter(|_| is_same);
         let basis = match (is_same, &self.reference) {
@@ -187,7 +187,7 @@ impl HostDiscipline {
 ///
 /// # Errors
 /// Why nothing can be said.
-pub(crate) fn common_bound_ns(
+pub fn common_bound_ns(
     (one_name, one): (&str, &HostDiscipline),
     (other_name, other): (&str, &HostDiscipline),
 ) -> Result<u64, String> {

@@ -78,7 +78,7 @@ impl HostFiles {
     }
 
     /// The names of the processes that this one can see, cut at fifteen bytes as the kernel does.
-    pub(crate) fn process_names(&self) -> Fact<Vec<String>> {
+    pub fn process_names(&self) -> Fact<Vec<String>> {
         self.list("/proc").and_then(|entries| {
             let is_number = |name: &&String| name.bytes().all(|byte| byte.is_ascii_digit());
             let names: Vec<String> = entries
@@ -106,7 +106,7 @@ impl HostFiles {
     }
 
     /// The first number of a binary file: a signed 32-bit word in the host's order.
-    pub(crate) fn read_word(&self, path: &str) -> Fact<i32> {
+    pub fn read_word(&self, path: &str) -> Fact<i32> {
         let read = fs::File::open(self.locate(path)).and_then(|mut file| {
             let mut word = [0; 4];
             io::Read::read_exact(&mut file, &mut word).map(|()| i32::from_ne_bytes(word))
@@ -133,7 +133,7 @@ impl HostFiles {
 
     /// Whether this process holds the capability with the kernel's number `capability`
     /// (`linux/capability.h`).
-    pub(crate) fn holds_capability(&self, capability: u32) -> Fact<bool> {
+    pub fn holds_capability(&self, capability: u32) -> Fact<bool> {
         let field = self.read_field("/proc/self/status", "CapEff");
         field.and_then(|text| match u64::from_str_radix(&text, 16) {
             Ok(mask) => Fact::Available(mask >> capability & 1 == 1),
@@ -143,9 +143,9 @@ impl HostFiles {
 }
 
 /// `CAP_IPC_LOCK`: memory may be locked beyond `RLIMIT_MEMLOCK`.
-pub(crate) const CAP_IPC_LOCK: u32 = 14;
+pub const CAP_IPC_LOCK: u32 = 14;
 /// `CAP_SYS_NICE`: real-time priorities may be taken beyond `RLIMIT_RTPRIO`.
-pub(crate) const CAP_SYS_NICE: u32 = 23;
+pub const CAP_SYS_NICE: u32 = 23;
 
 /// Largest CPU number accepted; beyond it a line is taken as damaged.
 const CPU_INDEX_MAX: usize = 8191;
@@ -171,7 +171,7 @@ pub(crate) fn parse_cpu_list(text: &str) -> Option<Vec<usize>> {
 }
 
 /// CPUs as people write them: `0-3,8`, or `none`.
-pub(crate) fn format_cpu_list(cpus: &[usize]) -> String {
+pub fn format_cpu_list(cpus: &[usize]) -> String {
     let mut parts = Vec::new();
     let mut index = 0;
     while index < cpus.len() {
@@ -196,53 +196,9 @@ pub(crate) fn format_cpu_list(cpus: &[usize]) -> String {
 }
 
 #[cfg(test)]
-pub(crate) mod fake {
-    //! A host made of a handful of text files.
-
-    use std::fs;
-    use std::path::PathBuf;
-    use std::sync::atomic::{AtomicUsize, Ordering};
-
-    use super::HostFiles;
-
-    /// A folder of planted files, removed on drop.
-    #[derive(Debug)]
-    pub(crate) struct FakeHost {
-        root: PathBuf,
-    }
-
-    impl FakeHost {
-        pub(crate) fn with(files: &[(&str, &str)]) -> Self {
-            static NEXT: AtomicUsize = AtomicUsize::new(0);
-            let index = NEXT.fetch_add(1, Ordering::Relaxed);
-            let name = format!("hil-fake-host-{}-{index}", std::process::id());
-            let host = Self {
-                root: std::env::temp_dir().join(name),
-            };
-            for (path, text) in files {
-                let path = host.files().locate(path);
-                fs::create_dir_all(path.parent().unwrap()).unwrap();
-                fs::write(path, text).unwrap();
-            }
-            host
-        }
-
-        pub(crate) fn files(&self) -> HostFiles {
-            HostFiles::under(&self.root)
-        }
-    }
-
-    impl Drop for FakeHost {
-        fn drop(&mut self) {
-            drop(fs::remove_dir_all(&self.root));
-        }
-    }
-}
-
-#[cfg(test)]
 mod tests {
-    use super::fake::FakeHost;
     use super::*;
+    use crate::platform::host_facts::FakeHost;
 
     #[test]
     fn cpu_lists_are_read_as_the_kernel_writes_them() {

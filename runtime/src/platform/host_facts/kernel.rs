@@ -7,7 +7,7 @@ use std::process::{Command, Stdio};
 use super::{Fact, HostFiles};
 
 /// The kernel's release, such as `6.12.1-amd64`.
-pub(crate) fn kernel_release(files: &HostFiles) -> Fact<String> {
+pub fn kernel_release(files: &HostFiles) -> Fact<String> {
     files.read("/proc/sys/kernel/osrelease")
 }
 
@@ -26,15 +26,16 @@ pub(crate) fn kernel_version(files: &HostFiles) -> Fact<(u32, u32)> {
 
 /// The options the kernel was built with.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct KernelOptions {
+pub struct KernelOptions {
     text: String,
     /// The file they were read from.
-    pub(crate) source: String,
+    pub source: String,
 }
 
 impl KernelOptions {
     /// From `/boot/config-<release>`, else `/proc/config.gz`.
-    pub(crate) fn read(files: &HostFiles) -> Fact<Self> {
+    /// What the kernel says.
+    pub fn read(files: &HostFiles) -> Fact<Self> {
         let release = kernel_release(files);
         let path = format!("/boot/config-{}", release.to_text());
         if let Fact::Available(text) = files.read(&path) {
@@ -48,7 +49,7 @@ impl KernelOptions {
     }
 
     /// True when option `name` (without `CONFIG_`) is built in.
-    pub(crate) fn has(&self, name: &str) -> bool {
+    pub fn has(&self, name: &str) -> bool {
         let wanted = format!("CONFIG_{name}=y");
         self.text.lines().any(|line| line.trim() == wanted)
     }
@@ -76,7 +77,7 @@ fn unpacked(files: &HostFiles, path: &str) -> Fact<String> {
 
 /// When a task in a system call gives way to a more urgent one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum PreemptionMode {
+pub enum PreemptionMode {
     /// Nearly everywhere, interrupt handlers included (`PREEMPT_RT`).
     Realtime,
     /// Wherever no lock is held.
@@ -124,7 +125,7 @@ const VERSION: &str = "/proc/sys/kernel/version";
 const DYNAMIC_MODE: &str = "/sys/kernel/debug/sched/preempt";
 
 /// `PREEMPT_RT`, or the model built in and, where it can be chosen at boot, the mode in force.
-pub(crate) fn preemption(files: &HostFiles) -> Fact<Preemption> {
+pub fn preemption(files: &HostFiles) -> Fact<Preemption> {
     let found = |mode, words: &str, source: &str| {
         Fact::Available(Preemption {
             mode: Fact::Available(mode),
@@ -197,7 +198,7 @@ fn dynamic(files: &HostFiles) -> Preemption {
 
 /// The value of `name=value` on the kernel's command line; the last one counts, `None` when it is
 /// not there.
-pub(crate) fn boot_parameter(files: &HostFiles, name: &str) -> Fact<Option<String>> {
+pub fn boot_parameter(files: &HostFiles, name: &str) -> Fact<Option<String>> {
     files.read("/proc/cmdline").map(|line| {
         let mut values = line.split_whitespace().filter_map(|word| {
             let (key, value) = word.split_once('=').unwrap_or((word, ""));
@@ -244,15 +245,15 @@ pub(super) fn boot_parameters(files: &HostFiles) -> Fact<String> {
 
 /// The share of each period that real-time tasks may take.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct RealtimeThrottle {
+pub struct RealtimeThrottle {
     /// `sched_rt_runtime_us`; negative means without limit.
-    pub(crate) runtime_us: i64,
+    pub runtime_us: i64,
     /// `sched_rt_period_us`.
-    pub(crate) period_us: i64,
+    pub period_us: i64,
 }
 
 impl RealtimeThrottle {
-    pub(crate) fn read(files: &HostFiles) -> Fact<Self> {
+    pub fn read(files: &HostFiles) -> Fact<Self> {
         let number = |name: &str| files.read_number(&format!("/proc/sys/kernel/{name}"));
         number("sched_rt_runtime_us").and_then(|runtime_us| {
             number("sched_rt_period_us").map(|period_us| Self {
@@ -263,7 +264,7 @@ impl RealtimeThrottle {
     }
 
     /// It takes something away.
-    pub(crate) fn is_active(self) -> bool {
+    pub fn is_active(self) -> bool {
         self.runtime_us >= 0 && self.runtime_us < self.period_us
     }
 
@@ -282,17 +283,17 @@ impl RealtimeThrottle {
 const FAIR_SERVER_SINCE: (u32, u32) = (6, 12);
 
 /// Whether this kernel lends normal tasks time even without a throttle.
-pub(crate) fn has_fair_server(files: &HostFiles) -> Fact<bool> {
+pub fn has_fair_server(files: &HostFiles) -> Fact<bool> {
     kernel_version(files).map(|version| version >= FAIR_SERVER_SINCE)
 }
 
 /// The counter behind the kernel's clocks.
-pub(crate) fn clocksource(files: &HostFiles) -> Fact<String> {
+pub fn clocksource(files: &HostFiles) -> Fact<String> {
     files.read("/sys/devices/system/clocksource/clocksource0/current_clocksource")
 }
 
 /// Whether a hypervisor runs below; the tail of every latency then belongs to it as well.
-pub(crate) fn virtual_machine(files: &HostFiles) -> Fact<String> {
+pub fn virtual_machine(files: &HostFiles) -> Fact<String> {
     files.read_field("/proc/cpuinfo", "flags").map(|flags| {
         let is_virtual = flags.split_whitespace().any(|flag| flag == "hypervisor");
         let product = files.read("/sys/class/dmi/id/product_name");

@@ -8,15 +8,15 @@ use super::kernel::boot_parameter;
 use super::{Fact, HostFiles};
 
 /// Where the kernel describes the processors.
-pub(crate) const CPU_FOLDER: &str = "/sys/devices/system/cpu";
+pub const CPU_FOLDER: &str = "/sys/devices/system/cpu";
 
 /// The processors that run.
-pub(crate) fn online_cpus(files: &HostFiles) -> Fact<Vec<usize>> {
+pub fn online_cpus(files: &HostFiles) -> Fact<Vec<usize>> {
     files.read_cpu_list(&format!("{CPU_FOLDER}/online"))
 }
 
 /// The isolated CPUs, else all that run; none when the host does not tell.
-pub(crate) fn isolated_or_online(files: &HostFiles) -> Vec<usize> {
+pub fn isolated_or_online(files: &HostFiles) -> Vec<usize> {
     let isolated = IsolatedCpus::read(files).isolated;
     let isolated = isolated
         .available()
@@ -29,7 +29,7 @@ pub(crate) fn isolated_or_online(files: &HostFiles) -> Vec<usize> {
 ///
 /// # Errors
 /// Names the first of them, and those that do run.
-pub(crate) fn refuse_absent(files: &HostFiles, cpus: &[usize]) -> Result<(), String> {
+pub fn refuse_absent(files: &HostFiles, cpus: &[usize]) -> Result<(), String> {
     let Fact::Available(online) = online_cpus(files) else {
         return Ok(());
     };
@@ -54,7 +54,8 @@ pub struct IsolatedCpus {
 }
 
 impl IsolatedCpus {
-    pub(crate) fn read(files: &HostFiles) -> Self {
+    /// What the kernel says.
+    pub fn read(files: &HostFiles) -> Self {
         let nohz_full = files.read_cpu_list(&format!("{CPU_FOLDER}/nohz_full"));
         Self {
             isolated: files.read_cpu_list(&format!("{CPU_FOLDER}/isolated")),
@@ -86,7 +87,7 @@ fn without_callbacks(files: &HostFiles, nohz_full: Option<&Vec<usize>>) -> Fact<
 
 /// The frequency governor of each of `cpus`, or of all that are there when none is named: the CPU and
 /// its governor.
-pub(crate) fn governors(files: &HostFiles, cpus: &[usize]) -> Fact<Vec<(usize, String)>> {
+pub fn governors(files: &HostFiles, cpus: &[usize]) -> Fact<Vec<(usize, String)>> {
     let all = || {
         files.list(CPU_FOLDER).map(|names| {
             let indexes = names.iter().filter_map(|name| name.strip_prefix("cpu"));
@@ -117,7 +118,7 @@ pub(crate) fn governors(files: &HostFiles, cpus: &[usize]) -> Fact<Vec<(usize, S
 }
 
 /// Runnable tasks, averaged over a minute, and the text for people.
-pub(crate) fn load_average(files: &HostFiles) -> Fact<(f64, String)> {
+pub fn load_average(files: &HostFiles) -> Fact<(f64, String)> {
     files.read("/proc/loadavg").and_then(|text| {
         let words: Vec<&str> = text.split_whitespace().take(3).collect();
         match words.first().and_then(|word| word.parse().ok()) {
@@ -143,7 +144,7 @@ pub struct ProcessorTicks {
 
 impl ProcessorTicks {
     /// The first line of `/proc/stat`.
-    pub(crate) fn read(files: &HostFiles) -> Fact<Self> {
+    pub fn read(files: &HostFiles) -> Fact<Self> {
         files.read("/proc/stat").and_then(|text| {
             let line = text.lines().next().unwrap_or_default();
             let numbers: Option<Vec<u64>> = line.strip_prefix("cpu ").map(|rest| {
@@ -166,7 +167,7 @@ impl ProcessorTicks {
     }
 
     /// What passed since `earlier`.
-    pub(crate) fn since(self, earlier: Self) -> Self {
+    pub fn since(self, earlier: Self) -> Self {
         Self {
             total: self.total.saturating_sub(earlier.total),
             idle: self.idle.saturating_sub(earlier.idle),

@@ -5,9 +5,9 @@ use std::collections::BTreeMap;
 use hil_models::measure::card_clock::CardTimeline;
 
 use super::records::RunRecords;
-use crate::engine::supervisor::RunResult;
-use crate::nic::card_clock::CardStory;
 use crate::report::card_figures::{CardSummary, HardwareStamps, Places, channel_stamps};
+use crate::rundir::card_story::CardStory;
+use crate::rundir::run_result::RunResult;
 use crate::topology::{Crossing, Timestamps, Topology, Via};
 
 /// What the cards of the run say; `None` when hardware stamps were not asked for.

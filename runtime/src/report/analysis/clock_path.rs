@@ -6,9 +6,9 @@ use hil_models::time::{Instant, RemoteInstant};
 
 use super::clocks;
 use super::records::RunRecords;
-use crate::engine::supervisor::RunResult;
-use crate::engine::supervisor::clock_path::process_name;
 use crate::report::clock_summary::{ClockPathEnd, ClockPathSummary, ClockRung, HostPairClock};
+use crate::rundir::run_result::RunResult;
+use crate::topology::clock_process_name;
 use crate::topology::{ClockPath, Host, Topology};
 
 /// A clock path that was silent for longer in a run is warned of: gateways on the data path exchange
@@ -97,7 +97,7 @@ fn end(host: &Host, address: &str) -> ClockPathEnd {
 
 /// How the end that asks stood to the other, or how its process ended.
 fn state(path: &ClockPath<'_>, result: &RunResult) -> String {
-    let name = process_name(path, &path.from.name);
+    let name = clock_process_name(path, &path.from.name);
     let mut processes = result.processes.iter();
     let Some(process) = processes.find(|one| one.name == name) else {
         return format!("nothing is known of process {name}");

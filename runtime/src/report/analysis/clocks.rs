@@ -9,10 +9,10 @@ use hil_models::time::{Alignment, Instant, RemoteInstant};
 
 use super::clock_path;
 use super::records::RunRecords;
-use crate::engine::supervisor::RunResult;
 use crate::platform::clock_discipline;
 use crate::platform::clock_discipline::HostDiscipline;
 use crate::report::clock_summary::{ClockRung, ClockSection, DisciplinedOffset, HostPairClock};
+use crate::rundir::run_result::RunResult;
 use crate::topology::Topology;
 
 /// How instants get from any host of the run to any other.

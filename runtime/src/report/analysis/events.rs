@@ -11,11 +11,11 @@ use super::axis::RunAxis;
 use super::clocks::HostClocks;
 use super::outages::OutageStory;
 use super::records::RunRecords;
-use crate::engine::supervisor::RunResult;
 use crate::report::network::within;
 use crate::report::score_event::{EventOutage, ExplainedEvent, ExplainedMessage, ScoreEvents};
 use crate::report::summary::{ChannelSummary, LinkKind};
 use crate::report::terminal::duration_s;
+use crate::rundir::run_result::RunResult;
 use crate::topology::{Channel, Topology};
 
 /// The events of `score` with the fates of their messages and the outages before them.

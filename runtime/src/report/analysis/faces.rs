@@ -1,11 +1,11 @@
 //! From what the faces of a run recorded and reported to their part of the summary.
 
 use super::records::RunRecords;
-use crate::engine::supervisor::RunResult;
 use crate::report::face::FaceSummary;
 use crate::report::face_figures::figures;
 use crate::report::summary::{CountByName, Fact};
 use crate::rundir::pipe::FaceReport;
+use crate::rundir::run_result::RunResult;
 use crate::topology::{
     EgmFace, FaceKind, Process, Program, Topology, command_channel, feedback_channel,
 };

@@ -8,8 +8,6 @@ use hil_models::time::Instant;
 
 use super::axis::RunAxis;
 use super::records::RunRecords;
-use crate::engine::supervisor;
-use crate::engine::supervisor::RunResult;
 use crate::platform::realtime::GrantOutcome;
 use crate::report::emulation::EmulationFigures;
 use crate::report::summary::{
@@ -17,8 +15,9 @@ use crate::report::summary::{
     ProcessSummary, RealtimeFacts, RunEvent, RunFacts,
 };
 use crate::rundir::event::{Event, ProcessStory};
-use crate::engine::supervisor::{self, RunResult};
+use crate::engine::supervisor::{RunResult, self};
 use crate::topology::{Channel, Topology};
+use crate::rundir::run_result::self;
 
 /// Datagrams that came while the socket's receive buffer was full; see [`NO_ROOM`].
 const NO_ROOM_COUNTER: &str = "socket: kernel_drop_count";
@@ -33,11 +32,11 @@ pub(super) fn run_facts(
     command_line: &[String],
 ) -> RunFacts {
     let outcome = match &result.outcome {
-        supervisor::Outcome::Completed | supervisor::Outcome::EndedEarly(_) => Outcome::Completed,
-        supervisor::Outcome::Interrupted(_) | supervisor::Outcome::EndedByPeer(_) => {
+        run_result::Outcome::Completed | run_result::Outcome::EndedEarly(_) => Outcome::Completed,
+        run_result::Outcome::Interrupted(_) | run_result::Outcome::EndedByPeer(_) => {
             Outcome::Stopped
         }
-        supervisor::Outcome::Failed(_) | supervisor::Outcome::PeerLost(_) => Outcome::Failed,
+        run_result::Outcome::Failed(_) | run_result::Outcome::PeerLost(_) => Outcome::Failed,
     };
     let files = [
         ("summary.json", "every figure of this report"),

@@ -9,8 +9,8 @@ use hil_models::time::{Instant, duration_ns};
 
 use super::channel_files::{ChannelFiles, all};
 use super::records::RunRecords;
-use crate::engine::supervisor::RunResult;
-use crate::engine::supervisor::plan::gateway_name;
+use crate::rundir::run_result::RunResult;
+use crate::topology::gateway_name;
 use crate::topology::{Channel, Topology};
 
 /// Longest time after a receiving gateway is back in which a loss is still put down to its start. Its

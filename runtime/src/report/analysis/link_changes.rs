@@ -13,7 +13,7 @@ use hil_models::time::Instant;
 use super::axis::RunAxis;
 use super::records::RunRecords;
 use crate::report::link_change::LinkChange;
-use crate::rundir::launch::EmulationLaunch;
+use crate::topology::emulation::EmulationLaunch;
 use crate::topology::{Crossing, Topology};
 
 /// Every order that was given to a link of `topology`, in order of time.

@@ -19,19 +19,19 @@ use hil_models::random::RandomStream;
 use hil_models::shuttle::{Shuttle, ShuttleCommand, ShuttleStatus};
 use hil_models::time::Instant;
 
-use super::conclude;
-use crate::engine::supervisor::{Outcome, RunResult};
+use super::{analyse, conclude};
 use crate::platform::host_facts::HostFacts;
+use crate::rundir::manifest::{self, ManifestContent};
 use crate::rundir::record::RecordKind;
 use crate::rundir::record::file::RecordHeader;
 use crate::rundir::run_folder::RunFolder;
+use crate::rundir::run_result::{Outcome, RunResult};
 use crate::topology::registry::Registry;
 use crate::topology::{self, Topology};
 
 /// Says to a process of this test which run to conclude.
 const FOLDER_VARIABLE: &str = "HIL_TEST_CONCLUDE_FOLDER";
-const THIS_TEST: &str =
-    "analysis::memory_tests::memory_does_not_grow_with_the_run_as_its_records_do";
+const THIS_TEST: &str = "memory_does_not_grow_with_the_run_as_its_records_do";
 
 /// Before the figure in what such a process says.
 const PEAK: &str = "peak bytes: ";
@@ -329,6 +329,7 @@ fn result(root: &Path, count: i64) -> RunResult {
         own_hosts: vec!["control-pc".to_owned()],
         problems: Vec::new(),
         facts: HostFacts::default(),
+        trace_delays: BTreeMap::new(),
     }
 }
 
@@ -372,8 +373,9 @@ fn peak_of(folder: &Path, count: i64) -> u64 {
     let root = folder.join(format!("run-{count}"));
     write_run(&root, count);
     fs::write(root.join("count"), count.to_string()).unwrap();
+    let (_, module) = module_path!().split_once("::").unwrap();
     let done = Command::new(env::current_exe().unwrap())
-        .args(["--exact", THIS_TEST, "--nocapture"])
+        .args(["--exact", &format!("{module}::{THIS_TEST}"), "--nocapture"])
         .env(FOLDER_VARIABLE, &root)
         .output()
         .unwrap();
@@ -382,6 +384,36 @@ fn peak_of(folder: &Path, count: i64) -> u64 {
     assert!(done.status.success(), "{said}{complaint}");
     let peak = said.lines().find_map(|line| line.split_once(PEAK));
     peak.unwrap().1.trim().parse().unwrap()
+}
+
+#[test]
+fn the_folder_alone_gives_the_same_summary() {
+    let root = env::temp_dir().join(format!("hil-analyse-{}", std::process::id()));
+    let count = 2_000;
+    write_run(&root, count);
+    let registry = registry();
+    let topology = topology(&registry);
+    let result = result(&root, count);
+    let command_line = ["hil-runtime".to_owned(), "-t".to_owned()];
+    let file = Path::new("long.toml");
+    let content = ManifestContent {
+        topology: &topology,
+        topology_file: file,
+        hosts: &result.own_hosts,
+        command_line: &command_line,
+        layouts: &BTreeMap::new(),
+        facts: &result.facts,
+        realtime_minus_monotonic_ns: None,
+    };
+    manifest::write(&content, &result.folder).unwrap();
+    result.write().unwrap();
+    assert_eq!(RunResult::read(&result.folder).unwrap(), result);
+    let from_memory = conclude(&topology, &result, &registry, (file, &command_line)).unwrap();
+    fs::remove_file(result.folder.summary()).unwrap();
+    let from_folder = analyse(&result.folder, &registry).unwrap();
+    assert_eq!(from_folder.summary, from_memory.summary);
+    assert!(result.folder.summary().is_file() && from_folder.unwritten.is_none());
+    fs::remove_dir_all(root).unwrap();
 }
 
 #[test]

@@ -36,34 +36,68 @@ use figures::{channel_summary, process_summary, realtime_facts, run_event, run_f
 use outages::OutageStory;
 use records::RunRecords;
 
-use crate::engine::supervisor::RunResult;
 use crate::report::event_log;
 use crate::report::summary::{Fact, RunSummary, ScoreMetric, SummaryError};
 use crate::report::terminal::{self, Style};
 use crate::report::trace::capture;
+use crate::rundir::manifest::{Manifest, ManifestTopologyError};
+use crate::rundir::run_folder::RunFolder;
+use crate::rundir::run_result::{RunResult, RunResultError};
 use crate::rundir::series;
 use crate::topology::Topology;
 use crate::topology::registry::{Case, CaseError, Registry};
 
 /// Why no summary could be made.
 #[derive(Debug, thiserror::Error)]
-pub(crate) enum AnalysisError {
+pub enum AnalysisError {
     #[error("records folder {folder}: {source}")]
     Folder { folder: PathBuf, source: io::Error },
     #[error(transparent)]
     Case(#[from] CaseError),
     #[error(transparent)]
     Summary(#[from] SummaryError),
+    #[error("{path}: {source}")]
+    Manifest { path: PathBuf, source: io::Error },
+    #[error("{path}: {source}")]
+    Topology {
+        path: PathBuf,
+        source: ManifestTopologyError,
+    },
+    #[error(transparent)]
+    Result(#[from] RunResultError),
     #[error("cannot write {path}: {source}")]
     Write { path: PathBuf, source: io::Error },
 }
 
 /// The account of a finished run.
 #[derive(Debug)]
-pub(crate) struct Concluded {
-    pub(crate) summary: RunSummary,
+pub struct Concluded {
+    pub summary: RunSummary,
     /// Why the run folder lacks it, e.g. because its disk is full; it can be shown all the same.
-    pub(crate) unwritten: Option<AnalysisError>,
+    pub unwritten: Option<AnalysisError>,
+}
+
+/// Draws up the summary of the finished run in `folder` from nothing but the files there, and writes
+/// it with its report beside them.
+///
+/// # Errors
+/// When the manifest, the result or the records cannot be read.
+pub(crate) fn analyse(folder: &RunFolder, registry: &Registry) -> Result<Concluded, AnalysisError> {
+    let path = folder.manifest();
+    let manifest = match Manifest::read(folder) {
+        Ok(manifest) => manifest,
+        Err(source) => return Err(AnalysisError::Manifest { path, source }),
+    };
+    let topology = match manifest.read_topology(registry.known()) {
+        Ok(topology) => topology,
+        Err(source) => return Err(AnalysisError::Topology { path, source }),
+    };
+    let result = RunResult::read(folder)?;
+    let origin = (
+        Path::new(&manifest.topology_file),
+        manifest.command_line.as_slice(),
+    );
+    conclude(&topology, &result, registry, origin)
 }
 
 /// Draws up the summary of a finished run and writes it with its report into the run's folder.

@@ -21,12 +21,12 @@ use super::events::start_on;
 use super::records::RunRecords;
 pub(crate) use super::robot_series::RobotSeries;
 use super::robot_series::{index_of, without_holes};
-use crate::engine::supervisor::RunResult;
 use crate::report::network::{
     ChannelNetwork, Correlation, CorrelationTests, FOREGOING_S, ForegoingEvent, ForegoingNetwork,
     NetworkReport, TestedPair, TimedEvent, Timeline, TimelineRow,
 };
 use crate::report::score_event::ScoreEvents;
+use crate::rundir::run_result::RunResult;
 use crate::topology::{Channel, Topology};
 
 /// Network events a summary keeps, and of those before one event of the score.

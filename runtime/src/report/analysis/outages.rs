@@ -8,9 +8,10 @@ use std::collections::BTreeMap;
 
 use super::axis::RunAxis;
 use super::records::RunRecords;
-use crate::engine::supervisor::RunResult;
+use crate::platform::text::grouped;
 use crate::report::score_event::EventOutage;
-use crate::report::terminal::{duration_s, grouped, seconds};
+use crate::report::terminal::{duration_s, seconds};
+use crate::rundir::run_result::RunResult;
 use crate::topology::{Channel, Topology};
 
 /// The outages of one channel, with what gives their times a meaning.

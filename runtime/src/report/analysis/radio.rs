@@ -11,11 +11,11 @@ use hil_models::time::Instant;
 
 use super::axis::RunAxis;
 use super::records::RunRecords;
-use crate::engine::supervisor::RunResult;
-use crate::nic::radio::nl80211::command;
 use crate::report::radio::{ChannelRadio, RadioHopSummary, RadioReport, Spread, StationSummary};
 use crate::report::summary::{Fact, RunEvent, RunSummary};
+use crate::rundir::radio_record::command;
 use crate::rundir::radio_record::{NO_CODE, NO_RATE, NO_SIGNAL, RadioRecord, RateRecord, SAMPLE};
+use crate::rundir::run_result::RunResult;
 use crate::topology::Topology;
 
 /// Puts everything about radios into the summary.
@@ -263,16 +263,14 @@ fn mac_text(mac: [u8; 6]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::nic::radio::nl80211::{Happening, Station};
 
     fn sample(at_ns: i64, signal_dbm: i8, tx_retries: u32) -> RadioRecord {
-        let station = Station {
+        RadioRecord {
             mac: [2, 0, 0, 0, 0, 1],
-            signal_dbm: Some(signal_dbm),
-            tx_retries: Some(tx_retries),
-            ..Station::default()
-        };
-        RadioRecord::sample(at_ns, &station)
+            signal_dbm: signal_dbm.into(),
+            tx_retries: tx_retries.into(),
+            ..RadioRecord::nothing(at_ns)
+        }
     }
 
     #[test]
@@ -291,13 +289,11 @@ mod tests {
 
     #[test]
     fn a_disconnection_becomes_an_event_with_its_reason() {
-        let happening = Happening {
-            command: command::DISCONNECT,
-            ifindex: 3,
-            mac: None,
-            code: Some(3),
-        };
-        let samples = [RadioRecord::happening(1_500_000_000, &happening)];
+        let samples = [RadioRecord {
+            event: command::DISCONNECT,
+            code: 3,
+            ..RadioRecord::nothing(1_500_000_000)
+        }];
         let mut hop = summarise(&samples);
         assert_eq!((hop.event_count, hop.stations.len()), (1, 0));
         (hop.process, hop.interface) = ("gateway".to_owned(), "wlan0".to_owned());
@@ -310,13 +306,10 @@ mod tests {
 
     #[test]
     fn events_without_a_start_are_left_out_and_said_to_be() {
-        let happening = Happening {
-            command: command::ROAM,
-            ifindex: 3,
-            mac: None,
-            code: None,
-        };
-        let mut hop = summarise(&[RadioRecord::happening(5, &happening)]);
+        let mut hop = summarise(&[RadioRecord {
+            event: command::ROAM,
+            ..RadioRecord::nothing(5)
+        }]);
         (hop.process, hop.interface) = ("gateway".to_owned(), "wlan0".to_owned());
         let warning = left_out(&hop).unwrap();
         assert!(warning.contains("1 events of the association of wlan0 are left out"));

@@ -25,15 +25,15 @@ use super::channel_files::{ChannelFiles, Signs, all, widen};
 use super::clocks::HostClocks;
 use super::message_records::missing_count;
 use super::{interruptions, link_changes, stalls};
-use crate::engine::supervisor::RunResult;
 use crate::report::summary::RecordedFigures;
 use crate::rundir::face_record::{FaceReceivedRecord, FaceSentRecord};
-use crate::rundir::launch::EmulationLaunch;
 use crate::rundir::radio_record::RadioRecord;
 use crate::rundir::record::stored::{
     ReadFaults, StoredFile, StoredRecords, file_bytes, sort_by_start,
 };
 use crate::rundir::record::{RecordFileError, RecordKind};
+use crate::rundir::run_result::RunResult;
+use crate::topology::emulation::EmulationLaunch;
 use crate::topology::{Channel, Topology};
 
 /// Share of the messages of an emulated link that are not under way for longer than is allowed for:
@@ -140,7 +140,8 @@ impl RunRecords {
         self.link_orders.get(channel).map_or(&[], Vec::as_slice)
     }
 
-    /// The clock of a card, as [`crate::nic::card_clock`] names it; `None` when it was not read.
+    /// The clock of a card, by the name that a
+    /// [`CardStory`](crate::rundir::card_story::CardStory) gives it; `None` when it was not read.
     pub(super) fn card_timeline(&self, card: &str) -> Option<CardTimeline> {
         self.cards.get(card).map(|pairs| CardTimeline::new(pairs))
     }
@@ -328,9 +329,13 @@ impl RunRecords {
             .map(|crossing| link_changes::longest_delay(topology, self, crossing));
         let delay = crossing
             .and_then(|crossing| EmulationLaunch::of(&crossing, topology.run().seed))
-            .map(|emulation| {
-                let delay = emulation.flight_time(FLIGHT_QUANTILE);
-                delay.expect("a run begins when its traces were read, and what was read is noted")
+            .map(|emulation| match emulation.trace {
+                // A run begins when its traces were read, and what was read is in its result.
+                Some(_) => {
+                    let noted = result.trace_delays.get(&channel.name);
+                    noted.copied().unwrap_or_default()
+                }
+                None => emulation.spec.flight_time(FLIGHT_QUANTILE),
             });
         let round_trips = files.round_trips.values();
         let round_trips_ns: Vec<i64> = round_trips.map(RoundTripRecord::rtt_ns).collect();

@@ -6,7 +6,7 @@ use hil_models::time::RemoteInstant;
 
 use super::clocks::HostClocks;
 use super::records::RunRecords;
-use crate::engine::supervisor::RunResult;
+use crate::rundir::run_result::RunResult;
 use crate::topology::Topology;
 use crate::topology::registry::MadeCase;
 

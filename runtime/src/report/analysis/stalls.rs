@@ -8,8 +8,8 @@ use hil_models::time::{Instant, duration_ns};
 
 use super::channel_files::all;
 use super::records::RunRecords;
-use crate::engine::supervisor::RunResult;
-use crate::engine::supervisor::plan::gateway_name;
+use crate::rundir::run_result::RunResult;
+use crate::topology::gateway_name;
 use crate::topology::{Channel, Topology};
 
 /// Those on the way of `channel` that had something to take and left no record from before it came

@@ -11,9 +11,10 @@ use hil_models::measure::statistics::{CONFIDENCE, IntervalNs, wilson};
 use super::data::{Channel, Figure, Table};
 use super::figures::waterfall::Bar;
 use super::words::{UNAVAILABLE, count, ns_s};
+use crate::platform::text::grouped;
 use crate::platform::words::counted;
 use crate::report::summary::LinkKind;
-use crate::report::terminal::{JOINT, duration, grouped, percent};
+use crate::report::terminal::{JOINT, duration, percent};
 
 /// What there is of one channel.
 #[derive(Debug, Clone, Copy, Default)]

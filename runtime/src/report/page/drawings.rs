@@ -9,7 +9,7 @@ use super::figures::waterfall::{Bar, waterfall};
 use hil_models::case_study::Severity;
 use hil_models::measure::account::ChannelAccount;
 
-use crate::report::terminal::grouped;
+use crate::platform::text::grouped;
 
 /// A name that is fit to be a file and an identifier.
 pub(super) fn name_of(parts: &[&str]) -> String {

@@ -7,9 +7,11 @@ use hil_models::measure::network::NetworkEventKind;
 use super::data::{Event, EventList};
 use super::drawings;
 use super::words::UNAVAILABLE;
+use crate::platform::text::grouped;
 use crate::report::network::{Correlation, NetworkReport, TimedEvent};
 use crate::report::score_event::{ExplainedEvent, ScoreEvents};
-use crate::report::terminal::{self, grouped, percent, seconds};
+use crate::report::terminal;
+use crate::report::terminal::{percent, seconds};
 
 /// Events of the score that a page lists.
 const EVENTS_MAX: usize = 200;

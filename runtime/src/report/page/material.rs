@@ -5,15 +5,17 @@ use crate::report::summary::{Fact, RunSummary};
 
 /// One folder.
 #[derive(Debug, Clone)]
-pub(crate) struct Material {
+pub struct Material {
     /// The folder's own name.
-    pub(crate) folder: String,
-    pub(crate) found: Found,
-    pub(crate) series: Vec<Series>,
+    pub folder: String,
+    /// What was found there.
+    pub found: Found,
+    /// What there is to plot.
+    pub series: Vec<Series>,
     /// `report.txt`.
     pub(crate) printed: Option<String>,
     /// What could not be read, in words.
-    pub(crate) problems: Vec<String>,
+    pub problems: Vec<String>,
 }
 
 /// What kind of folder it is.

@@ -9,9 +9,9 @@ pub(crate) mod data;
 mod drawings;
 mod events;
 mod figures;
-pub(crate) mod material;
+pub mod material;
 mod paper;
-pub(crate) mod read;
+pub mod read;
 mod run;
 pub(crate) mod series;
 mod svg;
@@ -21,7 +21,7 @@ mod tests;
 mod timeline;
 mod unfinished;
 mod words;
-pub(crate) mod write;
+pub mod write;
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -30,7 +30,8 @@ use clap::ValueEnum;
 
 use self::data::{Drawing, Page, Run, SCHEMA_VERSION, Table};
 use self::material::Material;
-use super::terminal::{JOINT, grouped};
+use super::terminal::JOINT;
+use crate::platform::text::grouped;
 
 pub(crate) use self::template::TemplateError;
 
@@ -53,7 +54,7 @@ pub enum Format {
 
 impl Format {
     /// By the ending of a file's name.
-    pub(crate) fn of_path(path: &Path) -> Option<Self> {
+    pub fn of_path(path: &Path) -> Option<Self> {
         let ending = path.extension()?.to_str()?.to_ascii_lowercase();
         match ending.as_str() {
             "html" | "htm" => Some(Self::Html),

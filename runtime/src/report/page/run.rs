@@ -10,12 +10,14 @@ use super::paper;
 use super::timeline;
 use super::unfinished::unfinished;
 use super::words::{UNAVAILABLE, count};
+use crate::platform::text::grouped;
 use crate::platform::words::counted;
 use crate::report::assessment::Assessment;
 use crate::report::clock_summary::ClockSection;
 use crate::report::score_event::ScoreEvents;
 use crate::report::summary::{ChannelSummary, Fact, LinkKind, RunSummary, ScoreMetric};
-use crate::report::terminal::{self, duration, grouped, seconds};
+use crate::report::terminal;
+use crate::report::terminal::{duration, seconds};
 
 /// How figures came about, for every run.
 pub(super) const METHOD: [&str; 3] = [

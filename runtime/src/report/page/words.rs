@@ -1,6 +1,7 @@
 //! Values as texts, in the units of a page.
 
-use crate::report::terminal::{JOINT, duration_s, figure, grouped, percent};
+use crate::platform::text::grouped;
+use crate::report::terminal::{JOINT, duration_s, figure, percent};
 
 /// What stands where there is no value.
 pub(super) const UNAVAILABLE: &str = "unavailable";

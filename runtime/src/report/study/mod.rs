@@ -22,18 +22,18 @@ use self::pool::Pool;
 
 /// How to run a study and where to put its tables.
 #[derive(Debug, Clone)]
-pub(crate) struct StudyOptions {
+pub struct StudyOptions {
     /// Threads; all processors if left out.
-    pub(crate) jobs: Option<NonZeroUsize>,
+    pub jobs: Option<NonZeroUsize>,
     /// Print JSON instead of tables.
-    pub(crate) is_json: bool,
+    pub is_json: bool,
     /// Folder for the tables as files.
-    pub(crate) output: Option<PathBuf>,
+    pub output: Option<PathBuf>,
 }
 
 /// How a study ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum StudyEnd {
+pub enum StudyEnd {
     /// Every criterion that could be judged is met.
     Passed,
     /// A criterion is missed.
@@ -93,7 +93,7 @@ pub(crate) enum StudyError {
 
 /// What is wanted of a case.
 #[derive(Debug, Clone, Copy)]
-pub(crate) enum Wanted<'a> {
+pub enum Wanted<'a> {
     /// Its tables.
     Tables,
     /// The link parameters under which a figure comes out as a value.

@@ -4,6 +4,8 @@ use anstyle::{AnsiColor, Style as Ansi};
 
 use super::units::JOINT;
 
+use crate::platform::text::{clean, columns, shortened};
+
 /// Whether the text carries colour sequences.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Style {
@@ -159,30 +161,6 @@ impl Canvas {
             self.line(&line);
         }
     }
-}
-
-/// Columns a text takes. Names are taken to be one column per character.
-pub(super) fn columns(text: &str) -> usize {
-    text.chars().count()
-}
-
-/// Without control characters: a name or a cause must not steer the terminal.
-pub(super) fn clean(text: &str) -> String {
-    let visible = |c: char| if c.is_control() { ' ' } else { c };
-    text.chars().map(visible).collect()
-}
-
-/// At most `width` columns, with an ellipsis where something is missing.
-pub(crate) fn shortened(text: &str, width: usize) -> String {
-    let text = clean(text);
-    if columns(&text) <= width {
-        return text;
-    }
-    let mut short: String = text.chars().take(width.saturating_sub(1)).collect();
-    if width > 0 {
-        short.push('…');
-    }
-    short
 }
 
 /// Exactly `width` columns, text at the left.

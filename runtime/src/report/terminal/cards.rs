@@ -6,7 +6,8 @@ use core::fmt::Write as _;
 use hil_models::measure::card_clock::CardClockFigures;
 
 use super::canvas::{Canvas, INDENT, Tone};
-use super::units::{duration, grouped, percent};
+use super::units::{duration, percent};
+use crate::platform::text::grouped;
 use crate::report::card_figures::{CardSegment, CardSummary, ChannelStamps, HardwareStamps};
 
 pub(super) fn hardware_stamps(canvas: &mut Canvas, stamps: &HardwareStamps) {

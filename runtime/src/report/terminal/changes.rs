@@ -1,7 +1,7 @@
 //! Links that were changed while the run went on, as a terminal shows them.
 
 use super::canvas::{Canvas, Tone};
-use super::units::grouped;
+use crate::platform::text::grouped;
 use crate::report::link_change::LinkChange;
 
 /// Changes on the page; all of them are in the summary and in events.log.

@@ -9,7 +9,8 @@ use hil_models::measure::statistics::IntervalNs;
 
 use super::canvas::{Canvas, INDENT, Tone, bar, left, right};
 use super::clocks;
-use super::units::{duration, grouped, percent};
+use super::units::{duration, percent};
+use crate::platform::text::grouped;
 use crate::platform::words::counted;
 use crate::report::summary::{ChannelSummary, CountByName, LinkKind, RecordedFigures};
 

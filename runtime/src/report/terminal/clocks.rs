@@ -6,7 +6,8 @@ use hil_models::measure::account::ChannelAccount;
 use hil_models::measure::histogram::Distribution;
 
 use super::canvas::{Canvas, INDENT, Tone};
-use super::units::{duration, duration_s, grouped};
+use super::units::{duration, duration_s};
+use crate::platform::text::grouped;
 use crate::report::clock_summary::{ClockPathSummary, ClockRung, ClockSection, HostPairClock};
 
 /// Column of the labels.

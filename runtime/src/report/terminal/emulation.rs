@@ -5,7 +5,8 @@ use hil_models::link::trace::ReplayCounts;
 use hil_models::measure::histogram::LatencySummary;
 
 use super::canvas::{Canvas, Tone};
-use super::units::{duration, grouped};
+use super::units::duration;
+use crate::platform::text::grouped;
 use crate::report::emulation::EmulationFigures;
 use crate::report::trace_counts::replay_words;
 

@@ -4,8 +4,10 @@
 use hil_models::case_study::Severity;
 use hil_models::measure::account::MessageFate;
 
-use super::canvas::{Canvas, INDENT, Tone, shortened};
-use super::units::{duration_s, grouped, seconds};
+use super::canvas::{Canvas, INDENT, Tone};
+use super::units::{duration_s, seconds};
+use crate::platform::text::grouped;
+use crate::platform::text::shortened;
 use crate::platform::words::counted;
 use crate::report::score_event::{ExplainedEvent, ExplainedMessage, ScoreEvents};
 

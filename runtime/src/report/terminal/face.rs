@@ -4,7 +4,8 @@
 use hil_models::measure::histogram::Distribution;
 
 use super::canvas::{Canvas, INDENT, Tone, left, right};
-use super::units::{duration, grouped, percent};
+use super::units::{duration, percent};
+use crate::platform::text::grouped;
 use crate::report::face::{FaceSegment, FaceSummary};
 
 /// Share of the robot's messages that a sensor should answer in time.

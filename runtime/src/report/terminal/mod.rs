@@ -16,12 +16,13 @@ mod timeline;
 mod trace;
 mod units;
 
-use crate::platform::words::counted;
+use crate::platform::text::{grouped, shortened};
 pub use canvas::Style;
-pub(crate) use canvas::{Tone, shortened, wrapped};
+pub(crate) use canvas::{Tone, wrapped};
 pub(crate) use channel::closing_text;
 pub(crate) use trace::{render_fit, render_trace, render_trace_plots};
-pub(crate) use units::{JOINT, duration, duration_s, figure, grouped, percent, seconds};
+pub use units::{JOINT, duration, percent};
+pub(crate) use units::{duration_s, figure, seconds};
 
 use canvas::{Canvas, INDENT};
 

@@ -10,7 +10,8 @@ use hil_models::measure::network::{
 };
 
 use super::canvas::{Canvas, INDENT, Tone, left, right};
-use super::units::{JOINT, duration, duration_s, figure, grouped, percent, seconds};
+use super::units::{JOINT, duration, duration_s, figure, percent, seconds};
+use crate::platform::text::grouped;
 use crate::report::network::{
     ChannelNetwork, Correlation, CorrelationTests, NetworkReport, TestedPair,
 };

@@ -3,7 +3,8 @@
 use hil_models::measure::account::{LongestOutage, OutageClass, OutageFigures};
 
 use super::canvas::{Canvas, INDENT, Tone, bar, right};
-use super::units::{duration, grouped, seconds};
+use super::units::{duration, seconds};
+use crate::platform::text::grouped;
 
 /// Columns of the label, of a class and of a count, and the gaps beside the bar.
 const LABEL_WIDTH: usize = 14;

@@ -3,7 +3,8 @@
 use hil_models::measure::radio::{RadioFigures, Share, TransmitStampFigures};
 
 use super::canvas::{Canvas, Tone};
-use super::units::{grouped, percent};
+use super::units::percent;
+use crate::platform::text::grouped;
 use crate::report::radio::{ChannelRadio, RadioHopSummary, RadioReport, Spread, StationSummary};
 
 /// Beside a channel's account: where it was stamped, and what the radio reported.

@@ -1,7 +1,9 @@
 //! The parts of a report that are not about one channel: score, processes, events, host.
 
-use super::canvas::{Canvas, INDENT, Tone, columns, left, right};
-use super::units::{duration_s, figure, grouped, seconds};
+use super::canvas::{Canvas, INDENT, Tone, left, right};
+use super::units::{duration_s, figure, seconds};
+use crate::platform::text::columns;
+use crate::platform::text::grouped;
 use crate::report::alike::joined_labels;
 use crate::report::summary::{Fact, ProcessSummary, RealtimeFacts, RunEvent, ScoreMetric};
 

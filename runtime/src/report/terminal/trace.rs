@@ -9,7 +9,8 @@ use hil_models::trace::{Trace, TraceHeader};
 
 use super::Style;
 use super::canvas::{Canvas, INDENT, Tone, bar, left, right};
-use super::units::{duration, grouped, percent, seconds};
+use super::units::{duration, percent, seconds};
+use crate::platform::text::grouped;
 
 /// Columns of a label.
 const LABEL: usize = 20;

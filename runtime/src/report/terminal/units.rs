@@ -2,10 +2,10 @@
 //! Number and unit are joined by [`JOINT`], so that no line breaks between them.
 
 /// Stands for a blank at which a line must not break; a page turns it into one.
-pub(crate) const JOINT: char = '\u{a0}';
+pub const JOINT: char = '\u{a0}';
 
 /// A duration in the unit that leaves one to three digits before the point.
-pub(crate) fn duration(ns: i64) -> String {
+pub fn duration(ns: i64) -> String {
     let magnitude = ns.unsigned_abs();
     let sign = if ns < 0 { "-" } else { "" };
     let (scale, unit) = match magnitude {
@@ -45,21 +45,8 @@ fn three_digits(value: f64) -> String {
     }
 }
 
-/// A count with its thousands grouped.
-pub(crate) fn grouped(count: u64) -> String {
-    let digits = count.to_string();
-    let mut text = String::with_capacity(digits.len() * 4 / 3);
-    for (index, digit) in digits.chars().enumerate() {
-        if index > 0 && (digits.len() - index).is_multiple_of(3) {
-            text.push(',');
-        }
-        text.push(digit);
-    }
-    text
-}
-
 /// A ratio as per cent. Nothing but all rounds to 100 %, nothing but none to 0 %.
-pub(crate) fn percent(ratio: f64) -> String {
+pub fn percent(ratio: f64) -> String {
     let value = 100.0 * ratio;
     if ratio > 0.0 && value < 0.01 {
         return format!("<0.01{JOINT}%");
@@ -124,10 +111,7 @@ mod tests {
     }
 
     #[test]
-    fn counts_are_grouped_and_figures_keep_four_digits() {
-        assert_eq!(grouped(0), "0");
-        assert_eq!(grouped(999), "999");
-        assert_eq!(grouped(1_234_567), "1,234,567");
+    fn figures_keep_four_digits() {
         assert_eq!(figure(890.0), "890");
         assert_eq!(figure(195.324_5), "195.3");
         assert_eq!(figure(0.001_234_56), "0.001235");

@@ -9,21 +9,17 @@ use hil_models::measure::account::{TraceChannel, each_traced, link_trace};
 use hil_models::trace::wire::TraceEncoder;
 use hil_models::trace::{TraceArrival, TraceDirection, TraceHeader, TraceRecord, UNAVAILABLE_NS};
 
-use crate::engine::supervisor::RunResult;
 use crate::report::analysis::link_changes;
 use crate::report::analysis::records::RunRecords;
 use crate::report::summary::{Fact, RunSummary};
+use crate::rundir::run_result::RunResult;
+use crate::topology::trace_source::file_name;
 use crate::topology::{Crossing, Direction, Topology, Via};
 
 /// What a trace of clocks without a relation says of them.
 pub(crate) const NOT_ALIGNED: &str = "clocks not aligned";
 /// What follows the name of a link that was changed while the run went on, before how often.
 pub(super) const CHANGED_BY_HAND: &str = " (changed by hand";
-
-/// The file of `channel` in a folder of traces.
-pub(crate) fn file_name(channel: &str) -> String {
-    format!("{}.trace", channel.replace('/', "."))
-}
 
 /// Writes the traces of a finished run and says so in its summary.
 pub(crate) fn write(

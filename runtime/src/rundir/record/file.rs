@@ -25,12 +25,11 @@ use hil_models::run_log::RunLog;
 
 use crate::rundir::face_record::{FaceReceivedRecord, FaceSentRecord};
 use crate::rundir::radio_record::RadioRecord;
+use crate::topology::CHANNEL_NAME_BYTES_MAX;
 
 const MAGIC: &[u8; 8] = b"HILREC01";
 /// Size of the file header.
 pub const HEADER_BYTES: usize = 128;
-/// Longest channel name a record file can carry.
-pub const CHANNEL_NAME_BYTES_MAX: usize = 96;
 
 /// What a record file holds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -197,11 +196,7 @@ impl RecordHeader {
     ///
     /// # Errors
     /// When it exists or cannot be written, or the channel name is too long.
-    pub(crate) fn create(
-        &self,
-        folder: &Path,
-        writer: &str,
-    ) -> Result<(PathBuf, File), RecordFileError> {
+    pub fn create(&self, folder: &Path, writer: &str) -> Result<(PathBuf, File), RecordFileError> {
         let path = folder.join(self.file_name(writer));
         let bytes = self.encode(&path)?;
         let made =
@@ -221,7 +216,7 @@ impl RecordHeader {
     }
 
     /// Reads a header off the beginning of a file.
-    pub(crate) fn decode(path: &Path, bytes: &[u8]) -> Result<Self, RecordFileError> {
+    pub fn decode(path: &Path, bytes: &[u8]) -> Result<Self, RecordFileError> {
         let Some(header) = bytes.first_chunk::<HEADER_BYTES>() else {
             return Err(malformed(
                 path,

@@ -3,7 +3,7 @@
 
 pub mod file;
 pub mod ring;
-pub(crate) mod stored;
+pub mod stored;
 
 pub use file::{RecordFile, RecordFileError, RecordKind};
 pub use ring::{RecordSink, Recorder};

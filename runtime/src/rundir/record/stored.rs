@@ -19,7 +19,7 @@ const PIECE_BYTES: usize = 1 << 16;
 
 /// What went wrong while record files were read, each file once.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct ReadFaults(Arc<Mutex<Vec<String>>>);
+pub struct ReadFaults(Arc<Mutex<Vec<String>>>);
 
 impl ReadFaults {
     fn note(&self, path: &Path, source: io::Error) {
@@ -32,7 +32,7 @@ impl ReadFaults {
     }
 
     /// In words.
-    pub(crate) fn texts(&self) -> Vec<String> {
+    pub fn texts(&self) -> Vec<String> {
         let known = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         known.clone()
     }
@@ -40,9 +40,9 @@ impl ReadFaults {
 
 /// One record file, as it was when it was opened first.
 #[derive(Debug, Clone)]
-pub(crate) struct StoredFile {
+pub struct StoredFile {
     path: PathBuf,
-    pub(crate) header: RecordHeader,
+    pub header: RecordHeader,
     /// Whole records in it.
     count: u64,
 }
@@ -52,7 +52,7 @@ impl StoredFile {
     ///
     /// # Errors
     /// When the file cannot be read or its header is not that of a record file.
-    pub(crate) fn open(path: &Path) -> Result<Self, RecordFileError> {
+    pub fn open(path: &Path) -> Result<Self, RecordFileError> {
         let read = || -> io::Result<(Vec<u8>, u64)> {
             let mut start = Vec::new();
             let file = File::open(path)?;
@@ -83,14 +83,14 @@ impl StoredFile {
 
 /// The record files of one kind and channel, one after the other.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct StoredRecords {
+pub struct StoredRecords {
     files: Vec<StoredFile>,
     faults: ReadFaults,
 }
 
 impl StoredRecords {
     /// None yet; what cannot be read later is noted in `faults`.
-    pub(crate) fn new(faults: &ReadFaults) -> Self {
+    pub fn new(faults: &ReadFaults) -> Self {
         Self {
             files: Vec::new(),
             faults: faults.clone(),
@@ -98,17 +98,17 @@ impl StoredRecords {
     }
 
     /// Puts `file` behind the others.
-    pub(crate) fn push(&mut self, file: StoredFile) {
+    pub fn push(&mut self, file: StoredFile) {
         self.files.push(file);
     }
 
     /// Whole records in all files.
-    pub(crate) fn record_count(&self) -> u64 {
+    pub fn record_count(&self) -> u64 {
         self.files.iter().map(|file| file.count).sum()
     }
 
     /// All records as `R`; none of files whose records have another size.
-    pub(crate) fn records<R: Pod>(&self) -> impl Iterator<Item = R> + '_ {
+    pub fn records<R: Pod>(&self) -> impl Iterator<Item = R> + '_ {
         let mut pieces = Pieces::of(self);
         core::iter::from_fn(move || {
             let mut record = R::zeroed();
@@ -207,7 +207,7 @@ impl MessageReader for Pieces<'_> {
 }
 
 /// Puts record files in the order in which the starts of each process wrote them.
-pub(crate) fn sort_by_start(paths: &mut [PathBuf]) {
+pub fn sort_by_start(paths: &mut [PathBuf]) {
     paths.sort_by_cached_key(|path| {
         let name = path.file_name().unwrap_or_default().to_string_lossy();
         let parts = name
@@ -220,7 +220,7 @@ pub(crate) fn sort_by_start(paths: &mut [PathBuf]) {
 }
 
 /// Bytes of a file; 0 when it is not there.
-pub(crate) fn file_bytes(path: &Path) -> u64 {
+pub fn file_bytes(path: &Path) -> u64 {
     fs::metadata(path).map_or(0, |file| file.len())
 }
 

@@ -8,10 +8,11 @@ use hil_models::endpoint::{InputPort, OutputPort};
 use hil_models::time::Instant;
 
 use super::super::{
-    ChannelHolder, ChannelSettings, Domain, DomainAddress, DomainError, OutputSettings,
-    ROOT_PATH_LENGTH_MAX, ShmInput, ShmOutput, Waiter,
+    ChannelHolder, ChannelSettings, Domain, DomainError, OutputSettings, ShmInput, ShmOutput,
+    Waiter,
 };
 use super::{POSE, assert_nothing_left, launch, pose, root_path, shared_memory_count};
+use crate::platform::domain_address::{DomainAddress, DomainAddressError, ROOT_PATH_LENGTH_MAX};
 
 #[test]
 fn a_clean_run_leaves_nothing() {
@@ -74,11 +75,11 @@ fn a_root_path_is_checked_before_anything_is_made() {
     let refused = |path: &str| Domain::create(Path::new(path)).unwrap_err();
     assert!(matches!(
         refused("relative/path"),
-        DomainError::UnusableRootPath { .. }
+        DomainError::Address(DomainAddressError::UnusableRootPath { .. })
     ));
     assert!(matches!(
         refused("/tmp/with space"),
-        DomainError::UnusableRootPath { .. }
+        DomainError::Address(DomainAddressError::UnusableRootPath { .. })
     ));
     let long = format!("/tmp/{}", "x".repeat(ROOT_PATH_LENGTH_MAX));
     let message = refused(&long).to_string();

@@ -61,9 +61,10 @@ fn child() {
 }
 
 fn spawn(role: &str, address: &str) -> Child {
+    let (_, module) = module_path!().split_once("::").unwrap();
     // Not `current_exe`: a rebuild may have replaced the file since this process started.
     Command::new("/proc/self/exe")
-        .args(["--exact", "--ignored", "channel::tests::kill::child"])
+        .args(["--exact", "--ignored", &format!("{module}::child")])
         .env(ROLE, role)
         .env(ADDRESS, address)
         .stdout(Stdio::null())

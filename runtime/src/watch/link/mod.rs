@@ -21,14 +21,15 @@ use hil_models::message::Envelope;
 use hil_models::time::Instant;
 use serde_json::Value;
 
-use crate::engine::gateway::link_control::{in_force, orders_on_record};
 use crate::platform::clock::MonotonicClock;
+use crate::platform::domain_address::{DomainAddress, DomainAddressError};
 use crate::rundir::launch;
 use crate::rundir::launch::GatewayLaunch;
+use crate::rundir::link_orders::{in_force, orders_on_record};
 use crate::rundir::manifest::Manifest;
 use crate::rundir::record::RecordFileError;
 use crate::rundir::run_folder::RunFolder;
-use crate::shm::{ChannelError, Domain, DomainAddress, DomainError, RawOutput};
+use crate::shm::{ChannelError, Domain, DomainError, RawOutput};
 
 /// How long the gateway may take to confirm an order. It looks every 5 ms.
 const CONFIRM_WITHIN: Duration = Duration::from_secs(3);
@@ -304,7 +305,10 @@ impl RunLinks {
                 longest_s: longest.as_secs_f64(),
             });
         }
-        let address: DomainAddress = direction.domain.parse().map_err(LinkError::Over)?;
+        let address: DomainAddress = direction
+            .domain
+            .parse()
+            .map_err(|error: DomainAddressError| LinkError::Over(error.into()))?;
         // Only until the order is confirmed, and as one who is no part of the run: whoever gives
         // orders may live on when the run's memory goes.
         let domain = Domain::observe(&address).map_err(LinkError::Over)?;

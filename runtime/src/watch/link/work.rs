@@ -10,7 +10,7 @@ use super::cli::{LinkCommand, RunChoice, SetArgs};
 use super::{Confirmed, LinkDirection, LinkError, RunLinks};
 use crate::platform::clock::MonotonicClock;
 use crate::platform::console::Console;
-use crate::watch;
+use crate::rundir::select;
 
 /// How it ended; the caller knows the exit codes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -87,7 +87,7 @@ fn open(choice: &RunChoice) -> Outcome<RunLinks> {
 fn folder(run: Option<&str>) -> Outcome<PathBuf> {
     match run.map(PathBuf::from) {
         Some(folder) if folder.join("manifest.json").is_file() => Ok(folder),
-        _ => watch::select(run)
+        _ => select::select(run)
             .map(|run| run.run_folder().root().to_owned())
             .map_err(refused),
     }

@@ -74,7 +74,7 @@ impl ChannelError {
 
 /// How it ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum End {
+pub enum End {
     /// As asked, or with the run.
     Done,
     /// By a signal; the totals so far were printed.

@@ -12,11 +12,11 @@ use hil_models::link::condition::{
 use hil_models::link::spec::Way;
 use hil_models::time::duration_ns;
 
-use crate::engine::gateway::link_control::{in_force, orders_on_record};
 use crate::platform::clock::MonotonicClock;
-use crate::rundir::launch::EmulationLaunch;
+use crate::rundir::link_orders::{in_force, orders_on_record};
 use crate::rundir::record::RecordFileError;
 use crate::topology::Topology;
+use crate::topology::emulation::EmulationLaunch;
 
 /// Share of the messages of an emulated link that are not under way for longer than is allowed for.
 const FLIGHT_QUANTILE: f64 = 0.9999;

@@ -15,8 +15,9 @@ use super::cli::WindowArgs;
 use super::observer::Observer;
 use crate::platform::console::Console;
 use crate::platform::signals::Signals;
+use crate::platform::text::grouped;
 use crate::platform::words::counted;
-use crate::report::terminal::{JOINT, duration, grouped};
+use crate::report::terminal::{JOINT, duration};
 
 /// The totals reach back no further: they are of messages that are kept in memory.
 const TOTAL_MAX: Duration = Duration::from_mins(10);

@@ -157,7 +157,7 @@ impl Place {
         &mut self,
         channel: &str,
         take: &mut dyn FnMut(&Envelope, &[u8]),
-    ) -> Result<(), channel::ChannelError> {
+    ) -> Result<(), shm::ChannelError> {
         match self {
             Self::Records(follower) => {
                 follower.poll(LOOK_BYTES_MAX, &mut |batch| {

@@ -1,7 +1,7 @@
 //! A running run on a terminal: its channels one by one (`hil-runtime channel`) and all of it at a
 //! glance (`hil-runtime top`). It watches; nothing here sends, and no measured process waits for it.
 
-pub(crate) mod channel;
+pub mod channel;
 pub mod cli;
 mod conditions;
 mod delay;
@@ -11,4 +11,4 @@ mod observer;
 mod pace;
 mod process;
 mod tail;
-pub(crate) mod top;
+pub mod top;

@@ -23,11 +23,11 @@ use crate::platform::signals::Signals;
 use crate::rundir::live_run::{LiveRun, Source};
 use crate::rundir::manifest::{ChannelDescription, Manifest};
 use crate::rundir::record::RecordKind;
+use crate::rundir::select;
 use crate::rundir::select::SelectError;
 use crate::shm::{Domain, DomainError};
 use crate::topology::registry::Registry;
 use crate::topology::{self, Topology};
-use crate::watch;
 use crate::watch::{PassiveReader, RecordFollower};
 
 /// How often records and shared memory are read: short against what queues hold.
@@ -126,7 +126,7 @@ impl Observer {
     /// # Errors
     /// When it is none or several, or its manifest cannot be read.
     pub(crate) fn open(wanted: Option<&str>, registry: &Registry) -> Result<Self, ObserveError> {
-        let run = watch::select(wanted)?;
+        let run = select::select(wanted)?;
         let manifest = run.manifest().map_err(|source| ObserveError::Manifest {
             run: run.name.clone(),
             source,
@@ -225,7 +225,7 @@ impl Observer {
     /// When it cannot be joined.
     pub(crate) fn domain(&mut self, host: &str) -> Result<&Domain, ObserveError> {
         if !self.domains.contains_key(host) {
-            let address = self.run.domain(host)?;
+            let address = self.run.domain(host).map_err(DomainError::Address)?;
             let domain = Domain::observe(&address)?.with_open_within(PassiveReader::OPEN_WITHIN);
             self.domains.insert(host.to_owned(), domain);
         }

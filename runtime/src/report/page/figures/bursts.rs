@@ -3,9 +3,9 @@
 use hil_models::measure::account::BurstCount;
 
 use super::{Frame, HALF_WIDTH};
+use crate::platform::text::grouped;
 use crate::report::page::axis::{Axis, Unit};
 use crate::report::page::svg::{Anchor, Svg};
-use crate::report::terminal::grouped;
 
 /// Lengths that get a bar of their own; beyond, a bar reaches to the next power of two.
 const SINGLE_MAX: u64 = 4;

@@ -4,9 +4,10 @@
 use hil_models::measure::histogram::DurationBin;
 
 use super::{Frame, HALF_WIDTH};
+use crate::platform::text::grouped;
 use crate::report::page::axis::{Axis, Unit};
 use crate::report::page::svg::Svg;
-use crate::report::terminal::{duration, grouped};
+use crate::report::terminal::duration;
 
 /// The figure; `None` without a bin above zero.
 pub(in crate::report::page) fn delay_histogram(

@@ -7,7 +7,8 @@ use ratatui::layout::Rect;
 use ratatui::style::{Color, Modifier, Style};
 
 use super::view::{ChannelRow, ProcessRow, Quantiles, View};
-use crate::report::terminal::{JOINT, duration, percent, shortened};
+use crate::platform::text::shortened;
+use crate::report::terminal::{JOINT, duration, percent};
 
 /// Longest bar of the run's progress, columns.
 const BAR_COLUMNS: usize = 30;

@@ -17,7 +17,7 @@ pub(crate) use gather::via;
 
 /// Why there is no view.
 #[derive(Debug, thiserror::Error)]
-pub(crate) enum TopError {
+pub enum TopError {
     /// The run.
     #[error(transparent)]
     Observe(#[from] ObserveError),
@@ -31,7 +31,7 @@ pub(crate) enum TopError {
 
 /// How it ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum TopEnd {
+pub enum TopEnd {
     /// All was shown, or the user left.
     Done,
     /// By a signal.
