@@ -108,13 +108,14 @@ fn calibration(
 fn a_calibration_is_computed_and_written_like_tables() {
     let batch = calibration("tuned", &["case.parameters.gain_per_s=2.0"], ("mlr", 0.5)).unwrap();
     let folder = std::env::temp_dir().join(format!("hil-calibration-{}", std::process::id()));
-    let options = StudyOptions {
+    let args = BatchArgs {
         jobs: NonZeroUsize::new(2),
-        is_json: true,
+        json: true,
         output: Some(folder.clone()),
+        quiet: true,
     };
     let signals = Signals::install().unwrap();
-    let end = run(batch.as_ref(), &options, &signals, &mut Console::new(true)).unwrap();
+    let end = run(batch.as_ref(), &args, &signals, &mut Console::new(true)).unwrap();
     assert_eq!(end, StudyEnd::Passed);
     let curve = fs::read_to_string(folder.join("curve.csv")).unwrap();
     assert_eq!(curve, "outages_per_h\r\n0\r\n1\r\n2\r\n3\r\n");
