@@ -144,15 +144,24 @@ fn stamps(files: &HostFiles, name: &str, interface: &Interface, query: StampQuer
             .locate(&format!("/sys/class/net/{name}/{entry}"))
             .exists()
     });
-    judge(name, &claims, is_wireless, interface.has_link)
+    judge(name, &claims, is_wireless, interface)
 }
 
-fn judge(name: &str, claims: &TimestampCapabilities, is_wireless: bool, has_link: bool) -> Finding {
+fn judge(
+    name: &str,
+    claims: &TimestampCapabilities,
+    is_wireless: bool,
+    interface: &Interface,
+) -> Finding {
     let value = format!(
         "{}{}{}",
         describe(claims),
         if is_wireless { ", wireless" } else { "" },
-        if has_link { "" } else { ", link down" }
+        if interface.has_link {
+            ""
+        } else {
+            ", link down"
+        }
     );
     let severity = if has_software_both_ways(claims) && !is_wireless {
         Severity::Ok
@@ -223,7 +232,7 @@ mod tests {
     };
 
     fn judged(claims: &TimestampCapabilities, is_wireless: bool) -> Finding {
-        judge("x", claims, is_wireless, true)
+        judge("x", claims, is_wireless, &present("x", [10, 0, 0, 1]).1)
     }
 
     fn present(name: &str, address: [u8; 4]) -> (String, Interface) {
@@ -252,7 +261,11 @@ mod tests {
         assert!(judged(&IGB, false).why.contains("claimed only"));
         assert_eq!(judged(&VETH, true).severity, Severity::Note);
         assert_eq!(judged(&DEAF, false).severity, Severity::Note);
-        assert!(judge("x", &VETH, false, false).value.ends_with("link down"));
+        assert!(
+            judge("x", &VETH, false, &Interface::default())
+                .value
+                .ends_with("link down")
+        );
     }
 
     #[test]

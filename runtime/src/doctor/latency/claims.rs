@@ -57,6 +57,8 @@ impl Claim {
 /// The least that is known of all CPUs, and the worst that was seen on one.
 #[derive(Debug, Clone, Copy)]
 struct Worst {
+    /// From one wake-up to the next.
+    period_ns: i64,
     count: u64,
     lateness: Quantiles,
 }
@@ -70,6 +72,7 @@ fn worst(report: &LatencyReport) -> Option<Worst> {
     let figures: Vec<(u64, Quantiles)> = figures.collect::<Option<_>>()?;
     let most = |of: fn(&Quantiles) -> i64| figures.iter().map(|(_, one)| of(one)).max();
     Some(Worst {
+        period_ns: i64::try_from(report.period_ns).unwrap_or(i64::MAX),
         count: figures.iter().map(|(count, _)| *count).min()?,
         lateness: Quantiles {
             p50_ns: most(|one| one.p50_ns)?,
@@ -82,7 +85,6 @@ fn worst(report: &LatencyReport) -> Option<Worst> {
 
 /// All claims, from the easiest to the hardest.
 pub(super) fn derive(report: &LatencyReport) -> Vec<Claim> {
-    let period_ns = i64::try_from(report.period_ns).unwrap_or(i64::MAX);
     let Some(worst) = worst(report) else {
         return vec![Claim::new(
             "median",
@@ -94,36 +96,26 @@ pub(super) fn derive(report: &LatencyReport) -> Vec<Claim> {
     };
     let of = worst.lateness;
     let mut claims = vec![
-        quantile(
-            "median",
-            "medians of delays",
-            500,
-            of.p50_ns,
-            worst.count,
-            period_ns,
-        ),
-        quantile(
-            "p99",
-            "99 % quantiles of delays",
-            990,
-            of.p99_ns,
-            worst.count,
-            period_ns,
-        ),
+        quantile("median", "medians of delays", 500, of.p50_ns, &worst),
+        quantile("p99", "99 % quantiles of delays", 990, of.p99_ns, &worst),
         quantile(
             "p999",
             "99.9 % quantiles of delays",
             999,
             of.p999_ns,
-            worst.count,
-            period_ns,
+            &worst,
         ),
         variation(&worst),
         largest(&worst),
     ];
     let deadlines = DEADLINE_RATES_HZ.iter().map(|rate| deadline(*rate, &worst));
     claims.extend(deadlines);
-    claims.extend(report.gaps.iter().map(|gaps| busy_polling(gaps, period_ns)));
+    claims.extend(
+        report
+            .gaps
+            .iter()
+            .map(|gaps| busy_polling(gaps, worst.period_ns)),
+    );
     if let Fact::Available(answer) = &report.surroundings.virtual_machine
         && answer != "no"
     {
@@ -136,14 +128,10 @@ const QUANTILE_RULE: &str = "supportable to what the host's own wake-up takes at
                              wake-ups lie beyond it and it stays within a tenth of the period";
 
 /// The rule of `permille` of delays that end in a blocking receive.
-fn quantile(
-    id: &str,
-    claim: &str,
-    permille: u64,
-    late_ns: i64,
-    count: u64,
-    period_ns: i64,
-) -> Claim {
+fn quantile(id: &str, claim: &str, permille: u64, late_ns: i64, worst: &Worst) -> Claim {
+    let Worst {
+        count, period_ns, ..
+    } = *worst;
     let late = us(late_ns);
     let needed = needed_count(permille);
     let (standing, why) = if count < needed {
