@@ -96,8 +96,6 @@ pub struct StudyReport {
     pub tables: Vec<Table>,
     /// What the figures were held against.
     pub criteria: Vec<Criterion>,
-    /// Work done, for whoever measures the time it took.
-    pub work: Vec<Work>,
 }
 
 impl StudyReport {
@@ -223,15 +221,6 @@ pub struct Criterion {
     pub is_met: Option<bool>,
     /// What was found, and how to see it again.
     pub finding: String,
-}
-
-/// A quantity of work.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Work {
-    /// What was done, e.g. `robot-seconds`.
-    pub name: &'static str,
-    /// How much of it.
-    pub amount: f64,
 }
 
 #[cfg(test)]

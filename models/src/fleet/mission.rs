@@ -132,11 +132,6 @@ impl MissionSource {
     pub fn parking(&self) -> Duration {
         self.parking
     }
-
-    /// True when every robot has had all its missions.
-    pub fn is_exhausted(&self) -> bool {
-        self.left_counts.iter().all(|count| *count == 0)
-    }
 }
 
 #[cfg(test)]
@@ -219,9 +214,8 @@ mod tests {
         assert_eq!(once.next(0, 0, &|_| false), None);
         assert_eq!(once.next(0, 0, &|_| true).map(|route| route.to), Some(2));
         assert_eq!(once.next(0, 2, &|_| true), None);
-        assert!(!once.is_exhausted());
         assert_eq!(once.next(1, 1, &|_| true).map(|route| route.to), Some(3));
-        assert!(once.is_exhausted());
+        assert!(once.left_counts.iter().all(|count| *count == 0));
     }
 
     #[test]

@@ -64,9 +64,6 @@ const REPLAY_EXAMPLES: &str = "\
 Examples:
   hil-runtime replay runs/teleop-local-20261121-101500
       run its robot again in virtual time and compare every message
-  hil-runtime replay run.mcap --only human/frame --speed 2 --loop
-      feed a recorded channel into the run that goes on here (starts
-      hil-recorder)
 
 Of a folder it reads the manifest and the records of the run, and nothing else.
 Exit code 0 when every message is the same to the last bit, 1 when one differs
@@ -211,23 +208,11 @@ pub struct ReportArgs {
 /// Arguments of a replay.
 #[derive(Debug, Args)]
 pub struct ReplayArgs {
-    /// The run's folder, of either host; or an MCAP file to play into a run that goes on.
+    /// The run's folder, of either host.
     pub run: PathBuf,
     /// Print JSON instead of text.
-    #[arg(long, conflicts_with_all = ["only", "speed", "is_looped", "into"])]
+    #[arg(long)]
     pub json: bool,
-    /// Of an MCAP file: play this channel; may be repeated.
-    #[arg(long, value_name = "CHANNEL")]
-    pub only: Vec<String>,
-    /// Of an MCAP file: how much faster than recorded.
-    #[arg(long, value_name = "FACTOR")]
-    pub speed: Option<f64>,
-    /// Of an MCAP file: begin again at the end.
-    #[arg(long = "loop")]
-    pub is_looped: bool,
-    /// Of an MCAP file: name or folder of the run to play into.
-    #[arg(long, value_name = "RUN")]
-    pub into: Option<String>,
 }
 
 /// Everything but a run.
@@ -275,8 +260,7 @@ pub enum Command {
     /// Compare two runs, or two sets of repetitions: delays, losses and scores, with intervals.
     #[command(after_help = compare_cli::EXAMPLES)]
     Compare(CompareArgs),
-    /// Run the robot of a finished run again and compare every message, or play recorded channels
-    /// into a run that goes on.
+    /// Run the robot of a finished run again and compare every message.
     #[command(after_help = REPLAY_EXAMPLES)]
     Replay(ReplayArgs),
     /// Describe, fit, plot and convert link traces.

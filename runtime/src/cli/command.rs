@@ -3,7 +3,6 @@
 mod case_work;
 mod doctor_work;
 mod live_work;
-mod play_work;
 mod report_work;
 
 use std::collections::BTreeMap;
@@ -93,10 +92,9 @@ fn run_command(command: Command, registry: &Registry, console: &mut Console) -> 
         } => {
             overrides
                 .extend(sections.map(|count| format!("case.parameters.tables.sections={count}")));
-            case_work::tables(&topology, &overrides, batch, registry)
+            case_work::tables(&topology, &overrides, &batch, registry)
         }
         Command::Calibrate(args) => case_work::calibrate(args, registry),
-        Command::Replay(args) if play_work::is_recording(&args) => play_work::play(&args, console),
         Command::Replay(args) => case_work::replay(&args.run, args.json, registry, console),
         Command::Report(args) => report_work::report(&args, registry, console),
         Command::Compare(args) => compare(&args, console),

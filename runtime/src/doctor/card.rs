@@ -2,8 +2,8 @@
 //! comes back when something is sent, and where their clock stands. Other interfaces have no
 //! finding here; what they claim is said beside.
 
-use super::network::Interfaces;
-use super::{Finding, StampCapabilityQuery};
+use super::network::{Interfaces, StampQuery};
+use super::Finding;
 use crate::nic::card_clock::probing::{CardProbe, Delivery};
 
 /// Offsets above this are no matter of accuracy but of another time scale or an unset clock.
@@ -12,7 +12,7 @@ const FOREIGN_OFFSET_NS: u64 = 1_000_000;
 pub(super) fn examine(
     present: &Interfaces,
     names: &[String],
-    query: &dyn StampCapabilityQuery,
+    query: StampQuery<'_>,
     probe: &dyn Fn(&str, u32) -> CardProbe,
 ) -> Vec<Finding> {
     names
@@ -20,8 +20,8 @@ pub(super) fn examine(
         .filter_map(|name| {
             // What is missing, or does not answer, is a finding of the network already.
             let interface = present.get(name)?;
-            let claims = query.stamp_capabilities(name).ok()?;
-            let index = claims.hardware_clock_index?;
+            let claims = query(name).ok()?;
+            let index = claims.phc_index?;
             Some(judge(name, index, interface.has_link, &probe(name, index)))
         })
         .collect()
@@ -88,10 +88,10 @@ fn explain_clock(finding: Finding, probe: &CardProbe) -> Finding {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::doctor::StampCapabilities;
     use crate::doctor::finding::Severity;
     use crate::doctor::network::Interface;
     use hil_gateways::transport::card_clock::CardPair;
+    use hil_gateways::transport::timestamping::TimestampCapabilities;
 
     fn probe(tx_hardware: Result<Delivery, String>) -> CardProbe {
         CardProbe {
@@ -136,9 +136,12 @@ mod tests {
     #[test]
     fn an_interface_without_a_clock_is_not_probed() {
         let query = |_: &str| {
-            Ok(StampCapabilities {
-                so_timestamping: 0x1a,
-                hardware_clock_index: None,
+            Ok(TimestampCapabilities {
+                tx_software: true,
+                rx_software: true,
+                tx_hardware: false,
+                rx_hardware: false,
+                phc_index: None,
             })
         };
         let present = Interfaces::from([("eth0".to_owned(), Interface::default())]);

@@ -3,7 +3,8 @@
 
 use std::net::IpAddr;
 
-use super::{Finding, StampCapabilityQuery};
+use super::Finding;
+use super::network::{StampQuery, describe, has_software_both_ways};
 use crate::topology::ClockEnd;
 
 const ID: &str = "clock_path";
@@ -18,7 +19,7 @@ pub(super) type InterfaceOf<'a> = &'a dyn Fn(IpAddr) -> Result<Option<String>, S
 pub(super) fn examine(
     end: Option<&ClockEnd>,
     interface_of: InterfaceOf<'_>,
-    stamps: &dyn StampCapabilityQuery,
+    stamps: StampQuery<'_>,
 ) -> Finding {
     let Some(end) = end else {
         return Finding::note(ID, "the topology names no clock_address of this host").fixed_by(
@@ -43,14 +44,14 @@ pub(super) fn examine(
             .because(GOES_ON)
             .fixed_by(format!("clock_interface = \"{interface}\""));
     }
-    let claims = match stamps.stamp_capabilities(&interface) {
+    let claims = match stamps(&interface) {
         Ok(claims) => claims,
         Err(reason) => return Finding::cannot_tell(ID, reason),
     };
     let port = end.port;
-    let claimed = claims.describe();
+    let claimed = describe(&claims);
     let value = format!("{address} on {interface}, UDP from port {port}; {claimed}");
-    if claims.has_software_both_ways() {
+    if has_software_both_ways(&claims) {
         return Finding::ok(ID, value);
     }
     Finding::note(ID, value)
@@ -63,8 +64,9 @@ pub(super) fn examine(
 
 #[cfg(test)]
 mod tests {
+    use hil_gateways::transport::timestamping::TimestampCapabilities;
+
     use super::*;
-    use crate::doctor::StampCapabilities;
     use crate::doctor::finding::Severity;
     use crate::topology::ClockEnd;
 
@@ -76,11 +78,18 @@ mod tests {
         }
     }
 
-    fn examined(interface: Option<&str>, found: Result<Option<&str>, &str>, bits: u32) -> Finding {
+    fn examined(
+        interface: Option<&str>,
+        found: Result<Option<&str>, &str>,
+        tx_software: bool,
+    ) -> Finding {
         let query = |_: &str| {
-            Ok(StampCapabilities {
-                so_timestamping: bits,
-                hardware_clock_index: None,
+            Ok(TimestampCapabilities {
+                tx_software,
+                rx_software: true,
+                tx_hardware: false,
+                rx_hardware: false,
+                phc_index: None,
             })
         };
         let of = |_| {
@@ -94,26 +103,26 @@ mod tests {
     #[test]
     fn an_end_that_is_here_is_told_with_its_stamps() {
         for named in [None, Some("eth1")] {
-            let finding = examined(named, Ok(Some("eth1")), 0x1a);
+            let finding = examined(named, Ok(Some("eth1")), true);
             assert_eq!(finding.severity, Severity::Ok);
             let expected = "10.78.0.1 on eth1, UDP from port 7390; software tx+rx, hardware none";
             assert_eq!(finding.value, expected);
         }
-        let deaf = examined(None, Ok(Some("wlan0")), 0x18);
+        let deaf = examined(None, Ok(Some("wlan0")), false);
         assert_eq!(deaf.severity, Severity::Note);
         assert!(deaf.value.contains("software rx only"), "{}", deaf.value);
     }
 
     #[test]
     fn an_address_that_is_not_here_or_elsewhere_is_a_problem_with_its_cure() {
-        let missing = examined(Some("eth1"), Ok(None), 0x1a);
+        let missing = examined(Some("eth1"), Ok(None), true);
         assert_eq!(missing.severity, Severity::Error);
         assert_eq!(missing.fix, "ip address add 10.78.0.1/24 dev eth1");
-        let elsewhere = examined(Some("eth2"), Ok(Some("eth1")), 0x1a);
+        let elsewhere = examined(Some("eth2"), Ok(Some("eth1")), true);
         assert_eq!(elsewhere.severity, Severity::Error);
         assert_eq!(elsewhere.fix, "clock_interface = \"eth1\"");
         assert_eq!(
-            examined(None, Err("no"), 0x1a).severity,
+            examined(None, Err("no"), true).severity,
             Severity::CannotTell
         );
         let query = |name: &str| panic!("{name} was asked");

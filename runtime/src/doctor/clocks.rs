@@ -20,7 +20,7 @@ pub(super) fn examine(
 ) -> Vec<Finding> {
     let mut findings = vec![read_cost(cheapest_read_ns())];
     findings.extend(steering(found));
-    findings.extend(other.map(|(name, other)| between(found.as_ref().ok(), (name, other))));
+    findings.extend(other.map(|(name, other)| between(found.as_ref().ok(), name, other)));
     findings
 }
 
@@ -61,10 +61,7 @@ fn steering(found: &Result<HostDiscipline, String>) -> [Finding; 2] {
 }
 
 /// How far apart the clocks of this host and of another may be.
-fn between(
-    own: Option<&HostDiscipline>,
-    (name, other): (&str, Option<&HostDiscipline>),
-) -> Finding {
+fn between(own: Option<&HostDiscipline>, name: &str, other: Option<&HostDiscipline>) -> Finding {
     let id = "clock_between_hosts";
     let (Some(own), Some(other)) = (own, other) else {
         let whose = if own.is_none() { "this host" } else { name };
@@ -184,14 +181,14 @@ mod tests {
         own.reference = Some("ptp a".to_owned());
         own.bound_ns = Some(4_000);
         let other = own.clone();
-        let finding = between(Some(&own), ("robot-pc", Some(&other)));
+        let finding = between(Some(&own), "robot-pc", Some(&other));
         assert_eq!(finding.severity, Severity::Ok);
         assert_eq!(finding.id, "clock_between_hosts.robot-pc");
         assert_eq!(finding.value, "apart by at most 8 us");
-        let finding = between(Some(&own), ("robot-pc", Some(&kept())));
+        let finding = between(Some(&own), "robot-pc", Some(&kept()));
         assert_eq!(finding.severity, Severity::Note);
         assert!(finding.value.contains("on robot-pc"), "{}", finding.value);
-        let finding = between(Some(&own), ("robot-pc", None));
+        let finding = between(Some(&own), "robot-pc", None);
         assert_eq!(finding.severity, Severity::CannotTell);
     }
 }

@@ -33,11 +33,12 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use hil_gateways::transport::interface::interface_with_address;
+use hil_gateways::transport::timestamping::TimestampCapabilities;
 use serde::{Deserialize, Serialize};
 
 pub use self::finding::{Finding, Severity};
 use self::latency::LatencyReport;
-pub use self::network::{StampCapabilities, StampCapabilityQuery};
+use self::network::StampQuery;
 pub use self::plan::{LinkLoad, Peer, Pin, Plan, Protocol, WantedPort};
 use self::privileges::Rights;
 use crate::nic::card_clock::probing::probe_card;
@@ -164,9 +165,9 @@ impl DoctorReport {
 ///
 /// A network card with a clock of its own is asked for stamps, sent a few datagrams through and put
 /// back as it was; that takes another half second for each.
-///
-/// `stamps` answers which timestamps an interface claims; the gateways own that system call.
-pub fn examine(request: &DoctorRequest, stamps: &dyn StampCapabilityQuery) -> DoctorReport {
+pub fn examine(request: &DoctorRequest) -> DoctorReport {
+    let stamps: StampQuery<'_> =
+        &|interface| TimestampCapabilities::query(interface).map_err(|error| error.to_string());
     let files = &request.files;
     let plan = request.plan.clone().unwrap_or_default();
     let rights = Rights::tried();
@@ -198,7 +199,7 @@ pub fn examine(request: &DoctorRequest, stamps: &dyn StampCapabilityQuery) -> Do
 fn examine_network(
     request: &DoctorRequest,
     plan: &Plan,
-    stamps: &dyn StampCapabilityQuery,
+    stamps: StampQuery<'_>,
     findings: &mut Vec<Finding>,
 ) {
     let files = &request.files;

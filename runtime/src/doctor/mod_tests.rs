@@ -7,12 +7,8 @@ use super::latency::{LatencyRequest, Watch, measure};
 use super::*;
 use crate::platform::host_facts::FakeHost;
 
-fn silent_query(_: &str) -> Result<StampCapabilities, String> {
-    Err("no query in this test".to_owned())
-}
-
 fn examined() -> DoctorReport {
-    let mut report = examine(&DoctorRequest::default(), &silent_query);
+    let mut report = examine(&DoctorRequest::default());
     let request = LatencyRequest {
         duration: Duration::from_millis(20),
         ..LatencyRequest::brief(None)
@@ -104,7 +100,7 @@ fn a_host_without_files_passes_nothing_that_is_read_from_files() {
         files: nowhere.files(),
         ..DoctorRequest::default()
     };
-    let report = examine(&request, &silent_query);
+    let report = examine(&request);
     for id in [
         "preemption",
         "realtime_throttle",

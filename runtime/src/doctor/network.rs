@@ -5,79 +5,38 @@
 use std::collections::BTreeMap;
 use std::net::IpAddr;
 
+use hil_gateways::transport::timestamping::TimestampCapabilities;
 use nix::ifaddrs::{InterfaceAddress, getifaddrs};
 use nix::net::if_::InterfaceFlags;
 use nix::sys::socket::SockaddrStorage;
-use serde::{Deserialize, Serialize};
 
 use super::Finding;
 use super::finding::Severity;
 use super::plan::Plan;
 use crate::platform::host_facts::{Fact, HostFiles};
 
-/// Bits of `SO_TIMESTAMPING` in `linux/net_tstamp.h`.
-const TX_HARDWARE: u32 = 1 << 0;
-const TX_SOFTWARE: u32 = 1 << 1;
-const RX_HARDWARE: u32 = 1 << 2;
-const RX_SOFTWARE: u32 = 1 << 3;
-const RAW_HARDWARE: u32 = 1 << 6;
-
 /// A second of 1 kHz messages with their stamps; the kernel charges about 800 bytes for each.
 const BUFFER_BYTES_MIN: i64 = 1024 * 1024;
 
-/// What an interface claims it can stamp, as `ETHTOOL_GET_TS_INFO` answers.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub struct StampCapabilities {
-    /// The `so_timestamping` bits of the answer.
-    pub so_timestamping: u32,
-    /// The number N of the interface's clock `/dev/ptpN`, if it has one.
-    pub hardware_clock_index: Option<u32>,
+/// Answers which timestamps an interface claims, or why not.
+pub(super) type StampQuery<'a> = &'a dyn Fn(&str) -> Result<TimestampCapabilities, String>;
+
+pub(super) fn has_software_both_ways(claims: &TimestampCapabilities) -> bool {
+    claims.tx_software && claims.rx_software
 }
 
-impl StampCapabilities {
-    fn has(self, bits: u32) -> bool {
-        self.so_timestamping & bits == bits
-    }
-
-    pub(super) fn has_software_both_ways(self) -> bool {
-        self.has(RX_SOFTWARE | TX_SOFTWARE)
-    }
-
-    pub(super) fn describe(self) -> String {
-        let kind = |tx: u32, rx: u32| match (self.has(tx), self.has(rx)) {
-            (true, true) => "tx+rx",
-            (true, false) => "tx only",
-            (false, true) => "rx only",
-            (false, false) => "none",
-        };
-        let software = kind(TX_SOFTWARE, RX_SOFTWARE);
-        let hardware = kind(TX_HARDWARE | RAW_HARDWARE, RX_HARDWARE | RAW_HARDWARE);
-        let clock = match self.hardware_clock_index {
-            Some(index) => format!(" (/dev/ptp{index})"),
-            None => String::new(),
-        };
-        format!("software {software}, hardware {hardware}{clock}")
-    }
-}
-
-/// Answers which timestamps an interface claims.
-///
-/// The system call belongs to the gateways; any closure of this shape serves.
-pub trait StampCapabilityQuery {
-    /// Asks for the interface called `interface`.
-    ///
-    /// # Errors
-    /// Why the interface did not answer, in words.
-    fn stamp_capabilities(&self, interface: &str) -> Result<StampCapabilities, String>;
-}
-
-impl<F> StampCapabilityQuery for F
-where
-    F: Fn(&str) -> Result<StampCapabilities, String>,
-{
-    fn stamp_capabilities(&self, interface: &str) -> Result<StampCapabilities, String> {
-        self(interface)
-    }
+pub(super) fn describe(claims: &TimestampCapabilities) -> String {
+    let kind = |tx: bool, rx: bool| match (tx, rx) {
+        (true, true) => "tx+rx",
+        (true, false) => "tx only",
+        (false, true) => "rx only",
+        (false, false) => "none",
+    };
+    let software = kind(claims.tx_software, claims.rx_software);
+    let hardware = kind(claims.tx_hardware, claims.rx_hardware);
+    let clock = claims.phc_index;
+    let clock = clock.map_or_else(String::new, |index| format!(" (/dev/ptp{index})"));
+    format!("software {software}, hardware {hardware}{clock}")
 }
 
 /// One interface of this network namespace.
@@ -155,7 +114,7 @@ pub(super) fn examine(
     files: &HostFiles,
     present: &Interfaces,
     names: &[String],
-    query: &dyn StampCapabilityQuery,
+    query: StampQuery<'_>,
 ) -> Vec<Finding> {
     let mut findings: Vec<Finding> = names
         .iter()
@@ -175,13 +134,8 @@ fn missing(name: &str, present: &Interfaces) -> Finding {
         .fixed_by(format!("name one of {}", known.join(", ")))
 }
 
-fn stamps(
-    files: &HostFiles,
-    name: &str,
-    interface: &Interface,
-    query: &dyn StampCapabilityQuery,
-) -> Finding {
-    let claims = match query.stamp_capabilities(name) {
+fn stamps(files: &HostFiles, name: &str, interface: &Interface, query: StampQuery<'_>) -> Finding {
+    let claims = match query(name) {
         Ok(claims) => claims,
         Err(reason) => return Finding::cannot_tell("timestamps", reason).of(name),
     };
@@ -190,17 +144,26 @@ fn stamps(
             .locate(&format!("/sys/class/net/{name}/{entry}"))
             .exists()
     });
-    judge(name, claims, (is_wireless, interface.has_link))
+    judge(name, &claims, is_wireless, interface)
 }
 
-fn judge(name: &str, claims: StampCapabilities, (is_wireless, has_link): (bool, bool)) -> Finding {
+fn judge(
+    name: &str,
+    claims: &TimestampCapabilities,
+    is_wireless: bool,
+    interface: &Interface,
+) -> Finding {
     let value = format!(
         "{}{}{}",
-        claims.describe(),
+        describe(claims),
         if is_wireless { ", wireless" } else { "" },
-        if has_link { "" } else { ", link down" }
+        if interface.has_link {
+            ""
+        } else {
+            ", link down"
+        }
     );
-    let severity = if claims.has_software_both_ways() && !is_wireless {
+    let severity = if has_software_both_ways(claims) && !is_wireless {
         Severity::Ok
     } else {
         Severity::Note
@@ -214,7 +177,7 @@ fn judge(name: &str, claims: StampCapabilities, (is_wireless, has_link): (bool, 
             )
             .fixed_by("none needed; the report says which stamps there were");
     }
-    if claims.has(TX_HARDWARE | RX_HARDWARE | RAW_HARDWARE) {
+    if claims.tx_hardware && claims.rx_hardware {
         return finding.because(
             "claimed only: some drivers advertise hardware stamps that never arrive, so a run \
              probes them before it relies on them",
@@ -249,17 +212,27 @@ mod tests {
     use super::*;
     use crate::platform::host_facts::FakeHost;
 
-    const VETH: StampCapabilities = StampCapabilities {
-        so_timestamping: 0x1a,
-        hardware_clock_index: None,
+    const DEAF: TimestampCapabilities = TimestampCapabilities {
+        tx_software: false,
+        rx_software: false,
+        tx_hardware: false,
+        rx_hardware: false,
+        phc_index: None,
     };
-    const IGB: StampCapabilities = StampCapabilities {
-        so_timestamping: 0x5f,
-        hardware_clock_index: Some(0),
+    const VETH: TimestampCapabilities = TimestampCapabilities {
+        tx_software: true,
+        rx_software: true,
+        ..DEAF
+    };
+    const IGB: TimestampCapabilities = TimestampCapabilities {
+        tx_hardware: true,
+        rx_hardware: true,
+        phc_index: Some(0),
+        ..VETH
     };
 
-    fn judged(claims: StampCapabilities, is_wireless: bool) -> Finding {
-        judge("x", claims, (is_wireless, true))
+    fn judged(claims: &TimestampCapabilities, is_wireless: bool) -> Finding {
+        judge("x", claims, is_wireless, &present("x", [10, 0, 0, 1]).1)
     }
 
     fn present(name: &str, address: [u8; 4]) -> (String, Interface) {
@@ -272,28 +245,24 @@ mod tests {
     }
 
     #[test]
-    fn the_ethtool_bits_are_put_into_words() {
-        assert_eq!(VETH.describe(), "software tx+rx, hardware none");
-        assert_eq!(IGB.describe(), "software tx+rx, hardware tx+rx (/dev/ptp0)");
-        let wireless = StampCapabilities {
-            so_timestamping: 0x18,
-            hardware_clock_index: None,
+    fn the_claims_are_put_into_words() {
+        assert_eq!(describe(&VETH), "software tx+rx, hardware none");
+        assert_eq!(describe(&IGB), "software tx+rx, hardware tx+rx (/dev/ptp0)");
+        let wireless = TimestampCapabilities {
+            rx_software: true,
+            ..DEAF
         };
-        assert_eq!(wireless.describe(), "software rx only, hardware none");
+        assert_eq!(describe(&wireless), "software rx only, hardware none");
     }
 
     #[test]
     fn claims_are_labelled_as_claims() {
-        assert_eq!(judged(VETH, false).severity, Severity::Ok);
-        assert!(judged(IGB, false).why.contains("claimed only"));
-        assert_eq!(judged(VETH, true).severity, Severity::Note);
-        let deaf = StampCapabilities {
-            so_timestamping: 0,
-            hardware_clock_index: None,
-        };
-        assert_eq!(judged(deaf, false).severity, Severity::Note);
+        assert_eq!(judged(&VETH, false).severity, Severity::Ok);
+        assert!(judged(&IGB, false).why.contains("claimed only"));
+        assert_eq!(judged(&VETH, true).severity, Severity::Note);
+        assert_eq!(judged(&DEAF, false).severity, Severity::Note);
         assert!(
-            judge("x", VETH, (false, false))
+            judge("x", &VETH, false, &Interface::default())
                 .value
                 .ends_with("link down")
         );

@@ -208,7 +208,7 @@ impl Plan {
         }
         if is_here(from) {
             if !is_stream {
-                self.bind(from, Protocol::Udp, (crossing.ports.sender, &channel.name));
+                self.bind(from, Protocol::Udp, crossing.ports.sender, &channel.name);
             }
             self.loads.push(LinkLoad {
                 link: crossing.link.name.clone(),
@@ -226,12 +226,12 @@ impl Plan {
             } else {
                 Protocol::Udp
             };
-            self.bind(to, protocol, (crossing.ports.receiver, &channel.name));
+            self.bind(to, protocol, crossing.ports.receiver, &channel.name);
             self.face(to, from);
         }
     }
 
-    fn bind(&mut self, host: &Host, protocol: Protocol, (port, of): (u16, &str)) {
+    fn bind(&mut self, host: &Host, protocol: Protocol, port: u16, of: &str) {
         self.ports.push(WantedPort {
             protocol,
             address: SocketAddr::new(host.gateway_address(), port),

@@ -1,8 +1,6 @@
 //! This host's monotonic clock and the absolute sleep on it. It is not a time of day, and it
 //! knows nothing of another host's clock: offsets and their bounds belong to the gateways.
 
-use std::time::Duration;
-
 use hil_models::time::Instant;
 use nix::errno::Errno;
 use nix::sys::time::TimeSpec;
@@ -61,13 +59,6 @@ impl MonotonicClock {
             Err(errno) => panic!("clock_nanosleep refused a normalised request: {errno}"),
         }
     }
-
-    /// Sleeps for `span` from now; otherwise as [`MonotonicClock::sleep_until`].
-    ///
-    /// Periodic work does not use this: a chain of relative sleeps drifts by every lateness.
-    pub fn sleep_for(span: Duration) -> Wake {
-        Self::sleep_until(Self::now() + span)
-    }
 }
 
 fn instant_of(read: &TimeSpec) -> Instant {
@@ -81,6 +72,8 @@ fn timespec_of(due: Instant) -> TimeSpec {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use super::*;
 
     #[test]

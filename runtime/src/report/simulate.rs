@@ -129,7 +129,8 @@ pub(crate) fn simulate(
         topology,
         watches.collect(),
         &result.log,
-        (case.errors(&result.log), &mut summary.score_events),
+        case.errors(&result.log),
+        &mut summary.score_events,
     )
     .unzip();
     summary.network = network;

@@ -76,7 +76,7 @@ fn a_worse_link_is_found_and_scripts_get_their_exit_code() {
         ],
     );
     let [near, again, far, farther] = [0, 1, 2, 3].map(|index: usize| folders[index].as_path());
-    let (code, text, error) = compare(&["--json"], &[near, far]);
+    let (code, text, error) = compare(&["--format", "json"], &[near, far]);
     assert_eq!(code, Some(0), "{error}");
     let json: Value = serde_json::from_str(&text).unwrap();
     for channel in ["shuttle/command", "shuttle/status"] {
@@ -144,7 +144,8 @@ fn check_repetitions(base: (&Path, &Path), new: (&Path, &Path)) {
         "--new".to_owned(),
         path(new.0),
         path(new.1),
-        "--json".to_owned(),
+        "--format".to_owned(),
+        "json".to_owned(),
     ];
     let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
     let (code, text, error) = compare(&arguments, &[]);

@@ -149,7 +149,7 @@ fn a_recorded_person_moves_the_arms_of_another_run() {
 #[test]
 fn a_channel_with_a_living_writer_is_refused_and_so_is_what_does_not_fit() {
     let record = RunFolder::new("play-refused");
-    let (first, file) = recording(&record);
+    let (_first, file) = recording(&record);
     let trial = Trial::shipped("local.toml", &record.join("second")).set("run.duration=\"10 min\"");
     let mut child = trial.start_here();
     let second = trial.folder("", LIMIT);
@@ -158,11 +158,11 @@ fn a_channel_with_a_living_writer_is_refused_and_so_is_what_does_not_fit() {
     });
     let into = second.root().to_str().unwrap();
     let play = |arguments: &[&str]| {
-        let mut command = Command::new(hil_runtime_binary());
-        // Beside the other binary, or where this says.
-        let folder = hil_recorder_binary().parent().unwrap();
-        command.env("PATH", folder).arg("replay").args(arguments);
-        finish(&mut command)
+        finish(
+            Command::new(hil_recorder_binary())
+                .arg("play")
+                .args(arguments),
+        )
     };
     let file = file.to_str().unwrap();
     for (arguments, words) in [
@@ -183,10 +183,6 @@ fn a_channel_with_a_living_writer_is_refused_and_so_is_what_does_not_fit() {
             "must be a number from 0.01 to 100",
         ),
         (vec![file], "Give --only CHANNEL"),
-        (
-            vec![first.root().to_str().unwrap(), "--only", MOTION],
-            "is a run's folder",
-        ),
     ] {
         let refused = play(&arguments);
         assert_eq!(refused.status.code(), Some(2), "{refused:?}");

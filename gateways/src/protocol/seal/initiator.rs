@@ -71,11 +71,6 @@ impl Initiator {
         }
     }
 
-    /// True once messages can be sealed.
-    pub const fn has_keys(&self) -> bool {
-        self.traffic.is_some()
-    }
-
     /// A request for keys that is due before the bridge's `datagram`: with every greeting, and when
     /// clock exchanges stay without an authentic reply.
     pub fn request_before(&mut self, datagram: &[u8]) -> Option<[u8; KEY_EXCHANGE_BYTES]> {

@@ -281,11 +281,6 @@ impl Controller {
         self.session.phase.state()
     }
 
-    /// Sessions (activations) so far.
-    pub fn session_number(&self) -> u32 {
-        self.session.number
-    }
-
     /// Cycles gone through after the first: the newest feedback's
     /// [`cycle_index`](EgmFeedback::cycle_index).
     pub fn cycle_index(&self) -> u64 {

@@ -11,7 +11,7 @@ use crate::fleet::experiment::study::{FleetStudy, worlds_text};
 use crate::fleet::experiment::tally::{FleetTally, collision_interval};
 use crate::fleet::scenario::Scenario;
 use crate::link::impaired::DelayLaw;
-use crate::study::{Cell, Column, StudyReport, Table, Work};
+use crate::study::{Cell, Column, StudyReport, Table};
 
 /// The cells of a study with what came of them, as far as they were run.
 #[derive(Debug)]
@@ -68,23 +68,11 @@ pub(crate) fn report(study: &FleetStudy, results: &Results<'_>) -> StudyReport {
         }
         tables.push(command_table(results));
     }
-    let sum = |amount: fn(&FleetTally) -> f64| {
-        let done = results.all().filter_map(|(_, tally)| tally);
-        done.map(amount).sum()
-    };
-    let work = |name, amount| Work { name, amount };
     StudyReport {
         title: "Case study 1: collisions per critical section (CS), in virtual time".to_owned(),
         notes: notes(study),
         tables,
         criteria: judgement::criteria(study, results),
-        work: vec![
-            work("robot-seconds", sum(|tally| tally.robot_s)),
-            work(
-                "critical sections",
-                sum(|tally| tally.section_count() as f64),
-            ),
-        ],
     }
 }
 

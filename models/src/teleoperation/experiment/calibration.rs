@@ -5,7 +5,7 @@ use crate::case_study::ParameterError;
 use crate::egm::parameters::ControllerSettings;
 use crate::link::outages::Outages;
 use crate::measure::statistics::{CONFIDENCE, poisson};
-use crate::study::{Cell, Column, Criterion, Study, StudyReport, Table, Watch, Work};
+use crate::study::{Cell, Column, Criterion, Study, StudyReport, Table, Watch};
 use crate::teleoperation::Teleoperation;
 use crate::teleoperation::experiment::conditions::{back_after, base, changed, without_time_out};
 use crate::teleoperation::experiment::drive::{Channel, Setup, drive};
@@ -83,7 +83,6 @@ pub(crate) struct Calibration {
 pub(crate) struct Point {
     found: Found,
     tries: usize,
-    loop_count: u64,
 }
 
 #[derive(Debug, Clone, PartialEq)]
@@ -240,7 +239,6 @@ impl Search<'_, '_> {
         Point {
             found,
             tries: self.tries.len(),
-            loop_count: self.tries.iter().map(|tried| tried.sent_count).sum(),
         }
     }
 }
@@ -319,10 +317,8 @@ impl Study for Calibration {
     fn report(&self, outcomes: &[Option<&Point>]) -> StudyReport {
         let ended = outcomes.iter().flatten();
         let found = ended
-            .clone()
             .filter(|point| matches!(point.found, Found::Rate { .. }))
             .count();
-        let loops: f64 = ended.map(|point| point.loop_count as f64).sum();
         StudyReport {
             title: format!(
                 "Case study 2: outages that make the motion loss rate {}, in virtual time",
@@ -334,10 +330,6 @@ impl Study for Calibration {
                 text: "at least one point of the curve exists".to_owned(),
                 is_met: outcomes.iter().all(Option::is_some).then_some(found > 0),
                 finding: format!("{found} of {} points have a rate", outcomes.len()),
-            }],
-            work: vec![Work {
-                name: "motion loops",
-                amount: loops,
             }],
         }
     }

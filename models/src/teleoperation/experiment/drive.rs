@@ -69,7 +69,6 @@ pub(crate) struct Tally {
     pub(crate) hours: f64,
     /// Share of the time held while a session ran.
     pub(crate) hold_ratio: f64,
-    pub(crate) cycle_count: u64,
 }
 
 impl Tally {
@@ -122,10 +121,7 @@ pub(crate) fn drive(
         .counter
         .count_peaks(&trajectory.sent_peaks_ns, &moved)
         .expect("a trajectory is as long as its loops");
-    Some(
-        run.happened
-            .tally(trajectory, &loops, (cycle.unsigned_abs(), end_ns)),
-    )
+    Some(run.happened.tally(trajectory, &loops, end_ns))
 }
 
 /// A run under way.
@@ -338,12 +334,7 @@ impl Happened {
         self.end_running(end_ns);
     }
 
-    fn tally(
-        &self,
-        trajectory: &Trajectory,
-        loops: &Loops,
-        (cycle_count, end_ns): (u64, i64),
-    ) -> Tally {
+    fn tally(&self, trajectory: &Trajectory, loops: &Loops, end_ns: i64) -> Tally {
         let mut lost_counts = [0; LossCause::KIND_COUNT];
         for lost in &loops.lost {
             let cause = self
@@ -362,7 +353,6 @@ impl Happened {
             trip_count: self.trip_count,
             hours: end_ns as f64 / 3.6e12,
             hold_ratio: held_ns as f64 / self.running_ns.max(1) as f64,
-            cycle_count,
         }
     }
 }

@@ -2,7 +2,7 @@
 
 use crate::measure::series::Estimate;
 use crate::measure::statistics::{CONFIDENCE, poisson};
-use crate::study::{Cell, Column, Criterion, StudyReport, Table, Work};
+use crate::study::{Cell, Column, Criterion, StudyReport, Table};
 use crate::teleoperation::experiment::conditions::{Condition, Expected, PUBLISHED_LOOPS};
 use crate::teleoperation::experiment::drive::Tally;
 use crate::teleoperation::experiment::study::MotionLossStudy;
@@ -13,14 +13,6 @@ pub(crate) type Row<'a> = (&'a Condition, Vec<&'a Tally>);
 
 /// The whole report.
 pub(crate) fn report(study: &MotionLossStudy, rows: &[Row<'_>]) -> StudyReport {
-    let cycles = rows
-        .iter()
-        .flat_map(|(_, runs)| runs)
-        .map(|run| run.cycle_count as f64);
-    let loops = rows
-        .iter()
-        .flat_map(|(_, runs)| runs)
-        .map(|run| run.sent_count as f64);
     StudyReport {
         title: "Case study 2: motion loss rate (MLR) by condition, in virtual time".to_owned(),
         notes: notes(study),
@@ -29,16 +21,6 @@ pub(crate) fn report(study: &MotionLossStudy, rows: &[Row<'_>]) -> StudyReport {
             .iter()
             .flat_map(|row| criteria(row, study.is_fitted))
             .collect(),
-        work: vec![
-            Work {
-                name: "robot cycles",
-                amount: cycles.sum(),
-            },
-            Work {
-                name: "motion loops",
-                amount: loops.sum(),
-            },
-        ],
     }
 }
 

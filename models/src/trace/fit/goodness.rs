@@ -81,12 +81,3 @@ pub(super) fn ks_distance(ascending: &[f64], distribution: impl Fn(f64) -> f64) 
     }
     largest
 }
-
-/// The largest difference between two samples' distributions, both ascending.
-#[cfg(test)]
-pub(super) fn ks_of_two(a: &[f64], b: &[f64]) -> f64 {
-    let share = |of: &[f64], x: f64| of.partition_point(|y| *y <= x) as f64 / of.len() as f64;
-    let all = a.iter().chain(b);
-    all.map(|x| (share(a, *x) - share(b, *x)).abs())
-        .fold(0.0, f64::max)
-}

@@ -9,11 +9,12 @@ use crate::platform::console::Console;
 use crate::platform::progress::Progress;
 use crate::topology::registry::Registry;
 use crate::report::replay;
+use hil_models::study::Batch;
 use crate::report::terminal::{self, Style};
 use crate::rundir::run_folder::RunFolder;
 use crate::platform::signals::Signals;
 use crate::report::simulate;
-use crate::report::study::{self, StudyEnd, StudyOptions, Wanted};
+use crate::report::study::{StudyEnd, StudyError, Wanted, self};
 use crate::topology::{self, Topology, TopologyErrors};
 
 use super::{columns, exit, interrupted, load, signals};
@@ -68,7 +69,7 @@ pub(super) fn simulate(
 pub(super) fn tables(
     path: &Path,
     overrides: &[String],
-    batch: BatchArgs,
+    batch: &BatchArgs,
     registry: &Registry,
 ) -> u8 {
     let mut console = Console::new(batch.quiet);
@@ -81,8 +82,8 @@ pub(super) fn tables(
     let Some(topology) = loaded(topology, &mut console) else {
         return exit::USAGE;
     };
-    let work = (&topology, Wanted::Tables);
-    compute(work, batch, (registry, &signals, &mut console))
+    let study = study::batch_of(&topology, registry, Wanted::Tables);
+    compute(study, batch, &signals, &mut console)
 }
 
 /// `calibrate`.
@@ -129,11 +130,8 @@ pub(super) fn calibrate(args: CalibrateArgs, registry: &Registry) -> u8 {
         return exit::USAGE;
     }
     let wanted = Wanted::Calibration { figure, value };
-    compute(
-        (&topology, wanted),
-        args.batch,
-        (registry, &signals, &mut console),
-    )
+    let study = study::batch_of(&topology, registry, wanted);
+    compute(study, &args.batch, &signals, &mut console)
 }
 
 /// The figure asked for, and its value.
@@ -170,23 +168,19 @@ fn loaded(topology: Result<Topology, TopologyErrors>, console: &mut Console) -> 
 }
 
 fn compute(
-    (topology, wanted): (&Topology, Wanted<'_>),
-    batch: BatchArgs,
-    (registry, signals, console): (&Registry, &Signals, &mut Console),
+    study: Result<Box<dyn Batch>, StudyError>,
+    args: &BatchArgs,
+    signals: &Signals,
+    console: &mut Console,
 ) -> u8 {
-    let options = StudyOptions {
-        jobs: batch.jobs,
-        is_json: batch.json,
-        output: batch.output,
-    };
-    let batch = match study::batch_of(topology, registry, wanted) {
-        Ok(batch) => batch,
+    let study = match study {
+        Ok(study) => study,
         Err(error) => {
             console.error(&error.to_string());
             return exit::USAGE;
         }
     };
-    match study::run(batch.as_ref(), &options, signals, console) {
+    match study::run(study.as_ref(), args, signals, console) {
         Ok(StudyEnd::Passed) => exit::RAN,
         Ok(StudyEnd::Missed) => {
             console

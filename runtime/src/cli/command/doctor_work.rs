@@ -4,12 +4,10 @@ use std::fs;
 use std::io::IsTerminal;
 use std::path::Path;
 
-use hil_gateways::transport::timestamping::TimestampCapabilities;
-
 use super::{exit, hosts_here, interrupted, load, signals};
 use crate::doctor::cli::DoctorArgs;
 use crate::doctor::latency::{LatencyReport, LatencyRequest, Watch, measure};
-use crate::doctor::{self, DoctorReport, DoctorRequest, Plan, Severity, StampCapabilities};
+use crate::doctor::{DoctorReport, DoctorRequest, Plan, Severity, self};
 use crate::platform::console::Console;
 use crate::platform::host_facts::{HostFiles, isolated_or_online};
 use crate::platform::progress::Progress;
@@ -36,7 +34,7 @@ pub(super) fn doctor(args: &DoctorArgs, registry: &Registry, console: &mut Conso
     let watch = signals.end_program_unless_over(
         "the doctor describes a host whole or not at all; a card it was trying is put back",
     );
-    let mut report = doctor::examine(&request, &stamp_capabilities);
+    let mut report = doctor::examine(&request);
     let is_interrupted = if latency.is_thorough {
         // From here on a signal ends the measurement, not the program.
         drop(watch);
@@ -144,26 +142,5 @@ fn measured(
             stage: Some(stage),
         };
         measure(request, files, &watch)
-    })
-}
-
-/// What an interface claims, in the bits of the kernel's answer.
-fn stamp_capabilities(interface: &str) -> Result<StampCapabilities, String> {
-    let claims = TimestampCapabilities::query(interface).map_err(|error| error.to_string())?;
-    let flag = |is_claimed: bool, bit: u32| if is_claimed { bit } else { 0 };
-    Ok(StampCapabilities {
-        so_timestamping: flag(claims.tx_hardware, libc::SOF_TIMESTAMPING_TX_HARDWARE)
-            | flag(claims.tx_software, libc::SOF_TIMESTAMPING_TX_SOFTWARE)
-            | flag(claims.rx_hardware, libc::SOF_TIMESTAMPING_RX_HARDWARE)
-            | flag(claims.rx_software, libc::SOF_TIMESTAMPING_RX_SOFTWARE)
-            | flag(
-                claims.tx_software || claims.rx_software,
-                libc::SOF_TIMESTAMPING_SOFTWARE,
-            )
-            | flag(
-                claims.tx_hardware || claims.rx_hardware,
-                libc::SOF_TIMESTAMPING_RAW_HARDWARE,
-            ),
-        hardware_clock_index: claims.phc_index,
     })
 }

@@ -43,7 +43,7 @@ pub struct Claim {
 }
 
 impl Claim {
-    fn new(id: &str, claim: &str, rule: &str, (standing, why): (Standing, String)) -> Self {
+    fn new(id: &str, claim: &str, rule: &str, standing: Standing, why: String) -> Self {
         Self {
             id: id.to_owned(),
             claim: claim.to_owned(),
@@ -57,6 +57,8 @@ impl Claim {
 /// The least that is known of all CPUs, and the worst that was seen on one.
 #[derive(Debug, Clone, Copy)]
 struct Worst {
+    /// From one wake-up to the next.
+    period_ns: i64,
     count: u64,
     lateness: Quantiles,
 }
@@ -70,6 +72,7 @@ fn worst(report: &LatencyReport) -> Option<Worst> {
     let figures: Vec<(u64, Quantiles)> = figures.collect::<Option<_>>()?;
     let most = |of: fn(&Quantiles) -> i64| figures.iter().map(|(_, one)| of(one)).max();
     Some(Worst {
+        period_ns: i64::try_from(report.period_ns).unwrap_or(i64::MAX),
         count: figures.iter().map(|(count, _)| *count).min()?,
         lateness: Quantiles {
             p50_ns: most(|one| one.p50_ns)?,
@@ -82,44 +85,37 @@ fn worst(report: &LatencyReport) -> Option<Worst> {
 
 /// All claims, from the easiest to the hardest.
 pub(super) fn derive(report: &LatencyReport) -> Vec<Claim> {
-    let period_ns = i64::try_from(report.period_ns).unwrap_or(i64::MAX);
     let Some(worst) = worst(report) else {
         return vec![Claim::new(
             "median",
             "medians of delays",
             QUANTILE_RULE,
-            (
-                Standing::NotMeasured,
-                "no wake-up fell into the time".to_owned(),
-            ),
+            Standing::NotMeasured,
+            "no wake-up fell into the time".to_owned(),
         )];
     };
     let of = worst.lateness;
     let mut claims = vec![
-        quantile(
-            "median",
-            "medians of delays",
-            (of.p50_ns, 500),
-            (worst.count, period_ns),
-        ),
-        quantile(
-            "p99",
-            "99 % quantiles of delays",
-            (of.p99_ns, 990),
-            (worst.count, period_ns),
-        ),
+        quantile("median", "medians of delays", 500, of.p50_ns, &worst),
+        quantile("p99", "99 % quantiles of delays", 990, of.p99_ns, &worst),
         quantile(
             "p999",
             "99.9 % quantiles of delays",
-            (of.p999_ns, 999),
-            (worst.count, period_ns),
+            999,
+            of.p999_ns,
+            &worst,
         ),
         variation(&worst),
         largest(&worst),
     ];
     let deadlines = DEADLINE_RATES_HZ.iter().map(|rate| deadline(*rate, &worst));
     claims.extend(deadlines);
-    claims.extend(report.gaps.iter().map(|gaps| busy_polling(gaps, period_ns)));
+    claims.extend(
+        report
+            .gaps
+            .iter()
+            .map(|gaps| busy_polling(gaps, worst.period_ns)),
+    );
     if let Fact::Available(answer) = &report.surroundings.virtual_machine
         && answer != "no"
     {
@@ -132,15 +128,13 @@ const QUANTILE_RULE: &str = "supportable to what the host's own wake-up takes at
                              wake-ups lie beyond it and it stays within a tenth of the period";
 
 /// The rule of `permille` of delays that end in a blocking receive.
-fn quantile(
-    id: &str,
-    claim: &str,
-    (late_ns, permille): (i64, u64),
-    (count, period_ns): (u64, i64),
-) -> Claim {
+fn quantile(id: &str, claim: &str, permille: u64, late_ns: i64, worst: &Worst) -> Claim {
+    let Worst {
+        count, period_ns, ..
+    } = *worst;
     let late = us(late_ns);
     let needed = needed_count(permille);
-    let outcome = if count < needed {
+    let (standing, why) = if count < needed {
         let why = format!("{count} wake-ups, and {needed} are needed: measure longer");
         (Standing::NotMeasured, why)
     } else if late_ns <= period_ns / PERIOD_PARTS {
@@ -150,7 +144,7 @@ fn quantile(
         let why = format!("the host's own wake-up is {late} us there, more than {tenth} us");
         (Standing::NotSupportable, why)
     };
-    Claim::new(id, claim, QUANTILE_RULE, outcome)
+    Claim::new(id, claim, QUANTILE_RULE, standing, why)
 }
 
 /// Wake-ups of which enough lie beyond the quantile.
@@ -160,7 +154,7 @@ fn needed_count(permille: u64) -> u64 {
 
 fn variation(worst: &Worst) -> Claim {
     let spread = us(worst.lateness.p99_ns - worst.lateness.p50_ns);
-    let outcome = if worst.count < needed_count(990) {
+    let (standing, why) = if worst.count < needed_count(990) {
         let why = format!("{} wake-ups are too few for a p99", worst.count);
         (Standing::NotMeasured, why)
     } else {
@@ -169,15 +163,20 @@ fn variation(worst: &Worst) -> Claim {
     };
     let rule =
         "what differs by less than p99 minus p50 of the host's own wake-up may be the host's";
-    Claim::new("variation", "delay variation", rule, outcome)
+    Claim::new("variation", "delay variation", rule, standing, why)
 }
 
 fn largest(worst: &Worst) -> Claim {
     let (max, count) = (us(worst.lateness.max_ns), worst.count);
     let why = format!("the host alone was {max} us late once in {count}, and may be later");
     let rule = "the largest of any number of wake-ups bounds nothing but itself";
-    let outcome = (Standing::NotSupportable, why);
-    Claim::new("largest", "largest delays", rule, outcome)
+    Claim::new(
+        "largest",
+        "largest delays",
+        rule,
+        Standing::NotSupportable,
+        why,
+    )
 }
 
 fn deadline(rate_hz: i64, worst: &Worst) -> Claim {
@@ -188,7 +187,7 @@ fn deadline(rate_hz: i64, worst: &Worst) -> Claim {
     } = worst.lateness;
     let (tail, max) = (us(p999_ns), us(max_ns));
     // One miss is enough to know; that there is none takes many wake-ups.
-    let outcome = if max_ns >= period_ns {
+    let (standing, why) = if max_ns >= period_ns {
         let why = format!("the host alone missed one: a wake-up was {max} us late");
         (Standing::NotSupportable, why)
     } else if worst.count < needed_count(999) {
@@ -212,7 +211,8 @@ fn deadline(rate_hz: i64, worst: &Worst) -> Claim {
         &format!("deadline misses at {rate}"),
         "supportable if the host's own wake-up stays within a tenth of the period at 99.9 % (at least 10 \
          wake-ups beyond) and never misses one itself",
-        outcome,
+        standing,
+        why,
     )
 }
 
@@ -245,7 +245,7 @@ fn busy_polling(gaps: &Gaps, period_ns: i64) -> Claim {
         None => ("busy_polling".to_owned(), "busy polling".to_owned()),
     };
     let rule = "supportable if gaps over 10 us take less than 1 ms per second and none a tenth of the period";
-    Claim::new(&id, &claim, rule, (standing, why))
+    Claim::new(&id, &claim, rule, standing, why)
 }
 
 fn below() -> Claim {
@@ -253,11 +253,9 @@ fn below() -> Claim {
         "tail_cause",
         "tails as this system's own",
         "below a hypervisor the tail is not this system's alone, whatever steal time says",
-        (
-            Standing::NotSupportable,
-            "a virtual machine: long wake-ups may come from below, also when nothing runs here"
-                .to_owned(),
-        ),
+        Standing::NotSupportable,
+        "a virtual machine: long wake-ups may come from below, also when nothing runs here"
+            .to_owned(),
     )
 }
 

@@ -49,11 +49,8 @@ pub struct CompareArgs {
     #[arg(long, requires = "fail_if")]
     pub strict: bool,
     /// What to print.
-    #[arg(long, value_enum, default_value_t = CompareFormat::Text, conflicts_with = "json")]
+    #[arg(long, value_enum, default_value_t = CompareFormat::Text)]
     pub format: CompareFormat,
-    /// Print JSON; short for --format json.
-    #[arg(long)]
-    pub json: bool,
 }
 
 /// How a comparison is printed.

@@ -68,12 +68,7 @@ fn compared(args: &CompareArgs, stage: &Stage) -> Result<(String, bool), String>
             .map_err(|error| error.to_string())?;
     }
     let has_failed = verdicts.judged.iter().any(|one| one.holds);
-    let format = if args.json {
-        CompareFormat::Json
-    } else {
-        args.format
-    };
-    let text = match format {
+    let text = match args.format {
         CompareFormat::Text => render::text(&comparison, &verdicts),
         CompareFormat::Md => render::markdown(&comparison, &verdicts),
         CompareFormat::Json => json(&comparison, &verdicts)?,

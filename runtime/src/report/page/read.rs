@@ -43,7 +43,7 @@ pub(crate) fn read(path: &Path) -> Result<Material, ReadError> {
     let mut problems = Vec::new();
     let series = match &found {
         Found::Unfinished(_) => Vec::new(),
-        _ => all_series(&folder.series(), &mut problems),
+        Found::Ended(_) => all_series(&folder.series(), &mut problems),
     };
     let printed = fs::read_to_string(folder.report()).ok();
     let printed = printed.filter(|text| text.len() <= PRINTED_BYTES_MAX);

@@ -19,7 +19,8 @@ pub(super) fn of_simulation(
     topology: &Topology,
     watches: Vec<(String, Watch)>,
     log: &RunLog,
-    (errors, events): (Vec<ErrorSeries>, &mut ScoreEvents),
+    errors: Vec<ErrorSeries>,
+    events: &mut ScoreEvents,
 ) -> Option<(NetworkReport, Vec<PlotSeries>)> {
     let seed = topology.run().seed;
     let length_ns = duration_ns(topology.run().duration);

@@ -15,21 +15,11 @@ use hil_models::study::{Batch, StudyReport};
 
 use crate::platform::console::Console;
 use crate::platform::signals::Signals;
+use crate::cli::arguments::BatchArgs;
 use crate::topology::Topology;
 use crate::topology::registry::Registry;
 
 use self::pool::Pool;
-
-/// How to run a study and where to put its tables.
-#[derive(Debug, Clone)]
-pub struct StudyOptions {
-    /// Threads; all processors if left out.
-    pub jobs: Option<NonZeroUsize>,
-    /// Print JSON instead of tables.
-    pub is_json: bool,
-    /// Folder for the tables as files.
-    pub output: Option<PathBuf>,
-}
 
 /// How a study ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -46,8 +36,6 @@ pub enum StudyEnd {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Cost {
     pub(crate) wall: Duration,
-    /// Processor time of all threads; `None` when the kernel does not tell.
-    pub(crate) processor: Option<Duration>,
     pub(crate) jobs: usize,
     pub(crate) task_count: usize,
     pub(crate) ended_count: usize,
@@ -142,11 +130,11 @@ pub(crate) fn batch_of(
 /// When a file cannot be written; the tables are printed all the same.
 pub(crate) fn run(
     batch: &dyn Batch,
-    options: &StudyOptions,
+    args: &BatchArgs,
     signals: &Signals,
     console: &mut Console,
 ) -> Result<StudyEnd, StudyError> {
-    let jobs = options
+    let jobs = args
         .jobs
         .or_else(|| thread::available_parallelism().ok())
         .map_or(1, NonZeroUsize::get)
@@ -154,13 +142,13 @@ pub(crate) fn run(
     let pool = Pool::new(batch, jobs);
     let (outcomes, cost) = pool.run(signals, console);
     let report = batch.report(&outcomes);
-    let text = if options.is_json {
+    let text = if args.json {
         render::json(&report, &cost)
     } else {
         render::text(&report, &cost)
     };
     console.result(&text);
-    if let Some(folder) = &options.output {
+    if let Some(folder) = &args.output {
         write_files(folder, &report, &cost)?;
         console.say(&format!("wrote the tables to {}", folder.display()));
     }

@@ -7,8 +7,6 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use hil_models::study::{Batch, TaskOutcome};
-use nix::sys::resource::{UsageWho, getrusage};
-use nix::sys::time::TimeVal;
 
 use crate::platform::console::Console;
 use crate::platform::progress::line;
@@ -58,7 +56,7 @@ impl<'a> Pool<'a> {
         console: &mut Console,
     ) -> (Vec<Option<TaskOutcome>>, Cost) {
         let task_count = self.batch.task_count();
-        let (begun, used_before) = (Instant::now(), processor_time());
+        let begun = Instant::now();
         let mut outcomes: Vec<_> = (0..task_count).map(|_| None).collect();
         let mut ended_count = 0;
         thread::scope(|scope| {
@@ -85,9 +83,6 @@ impl<'a> Pool<'a> {
         });
         let cost = Cost {
             wall: begun.elapsed(),
-            processor: processor_time()
-                .zip(used_before)
-                .map(|(after, before)| after.saturating_sub(before)),
             jobs: self.workers.len(),
             task_count,
             ended_count,
@@ -137,17 +132,6 @@ impl<'a> Pool<'a> {
 )]
 fn parts(share: f64) -> u64 {
     (share.clamp(0.0, 1.0) * SHARE_UNIT) as u64
-}
-
-/// Processor time this process has used so far, in user and in kernel mode.
-fn processor_time() -> Option<Duration> {
-    let usage = getrusage(UsageWho::RUSAGE_SELF).ok()?;
-    let duration = |time: TimeVal| {
-        let seconds = u64::try_from(time.tv_sec()).ok()?;
-        let micros = u64::try_from(time.tv_usec()).ok()?;
-        Some(Duration::from_secs(seconds) + Duration::from_micros(micros))
-    };
-    Some(duration(usage.user_time())? + duration(usage.system_time())?)
 }
 
 #[cfg(test)]

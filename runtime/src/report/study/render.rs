@@ -1,10 +1,9 @@
-//! A study's report as a page, as comma-separated values and as JSON. It computes nothing but the
-//! rates that the measured time allows.
+//! A study's report as a page, as comma-separated values and as JSON. It computes nothing.
 
 use core::fmt::Write;
 
 use hil_models::study::{Cell, Criterion, StudyReport, Table};
-use serde_json::{Value, json};
+use serde_json::json;
 
 use crate::report::study::Cost;
 
@@ -28,7 +27,7 @@ pub(super) fn text(report: &StudyReport, cost: &Cost) -> String {
         }
     }
     page.push('\n');
-    push(&mut page, format_args!("{}", cost_text(report, cost)));
+    push(&mut page, format_args!("{}", cost_text(cost)));
     page
 }
 
@@ -94,33 +93,17 @@ fn push_criterion(page: &mut String, criterion: &Criterion) {
     push(page, format_args!("  {verdict} {text}: {finding}"));
 }
 
-fn cost_text(report: &StudyReport, cost: &Cost) -> String {
+fn cost_text(cost: &Cost) -> String {
     let tasks = if cost.ended_count == cost.task_count {
         format!("{} tasks", cost.task_count)
     } else {
         format!("{} of {} tasks", cost.ended_count, cost.task_count)
     };
-    let mut text = format!(
+    format!(
         "{tasks} on {} threads: {:.1} s of wall time",
         cost.jobs,
         cost.wall.as_secs_f64()
-    );
-    let Some(processor_s) = cost.processor.map(|time| time.as_secs_f64()) else {
-        text.push_str(", processor time unavailable");
-        return text;
-    };
-    let _infallible = write!(text, ", {processor_s:.1} s of processor time");
-    if processor_s > 0.0 {
-        for work in report.work.iter().filter(|work| work.amount > 0.0) {
-            let rate = work.amount / processor_s;
-            let _infallible = write!(
-                text,
-                "; {:.0} {}, {rate:.0} per processor second",
-                work.amount, work.name
-            );
-        }
-    }
-    text
+    )
 }
 
 /// A table as comma-separated values (RFC 4180), figures at full precision, an interval as two
@@ -179,7 +162,6 @@ pub(super) fn json(report: &StudyReport, cost: &Cost) -> String {
         "is_passed": report.is_passed(),
         "cost": {
             "wall_s": cost.wall.as_secs_f64(),
-            "processor_s": cost.processor.map_or(Value::Null, |time| json!(time.as_secs_f64())),
             "jobs": cost.jobs,
             "task_count": cost.task_count,
             "ended_count": cost.ended_count,
@@ -192,7 +174,7 @@ pub(super) fn json(report: &StudyReport, cost: &Cost) -> String {
 mod tests {
     use super::*;
     use core::time::Duration;
-    use hil_models::study::{Column, Work};
+    use hil_models::study::Column;
 
     fn table() -> Table {
         let column = |name, label| Column { name, label };
@@ -219,7 +201,6 @@ mod tests {
     fn cost() -> Cost {
         Cost {
             wall: Duration::from_secs(2),
-            processor: Some(Duration::from_secs(4)),
             jobs: 2,
             task_count: 3,
             ended_count: 3,
@@ -231,10 +212,6 @@ mod tests {
         let report = StudyReport {
             title: "Study".to_owned(),
             tables: vec![table()],
-            work: vec![Work {
-                name: "robot-seconds",
-                amount: 400.0,
-            }],
             ..StudyReport::default()
         };
         let page = text(&report, &cost());
@@ -245,38 +222,14 @@ mod tests {
         assert_eq!(lines[6], "  c           -             -");
         assert_eq!(lines[7], "  below");
         assert!(
-            page.ends_with(
-                "3 tasks on 2 threads: 2.0 s of wall time, 4.0 s of processor time; 400 \
-                 robot-seconds, 100 per processor second\n"
-            ),
+            page.ends_with("3 tasks on 2 threads: 2.0 s of wall time\n"),
             "{page}"
         );
-        let nothing = StudyReport {
-            work: vec![Work {
-                name: "motion loops",
-                amount: -0.0,
-            }],
-            ..StudyReport::default()
-        };
-        let page = text(&nothing, &cost());
-        assert!(page.ends_with("4.0 s of processor time\n"), "{page}");
     }
 
     #[test]
     fn values_keep_their_precision_and_quote_their_commas() {
         let expected = "row,count,ratio_low,ratio_high\r\n\"a, \"\"b\"\"\",7,0.125,0.5\r\nc,,,\r\n";
         assert_eq!(csv(&table()), expected);
-    }
-
-    #[test]
-    fn unavailable_processor_time_is_said_to_be_so() {
-        let unknown = Cost {
-            processor: None,
-            ..cost()
-        };
-        let report = StudyReport::default();
-        assert!(text(&report, &unknown).contains("processor time unavailable"));
-        let document: Value = serde_json::from_str(&json(&report, &unknown)).unwrap();
-        assert!(document["cost"]["processor_s"].is_null());
     }
 }

@@ -96,7 +96,8 @@ fn registry() -> Registry {
 fn calibration(
     case: &str,
     overrides: &[&str],
-    (figure, value): (&str, f64),
+    figure: &str,
+    value: f64,
 ) -> Result<Box<dyn Batch>, StudyError> {
     let registry = registry();
     let overrides: Vec<_> = overrides.iter().map(|&text| text.to_owned()).collect();
@@ -106,15 +107,16 @@ fn calibration(
 
 #[test]
 fn a_calibration_is_computed_and_written_like_tables() {
-    let batch = calibration("tuned", &["case.parameters.gain_per_s=2.0"], ("mlr", 0.5)).unwrap();
+    let batch = calibration("tuned", &["case.parameters.gain_per_s=2.0"], "mlr", 0.5).unwrap();
     let folder = std::env::temp_dir().join(format!("hil-calibration-{}", std::process::id()));
-    let options = StudyOptions {
+    let args = BatchArgs {
         jobs: NonZeroUsize::new(2),
-        is_json: true,
+        json: true,
         output: Some(folder.clone()),
+        quiet: true,
     };
     let signals = Signals::install().unwrap();
-    let end = run(batch.as_ref(), &options, &signals, &mut Console::new(true)).unwrap();
+    let end = run(batch.as_ref(), &args, &signals, &mut Console::new(true)).unwrap();
     assert_eq!(end, StudyEnd::Passed);
     let curve = fs::read_to_string(folder.join("curve.csv")).unwrap();
     assert_eq!(curve, "outages_per_h\r\n0\r\n1\r\n2\r\n3\r\n");
@@ -124,12 +126,16 @@ fn a_calibration_is_computed_and_written_like_tables() {
 
 #[test]
 fn what_cannot_be_calibrated_is_said_with_what_can() {
-    let error = |case, wanted| calibration(case, &[], wanted).unwrap_err().to_string();
-    assert_eq!(error("tuned", ("mlr", 1.5)), "mlr 1.5 is outside 0 to 1");
+    let error = |case, figure, value| {
+        calibration(case, &[], figure, value)
+            .unwrap_err()
+            .to_string()
+    };
+    assert_eq!(error("tuned", "mlr", 1.5), "mlr 1.5 is outside 0 to 1");
     let expected = "case tuned cannot be calibrated for lag; there is mlr";
-    assert_eq!(error("tuned", ("lag", 0.5)), expected);
+    assert_eq!(error("tuned", "lag", 0.5), expected);
     let expected = "case shuttle cannot be calibrated for mlr; it has no calibration";
-    assert_eq!(error("shuttle", ("mlr", 0.5)), expected);
+    assert_eq!(error("shuttle", "mlr", 0.5), expected);
     let registry = registry();
     let topology = topology::case_by_name("tuned", &[], registry.known()).unwrap();
     let error = batch_of(&topology, &registry, Wanted::Tables).unwrap_err();
