@@ -4,6 +4,8 @@ export const UNAVAILABLE = "unavailable";
 
 const known = (value) => typeof value === "number" && Number.isFinite(value);
 
+export const byId = (id) => document.getElementById(id);
+
 // Three significant figures without an exponent.
 export function figures(value) {
   const size = Math.abs(value);

@@ -3,14 +3,13 @@
 import { ArmScene, TRAIL_S, trailsOf } from "./arms.js";
 import { Conditions } from "./conditions.js";
 import { FleetScene } from "./fleet.js";
-import { age, palette, seconds, write } from "./format.js";
+import { age, byId, palette, seconds, write } from "./format.js";
 import { Gestures } from "./gestures.js";
 import { KEPT_S, Shelf, View } from "./history.js";
 import { ChannelTable, showEvents, showFacts, showRun, showWarnings } from "./panels.js";
 import { Socket } from "./socket.js";
 import { Strips } from "./strips.js";
 
-const byId = (id) => document.getElementById(id);
 const PANELS_EVERY_MS = 200;
 const STRIP_MS_PER_S = 2.5;
 const SILENT_S = 3;

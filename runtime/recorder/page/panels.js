@@ -1,9 +1,8 @@
 // Head of the page, table of channels, warnings and events: what is written rather than drawn.
 
-import { UNAVAILABLE, count, keepAt, make, microseconds, quantity, seconds, share, write } from "./format.js";
+import { UNAVAILABLE, byId, count, keepAt, make, microseconds, quantity, seconds, share, write } from "./format.js";
 import { boundText } from "./strips.js";
 
-const byId = (id) => document.getElementById(id);
 const STATES = { waiting: ["waiting for a run", "caution"], running: ["running", "good"], ended: ["ended", ""] };
 const MOST_WARNINGS = 4;
 const MOST_EVENTS = 80;

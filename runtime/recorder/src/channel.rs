@@ -7,7 +7,7 @@ use prost::Message as _;
 
 use crate::encode::Encoder;
 use crate::facts::Words;
-use crate::net::{self, LinkDecision, MessageLatency};
+use crate::net::{LinkDecision, MessageLatency};
 use crate::schema::{self, Schema};
 use crate::sink::{Sink, Topic};
 use crate::topics::{Names, View, topic_of};
@@ -96,8 +96,8 @@ impl ChannelTopics {
             encoder,
             untyped,
             views: views.collect(),
-            latency: derived(format!("/net{base}/latency"), net::latency_schema()),
-            link: derived(format!("/net{base}/link"), net::decision_schema()),
+            latency: derived(format!("/net{base}/latency"), MessageLatency::schema()),
+            link: derived(format!("/net{base}/link"), LinkDecision::schema()),
             buffer: Vec::new(),
         }
     }

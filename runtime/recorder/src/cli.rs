@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand};
+use hil_runtime::topology::read_duration;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -184,23 +185,27 @@ pub(crate) enum Command {
     Serve(ServeOptions),
     /// Feed recorded channels into a run that goes on, at their recorded spacing.
     #[command(after_help = PLAY_EXAMPLES)]
-    Play {
-        /// The MCAP file.
-        #[arg(value_name = "FILE")]
-        file: PathBuf,
-        /// Play this channel; may be repeated. Without one, those of the file are listed.
-        #[arg(long, value_name = "CHANNEL")]
-        only: Vec<String>,
-        /// How much faster than recorded, 0.01 to 100.
-        #[arg(long, value_name = "FACTOR", value_parser = speed, default_value = "1")]
-        speed: f64,
-        /// Begin again at the end, until the run ends.
-        #[arg(long = "loop")]
-        is_looped: bool,
-        /// Name or folder of the run; otherwise the run that started this program, or the only one.
-        #[arg(long, value_name = "RUN")]
-        into: Option<String>,
-    },
+    Play(PlayOptions),
+}
+
+/// What to play, and how.
+#[derive(Debug, Args)]
+pub(crate) struct PlayOptions {
+    /// The MCAP file.
+    #[arg(value_name = "FILE")]
+    pub(crate) file: PathBuf,
+    /// Play this channel; may be repeated. Without one, those of the file are listed.
+    #[arg(long, value_name = "CHANNEL")]
+    pub(crate) only: Vec<String>,
+    /// How much faster than recorded, 0.01 to 100.
+    #[arg(long, value_name = "FACTOR", value_parser = speed, default_value = "1")]
+    pub(crate) speed: f64,
+    /// Begin again at the end, until the run ends.
+    #[arg(long = "loop")]
+    pub(crate) is_looped: bool,
+    /// Name or folder of the run; otherwise the run that started this program, or the only one.
+    #[arg(long, value_name = "RUN")]
+    pub(crate) into: Option<String>,
 }
 
 /// What is served, and where.
@@ -261,52 +266,28 @@ const SIZES: [(&str, f64); 7] = [
     ("GB", 1e9),
     ("B", 1.0),
 ];
-/// Units of times, seconds each.
-const TIMES: [(&str, f64); 4] = [("ms", 1e-3), ("min", 60.0), ("s", 1.0), ("h", 3600.0)];
 
-/// A number with one of `units` behind it, in the smallest of them.
-fn measured(text: &str, units: &[(&str, f64)]) -> Result<f64, String> {
-    let names: Vec<&str> = units.iter().map(|(name, _)| *name).collect();
-    let unit = units.iter().find(|(name, _)| text.ends_with(name));
-    let value = unit.and_then(|(name, factor)| {
+fn size(text: &str) -> Result<u64, String> {
+    let unit = SIZES.iter().find(|(name, _)| text.ends_with(name));
+    let bytes = unit.and_then(|(name, factor)| {
         let number: f64 = text.strip_suffix(name)?.trim_end().parse().ok()?;
         Some(number * factor)
     });
-    let value = value.filter(|value| value.is_finite() && *value > 0.0);
-    value.ok_or_else(|| {
-        format!(
-            "a number above 0 with one of {} behind it",
-            names.join(", ")
-        )
-    })
-}
-
-fn size(text: &str) -> Result<u64, String> {
-    let bytes = measured(text, &SIZES)?;
-    if !(1.0..=1e18).contains(&bytes) {
-        return Err("1B to 1000000000GB".to_owned());
-    }
+    let bytes = bytes.filter(|bytes| (1.0..=1e18).contains(bytes));
     #[allow(
         clippy::cast_possible_truncation,
         clippy::cast_sign_loss,
         reason = "checked just above"
     )]
-    Ok(bytes as u64)
-}
-
-fn time(text: &str) -> Result<Duration, String> {
-    let seconds = measured(text, &TIMES)?;
-    Duration::try_from_secs_f64(seconds).map_err(|error| error.to_string())
+    bytes
+        .map(|bytes| bytes as u64)
+        .ok_or_else(|| "1B to 1000000000GB, in B, kB, MB, GB, KiB, MiB or GiB".to_owned())
 }
 
 fn flush(text: &str) -> Result<Duration, String> {
-    let flush = time(text)?;
     let range = Duration::from_millis(100)..=Duration::from_mins(1);
-    if range.contains(&flush) {
-        Ok(flush)
-    } else {
-        Err("100ms to 60s".to_owned())
-    }
+    let flush = read_duration(text).filter(|flush| range.contains(flush));
+    flush.ok_or_else(|| "100ms to 60s".to_owned())
 }
 
 #[cfg(test)]
@@ -317,11 +298,9 @@ mod tests {
     fn sizes_and_times_are_read_with_their_units_and_never_without() {
         assert_eq!(size("1GiB"), Ok(1 << 30));
         assert_eq!(size("1.5 kB"), Ok(1500));
-        assert_eq!(time("10min"), Ok(Duration::from_mins(10)));
-        assert_eq!(time("250ms"), Ok(Duration::from_millis(250)));
         assert_eq!(flush("0.5 s"), Ok(Duration::from_millis(500)));
         for text in ["10", "0s", "-1s", "s", "1 d", "nans", "infs"] {
-            assert!(time(text).is_err(), "{text}");
+            assert!(flush(text).is_err(), "{text}");
         }
         assert!(size("0.5B").is_err() && size("1").is_err());
         assert!(flush("10ms").is_err() && flush("2min").is_err());

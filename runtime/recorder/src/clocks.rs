@@ -3,11 +3,12 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use hil_models::measure::record::{EgressRecord, IngressRecord, UNAVAILABLE};
+use hil_models::measure::record::UNAVAILABLE;
 use hil_runtime::rundir::manifest::Manifest;
-use hil_runtime::rundir::record::RecordKind;
+use hil_runtime::watch::Record;
 
 use crate::facts::Words;
+use crate::net;
 use crate::run::Run;
 
 /// Where a host's relation to real time comes from.
@@ -208,23 +209,21 @@ fn noted_offsets(run: &Run) -> BTreeMap<String, Noted> {
     let mut noted: BTreeMap<String, Noted> = BTreeMap::new();
     for file in &run.files {
         let described = run.described(&file.header.channel);
-        let (host, offsets): (_, Vec<i64>) = match file.header.kind {
-            RecordKind::Egress => (
-                described.and_then(|one| one.from_host.as_ref()),
-                file.records::<EgressRecord>()
-                    .map(|record| record.realtime_offset_ns)
-                    .collect(),
-            ),
-            RecordKind::Ingress => (
-                described.and_then(|one| one.to_host.as_ref()),
-                file.records::<IngressRecord>()
-                    .map(|record| record.realtime_offset_ns)
-                    .collect(),
-            ),
-            _ => continue,
-        };
-        let Some(host) = host else { continue };
-        for offset_ns in offsets.into_iter().filter(|one| *one != UNAVAILABLE) {
+        for record in net::records(file) {
+            let (host, offset_ns) = match record {
+                Record::Egress(one) => {
+                    let host = described.and_then(|one| one.from_host.as_ref());
+                    (host, one.realtime_offset_ns)
+                }
+                Record::Ingress(one) => {
+                    let host = described.and_then(|one| one.to_host.as_ref());
+                    (host, one.realtime_offset_ns)
+                }
+                _ => break,
+            };
+            let Some(host) = host.filter(|_| offset_ns != UNAVAILABLE) else {
+                continue;
+            };
             let one = noted.entry(host.clone()).or_insert(Noted {
                 first_ns: offset_ns,
                 ends_ns: (offset_ns, offset_ns),

@@ -11,14 +11,13 @@ use hil_runtime::platform::signals::{EXIT_INTERRUPTED, Signals};
 use hil_runtime::platform::words::counted_plainly;
 use hil_runtime::topology::documents;
 
-use crate::cli::{Cli, Command, ServeOptions};
+use crate::cli::{Cli, Command, PlayOptions, ServeOptions};
 use crate::convert::{ConvertError, convert};
 use crate::ending::Ending;
-use crate::play::{PlayEnd, PlayError, PlayOptions, SourceError, TargetError, play};
+use crate::play::{PlayEnd, PlayError, SourceError, TargetError, play};
 use crate::record::{Progress as RecordProgress, RecordError, Request, Which, record};
 use crate::recover::{RecoverError, loss_words, recover};
 use crate::scan::ScanError;
-use crate::scene::Scenery;
 use crate::serve::{ServeError, serve};
 use crate::writer::{WriteError, check_target, partial};
 
@@ -52,10 +51,11 @@ fn work(command: Command, signals: &Signals, console: &mut Console) -> u8 {
             force,
             no_scene,
         } => {
-            let checked = check_target(&output, &run, force);
-            let work = (run.as_path(), output.as_path(), Scenery::of(no_scene));
-            unless_refused(checked, console)
-                .unwrap_or_else(|console| convert_run(work, signals, console))
+            if let Err(error) = check_target(&output, &run, force) {
+                console.error(&error.to_string());
+                return exit::USAGE;
+            }
+            convert_run(&run, &output, !no_scene, signals, console)
         }
         Command::Record {
             run,
@@ -77,7 +77,7 @@ fn work(command: Command, signals: &Signals, console: &mut Console) -> u8 {
                 split_bytes: split_size,
                 flush,
                 force,
-                scenery: Scenery::of(no_scene),
+                has_scene: !no_scene,
             };
             record_run(&request, signals, console)
         }
@@ -86,28 +86,15 @@ fn work(command: Command, signals: &Signals, console: &mut Console) -> u8 {
             output,
             force,
         } => {
-            let checked = check_target(&output, &broken, force);
-            unless_refused(checked, console)
-                .unwrap_or_else(|console| recover_file((&broken, &output), signals, console))
+            if let Err(error) = check_target(&output, &broken, force) {
+                console.error(&error.to_string());
+                return exit::USAGE;
+            }
+            recover_file(&broken, &output, signals, console)
         }
         Command::Documents { folder } => write_documents(&folder, console),
         Command::Serve(options) => serve_run(&options, signals, console),
-        Command::Play {
-            file,
-            only,
-            speed,
-            is_looped,
-            into,
-        } => {
-            let options = PlayOptions {
-                file,
-                only,
-                speed,
-                is_looped,
-                into,
-            };
-            play_file(&options, signals, console)
-        }
+        Command::Play(options) => play_file(&options, signals, console),
     }
 }
 
@@ -117,20 +104,6 @@ fn write_documents(folder: &Path, console: &mut Console) -> u8 {
         Err(error) => {
             console.error(&format!("{}: {error}", folder.display()));
             exit::FAILED
-        }
-    }
-}
-
-/// The exit code of a refusal; the console again when there was none.
-fn unless_refused(
-    checked: Result<(), WriteError>,
-    console: &mut Console,
-) -> Result<u8, &mut Console> {
-    match checked {
-        Ok(()) => Err(console),
-        Err(error) => {
-            console.error(&error.to_string());
-            Ok(exit::USAGE)
         }
     }
 }
@@ -158,14 +131,16 @@ fn interrupted() -> u8 {
 }
 
 fn convert_run(
-    (run, output, scenery): (&Path, &Path, Scenery),
+    run: &Path,
+    output: &Path,
+    has_scene: bool,
     signals: &Signals,
     console: &mut Console,
 ) -> u8 {
     let progress = Progress::begin();
     // Much of the work is done in one piece, of a large run for seconds.
     let ending = Ending::watch(signals, partial(output));
-    let converted = convert(run, output, scenery, &mut |share, words| {
+    let converted = convert(run, output, has_scene, &mut |share, words| {
         progress.show(console, share, words);
         signals.received()
     });
@@ -268,7 +243,7 @@ fn progress_words(progress: &RecordProgress<'_>) -> String {
     )
 }
 
-fn recover_file((broken, output): (&Path, &Path), signals: &Signals, console: &mut Console) -> u8 {
+fn recover_file(broken: &Path, output: &Path, signals: &Signals, console: &mut Console) -> u8 {
     let progress = Progress::begin();
     let size_bytes = fs::metadata(broken).map_or(0, |file| file.len());
     let recovered = recover(broken, output, &mut |offset| {

@@ -5,10 +5,9 @@ use std::collections::BTreeMap;
 
 use hil_models::link::condition::{LinkCondition, LinkConditionRecord, OrderOutcome};
 use prost::Message as _;
-use prost_types::field_descriptor_proto::Type;
 use serde_json::Value;
 
-use crate::schema::{self, OwnField, Schema};
+use crate::schema::own_message;
 use crate::sink::{Sink, Topic};
 use crate::topics::Names;
 use crate::writer::Stamp;
@@ -16,59 +15,31 @@ use crate::writer::Stamp;
 /// Before the link and the direction in the name under which orders are recorded.
 const RECORDED_AS: &str = "hil/link/";
 
-/// An order to one direction of a link and what became of it.
-#[derive(Clone, PartialEq, prost::Message)]
-pub(crate) struct OrderedCondition {
-    /// The gateway's count of orders, from 1 at each of its starts.
-    #[prost(uint64, tag = "1")]
-    number: u64,
-    /// What the order was called by whoever gave it.
-    #[prost(uint64, tag = "2")]
-    request: u64,
-    #[prost(string, tag = "3")]
-    link: String,
-    /// `forward` or `backward`.
-    #[prost(string, tag = "4")]
-    direction: String,
-    /// `topology`, `fixed`, `cut`, or `unknown` to this version.
-    #[prost(string, tag = "5")]
-    condition: String,
-    /// Of a fixed condition, nanoseconds.
-    #[prost(uint64, optional, tag = "6")]
-    delay_ns: Option<u64>,
-    /// Of a fixed condition, 0 to 1; of a cut 1.
-    #[prost(double, optional, tag = "7")]
-    loss_ratio: Option<f64>,
-    /// It took effect.
-    #[prost(bool, tag = "8")]
-    is_in_force: bool,
-    /// Why it did not; empty where it did.
-    #[prost(string, tag = "9")]
-    refusal: String,
-    /// Messages that the gateway received from here on met it, on its host's monotonic clock.
-    #[prost(int64, tag = "10")]
-    from_ns: i64,
-    /// Messages received between `from_ns` and this may have met the one before.
-    #[prost(int64, tag = "11")]
-    certain_ns: i64,
-}
-
-/// The schema of these.
-fn condition_schema() -> Schema {
-    const FIELDS: [OwnField; 11] = [
-        ("number", Type::Uint64, false),
-        ("request", Type::Uint64, false),
-        ("link", Type::String, false),
-        ("direction", Type::String, false),
-        ("condition", Type::String, false),
-        ("delay_ns", Type::Uint64, true),
-        ("loss_ratio", Type::Double, true),
-        ("is_in_force", Type::Bool, false),
-        ("refusal", Type::String, false),
-        ("from_ns", Type::Int64, false),
-        ("certain_ns", Type::Int64, false),
-    ];
-    schema::own("LinkCondition", &FIELDS)
+own_message! {
+    /// An order to one direction of a link and what became of it.
+    pub(crate) struct OrderedCondition as "LinkCondition" {
+        /// The gateway's count of orders, from 1 at each of its starts.
+        number: uint64 = "1",
+        /// What the order was called by whoever gave it.
+        request: uint64 = "2",
+        link: string = "3",
+        /// `forward` or `backward`.
+        direction: string = "4",
+        /// `topology`, `fixed`, `cut`, or `unknown` to this version.
+        condition: string = "5",
+        /// Of a fixed condition, nanoseconds.
+        delay_ns: optional uint64 = "6",
+        /// Of a fixed condition, 0 to 1; of a cut 1.
+        loss_ratio: optional double = "7",
+        /// It took effect.
+        is_in_force: bool = "8",
+        /// Why it did not; empty where it did.
+        refusal: string = "9",
+        /// Messages that the gateway received from here on met it, on its host's monotonic clock.
+        from_ns: int64 = "10",
+        /// Messages received between `from_ns` and this may have met the one before.
+        certain_ns: int64 = "11",
+    }
 }
 
 impl OrderedCondition {
@@ -130,7 +101,7 @@ impl Conditions {
                     link: link.clone(),
                     way: way.to_owned(),
                     host: host.to_owned(),
-                    topic: Topic::new(name, condition_schema(), &metadata),
+                    topic: Topic::new(name, OrderedCondition::schema(), &metadata),
                 };
                 directions.insert(format!("{RECORDED_AS}{link}/{way}"), direction);
             }

@@ -16,7 +16,7 @@ use crate::conditions::Conditions;
 use crate::facts;
 use crate::net::{self, Latencies, MessageId};
 use crate::run::{Run, RunError};
-use crate::scene::{Heard, Scene, Scenery};
+use crate::scene::{Heard, Scene};
 use crate::sink::Topic;
 use crate::topics::{self, Names};
 use crate::writer::{Recording, Stamp, WriteError};
@@ -79,7 +79,7 @@ struct Item {
 pub(crate) fn convert(
     from: &Path,
     to: &Path,
-    scenery: Scenery,
+    has_scene: bool,
     look: &mut dyn FnMut(Option<f64>, &str) -> Option<&'static str>,
 ) -> Result<Converted, ConvertError> {
     let mut stopped = None;
@@ -92,8 +92,9 @@ pub(crate) fn convert(
     }
     run.count_missing();
     let clocks = Clocks::of(&run);
-    let mut conversion = Conversion::begin(to, &run, &clocks, scenery)?;
-    while !conversion.is_ready() {
+    let mut conversion = Conversion::begin(to, &run, &clocks, has_scene)?;
+    // Something may still be made that the pictures need.
+    while !conversion.scene.as_mut().is_none_or(Scene::is_ready) {
         if let Some(signal) = look(None, "making the fleet's ground") {
             return Err(ConvertError::Interrupted(signal));
         }
@@ -119,16 +120,10 @@ pub(crate) fn convert(
         conversion.write(&mut run, *item)?;
     }
     conversion.finish_scene(&mut run)?;
-    let Conversion {
-        mut recording,
-        channels,
-        message_count,
-        names,
-        ..
-    } = conversion;
-    facts::write(&mut recording, &run, &clocks, &channels, &names)?;
+    let channels = &conversion.channels;
+    let recording = &mut conversion.recording;
+    facts::write(recording, &run, &clocks, channels, &conversion.names)?;
     let topic_count = recording.topic_count();
-    let written_count = recording.finish()?;
     let untyped = channels.iter().filter_map(|channel| {
         let why = channel.untyped()?;
         Some(format!("{}: kept as bytes: {why}", channel.name))
@@ -136,8 +131,8 @@ pub(crate) fn convert(
     let mut words = run.gaps.words.clone();
     words.extend(untyped);
     Ok(Converted {
-        written_count,
-        message_count,
+        written_count: conversion.recording.finish()?,
+        message_count: conversion.message_count,
         topic_count,
         has_gaps: run.gaps.is_any(),
         words,
@@ -158,7 +153,7 @@ struct Conversion {
 
 impl Conversion {
     /// Opens the file and declares every topic in it.
-    fn begin(to: &Path, run: &Run, clocks: &Clocks, scenery: Scenery) -> Result<Self, WriteError> {
+    fn begin(to: &Path, run: &Run, clocks: &Clocks, has_scene: bool) -> Result<Self, WriteError> {
         let mut recording = Recording::create(to)?;
         let mut names = Names::default();
         let recorded = run.channels();
@@ -191,17 +186,16 @@ impl Conversion {
                 channel.link.declare(&mut recording)?;
             }
         }
-        let events = names.claim("/score/events".to_owned());
-        let mut events = Topic::new(events, topics::event_schema(), &[]);
+        let mut events = topics::event_topic(&mut names);
         let told = run.summary.as_ref().map(|one| &one.score_events.events);
         if told.is_some_and(|events| !events.is_empty()) {
             events.declare(&mut recording)?;
         }
         let mut conditions = Conditions::of(run.topology(), &mut names);
-        for file in run.files.iter().filter(|file| is_order_file(file)) {
+        for file in &run.files {
             conditions.declare(&file.header.channel, &mut recording)?;
         }
-        let mut scene = scenery.is_drawn().then(|| {
+        let mut scene = has_scene.then(|| {
             let case = &run.topology()["case"];
             Scene::new(case["name"].as_str(), &case["parameters"], &mut names)
         });
@@ -223,11 +217,6 @@ impl Conversion {
             message_count: 0,
             timeless_count: 0,
         })
-    }
-
-    /// False while something is being made that the pictures need.
-    fn is_ready(&mut self) -> bool {
-        self.scene.as_mut().is_none_or(Scene::is_ready)
     }
 
     /// Draws the last of the scene, and says why it lacks its ground, if it does.
@@ -278,7 +267,7 @@ impl Conversion {
         }
         let after_all = self.channels.len();
         for (file, records) in run.files.iter().enumerate() {
-            if !is_order_file(records) {
+            if records.header.kind != RecordKind::LinkCondition {
                 continue;
             }
             let host = self.conditions.host_of(&records.header.channel);
@@ -375,10 +364,6 @@ fn typed_as_recorded(run: &Run, channel: &str) -> Typed {
 
 fn is_of(file: &RecordFile, channel: &str, kind: RecordKind) -> bool {
     file.header.kind == kind && file.header.channel == channel
-}
-
-fn is_order_file(file: &RecordFile) -> bool {
-    file.header.kind == RecordKind::LinkCondition
 }
 
 /// The trace of a channel, and its number among all.

@@ -173,7 +173,7 @@ fn read_record(
         else {
             return Err(DecodeFault::Kind { number });
         };
-        read_field((number, field), value, count, memory)
+        read_field(number, field, value, count, memory)
     })?;
     for (field, found) in fields.iter().zip(counts) {
         // A single value may be left out when it is zero; an array is there or it is not.
@@ -192,7 +192,8 @@ fn read_record(
 
 /// Writes one occurrence of a field behind the `count` elements that were there before.
 fn read_field(
-    (number, field): (u32, &FieldDescription),
+    number: u32,
+    field: &FieldDescription,
     value: Wire<'_>,
     count: &mut usize,
     memory: &mut [u8],
@@ -225,20 +226,21 @@ fn read_field(
                     _ => Wire::Number(varint(&mut packed)?),
                 };
                 let place = next(count).ok_or_else(|| too_many(*count))?;
-                write_value((number, field), value, &mut memory[place])?;
+                write_value(number, field, value, &mut memory[place])?;
             }
             Ok(())
         }
         (_, value) => {
             let place = next(count).ok_or_else(|| too_many(*count))?;
-            write_value((number, field), value, &mut memory[place])
+            write_value(number, field, value, &mut memory[place])
         }
     }
 }
 
 /// Writes one number into `memory`, which has its size.
 fn write_value(
-    (number, field): (u32, &FieldDescription),
+    number: u32,
+    field: &FieldDescription,
     value: Wire<'_>,
     memory: &mut [u8],
 ) -> Result<(), DecodeFault> {

@@ -24,19 +24,14 @@ const HOLD_NS: i64 = 300_000_000;
 const WAIT: Duration = Duration::from_secs(5);
 /// Messages waited for at a time; the oldest is given out when there are more.
 const WAITING_MAX: usize = 1 << 16;
-/// Stages there are.
-const STAGES: usize = 4;
 
 /// Joins the stamps of one channel.
 #[derive(Debug, Default)]
 pub(crate) struct Joining {
-    /// What is noted here, as bits.
-    wanted: u8,
+    told: Vec<Told>,
     waiting: Latencies,
     /// The same by instant of publication, nanoseconds.
     order: BTreeMap<(i64, MessageId), First>,
-    /// The newest publication of which each stage has told.
-    newest: [Newest; STAGES],
     given: Seen,
     /// The newest publication that was given out.
     newest_given: Newest,
@@ -54,25 +49,23 @@ struct First {
     is_of_this_host: bool,
 }
 
-const fn place(stage: Stage) -> usize {
-    match stage {
-        Stage::Published => 0,
-        Stage::Sent => 1,
-        Stage::Received => 2,
-        Stage::Taken => 3,
-    }
-}
-
-const fn bit(stage: Stage) -> u8 {
-    1 << place(stage)
+/// A stage that is noted here.
+#[derive(Debug)]
+struct Told {
+    stage: Stage,
+    /// The newest publication of which it has told.
+    newest: Newest,
 }
 
 impl Joining {
     /// For a channel of whose messages `noted` is noted here.
     pub(crate) fn new(noted: &[Stage]) -> Self {
-        let wanted = noted.iter().fold(0, |bits, stage| bits | bit(*stage));
+        let told = noted.iter().map(|stage| Told {
+            stage: *stage,
+            newest: Newest::default(),
+        });
         Self {
-            wanted,
+            told: told.collect(),
             ..Self::default()
         }
     }
@@ -84,7 +77,10 @@ impl Joining {
         };
         let (stage, key, published_ns) = (noted.stage, noted.message, noted.published_ns);
         if is_of_this_host {
-            self.newest[place(stage)].take(published_ns);
+            let mut told = self.told.iter_mut();
+            if let Some(told) = told.find(|told| told.stage == stage) {
+                told.newest.take(published_ns);
+            }
         }
         if self.given.contains(key.epoch, key.sequence) {
             // The others bring the publication stamp along.
@@ -104,14 +100,14 @@ impl Joining {
 
     fn is_whole(&self, key: &MessageId) -> bool {
         let message = self.waiting.get(key);
-        message.is_some_and(|one| self.wanted != 0 && has(one) & self.wanted == self.wanted)
+        let is_whole = |one: &MessageLatency| self.told.iter().all(|told| has(one, told.stage));
+        !self.told.is_empty() && message.is_some_and(is_whole)
     }
 
     /// The publication up to which every stage here has told of all that it will tell, but for what
     /// comes out of order.
     fn reached_ns(&self) -> Option<i64> {
-        let stages = (0..STAGES).filter(|place| self.wanted & (1 << place) != 0);
-        let newest = stages.map(|place| self.newest[place].get());
+        let newest = self.told.iter().map(|told| told.newest.get());
         newest.min().flatten()
     }
 
@@ -150,17 +146,15 @@ impl Joining {
     }
 }
 
-/// The stages of which a message has stamps.
-fn has(one: &MessageLatency) -> u8 {
-    // A publication stamp travels with the message, so the others bring it too.
-    let stages = [
-        (one.published_ns.is_some(), Stage::Published),
-        (one.gateway_taken_ns.is_some(), Stage::Sent),
-        (one.received_ns.is_some(), Stage::Received),
-        (one.taken_ns.is_some(), Stage::Taken),
-    ];
-    let there = stages.into_iter().filter(|(is_there, _)| *is_there);
-    there.fold(0, |bits, (_, stage)| bits | bit(stage))
+/// True when a message has the stamp of this stage.
+const fn has(one: &MessageLatency, stage: Stage) -> bool {
+    match stage {
+        // It travels with the message, so the others bring it too.
+        Stage::Published => one.published_ns.is_some(),
+        Stage::Sent => one.gateway_taken_ns.is_some(),
+        Stage::Received => one.received_ns.is_some(),
+        Stage::Taken => one.taken_ns.is_some(),
+    }
 }
 
 #[cfg(test)]

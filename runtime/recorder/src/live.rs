@@ -18,7 +18,7 @@ use crate::live_clocks::LiveClocks;
 use crate::net::{self, MessageLatency};
 use crate::run::Run;
 use crate::scene::waiting::LiveScene;
-use crate::scene::{Heard, Scene, Scenery};
+use crate::scene::{Heard, Scene};
 use crate::sink::{Sink, Topic};
 use crate::topics::{self, Names};
 use crate::writer::Stamp;
@@ -43,16 +43,20 @@ struct LiveChannel {
 #[derive(Debug)]
 pub(crate) struct LiveTopics {
     channels: BTreeMap<String, LiveChannel>,
-    names: Names,
+    /// Those that were not free among them.
+    pub(crate) names: Names,
     events: Topic,
     conditions: Conditions,
     scene: Option<LiveScene>,
-    clocks: LiveClocks,
-    counts: Counts,
+    /// The clocks of the recording.
+    pub(crate) clocks: LiveClocks,
+    /// What was made so far.
+    pub(crate) counts: Counts,
 }
 
 /// What was made, and what could not be.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[allow(clippy::struct_field_names, reason = "the ending of every count")]
 pub(crate) struct Counts {
     /// Messages of the run's own channels.
     pub(crate) message_count: u64,
@@ -60,14 +64,12 @@ pub(crate) struct Counts {
     pub(crate) misfit_count: u64,
     /// Messages and records without a time on the recording's clock, left out.
     pub(crate) timeless_count: u64,
-    /// When the newest message was published, on the recording's clock.
-    pub(crate) newest_ns: u64,
 }
 
 impl LiveTopics {
     /// Names the topics of a run; they appear with their first message. Without a scene, what it takes
     /// to draw one is not worked out.
-    pub(crate) fn of(feed: &Feed, scenery: Scenery) -> Self {
+    pub(crate) fn of(feed: &Feed, has_scene: bool) -> Self {
         let mut names = Names::default();
         let wanted = feed.channels().map(|channel| {
             let described = Some(&channel.description);
@@ -82,18 +84,18 @@ impl LiveTopics {
         let channels = channels
             .map(|(channel, topics)| (topics.name.clone(), LiveChannel::of(feed, channel, topics)))
             .collect();
-        let events = names.claim("/score/events".to_owned());
+        let events = topics::event_topic(&mut names);
         let topology = &feed.manifest().topology;
         let conditions = Conditions::of(topology, &mut names);
         let case = &topology["case"];
-        let scene = scenery.is_drawn().then(|| {
+        let scene = has_scene.then(|| {
             let scene = Scene::new(case["name"].as_str(), &case["parameters"], &mut names);
             LiveScene::new(scene)
         });
         Self {
             channels,
             names,
-            events: Topic::new(events, topics::event_schema(), &[]),
+            events,
             conditions,
             scene,
             clocks: LiveClocks::of(feed),
@@ -111,15 +113,7 @@ impl LiveTopics {
         sink: &mut S,
     ) -> Result<(), S::Error> {
         match event {
-            Event::Message {
-                channel,
-                origin,
-                envelope,
-                payload,
-            } => {
-                let name = channel.description.name.as_str();
-                self.message(name, *origin, envelope, payload, sink)
-            }
+            Event::Message { .. } => self.message(event, sink),
             Event::Record {
                 channel,
                 is_of_this_host,
@@ -131,14 +125,17 @@ impl LiveTopics {
         }
     }
 
-    fn message<S: Sink>(
-        &mut self,
-        name: &str,
-        origin: Origin,
-        envelope: &Envelope,
-        payload: &[u8],
-        sink: &mut S,
-    ) -> Result<(), S::Error> {
+    fn message<S: Sink>(&mut self, event: &Event<'_>, sink: &mut S) -> Result<(), S::Error> {
+        let Event::Message {
+            channel,
+            origin,
+            envelope,
+            payload,
+        } = event
+        else {
+            return Ok(());
+        };
+        let name = channel.description.name.as_str();
         let Some(channel) = self.channels.get_mut(name) else {
             return Ok(());
         };
@@ -154,10 +151,9 @@ impl LiveTopics {
         channel.note_written(envelope);
         self.counts.message_count += 1;
         // What another host sends at the end was long ago: the pictures of that time are drawn.
-        if origin == Origin::OtherHost {
+        if *origin == Origin::OtherHost {
             return Ok(());
         }
-        self.counts.newest_ns = self.counts.newest_ns.max(at_ns);
         if let Some((scene, message)) = self.scene.as_mut().zip(channel.topics.message.as_deref()) {
             let heard = Heard {
                 channel: name,
@@ -196,26 +192,7 @@ impl LiveTopics {
         channel
             .joining
             .take(record, is_of_this_host, Instant::now());
-        self.give_out_of(name, &mut Joining::next, sink)
-    }
-
-    fn latency<S: Sink>(
-        &mut self,
-        name: &str,
-        mut one: MessageLatency,
-        sink: &mut S,
-    ) -> Result<(), S::Error> {
-        let Some(channel) = self.channels.get_mut(name) else {
-            return Ok(());
-        };
-        let Some(at_ns) = self.clocks.latency_ns(&channel.host, &one) else {
-            self.counts.timeless_count += 1;
-            return Ok(());
-        };
-        if self.clocks.compares() || channel.host == channel.receiving_host {
-            one.compare_ends();
-        }
-        channel.topics.write_latency(at_ns, &one, sink)
+        channel.give_out(&mut Joining::next, &mut self.clocks, &mut self.counts, sink)
     }
 
     /// Nothing more is to be read by `now`: gives out the stamps of messages that were held for long
@@ -240,27 +217,9 @@ impl LiveTopics {
         next: &mut dyn FnMut(&mut Joining) -> Option<MessageLatency>,
         sink: &mut S,
     ) -> Result<(), S::Error> {
-        let names: Vec<String> = self.channels.keys().cloned().collect();
-        for name in names {
-            self.give_out_of(&name, next, sink)?;
-        }
-        Ok(())
-    }
-
-    fn give_out_of<S: Sink>(
-        &mut self,
-        name: &str,
-        next: &mut dyn FnMut(&mut Joining) -> Option<MessageLatency>,
-        sink: &mut S,
-    ) -> Result<(), S::Error> {
-        while let Some(one) = self
-            .channels
-            .get_mut(name)
-            .and_then(|one| next(&mut one.joining))
-        {
-            self.latency(name, one, sink)?;
-        }
-        Ok(())
+        let (clocks, counts) = (&mut self.clocks, &mut self.counts);
+        let mut channels = self.channels.values_mut();
+        channels.try_for_each(|channel| channel.give_out(next, clocks, counts, sink))
     }
 
     /// Writes what only the end of the run tells: the verdicts of its links, and the events of its
@@ -301,21 +260,6 @@ impl LiveTopics {
             }
         }
         Ok(())
-    }
-
-    /// What was made so far.
-    pub(crate) const fn counts(&self) -> Counts {
-        self.counts
-    }
-
-    /// The clocks of the recording.
-    pub(crate) fn clocks(&mut self) -> &mut LiveClocks {
-        &mut self.clocks
-    }
-
-    /// The names that were not free.
-    pub(crate) const fn names(&self) -> &Names {
-        &self.names
     }
 
     /// Messages that should be there and are not, by channel. `is_silent` says that all records of
@@ -443,6 +387,27 @@ impl LiveChannel {
                 })
             ),
         }
+    }
+
+    /// Writes the stamps of the messages that `next` gives out.
+    fn give_out<S: Sink>(
+        &mut self,
+        next: &mut dyn FnMut(&mut Joining) -> Option<MessageLatency>,
+        clocks: &mut LiveClocks,
+        counts: &mut Counts,
+        sink: &mut S,
+    ) -> Result<(), S::Error> {
+        while let Some(mut one) = next(&mut self.joining) {
+            let Some(at_ns) = clocks.latency_ns(&self.host, &one) else {
+                counts.timeless_count += 1;
+                continue;
+            };
+            if clocks.compares() || self.host == self.receiving_host {
+                one.compare_ends();
+            }
+            self.topics.write_latency(at_ns, &one, sink)?;
+        }
+        Ok(())
     }
 
     fn note_written(&mut self, envelope: &Envelope) {

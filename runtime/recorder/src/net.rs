@@ -8,151 +8,80 @@ use hil_models::trace::{Trace, TraceFate, TraceRecord, UNAVAILABLE_NS, UNBOUNDED
 use hil_runtime::rundir::record::{RecordFile, RecordKind};
 use hil_runtime::rundir::live_run::Stage;
 use hil_runtime::watch::Record;
-use prost_types::field_descriptor_proto::Type;
 
-use crate::schema::{self, OwnField, Schema};
+use crate::schema::own_message;
 
-/// The stamps of one message, nanoseconds; absent where there was none. Each is on the clock that
-/// its name says: monotonic of its own host unless `realtime` or `card` stands in it.
-#[derive(Clone, PartialEq, prost::Message)]
-pub(crate) struct MessageLatency {
-    /// Number on the channel, from 0 at each start of the producer.
-    #[prost(uint64, tag = "1")]
-    pub(crate) sequence: u64,
-    /// The producer's start.
-    #[prost(uint32, tag = "2")]
-    pub(crate) epoch: u32,
-    /// The producer published it, on its host.
-    #[prost(int64, optional, tag = "3")]
-    pub(crate) published_ns: Option<i64>,
-    /// The sending gateway took it.
-    #[prost(int64, optional, tag = "4")]
-    pub(crate) gateway_taken_ns: Option<i64>,
-    /// Just before the send call.
-    #[prost(int64, optional, tag = "5")]
-    pub(crate) handed_ns: Option<i64>,
-    /// Kernel transmit stamp.
-    #[prost(int64, optional, tag = "6")]
-    pub(crate) tx_realtime_ns: Option<i64>,
-    /// The network card's transmit stamp, on the card's clock.
-    #[prost(int64, optional, tag = "7")]
-    pub(crate) tx_card_ns: Option<i64>,
-    /// Real-time minus monotonic clock of the sending host.
-    #[prost(int64, optional, tag = "8")]
-    pub(crate) sender_realtime_offset_ns: Option<i64>,
-    /// The network card's receive stamp, on the card's clock.
-    #[prost(int64, optional, tag = "9")]
-    pub(crate) rx_card_ns: Option<i64>,
-    /// Kernel receive stamp.
-    #[prost(int64, optional, tag = "10")]
-    pub(crate) rx_realtime_ns: Option<i64>,
-    /// The receive call had returned, on the receiving host.
-    #[prost(int64, optional, tag = "11")]
-    pub(crate) received_ns: Option<i64>,
-    /// The receiving gateway published it.
-    #[prost(int64, optional, tag = "12")]
-    pub(crate) forwarded_ns: Option<i64>,
-    /// Real-time minus monotonic clock of the receiving host.
-    #[prost(int64, optional, tag = "13")]
-    pub(crate) receiver_realtime_offset_ns: Option<i64>,
-    /// The consumer took it.
-    #[prost(int64, optional, tag = "14")]
-    pub(crate) taken_ns: Option<i64>,
-    /// Published to taken; absent unless both hosts read one clock.
-    #[prost(int64, optional, tag = "15")]
-    pub(crate) delay_ns: Option<i64>,
-    /// Handed to received, as the run's link trace has it.
-    #[prost(int64, optional, tag = "16")]
-    pub(crate) link_delay_ns: Option<i64>,
-    /// Largest error of `link_delay_ns` by the clocks' alignment; 0 on one clock.
-    #[prost(uint64, optional, tag = "17")]
-    pub(crate) link_delay_bound_ns: Option<u64>,
+own_message! {
+    /// The stamps of one message, nanoseconds; absent where there was none. Each is on the clock that
+    /// its name says: monotonic of its own host unless `realtime` or `card` stands in it.
+    pub(crate) struct MessageLatency as "MessageLatency" {
+        /// Number on the channel, from 0 at each start of the producer.
+        sequence: uint64 = "1",
+        /// The producer's start.
+        epoch: uint32 = "2",
+        /// The producer published it, on its host.
+        published_ns: optional int64 = "3",
+        /// The sending gateway took it.
+        gateway_taken_ns: optional int64 = "4",
+        /// Just before the send call.
+        handed_ns: optional int64 = "5",
+        /// Kernel transmit stamp.
+        tx_realtime_ns: optional int64 = "6",
+        /// The network card's transmit stamp, on the card's clock.
+        tx_card_ns: optional int64 = "7",
+        /// Real-time minus monotonic clock of the sending host.
+        sender_realtime_offset_ns: optional int64 = "8",
+        /// The network card's receive stamp, on the card's clock.
+        rx_card_ns: optional int64 = "9",
+        /// Kernel receive stamp.
+        rx_realtime_ns: optional int64 = "10",
+        /// The receive call had returned, on the receiving host.
+        received_ns: optional int64 = "11",
+        /// The receiving gateway published it.
+        forwarded_ns: optional int64 = "12",
+        /// Real-time minus monotonic clock of the receiving host.
+        receiver_realtime_offset_ns: optional int64 = "13",
+        /// The consumer took it.
+        taken_ns: optional int64 = "14",
+        /// Published to taken; absent unless both hosts read one clock.
+        delay_ns: optional int64 = "15",
+        /// Handed to received, as the run's link trace has it.
+        link_delay_ns: optional int64 = "16",
+        /// Largest error of `link_delay_ns` by the clocks' alignment; 0 on one clock.
+        link_delay_bound_ns: optional uint64 = "17",
+    }
 }
 
-const LATENCY: [OwnField; 17] = [
-    ("sequence", Type::Uint64, false),
-    ("epoch", Type::Uint32, false),
-    ("published_ns", Type::Int64, true),
-    ("gateway_taken_ns", Type::Int64, true),
-    ("handed_ns", Type::Int64, true),
-    ("tx_realtime_ns", Type::Int64, true),
-    ("tx_card_ns", Type::Int64, true),
-    ("sender_realtime_offset_ns", Type::Int64, true),
-    ("rx_card_ns", Type::Int64, true),
-    ("rx_realtime_ns", Type::Int64, true),
-    ("received_ns", Type::Int64, true),
-    ("forwarded_ns", Type::Int64, true),
-    ("receiver_realtime_offset_ns", Type::Int64, true),
-    ("taken_ns", Type::Int64, true),
-    ("delay_ns", Type::Int64, true),
-    ("link_delay_ns", Type::Int64, true),
-    ("link_delay_bound_ns", Type::Uint64, true),
-];
-
-/// Schema of [`MessageLatency`].
-pub(crate) fn latency_schema() -> Schema {
-    schema::own("MessageLatency", &LATENCY)
-}
-
-/// What the link did to one message.
-#[derive(Clone, PartialEq, prost::Message)]
-#[allow(
-    clippy::struct_excessive_bools,
-    reason = "a row of a table, not a state"
-)]
-pub(crate) struct LinkDecision {
-    /// Number on the channel, from 0 at each start of the producer.
-    #[prost(uint64, tag = "1")]
-    pub(crate) sequence: u64,
-    /// Starts of the producer before this message's.
-    #[prost(uint32, tag = "2")]
-    pub(crate) start: u32,
-    /// `delivered`, `lost-in-network`, `lost-before-link`, `lost-after-link` or `unknown`.
-    #[prost(string, tag = "3")]
-    pub(crate) fate: String,
-    /// True for the three kinds of loss.
-    #[prost(bool, tag = "4")]
-    pub(crate) is_lost: bool,
-    /// True when a second copy arrived.
-    #[prost(bool, tag = "5")]
-    pub(crate) is_duplicated: bool,
-    /// It arrived after a message published later.
-    #[prost(bool, tag = "6")]
-    pub(crate) is_reordered: bool,
-    /// A link model, not a network, decided.
-    #[prost(bool, tag = "7")]
-    pub(crate) is_emulated: bool,
-    /// Handed to the link until it arrived.
-    #[prost(int64, optional, tag = "8")]
-    pub(crate) delay_ns: Option<i64>,
-    /// Largest error of `delay_ns` by the clocks' alignment; 0 on one clock.
-    #[prost(uint64, optional, tag = "9")]
-    pub(crate) delay_bound_ns: Option<u64>,
-    /// Handed to the link until the second copy arrived.
-    #[prost(int64, optional, tag = "10")]
-    pub(crate) second_delay_ns: Option<i64>,
-    /// Size of the message.
-    #[prost(uint32, tag = "11")]
-    pub(crate) size_bytes: u32,
-}
-
-const DECISION: [OwnField; 11] = [
-    ("sequence", Type::Uint64, false),
-    ("start", Type::Uint32, false),
-    ("fate", Type::String, false),
-    ("is_lost", Type::Bool, false),
-    ("is_duplicated", Type::Bool, false),
-    ("is_reordered", Type::Bool, false),
-    ("is_emulated", Type::Bool, false),
-    ("delay_ns", Type::Int64, true),
-    ("delay_bound_ns", Type::Uint64, true),
-    ("second_delay_ns", Type::Int64, true),
-    ("size_bytes", Type::Uint32, false),
-];
-
-/// Schema of [`LinkDecision`].
-pub(crate) fn decision_schema() -> Schema {
-    schema::own("LinkDecision", &DECISION)
+own_message! {
+    /// What the link did to one message.
+    #[allow(
+        clippy::struct_excessive_bools,
+        reason = "a row of a table, not a state"
+    )]
+    pub(crate) struct LinkDecision as "LinkDecision" {
+        /// Number on the channel, from 0 at each start of the producer.
+        sequence: uint64 = "1",
+        /// Starts of the producer before this message's.
+        start: uint32 = "2",
+        /// `delivered`, `lost-in-network`, `lost-before-link`, `lost-after-link` or `unknown`.
+        fate: string = "3",
+        /// True for the three kinds of loss.
+        is_lost: bool = "4",
+        /// True when a second copy arrived.
+        is_duplicated: bool = "5",
+        /// It arrived after a message published later.
+        is_reordered: bool = "6",
+        /// A link model, not a network, decided.
+        is_emulated: bool = "7",
+        /// Handed to the link until it arrived.
+        delay_ns: optional int64 = "8",
+        /// Largest error of `delay_ns` by the clocks' alignment; 0 on one clock.
+        delay_bound_ns: optional uint64 = "9",
+        /// Handed to the link until the second copy arrived.
+        second_delay_ns: optional int64 = "10",
+        /// Size of the message.
+        size_bytes: uint32 = "11",
+    }
 }
 
 impl LinkDecision {

@@ -17,7 +17,6 @@ use crate::facts::{self, Words};
 use crate::live::LiveTopics;
 use crate::pace::Pace;
 use crate::run::Run;
-use crate::scene::Scenery;
 use crate::split::{Files, prepare, target};
 use crate::writer::WriteError;
 
@@ -78,6 +77,7 @@ pub(crate) enum Which {
 
 /// What is asked for.
 #[derive(Debug, Clone)]
+#[allow(clippy::struct_excessive_bools, reason = "options of a command line")]
 pub(crate) struct Request {
     /// Which run.
     pub(crate) run: Which,
@@ -96,7 +96,7 @@ pub(crate) struct Request {
     /// Replace files that exist.
     pub(crate) force: bool,
     /// Draw the scene.
-    pub(crate) scenery: Scenery,
+    pub(crate) has_scene: bool,
 }
 
 /// What a recording came to.
@@ -121,7 +121,7 @@ pub(crate) struct Recorded {
 }
 
 /// How far a recording is.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Progress<'a> {
     /// The run; empty while none has begun.
     pub(crate) run: &'a str,
@@ -152,20 +152,13 @@ pub(crate) fn record(request: &Request, look: Look<'_>) -> Result<Recorded, Reco
         feed.skip_to_now();
     }
     let files = Files::begin(&target, request.split_bytes, request.force)?;
-    let topics = LiveTopics::of(&feed, request.scenery);
+    let topics = LiveTopics::of(&feed, request.has_scene);
     let mut recording = LiveRecording::begin(feed, topics, files)?;
     let signal = recording.run(request.flush, look)?;
     recording.finish(signal)
 }
 
 fn find(request: &Request, look: Look<'_>) -> Result<LiveRun, RecordError> {
-    let nothing = Progress {
-        run: "",
-        rate_hz: 0.0,
-        size_bytes: 0,
-        file_count: 0,
-        missed_count: 0,
-    };
     let wanted = match &request.run {
         Which::Named(wanted) => wanted.as_deref(),
         Which::In(folder) => {
@@ -188,7 +181,7 @@ fn find(request: &Request, look: Look<'_>) -> Result<LiveRun, RecordError> {
             }
             Err(error) => return Err(error.into()),
         }
-        if let Some(signal) = look(&nothing) {
+        if let Some(signal) = look(&Progress::default()) {
             return Err(RecordError::Interrupted(signal));
         }
         thread::sleep(WAIT_PAUSE);
@@ -268,7 +261,7 @@ impl LiveRecording {
             }
             let since_told = now.duration_since(told);
             if since_told >= PROGRESS_PERIOD {
-                let count = self.topics.counts().message_count;
+                let count = self.topics.counts.message_count;
                 let rate_hz = (count - told_count) as f64 / since_told.as_secs_f64();
                 (told, told_count) = (now, count);
                 if let Some(signal) = look(&self.progress(rate_hz)) {
@@ -294,26 +287,17 @@ impl LiveRecording {
     }
 
     fn poll(&mut self) -> Result<Poll, WriteError> {
-        let Self {
-            feed,
-            topics,
-            files,
-            is_silent,
-            has_summary,
-            problems,
-            ..
-        } = self;
-        topics.clocks().learn(feed.has_one_clock());
+        self.topics.clocks.learn(self.feed.has_one_clock());
         let mut failed = None;
-        let polled = feed.poll(&mut |event| {
+        let polled = self.feed.poll(&mut |event| {
             match &event {
-                Event::Problem(text) => problems.note(text),
-                Event::Silent => *is_silent = true,
-                Event::Ended { has_summary: has } => *has_summary = *has,
+                Event::Problem(text) => self.problems.note(text),
+                Event::Silent => self.is_silent = true,
+                Event::Ended { has_summary } => self.has_summary = *has_summary,
                 Event::Message { .. } | Event::Record { .. } => {}
             }
             if failed.is_none() {
-                failed = topics.take(&event, files).err();
+                failed = self.topics.take(&event, &mut self.files).err();
             }
         });
         failed.map_or(Ok(polled), Err)
@@ -355,12 +339,11 @@ impl LiveRecording {
         if self.has_summary {
             // A folder that cannot be listed is one more thing to say, and no reason to lose the rest.
             if let Err(error) = run.read_traces() {
-                run.gaps.words.push(error.to_string());
-                run.gaps.unreadable_file_count += 1;
+                run.gaps.leave_out(error.to_string());
             }
             let section = run.summary.as_ref().and_then(|one| one.clocks.as_ref());
             let has_one_clock = section.map(|section| section.has_one_clock);
-            let clocks = self.topics.clocks();
+            let clocks = &mut self.topics.clocks;
             let mut time_ns = |host: &str, at_ns| clocks.time_ns(host, at_ns);
             let events = facts::event_times(&run, has_one_clock, &mut time_ns);
             self.topics.conclude(&run, &events, &mut self.files)?;
@@ -377,7 +360,7 @@ impl LiveRecording {
         }
         self.files.open().describe("hil.end", end)?;
         facts::attach(self.files.open(), &run.folder)?;
-        let counts = self.topics.counts();
+        let counts = self.topics.counts;
         let missed = self.topics.missed(&self.feed, self.is_silent);
         let mut words = self.problems.words.clone();
         if self.has_summary {
@@ -408,7 +391,7 @@ impl LiveRecording {
             "exit_reason".to_owned(),
             "recorded while it went".to_owned(),
         );
-        self.told_clocks = self.topics.clocks().words();
+        self.told_clocks = self.topics.clocks.words();
         let file = self.files.open();
         file.describe("hil.clocks", self.told_clocks.clone())?;
         file.describe("hil.run", words)?;
@@ -418,7 +401,7 @@ impl LiveRecording {
 
     /// What was recorded so far, at the end of each file.
     fn describe_recording(&mut self, how: &str) -> Result<(), WriteError> {
-        let counts = self.topics.counts();
+        let counts = self.topics.counts;
         let numbers = [
             ("file_number", self.files.number() as u64),
             ("message_count", counts.message_count),
@@ -428,7 +411,7 @@ impl LiveRecording {
             ("unordered_latency_count", self.topics.unordered_count()),
             ("problem_count", self.problems.count),
         ];
-        let names = self.topics.names();
+        let names = &self.topics.names;
         let mut words = facts::recording_words(&numbers, &self.problems.words, names);
         words.insert("mode".to_owned(), "live".to_owned());
         words.insert("ended".to_owned(), how.to_owned());
@@ -438,7 +421,7 @@ impl LiveRecording {
         for (channel, count) in self.topics.earlier(&self.feed) {
             words.insert(format!("before {channel}"), count.to_string());
         }
-        let clocks = self.topics.clocks().words();
+        let clocks = self.topics.clocks.words();
         let channels = self.topics.channel_words();
         let file = self.files.open();
         // Offsets of other clocks come with the last records.

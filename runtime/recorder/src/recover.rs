@@ -9,6 +9,7 @@ use mcap::records::Record;
 use mcap::{Attachment, Channel, Schema};
 
 use crate::scan::{Loss, ScanEnd, ScanError, scan};
+use crate::sink::Sink as _;
 use crate::writer::{Recording, Stamp, WriteError};
 use hil_runtime::platform::words::counted_plainly;
 
@@ -104,7 +105,7 @@ fn attempt(
     let end = scan(from, &mut |offset, record| {
         match copy.take(record) {
             Ok(()) => {}
-            Err(CopyError::Conflict(why)) => conflicts.push((offset, why)),
+            Err(CopyError::Conflict(why)) => conflicts.push(Loss::new(offset, 0, why)),
             Err(CopyError::Write(error)) => copy.stopped = Some(error.into()),
         }
         copy.record_count += 1;
@@ -118,14 +119,7 @@ fn attempt(
     }
     let mut recovered = copy.recovered;
     recovered.end = end;
-    for (offset, why) in conflicts {
-        recovered.end.losses.push(Loss {
-            offset,
-            size_bytes: 0,
-            message_count: None,
-            why,
-        });
-    }
+    recovered.end.losses.extend(conflicts);
     let mut recording = copy.recording;
     recording.describe("hil.recovery", words(from, &recovered))?;
     Ok((recording, recovered))
@@ -135,21 +129,20 @@ fn attempt(
 fn words(from: &Path, recovered: &Recovered) -> BTreeMap<String, String> {
     let name = from.file_name().unwrap_or_default().to_string_lossy();
     let lost = recovered.lost_count();
-    let mut words = BTreeMap::from([
-        ("recovered_from".to_owned(), name.into_owned()),
+    let lost = lost.map_or_else(|| "unknown".to_owned(), |count| count.to_string());
+    let words = [
+        ("recovered_from", name.into_owned()),
+        ("recorder_version", env!("CARGO_PKG_VERSION").to_owned()),
+        ("lost_message_count", lost),
         (
-            "recorder_version".to_owned(),
-            env!("CARGO_PKG_VERSION").to_owned(),
-        ),
-        (
-            "lost_message_count".to_owned(),
-            lost.map_or_else(|| "unknown".to_owned(), |count| count.to_string()),
-        ),
-        (
-            "message_count_without_topic".to_owned(),
+            "message_count_without_topic",
             recovered.homeless_count.to_string(),
         ),
-    ]);
+    ];
+    let words = words
+        .into_iter()
+        .map(|(key, value)| (key.to_owned(), value));
+    let mut words: BTreeMap<String, String> = words.collect();
     for (loss, number) in recovered.end.losses.iter().zip(1..) {
         words.insert(format!("loss_{number:04}"), loss_words(loss));
     }
@@ -231,36 +224,24 @@ impl Copy {
     }
 
     fn channel(&mut self, channel: mcap::records::Channel) -> Result<(), CopyError> {
-        let schema = self.schemas.get(&channel.schema_id).cloned();
-        if schema.is_none() && channel.schema_id != 0 {
-            let why = format!(
-                "the schema of topic {:?} was lost; its messages are kept without",
-                channel.topic
-            );
-            self.put(channel, None)?;
-            return Err(CopyError::Conflict(why));
+        let (id, schema_id) = (channel.id, channel.schema_id);
+        let schema = self.schemas.get(&schema_id).cloned();
+        let is_lost = schema.is_none() && schema_id != 0;
+        let why = is_lost.then(|| {
+            let topic = &channel.topic;
+            format!("the schema of topic {topic:?} was lost; its messages are kept without")
+        });
+        if !self.channels.contains(&id) {
+            self.recording.copy_topic(&Channel {
+                id,
+                topic: channel.topic,
+                schema,
+                message_encoding: channel.message_encoding,
+                metadata: channel.metadata,
+            })?;
+            self.channels.insert(id);
         }
-        self.put(channel, schema)
-    }
-
-    fn put(
-        &mut self,
-        channel: mcap::records::Channel,
-        schema: Option<Arc<Schema<'static>>>,
-    ) -> Result<(), CopyError> {
-        let id = channel.id;
-        if self.channels.contains(&id) {
-            return Ok(());
-        }
-        self.recording.copy_topic(&Channel {
-            id,
-            topic: channel.topic,
-            schema,
-            message_encoding: channel.message_encoding,
-            metadata: channel.metadata,
-        })?;
-        self.channels.insert(id);
-        Ok(())
+        why.map_or(Ok(()), |why| Err(CopyError::Conflict(why)))
     }
 
     fn message(

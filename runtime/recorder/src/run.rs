@@ -82,6 +82,12 @@ pub(crate) struct Gaps {
 }
 
 impl Gaps {
+    /// A file was left out, in words.
+    pub(crate) fn leave_out(&mut self, words: String) {
+        self.unreadable_file_count += 1;
+        self.words.push(words);
+    }
+
     /// True when anything of the run is not in the recording.
     pub(crate) const fn is_any(&self) -> bool {
         self.unreadable_file_count > 0
@@ -127,7 +133,7 @@ impl Run {
     pub(crate) fn without_records(folder: RunFolder) -> Self {
         let mut gaps = Gaps::default();
         Self {
-            manifest: read_json(&folder.manifest(), "the run's own layouts", &mut gaps),
+            manifest: read_manifest(&folder.manifest(), &mut gaps),
             summary: read_summary(&folder, &mut gaps),
             files: Vec::new(),
             traces: Vec::new(),
@@ -170,8 +176,7 @@ impl Run {
                 self.files.push(file);
             }
             Err(error) => {
-                self.gaps.unreadable_file_count += 1;
-                self.gaps.words.push(format!("{error}; left out"));
+                self.gaps.leave_out(format!("{error}; left out"));
             }
         }
     }
@@ -196,9 +201,8 @@ impl Run {
                 self.traces.push(decoded.trace);
             }
             Err(why) => {
-                self.gaps.unreadable_file_count += 1;
                 let words = format!("trace {}: {why}; left out", path.display());
-                self.gaps.words.push(words);
+                self.gaps.leave_out(words);
             }
         }
     }
@@ -268,13 +272,12 @@ fn listed(folder: &Path) -> Result<Vec<PathBuf>, RunError> {
     Ok(paths)
 }
 
-fn read_json(path: &Path, what: &str, gaps: &mut Gaps) -> Option<Manifest> {
+fn read_manifest(path: &Path, gaps: &mut Gaps) -> Option<Manifest> {
     let read = fs::read_to_string(path).map_err(|error| error.to_string());
     let read = read.and_then(|text| serde_json::from_str(&text).map_err(|e| e.to_string()));
     read.inspect_err(|why| {
-        gaps.unreadable_file_count += 1;
-        let words = format!("{}: {why}; without {what}", path.display());
-        gaps.words.push(words);
+        let what = "the run's own layouts";
+        gaps.leave_out(format!("{}: {why}; without {what}", path.display()));
     })
     .ok()
 }
@@ -290,9 +293,7 @@ fn read_summary(folder: &RunFolder, gaps: &mut Gaps) -> Option<RunSummary> {
     };
     RunSummary::from_json(&text)
         .inspect_err(|error| {
-            gaps.unreadable_file_count += 1;
-            let words = format!("{}: {error}; without its events", path.display());
-            gaps.words.push(words);
+            gaps.leave_out(format!("{}: {error}; without its events", path.display()));
         })
         .ok()
 }

@@ -53,6 +53,18 @@ pub(crate) struct Loss {
     pub(crate) why: String,
 }
 
+impl Loss {
+    /// Of a record in which nobody knows how many messages were.
+    pub(crate) const fn new(offset: u64, size_bytes: u64, why: String) -> Self {
+        Self {
+            offset,
+            size_bytes,
+            message_count: None,
+            why,
+        }
+    }
+}
+
 /// Hears each record with its place in the file, and says whether it wants more.
 pub(crate) type Visit<'a> = dyn FnMut(u64, Record<'_>) -> bool + 'a;
 
@@ -183,24 +195,20 @@ impl<R: Read> Scanner<R> {
         }
         let body = self.take(length.min(left))?;
         if *opcode == op::CHUNK {
-            let goes_on = self.chunk((start, is_whole), &body, visit);
+            let goes_on = self.chunk(start, is_whole, &body, visit);
             return Ok(goes_on && is_whole);
         }
-        Ok(self.record((start, *opcode), &body, visit))
+        Ok(self.record(start, *opcode, &body, visit))
     }
 
     fn lose(&mut self, offset: u64, why: &str) {
         let size_bytes = self.end.size_bytes.saturating_sub(offset);
-        self.end.losses.push(Loss {
-            offset,
-            size_bytes,
-            message_count: None,
-            why: why.to_owned(),
-        });
+        let loss = Loss::new(offset, size_bytes, why.to_owned());
+        self.end.losses.push(loss);
     }
 
     /// A record outside of any chunk; false to end.
-    fn record(&mut self, (start, opcode): (u64, u8), body: &[u8], visit: &mut Visit<'_>) -> bool {
+    fn record(&mut self, start: u64, opcode: u8, body: &[u8], visit: &mut Visit<'_>) -> bool {
         match parse(opcode, body) {
             Ok(Record::MessageIndex(index)) => {
                 let loss = self.damaged.and_then(|at| self.end.losses.get_mut(at));
@@ -221,24 +229,15 @@ impl<R: Read> Scanner<R> {
             Ok(record) => return visit(start, record),
             Err(why) => {
                 let size_bytes = body.len() as u64 + RECORD_HEAD_BYTES;
-                self.end.losses.push(Loss {
-                    offset: start,
-                    size_bytes,
-                    message_count: None,
-                    why: format!("a record of kind {opcode:#04x} is damaged: {why}"),
-                });
+                let why = format!("a record of kind {opcode:#04x} is damaged: {why}");
+                self.end.losses.push(Loss::new(start, size_bytes, why));
             }
         }
         true
     }
 
     /// The records of a chunk; false to end.
-    fn chunk(
-        &mut self,
-        (start, is_whole): (u64, bool),
-        body: &[u8],
-        visit: &mut Visit<'_>,
-    ) -> bool {
+    fn chunk(&mut self, start: u64, is_whole: bool, body: &[u8], visit: &mut Visit<'_>) -> bool {
         self.damaged = None;
         let mut goes_on = true;
         let mut kept_count = 0_u64;
@@ -250,12 +249,12 @@ impl<R: Read> Scanner<R> {
         };
         let decoded = if is_whole {
             let bytes = framed(unpadded(body));
-            decode(&bytes, (true, self.record_bytes_max), &mut take)
+            decode(&bytes, true, self.record_bytes_max, &mut take)
         } else {
             // Its header was to be written last, so nothing in it but the compression counts.
             unfinished(body).map_or_else(
                 || Err("its header is not whole".to_owned()),
-                |bytes| decode(&bytes, (false, self.record_bytes_max), &mut take),
+                |bytes| decode(&bytes, false, self.record_bytes_max, &mut take),
             )
         };
         let why = match decoded {
@@ -266,12 +265,9 @@ impl<R: Read> Scanner<R> {
             Err(why) => format!("the file ends here ({why})"),
         };
         self.damaged = is_whole.then_some(self.end.losses.len());
-        self.end.losses.push(Loss {
-            offset: start,
-            size_bytes: body.len() as u64 + RECORD_HEAD_BYTES,
-            message_count: None,
-            why: format!("a chunk is not whole: {why}; {kept_count} of its messages were kept"),
-        });
+        let size_bytes = body.len() as u64 + RECORD_HEAD_BYTES;
+        let why = format!("a chunk is not whole: {why}; {kept_count} of its messages were kept");
+        self.end.losses.push(Loss::new(start, size_bytes, why));
         true
     }
 }
@@ -335,7 +331,8 @@ type Take<'a> = dyn FnMut(u8, &[u8]) -> Result<bool, String> + 'a;
 /// Hands every record of the chunk record `bytes` to `take` until that wants no more.
 fn decode(
     bytes: &[u8],
-    (is_checked, record_bytes_max): (bool, usize),
+    is_checked: bool,
+    record_bytes_max: usize,
     take: &mut Take<'_>,
 ) -> Result<(), String> {
     let options = LinearReaderOptions::default()

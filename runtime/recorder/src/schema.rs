@@ -54,7 +54,72 @@ pub(crate) fn opaque() -> Schema {
 }
 
 /// A field of the recorder's own messages: its name and type, and whether it may be absent.
-pub(crate) type OwnField = (&'static str, Type, bool);
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct OwnField {
+    /// Its name.
+    pub(crate) name: &'static str,
+    /// Its type.
+    pub(crate) kind: Type,
+    /// True when it is `optional`.
+    pub(crate) may_be_absent: bool,
+}
+
+/// One of the recorder's own messages, `hil.<name>`: its fields with their kinds and numbers, from which
+/// protobuf's form and the schema are made.
+macro_rules! own_message {
+    (@type optional $kind:ident) => { Option<$crate::schema::own_message!(@type $kind)> };
+    (@type uint32) => { u32 };
+    (@type uint64) => { u64 };
+    (@type int64) => { i64 };
+    (@type double) => { f64 };
+    (@type bool) => { bool };
+    (@type string) => { String };
+    (@kind uint32) => { prost_types::field_descriptor_proto::Type::Uint32 };
+    (@kind uint64) => { prost_types::field_descriptor_proto::Type::Uint64 };
+    (@kind int64) => { prost_types::field_descriptor_proto::Type::Int64 };
+    (@kind double) => { prost_types::field_descriptor_proto::Type::Double };
+    (@kind bool) => { prost_types::field_descriptor_proto::Type::Bool };
+    (@kind string) => { prost_types::field_descriptor_proto::Type::String };
+    (@field $name:ident optional $kind:ident) => {
+        $crate::schema::OwnField {
+            name: stringify!($name),
+            kind: $crate::schema::own_message!(@kind $kind),
+            may_be_absent: true,
+        }
+    };
+    (@field $name:ident $kind:ident) => {
+        $crate::schema::OwnField {
+            name: stringify!($name),
+            kind: $crate::schema::own_message!(@kind $kind),
+            may_be_absent: false,
+        }
+    };
+    (
+        $(#[$meta:meta])*
+        pub(crate) struct $name:ident as $message:literal {
+            $($(#[$field_meta:meta])* $field:ident: $($kind:ident)+ = $number:tt,)+
+        }
+    ) => {
+        $(#[$meta])*
+        #[derive(Clone, PartialEq, prost::Message)]
+        pub(crate) struct $name {
+            $(
+                $(#[$field_meta])*
+                #[prost($($kind),+, tag = $number)]
+                pub(crate) $field: $crate::schema::own_message!(@type $($kind)+),
+            )+
+        }
+
+        impl $name {
+            /// Its schema.
+            pub(crate) fn schema() -> $crate::schema::Schema {
+                let fields = [$($crate::schema::own_message!(@field $field $($kind)+)),+];
+                $crate::schema::own($message, &fields)
+            }
+        }
+    };
+}
+pub(crate) use own_message;
 
 /// The schema of one of the recorder's own messages, `hil.<name>`; numbers are positions from 1.
 pub(crate) fn own(name: &str, fields: &[OwnField]) -> Schema {
@@ -62,9 +127,10 @@ pub(crate) fn own(name: &str, fields: &[OwnField]) -> Schema {
         name: Some("v1".to_owned()),
         ..DescriptorProto::default()
     };
-    for ((name, kind, may_be_absent), number) in fields.iter().zip(1..) {
-        let mut field = own_field(name, number, *kind);
-        if *may_be_absent {
+    for (one, number) in fields.iter().zip(1..) {
+        let name = one.name;
+        let mut field = own_field(name, number, one.kind);
+        if one.may_be_absent {
             // What `optional` of proto3 compiles to: a choice of one.
             field.proto3_optional = Some(true);
             field.oneof_index = i32::try_from(proto.oneof_decl.len()).ok();

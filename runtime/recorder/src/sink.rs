@@ -48,12 +48,26 @@ impl Topic {
     pub(crate) fn new(name: String, schema: Schema, metadata: &[(&str, &str)]) -> Self {
         let pairs = metadata.iter();
         let pairs = pairs.map(|(key, value)| ((*key).to_owned(), (*value).to_owned()));
+        Self::with_metadata(name, schema, pairs.collect())
+    }
+
+    /// The same, as a sink is told of it.
+    pub(crate) const fn with_metadata(
+        name: String,
+        schema: Schema,
+        metadata: BTreeMap<String, String>,
+    ) -> Self {
         Self {
             name,
             schema,
-            metadata: pairs.collect(),
+            metadata,
             number: None,
         }
+    }
+
+    /// The next sink has not heard of it.
+    pub(crate) const fn forget(&mut self) {
+        self.number = None;
     }
 
     /// True once a sink has heard of it.

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::thread::{self, JoinHandle};
 
 use crate::schema::Schema;
-use crate::sink::Sink;
+use crate::sink::{Sink, Topic};
 use crate::writer::{Recording, Stamp, WriteError, check_folder, check_live_target, check_target};
 
 /// Files that may be on their way to the disk beside the open one: each has a queue of its own in
@@ -48,12 +48,7 @@ pub(crate) fn another(output: &Path, number: usize) -> PathBuf {
         return output.to_owned();
     }
     let is_free = |path: &PathBuf| check_live_target(path, false).is_ok();
-    let mut names = (number..).map(|number| {
-        let stem = output.file_stem().unwrap_or_default().to_string_lossy();
-        let extension = output.extension().unwrap_or_default().to_string_lossy();
-        let dot = if extension.is_empty() { "" } else { "." };
-        output.with_file_name(format!("{stem}-{number}{dot}{extension}"))
-    });
+    let mut names = (number..).map(|number| suffixed(output, &format!("-{number}")));
     // Where none can be written, the recording says why.
     let found = names.by_ref().take(NUMBERS_MAX).find(is_free);
     found.unwrap_or_else(|| output.to_owned())
@@ -77,15 +72,6 @@ pub(crate) fn prepare(
         source,
     })?;
     check_folder(output, output)
-}
-
-#[derive(Debug)]
-struct KnownTopic {
-    name: String,
-    schema: Schema,
-    metadata: BTreeMap<String, String>,
-    /// In the file that is open; `None` until a message of it comes.
-    number: Option<u16>,
 }
 
 /// Files on their way to the disk, which takes its time; oldest first. None of them is left alone:
@@ -140,7 +126,8 @@ pub(crate) struct Files {
     split_bytes: Option<u64>,
     may_replace: bool,
     open: Recording,
-    topics: Vec<KnownTopic>,
+    /// Each is in the file that is open once a message of it has come.
+    topics: Vec<Topic>,
     done: Vec<PathBuf>,
     done_bytes: u64,
     closing: Closing,
@@ -148,12 +135,18 @@ pub(crate) struct Files {
 
 /// Where the `number`th file of a recording that is split goes: before the extension.
 fn numbered(target: &Path, number: usize) -> PathBuf {
-    let stem = target.file_stem().unwrap_or_default().to_string_lossy();
-    let extension = target
-        .extension()
-        .map(|one| format!(".{}", one.to_string_lossy()));
-    let extension = extension.unwrap_or_default();
-    target.with_file_name(format!("{stem}_{number:04}{extension}"))
+    suffixed(target, &format!("_{number:04}"))
+}
+
+/// The path with `suffix` before its extension.
+fn suffixed(path: &Path, suffix: &str) -> PathBuf {
+    let mut name = path.file_stem().unwrap_or_default().to_owned();
+    name.push(suffix);
+    if let Some(extension) = path.extension() {
+        name.push(".");
+        name.push(extension);
+    }
+    path.with_file_name(name)
 }
 
 impl Files {
@@ -214,7 +207,7 @@ impl Files {
         let closing = thread::spawn(move || finished.finish());
         self.closing.files.push_back(closing);
         for topic in &mut self.topics {
-            topic.number = None;
+            topic.forget();
         }
         Ok(())
     }
@@ -261,25 +254,13 @@ impl Sink for Files {
         metadata: &BTreeMap<String, String>,
     ) -> Result<u16, WriteError> {
         let number = u16::try_from(self.topics.len()).map_err(|_many| self.open.full())?;
-        self.topics.push(KnownTopic {
-            name: topic.to_owned(),
-            schema: schema.clone(),
-            metadata: metadata.clone(),
-            number: None,
-        });
+        let topic = Topic::with_metadata(topic.to_owned(), schema.clone(), metadata.clone());
+        self.topics.push(topic);
         Ok(number)
     }
 
     fn write(&mut self, topic: u16, at: Stamp, data: &[u8]) -> Result<(), WriteError> {
-        let known = &mut self.topics[usize::from(topic)];
-        let number = match known.number {
-            Some(number) => number,
-            None => self
-                .open
-                .add_topic(&known.name, &known.schema, &known.metadata)?,
-        };
-        known.number = Some(number);
-        self.open.write(number, at, data)
+        self.topics[usize::from(topic)].write(&mut self.open, at, data)
     }
 }
 

@@ -18,7 +18,6 @@ use crate::convert::{ConvertError, Converted, convert};
 use crate::recover::{RecoverError, Recovered, recover};
 use crate::run::RunError;
 use crate::scan::{ScanError, scan};
-use crate::scene::Scenery;
 
 /// Messages of each made-up channel: enough for several chunks.
 const MESSAGE_COUNT: u64 = 60_000;
@@ -78,12 +77,9 @@ impl Folder {
     }
 
     fn convert(&self) -> Result<Converted, ConvertError> {
-        convert(
-            &self.at("run"),
-            &self.at("run.mcap"),
-            Scenery::Drawn,
-            &mut |_, _| None,
-        )
+        convert(&self.at("run"), &self.at("run.mcap"), true, &mut |_, _| {
+            None
+        })
     }
 
     fn recover(&self, bytes: &[u8]) -> Result<Recovered, String> {
@@ -128,7 +124,8 @@ impl Held {
         let bytes = fs::read(path).unwrap();
         let mut held = Self::default();
         let summary = mcap::Summary::read(&bytes).unwrap().unwrap();
-        for channel in summary.channels.values() {
+        let channels: BTreeMap<_, _> = summary.channels.into_iter().collect();
+        for channel in channels.values() {
             let schema = channel.schema.as_ref().unwrap().name.clone();
             held.topics
                 .insert(channel.topic.clone(), (schema, Vec::new()));
@@ -247,12 +244,7 @@ fn a_signal_leaves_no_file() {
     folder.record("a", 0..9000);
     for wanted in ["reading", "writing"] {
         let mut stop = |_: Option<f64>, words: &str| words.starts_with(wanted).then_some("Ctrl-C");
-        let stopped = convert(
-            &folder.at("run"),
-            &folder.at("run.mcap"),
-            Scenery::Drawn,
-            &mut stop,
-        );
+        let stopped = convert(&folder.at("run"), &folder.at("run.mcap"), true, &mut stop);
         assert!(matches!(stopped, Err(ConvertError::Interrupted("Ctrl-C"))));
         assert_eq!(fs::read_dir(&folder.0).unwrap().count(), 1);
     }

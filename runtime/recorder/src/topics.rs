@@ -9,7 +9,7 @@ use foxglove::messages::{
     SceneEntity, SceneUpdate, TextPrimitive, Timestamp, Vector3, log,
 };
 use hil_models::case_study::Severity;
-use hil_models::egm::messages::{EgmCommand, EgmFeedback};
+use hil_models::egm::messages::{EgmCommand, EgmFeedback, Side};
 use hil_models::fleet::messages::State;
 use hil_models::message::Message;
 use hil_models::yumi::description::joint_name;
@@ -17,11 +17,18 @@ use hil_runtime::report::score_event::ExplainedEvent;
 use prost::Message as _;
 
 use crate::schema::Schema;
+use crate::sink::Topic;
 
 /// How long a vehicle stays in a picture after its last state, seconds.
 const VEHICLE_SHOWN_S: i32 = 2;
 /// Size of a vehicle in a picture, metres. No message carries the true size.
-const VEHICLE_SIZE_M: (f64, f64, f64) = (1.0, 0.6, 0.4);
+const VEHICLE_SIZE_M: [f64; 3] = [1.0, 0.6, 0.4];
+
+/// The topic of the score's events.
+pub(crate) fn event_topic(names: &mut Names) -> Topic {
+    let name = names.claim("/score/events".to_owned());
+    Topic::new(name, well_known::<Log>(), &[])
+}
 
 /// The names of a recording's topics: each is used once.
 #[derive(Debug, Default)]
@@ -118,12 +125,11 @@ impl View {
             }
             Self::Tool => {
                 let feedback: EgmFeedback = read(payload)?;
-                let [x, y, z] = feedback.tool.position_m;
                 let [w, i, j, k] = feedback.tool.quaternion_wxyz;
                 PoseInFrame {
                     timestamp,
                     frame_id: "body".to_owned(),
-                    pose: Some(pose((x, y, z), (i, j, k, w))),
+                    pose: Some(pose(feedback.tool.position_m, [i, j, k, w])),
                 }
                 .encode_to_vec()
             }
@@ -132,7 +138,8 @@ impl View {
     }
 }
 
-fn read<M: Message>(payload: &[u8]) -> Option<M> {
+/// The message that `payload` is, if it has its size.
+pub(crate) fn read<M: Message>(payload: &[u8]) -> Option<M> {
     bytemuck::try_pod_read_unaligned(payload).ok()
 }
 
@@ -150,15 +157,19 @@ pub(crate) fn timestamp(at_ns: u64) -> Option<Timestamp> {
     Timestamp::new_checked(seconds, (at_ns % 1_000_000_000) as u32)
 }
 
+/// Which arm the messages of a channel are about: the channel's name tells.
+pub(crate) fn side_of(channel: &str) -> Option<Side> {
+    let mut parts = channel.split('/');
+    parts.find_map(|part| Side::BOTH.into_iter().find(|side| side.word() == part))
+}
+
 fn joints(
     channel: &str,
     timestamp: Option<Timestamp>,
     positions_rad: &[f64; 7],
     speeds_rad_per_s: Option<&[f64; 7]>,
 ) -> JointStates {
-    let mut parts = channel.split('/');
-    let side = parts.find(|part| ["right", "left"].contains(part));
-    let side = side.unwrap_or_default();
+    let side = side_of(channel).map_or("", Side::word);
     let joints = positions_rad.iter().enumerate();
     let joints = joints.map(|(index, position_rad)| JointState {
         name: joint_name(side, index),
@@ -172,24 +183,28 @@ fn joints(
     }
 }
 
-/// A place, and the quaternion x, y, z, w.
-pub(crate) fn pose((x, y, z): (f64, f64, f64), (i, j, k, w): (f64, f64, f64, f64)) -> Pose {
+/// The quaternion of no turn.
+pub(crate) const UNTURNED: [f64; 4] = [0.0, 0.0, 0.0, 1.0];
+
+/// A place x, y, z, and the quaternion x, y, z, w.
+pub(crate) fn pose([x, y, z]: [f64; 3], [i, j, k, w]: [f64; 4]) -> Pose {
+    let turn = Quaternion {
+        x: i,
+        y: j,
+        z: k,
+        w,
+    };
     Pose {
         position: Some(Vector3 { x, y, z }),
-        orientation: Some(Quaternion {
-            x: i,
-            y: j,
-            z: k,
-            w,
-        }),
+        orientation: Some(turn),
     }
 }
 
 fn vehicle(state: &State, timestamp: Option<Timestamp>) -> SceneUpdate {
     let (fleet, robot) = (state.header.fleet_id, state.header.robot_id);
     let (sine, cosine) = (state.heading_rad / 2.0).sin_cos();
-    let turned = (0.0, 0.0, sine, cosine);
-    let (length, width, height) = VEHICLE_SIZE_M;
+    let turned = [0.0, 0.0, sine, cosine];
+    let [length, width, height] = VEHICLE_SIZE_M;
     // Neighbours in number get colours far apart: steps of the golden section around the circle.
     let hue = f64::from(robot) * 0.618_033_988_75 % 1.0;
     let part = |shift: f64| 0.55 + 0.4 * (core::f64::consts::TAU * (hue + shift)).cos();
@@ -200,7 +215,7 @@ fn vehicle(state: &State, timestamp: Option<Timestamp>) -> SceneUpdate {
         a: 1.0,
     };
     let body = CubePrimitive {
-        pose: Some(pose((state.x_m, state.y_m, height / 2.0), turned)),
+        pose: Some(pose([state.x_m, state.y_m, height / 2.0], turned)),
         size: Some(Vector3 {
             x: length,
             y: width,
@@ -209,7 +224,7 @@ fn vehicle(state: &State, timestamp: Option<Timestamp>) -> SceneUpdate {
         color: Some(color),
     };
     let name = TextPrimitive {
-        pose: Some(pose((state.x_m, state.y_m, 2.0 * height), turned)),
+        pose: Some(pose([state.x_m, state.y_m, 2.0 * height], turned)),
         billboard: true,
         font_size: 0.5,
         text: format!("{robot}"),
@@ -229,11 +244,6 @@ fn vehicle(state: &State, timestamp: Option<Timestamp>) -> SceneUpdate {
         deletions: Vec::new(),
         entities: vec![entity],
     }
-}
-
-/// The schema of the score's events.
-pub(crate) fn event_schema() -> Schema {
-    well_known::<Log>()
 }
 
 /// An event of the score as a line of a log.

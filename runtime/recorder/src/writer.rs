@@ -10,6 +10,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use mcap::records::{MessageHeader, Metadata};
+use mcap::write::NoSeek;
 use mcap::{Attachment, Compression, McapError, WriteOptions, Writer};
 use nix::unistd::{AccessFlags, access};
 
@@ -97,7 +98,7 @@ impl Stamp {
 
 /// A file being written.
 pub(crate) struct Recording {
-    writer: Option<Writer<QueuedFile>>,
+    writer: Option<Writer<NoSeek<QueuedFile>>>,
     partial: PathBuf,
     path: PathBuf,
     message_count: u64,
@@ -222,7 +223,7 @@ impl Recording {
             .library(library)
             // A chunk reaches the file whole.
             .disable_seeking(true)
-            .create(file)
+            .create(NoSeek::new(file))
             .map_err(|source| recording.refused(source))?;
         recording.writer = Some(writer);
         Ok(recording)
@@ -273,28 +274,11 @@ impl Recording {
 
     fn with<T>(
         &mut self,
-        work: impl FnOnce(&mut Writer<QueuedFile>) -> Result<T, McapError>,
+        work: impl FnOnce(&mut Writer<NoSeek<QueuedFile>>) -> Result<T, McapError>,
     ) -> Result<T, WriteError> {
         let writer = self.writer.as_mut();
         let worked = writer.map_or(Err(McapError::AttemptedWriteAfterFailure), work);
         worked.map_err(|source| self.refused(source))
-    }
-
-    /// A new topic; its number.
-    ///
-    /// # Errors
-    /// When the file cannot be written, or there are more than 65 535.
-    pub(crate) fn add_topic(
-        &mut self,
-        topic: &str,
-        schema: &Schema,
-        metadata: &BTreeMap<String, String>,
-    ) -> Result<u16, WriteError> {
-        self.topic_count += 1;
-        self.with(|writer| {
-            let schema = writer.add_schema(&schema.name, "protobuf", &schema.data)?;
-            writer.add_channel(schema, topic, "protobuf", metadata)
-        })
     }
 
     /// A topic with the number and schema that it had elsewhere.
@@ -330,22 +314,6 @@ impl Recording {
         self.with(Writer::flush)
     }
 
-    /// A message of a topic.
-    ///
-    /// # Errors
-    /// When the file cannot be written, or there is no such topic.
-    pub(crate) fn write(&mut self, topic: u16, at: Stamp, data: &[u8]) -> Result<(), WriteError> {
-        let header = MessageHeader {
-            channel_id: topic,
-            sequence: at.sequence,
-            log_time: at.log_ns,
-            publish_time: at.publish_ns,
-        };
-        self.with(|writer| writer.write_to_known_channel(&header, data))?;
-        self.message_count += 1;
-        Ok(())
-    }
-
     /// A table of words about the recording.
     ///
     /// # Errors
@@ -378,7 +346,7 @@ impl Recording {
             source,
         };
         if let Some(writer) = self.writer.take() {
-            let written = writer.into_inner().finish();
+            let written = writer.into_inner().into_inner().finish();
             written.map_err(|error| failed(self.told_path(), error))?;
         }
         fs::rename(&self.partial, &self.path).map_err(|source| {
@@ -405,11 +373,23 @@ impl Sink for Recording {
         schema: &Schema,
         metadata: &BTreeMap<String, String>,
     ) -> Result<u16, WriteError> {
-        Self::add_topic(self, topic, schema, metadata)
+        self.topic_count += 1;
+        self.with(|writer| {
+            let schema = writer.add_schema(&schema.name, "protobuf", &schema.data)?;
+            writer.add_channel(schema, topic, "protobuf", metadata)
+        })
     }
 
     fn write(&mut self, topic: u16, at: Stamp, data: &[u8]) -> Result<(), WriteError> {
-        Self::write(self, topic, at, data)
+        let header = MessageHeader {
+            channel_id: topic,
+            sequence: at.sequence,
+            log_time: at.log_ns,
+            publish_time: at.publish_ns,
+        };
+        self.with(|writer| writer.write_to_known_channel(&header, data))?;
+        self.message_count += 1;
+        Ok(())
     }
 }
 

@@ -5,7 +5,7 @@ mod schedule;
 mod source;
 mod target;
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::thread;
 use std::time::Duration;
 
@@ -16,6 +16,7 @@ use hil_runtime::platform::signals::Signals;
 use hil_runtime::platform::words::counted_plainly;
 use hil_runtime::rundir::manifest::ChannelDescription;
 
+use crate::cli::PlayOptions;
 use schedule::{Punctuality, Schedule};
 pub(crate) use source::SourceError;
 use source::{Material, known_channels, read};
@@ -26,21 +27,6 @@ use target::{Outlet, Target};
 const SLEEP_MAX: Duration = Duration::from_millis(50);
 /// From the moment all is ready to the first message.
 const LEAD: Duration = Duration::from_millis(2);
-
-/// What to play, and how.
-#[derive(Debug)]
-pub(crate) struct PlayOptions {
-    /// The file.
-    pub(crate) file: PathBuf,
-    /// The channels.
-    pub(crate) only: Vec<String>,
-    /// How much faster than recorded.
-    pub(crate) speed: f64,
-    /// Begin again at the end.
-    pub(crate) is_looped: bool,
-    /// The run; otherwise the one that started this program, or the only one.
-    pub(crate) into: Option<String>,
-}
 
 /// Why nothing was played, or why it broke off.
 #[derive(Debug, thiserror::Error)]
@@ -93,37 +79,33 @@ pub(crate) fn play(
     let domains = domains.collect::<Result<Vec<_>, _>>()?;
     let outlets = channels.iter().zip(&domains);
     let outlets = outlets.map(|(channel, domain)| target.open(domain, channel));
+    let after_ns = material.messages.iter().map(|one| one.after_ns);
     let mut player = Player {
         outlets: outlets.collect::<Result<_, _>>()?,
-        schedule: schedule_of(&material, options.speed),
+        schedule: Schedule::new(after_ns.collect(), options.speed),
         kept: Punctuality::of(channels.len()),
         looked: MonotonicClock::now(),
         target: &target,
         signals,
     };
-    console.say(&announcement(&options.file, &material, &target));
+    let count = counted_plainly(material.messages.len() as u64, "message");
+    let file = options.file.display();
+    console.say(&format!("{file}: {count} for run {}", target.run.name));
     let end = player.play(&material, options.is_looped)?;
-    console.say(&player.account());
+    let count = counted_plainly(player.kept.published_count, "message");
+    console.say(&format!("{count} published"));
     if player.kept.late_count > 0 || player.kept.bunched_count > 0 {
         console.warn(&player.lateness());
     }
-    if end.is_none() && target.is_ours() && !target.is_over() {
+    if end.is_none() && target.is_ours && !target.is_over() {
         // To end now would end the run.
         console.say("the recording is over; silent until the run ends");
-        player.wait_for_end();
+        while player.ended().is_none() {
+            thread::sleep(SLEEP_MAX);
+        }
     }
     // A run asks its processes to end by a signal.
-    Ok(end.filter(|_| !target.is_ours()).unwrap_or(PlayEnd::Done))
-}
-
-fn schedule_of(material: &Material, speed: f64) -> Schedule {
-    let after_ns = material.messages.iter().map(|one| one.after_ns);
-    Schedule::new(after_ns.collect(), speed)
-}
-
-fn announcement(file: &Path, material: &Material, target: &Target) -> String {
-    let count = counted_plainly(material.messages.len() as u64, "message");
-    format!("{}: {count} for run {}", file.display(), target.name())
+    Ok(end.filter(|_| !target.is_ours).unwrap_or(PlayEnd::Done))
 }
 
 struct Player<'a> {
@@ -156,7 +138,7 @@ impl Player<'_> {
                 self.outlets[message.channel].publish(&message.payload)?;
                 let at_ns = at.saturating_duration_since(start).as_nanos();
                 let at_ns = u64::try_from(at_ns).unwrap_or(u64::MAX);
-                self.kept.note(message.channel, (due_ns, at_ns));
+                self.kept.note(message.channel, due_ns, at_ns);
             }
             if !is_looped {
                 break;
@@ -192,19 +174,6 @@ impl Player<'_> {
                 return None;
             }
         }
-    }
-
-    fn wait_for_end(&self) {
-        while self.ended().is_none() {
-            thread::sleep(SLEEP_MAX);
-        }
-    }
-
-    fn account(&self) -> String {
-        format!(
-            "{} published",
-            counted_plainly(self.kept.published_count, "message")
-        )
     }
 
     fn lateness(&self) -> String {

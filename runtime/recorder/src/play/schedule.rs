@@ -72,7 +72,7 @@ impl Punctuality {
 
     /// A message on `channel` that was due at `due_ns` left at `at_ns`, both since the first one of
     /// all was due.
-    pub(crate) fn note(&mut self, channel: usize, (due_ns, at_ns): (u64, u64)) {
+    pub(crate) fn note(&mut self, channel: usize, due_ns: u64, at_ns: u64) {
         self.published_count += 1;
         let late_ns = at_ns.saturating_sub(due_ns);
         self.worst_ns = self.worst_ns.max(late_ns);
@@ -118,7 +118,7 @@ mod tests {
     fn what_was_late_and_what_was_pressed_together_is_counted() {
         let mut kept = Punctuality::of(1);
         for (due, at) in [(0, 0), (8, 8), (16, 26), (24, 27), (32, 32)] {
-            kept.note(0, (due * MS, at * MS));
+            kept.note(0, due * MS, at * MS);
         }
         assert_eq!(kept.published_count, 5);
         assert_eq!((kept.late_count, kept.bunched_count), (2, 1));
@@ -129,10 +129,10 @@ mod tests {
     fn a_late_message_of_one_channel_presses_none_of_another() {
         let mut kept = Punctuality::of(2);
         for (channel, due, at) in [(0, 0, 0), (1, 4, 7), (0, 8, 8), (1, 12, 12)] {
-            kept.note(channel, (due * MS, at * MS));
+            kept.note(channel, due * MS, at * MS);
         }
         assert_eq!((kept.late_count, kept.bunched_count), (1, 0));
-        kept.note(1, (20 * MS, 15 * MS));
+        kept.note(1, 20 * MS, 15 * MS);
         assert_eq!(kept.bunched_count, 1);
     }
 }

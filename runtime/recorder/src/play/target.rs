@@ -84,10 +84,11 @@ pub(crate) enum TargetError {
 /// A run to play into.
 #[derive(Debug)]
 pub(crate) struct Target {
-    run: LiveRun,
+    /// The run.
+    pub(crate) run: LiveRun,
     manifest: Manifest,
-    /// It started this program.
-    is_ours: bool,
+    /// It started this program, as one of its processes.
+    pub(crate) is_ours: bool,
 }
 
 /// One channel that is fed.
@@ -115,16 +116,6 @@ impl Target {
             manifest,
             is_ours,
         })
-    }
-
-    /// Name of the run.
-    pub(crate) fn name(&self) -> &str {
-        &self.run.name
-    }
-
-    /// True when the run started this program as one of its processes.
-    pub(crate) const fn is_ours(&self) -> bool {
-        self.is_ours
     }
 
     /// The channel called `name`, whose producer must be on this host.

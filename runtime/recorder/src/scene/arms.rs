@@ -2,13 +2,13 @@
 //! (`page/arms.js`): measured solid, commanded as a ghost, simple shapes from frame to frame.
 
 use foxglove::messages::{
-    Duration, FrameTransform, FrameTransforms, Quaternion, SceneEntity, SceneUpdate, Timestamp,
+    Color, FrameTransform, FrameTransforms, Quaternion, SceneEntity, SceneUpdate, Timestamp,
     Vector3,
 };
 use serde_json::Value;
 
 use super::entire;
-use super::shapes::{BAD, Paint, SERIES, ball, color, lifted, rod, strokes, word};
+use super::shapes::{BAD, Paint, SERIES, ball, color, entity, lifted, list, rod, strokes, word};
 
 /// The frame in which the models place the arms.
 const BODY: &str = "body";
@@ -34,13 +34,13 @@ pub(crate) fn shapes(arms: &Value, at: Timestamp) -> SceneUpdate {
             if frames.is_empty() {
                 continue;
             }
-            let mut entity = entity(&format!("{side} arm {motion}"), at);
+            let mut entity = entity(BODY.to_owned(), format!("{side} arm {motion}"), at);
             let paint = match (motion, side) {
                 ("desired", _) => DESIRED,
                 (_, "left") => SERIES[2],
                 _ => SERIES[0],
             };
-            links(&mut entity, (&frames, &arms["shapes"]), (paint, alpha));
+            links(&mut entity, &frames, &arms["shapes"], color(paint, alpha));
             entity.metadata = ["state", "session", "tool_error_mm"]
                 .map(|key| word(key, &arm[key]))
                 .to_vec();
@@ -48,7 +48,7 @@ pub(crate) fn shapes(arms: &Value, at: Timestamp) -> SceneUpdate {
         }
         let [desired, measured] = MOTIONS.map(|(key, _, _)| frames(&arm[key]).pop());
         if let Some((desired, measured)) = desired.zip(measured) {
-            let mut entity = entity(&format!("{side} tool error"), at);
+            let mut entity = entity(BODY.to_owned(), format!("{side} tool error"), at);
             let ends = [desired, measured].map(|[x, y, z, ..]| lifted([x, y], z));
             entity.lines = vec![strokes(ends.to_vec(), 0.006, color(BAD, 1.0))];
             entities.push(entity);
@@ -89,10 +89,6 @@ pub(crate) fn transforms(arms: &Value, at: Timestamp) -> FrameTransforms {
     FrameTransforms { transforms }
 }
 
-fn list(value: &Value) -> impl Iterator<Item = &Value> {
-    value.as_array().into_iter().flatten()
-}
-
 /// All frames of an arm, or none.
 fn frames(value: &Value) -> Vec<Frame> {
     let frame = |one: &Value| -> Option<Frame> {
@@ -103,23 +99,8 @@ fn frames(value: &Value) -> Vec<Frame> {
     all.unwrap_or_default()
 }
 
-fn entity(id: &str, at: Timestamp) -> SceneEntity {
-    SceneEntity {
-        timestamp: Some(at),
-        frame_id: BODY.to_owned(),
-        id: id.to_owned(),
-        // Where a viewer does not know what replaces what, old shapes go by themselves.
-        lifetime: Some(Duration::new(1, 0)),
-        ..SceneEntity::default()
-    }
-}
-
 /// Rods with round ends, as `shapes` names their frames.
-fn links(
-    entity: &mut SceneEntity,
-    (frames, shapes): (&[Frame], &Value),
-    (paint, alpha): (Paint, f64),
-) {
+fn links(entity: &mut SceneEntity, frames: &[Frame], shapes: &Value, color: Color) {
     let position = |index: &Value| {
         let index = usize::try_from(index.as_u64()?).ok()?;
         let [x, y, z, ..] = *frames.get(index)?;
@@ -130,9 +111,7 @@ fn links(
         let Some(((from, to), radius_m)) = ends.zip(shape["radius_m"].as_f64()) else {
             continue;
         };
-        entity
-            .cylinders
-            .extend(rod(from, to, radius_m, color(paint, alpha)));
-        entity.spheres.push(ball(to, radius_m, color(paint, alpha)));
+        entity.cylinders.extend(rod(from, to, radius_m, color));
+        entity.spheres.push(ball(to, radius_m, color));
     }
 }

@@ -2,15 +2,16 @@
 //! (`page/fleet.js`). Heights are for the eye; no message carries any.
 
 use foxglove::messages::{
-    CubePrimitive, Duration, SceneEntity, SceneUpdate, Timestamp, TriangleListPrimitive, Vector3,
+    CubePrimitive, SceneEntity, SceneUpdate, Timestamp, TriangleListPrimitive, Vector3,
 };
 use serde_json::Value;
 
 use super::entire;
 use super::shapes::{
-    BAD, FAINT, LIGHT, Paint, SERIES, STONE, ball, color, filled, lifted, line, strokes, text, word,
+    BAD, FAINT, LIGHT, Paint, SERIES, STONE, ball, color, entity, filled, lifted, line, list,
+    strokes, text, word,
 };
-use crate::topics::pose;
+use crate::topics::{UNTURNED, pose};
 
 /// Height of a vehicle, metres.
 const HEIGHT_M: f64 = 0.4;
@@ -33,7 +34,7 @@ pub(crate) fn moving(fleet: &Value, size: Size, at: Timestamp) -> SceneUpdate {
     let mut entities: Vec<SceneEntity> = sections.chain(robots).collect();
     let now_s = fleet["at_s"].as_f64().unwrap_or(0.0);
     for (index, hit) in list(&fleet["collisions"]).enumerate() {
-        entities.extend(collision(hit, (index, now_s), at));
+        entities.extend(collision(hit, index, now_s, at));
     }
     entire(entities, at)
 }
@@ -41,8 +42,8 @@ pub(crate) fn moving(fleet: &Value, size: Size, at: Timestamp) -> SceneUpdate {
 /// What does not move, from `/live/map`, for each of its fleets.
 pub(crate) fn ground(map: &Value, at: Timestamp) -> SceneUpdate {
     let fleets = map["fleet_count"].as_u64().unwrap_or(1).max(1);
-    let of_fleet = |fleet| ground_of(map, fleet, at);
-    entire((0..fleets).filter_map(of_fleet).collect(), at)
+    let grounds = (0..fleets).filter_map(|fleet| ground_of(map, fleet, at));
+    entire(grounds.collect(), at)
 }
 
 /// The frame of a fleet's ground: each fleet has one to itself.
@@ -53,19 +54,8 @@ fn frame(fleet: u64) -> String {
     }
 }
 
-fn entity(fleet: u64, id: &str, at: Timestamp) -> SceneEntity {
-    SceneEntity {
-        timestamp: Some(at),
-        frame_id: frame(fleet),
-        id: format!("fleet {fleet} {id}"),
-        // Where a viewer does not know what replaces what, old shapes go by themselves.
-        lifetime: Some(Duration::new(1, 0)),
-        ..SceneEntity::default()
-    }
-}
-
-fn list(value: &Value) -> impl Iterator<Item = &Value> {
-    value.as_array().into_iter().flatten()
+fn of_fleet(fleet: u64, id: &str, at: Timestamp) -> SceneEntity {
+    entity(frame(fleet), format!("fleet {fleet} {id}"), at)
 }
 
 fn points(value: &Value) -> Vec<[f64; 2]> {
@@ -86,10 +76,10 @@ fn robot(one: &Value, [length, width]: Size, at: Timestamp) -> Option<SceneEntit
     let paint = if is_stale { FAINT } else { series(id) };
     let alpha = if is_stale { 0.35 } else { 1.0 };
     let (half_sine, half_cosine) = (heading / 2.0).sin_cos();
-    let turned = (0.0, 0.0, half_sine, half_cosine);
-    let mut entity = entity(fleet, &format!("robot {id}"), at);
+    let turned = [0.0, 0.0, half_sine, half_cosine];
+    let mut entity = of_fleet(fleet, &format!("robot {id}"), at);
     entity.cubes = vec![CubePrimitive {
-        pose: Some(pose((x, y, HEIGHT_M / 2.0), turned)),
+        pose: Some(pose([x, y, HEIGHT_M / 2.0], turned)),
         size: Some(Vector3 {
             x: length,
             y: width,
@@ -103,7 +93,7 @@ fn robot(one: &Value, [length, width]: Size, at: Timestamp) -> Option<SceneEntit
         lifted([along * length, across * width], above)
     });
     entity.triangles = vec![TriangleListPrimitive {
-        pose: Some(pose((x, y, 0.0), turned)),
+        pose: Some(pose([x, y, 0.0], turned)),
         points: bow.to_vec(),
         color: Some(color(if is_stale { FAINT } else { LIGHT }, 0.85)),
         ..TriangleListPrimitive::default()
@@ -113,7 +103,7 @@ fn robot(one: &Value, [length, width]: Size, at: Timestamp) -> Option<SceneEntit
         if way.len() > 1 {
             let way = way.into_iter().map(|point| lifted(point, WAY_M)).collect();
             let color = color(paint, alpha);
-            entity.lines.push(line(way, (thickness, false), color));
+            entity.lines.push(line(way, thickness, false, color));
         }
     }
     let age = one["age_s"].as_f64().filter(|_| is_stale);
@@ -128,7 +118,7 @@ fn robot(one: &Value, [length, width]: Size, at: Timestamp) -> Option<SceneEntit
 
 /// Coloured by who may pass.
 fn section(one: &Value, at: Timestamp) -> Option<SceneEntity> {
-    let mut entity = entity(
+    let mut entity = of_fleet(
         one["fleet"].as_u64()?,
         &format!("section {}", one["id"].as_str()?),
         at,
@@ -154,7 +144,7 @@ fn section(one: &Value, at: Timestamp) -> Option<SceneEntity> {
     let corners = polygon
         .into_iter()
         .map(|point| lifted(point, 2.0 * SECTION_M));
-    let edge = line(corners.collect(), (edge_m, true), color(paint, edge_alpha));
+    let edge = line(corners.collect(), edge_m, true, color(paint, edge_alpha));
     entity.lines = vec![edge];
     let words = ["robots", "may_pass", "inside"].map(|key| word(key, &one[key]));
     entity.metadata = words.to_vec();
@@ -162,11 +152,11 @@ fn section(one: &Value, at: Timestamp) -> Option<SceneEntity> {
     Some(entity)
 }
 
-fn collision(hit: &Value, (index, now_s): (usize, f64), at: Timestamp) -> Option<SceneEntity> {
+fn collision(hit: &Value, index: usize, now_s: f64, at: Timestamp) -> Option<SceneEntity> {
     let here = [hit["x_m"].as_f64()?, hit["y_m"].as_f64()?];
     let is_fresh = now_s - hit["at_s"].as_f64()? < FRESH_S;
     let (arm_m, alpha) = if is_fresh { (0.8, 1.0) } else { (0.4, 0.45) };
-    let mut entity = entity(hit["fleet"].as_u64()?, &format!("collision {index}"), at);
+    let mut entity = of_fleet(hit["fleet"].as_u64()?, &format!("collision {index}"), at);
     let corner = |x: f64, y: f64| lifted([here[0] + x * arm_m, here[1] + y * arm_m], MARK_M);
     let cross = vec![
         corner(-1.0, -1.0),
@@ -190,21 +180,20 @@ fn ground_of(map: &Value, fleet: u64, at: Timestamp) -> Option<SceneEntity> {
         let low = [number("x_min_m")?, number("y_min_m")?];
         Some([low, [number("x_max_m")?, number("y_max_m")?]])
     };
-    let mut entity = entity(fleet, "ground", at);
+    let mut entity = of_fleet(fleet, "ground", at);
     entity.lifetime = None;
     let [low, high] = corners(&map["bounds"])?;
     let edge = [low, [high[0], low[1]], high, [low[0], high[1]]];
     let edge = edge.map(|point| lifted(point, 0.0)).to_vec();
-    entity.lines = vec![line(edge, (0.06, true), color(FAINT, 0.8))];
+    entity.lines = vec![line(edge, 0.06, true, color(FAINT, 0.8))];
     for area in list(&map["conflict_areas"]) {
         let area = filled(&points(area), 0.0, color(FAINT, 0.08));
         entity.triangles.extend(area);
     }
     for [low, high] in list(&map["obstacles"]).filter_map(corners) {
         let [x, y] = [0, 1].map(|axis| 0.5 * (low[axis] + high[axis]));
-        let still = (0.0, 0.0, 0.0, 1.0);
         entity.cubes.push(CubePrimitive {
-            pose: Some(pose((x, y, OBSTACLE_HEIGHT_M / 2.0), still)),
+            pose: Some(pose([x, y, OBSTACLE_HEIGHT_M / 2.0], UNTURNED)),
             size: Some(Vector3 {
                 x: high[0] - low[0],
                 y: high[1] - low[1],
@@ -229,7 +218,7 @@ fn ground_of(map: &Value, fleet: u64, at: Timestamp) -> Option<SceneEntity> {
             corner(1.0, 1.0),
             corner(-1.0, 1.0),
         ];
-        let edge = line(corners, (0.03, true), color(FAINT, 0.55));
+        let edge = line(corners, 0.03, true, color(FAINT, 0.55));
         entity.lines.push(edge);
         let name = bay["id"].as_u64()?.to_string();
         let above = [x, y, MARK_M];

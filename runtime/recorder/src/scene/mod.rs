@@ -39,31 +39,6 @@ const GROUND_PERIOD_NS: u64 = 10_000_000_000;
 /// Nothing is drawn of a silence longer than this: one damaged time must not make a million pictures.
 const SILENCE_NS: u64 = 2_000_000_000;
 
-/// Whether a recording has its scene.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Scenery {
-    /// It has.
-    Drawn,
-    /// It has not, and what it takes to draw one is not worked out.
-    LeftOut,
-}
-
-impl Scenery {
-    /// As the command line says it.
-    pub(crate) const fn of(is_unwanted: bool) -> Self {
-        if is_unwanted {
-            Self::LeftOut
-        } else {
-            Self::Drawn
-        }
-    }
-
-    /// True when it has one.
-    pub(crate) const fn is_drawn(self) -> bool {
-        matches!(self, Self::Drawn)
-    }
-}
-
 /// A message that says something of the scene.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Heard<'a> {

@@ -2,11 +2,12 @@
 //! the modules beside this one.
 
 use foxglove::messages::{
-    Color, CylinderPrimitive, KeyValuePair, LinePrimitive, Point3, SpherePrimitive, TextPrimitive,
-    TriangleListPrimitive, Vector3, line_primitive,
+    Color, CylinderPrimitive, Duration, KeyValuePair, LinePrimitive, Point3, SceneEntity,
+    SpherePrimitive, TextPrimitive, Timestamp, TriangleListPrimitive, Vector3, line_primitive,
 };
+use serde_json::Value;
 
-use crate::topics::pose;
+use crate::topics::{UNTURNED, pose};
 
 /// Red, green, blue.
 pub(crate) type Paint = [u8; 3];
@@ -30,6 +31,23 @@ pub(crate) const STONE: Paint = [0xa6, 0xad, 0xb8];
 /// Marks on vehicles (`--panel`).
 pub(crate) const LIGHT: Paint = [0xff, 0xff, 0xff];
 
+/// The elements of a list, none of anything else.
+pub(crate) fn list(value: &Value) -> impl Iterator<Item = &Value> {
+    value.as_array().into_iter().flatten()
+}
+
+/// Something to draw that has no shape yet.
+pub(crate) fn entity(frame_id: String, id: String, at: Timestamp) -> SceneEntity {
+    SceneEntity {
+        timestamp: Some(at),
+        frame_id,
+        id,
+        // Where a viewer does not know what replaces what, old shapes go by themselves.
+        lifetime: Some(Duration::new(1, 0)),
+        ..SceneEntity::default()
+    }
+}
+
 /// A colour that covers by `alpha`, 0 to 1.
 pub(crate) fn color(paint: Paint, alpha: f64) -> Color {
     let [r, g, b] = paint.map(|part| f64::from(part) / 255.0);
@@ -44,7 +62,8 @@ pub(crate) const fn lifted([x, y]: [f64; 2], z: f64) -> Point3 {
 /// A line through `points`, `thickness` metres thick; closed where `is_closed`.
 pub(crate) fn line(
     points: Vec<Point3>,
-    (thickness, is_closed): (f64, bool),
+    thickness: f64,
+    is_closed: bool,
     color: Color,
 ) -> LinePrimitive {
     let kind = if is_closed {
@@ -54,7 +73,7 @@ pub(crate) fn line(
     };
     LinePrimitive {
         r#type: kind.into(),
-        pose: Some(pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))),
+        pose: Some(pose([0.0; 3], UNTURNED)),
         thickness,
         points,
         color: Some(color),
@@ -66,7 +85,7 @@ pub(crate) fn line(
 pub(crate) fn strokes(points: Vec<Point3>, thickness: f64, color: Color) -> LinePrimitive {
     LinePrimitive {
         r#type: line_primitive::Type::LineList.into(),
-        ..line(points, (thickness, false), color)
+        ..line(points, thickness, false, color)
     }
 }
 
@@ -94,7 +113,7 @@ pub(crate) fn filled(polygon: &[[f64; 2]], z: f64, color: Color) -> Option<Trian
         return None;
     };
     Some(TriangleListPrimitive {
-        pose: Some(pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))),
+        pose: Some(pose([0.0; 3], UNTURNED)),
         points: polygon.iter().map(|point| lifted(*point, z)).collect(),
         color: Some(color),
         indices,
@@ -119,9 +138,9 @@ fn is_convex(polygon: &[[f64; 2]]) -> bool {
 }
 
 /// A word that always faces the viewer.
-pub(crate) fn text(words: String, [x, y, z]: [f64; 3], size_m: f64, color: Color) -> TextPrimitive {
+pub(crate) fn text(words: String, at: [f64; 3], size_m: f64, color: Color) -> TextPrimitive {
     TextPrimitive {
-        pose: Some(pose((x, y, z), (0.0, 0.0, 0.0, 1.0))),
+        pose: Some(pose(at, UNTURNED)),
         billboard: true,
         font_size: size_m,
         text: words,
@@ -131,10 +150,10 @@ pub(crate) fn text(words: String, [x, y, z]: [f64; 3], size_m: f64, color: Color
 }
 
 /// A ball of this radius, metres.
-pub(crate) fn ball([x, y, z]: [f64; 3], radius_m: f64, color: Color) -> SpherePrimitive {
+pub(crate) fn ball(at: [f64; 3], radius_m: f64, color: Color) -> SpherePrimitive {
     let side = 2.0 * radius_m;
     SpherePrimitive {
-        pose: Some(pose((x, y, z), (0.0, 0.0, 0.0, 1.0))),
+        pose: Some(pose(at, UNTURNED)),
         size: Some(Vector3 {
             x: side,
             y: side,
@@ -166,7 +185,7 @@ pub(crate) fn rod(
     };
     let middle = [0, 1, 2].map(|axis| 0.5 * (from[axis] + to[axis]));
     Some(CylinderPrimitive {
-        pose: Some(pose((middle[0], middle[1], middle[2]), (i, j, 0.0, w))),
+        pose: Some(pose(middle, [i, j, 0.0, w])),
         size: Some(Vector3 {
             x: 2.0 * radius_m,
             y: 2.0 * radius_m,

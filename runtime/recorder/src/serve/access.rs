@@ -230,24 +230,17 @@ impl Access {
     /// All refusals, if there were any: the most frequent by name.
     pub(crate) fn account(&self) -> Option<String> {
         let refused = self.refused();
-        let mut counts: Vec<(&Refusal, u64)> = refused
-            .counts
-            .iter()
-            .map(|(who, count)| (who, *count))
-            .collect();
-        counts.sort_by_key(|(_, count)| core::cmp::Reverse(*count));
-        let total: u64 = counts.iter().map(|(_, count)| count).sum();
+        let mut counts: Vec<(&Refusal, &u64)> = refused.counts.iter().collect();
+        counts.sort_by_key(|(_, count)| core::cmp::Reverse(**count));
+        let total: u64 = refused.counts.values().sum();
         let total = total.saturating_add(refused.unnamed_count);
         let mut words = format!("refused {}", counted_plainly(total, "request"));
         for (index, (who, count)) in counts.iter().take(ACCOUNT_MAX).enumerate() {
             let between = if index == 0 { ": " } else { "; " };
             let _infallible = write!(words, "{between}{count} × {who}");
         }
-        let rest: u64 = counts
-            .iter()
-            .skip(ACCOUNT_MAX)
-            .map(|(_, count)| count)
-            .sum();
+        let rest = counts.iter().skip(ACCOUNT_MAX);
+        let rest: u64 = rest.map(|(_, count)| **count).sum();
         let rest = rest.saturating_add(refused.unnamed_count);
         if rest > 0 {
             let _infallible = write!(words, "; {}", counted_plainly(rest, "other"));

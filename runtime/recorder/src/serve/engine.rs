@@ -214,7 +214,7 @@ impl Engine {
             let parameters = self.links.list();
             if parameters != self.told {
                 self.told.clone_from(&parameters);
-                self.viewers.server().publish_parameter_values(parameters);
+                self.viewers.server.publish_parameter_values(parameters);
             }
         }
         self.viewers.welcome(now_ns);

@@ -46,7 +46,7 @@ const BUFFER_BYTES: usize = 32 * 1024;
 const KERNEL_BYTES: u32 = 128 * 1024;
 /// How long a viewer may neither acknowledge nor have room for what it is sent: one whose cable was
 /// pulled says no goodbye, and would keep its seat for the kernel's two hours.
-const GONE_AFTER: Duration = Duration::from_secs(30);
+pub(super) const GONE_AFTER: Duration = Duration::from_secs(30);
 /// Out of file descriptors, mostly: others must close first.
 const PAUSE: Duration = Duration::from_millis(50);
 
@@ -74,7 +74,7 @@ fn hidden([a, b, c]: [u8; 3]) -> Ipv4Addr {
 ///
 /// # Errors
 /// When the kernel does not know these options.
-pub(super) fn let_go_after(socket: &impl AsFd, time: Duration) -> io::Result<()> {
+fn let_go_after(socket: &impl AsFd, time: Duration) -> io::Result<()> {
     let whole = |number: u128| u32::try_from(number).unwrap_or(u32::MAX);
     let asked_every_s = whole(u128::from(time.as_secs() / 3).max(1));
     setsockopt(socket, sockopt::KeepAlive, &true)?;
@@ -82,6 +82,30 @@ pub(super) fn let_go_after(socket: &impl AsFd, time: Duration) -> io::Result<()>
     setsockopt(socket, sockopt::TcpKeepInterval, &asked_every_s)?;
     setsockopt(socket, sockopt::TcpUserTimeout, &whole(time.as_millis()))?;
     Ok(())
+}
+
+/// Listens at `address`. Connections that take nothing for `gone_after` are closed, and the kernel keeps
+/// `kernel_bytes` for each.
+///
+/// # Errors
+/// When the address cannot be had.
+pub(super) fn listen(
+    runtime: &Handle,
+    address: SocketAddr,
+    gone_after: Duration,
+    kernel_bytes: u32,
+) -> io::Result<TcpListener> {
+    let _entered = runtime.enter();
+    let socket = match address {
+        SocketAddr::V4(_) => TcpSocket::new_v4()?,
+        SocketAddr::V6(_) => TcpSocket::new_v6()?,
+    };
+    socket.set_reuseaddr(true)?;
+    // Handed down to the connections.
+    let_go_after(&socket, gone_after)?;
+    socket.set_send_buffer_size(kernel_bytes)?;
+    socket.bind(address)?;
+    socket.listen(1024)
 }
 
 /// The port that viewers connect to, before anybody is let in.
@@ -92,27 +116,16 @@ pub(super) struct Door {
 }
 
 impl Door {
-    /// Takes `address`; connections wait.
+    /// Takes `address`; connections wait. Viewers that take nothing for `gone_after` lose their place.
     ///
     /// # Errors
     /// When it cannot be had.
-    pub(super) fn take(runtime: &Handle, address: SocketAddr) -> io::Result<Self> {
-        Self::take_for(runtime, address, GONE_AFTER)
-    }
-
-    /// As [`Door::take`]; viewers that take nothing for `gone_after` lose their place.
-    fn take_for(runtime: &Handle, address: SocketAddr, gone_after: Duration) -> io::Result<Self> {
-        let _entered = runtime.enter();
-        let socket = match address {
-            SocketAddr::V4(_) => TcpSocket::new_v4()?,
-            SocketAddr::V6(_) => TcpSocket::new_v6()?,
-        };
-        socket.set_reuseaddr(true)?;
-        // Handed down to the connections.
-        let_go_after(&socket, gone_after)?;
-        socket.set_send_buffer_size(KERNEL_BYTES)?;
-        socket.bind(address)?;
-        let listener = socket.listen(1024)?;
+    pub(super) fn take(
+        runtime: &Handle,
+        address: SocketAddr,
+        gone_after: Duration,
+    ) -> io::Result<Self> {
+        let listener = listen(runtime, address, gone_after, KERNEL_BYTES)?;
         let port = listener.local_addr()?.port();
         Ok(Self { listener, port })
     }
@@ -349,7 +362,7 @@ mod tests {
         let mut builder = Builder::new_multi_thread();
         let runtime = builder.worker_threads(2).enable_all().build().unwrap();
         let loopback = SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 0);
-        let door = Door::take_for(runtime.handle(), loopback, gone_after).unwrap();
+        let door = Door::take(runtime.handle(), loopback, gone_after).unwrap();
         let address = SocketAddr::new(loopback.ip(), door.port());
         let access = Arc::new(Access::new(&[], &[], None));
         let front = door.open(runtime.handle(), server, access, 80);

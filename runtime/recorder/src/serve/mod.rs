@@ -34,12 +34,11 @@ use hil_runtime::watch::FeedError;
 use tokio::runtime::Runtime;
 
 use crate::cli::ServeOptions;
-use crate::scene::Scenery;
 use crate::split::prepare;
 use crate::writer::WriteError;
 use access::{Access, NO_ORIGIN, Refusal};
 use engine::{Engine, Showing, Shown};
-use front::{Door, Front};
+use front::{Door, Front, GONE_AFTER};
 use parameters::Links;
 use playback::Playback;
 use recording::Target;
@@ -131,7 +130,11 @@ pub(crate) fn serve(
         .build()?;
     let access = Arc::new(admitted(options));
     let (viewers, front) = open(options, &runtime, &links, &access, console)?;
-    let mut engine = Engine::new(viewers, links, target(options));
+    let target = options.record.clone().map(|path| Target {
+        path,
+        has_scene: !options.no_scene,
+    });
+    let mut engine = Engine::new(viewers, links, target);
     match shown {
         Some(shown) => engine.show(shown, console),
         None => console.say("no run goes on here; waiting for one"),
@@ -160,15 +163,6 @@ pub(crate) fn serve(
     Ok(i32::from(!is_recorded))
 }
 
-/// Where what is shown is recorded, if it is.
-fn target(options: &ServeOptions) -> Option<Target> {
-    let path = options.record.clone()?;
-    Some(Target {
-        path,
-        scenery: Scenery::of(options.no_scene),
-    })
-}
-
 /// What is shown first; `None` when it has to be waited for.
 fn first(
     options: &ServeOptions,
@@ -186,6 +180,7 @@ fn first(
             Err(ServeError::NotBegun { folder })
         };
     }
+    let goes_on = |folder: &&Path| LiveRun::read(folder).is_ok_and(|run| run.is_held());
     if let Some(folder) = folder.filter(|folder| !goes_on(folder)) {
         if options.record.is_some() {
             let folder = folder.to_owned();
@@ -206,13 +201,9 @@ fn first(
     }
     match select(wanted) {
         Ok(run) => Ok(Some(watch(run)?)),
-        Err(error) if options.wait && is_none_yet(&error) => Ok(None),
+        Err(SelectError::NoneRuns | SelectError::NoSuch { .. }) if options.wait => Ok(None),
         Err(error) => Err(error.into()),
     }
-}
-
-fn goes_on(folder: &Path) -> bool {
-    LiveRun::read(folder).is_ok_and(|run| run.is_held())
 }
 
 /// True for the folder of a run whose supervisor has only just made it: nothing is announced or
@@ -222,10 +213,6 @@ fn has_not_begun(folder: &Path) -> bool {
     let is_told = folder.join(LiveRun::FILE_NAME).exists() || run.summary().exists();
     let records = fs::read_dir(run.records());
     !is_told && records.is_ok_and(|mut records| records.next().is_none())
-}
-
-const fn is_none_yet(error: &SelectError) -> bool {
-    matches!(error, SelectError::NoneRuns | SelectError::NoSuch { .. })
 }
 
 fn watch(run: LiveRun) -> Result<Shown, ServeError> {
@@ -296,14 +283,15 @@ fn open(
 ) -> Result<(Viewers, Front), ServeError> {
     let runtime = runtime.handle();
     let address = SocketAddr::new(options.host, options.port);
-    let door = Door::take(runtime, address).map_err(|why| ServeError::Socket { address, why })?;
+    let door = Door::take(runtime, address, GONE_AFTER)
+        .map_err(|why| ServeError::Socket { address, why })?;
     let socket = SocketAddr::new(options.host, door.port());
     let viewers = Viewers::begin(runtime, Arc::new(links.clone()))
         .map_err(|error| ServeError::Hidden(error.to_string()))?;
     let address = SocketAddr::new(options.host, options.http_port);
     let page = page::serve(runtime, address, door.port(), Arc::clone(access))
         .map_err(|why| ServeError::Page { address, why })?;
-    let front = door.open(runtime, viewers.address(), Arc::clone(access), page.port());
+    let front = door.open(runtime, viewers.address, Arc::clone(access), page.port());
     if !options.host.is_loopback() {
         console.warn(
             "anybody who can reach this address sees the run and may change its emulated links; \

@@ -16,12 +16,12 @@ use hyper::service::service_fn;
 use hyper::{Method, Request, Response, StatusCode};
 use hyper_util::rt::{TokioIo, TokioTimer};
 use serde_json::json;
-use tokio::net::{TcpListener, TcpSocket, TcpStream};
+use tokio::net::{TcpListener, TcpStream};
 use tokio::runtime::Handle;
 use tokio::time::timeout;
 
 use super::access::{Access, Refusal};
-use super::front::let_go_after;
+use super::front::listen;
 
 /// The page with its style and scripts, made of the folder `page` by the build script.
 const PAGE: &str = include_str!(concat!(env!("OUT_DIR"), "/page.html"));
@@ -59,31 +59,17 @@ pub(crate) fn serve(
     ws_port: u16,
     access: Arc<Access>,
 ) -> io::Result<SocketAddr> {
-    let listener = listen(runtime, address)?;
+    // What is unsent when a connection is closed is the kernel's, which would try for minutes.
+    let listener = listen(runtime, address, SERVED_WITHIN, KERNEL_BYTES)?;
     let at = listener.local_addr()?;
     let config = json!({ "ws_port": ws_port, "version": env!("CARGO_PKG_VERSION") });
     let config = Bytes::from(config.to_string());
-    runtime.spawn(attend(listener, (config, access), SERVED_WITHIN));
+    runtime.spawn(attend(listener, config, access, SERVED_WITHIN));
     Ok(at)
 }
 
-fn listen(runtime: &Handle, address: SocketAddr) -> io::Result<TcpListener> {
-    let _entered = runtime.enter();
-    let socket = match address {
-        SocketAddr::V4(_) => TcpSocket::new_v4()?,
-        SocketAddr::V6(_) => TcpSocket::new_v6()?,
-    };
-    socket.set_reuseaddr(true)?;
-    // Handed down to the connections. What is unsent when one is closed is the kernel's, which would
-    // try for minutes.
-    socket.set_send_buffer_size(KERNEL_BYTES)?;
-    let_go_after(&socket, SERVED_WITHIN)?;
-    socket.bind(address)?;
-    socket.listen(1024)
-}
-
 /// Takes connections, and gives each at most `within` for all of it.
-async fn attend(listener: TcpListener, (config, access): (Bytes, Arc<Access>), within: Duration) {
+async fn attend(listener: TcpListener, config: Bytes, access: Arc<Access>, within: Duration) {
     let room = Arc::new(tokio::sync::Semaphore::new(CONNECTIONS_MAX));
     loop {
         let Ok(place) = Arc::clone(&room).acquire_owned().await else {
@@ -128,32 +114,20 @@ fn answer(method: &Method, path: &str, config: &Bytes) -> Response<Full<Bytes>> 
         return response;
     }
     match path {
-        "/" => found(
-            "text/html; charset=utf-8",
-            Bytes::from_static(PAGE.as_bytes()),
-        ),
-        "/config.json" => found("application/json", config.clone()),
+        "/" => with_headers(StatusCode::OK, "text/html; charset=utf-8", PAGE.into()),
+        "/config.json" => with_headers(StatusCode::OK, "application/json", config.clone()),
         _ => plain(StatusCode::NOT_FOUND, "no such file\n"),
     }
 }
 
-fn found(kind: &'static str, content: Bytes) -> Response<Full<Bytes>> {
-    with_headers(StatusCode::OK, kind, content)
-}
-
-fn plain(status: StatusCode, words: &'static str) -> Response<Full<Bytes>> {
-    with_headers(
-        status,
-        "text/plain; charset=utf-8",
-        Bytes::from_static(words.as_bytes()),
-    )
+fn plain(status: StatusCode, words: impl Into<Bytes>) -> Response<Full<Bytes>> {
+    with_headers(status, "text/plain; charset=utf-8", words.into())
 }
 
 fn refused(refusal: &Refusal) -> Response<Full<Bytes>> {
     let (code, _) = refusal.status();
     let status = StatusCode::from_u16(code).unwrap_or(StatusCode::FORBIDDEN);
-    let words = format!("{}\n", refusal.words());
-    with_headers(status, "text/plain; charset=utf-8", Bytes::from(words))
+    plain(status, format!("{}\n", refusal.words()))
 }
 
 fn with_headers(status: StatusCode, kind: &'static str, content: Bytes) -> Response<Full<Bytes>> {
@@ -176,6 +150,8 @@ fn with_headers(status: StatusCode, kind: &'static str, content: Bytes) -> Respo
 #[cfg(test)]
 mod tests {
     use std::io::{Read as _, Write as _};
+
+    use tokio::net::TcpSocket;
 
     use super::*;
 
@@ -252,11 +228,17 @@ mod tests {
             .enable_all()
             .build()
             .unwrap();
-        let listener = listen(runtime.handle(), ([127, 0, 0, 1], 0).into()).unwrap();
+        let listener = listen(
+            runtime.handle(),
+            ([127, 0, 0, 1], 0).into(),
+            SERVED_WITHIN,
+            KERNEL_BYTES,
+        )
+        .unwrap();
         let at = listener.local_addr().unwrap();
         let access = Arc::new(Access::new(&[], &[], None));
-        let served = (Bytes::from_static(b"{}"), access);
-        runtime.spawn(attend(listener, served, Duration::from_millis(300)));
+        let config = Bytes::from_static(b"{}");
+        runtime.spawn(attend(listener, config, access, Duration::from_millis(300)));
         let mut stuck: Vec<_> = (0..CONNECTIONS_MAX)
             .map(|_| asked(&runtime, at, "/"))
             .collect();

@@ -35,6 +35,23 @@ const DELAY: &str = "delay_ms";
 const LOSS: &str = "loss_ratio";
 const CUT: &str = "is_cut";
 
+/// One direction of a link.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+struct Direction {
+    link: String,
+    /// `forward` or `backward`.
+    way: String,
+}
+
+impl Direction {
+    fn new(link: &str, way: &str) -> Self {
+        Self {
+            link: link.to_owned(),
+            way: way.to_owned(),
+        }
+    }
+}
+
 /// What a direction does, as far as it has numbers.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 struct Wish {
@@ -98,7 +115,7 @@ pub(crate) struct Links {
     ask: SyncSender<Request>,
     /// Beside the queue, so that it is not lost when viewers fill that.
     change: Arc<Mutex<Option<Change>>>,
-    known: Arc<Mutex<BTreeMap<(String, String), Wish>>>,
+    known: Arc<Mutex<BTreeMap<Direction, Wish>>>,
 }
 
 impl Links {
@@ -131,7 +148,7 @@ impl Links {
     /// What the direction `way` of `link` does: `condition`, `is_settable` and `why_not` of
     /// `/live/run`.
     pub(crate) fn describe(&self, link: &str, via: &str, way: &str, is_over: bool) -> Value {
-        let key = (link.to_owned(), way.to_owned());
+        let key = Direction::new(link, way);
         let wish = locked(&self.known).get(&key).copied();
         let condition = wish
             .map(|wish| json!({ DELAY: wish.delay_ms, LOSS: wish.loss_ratio, CUT: wish.is_cut }));
@@ -191,9 +208,9 @@ struct Worker {
     /// The launch files when the links were opened.
     launches: BTreeMap<OsString, u64>,
     change: Arc<Mutex<Option<Change>>>,
-    known: Arc<Mutex<BTreeMap<(String, String), Wish>>>,
+    known: Arc<Mutex<BTreeMap<Direction, Wish>>>,
     topology: Value,
-    wishes: BTreeMap<(String, String), Wish>,
+    wishes: BTreeMap<Direction, Wish>,
 }
 
 impl Worker {
@@ -311,8 +328,8 @@ fn launches_in(folder: &Path) -> BTreeMap<OsString, u64> {
     files.collect()
 }
 
-fn key_of(direction: &LinkDirection) -> (String, String) {
-    (direction.link.clone(), direction.way.word().to_owned())
+fn key_of(direction: &LinkDirection) -> Direction {
+    Direction::new(&direction.link, direction.way.word())
 }
 
 /// The direction and the part of it that `name` means.
@@ -351,7 +368,7 @@ fn wish_of(
     condition: LinkCondition,
     before: Option<Wish>,
     topology: &Value,
-    key: &(String, String),
+    key: &Direction,
 ) -> Wish {
     match condition {
         LinkCondition::Fixed { delay, loss_ratio } => Wish {
@@ -369,8 +386,8 @@ fn wish_of(
 }
 
 /// What the topology gives numbers for.
-fn of_topology(topology: &Value, (link, way): &(String, String)) -> Wish {
-    let spec = &topology["links"][link][way];
+fn of_topology(topology: &Value, key: &Direction) -> Wish {
+    let spec = &topology["links"][&key.link][&key.way];
     let delay = spec["delay"].as_str().and_then(read_duration);
     Wish {
         delay_ms: delay.map(|delay| delay.as_secs_f64() * 1e3),
@@ -380,8 +397,8 @@ fn of_topology(topology: &Value, (link, way): &(String, String)) -> Wish {
     }
 }
 
-fn parameters_of((link, way): &(String, String), wish: &Wish) -> Vec<Parameter> {
-    let named = |what: &str| format!("link.{link}.{way}.{what}");
+fn parameters_of(key: &Direction, wish: &Wish) -> Vec<Parameter> {
+    let named = |what: &str| format!("link.{}.{}.{what}", key.link, key.way);
     let numbers = [(DELAY, wish.delay_ms), (LOSS, wish.loss_ratio)];
     let numbers = numbers.into_iter().filter_map(|(what, value)| {
         Some(Parameter {
@@ -414,7 +431,7 @@ mod tests {
     /// What the gateway is asked for when the link is cut and then no longer, with a look at its
     /// record between.
     fn cut_and_back(wish: Wish) -> LinkCondition {
-        let key = ("hop".to_owned(), "forward".to_owned());
+        let key = Direction::new("hop", "forward");
         let cut = after(wish, CUT, ParameterValue::Bool(true));
         assert_eq!(cut.condition(), LinkCondition::Cut);
         let seen = wish_of(LinkCondition::Cut, Some(cut), &Value::Null, &key);
@@ -423,7 +440,7 @@ mod tests {
 
     #[test]
     fn a_link_that_was_cut_does_afterwards_what_it_did_before() {
-        let key = ("hop".to_owned(), "forward".to_owned());
+        let key = Direction::new("hop", "forward");
         let topology = json!({ "links": { "hop": { "forward": {
             "delay": "5 ms", "loss_ratio": 0.1,
         }}}});

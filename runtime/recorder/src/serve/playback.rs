@@ -209,11 +209,11 @@ fn plan(
     }
     for record in net::records(file) {
         if let Some(noted) = Noted::of(&record) {
-            let offset_ns = match noted.stage {
+            let shift_ns = match noted.stage {
                 Stage::Published | Stage::Sent => sender,
                 Stage::Received | Stage::Taken => receiver,
             };
-            add(noted.at_ns, offset_ns, What::Record(record));
+            add(noted.at_ns, shift_ns, What::Record(record));
         }
     }
 }

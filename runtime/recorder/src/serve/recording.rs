@@ -11,7 +11,6 @@ use hil_runtime::platform::console::Console;
 use hil_runtime::platform::words::counted_plainly;
 
 use crate::record::{RecordError, Recorded, Request, Which, record};
-use crate::scene::Scenery;
 use crate::split::another;
 
 /// What a kill may lose at most.
@@ -23,7 +22,7 @@ pub(super) struct Target {
     /// The file, or the folder that files are written into.
     pub(super) path: PathBuf,
     /// Draw the scene.
-    pub(super) scenery: Scenery,
+    pub(super) has_scene: bool,
 }
 
 /// A run that is being recorded.
@@ -51,7 +50,7 @@ impl Recording {
             split_bytes: None,
             flush: FLUSH,
             force: false,
-            scenery: target.scenery,
+            has_scene: target.has_scene,
         };
         let stop = Arc::new(AtomicBool::new(false));
         let is_stopped = Arc::clone(&stop);

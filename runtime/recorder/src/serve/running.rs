@@ -108,17 +108,9 @@ impl Source for Running {
     }
 
     fn poll(&mut self, take: &mut dyn FnMut(&LiveRecord)) -> Progress {
-        let Self {
-            feed,
-            channels,
-            offset_ns,
-            is_silent,
-            problems,
-            ..
-        } = self;
-        let (offset_ns, mut has_summary) = (*offset_ns, None);
+        let (offset_ns, mut has_summary) = (self.offset_ns, None);
         let now_ns = MonotonicClock::now().as_ns();
-        let place = |name: &str| channels.iter().position(|known| known == name);
+        let place = |name: &str| self.channels.iter().position(|known| known == name);
         let mut give = |channel: &str, own_ns: Option<i64>, body: Body| {
             if let Some(channel) = place(channel) {
                 // Of another host's clock nothing is known but that it was before now.
@@ -131,7 +123,7 @@ impl Source for Running {
             }
         };
         for _ in 0..POLLS_MAX {
-            let poll = feed.poll(&mut |event| match event {
+            let poll = self.feed.poll(&mut |event| match event {
                 Event::Message {
                     channel,
                     origin,
@@ -158,8 +150,8 @@ impl Source for Running {
                     }
                 }
                 Event::Record { .. } => {}
-                Event::Problem(text) => problems.push(text.to_owned()),
-                Event::Silent => *is_silent = true,
+                Event::Problem(text) => self.problems.push(text.to_owned()),
+                Event::Silent => self.is_silent = true,
                 Event::Ended { has_summary: has } => has_summary = Some(has),
             });
             if poll != Poll::Busy {

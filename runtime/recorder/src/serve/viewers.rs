@@ -41,14 +41,8 @@ pub(crate) const LIVE_TOPICS: [&str; 6] = [
     "/live/arms",
 ];
 
-/// The last of these is sent to each new subscriber.
-const KEPT: [&str; 5] = [
-    "/live/run",
-    "/live/map",
-    "/live/channels",
-    "/live/fleet",
-    "/live/arms",
-];
+/// The only one whose last message is not sent to each new subscriber.
+const LOSSES: &str = "/live/losses";
 
 /// Subscriptions, as they happen.
 struct Listener {
@@ -112,9 +106,10 @@ impl Sink for Offered {
 
 /// All viewers.
 pub(crate) struct Viewers {
-    server: WebSocketServerHandle,
-    /// Where the library listens.
-    address: SocketAddr,
+    /// The socket, to tell viewers of changed parameters.
+    pub(crate) server: WebSocketServerHandle,
+    /// Where the library listens, to nobody but the door.
+    pub(crate) address: SocketAddr,
     live: BTreeMap<&'static str, Live>,
     channels: Vec<ChannelTopics>,
     offered: Offered,
@@ -167,11 +162,6 @@ impl Viewers {
             },
             subscribed,
         })
-    }
-
-    /// Where the library listens, to nobody but the door.
-    pub(crate) const fn address(&self) -> SocketAddr {
-        self.address
     }
 
     /// Viewers that are connected.
@@ -247,7 +237,7 @@ impl Viewers {
         let text = value.to_string().into_bytes();
         let stamp = PartialMetadata::with_log_time(u64::try_from(at_ns).unwrap_or(0));
         live.channel.log_with_meta(&text, stamp);
-        live.last = KEPT.contains(&topic).then_some(text);
+        live.last = (topic != LOSSES).then_some(text);
     }
 
     /// Forgets the last state of a live topic, which is of a run before.
@@ -266,11 +256,6 @@ impl Viewers {
                 live.channel.log_with_meta_to_sink(last, stamp, Some(sink));
             }
         }
-    }
-
-    /// The socket, to tell viewers of changed parameters.
-    pub(crate) const fn server(&self) -> &WebSocketServerHandle {
-        &self.server
     }
 
     /// Says goodbye to all.

@@ -9,6 +9,7 @@ use hil_models::yumi::{Joints, Pose};
 use serde_json::{Value, json};
 
 use super::{rounded, seconds};
+use crate::topics::{read, side_of};
 
 /// Both arms.
 #[derive(Debug)]
@@ -43,20 +44,16 @@ impl ArmsView {
 
     /// Takes a message of `channel` at `at_ns`; which arm it is about, the channel's name tells.
     pub(crate) fn take(&mut self, channel: &str, message: &str, payload: &[u8], at_ns: i64) {
-        let mut parts = channel.split('/');
-        let side = parts.find_map(|part| Side::BOTH.into_iter().find(|side| side.word() == part));
-        let Some(side) = side else { return };
+        let Some(side) = side_of(channel) else {
+            return;
+        };
         let arm = &mut self.arms[side.index()];
         match message {
             EgmCommand::NAME => {
-                if let Ok(command) = bytemuck::try_pod_read_unaligned(payload) {
-                    arm.command = Some((command, at_ns));
-                }
+                arm.command = read(payload).map(|one| (one, at_ns)).or(arm.command);
             }
             EgmFeedback::NAME => {
-                if let Ok(feedback) = bytemuck::try_pod_read_unaligned(payload) {
-                    arm.feedback = Some((feedback, at_ns));
-                }
+                arm.feedback = read(payload).map(|one| (one, at_ns)).or(arm.feedback);
             }
             _ => {}
         }
@@ -103,7 +100,7 @@ impl OneArm {
             "desired_rad": desired, "measured_rad": measured,
             "desired_age_s": age(self.command.map(|(_, at_ns)| at_ns)),
             "measured_age_s": age(self.feedback.map(|(_, at_ns)| at_ns)),
-            "tool_error_mm": desired.zip(measured).map(|both| self.tool_error_mm(&both)),
+            "tool_error_mm": desired.zip(measured).map(|(one, other)| self.tool_error_mm(&one, &other)),
             "desired_frames": desired.map(|joints| self.frames(&joints)),
             "measured_frames": measured.map(|joints| self.frames(&joints)),
         })
@@ -134,7 +131,7 @@ impl OneArm {
         words.map(|(_, word)| *word).collect()
     }
 
-    fn tool_error_mm(&self, (desired, measured): &(Joints, Joints)) -> f64 {
+    fn tool_error_mm(&self, desired: &Joints, measured: &Joints) -> f64 {
         let position = |joints| Pose::from(self.arm.tool(joints)).position_m;
         let (one, other) = (position(desired), position(measured));
         let squares = one.iter().zip(&other).map(|(a, b)| (a - b) * (a - b));

@@ -31,7 +31,8 @@ pub(crate) struct Collisions {
     overlapping: BTreeSet<(u32, u32, u32)>,
     listed: VecDeque<Value>,
     count: u64,
-    has_truth: bool,
+    /// Collisions are those of the robots' true motion.
+    pub(crate) has_truth: bool,
 }
 
 impl Collisions {
@@ -51,11 +52,6 @@ impl Collisions {
         self.waiting.push_back(truth);
     }
 
-    /// True when collisions are those of the robots' true motion.
-    pub(crate) const fn is_by_truth(&self) -> bool {
-        self.has_truth
-    }
-
     /// Looks at all that was until shortly before `now_ns`; `origin_ns` is the run's beginning,
     /// both on the robots' clock.
     pub(crate) fn look(&mut self, now_ns: i64, origin_ns: i64) {
@@ -69,7 +65,7 @@ impl Collisions {
         let Some(begin) = self.next.or(first) else {
             return;
         };
-        self.next = Some(scan(referee, &mut self.waiting, (begin, now_ns)));
+        self.next = Some(scan(referee, &mut self.waiting, begin, now_ns));
         let incidents = referee.incidents();
         let listed: Vec<Value> = incidents[self.known_count..]
             .iter()
@@ -138,7 +134,8 @@ impl Collisions {
 fn scan(
     referee: &mut Referee,
     waiting: &mut VecDeque<Truth>,
-    (begin, now_ns): (Instant, i64),
+    begin: Instant,
+    now_ns: i64,
 ) -> Instant {
     let mut at = begin;
     while at.as_ns() + BEHIND_NS <= now_ns {

@@ -13,6 +13,7 @@ use super::collisions::Collisions;
 use super::ground::{Ground, Made, Making, points};
 use super::sections::{Areas, OnPath, of_pair};
 use super::{rounded, seconds};
+use crate::topics::read;
 
 /// A state older than this is shown as stale.
 const STALE_NS: i64 = 1_000_000_000;
@@ -25,8 +26,12 @@ const SECTIONS_MAX: usize = 400;
 /// Robots shown at all: a damaged record must not fill the memory.
 const ROBOTS_MAX: usize = 64 * 448;
 
-/// A robot's fleet and number.
-type Id = (u32, u32);
+/// Which robot.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+struct Id {
+    fleet: u32,
+    robot: u32,
+}
 
 /// The fleets of a run.
 #[derive(Debug)]
@@ -99,7 +104,7 @@ impl FleetView {
                 if let Some(state) = read::<State>(payload).filter(State::is_sound) {
                     self.offset_ns = offset_ns;
                     let header = state.header;
-                    if let Some(robot) = self.robot((header.fleet_id, header.robot_id)) {
+                    if let Some(robot) = self.robot(header.fleet_id, header.robot_id) {
                         robot.state = Some((state, at_ns));
                     }
                 }
@@ -107,7 +112,7 @@ impl FleetView {
             Mission::NAME => {
                 if let Some(mission) = read::<Mission>(payload) {
                     let header = mission.header;
-                    if let Some(robot) = self.robot((header.fleet_id, header.robot_id)) {
+                    if let Some(robot) = self.robot(header.fleet_id, header.robot_id) {
                         robot.learn(header.mission_id, mission.path_id);
                     }
                 }
@@ -115,7 +120,7 @@ impl FleetView {
             Truth::NAME => {
                 if let Some(truth) = read::<Truth>(payload) {
                     self.offset_ns = offset_ns;
-                    if let Some(robot) = self.robot((truth.fleet_id, truth.robot_id)) {
+                    if let Some(robot) = self.robot(truth.fleet_id, truth.robot_id) {
                         robot.learn(truth.mission_id, truth.path_id);
                     }
                     self.collisions.on_truth(truth);
@@ -125,7 +130,8 @@ impl FleetView {
         }
     }
 
-    fn robot(&mut self, id: Id) -> Option<&mut Robot> {
+    fn robot(&mut self, fleet: u32, robot: u32) -> Option<&mut Robot> {
+        let id = Id { fleet, robot };
         if self.robots.len() >= ROBOTS_MAX && !self.robots.contains_key(&id) {
             return None;
         }
@@ -173,7 +179,7 @@ impl FleetView {
             .collect();
         let sections = self.sections();
         let (collisions, count) = self.collisions.listed();
-        let basis = if self.collisions.is_by_truth() {
+        let basis = if self.collisions.has_truth {
             "truth"
         } else {
             "states"
@@ -185,16 +191,16 @@ impl FleetView {
     }
 
     fn look_at_states(&mut self, now_ns: i64, at_s: f64) {
-        let Some(vehicle) = self.vehicle.filter(|_| !self.collisions.is_by_truth()) else {
+        let Some(vehicle) = self.vehicle.filter(|_| !self.collisions.has_truth) else {
             return;
         };
         let mut fleets: BTreeMap<u32, Vec<(u32, Pose)>> = BTreeMap::new();
-        for ((fleet, id), robot) in &self.robots {
+        for (id, robot) in &self.robots {
             if let Some((state, at_ns)) = robot.state
                 && now_ns - at_ns < STALE_NS
             {
                 let pose = Pose::new(state.x_m, state.y_m, state.heading_rad);
-                fleets.entry(*fleet).or_default().push((*id, pose));
+                fleets.entry(id.fleet).or_default().push((id.robot, pose));
             }
         }
         for (fleet, robots) in fleets {
@@ -211,11 +217,11 @@ impl FleetView {
         let world = &self.ground.as_ref()?.scene.world;
         let areas = self.areas.as_mut()?;
         let mut fleets: BTreeMap<u32, Vec<OnPath>> = BTreeMap::new();
-        for ((fleet, id), robot) in &self.robots {
+        for (id, robot) in &self.robots {
             fleets
-                .entry(*fleet)
+                .entry(id.fleet)
                 .or_default()
-                .extend(on_path(*id, robot, world));
+                .extend(on_path(id.robot, robot, world));
         }
         let mut list = Vec::new();
         for (fleet, robots) in &fleets {
@@ -225,7 +231,7 @@ impl FleetView {
             for (index, one) in robots.iter().enumerate() {
                 for other in &robots[index + 1..] {
                     if list.len() < SECTIONS_MAX {
-                        of_pair(world, areas, *fleet, (one, other), &mut list);
+                        list.extend(of_pair(world, areas, *fleet, one, other));
                     }
                 }
             }
@@ -265,7 +271,7 @@ fn granted(state: &State, path: &Path) -> Option<usize> {
     }
 }
 
-fn picture_of((fleet, id): Id, robot: &Robot, scene: Option<&Scene>, now_ns: i64) -> Option<Value> {
+fn picture_of(id: Id, robot: &Robot, scene: Option<&Scene>, now_ns: i64) -> Option<Value> {
     let (state, at_ns) = robot.state?;
     let phase = Phase::of(state.phase)?;
     let word = match phase {
@@ -277,7 +283,7 @@ fn picture_of((fleet, id): Id, robot: &Robot, scene: Option<&Scene>, now_ns: i64
     let is_standing = state.speed_mps.abs() < 1e-3;
     let mission = state.header.mission_id;
     let mut picture = json!({
-        "fleet": fleet, "id": id,
+        "fleet": id.fleet, "id": id.robot,
         "x_m": rounded(state.x_m), "y_m": rounded(state.y_m),
         "heading_rad": rounded(state.heading_rad), "speed_mps": rounded(state.speed_mps.into()),
         "age_s": seconds((now_ns - at_ns).max(0)), "is_stale": now_ns - at_ns > STALE_NS,
@@ -301,22 +307,18 @@ fn picture_of((fleet, id): Id, robot: &Robot, scene: Option<&Scene>, now_ns: i64
         picture["last_index"] = json!(path.last_index());
         picture["granted_index"] = json!(granted);
         if matches!(phase, Phase::Driving | Phase::AtPoint) {
-            let ahead = points(path, (here, path.last_index()), AHEAD_MAX);
+            let ahead = points(path, here, path.last_index(), AHEAD_MAX);
             picture["ahead"] = json!(ahead);
         }
         if let Some(granted) = granted {
             let way_m = path.way_to_m(granted) - state.travelled_m;
             picture["granted_m"] = json!(rounded(way_m.max(0.0)));
             if granted > here {
-                picture["granted"] = json!(points(path, (here, granted), AHEAD_MAX));
+                picture["granted"] = json!(points(path, here, granted, AHEAD_MAX));
             }
         }
     }
     Some(picture)
-}
-
-fn read<M: Message>(payload: &[u8]) -> Option<M> {
-    bytemuck::try_pod_read_unaligned(payload).ok()
 }
 
 #[cfg(test)]

@@ -29,7 +29,7 @@ fn header(robot_id: u32) -> Header {
     }
 }
 
-fn tell(view: &mut FleetView, robot: u32, (x_m, y_m): (f64, f64), index: i32, at_ns: i64) {
+fn tell(view: &mut FleetView, robot: u32, [x_m, y_m]: [f64; 2], index: i32, at_ns: i64) {
     let mission = Mission {
         header: header(robot),
         path_id: 2 * robot,
@@ -58,7 +58,7 @@ fn a_robot_is_shown_on_its_path_with_what_it_was_granted() {
         (&json!(2), &json!("crossing"))
     );
     assert_eq!(map["conflict_areas"].as_array().map(Vec::len), Some(1));
-    tell(&mut view, 0, (-20.0, 0.0), 3, 5 * S);
+    tell(&mut view, 0, [-20.0, 0.0], 3, 5 * S);
     let picture = view.picture(7 * S, 4 * S);
     let robot = &picture["robots"][0];
     assert_eq!(
@@ -90,8 +90,8 @@ fn a_robot_is_shown_on_its_path_with_what_it_was_granted() {
 fn robots_that_report_the_same_place_collide_once_until_they_part() {
     let (mut view, _) = view();
     let meet = |view: &mut FleetView, x_m: f64, at_ns: i64| {
-        tell(view, 0, (x_m, 0.0), 66, at_ns);
-        tell(view, 1, (0.0, 0.0), 66, at_ns);
+        tell(view, 0, [x_m, 0.0], 66, at_ns);
+        tell(view, 1, [0.0, 0.0], 66, at_ns);
         view.picture(at_ns, 0)["collision_count"].clone()
     };
     let counts = [0.0, 0.1, 9.0, 0.0].map(|x_m| meet(&mut view, x_m, S));
@@ -134,10 +134,10 @@ fn the_referee_judges_where_the_truth_is_recorded() {
 #[test]
 fn nonsense_is_not_shown() {
     let (mut view, _) = view();
-    tell(&mut view, 0, (f64::NAN, 0.0), 3, 0);
+    tell(&mut view, 0, [f64::NAN, 0.0], 3, 0);
     view.take(State::NAME, &[1, 2, 3], 0, 0);
     assert_eq!(view.picture(0, 0)["robots"], json!([]));
-    tell(&mut view, 0, (0.0, 0.0), i32::MAX, 0);
+    tell(&mut view, 0, [0.0, 0.0], i32::MAX, 0);
     assert_eq!(
         view.picture(0, 0)["robots"].as_array().map(Vec::len),
         Some(1)

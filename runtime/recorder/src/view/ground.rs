@@ -109,7 +109,7 @@ fn map(
     let paths: Vec<_> = forward
         .map(|route| {
             let path = world.path(route.path);
-            let points = points(path, (0, path.last_index()), each.clamp(2, 200));
+            let points = points(path, 0, path.last_index(), each.clamp(2, 200));
             json!({ "id": route.path.0, "from": route.from, "to": route.to, "points": points })
         })
         .collect();
@@ -146,7 +146,7 @@ fn conflict_areas(scene: &Scene, vehicle: &Footprint) -> Vec<Value> {
                 if shown.len() == AREAS_MAX {
                     return shown;
                 }
-                let area = areas.of(world, (*one, *other), section);
+                let area = areas.of(world, *one, *other, section);
                 if !area.is_empty() {
                     shown.push(json!(area));
                 }
@@ -178,7 +178,7 @@ fn around(scene: &Scene) -> Bounds {
 }
 
 /// At most about `count_max` points of `path` from one pose to another, both ends among them.
-pub(crate) fn points(path: &Path, (from, to): (usize, usize), count_max: usize) -> Vec<[f64; 2]> {
+pub(crate) fn points(path: &Path, from: usize, to: usize, count_max: usize) -> Vec<[f64; 2]> {
     let to = to.min(path.last_index());
     let from = from.min(to);
     let step = (to - from).div_ceil(count_max.max(1)).max(1);

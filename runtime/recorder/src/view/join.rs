@@ -80,10 +80,6 @@ impl Joined {
     /// Hears of each segment whose two ends are known now and were not before: its place among
     /// [`LINK_SEGMENTS`] or [`LOCAL_SEGMENTS`], `None` for the whole way, and its length.
     pub(crate) fn news(&mut self, way: Way, hear: &mut dyn FnMut(Option<usize>, i64)) {
-        let Way {
-            has_link,
-            has_one_clock,
-        } = way;
         let one = &self.stamps;
         let mut counted = self.counted;
         let mut offer = |bit: usize, length_ns: Option<i64>| {
@@ -93,11 +89,12 @@ impl Joined {
                 hear((bit != WHOLE).then_some(bit), length_ns);
             }
         };
-        let whole = span(one.published_ns, one.taken_ns).filter(|_| has_one_clock || !has_link);
-        if has_link {
+        let whole =
+            span(one.published_ns, one.taken_ns).filter(|_| way.has_one_clock || !way.has_link);
+        if way.has_link {
             let tx_ns = minus(one.tx_realtime_ns, one.sender_realtime_offset_ns);
             let rx_ns = minus(one.rx_realtime_ns, one.receiver_realtime_offset_ns);
-            let wire = span(one.tx_realtime_ns, one.rx_realtime_ns).filter(|_| has_one_clock);
+            let wire = span(one.tx_realtime_ns, one.rx_realtime_ns).filter(|_| way.has_one_clock);
             let segments = [
                 span(one.published_ns, one.gateway_taken_ns),
                 span(one.gateway_taken_ns, one.handed_ns),

@@ -41,7 +41,8 @@ impl Areas {
     pub(crate) fn of(
         &mut self,
         world: &World,
-        (one, other): (PathId, PathId),
+        one: PathId,
+        other: PathId,
         section: usize,
     ) -> &[Point] {
         if self.known.len() > AREAS_MAX {
@@ -55,14 +56,14 @@ impl Areas {
                 return Vec::new();
             };
             let ground = |side, path: PathId| {
-                let part = (section.start(side), section.end(side));
-                hull(covered(world.path(path), part, &vehicle))
+                let (from, to) = (section.start(side), section.end(side));
+                hull(covered(world.path(path), from, to, &vehicle))
             };
             let (from, to) = (section.start(Side::First), section.end(Side::First));
             let path = world.path(one);
             let long_m = STRIP_LENGTHS * vehicle.length_m + vehicle.width_m;
             if path.way_to_m(to.min(path.last_index())) - path.way_to_m(from) > long_m {
-                return strip(path, (from, to), &vehicle);
+                return strip(path, from, to, &vehicle);
             }
             let area = shared(&ground(Side::First, one), &ground(Side::Second, other));
             area.iter().map(|point| point.map(rounded)).collect()
@@ -71,7 +72,7 @@ impl Areas {
 }
 
 /// Corners of the vehicle at poses of the path's part, its ends among them.
-fn covered(path: &Path, (from, to): (usize, usize), vehicle: &Footprint) -> Vec<Point> {
+fn covered(path: &Path, from: usize, to: usize, vehicle: &Footprint) -> Vec<Point> {
     let to = to.min(path.last_index());
     let step = to.saturating_sub(from).div_ceil(POSES_MAX).max(1);
     let poses = path.poses();
@@ -81,7 +82,7 @@ fn covered(path: &Path, (from, to): (usize, usize), vehicle: &Footprint) -> Vec<
 }
 
 /// The strip that a vehicle covers along the path's part.
-fn strip(path: &Path, (from, to): (usize, usize), vehicle: &Footprint) -> Vec<Point> {
+fn strip(path: &Path, from: usize, to: usize, vehicle: &Footprint) -> Vec<Point> {
     let to = to.min(path.last_index());
     let step = to.saturating_sub(from).div_ceil(POSES_MAX).max(1);
     let part = (from..to).step_by(step).chain([to]);
@@ -137,9 +138,10 @@ pub(crate) fn of_pair(
     world: &World,
     areas: &mut Areas,
     fleet: u32,
-    (one, other): (&OnPath, &OnPath),
-    list: &mut Vec<Value>,
-) {
+    one: &OnPath,
+    other: &OnPath,
+) -> Vec<Value> {
+    let mut list = Vec::new();
     let sections = world.sections.between(one.path, other.path);
     for (index, section) in sections.iter().enumerate() {
         let sides = [(one, Side::First), (other, Side::Second)];
@@ -166,9 +168,10 @@ pub(crate) fn of_pair(
             "may_pass": may_pass,
             "inside": inside,
             "is_contested": is_contested,
-            "polygon": areas.of(world, (one.path, other.path), index),
+            "polygon": areas.of(world, one.path, other.path, index),
         }));
     }
+    list
 }
 
 #[cfg(test)]
@@ -185,7 +188,7 @@ mod tests {
         parameters.build().unwrap()
     }
 
-    fn at(robot: u32, (index, granted): (usize, usize)) -> OnPath {
+    fn at(robot: u32, index: usize, granted: usize) -> OnPath {
         OnPath {
             robot,
             path: PathId(2 * robot),
@@ -196,16 +199,14 @@ mod tests {
 
     fn listed(scene: &Scene, one: &OnPath, other: &OnPath) -> Vec<Value> {
         let mut areas = Areas::new(scene.world.vehicle.footprint);
-        let mut list = Vec::new();
-        of_pair(&scene.world, &mut areas, 0, (one, other), &mut list);
-        list
+        of_pair(&scene.world, &mut areas, 0, one, other)
     }
 
     #[test]
     fn a_crossing_is_the_square_that_both_can_cover() {
         let scene = crossing();
         let mut areas = Areas::new(scene.world.vehicle.footprint);
-        let area = areas.of(&scene.world, (PathId(0), PathId(2)), 0);
+        let area = areas.of(&scene.world, PathId(0), PathId(2), 0);
         let spread = |axis: usize| {
             let values = area.iter().map(|point| point[axis]);
             values.clone().fold(f64::MIN, f64::max) - values.fold(f64::MAX, f64::min)
@@ -214,14 +215,14 @@ mod tests {
             (spread(0) - 0.5).abs() < 1e-9 && (spread(1) - 0.5).abs() < 1e-9,
             "{area:?}"
         );
-        assert!(areas.of(&scene.world, (PathId(0), PathId(2)), 9).is_empty());
+        assert!(areas.of(&scene.world, PathId(0), PathId(2), 9).is_empty());
     }
 
     #[test]
     fn who_is_granted_the_crossing_may_pass_and_two_contest_it() {
         let scene = crossing();
         // The section has the poses 188 to 212 of both.
-        let list = listed(&scene, &at(0, (190, 400)), &at(1, (150, 180)));
+        let list = listed(&scene, &at(0, 190, 400), &at(1, 150, 180));
         assert_eq!(
             (&list[0]["may_pass"], &list[0]["inside"]),
             (&json!([0]), &json!([0]))
@@ -230,13 +231,13 @@ mod tests {
             (&list[0]["is_contested"], &list[0]["id"]),
             (&json!(false), &json!("0:0-1:0"))
         );
-        let both = listed(&scene, &at(0, (150, 400)), &at(1, (150, 400)));
+        let both = listed(&scene, &at(0, 150, 400), &at(1, 150, 400));
         assert_eq!(
             (&both[0]["may_pass"], &both[0]["is_contested"]),
             (&json!([0, 1]), &json!(true))
         );
         assert_eq!(
-            listed(&scene, &at(0, (213, 400)), &at(1, (150, 400))),
+            listed(&scene, &at(0, 213, 400), &at(1, 150, 400)),
             Vec::<Value>::new()
         );
     }
@@ -249,7 +250,7 @@ mod tests {
         };
         let scene = parameters.build().unwrap();
         let mut areas = Areas::new(scene.world.vehicle.footprint);
-        let area = areas.of(&scene.world, (PathId(0), PathId(2)), 0);
+        let area = areas.of(&scene.world, PathId(0), PathId(2), 0);
         let path = scene.world.path(PathId(0));
         assert!(area.len() > 20);
         // Its corners stand by twos beside the path.

@@ -13,22 +13,13 @@ use crate::net::MessageLatency;
 /// Robots from which on the fleet's picture is drawn more seldom.
 const MANY_ROBOTS: usize = 64;
 
-/// How a run stands.
-#[derive(Debug, Clone, PartialEq, Eq)]
-enum Standing {
-    /// Records come.
-    Running,
-    /// None comes any more, and how it ended.
-    Ended(String),
-}
-
 /// A run while it goes on.
 #[derive(Debug)]
 pub(crate) struct RunState {
     /// What was known before.
     pub(crate) facts: RunFacts,
-    /// How it stands.
-    standing: Standing,
+    /// How it ended; `None` while records come.
+    how_ended: Option<String>,
     accounts: Vec<Account>,
     fleet: Option<FleetView>,
     arms: ArmsView,
@@ -41,14 +32,19 @@ pub(crate) struct RunState {
 impl RunState {
     /// A run without a record yet.
     pub(crate) fn new(facts: RunFacts) -> Self {
+        let is_fleet = facts.case.as_deref() == Some("fleet");
+        let fleet = is_fleet.then(|| FleetView::new(&facts.parameters));
+        Self::with(facts, fleet)
+    }
+
+    fn with(facts: RunFacts, fleet: Option<FleetView>) -> Self {
         let channels = facts.channels.iter();
         let accounts = channels.map(|channel| Account::new(channel, facts.has_one_clock));
-        let is_fleet = facts.case.as_deref() == Some("fleet");
         Self {
             accounts: accounts.collect(),
-            fleet: is_fleet.then(|| FleetView::new(&facts.parameters)),
+            fleet,
             arms: ArmsView::new(),
-            standing: Standing::Running,
+            how_ended: None,
             origin_ns: None,
             ended_ns: None,
             read_count: 0,
@@ -58,17 +54,11 @@ impl RunState {
 
     /// Begins again with the same run; what takes long to work out is kept.
     pub(crate) fn rewind(&mut self) {
-        let channels = self.facts.channels.iter();
-        let accounts = channels.map(|channel| Account::new(channel, self.facts.has_one_clock));
-        self.accounts = accounts.collect();
-        self.arms = ArmsView::new();
-        if let Some(fleet) = &mut self.fleet {
+        let mut fleet = self.fleet.take();
+        if let Some(fleet) = &mut fleet {
             fleet.rewind();
         }
-        self.origin_ns = None;
-        self.ended_ns = None;
-        self.standing = Standing::Running;
-        self.read_count = 0;
+        *self = Self::with(core::mem::take(&mut self.facts), fleet);
     }
 
     /// Stamps of all hosts compare from now on.
@@ -104,10 +94,9 @@ impl RunState {
 
     /// It ended, and how; true when that is news.
     pub(crate) fn end(&mut self, how: String, now_ns: i64) -> bool {
-        let standing = Standing::Ended(how);
-        let is_news = self.standing != standing;
         self.ended_ns.get_or_insert(now_ns);
-        self.standing = standing;
+        let is_news = self.how_ended.as_ref() != Some(&how);
+        self.how_ended = Some(how);
         is_news
     }
 
@@ -121,12 +110,10 @@ impl RunState {
     /// `/live/run`, without what only the server knows.
     pub(crate) fn run(&self, now_ns: i64) -> Value {
         let facts = &self.facts;
-        let (state, how) = match &self.standing {
-            Standing::Running => ("running", None),
-            Standing::Ended(how) => ("ended", Some(how)),
-        };
+        let state = if self.is_over() { "ended" } else { "running" };
         json!({
-            "name": facts.name, "case": facts.case, "state": state, "how": how,
+            "name": facts.name, "case": facts.case, "state": state,
+            "how": self.how_ended,
             "elapsed_s": self.elapsed_s(now_ns),
             "duration_s": facts.duration.map(|one| one.as_secs_f64()),
             "hosts_here": facts.hosts_here, "hosts": facts.hosts,
@@ -139,7 +126,7 @@ impl RunState {
 
     /// True when no more records come.
     pub(crate) fn is_over(&self) -> bool {
-        self.standing != Standing::Running
+        self.how_ended.is_some()
     }
 
     /// What went wrong in here.

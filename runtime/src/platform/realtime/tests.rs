@@ -74,9 +74,8 @@ fn a_child_thread_does_not_inherit_the_priority() {
         policy,
         ..RealtimeRequest::default()
     };
-    let child_policy = apply_in_scratch_thread(request, |_| {
-        thread::spawn(|| current_policy()).join().unwrap()
-    });
+    let child_policy =
+        apply_in_scratch_thread(request, |_| thread::spawn(current_policy).join().unwrap());
     assert_eq!(child_policy, libc::SCHED_OTHER);
 }
 
