@@ -17,8 +17,8 @@ use std::process::ExitCode;
 use std::thread;
 use std::time::Duration;
 
-use hil_models::measure::record::{TakenRecord, UNAVAILABLE};
 use hil_models::random::RandomStream;
+use hil_models::record::{TakenRecord, UNAVAILABLE};
 use hil_runtime::clock::MonotonicClock;
 use hil_runtime::record::{RecordFile, RecordKind};
 use hil_runtime::signals::EXIT_INTERRUPTED;

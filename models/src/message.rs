@@ -66,9 +66,11 @@ pub const fn type_hash(name: &str, size_bytes: usize, alignment_bytes: usize) ->
     fnv1a(hash, &(alignment_bytes as u64).to_le_bytes())
 }
 
-pub(crate) const FNV_OFFSET: u64 = 0xcbf2_9ce4_8422_2325;
+/// Where 64-bit FNV-1a begins.
+pub const FNV_OFFSET: u64 = 0xcbf2_9ce4_8422_2325;
 
-pub(crate) const fn fnv1a(mut hash: u64, bytes: &[u8]) -> u64 {
+/// 64-bit FNV-1a of `bytes`, going on from `hash`.
+pub const fn fnv1a(mut hash: u64, bytes: &[u8]) -> u64 {
     let mut index = 0;
     while index < bytes.len() {
         hash = (hash ^ bytes[index] as u64).wrapping_mul(0x0000_0100_0000_01b3);

@@ -13,10 +13,10 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use hil_models::account::OutageFigures;
 use hil_models::case_study::Score;
-use hil_models::link::LinkModel;
-use hil_models::link::trace::{ReplayCounts, ReplayTally};
-use hil_models::measure::account::OutageFigures;
+use hil_models::link_model::LinkModel;
+use hil_models::link_model::{ReplayCounts, ReplayTally};
 use hil_models::plot::PlotSeries;
 use hil_models::simulation::{Carrier, Simulation, SimulationError, SimulationResult};
 use hil_models::time::Instant;

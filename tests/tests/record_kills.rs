@@ -7,8 +7,8 @@ use std::path::{Path, PathBuf};
 use std::thread;
 use std::time::Duration;
 
-use hil_models::measure::record::PublishedRecord;
 use hil_models::random::RandomStream;
+use hil_models::record::PublishedRecord;
 use hil_runtime::clock::MonotonicClock;
 use hil_runtime::record::RecordFile;
 use hil_runtime::report::summary::Outcome;

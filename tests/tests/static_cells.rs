@@ -5,7 +5,7 @@
 use std::process::Command;
 use std::time::Duration;
 
-use hil_models::measure::statistics::clopper_pearson;
+use hil_models::stats::statistics::clopper_pearson;
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::child::ChildGuard;
 use hil_tests::trial::shipped_topology;

@@ -10,8 +10,8 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use hil_models::measure::record::{EgressRecord, IngressRecord};
 use hil_models::message::MessageType;
+use hil_models::record::{EgressRecord, IngressRecord};
 use hil_runtime::channel::{
     ChannelHolder, ChannelSettings, Domain, DomainAddress, OutputSettings, ShmInput, ShmOutput,
     Waiter,

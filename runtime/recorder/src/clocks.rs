@@ -3,7 +3,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use hil_models::measure::record::{EgressRecord, IngressRecord, UNAVAILABLE};
+use hil_models::record::{EgressRecord, IngressRecord, UNAVAILABLE};
 use hil_runtime::manifest::Manifest;
 use hil_runtime::record::RecordKind;
 

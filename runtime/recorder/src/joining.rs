@@ -8,7 +8,7 @@
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-use hil_models::measure::record::IngressRecord;
+use hil_models::record::IngressRecord;
 use hil_runtime::watch::{Record, Seen, Stage};
 
 use crate::net::{self, Latencies, MessageLatency};

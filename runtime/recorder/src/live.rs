@@ -6,8 +6,8 @@ mod beside;
 use std::collections::BTreeMap;
 use std::time::Instant;
 
-use hil_models::measure::record::UNAVAILABLE;
 use hil_models::message::Envelope;
+use hil_models::record::UNAVAILABLE;
 use hil_runtime::watch::{Event, Feed, Origin, Record, Seen, Source, WatchedChannel};
 use prost::Message as _;
 

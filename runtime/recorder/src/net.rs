@@ -3,7 +3,7 @@
 
 use std::collections::BTreeMap;
 
-use hil_models::measure::record::{
+use hil_models::record::{
     EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE,
 };
 use hil_models::trace::{Trace, TraceFate, TraceRecord, UNAVAILABLE_NS, UNBOUNDED_NS};

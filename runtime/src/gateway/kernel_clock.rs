@@ -73,7 +73,7 @@ impl KernelClock {
 mod tests {
     use super::*;
     use crate::wait::WAIT_MAX;
-    use hil_models::measure::network::CLOCK_READING_AGE_NS_MAX;
+    use hil_models::account::network::CLOCK_READING_AGE_NS_MAX;
     use hil_models::time::duration_ns;
 
     #[test]

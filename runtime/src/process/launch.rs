@@ -8,8 +8,8 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use hil_models::case_study::ParameterError;
-use hil_models::link::LinkModel;
 use hil_models::link::spec::{LinkPlace, LinkSpec, Way};
+use hil_models::link_model::LinkModel;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 

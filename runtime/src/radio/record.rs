@@ -2,7 +2,7 @@
 //! happened to an association.
 
 use bytemuck::{Pod, Zeroable};
-use hil_models::measure::record::UNAVAILABLE;
+use hil_models::record::UNAVAILABLE;
 
 use super::nl80211::{Happening, Rate, Station};
 

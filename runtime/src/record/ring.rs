@@ -225,7 +225,7 @@ fn flush(drain: &mut Drain) -> io::Result<()> {
 mod tests {
     use super::*;
     use crate::record::RecordFile;
-    use hil_models::measure::record::PublishedRecord;
+    use hil_models::record::PublishedRecord;
     use std::env;
     use std::fs;
     use std::process;

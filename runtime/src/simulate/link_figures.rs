@@ -3,9 +3,9 @@
 
 use core::fmt::Write;
 
-use hil_models::link::{Fate, LossCauses};
-use hil_models::measure::histogram::{LatencyHistogram, LatencySummary};
-use hil_models::measure::statistics::wilson;
+use hil_models::link_model::{Fate, LossCauses};
+use hil_models::stats::histogram::{LatencyHistogram, LatencySummary};
+use hil_models::stats::statistics::wilson;
 use hil_models::time::Instant;
 use serde::Serialize;
 

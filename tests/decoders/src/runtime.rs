@@ -4,7 +4,7 @@
 use std::path::Path;
 
 use hil_gateways::capture::flow::FlowFilter;
-use hil_models::measure::record::{IngressRecord, PublishedRecord};
+use hil_models::record::{IngressRecord, PublishedRecord};
 use hil_runtime::channel::DomainAddress;
 use hil_runtime::clock_discipline::{ChronyTracking, NtpVariables, PtpStatus};
 use hil_runtime::layout::{Decoder, Value};

@@ -2,14 +2,14 @@
 
 use core::time::Duration;
 
-use super::goodness::ks_distance;
 use super::{Fit, NEARLY_FIXED, REFUSED_BELOW, Ranking, duration_text};
 use crate::case_study::ParameterError;
 use crate::link::delay::{
     DELAY_MAX, DelayLaw, Exponential, Histogram, LogNormal, Normal, Pareto, Uniform,
 };
-use crate::measure::special::{ceil_count, incomplete_gamma};
 use crate::random::RandomStream;
+use crate::stats::goodness::ks_distance;
+use crate::stats::special::{ceil_count, incomplete_gamma};
 
 /// Most delays the test of distribution looks at, evenly spread.
 const TESTED_MAX: usize = 1_000;

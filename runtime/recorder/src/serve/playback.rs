@@ -3,9 +3,7 @@
 use std::path::Path;
 use std::time::Instant;
 
-use hil_models::measure::record::{
-    EgressRecord, IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE,
-};
+use hil_models::record::{EgressRecord, IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE};
 use hil_models::time::duration_ns;
 use hil_runtime::record::{RecordFile, RecordKind};
 use hil_runtime::report::assessment::Assessment;

@@ -141,7 +141,7 @@ impl Account {
                 self.update((one.epoch, one.sequence), at_ns, &|joined| joined.sent(one));
             }
             Body::Ingress(one) => {
-                if one.flags & hil_models::measure::record::IngressRecord::DUPLICATE != 0 {
+                if one.flags & hil_models::record::IngressRecord::DUPLICATE != 0 {
                     return;
                 }
                 let key = (one.epoch, one.sequence);

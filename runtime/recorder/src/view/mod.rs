@@ -17,7 +17,7 @@ mod sections;
 pub(crate) mod state;
 mod window;
 
-use hil_models::measure::record::{EgressRecord, IngressRecord, PublishedRecord, TakenRecord};
+use hil_models::record::{EgressRecord, IngressRecord, PublishedRecord, TakenRecord};
 
 /// Something that a process of the run recorded.
 #[derive(Debug, Clone)]

@@ -2,8 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use hil_models::measure::account::OutageFigures;
-use hil_models::measure::histogram::LatencySummary;
+use hil_models::account::OutageFigures;
+use hil_models::stats::histogram::LatencySummary;
 use serde::Deserialize;
 
 use super::series::Series;

@@ -23,7 +23,7 @@ pub(crate) use channel::closing_text;
 pub(crate) use trace::{render_fit, render_trace, render_trace_plots};
 pub(crate) use units::{JOINT, duration, duration_s, figure, grouped, percent, seconds};
 
-use hil_models::measure::account::OutageFigures;
+use hil_models::account::OutageFigures;
 
 use canvas::{Canvas, INDENT};
 
