@@ -6,7 +6,7 @@ use core::cmp::Ordering;
 use serde::{Deserialize, Serialize};
 
 use super::histogram::DurationBin;
-use super::special::{incomplete_beta, invert};
+use super::special::student_quantile;
 use super::statistics::{Interval, IntervalNs, quantile_ranks, wilson};
 
 /// A figure of one run, with its interval where it has one.
@@ -159,15 +159,6 @@ impl Moments {
     }
 }
 
-/// The quantile of Student's distribution above the median.
-fn student_quantile(probability: f64, freedom: f64) -> f64 {
-    let below = |t: f64| {
-        let x = freedom / (freedom + t * t);
-        1.0 - 0.5 * incomplete_beta(freedom / 2.0, 0.5, x)
-    };
-    invert(probability, 0.0, 1e4, below)
-}
-
 /// The order-statistics interval of a quantile from a histogram, as wide as its bins make it. It takes
 /// values as independent, so it is too narrow where successive ones are correlated. `None` when there
 /// are too few.
@@ -224,13 +215,6 @@ mod tests {
             newcombe(Share { count: 0, of: 0 }, Share { count: 1, of: 2 }, 0.95),
             None
         );
-    }
-
-    #[test]
-    fn student_quantiles_are_those_of_the_tables() {
-        for (freedom, expected) in [(1.0, 12.706), (4.0, 2.776), (10.0, 2.228), (1e6, 1.960)] {
-            close(student_quantile(0.975, freedom), expected, 6e-4);
-        }
     }
 
     #[test]

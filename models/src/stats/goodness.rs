@@ -2,8 +2,7 @@
 //! values. They say what speaks against a model, never that it is true.
 
 use serde::{Deserialize, Serialize};
-
-use super::special::incomplete_gamma;
+use statrs::distribution::{ChiSquared, ContinuousCDF};
 
 /// Pearson's test.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -28,8 +27,8 @@ impl ChiSquare {
             (observed - expected).powi(2) / expected.max(f64::MIN_POSITIVE)
         });
         let statistic: f64 = terms.sum();
-        let probability = 1.0 - incomplete_gamma(0.5 * degrees as f64, 0.5 * statistic);
-        Some(ChiSquare {
+        let probability = ChiSquared::new(degrees as f64).map_or(f64::NAN, |law| law.sf(statistic));
+        Some(Self {
             statistic,
             degrees: u32::try_from(degrees).unwrap_or(u32::MAX),
             probability: probability.clamp(0.0, 1.0),

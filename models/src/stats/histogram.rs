@@ -276,10 +276,7 @@ impl LatencySummary {
         let ascending = samples.ascending();
         let count = ascending.len();
         let last = count.checked_sub(1)?;
-        let at = |quantile: f64| {
-            let rank = ceil_count(quantile * count as f64).clamp(1, count);
-            ascending.at(rank - 1)
-        };
+        let at = |quantile: f64| ascending.at_share(quantile);
         let sum_ns: i128 = ascending.iter().map(i128::from).sum();
         Some(Self {
             count: count as u64,

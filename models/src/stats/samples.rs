@@ -1,7 +1,7 @@
 //! Exact values of every message of a run, in as little memory as they need. What figures are made of them is decided elsewhere.
 
 use super::histogram::{Distribution, LatencySummary};
-use super::special::ceil_count;
+use super::special::place_of;
 
 /// Exact values of one kind, in four bytes each while they lie close together.
 #[derive(Debug, Clone)]
@@ -100,8 +100,7 @@ impl Samples {
     /// # Panics
     /// When there are none.
     pub fn at_share(&self, share: f64) -> i64 {
-        let rank = ceil_count(share * self.len() as f64).clamp(1, self.len());
-        self.at(rank - 1)
+        self.at(place_of(share, self.len()))
     }
 
     /// The value at this place.

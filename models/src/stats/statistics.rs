@@ -6,13 +6,12 @@
 //! [`block_bootstrap_quantile`], which keeps the correlation inside its blocks.
 
 use serde::{Deserialize, Serialize};
+use statrs::function::gamma::gamma_lr;
 
 use crate::random::RandomStream;
 use crate::stats::resampling::BlockResampling;
 use crate::stats::samples::Samples;
-use crate::stats::special::{
-    binomial_cdf, incomplete_beta, incomplete_gamma, invert, normal_quantile,
-};
+use crate::stats::special::{binomial_cdf, incomplete_beta, invert, normal_quantile};
 
 /// The confidence every report uses.
 pub const CONFIDENCE: f64 = 0.95;
@@ -60,24 +59,25 @@ pub fn wilson(successes: u64, trials: u64, confidence: f64) -> Option<Interval> 
     if trials == 0 {
         return None;
     }
-    let z = normal_quantile(0.5 + 0.5 * confidence);
     let n = trials as f64;
-    let share = successes as f64 / n;
+    let Interval { low, high } = wilson_of(successes as f64 / n, n, confidence);
+    // The closed form is exact at the ends; rounding is not.
+    Some(Interval {
+        low: if successes == 0 { 0.0 } else { low },
+        high: if successes == trials { 1.0 } else { high },
+    })
+}
+
+/// Wilson's interval for a share of `n` trials, which need not be a whole number.
+pub fn wilson_of(share: f64, n: f64, confidence: f64) -> Interval {
+    let z = normal_quantile(0.5 + 0.5 * confidence);
     let centre = share + z * z / (2.0 * n);
     let spread = z * (share * (1.0 - share) / n + z * z / (4.0 * n * n)).sqrt();
     let scale = 1.0 + z * z / n;
-    // The closed form is exact at the ends; rounding is not.
-    let low = if successes == 0 {
-        0.0
-    } else {
-        (centre - spread) / scale
-    };
-    let high = if successes == trials {
-        1.0
-    } else {
-        (centre + spread) / scale
-    };
-    Some(Interval { low, high })
+    Interval {
+        low: ((centre - spread) / scale).max(0.0),
+        high: ((centre + spread) / scale).min(1.0),
+    }
 }
 
 /// The exact interval for a proportion (Clopper and Pearson 1934): never covers less than
@@ -120,9 +120,9 @@ pub fn poisson(count: u64, confidence: f64) -> Interval {
     let low = if count == 0 {
         0.0
     } else {
-        invert(tail, 0.0, ceiling, |x| incomplete_gamma(k, x))
+        invert(tail, 0.0, ceiling, |x| gamma_lr(k, x))
     };
-    let high = invert(1.0 - tail, 0.0, ceiling, |x| incomplete_gamma(k + 1.0, x));
+    let high = invert(1.0 - tail, 0.0, ceiling, |x| gamma_lr(k + 1.0, x));
     Interval { low, high }
 }
 

@@ -9,6 +9,7 @@ use serde::{Deserialize, Serialize};
 use super::{Trace, TraceCounts, TraceFate, TraceRecord, UNAVAILABLE_NS};
 use crate::random::RandomStream;
 use crate::stats::histogram::Distribution;
+use crate::stats::special::place_of;
 use crate::stats::statistics::{
     CONFIDENCE, Interval, IntervalNs, block_bootstrap_quantile, has_tail, wilson,
 };
@@ -204,15 +205,12 @@ fn quantiles(delays_ns: &[i64], seed: u64) -> Vec<QuantileFigure> {
         return Vec::new();
     }
     let mut random = RandomStream::new(seed, "trace.figures.bootstrap");
-    let of = |quantile: f64| {
-        let rank = crate::stats::special::ceil_count(quantile * ascending.len() as f64);
-        QuantileFigure {
-            quantile,
-            value_ns: ascending[rank.clamp(1, ascending.len()) - 1],
-            interval: has_tail(ascending.len(), quantile)
-                .then(|| block_bootstrap_quantile(delays_ns, quantile, CONFIDENCE, &mut random))
-                .flatten(),
-        }
+    let of = |quantile: f64| QuantileFigure {
+        quantile,
+        value_ns: ascending[place_of(quantile, ascending.len())],
+        interval: has_tail(ascending.len(), quantile)
+            .then(|| block_bootstrap_quantile(delays_ns, quantile, CONFIDENCE, &mut random))
+            .flatten(),
     };
     QUANTILES.into_iter().map(of).collect()
 }

@@ -1,7 +1,5 @@
 //! Tests of the link model behind a socket: on the run's clock, and whole messages in pieces.
 
-use std::sync::Arc;
-
 use hil_gateways::protocol::wire::Header;
 use hil_gateways::transport::queue::{QueueSettings, queue_pair};
 use hil_models::link::outages::{Outage, OutageSchedule, Outages};

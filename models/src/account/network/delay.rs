@@ -11,7 +11,7 @@ use crate::stats::histogram::{DurationBin, LatencyHistogram};
 use crate::stats::in_order::in_order;
 use crate::stats::resampling::BlockResampling;
 use crate::stats::samples::Samples;
-use crate::stats::special::ceil_count;
+use crate::stats::special::place_of;
 use crate::stats::statistics::{CONFIDENCE, IntervalNs, has_tail};
 use crate::time::RemoteInstant;
 
@@ -217,8 +217,7 @@ fn variation_bound_ns(
 
 /// The smallest of `ascending` that at least `share` of them do not exceed.
 pub(super) fn at_share(ascending: &[i64], share: f64) -> i64 {
-    let rank = ceil_count(share * ascending.len() as f64).clamp(1, ascending.len());
-    ascending[rank - 1]
+    ascending[place_of(share, ascending.len())]
 }
 
 pub(super) fn successive<P: Passages + ?Sized>(

@@ -8,8 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{Crossing, Figure, Passages};
 use crate::account::BurstCount;
-use crate::stats::special::normal_quantile;
-use crate::stats::statistics::{CONFIDENCE, Interval, wilson};
+use crate::stats::statistics::{CONFIDENCE, Interval, wilson, wilson_of};
 
 /// Messages received in a row that end a burst (`Gmin` of RFC 3611, section 4.7.2).
 pub const BURST_GAP_MIN: u64 = 16;
@@ -154,7 +153,7 @@ pub(super) fn losses<P: Passages + ?Sized>(
         interval: if lost_count == 0 {
             independent_interval
         } else {
-            wilson_of(ratio, effective_count)
+            wilson_of(ratio, effective_count, CONFIDENCE)
         },
         effective_count,
         independent_interval,
@@ -228,18 +227,6 @@ fn variance_between_blocks(runs: &[LossRun], of_count: u64) -> f64 {
     let mean = sums.iter().sum::<f64>() / m;
     let scatter = sums.iter().map(|sum| (sum - mean).powi(2)).sum::<f64>() / (m - 1.0);
     scatter * of_count as f64 / length as f64
-}
-
-/// Wilson's interval for a share of `n` trials, which need not be a whole number.
-fn wilson_of(share: f64, n: f64) -> Interval {
-    let z = normal_quantile(0.5 + 0.5 * CONFIDENCE);
-    let centre = share + z * z / (2.0 * n);
-    let spread = z * (share * (1.0 - share) / n + z * z / (4.0 * n * n)).sqrt();
-    let scale = 1.0 + z * z / n;
-    Interval {
-        low: ((centre - spread) / scale).max(0.0),
-        high: ((centre + spread) / scale).min(1.0),
-    }
 }
 
 fn bursts(runs: &[LossRun], of_count: u64, lost_count: u64) -> Option<BurstFigures> {
