@@ -66,10 +66,10 @@ pub const fn type_hash(name: &str, size_bytes: usize, alignment_bytes: usize) ->
     fnv1a(hash, &(alignment_bytes as u64).to_le_bytes())
 }
 
-/// What [`fnv1a`] begins with.
+/// Where 64-bit FNV-1a begins.
 pub const FNV_OFFSET: u64 = 0xcbf2_9ce4_8422_2325;
 
-/// Fowler, Noll and Vo's hash 1a over 64 bits, continued from `hash` with `bytes`.
+/// 64-bit FNV-1a of `bytes`, going on from `hash`.
 pub const fn fnv1a(mut hash: u64, bytes: &[u8]) -> u64 {
     let mut index = 0;
     while index < bytes.len() {

@@ -8,8 +8,8 @@ use core::fmt::Debug;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use crate::measure::packed::{Unpacked, put};
 use crate::message::{Envelope, Message};
+use crate::packed::{Unpacked, put};
 use crate::time::Instant;
 
 /// One recorded message.

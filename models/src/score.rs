@@ -182,7 +182,18 @@ impl Score {
 
 #[cfg(test)]
 mod tests {
+    use bytemuck::{Pod, Zeroable};
+
     use super::*;
+    use crate::message::Message;
+
+    #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+    #[repr(C)]
+    struct Any(u64);
+
+    impl Message for Any {
+        const NAME: &'static str = "test.Any.v1";
+    }
 
     fn event(severity: Severity, at_ns: i64) -> ScoreEvent {
         ScoreEvent::new(severity, Instant::from_ns(at_ns), "a/b", "something")
@@ -212,7 +223,6 @@ mod tests {
 
     #[test]
     fn an_event_concerns_what_its_messages_went_over_or_what_its_teller_hears() {
-        use crate::shuttle::ShuttleCommand as Any;
         let channels = [
             ChannelSpec::of::<Any>("right/command", "controller", "robot"),
             ChannelSpec::of::<Any>("left/command", "controller", "robot"),

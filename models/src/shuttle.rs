@@ -12,10 +12,10 @@ use serde::{Deserialize, Serialize};
 use crate::case_study::{CaseStudy, ChannelSpec, ErrorSeries, Metric, ParameterError, Score};
 use crate::component::{Component, Outbox, Role, into_role};
 use crate::layout::Field;
-use crate::measure::series::Estimate;
-use crate::measure::special::ceil_count;
 use crate::message::Message;
 use crate::run_log::RunLog;
+use crate::stats::series::Estimate;
+use crate::stats::special::ceil_count;
 use crate::time::{Instant, PeriodicTimer};
 
 /// Controller to robot: the speed to drive.
@@ -325,3 +325,6 @@ impl Component for Robot {
         self.timer.skipped_total()
     }
 }
+
+#[cfg(test)]
+mod tests;

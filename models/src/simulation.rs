@@ -11,7 +11,7 @@ use std::rc::Rc;
 use crate::case_study::{CaseStudy, ChannelSpec, inputs_of, outputs_of};
 use crate::component::Role;
 use crate::endpoint::{Endpoint, InputPort, OutputPort, PortCountError};
-use crate::link::{LinkModel, PerfectLink};
+use crate::link_model::{LinkModel, PerfectLink};
 use crate::message::Envelope;
 use crate::run_log::RunLog;
 use crate::time::Instant;

@@ -3,9 +3,7 @@
 
 use std::fmt::Write;
 
-use hil_models::measure::account::{
-    ChannelAccount, ClosingFigures, MessageFate, RESIDUAL_LIMIT_NS,
-};
+use hil_models::account::{ChannelAccount, ClosingFigures, MessageFate, RESIDUAL_LIMIT_NS};
 use hil_runtime::report::summary::{ChannelSummary, LinkKind, RunSummary};
 
 /// Share of messages whose account must close.

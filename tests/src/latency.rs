@@ -6,7 +6,7 @@ use std::fs;
 use std::ops::Range;
 use std::path::Path;
 
-use hil_models::measure::record::TakenRecord;
+use hil_models::record::TakenRecord;
 use hil_runtime::rundir::record::{RecordFile, RecordKind};
 
 /// What belongs to a moment, nanoseconds from it on: a killed process goes on dying for a while.

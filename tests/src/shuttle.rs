@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use std::fs;
 
 use bytemuck::Pod;
-use hil_models::measure::record::{IngressRecord, UNAVAILABLE};
+use hil_models::record::{IngressRecord, UNAVAILABLE};
 use hil_models::trace::{Trace, wire};
 use hil_runtime::rundir::record::RecordFile;
 

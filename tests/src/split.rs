@@ -4,7 +4,7 @@
 
 use std::time::Duration;
 
-use hil_models::measure::record::TakenRecord;
+use hil_models::record::TakenRecord;
 use hil_runtime::report::summary::{DirectionSummary, Outcome, RunSummary};
 
 use crate::account::{account, assert_every_message_is_accounted_for, channel, describe};

@@ -10,7 +10,6 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use hil_models::measure::record::{EgressRecord, IngressRecord};
 use hil_models::message::MessageType;
 use hil_runtime::engine::gateway::Surroundings;
 use hil_runtime::engine::gateway::direction;

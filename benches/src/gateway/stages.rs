@@ -10,8 +10,8 @@ use hil_gateways::protocol::{
 use hil_gateways::transport::udp::{UdpReceiver, UdpSender};
 use hil_gateways::transport::{DatagramReceiver, DatagramSender};
 use hil_models::endpoint::InputPort;
-use hil_models::measure::record::{EgressRecord, IngressRecord};
 use hil_models::message::Envelope;
+use hil_models::record::{EgressRecord, IngressRecord};
 use hil_models::time::Instant;
 use hil_runtime::platform::clock::MonotonicClock;
 use hil_runtime::rundir::record::RecordSink;

@@ -13,11 +13,11 @@
 
 use std::collections::BTreeMap;
 
-use hil_models::measure::histogram::{Distribution, LatencyHistogram};
-use hil_models::measure::statistics::{
+use hil_models::random::RandomStream;
+use hil_models::stats::histogram::{Distribution, LatencyHistogram};
+use hil_models::stats::statistics::{
     CONFIDENCE, Interval, IntervalNs, block_bootstrap_quantile, wilson,
 };
-use hil_models::random::RandomStream;
 use serde::{Deserialize, Serialize};
 
 use super::Direction;

@@ -3,7 +3,7 @@
 
 use std::collections::BTreeMap;
 
-use hil_models::measure::histogram::{Distribution, LatencyHistogram};
+use hil_models::stats::histogram::{Distribution, LatencyHistogram};
 use serde::{Deserialize, Serialize};
 
 use super::flow::Numbered;

@@ -8,7 +8,7 @@
 use std::thread;
 use std::time::Duration;
 
-use hil_models::link::PerfectLink;
+use hil_models::link_model::PerfectLink;
 use hil_models::time::Instant;
 
 use super::clock_pair::monotonic_now;

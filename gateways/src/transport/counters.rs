@@ -1,6 +1,6 @@
 //! What the two ends of a transport count. It counts nothing by itself.
 
-use hil_models::link::LossCauses;
+use hil_models::link_model::LossCauses;
 
 use super::{Received, SendRefusal};
 

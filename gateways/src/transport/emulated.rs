@@ -10,7 +10,7 @@ use std::io;
 use std::net::SocketAddr;
 use std::os::fd::BorrowedFd;
 
-use hil_models::link::{LinkModel, MessageNumber};
+use hil_models::link_model::{LinkModel, MessageNumber};
 use hil_models::time::Instant;
 
 use super::tcp::StreamFigures;

@@ -3,8 +3,8 @@
 
 use core::time::Duration;
 
-use hil_models::link::Fate;
 use hil_models::link::bernoulli::BernoulliLink;
+use hil_models::link_model::Fate;
 use hil_models::random::RandomStream;
 
 use super::*;

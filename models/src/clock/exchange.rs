@@ -4,7 +4,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::ClockSettings;
-use crate::measure::record::{RoundTripRecord, UNAVAILABLE};
+use crate::record::{RoundTripRecord, UNAVAILABLE};
 
 /// Which of the two hosts asked.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

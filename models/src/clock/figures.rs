@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use super::exchange::StampKind;
+use crate::stats::bounds::BoundFigures;
 
 /// An alignment in figures.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -62,26 +63,4 @@ pub struct ClockStep {
     pub until_ns: i64,
     /// What the offset gained by it, as estimated, nanoseconds.
     pub size_ns: Option<i64>,
-}
-
-/// The error bounds of a set of figures.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub struct BoundFigures {
-    /// Half of them are no larger, nanoseconds.
-    pub median_ns: u64,
-    /// The largest, nanoseconds.
-    pub largest_ns: u64,
-}
-
-impl BoundFigures {
-    /// Of these bounds; `None` of none.
-    pub fn of(mut bounds_ns: Vec<u64>) -> Option<Self> {
-        let middle = bounds_ns.len().checked_sub(1)? / 2;
-        let largest_ns = bounds_ns.iter().copied().max()?;
-        let (_, median_ns, _) = bounds_ns.select_nth_unstable(middle);
-        Some(Self {
-            median_ns: *median_ns,
-            largest_ns,
-        })
-    }
 }

@@ -7,7 +7,8 @@ use super::ClockSettings;
 use super::anchors::Anchors;
 use super::band::{Band, Stretch, stretches};
 use super::exchange::{Constraint, Exchange};
-use super::figures::{BoundFigures, ClockFigures, ClockStep, OffsetFigures};
+use super::figures::{ClockFigures, ClockStep, OffsetFigures};
+use crate::stats::bounds::BoundFigures;
 use crate::time::{Instant, RemoteInstant};
 
 /// An instant of another host on this host's clock, with its bounds.

@@ -37,7 +37,7 @@ mod simulated;
 mod tests;
 
 pub use exchange::{Exchange, Requester, StampKind};
-pub use figures::{BoundFigures, ClockFigures, ClockStep, OffsetFigures};
+pub use figures::{ClockFigures, ClockStep, OffsetFigures};
 pub use map::{ClockMap, Localised};
 
 use serde::{Deserialize, Serialize};
@@ -79,7 +79,7 @@ impl Default for ClockSettings {
 
 impl ClockSettings {
     /// How far the offset may have moved in `span_ns`, rounded up.
-    pub(crate) fn drift_ns(&self, span_ns: i64) -> i64 {
+    pub fn drift_ns(&self, span_ns: i64) -> i64 {
         let product = i128::from(span_ns.unsigned_abs()) * i128::from(self.drift_ppb);
         let drift = (product + 999_999_999) / 1_000_000_000;
         i64::try_from(drift).unwrap_or(i64::MAX)

@@ -7,8 +7,8 @@
 )]
 
 use super::{Exchange, Requester};
-use crate::measure::record::RoundTripRecord;
 use crate::random::RandomStream;
+use crate::record::RoundTripRecord;
 use crate::time::{Instant, RemoteInstant};
 
 /// Largest error of a stamp, nanoseconds; below what the settings allow for.

@@ -8,8 +8,8 @@
 
 use super::simulated::SimulatedRun;
 use super::{BEYOND_NS_MAX, ClockMap, ClockSettings, Exchange, Localised, Requester};
-use crate::measure::record::{RoundTripRecord, UNAVAILABLE};
 use crate::random::RandomStream;
+use crate::record::{RoundTripRecord, UNAVAILABLE};
 use crate::time::{Instant, RemoteInstant};
 
 const DURATION_NS: i64 = 20_000_000_000;

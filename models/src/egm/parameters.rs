@@ -271,7 +271,7 @@ impl ControllerSettings {
 
 impl EgmParameters {
     /// The arms that guided motion shall move: with [`StartMode::Request`], all that are asked to.
-    pub(crate) fn guided_arms(&self) -> GuidedArms {
+    pub fn guided_arms(&self) -> GuidedArms {
         let preset = ControllerSettings::of(self.preset);
         match self.start.unwrap_or(preset.start) {
             StartMode::Request => GuidedArms::Both,

@@ -10,8 +10,8 @@ use crate::fleet::events::events;
 use crate::fleet::experiment::collision_interval;
 use crate::fleet::messages::{Authority, State, Truth};
 use crate::fleet::referee::{Referee, SCAN_PERIOD, Tally};
-use crate::measure::histogram::{LatencyHistogram, LatencySummary};
 use crate::run_log::RunLog;
+use crate::stats::histogram::{LatencyHistogram, LatencySummary};
 use crate::time::Instant;
 
 /// Scores a run.
@@ -299,7 +299,7 @@ mod tests {
     use crate::case_study::CaseStudy;
     use crate::fleet::FleetParameters;
     use crate::fleet::scenario::Scenario;
-    use crate::link::{Fate, LinkModel};
+    use crate::link_model::{Fate, LinkModel};
     use crate::simulation::{Carrier, Simulation};
 
     fn crossing() -> Fleet {

@@ -10,8 +10,8 @@ use super::rate::Bottleneck;
 use super::reordering::Strikes;
 use super::spec::{LinkPlace, LinkSpec};
 use super::wifi::WifiLink;
-use super::{Fate, LinkModel, LossCauses};
 use crate::case_study::ParameterError;
+use crate::link_model::{Fate, LinkModel, LossCauses};
 use crate::random::RandomStream;
 use crate::time::Instant;
 

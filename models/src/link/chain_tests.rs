@@ -11,7 +11,7 @@ use super::outages::{OutageLink, Outages};
 use super::rate::RateLimit;
 use super::reordering::{Duplication, Reordering};
 use super::spec::{LinkPlace, LinkSpec, Way};
-use super::{Fate, LinkModel};
+use crate::link_model::{Fate, LinkModel};
 use crate::random::RandomStream;
 use crate::time::Instant;
 

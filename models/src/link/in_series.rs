@@ -1,6 +1,6 @@
 //! Two links one after the other, as a radio hop before a fixed delay. It adds nothing of its own.
 
-use crate::link::{Fate, LinkModel};
+use crate::link_model::{Fate, LinkModel};
 use crate::time::Instant;
 
 /// What the first delivers sets out on the second when it arrives.

@@ -10,7 +10,7 @@ use core::time::Duration;
 use serde::{Deserialize, Serialize};
 
 use crate::case_study::ParameterError;
-use crate::link::{Fate, LinkModel};
+use crate::link_model::{Fate, LinkModel};
 use crate::random::RandomStream;
 use crate::time::Instant;
 

@@ -25,7 +25,6 @@ use core::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use super::LinkModel;
 use super::chain::LinkChain;
 use super::delay::DelayLaw;
 use super::loss::LossLaw;
@@ -34,6 +33,7 @@ use super::rate::RateLimit;
 use super::reordering::{Duplication, Reordering};
 use super::wifi::WifiSpec;
 use crate::case_study::ParameterError;
+use crate::link_model::LinkModel;
 
 /// One direction of a link. The default does nothing.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]

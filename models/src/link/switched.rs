@@ -1,8 +1,8 @@
 //! A link whose condition can be changed while messages are under way: what was offered before keeps
 //! its fate. It decides neither when nor to what.
 
-use super::trace::ReplayTally;
-use super::{Fate, LinkModel, LossCauses, MessageNumber};
+use crate::link_model::ReplayTally;
+use crate::link_model::{Fate, LinkModel, LossCauses, MessageNumber};
 use crate::time::Instant;
 
 /// What takes the place of the topology's link.

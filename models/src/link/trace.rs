@@ -1,37 +1,52 @@
 //! A recorded trace as a link: each message meets what a message of the trace met. It draws no
-//! random number and reads no file; see [`crate::trace`] for what a trace is.
-
-use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+//! random number and reads no file; a trace comes to it as a [`ReplayTrace`].
 
 use core::time::Duration;
+
 use serde::{Deserialize, Serialize};
 
 use crate::link::trace_offers::{OfferGrid, Offered};
 use crate::link::trace_ticks::Ticks;
-use crate::link::{Fate, LinkModel, MessageNumber};
+use crate::link_model::{Fate, LinkModel, MessageNumber, ReplayEvent, ReplayTally, TraceMatch};
 use crate::time::{Instant, RemoteInstant};
-use crate::trace::{Trace, TraceFate, TraceRecord, UNAVAILABLE_NS};
 
-/// Which record a message meets.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum TraceMatch {
-    /// The n-th message of the channel meets the n-th record: equal departures have equal counts. Counted
-    /// over all starts of its producer: a start's first comes after the last one offered before.
-    #[default]
-    Index,
-    /// The record published last at that time of the run: counted from the run's start where the
-    /// trace says how long its run was, else from its first record. Before the first record the
-    /// first, in a later round the last of the round before.
-    Time,
-    /// The record of the same tick: as many periods after the first message of its channel as the
-    /// record is after the first of the trace, however many were missed and however long it is. What
-    /// nobody published live is lost, so the other end hears at each tick what it heard live. A
-    /// trace without a period, or of a producer that was started anew, is matched by index instead,
-    /// and the counts say so. The first message offered belongs to the tick of its number: to none
-    /// too early, and to one too late by what was missed before it.
-    Tick,
+/// A trace as far as a replay needs it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ReplayTrace {
+    /// What each message met, in the order of publication.
+    pub records: Vec<ReplayRecord>,
+    /// Middle of the times from one publication to the next; `None` below two messages.
+    pub period_ns: Option<i64>,
+    /// Length of the run that it was taken from, where it is known.
+    pub duration_ns: Option<i64>,
+    /// What it says of its clocks.
+    pub clock: String,
+}
+
+/// What one message of a trace met.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ReplayRecord {
+    /// When it was published, nanoseconds since the run's start.
+    pub published_ns: i64,
+    /// Starts of the producer before this message's.
+    pub start: u16,
+    /// What became of it.
+    pub fate: ReplayFate,
+    /// Its delay, where it is known.
+    pub delay_ns: Option<i64>,
+    /// That of its second copy, if there was one and it is known.
+    pub second_delay_ns: Option<i64>,
+}
+
+/// What became of a message of a trace.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ReplayFate {
+    /// It arrived.
+    Delivered,
+    /// It was lost, wherever.
+    Lost,
+    /// Nobody can say.
+    Unknown,
 }
 
 /// What a message meets that comes after the end of the trace.
@@ -77,86 +92,11 @@ pub enum ReplayError {
     },
 }
 
-/// What a replay met so far. Read it while the link works, or after.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-pub struct ReplayCounts {
-    /// How records were matched in the end.
-    pub matching: TraceMatch,
-    /// Records of the trace.
-    pub record_count: u64,
-    /// Messages offered, however many pieces or copies each came in.
-    pub offered_count: u64,
-    /// Of these, within the trace.
-    pub met_count: u64,
-    /// Of those within it, delivered.
-    pub delivered_count: u64,
-    /// Of those within it, lost, wherever the trace's were.
-    pub lost_count: u64,
-    /// Of those within it, lost here because nobody knows what became of the trace's.
-    pub unknown_count: u64,
-    /// Lost because the trace has no record at their tick: nobody published live.
-    pub unpublished_count: u64,
-    /// Messages at a tick that had its message already; they met the same record again.
-    pub repeated_count: u64,
-    /// After the end of the trace.
-    pub beyond_end_count: u64,
-    /// Delivered at once because the trace's delay is below zero, which clocks within their bound
-    /// allow.
-    pub negative_delay_count: u64,
-}
-
-#[derive(Debug, Default)]
-struct Cells {
-    delivered: AtomicU64,
-    lost: AtomicU64,
-    unknown: AtomicU64,
-    unpublished: AtomicU64,
-    repeated: AtomicU64,
-    beyond_end: AtomicU64,
-    negative_delay: AtomicU64,
-}
-
-/// The counts of a [`TraceLink`] that somebody else owns.
-#[derive(Debug, Clone)]
-pub struct ReplayTally {
-    cells: Arc<Cells>,
-    record_count: u64,
-    matching: TraceMatch,
-}
-
-impl ReplayTally {
-    /// What the link met so far.
-    pub fn counts(&self) -> ReplayCounts {
-        let of = |cell: &AtomicU64| cell.load(Ordering::Relaxed);
-        let delivered_count = of(&self.cells.delivered);
-        let lost_count = of(&self.cells.lost);
-        let unknown_count = of(&self.cells.unknown);
-        let beyond_end_count = of(&self.cells.beyond_end);
-        let unpublished_count = of(&self.cells.unpublished);
-        let repeated_count = of(&self.cells.repeated);
-        let met_count = delivered_count + lost_count + unknown_count;
-        let apart_count = unpublished_count + repeated_count + beyond_end_count;
-        ReplayCounts {
-            matching: self.matching,
-            record_count: self.record_count,
-            offered_count: met_count + apart_count,
-            met_count,
-            delivered_count,
-            lost_count,
-            unknown_count,
-            unpublished_count,
-            repeated_count,
-            beyond_end_count,
-            negative_delay_count: of(&self.cells.negative_delay),
-        }
-    }
-}
-
 /// What a message met. Each piece of it meets the same: a message that was lost comes in none, and one
 /// that was delivered in all, each as much later as the record says.
 #[derive(Debug, Clone, Copy)]
 enum Met {
-    Record(TraceRecord),
+    Record(ReplayRecord),
     /// The trace has no record at its tick.
     Unpublished,
     /// It came after the end.
@@ -166,7 +106,7 @@ enum Met {
 /// The link.
 #[derive(Debug)]
 pub struct TraceLink {
-    trace: Arc<Trace>,
+    trace: ReplayTrace,
     replay: TraceReplay,
     /// What time zero of the run is in the trace, and the length of one round through it, above
     /// zero.
@@ -176,7 +116,7 @@ pub struct TraceLink {
     /// Where records are matched by ticks.
     ticks: Option<Ticks>,
     offers: Option<Offers>,
-    cells: Arc<Cells>,
+    tally: ReplayTally,
 }
 
 /// Where a replay by ticks stands.
@@ -194,20 +134,21 @@ impl TraceLink {
     ///
     /// # Errors
     /// [`ReplayError`].
-    pub fn new(trace: Arc<Trace>, mut replay: TraceReplay) -> Result<Self, ReplayError> {
+    pub fn new(trace: ReplayTrace, mut replay: TraceReplay) -> Result<Self, ReplayError> {
         let Some(last) = trace.records.last() else {
             return Err(ReplayError::Empty);
         };
         let mut records = trace.records.iter();
-        let unknown =
-            |record: &TraceRecord| record.fate == TraceFate::Delivered && record.delay().is_none();
+        let unknown = |record: &ReplayRecord| {
+            record.fate == ReplayFate::Delivered && record.delay_ns.is_none()
+        };
         if replay.delay_otherwise.is_none()
             && let Some(index) = records.position(unknown)
         {
-            let clock = trace.header.clock.clone();
+            let clock = trace.clock;
             return Err(ReplayError::DelayUnknown { index, clock });
         }
-        let period_ns = trace.period_ns().unwrap_or(0);
+        let period_ns = trace.period_ns.unwrap_or(0);
         let (origin_ns, end_ns) = round(&trace, last.published_ns, period_ns);
         let ticks = match replay.matching {
             TraceMatch::Index | TraceMatch::Time => None,
@@ -216,6 +157,7 @@ impl TraceLink {
         if replay.matching == TraceMatch::Tick && ticks.is_none() {
             replay.matching = TraceMatch::Index;
         }
+        let tally = ReplayTally::new(trace.records.len() as u64, replay.matching);
         Ok(Self {
             trace,
             replay,
@@ -224,24 +166,20 @@ impl TraceLink {
             offered: Offered::new(),
             ticks,
             offers: None,
-            cells: Arc::default(),
+            tally,
         })
     }
 
     /// Its counts, for whoever gives the link away.
     pub fn tally(&self) -> ReplayTally {
-        ReplayTally {
-            cells: Arc::clone(&self.cells),
-            record_count: self.trace.records.len() as u64,
-            matching: self.replay.matching,
-        }
+        self.tally.clone()
     }
 
     /// The longest delay it can add.
     pub fn delay_max(&self) -> Duration {
         let delays = self.trace.records.iter();
         let delays = delays.flat_map(|record| [record.delay_ns, record.second_delay_ns]);
-        let longest_ns = delays.max().unwrap_or(0).max(0);
+        let longest_ns = delays.flatten().max().unwrap_or(0).max(0);
         let longest = Duration::from_nanos(longest_ns.unsigned_abs());
         longest.max(self.replay.delay_otherwise.unwrap_or_default())
     }
@@ -260,33 +198,33 @@ impl TraceLink {
         };
         self.offered.keep(number, met);
         if let Met::Record(record) = met
-            && record.fate == TraceFate::Delivered
+            && record.fate == ReplayFate::Delivered
         {
-            let delays = [record.delay(), record.second_delay()];
+            let delays = [record.delay_ns, record.second_delay_ns];
             for _ in delays.into_iter().flatten().filter(|delay| *delay < 0) {
-                add(&self.cells.negative_delay);
+                self.tally.count(ReplayEvent::NegativeDelay);
             }
         }
         self.fate(met, now)
     }
 
     /// Counts what a message meets with a record of its own, or none after the end.
-    fn counted(&self, place: Option<(TraceRecord, bool)>) -> Met {
+    fn counted(&self, place: Option<(ReplayRecord, bool)>) -> Met {
         let Some((record, is_beyond)) = place else {
-            add(&self.cells.beyond_end);
+            self.tally.count(ReplayEvent::BeyondEnd);
             return Met::End;
         };
-        add(match record.fate {
-            _ if is_beyond => &self.cells.beyond_end,
-            TraceFate::Delivered => &self.cells.delivered,
-            TraceFate::Unknown => &self.cells.unknown,
-            _ => &self.cells.lost,
+        self.tally.count(match record.fate {
+            _ if is_beyond => ReplayEvent::BeyondEnd,
+            ReplayFate::Delivered => ReplayEvent::Delivered,
+            ReplayFate::Unknown => ReplayEvent::Unknown,
+            ReplayFate::Lost => ReplayEvent::Lost,
         });
         Met::Record(record)
     }
 
     /// The record, and whether it stands for one after the end; `None` after the end.
-    fn by_index(&self, number: u64) -> Option<(TraceRecord, bool)> {
+    fn by_index(&self, number: u64) -> Option<(ReplayRecord, bool)> {
         let records = &self.trace.records;
         let count = records.len() as u64;
         let is_beyond = number >= count;
@@ -297,7 +235,7 @@ impl TraceLink {
         Some((records[index], is_beyond))
     }
 
-    fn by_time(&self, now: Instant) -> Option<(TraceRecord, bool)> {
+    fn by_time(&self, now: Instant) -> Option<(ReplayRecord, bool)> {
         let is_beyond = now.as_ns() >= self.span_ns;
         if is_beyond && self.replay.end != TraceEnd::Wrap {
             return None;
@@ -357,12 +295,12 @@ impl TraceLink {
             return self.counted(None);
         }
         let Some(place) = ticks.record_of(offered % ticks.count()) else {
-            add(&self.cells.unpublished);
+            self.tally.count(ReplayEvent::Unpublished);
             return Met::Unpublished;
         };
         let record = self.trace.records[place];
         if is_repeated && !is_beyond {
-            add(&self.cells.repeated);
+            self.tally.count(ReplayEvent::Repeated);
             return Met::Record(record);
         }
         self.counted(Some((record, is_beyond)))
@@ -370,14 +308,14 @@ impl TraceLink {
 
     fn fate(&self, met: Met, now: Instant) -> Fate {
         let record = match met {
-            Met::Record(record) if record.fate == TraceFate::Delivered => record,
+            Met::Record(record) if record.fate == ReplayFate::Delivered => record,
             Met::End if self.replay.end != TraceEnd::Lost => return Fate::Delivered(now),
             Met::Record(_) | Met::Unpublished | Met::End => return Fate::Lost,
         };
         let after = |delay_ns: i64| now + Duration::from_nanos(delay_ns.max(0).unsigned_abs());
         let otherwise = now + self.replay.delay_otherwise.unwrap_or_default();
-        let first = record.delay().map_or(otherwise, after);
-        match record.second_delay().map(after) {
+        let first = record.delay_ns.map_or(otherwise, after);
+        match record.second_delay_ns.map(after) {
             None => Fate::Delivered(first),
             Some(second) => Fate::Duplicated {
                 first: first.min(second),
@@ -391,18 +329,14 @@ impl TraceLink {
 /// was, so also a text of opportunities, which wraps at its last line; else with its first record and
 /// a period after its last. Instants of another origin than the run's thus do not count as a time
 /// without end before the first record.
-fn round(trace: &Trace, last_ns: i64, period_ns: i64) -> (i64, i64) {
+fn round(trace: &ReplayTrace, last_ns: i64, period_ns: i64) -> (i64, i64) {
     let first_ns = trace.records.first().map_or(0, |first| first.published_ns);
-    let duration_ns = trace.header.duration_ns;
-    if duration_ns != UNAVAILABLE_NS && first_ns <= duration_ns {
+    if let Some(duration_ns) = trace.duration_ns
+        && first_ns <= duration_ns
+    {
         return (0, duration_ns.max(last_ns));
     }
     (first_ns, last_ns.saturating_add(period_ns))
-}
-
-/// One thread counts, another reads when the first is done.
-fn add(cell: &AtomicU64) {
-    cell.fetch_add(1, Ordering::Relaxed);
 }
 
 impl LinkModel for TraceLink {
@@ -423,7 +357,3 @@ impl LinkModel for TraceLink {
         Some(self.tally())
     }
 }
-
-#[cfg(test)]
-#[path = "trace_tests.rs"]
-mod tests;

@@ -3,8 +3,8 @@
 //! trace's, so its grid is followed like that of a trace: by the same rules over the first messages, and
 //! message by message from then on.
 
-use crate::link::MessageNumber;
 use crate::link::trace_ticks::{EARLY_RATIO, sort_out, whole};
+use crate::link_model::MessageNumber;
 
 /// Messages that the grid is sought in anew with each of them: the first of a run is the coldest, and
 /// later by itself than any after it.

@@ -1,6 +1,7 @@
 //! Tests of the ticks of a trace, against a producer that a loaded host holds up.
 
 use super::*;
+use crate::link::trace::ReplayFate;
 use crate::random::RandomStream;
 use crate::time::{Instant, PeriodicTimer};
 use core::time::Duration;
@@ -26,13 +27,23 @@ struct Published {
     lateness: f64,
 }
 
+fn record(published_ns: i64) -> ReplayRecord {
+    ReplayRecord {
+        published_ns,
+        start: 0,
+        fate: ReplayFate::Unknown,
+        delay_ns: None,
+        second_delay_ns: None,
+    }
+}
+
 fn whole_ns(ns: f64) -> i64 {
     whole(ns.round())
 }
 
 /// A run of a producer with the timer that producers have. One wake-up in ten is late by up to 0.45
 /// of a period, the others by up to 0.02.
-fn run(host: Host, seed: u64) -> (Vec<TraceRecord>, Vec<Published>) {
+fn run(host: Host, seed: u64) -> (Vec<ReplayRecord>, Vec<Published>) {
     // The timer counts in its own nanoseconds; the trace's clock runs at another rate.
     let nominal_ns = 1_000_000;
     let rate = host.period_ns / nominal_ns as f64;
@@ -73,7 +84,7 @@ fn run(host: Host, seed: u64) -> (Vec<TraceRecord>, Vec<Published>) {
         };
         now_ns = polled_ns + work * period;
         let published_ns = 170_000_123 + whole_ns(now_ns * rate);
-        records.push(TraceRecord::published(published_ns, count as u64, 1));
+        records.push(record(published_ns));
         let lateness = (now_ns - tick.scheduled.as_ns() as f64) / period;
         published.push(Published {
             tick: tick.index,
@@ -199,9 +210,9 @@ fn of_two_in_one_period_the_earlier_takes_the_last_tick_without_a_record() {
 fn what_has_no_period_has_no_ticks() {
     let mut random = RandomStream::new(1, "no period");
     let mut at_ns = 0;
-    let mut next = |index: u64| {
+    let mut next = |_| {
         at_ns += i64::try_from(random.next_u64() % 30_000_000).unwrap();
-        TraceRecord::published(at_ns, index, 1)
+        record(at_ns)
     };
     let records: Vec<_> = (0..500).map(&mut next).collect();
     assert!(Ticks::of(&records, 15_000_000).is_none());

@@ -1,54 +1,20 @@
 //! Tests of the virtual-time driver.
 
 use super::*;
+use bytemuck::{Pod, Zeroable};
+
 use crate::component::{Component, Outbox, into_role};
-use crate::link::bernoulli::BernoulliLink;
-use crate::random::RandomStream;
-use crate::shuttle::{Shuttle, ShuttleParameters, ShuttleStatus};
+use crate::message::Message;
 use crate::time::PeriodicTimer;
 
-fn run(seed: u64, loss_ratio: f64, delay_ms: u64) -> SimulationResult {
-    let case = Shuttle::new(ShuttleParameters::default(), seed).unwrap();
-    let stream = RandomStream::new(seed, "shuttle/command");
-    let link = BernoulliLink::new(Duration::from_millis(delay_ms), loss_ratio, stream).unwrap();
-    let carriers = BTreeMap::from([(
-        "shuttle/command".to_owned(),
-        Box::new(link) as Box<dyn Carrier>,
-    )]);
-    Simulation::new(&case, carriers)
-        .unwrap()
-        .run(Duration::from_secs(10))
-        .unwrap()
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+struct Status {
+    position_m: f64,
 }
 
-#[test]
-fn equal_seeds_give_equal_runs() {
-    assert_eq!(run(7, 0.1, 10), run(7, 0.1, 10));
-}
-
-#[test]
-fn unequal_seeds_give_unequal_runs() {
-    assert_ne!(run(7, 0.1, 10).log, run(8, 0.1, 10).log);
-}
-
-#[test]
-fn every_message_is_taken_lost_or_in_flight() {
-    let clean = run(1, 0.0, 50).channels["shuttle/command"];
-    assert_eq!(
-        clean.published_count,
-        clean.taken_count + clean.in_flight_count
-    );
-    assert!(clean.in_flight_count > 0);
-    let lossy = run(1, 0.5, 50).channels["shuttle/command"];
-    assert!(lossy.taken_count < lossy.published_count * 6 / 10);
-}
-
-#[test]
-fn an_unknown_channel_is_named() {
-    let case = Shuttle::new(ShuttleParameters::default(), 0).unwrap();
-    let carriers = BTreeMap::from([("nope".to_owned(), Box::new(PerfectLink) as Box<dyn Carrier>)]);
-    let error = Simulation::new(&case, carriers).unwrap_err();
-    assert_eq!(error.to_string(), "case shuttle has no channel nope");
+impl Message for Status {
+    const NAME: &'static str = "test.Status.v1";
 }
 
 /// Tells the record where it is, and nobody listens.
@@ -56,18 +22,18 @@ fn an_unknown_channel_is_named() {
 struct Diarist(PeriodicTimer);
 
 impl Component for Diarist {
-    type Input = ShuttleStatus;
-    type Output = ShuttleStatus;
+    type Input = Status;
+    type Output = Status;
 
     fn on_start(&mut self, now: Instant) {
         self.0.start(now);
     }
 
-    fn on_message(&mut self, _: Instant, _: &ShuttleStatus, _: &mut Outbox<ShuttleStatus>) {}
+    fn on_message(&mut self, _: Instant, _: &Status, _: &mut Outbox<Status>) {}
 
-    fn on_tick(&mut self, now: Instant, out: &mut Outbox<ShuttleStatus>) {
+    fn on_tick(&mut self, now: Instant, out: &mut Outbox<Status>) {
         if self.0.poll(now).is_some() {
-            out.send(ShuttleStatus { position_m: 1.0 });
+            out.send(Status { position_m: 1.0 });
         }
     }
 
@@ -81,8 +47,8 @@ impl Component for Diarist {
 }
 
 const DIARY: &[ChannelSpec] = &[
-    ChannelSpec::of::<ShuttleStatus>("a/heard", "other", "diarist"),
-    ChannelSpec::recorded::<ShuttleStatus>("a/diary", "diarist"),
+    ChannelSpec::of::<Status>("a/heard", "other", "diarist"),
+    ChannelSpec::recorded::<Status>("a/diary", "diarist"),
 ];
 
 fn diary(carriers: BTreeMap<String, Box<dyn Carrier>>) -> Result<Simulation, SimulationError> {

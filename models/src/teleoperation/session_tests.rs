@@ -14,7 +14,7 @@ use crate::egm::messages::{
 };
 use crate::egm::parameters::{GuidedArms, RestartPolicy, StartMode};
 use crate::link::bernoulli::BernoulliLink;
-use crate::link::{Fate, LinkModel};
+use crate::link_model::{Fate, LinkModel};
 use crate::message::Message;
 use crate::random::RandomStream;
 use crate::simulation::{Carrier, Simulation, SimulationResult};

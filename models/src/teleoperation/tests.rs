@@ -7,8 +7,7 @@ use nalgebra::Vector3;
 
 use super::*;
 use crate::link::bernoulli::BernoulliLink;
-use crate::link::{Fate, LinkModel};
-use crate::measure::series;
+use crate::link_model::{Fate, LinkModel};
 use crate::simulation::{Carrier, Simulation, SimulationResult};
 use crate::teleoperation::follower::Follower;
 use crate::time::Instant;
@@ -121,40 +120,6 @@ fn at_the_default_gain_the_robot_lags_195_ms_and_executes_every_loop() {
     assert!(figure("motion_loss_ratio").abs() < 1e-12);
     assert!(figure("ik_failure_count") + figure("ik_limited_count") < 0.5);
     assert!(figure("hold_count") < 0.5);
-}
-
-/// The entries of `log` published before `until_s`.
-fn beginning(log: &RunLog, until_s: f64) -> RunLog {
-    let mut beginning = RunLog::default();
-    for channel in [HUMAN_FRAME, EGM_RIGHT_COMMAND, EGM_RIGHT_FEEDBACK] {
-        let messages = log.raw(channel).iter();
-        for logged in
-            messages.take_while(|logged| logged.envelope.published_ns as f64 <= until_s * 1e9)
-        {
-            beginning.push(channel, logged.envelope, &logged.payload);
-        }
-    }
-    beginning
-}
-
-#[test]
-fn scoring_twice_the_loops_takes_twice_the_work() {
-    let case = case(|_| {});
-    let whole = run(&case, None, 120.0 * 4.033).log;
-    let half = beginning(&whole, 60.0 * 4.033);
-    let [small, large] = [&half, &whole].map(|log| {
-        series::work::take();
-        let executed = case.score(log).get("motion_loops_executed_count").cloned();
-        (executed.unwrap().value.unwrap(), series::work::take())
-    });
-    assert!(
-        (large.0 - small.0 - 60.0).abs() < 0.5,
-        "{small:?} {large:?}"
-    );
-    assert!(small.1 > 1e6, "{small:?}");
-    // A little more than twice: of a longer log a smaller share lies in the margins of the search.
-    let ratio = large.1 / small.1;
-    assert!((1.9..2.2).contains(&ratio), "{ratio}");
 }
 
 #[test]

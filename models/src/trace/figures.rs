@@ -7,12 +7,12 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use super::{Trace, TraceCounts, TraceFate, TraceRecord, UNAVAILABLE_NS};
-use crate::measure::histogram::Distribution;
-use crate::measure::network::has_tail;
-use crate::measure::statistics::{
-    CONFIDENCE, Interval, IntervalNs, block_bootstrap_quantile, wilson,
-};
 use crate::random::RandomStream;
+use crate::stats::histogram::Distribution;
+use crate::stats::special::place_of;
+use crate::stats::statistics::{
+    CONFIDENCE, Interval, IntervalNs, block_bootstrap_quantile, has_tail, wilson,
+};
 
 /// Quantiles with an interval of their own.
 pub const QUANTILES: [f64; 6] = [0.01, 0.1, 0.5, 0.9, 0.99, 0.999];
@@ -205,15 +205,12 @@ fn quantiles(delays_ns: &[i64], seed: u64) -> Vec<QuantileFigure> {
         return Vec::new();
     }
     let mut random = RandomStream::new(seed, "trace.figures.bootstrap");
-    let of = |quantile: f64| {
-        let rank = crate::measure::special::ceil_count(quantile * ascending.len() as f64);
-        QuantileFigure {
-            quantile,
-            value_ns: ascending[rank.clamp(1, ascending.len()) - 1],
-            interval: has_tail(ascending.len(), quantile)
-                .then(|| block_bootstrap_quantile(delays_ns, quantile, CONFIDENCE, &mut random))
-                .flatten(),
-        }
+    let of = |quantile: f64| QuantileFigure {
+        quantile,
+        value_ns: ascending[place_of(quantile, ascending.len())],
+        interval: has_tail(ascending.len(), quantile)
+            .then(|| block_bootstrap_quantile(delays_ns, quantile, CONFIDENCE, &mut random))
+            .flatten(),
     };
     QUANTILES.into_iter().map(of).collect()
 }

@@ -10,13 +10,18 @@ pub mod csv;
 pub mod fault;
 pub mod figures;
 pub mod fit;
+pub mod from_records;
 pub mod netem;
 pub mod opportunities;
+#[cfg(test)]
+mod replay_tests;
 pub mod wire;
 
 use core::fmt;
 
 use serde::{Deserialize, Serialize};
+
+use crate::link::trace::{ReplayFate, ReplayRecord, ReplayTrace};
 
 /// An instant or a delay that is not known; never a made-up zero.
 pub const UNAVAILABLE_NS: i64 = i64::MIN;
@@ -314,6 +319,28 @@ impl TraceCounts {
 }
 
 impl Trace {
+    /// What a replay needs of it.
+    pub fn replayed(&self) -> ReplayTrace {
+        let record = |record: &TraceRecord| ReplayRecord {
+            published_ns: record.published_ns,
+            start: record.start,
+            fate: match record.fate {
+                TraceFate::Delivered => ReplayFate::Delivered,
+                TraceFate::Unknown => ReplayFate::Unknown,
+                _ => ReplayFate::Lost,
+            },
+            delay_ns: record.delay(),
+            second_delay_ns: record.second_delay(),
+        };
+        let duration_ns = self.header.duration_ns;
+        ReplayTrace {
+            records: self.records.iter().map(record).collect(),
+            period_ns: self.period_ns(),
+            duration_ns: (duration_ns != UNAVAILABLE_NS).then_some(duration_ns),
+            clock: self.header.clock.clone(),
+        }
+    }
+
     /// What its messages met.
     pub fn counts(&self) -> TraceCounts {
         let mut counts = TraceCounts::default();

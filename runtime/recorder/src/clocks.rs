@@ -3,7 +3,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use hil_models::measure::record::UNAVAILABLE;
+use hil_models::record::UNAVAILABLE;
 use hil_runtime::rundir::manifest::Manifest;
 use hil_runtime::watch::Record;
 

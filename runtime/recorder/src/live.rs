@@ -5,10 +5,10 @@ use std::collections::BTreeMap;
 use std::time::Instant;
 
 use hil_models::link::condition::LinkConditionRecord;
-use hil_models::measure::record::UNAVAILABLE;
 use hil_models::message::Envelope;
 use hil_runtime::rundir::live_run::Source;
 use hil_runtime::watch::{Event, Feed, Origin, Record, Seen, WatchedChannel};
+use hil_models::record::UNAVAILABLE;
 
 use crate::channel::{ChannelTopics, Wanted, typed};
 use crate::conditions::Conditions;

@@ -3,8 +3,8 @@
 
 use std::collections::BTreeMap;
 
-use hil_models::measure::record::UNAVAILABLE;
 use hil_models::message::Envelope;
+use hil_models::record::UNAVAILABLE;
 use hil_runtime::watch::Feed;
 
 use crate::clocks::{self, Basis, UNKNOWN_HOST, at};

@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use hil_models::measure::histogram::LatencyHistogram;
+use hil_models::stats::histogram::LatencyHistogram;
 use nix::sys::mman::munlockall;
 use serde::{Deserialize, Serialize};
 

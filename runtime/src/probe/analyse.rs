@@ -9,8 +9,8 @@ use hil_gateways::capture::join::{JoinFigures, Joined, OrderSource};
 use hil_gateways::capture::observe::{Observation, Observer, PacketCounts, Point, Stream};
 use hil_gateways::capture::pairing::join_all;
 use hil_gateways::capture::point::{PointFigures, single_point_figures};
-use hil_models::measure::histogram::Distribution;
-use hil_models::measure::statistics::IntervalNs;
+use hil_models::stats::histogram::Distribution;
+use hil_models::stats::statistics::IntervalNs;
 use serde::Serialize;
 
 use super::files::{CaptureFile, FileError, read};

@@ -13,8 +13,8 @@ use hil_gateways::capture::flow::OwnHeader;
 use hil_gateways::capture::join::Joined;
 use hil_gateways::capture::observe::{Observation, Stream};
 use hil_gateways::protocol::wire::Kind;
-use hil_models::measure::histogram::{Distribution, LatencyHistogram};
-use hil_models::measure::record::{EgressRecord, IngressRecord, UNAVAILABLE};
+use hil_models::record::{EgressRecord, IngressRecord, UNAVAILABLE};
+use hil_models::stats::histogram::{Distribution, LatencyHistogram};
 use serde::Serialize;
 
 use super::analyse::{Reading, quantiles};

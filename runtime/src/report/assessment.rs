@@ -1,7 +1,7 @@
 //! What follows from a summary's figures: whether the run may be called a network result at all,
 //! and what a reader must be warned of. It draws conclusions, it does not measure.
 
-use hil_models::measure::account::{ChannelAccount, ClosingFigures, Coverage, MessageFate};
+use hil_models::account::{ChannelAccount, ClosingFigures, Coverage, MessageFate};
 use serde::{Deserialize, Serialize};
 
 use super::face::FaceSummary;

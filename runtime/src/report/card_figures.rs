@@ -3,10 +3,10 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use hil_models::measure::account::ChannelPath;
-use hil_models::measure::card_clock::{Bounded, CardClockFigures, CardTimeline};
-use hil_models::measure::histogram::{Distribution, LatencyHistogram};
-use hil_models::measure::record::{EgressRecord, IngressRecord, UNAVAILABLE};
+use hil_models::account::ChannelPath;
+use hil_models::account::card_clock::{Bounded, CardClockFigures, CardTimeline};
+use hil_models::record::{EgressRecord, IngressRecord, UNAVAILABLE};
+use hil_models::stats::histogram::{Distribution, LatencyHistogram};
 use hil_models::time::RemoteInstant;
 use serde::{Deserialize, Serialize};
 
@@ -249,7 +249,7 @@ fn crossing(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use hil_models::measure::card_clock::CardClockRecord;
+    use hil_models::account::card_clock::CardClockRecord;
     use hil_models::time::Alignment;
 
     const EPOCH_NS: i64 = 1_700_000_000_000_000_000;

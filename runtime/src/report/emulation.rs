@@ -3,8 +3,8 @@
 
 use core::borrow::Borrow;
 
-use hil_models::measure::histogram::{LatencyHistogram, LatencySummary};
-use hil_models::measure::record::{IngressRecord, UNAVAILABLE};
+use hil_models::record::{IngressRecord, UNAVAILABLE};
+use hil_models::stats::histogram::{LatencyHistogram, LatencySummary};
 use serde::{Deserialize, Serialize};
 
 /// A release may be late by this much at its 99th percentile, whatever the model asks for.

@@ -92,8 +92,8 @@ mod tests {
     use crate::report::link_change::ChangedTo;
     use crate::report::network::ForegoingNetwork;
     use crate::report::score_event::EventOutage;
+    use hil_models::account::Standing;
     use hil_models::link::spec::Way;
-    use hil_models::measure::account::Standing;
 
     fn event(at_s: Option<f64>, severity: Severity, what: &str) -> ExplainedEvent {
         ExplainedEvent {

@@ -1,7 +1,7 @@
 //! What a summary says of the foreign programs that played a role through an EGM face. It holds
 //! figures; `crate::report::face_figures` computes them.
 
-use hil_models::measure::histogram::Distribution;
+use hil_models::stats::histogram::Distribution;
 use serde::{Deserialize, Serialize};
 
 use super::summary::{CountByName, Fact};

@@ -1,8 +1,8 @@
 //! From the records of a face to its figures: where time went, how many of the robot's messages
 //! were answered and how fast. It reads no file.
 
-use hil_models::measure::histogram::LatencyHistogram;
-use hil_models::measure::record::UNAVAILABLE;
+use hil_models::record::UNAVAILABLE;
+use hil_models::stats::histogram::LatencyHistogram;
 
 use crate::report::face::{Answers, FaceSegment};
 use crate::rundir::face_record::{FaceReceivedRecord, FaceSentRecord};

@@ -1,8 +1,8 @@
 //! The network of a run as a summary keeps it: figures of each channel, what happened, both on the
 //! time of the run beside what the robot did. Figures are computed elsewhere.
 
-use hil_models::measure::correlation::PairCorrelation;
-use hil_models::measure::network::{NetworkEventKind, NetworkFigures};
+use hil_models::account::network::{NetworkEventKind, NetworkFigures};
+use hil_models::stats::correlation::PairCorrelation;
 use serde::{Deserialize, Serialize};
 
 use super::terminal::{JOINT, duration_s, seconds};

@@ -2,7 +2,7 @@
 //! channel what the radio reported of its messages and where they were stamped. It draws no
 //! conclusion.
 
-use hil_models::measure::radio::{RadioFigures, TransmitStampFigures};
+use hil_models::account::radio::{RadioFigures, TransmitStampFigures};
 use serde::{Deserialize, Serialize};
 
 /// Everything about radios. Empty on a wired run, but for where messages were stamped.

@@ -4,7 +4,7 @@
 
 use std::collections::BTreeMap;
 
-use hil_models::measure::account::{
+use hil_models::account::{
     AccountContext, ChannelAccount, ChannelPath, ChannelRecords, Coverage, account,
 };
 use hil_models::time::Alignment;

@@ -3,8 +3,8 @@
 
 use std::collections::BTreeMap;
 
+use hil_models::account::{MessageFate, Standing};
 use hil_models::case_study::Severity;
-use hil_models::measure::account::{MessageFate, Standing};
 
 use super::assessment::{Assessment, NetworkVerdict};
 use super::score_event::{EventOutage, ExplainedEvent, ExplainedMessage, ScoreEvents};

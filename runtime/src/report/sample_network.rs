@@ -1,11 +1,11 @@
 //! The network of a run that never was, put together as that of a real one, for the reports that
 //! are checked in.
 
-use hil_models::case_study::ErrorSeries;
-use hil_models::measure::account::{ChannelPath, Side};
-use hil_models::measure::network::{
+use hil_models::account::network::{
     Crossing, Moment, NetworkContext, NetworkEvent, NetworkEventKind, Passage,
 };
+use hil_models::account::{ChannelPath, Side};
+use hil_models::case_study::ErrorSeries;
 use hil_models::random::RandomStream;
 use hil_models::time::{Alignment, Instant};
 

@@ -1,13 +1,11 @@
 //! The records of a run that never was, for the reports that are checked in.
 
-use hil_models::measure::account::{
+use hil_models::account::{
     AccountContext, ChannelAccount, ChannelPath, ChannelRecords, Interruption, OutageFigures,
     PathProcess, RunSpan, account, outages,
 };
-use hil_models::measure::record::{
-    EgressRecord, IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE,
-};
 use hil_models::random::RandomStream;
+use hil_models::record::{EgressRecord, IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE};
 use hil_models::time::{Alignment, Instant};
 
 const PERIOD_NS: i64 = 4_000_000;

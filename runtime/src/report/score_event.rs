@@ -1,9 +1,9 @@
 //! What happened to the robot, as a summary keeps it: each event of the score beside the fates of
 //! the messages it names. Fates are found elsewhere, in the analysis.
 
+use hil_models::account::network::NetworkEventKind;
+use hil_models::account::{MessageFate, Standing};
 use hil_models::case_study::Severity;
-use hil_models::measure::account::{MessageFate, Standing};
-use hil_models::measure::network::NetworkEventKind;
 use serde::{Deserialize, Serialize};
 
 use super::network::{ForegoingEvent, ForegoingNetwork};

@@ -13,10 +13,10 @@ use std::time::Duration;
 
 use hil_models::link::LinkModel;
 use hil_models::link::trace::ReplayTally;
-use hil_models::measure::account::{
+use hil_models::account::{
     ChannelAccount, Closing, EndToEnd, FateCounts, Gaps, MessageFate, StampCoverage,
 };
-use hil_models::measure::histogram::Distribution;
+use hil_models::stats::histogram::Distribution;
 use hil_models::plot::PlotSeries;
 use hil_models::run_log::RunLog;
 use hil_models::simulation::{

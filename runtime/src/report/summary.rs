@@ -9,9 +9,9 @@ use std::collections::BTreeMap;
 use std::io;
 use std::path::{Path, PathBuf};
 
+use hil_models::account::{ChannelAccount, MessageFate, OutageFigures};
 use hil_models::case_study::{Metric, Score};
-use hil_models::link::trace::ReplayCounts;
-use hil_models::measure::account::{ChannelAccount, MessageFate, OutageFigures};
+use hil_models::link_model::ReplayCounts;
 use serde::{Deserialize, Serialize};
 
 use super::assessment::Assessment;

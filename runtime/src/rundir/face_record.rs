@@ -2,7 +2,7 @@
 //! path, joined after the run by `figures`. It computes nothing.
 
 use bytemuck::{Pod, Zeroable};
-use hil_models::measure::record::UNAVAILABLE;
+use hil_models::record::UNAVAILABLE;
 
 /// A datagram that was handed to the kernel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]

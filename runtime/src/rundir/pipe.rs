@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::Duration;
 
-use hil_models::link::trace::ReplayCounts;
+use hil_models::link_model::ReplayCounts;
 use hil_models::time::Instant;
 use serde::{Deserialize, Serialize};
 use zeroize::Zeroizing;

@@ -2,7 +2,7 @@
 //! happened to an association.
 
 use bytemuck::{Pod, Zeroable};
-use hil_models::measure::record::UNAVAILABLE;
+use hil_models::record::UNAVAILABLE;
 
 /// A signal that is not known.
 pub const NO_SIGNAL: i32 = i32::MIN;

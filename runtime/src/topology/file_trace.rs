@@ -1,6 +1,7 @@
 //! What `[links.<name>.trace]` says, read and written back; see `file_links`. It opens no trace.
 
-use hil_models::link::trace::{TraceEnd, TraceMatch, TraceReplay};
+use hil_models::link::trace::{TraceEnd, TraceReplay};
+use hil_models::link_model::TraceMatch;
 use toml::{Table, Value};
 
 use super::errors::Fault;

@@ -10,7 +10,6 @@ mod hosts;
 mod layers;
 mod links;
 mod misspelt;
-mod mutation;
 mod recorded;
 mod relations;
 mod security;

@@ -8,7 +8,8 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use hil_models::link::trace::{ReplayError, TraceEnd, TraceLink, TraceMatch, TraceReplay};
+use hil_models::link::trace::{ReplayError, TraceEnd, TraceLink, TraceReplay};
+use hil_models::link_model::TraceMatch;
 use hil_models::trace::wire::{self, Decoded};
 use hil_models::trace::{Trace, csv, fault::TraceFault};
 use serde::{Deserialize, Serialize};
@@ -230,7 +231,7 @@ impl TraceLaunch {
             source,
         };
         let trace = read_whole(&self.file).map_err(failed)?;
-        let link = TraceLink::new(Arc::new(trace), self.replay);
+        let link = TraceLink::new(trace.replayed(), self.replay);
         let link = link.map_err(|source| {
             failed(TraceFileError::Replay {
                 path: self.file.clone(),

@@ -1,11 +1,11 @@
 //! What an observer hears of a run, one thing at a time.
 
+use hil_models::account::card_clock::CardClockRecord;
 use hil_models::link::condition::LinkConditionRecord;
-use hil_models::measure::card_clock::CardClockRecord;
-use hil_models::measure::record::{
+use hil_models::message::Envelope;
+use hil_models::record::{
     EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
 };
-use hil_models::message::Envelope;
 
 use super::feed::WatchedChannel;
 use super::follow::Batch;

@@ -1,6 +1,6 @@
 //! One channel that is read from shared memory, and what is known of what did not come out of it.
 
-use hil_models::measure::record::{IngressRecord, UNAVAILABLE};
+use hil_models::record::{IngressRecord, UNAVAILABLE};
 
 use super::passive::{PassiveCounters, PassiveReader};
 use super::seen::Seen;

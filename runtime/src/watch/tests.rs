@@ -6,9 +6,9 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use bytemuck::bytes_of;
-use hil_models::measure::record::{IngressRecord, PublishedRecord, UNAVAILABLE};
 use hil_models::message::Envelope;
 use hil_models::random::RandomStream;
+use hil_models::record::{IngressRecord, PublishedRecord, UNAVAILABLE};
 
 use super::*;
 use crate::platform::clock::MonotonicClock;

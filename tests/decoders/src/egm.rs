@@ -10,7 +10,7 @@ use hil_models::egm::wire::{
     DATAGRAM_BYTES_MAX, decode_path_correction, decode_robot, decode_sensor, encode, message_type,
 };
 use hil_models::time::Instant;
-use hil_models::yumi::arm::RIGHT_START_RAD;
+use hil_models::yumi::arm::{POSITION_MAX_RAD, POSITION_MIN_RAD, RIGHT_START_RAD};
 
 use crate::Verdict;
 use crate::input::Input;
@@ -96,10 +96,12 @@ fn to_the_robot(axes: Axes, mut input: Input<'_>) -> Verdict {
                 numbers.clone().all(|number| number.is_finite()),
                 "{command:?}"
             );
-            let largest = position_rad
-                .iter()
-                .fold(0_f64, |most, one| most.max(one.abs()));
-            assert!(largest < 6.0, "no arm gets there: {command:?}");
+            let limits = POSITION_MIN_RAD.iter().zip(&POSITION_MAX_RAD);
+            let mut places = position_rad.iter().zip(limits);
+            assert!(
+                places.all(|(place, (min, max))| (min..=max).contains(&place)),
+                "no arm gets there: {command:?}"
+            );
         }
     }
     assert_eq!(face.received().total(), count);

@@ -4,7 +4,7 @@
 use std::path::Path;
 
 use hil_gateways::capture::flow::FlowFilter;
-use hil_models::measure::record::{IngressRecord, PublishedRecord};
+use hil_models::record::{IngressRecord, PublishedRecord};
 use hil_runtime::engine::supervisor::frame::{
     FRAME_BYTES_MAX, Frame, is_plain_record_name, read_frame, write_chunk, write_message,
 };

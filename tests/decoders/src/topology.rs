@@ -19,7 +19,8 @@ fn read(text: &str) -> Result<Topology, TopologyErrors> {
     parse("/nowhere/input.toml", text, &[], &known())
 }
 
-/// A topology that is accepted, written with all its defaults, is accepted as the same; one that is
+/// As the text of an override on the command line, nothing is worse than refused with a reason; a
+/// topology that is accepted, written with all its defaults, is accepted as the same; one that is
 /// refused says why.
 pub(crate) fn topology(bytes: &[u8]) -> Verdict {
     let Ok(text) = str::from_utf8(bytes) else {
@@ -28,6 +29,14 @@ pub(crate) fn topology(bytes: &[u8]) -> Verdict {
     // Would make the outcome hang on this machine's files.
     if text.contains("extends") {
         return Verdict::Refused;
+    }
+    if let Err(errors) = parse(
+        "/nowhere/input.toml",
+        "version = 1",
+        &[text.to_owned()],
+        &known(),
+    ) {
+        assert!(errors.render(false).contains("error"));
     }
     match read(text) {
         Ok(topology) => {

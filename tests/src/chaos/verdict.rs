@@ -6,8 +6,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::Path;
 
-use hil_models::measure::account::MessageFate;
-use hil_models::measure::record::TakenRecord;
+use hil_models::account::MessageFate;
+use hil_models::record::TakenRecord;
 use hil_runtime::report::summary::{Outcome, RunSummary};
 use hil_runtime::rundir::record::{RecordFile, RecordKind};
 use nix::unistd::Pid;

@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Duration;
 
+use hil_models::account::MessageFate;
 use hil_models::egm::messages::EgmCommand;
-use hil_models::measure::account::MessageFate;
 use hil_runtime::report::summary::Outcome;
 use hil_runtime::rundir::layout::hex;
 use hil_runtime::rundir::record::RecordFile;

@@ -7,7 +7,7 @@ use std::path::Path;
 use std::process::Command;
 use std::time::{Duration, Instant};
 
-use hil_models::measure::account::{MessageFate, Stage};
+use hil_models::account::{MessageFate, Stage};
 use hil_runtime::report::summary::RunSummary;
 use hil_tests::account::{account, assert_every_message_is_accounted_for};
 use hil_tests::binary::hil_runtime_binary;

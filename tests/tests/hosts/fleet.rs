@@ -7,7 +7,7 @@
 use std::env;
 use std::time::Duration;
 
-use hil_models::measure::account::MessageFate;
+use hil_models::account::MessageFate;
 use hil_runtime::report::assessment::{Assessment, NetworkVerdict};
 use hil_runtime::report::score_event::ExplainedMessage;
 use hil_runtime::report::summary::{LinkKind, Outcome, RunSummary};

@@ -6,8 +6,8 @@ use std::process::Command;
 use std::thread;
 use std::time::Duration;
 
-use hil_models::measure::account::{InterruptionFigures, MessageFate};
-use hil_models::measure::record::IngressRecord;
+use hil_models::account::{InterruptionFigures, MessageFate};
+use hil_models::record::IngressRecord;
 use hil_runtime::report::assessment::{Assessment, NetworkVerdict};
 use hil_runtime::report::summary::{NO_ROOM, Outcome, RunSummary};
 use hil_tests::account::{account, assert_every_message_is_accounted_for, carried, describe};

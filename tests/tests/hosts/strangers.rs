@@ -14,7 +14,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use hil_models::measure::account::MessageFate;
+use hil_models::account::MessageFate;
 use hil_models::random::RandomStream;
 use hil_runtime::platform::clock::MonotonicClock;
 use hil_runtime::report::summary::{DirectionSummary, RunSummary};

@@ -14,7 +14,7 @@ use hil_gateways::protocol::{
 };
 use hil_models::case_study::{CaseStudy, ChannelSpec};
 use hil_models::link::bernoulli::BernoulliLink;
-use hil_models::link::{Fate, LinkModel, PerfectLink};
+use hil_models::link_model::{Fate, LinkModel, PerfectLink};
 use hil_models::message::Envelope;
 use hil_models::random::RandomStream;
 use hil_models::shuttle::{Shuttle, ShuttleParameters};

@@ -5,8 +5,8 @@ use std::fs;
 use std::process::Command;
 use std::time::Duration;
 
-use hil_models::measure::account::MessageFate;
-use hil_models::measure::statistics::clopper_pearson;
+use hil_models::account::MessageFate;
+use hil_models::stats::statistics::clopper_pearson;
 use hil_runtime::report::summary::RunSummary;
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::child::ChildGuard;

@@ -4,9 +4,9 @@
 use std::fs;
 use std::time::Duration;
 
-use hil_models::link::Fate;
 use hil_models::link::spec::{LinkPlace, LinkSpec, Way};
 use hil_models::link::wifi::WifiPreset;
+use hil_models::link_model::Fate;
 use hil_models::time::Instant;
 use hil_tests::binary::workspace_folder;
 

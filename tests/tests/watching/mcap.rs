@@ -9,8 +9,8 @@ use std::path::Path;
 use std::process::{Command, Output};
 use std::time::Duration;
 
+use hil_models::account::MessageFate;
 use hil_models::egm::messages::EgmFeedback;
-use hil_models::measure::account::MessageFate;
 use hil_models::message::Envelope;
 use hil_runtime::report::summary::RunSummary;
 use hil_runtime::rundir::record::RecordFile;

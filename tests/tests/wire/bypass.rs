@@ -12,7 +12,7 @@ use hil_gateways::protocol::{
     ArrivalStamps, ChannelIdentity, EgressBridge, EgressEvent, EgressSettings, IngressBridge,
     IngressSettings, LocalRefusal, PeerState, Refusal,
 };
-use hil_models::measure::account::MessageFate;
+use hil_models::account::MessageFate;
 use hil_models::message::{Envelope, MessageType};
 use hil_models::shuttle::ShuttleCommand;
 use hil_models::time::Instant;

@@ -7,8 +7,8 @@ use std::thread;
 use std::time::Duration;
 
 use hil_models::link::condition::LinkConditionRecord;
-use hil_models::measure::record::{EgressRecord, IngressRecord, UNAVAILABLE};
-use hil_models::measure::statistics::clopper_pearson;
+use hil_models::record::{EgressRecord, IngressRecord, UNAVAILABLE};
+use hil_models::stats::statistics::clopper_pearson;
 use hil_runtime::report::link_change::ChangedTo;
 use hil_runtime::report::summary::Outcome;
 use hil_tests::account::assert_every_message_is_accounted_for;

@@ -7,9 +7,9 @@ use std::fs;
 use std::path::Path;
 use std::time::Duration;
 
-use hil_models::link::trace::{ReplayCounts, TraceMatch};
-use hil_models::measure::record::IngressRecord;
+use hil_models::link_model::{ReplayCounts, TraceMatch};
 use hil_models::random::RandomStream;
+use hil_models::record::IngressRecord;
 use hil_models::trace::{Trace, TraceFate, TraceHeader, TraceRecord, wire};
 use hil_tests::account::{assert_every_message_is_accounted_for, channel};
 use hil_tests::run_folder::RunFolder;

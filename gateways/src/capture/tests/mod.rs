@@ -1,10 +1,9 @@
-//! Tests of the capture decoders: files made byte by byte, mutations of them, and figures of flows
+//! Tests of the capture decoders: files made byte by byte and figures of flows
 //! whose truth is known.
 
 mod containers;
 mod frames;
 mod joins;
-mod mutations;
 pub(crate) mod programs;
 
 use super::reader::{CaptureReader, Step};

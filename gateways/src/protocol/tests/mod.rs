@@ -4,7 +4,6 @@ mod bridges;
 mod clock_path;
 mod fragments;
 mod golden;
-mod mutation;
 pub(super) mod network;
 mod recovery;
 mod sequences;

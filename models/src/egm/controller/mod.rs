@@ -262,7 +262,7 @@ impl Controller {
     }
 
     /// True when `MaxSpeedDeviation` bound in the last cycle.
-    pub(crate) fn is_throttled(&self) -> bool {
+    pub fn is_throttled(&self) -> bool {
         self.cycle_flags & EgmFeedback::SPEED_DEVIATION_LIMITED != 0
     }
 

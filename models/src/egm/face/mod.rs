@@ -98,6 +98,4 @@ pub enum RobotWare {
 #[cfg(test)]
 mod face_tests;
 #[cfg(test)]
-mod fuzz_tests;
-#[cfg(test)]
 mod sensor_tests;

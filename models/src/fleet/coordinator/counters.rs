@@ -3,7 +3,7 @@
 
 use serde::Serialize;
 
-use crate::measure::histogram::LatencyHistogram;
+use crate::stats::histogram::LatencyHistogram;
 
 /// Figures of one coordinator since its start.
 #[derive(Debug, Clone, Default)]

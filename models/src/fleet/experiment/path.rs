@@ -3,10 +3,10 @@
 
 use crate::case_study::ParameterError;
 use crate::fleet::experiment::setup::Links;
-use crate::link::LinkModel;
 use crate::link::impaired::{ImpairedLink, LinkCounts};
 use crate::link::spec::Way;
 use crate::link::wifi::WifiLink;
+use crate::link_model::LinkModel;
 use crate::random::RandomStream;
 use crate::time::Instant;
 

@@ -7,7 +7,7 @@ use crate::fleet::referee::Tally;
 use crate::fleet::robot::RobotCounters;
 use crate::fleet::scenario::Scene;
 use crate::link::impaired::LinkCounts;
-use crate::measure::statistics::clopper_pearson;
+use crate::stats::statistics::clopper_pearson;
 use crate::time::Instant;
 
 /// Figures of one or more runs.

@@ -28,7 +28,7 @@ pub use spec::{AccessCategory, PowerSave, WIFI_FIELDS, WifiField, WifiSpec};
 use crate::case_study::ParameterError;
 use crate::link::outages::OutageLink;
 use crate::link::spec::Way;
-use crate::link::{Fate, LinkModel, LossCauses};
+use crate::link_model::{Fate, LinkModel, LossCauses};
 use crate::random::RandomStream;
 use crate::time::Instant;
 

@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::link::outages::Outages;
-use crate::measure::statistics::clopper_pearson;
+use crate::stats::statistics::clopper_pearson;
 
 const COUNT: i64 = 1_000_000;
 const NONE: Outages = Outages {

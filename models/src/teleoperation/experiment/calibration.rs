@@ -4,7 +4,7 @@
 use crate::case_study::ParameterError;
 use crate::egm::parameters::ControllerSettings;
 use crate::link::outages::Outages;
-use crate::measure::statistics::{CONFIDENCE, poisson};
+use crate::stats::statistics::{CONFIDENCE, poisson};
 use crate::study::{Cell, Column, Criterion, Study, StudyReport, Table, Watch};
 use crate::teleoperation::Teleoperation;
 use crate::teleoperation::experiment::conditions::{back_after, base, changed, without_time_out};

@@ -1,7 +1,7 @@
 //! The motion-loss table and what it is held against. It computes means and intervals, nothing else.
 
-use crate::measure::series::Estimate;
-use crate::measure::statistics::{CONFIDENCE, poisson};
+use crate::stats::series::Estimate;
+use crate::stats::statistics::{CONFIDENCE, poisson};
 use crate::study::{Cell, Column, Criterion, StudyReport, Table};
 use crate::teleoperation::experiment::conditions::{Condition, Expected, PUBLISHED_LOOPS};
 use crate::teleoperation::experiment::drive::Tally;

@@ -10,7 +10,7 @@ use crate::component::Role;
 use crate::egm::controller::Controller;
 use crate::egm::messages::{EgmCommand, EgmFeedback, SessionState, Side};
 use crate::egm::parameters::{ControllerSettings, StartMode};
-use crate::measure::series::{Sample, peaks};
+use crate::stats::series::{Sample, peaks};
 use crate::teleoperation::messages::HumanFrame;
 use crate::teleoperation::score::loops::LoopCounter;
 use crate::teleoperation::{ResumePolicy, SendPolicy, Teleoperation};

@@ -1,8 +1,8 @@
 //! Shorthand for the figures of a score: a value with how it was obtained, or the reason why there
 //! is none.
 
-use crate::measure::series::Estimate;
 use crate::score::Metric;
+use crate::stats::series::Estimate;
 
 /// A figure called `name`, labelled `label`, in `unit`; without a value, for the reason `missing`.
 pub(crate) fn figure(

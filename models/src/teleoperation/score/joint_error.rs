@@ -10,8 +10,8 @@ use crate::egm::messages::{
     MotionRequest, Side,
 };
 use crate::egm::parameters::{ControllerSettings, StartMode};
-use crate::measure::series::Estimate;
 use crate::run_log::RunLog;
+use crate::stats::series::Estimate;
 use crate::teleoperation::score::figure::figure;
 use crate::teleoperation::score::sessions::{events, is_right};
 use crate::teleoperation::{

@@ -2,7 +2,7 @@
 //! equation 1). It counts on sampled signals and knows no messages; virtual-time tables use it too.
 
 use crate::egm::messages::EndCause;
-use crate::measure::series::{Sample, peaks};
+use crate::stats::series::{Sample, peaks};
 
 /// A motion loop counts when the tool falls back by this share of the nominal peak-to-peak.
 pub(crate) const PROMINENCE_RATIO: f64 = 0.5;

@@ -18,10 +18,10 @@ mod tests;
 
 use crate::case_study::{ErrorSeries, Metric, Score};
 use crate::egm::messages::{EgmCommand, EgmFeedback};
-use crate::measure::series::{Estimate, Sample, lag_s, peak_to_peak};
-use crate::measure::statistics::{CONFIDENCE, poisson};
 use crate::plot::PlotSeries;
 use crate::run_log::RunLog;
+use crate::stats::series::{Estimate, Sample, lag_s, peak_to_peak};
+use crate::stats::statistics::{CONFIDENCE, poisson};
 use crate::teleoperation::messages::HumanFrame;
 use crate::teleoperation::score::figure::{count, estimated, figure};
 use crate::teleoperation::score::joint_error::JointError;

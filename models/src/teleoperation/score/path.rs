@@ -1,8 +1,8 @@
 //! Where the tool went against where it was sent: dynamic time warping, distance from the path and
 //! jerk. Time linear in the log's length: both searches look no farther than half a loop.
 
-use crate::measure::series::{Sample, resampled};
 use crate::score::Metric;
+use crate::stats::series::{Sample, resampled};
 use crate::teleoperation::score::figure::figure;
 use crate::teleoperation::score::record::Record;
 

@@ -2,10 +2,10 @@
 //! clock. It judges nothing.
 
 use crate::egm::messages::{EgmCommand, EgmFeedback, SessionState};
-use crate::measure::series::Sample;
 use crate::message::Envelope;
 use crate::run_log::RunLog;
 use crate::score::MessageRef;
+use crate::stats::series::Sample;
 use crate::teleoperation::{EGM_RIGHT_COMMAND, EGM_RIGHT_FEEDBACK};
 use crate::time::Instant;
 use crate::yumi::arm::Arm;

@@ -2,14 +2,14 @@
 
 use core::time::Duration;
 
-use super::goodness::ks_distance;
 use super::{Fit, NEARLY_FIXED, REFUSED_BELOW, Ranking, duration_text};
 use crate::case_study::ParameterError;
 use crate::link::delay::{
     DELAY_MAX, DelayLaw, Exponential, Histogram, LogNormal, Normal, Pareto, Uniform,
 };
-use crate::measure::special::{ceil_count, incomplete_gamma};
 use crate::random::RandomStream;
+use crate::stats::goodness::ks_distance;
+use crate::stats::special::{ceil_count, normal_distribution};
 
 /// Most delays the test of distribution looks at, evenly spread.
 const TESTED_MAX: usize = 1_000;
@@ -210,12 +210,6 @@ fn pareto(ascending: &[f64]) -> Law {
     let scale = f64::midpoint(low, high).exp();
     let shape = shape_of(scale);
     Law::Pareto { min, scale, shape }
-}
-
-/// Standard normal distribution function.
-fn normal_distribution(z: f64) -> f64 {
-    let half = 0.5 * incomplete_gamma(0.5, 0.5 * z * z);
-    if z < 0.0 { 0.5 - half } else { 0.5 + half }
 }
 
 impl Law {

@@ -11,9 +11,8 @@ use serde::{Deserialize, Serialize};
 
 use super::figures::{TraceFigures, known_losses};
 use super::{Trace, TraceDirection};
-use crate::measure::histogram::Distribution;
-
-pub use goodness::ChiSquare;
+use crate::stats::goodness::ChiSquare;
+use crate::stats::histogram::Distribution;
 
 /// Below this probability of its own data a model is not taken.
 pub const REFUSED_BELOW: f64 = 0.05;

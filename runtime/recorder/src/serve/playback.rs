@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::time::Instant;
 
-use hil_models::measure::record::UNAVAILABLE;
+use hil_models::record::UNAVAILABLE;
 use hil_models::time::duration_ns;
 use hil_runtime::report::assessment::Assessment;
 use hil_runtime::report::summary::RunSummary;

@@ -4,7 +4,7 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use hil_models::measure::histogram::LatencyHistogram;
+use hil_models::stats::histogram::LatencyHistogram;
 use hil_models::time::PeriodicTimer;
 use nix::sys::resource::{UsageWho, getrusage};
 

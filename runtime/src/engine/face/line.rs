@@ -6,7 +6,7 @@ use hil_gateways::transport::udp_server::UdpServer;
 use hil_gateways::transport::{
     DatagramSender, Received, SendRefusal, SenderCounters, TransmitStage, TxToken,
 };
-use hil_models::measure::record::UNAVAILABLE;
+use hil_models::record::UNAVAILABLE;
 use hil_models::time::Instant;
 use std::net::SocketAddr;
 use std::os::fd::BorrowedFd;

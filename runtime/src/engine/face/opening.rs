@@ -9,8 +9,8 @@ use hil_gateways::transport::timestamping::TimestampMode;
 use hil_gateways::transport::udp::{GrantedOptions, UdpSender, UdpSettings};
 use hil_gateways::transport::udp_server::UdpServer;
 use hil_models::egm::messages::{EgmCommand, EgmFeedback};
-use hil_models::measure::record::{PublishedRecord, TakenRecord};
 use hil_models::message::{Envelope, MessageType};
+use hil_models::record::{PublishedRecord, TakenRecord};
 
 use super::FaceError;
 use super::arm::{Arm, Attention, DATAGRAM_BYTES_MAX, Work};

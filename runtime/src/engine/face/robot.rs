@@ -7,7 +7,7 @@ use bytemuck::bytes_of;
 use hil_models::egm::face::{RobotFace, RobotFaceSettings};
 use hil_models::egm::messages::{EgmFeedback, Side};
 use hil_models::endpoint::{InputPort, OutputPort};
-use hil_models::measure::record::UNAVAILABLE;
+use hil_models::record::UNAVAILABLE;
 use hil_models::time::Instant;
 
 use super::FaceError;

@@ -9,7 +9,7 @@ use bytemuck::bytes_of;
 use hil_models::egm::face::{SendPolicy, SensorFace, SensorFaceSettings};
 use hil_models::egm::messages::{EgmCommand, Side};
 use hil_models::endpoint::{InputPort, OutputPort};
-use hil_models::measure::record::UNAVAILABLE;
+use hil_models::record::UNAVAILABLE;
 use hil_models::time::Instant;
 use hil_models::yumi::arm::{LEFT_START_RAD, RIGHT_START_RAD};
 

@@ -5,8 +5,8 @@
 use std::sync::Arc;
 use std::thread::{self, JoinHandle};
 
-use hil_models::measure::record::{TakenRecord, UNAVAILABLE};
 use hil_models::message::Envelope;
+use hil_models::record::{TakenRecord, UNAVAILABLE};
 
 use super::{FaceError, Gate};
 use crate::engine::gateway::GatewayError;

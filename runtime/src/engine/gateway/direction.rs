@@ -11,8 +11,8 @@ use hil_gateways::protocol::{
 };
 use hil_gateways::transport::tcp::ConnectionTally;
 use hil_gateways::transport::{DatagramReceiver, DatagramSender};
-use hil_models::link::trace::ReplayTally;
-use hil_models::measure::record::{EgressRecord, FollowUpRecord, IngressRecord, RoundTripRecord};
+use hil_models::link_model::ReplayTally;
+use hil_models::record::{EgressRecord, FollowUpRecord, IngressRecord, RoundTripRecord};
 
 use super::egress::{Attention, Egress};
 use super::gathering::Gathering;

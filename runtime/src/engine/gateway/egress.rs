@@ -6,8 +6,8 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use hil_gateways::protocol::egress::RoundTrip;
 use hil_gateways::protocol::{EgressBridge, EgressEvent, LocalRefusal, PeerState};
-use hil_models::measure::record::{EgressRecord, RoundTripRecord, UNAVAILABLE};
 use hil_models::message::Envelope;
+use hil_models::record::{EgressRecord, RoundTripRecord, UNAVAILABLE};
 use hil_models::time::Instant;
 
 use super::gathering::Gathering;

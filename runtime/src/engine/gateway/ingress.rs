@@ -10,8 +10,8 @@ use hil_gateways::protocol::sequence::Order;
 use hil_gateways::protocol::wire::Kind;
 use hil_gateways::protocol::{Delivery, Disposition, IngressBridge};
 use hil_gateways::transport::{DatagramReceiver, Received};
-use hil_models::measure::record::{FollowUpRecord, IngressRecord, UNAVAILABLE};
 use hil_models::message::Envelope;
+use hil_models::record::{FollowUpRecord, IngressRecord, UNAVAILABLE};
 use hil_models::time::Instant;
 
 use super::gathering::Gathering;

@@ -8,7 +8,7 @@ use hil_gateways::protocol::wire::Kind;
 use hil_gateways::protocol::{EgressBridge, PeerState};
 use hil_gateways::transport::radio::RadioReport;
 use hil_gateways::transport::{DatagramSender, SendRefusal, TransmitStage, TransmitStamp, TxToken};
-use hil_models::measure::record::{EgressRecord, UNAVAILABLE};
+use hil_models::record::{EgressRecord, UNAVAILABLE};
 use hil_models::time::Instant;
 
 use super::kernel_clock::KernelClock;

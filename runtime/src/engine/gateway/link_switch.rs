@@ -4,8 +4,8 @@
 use hil_models::link::condition::LinkCondition;
 use hil_models::link::spec::LinkPlace;
 use hil_models::link::switched::{Replacement, SwitchedLink};
-use hil_models::link::trace::ReplayTally;
-use hil_models::link::{Fate, LinkModel, LossCauses, MessageNumber};
+use hil_models::link_model::ReplayTally;
+use hil_models::link_model::{Fate, LinkModel, LossCauses, MessageNumber};
 use hil_models::time::Instant;
 
 use crate::topology::emulation::{EmulationError, EmulationLaunch};

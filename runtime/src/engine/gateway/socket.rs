@@ -15,8 +15,8 @@ use hil_gateways::transport::tcp::{
 use hil_gateways::transport::timestamping::TimestampMode;
 use hil_gateways::transport::udp::{GrantedOptions, PathMtu, UdpReceiver, UdpSender, UdpSettings};
 use hil_gateways::transport::{DatagramReceiver, DatagramSender};
-use hil_models::link::trace::ReplayTally;
-use hil_models::link::{Fate, LinkModel, LossCauses, MessageNumber};
+use hil_models::link_model::ReplayTally;
+use hil_models::link_model::{Fate, LinkModel, LossCauses, MessageNumber};
 use hil_models::time::{Instant, RemoteInstant};
 
 use super::GatewayError;

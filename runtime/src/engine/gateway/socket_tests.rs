@@ -1,12 +1,11 @@
 //! Tests of the link model behind a socket: on the run's clock, and whole messages in pieces.
 
-use std::sync::Arc;
-
 use hil_gateways::protocol::wire::Header;
 use hil_gateways::transport::queue::{QueueSettings, queue_pair};
 use hil_models::link::outages::{Outage, OutageSchedule, Outages};
 use hil_models::link::spec::{LinkSpec, Way};
-use hil_models::link::trace::{TraceLink, TraceMatch, TraceReplay};
+use hil_models::link::trace::{TraceLink, TraceReplay};
+use hil_models::link_model::TraceMatch;
 use hil_models::random::RandomStream;
 use hil_models::trace::{Trace, TraceFate, TraceHeader, TraceRecord};
 
@@ -107,7 +106,7 @@ fn traced(matching: TraceMatch) -> TraceLink {
         matching,
         ..TraceReplay::default()
     };
-    TraceLink::new(Arc::new(trace), replay).unwrap()
+    TraceLink::new(trace.replayed(), replay).unwrap()
 }
 
 #[test]

@@ -9,8 +9,8 @@ use std::time::Duration;
 
 use hil_models::component::Role;
 use hil_models::endpoint::{Endpoint, PortCountError};
-use hil_models::measure::record::{PublishedRecord, TakenRecord};
 use hil_models::message::{Envelope, MessageType};
+use hil_models::record::{PublishedRecord, TakenRecord};
 
 use super::pulse::{Pulse, Pulses};
 use super::recording::{Destination, RecordedInput, RecordedOutput};

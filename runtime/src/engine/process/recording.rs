@@ -5,8 +5,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use hil_models::endpoint::{InputPort, OutputPort};
-use hil_models::measure::record::{PublishedRecord, TakenRecord, UNAVAILABLE};
 use hil_models::message::Envelope;
+use hil_models::record::{PublishedRecord, TakenRecord, UNAVAILABLE};
 use hil_models::time::Instant;
 
 use crate::platform::clock::MonotonicClock;

@@ -18,7 +18,7 @@ use hil_gateways::transport::card_clock::CardClock;
 use hil_gateways::transport::clock_pair::ClockPair;
 use hil_gateways::transport::interface::interface_with_address;
 use hil_gateways::transport::timestamping::TimestampCapabilities;
-use hil_models::measure::card_clock::CardClockRecord;
+use hil_models::account::card_clock::CardClockRecord;
 
 use self::guard::GuardedCard;
 use crate::rundir::card_story::CardStory;

@@ -1,6 +1,6 @@
 //! From what the wireless subsystem says to the records of a radio.
 
-use hil_models::measure::record::UNAVAILABLE;
+use hil_models::record::UNAVAILABLE;
 
 use super::nl80211::{Happening, Rate, Station};
 use crate::rundir::radio_record::{

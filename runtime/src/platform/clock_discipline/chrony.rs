@@ -82,7 +82,6 @@ impl ChronyTracking {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use hil_models::random::RandomStream;
 
     /// Printed by `chronyc -n -c tracking` of chrony 4.3 (Debian 12): a `chronyd -x` that follows
     /// another over a veth, ten seconds after its start.
@@ -116,27 +115,5 @@ mod tests {
         let infinite = RECORDED.replace("0.000009866", "inf");
         let error = ChronyTracking::parse(&infinite).unwrap_err();
         assert_eq!(error, "root delay inf s is outside 0 to 86400");
-    }
-
-    #[test]
-    fn mutated_answers_give_a_bound_or_an_error() {
-        let mut random = RandomStream::new(3, "chrony");
-        let mut read_count = 0_u32;
-        for _ in 0..100_000 {
-            let mut bytes = RECORDED.as_bytes().to_vec();
-            for _ in 0..=random.next_u64() % 4 {
-                let at = usize::try_from(random.next_u64()).unwrap() % bytes.len();
-                match random.next_u64() % 3 {
-                    0 => bytes[at] = random.next_u64().to_le_bytes()[0],
-                    1 => bytes.truncate(at.max(1)),
-                    _ => bytes.insert(at, b"0123456789.,-einf"[at % 17]),
-                }
-            }
-            if let Ok(tracking) = ChronyTracking::parse(&String::from_utf8_lossy(&bytes)) {
-                read_count += 1;
-                assert!(tracking.bound_ns() <= 3 * 86_400_000_000_000);
-            }
-        }
-        assert!(read_count > 1_000, "{read_count}");
     }
 }

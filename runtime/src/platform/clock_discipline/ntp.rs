@@ -128,7 +128,6 @@ fn within(name: &str, value_s: f64, lowest_s: f64) -> Result<f64, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use hil_models::random::RandomStream;
 
     /// Printed by `ntpq -n -c rv 127.0.0.1` for ntpd of ntpsec 1.2.2 (Debian 12), without the right
     /// to set a clock, 20 s after it began to follow a `chronyd` over a veth.
@@ -186,27 +185,5 @@ mintc=0
         let ahead = RECORDED.replace("eead2f17", "eead2f19");
         let error = NtpVariables::parse(&ahead).unwrap_err();
         assert!(error.starts_with("time since the last update"), "{error}");
-    }
-
-    #[test]
-    fn mutated_answers_give_a_bound_or_an_error() {
-        let mut random = RandomStream::new(5, "ntpq");
-        let mut read_count = 0_u32;
-        for _ in 0..20_000 {
-            let mut bytes = RECORDED.as_bytes().to_vec();
-            for _ in 0..=random.next_u64() % 6 {
-                let at = usize::try_from(random.next_u64()).unwrap() % bytes.len();
-                match random.next_u64() % 8 {
-                    0 => bytes.truncate(at.max(1)),
-                    1..=3 => bytes.insert(at, b"0123456789.-einf \n"[at % 18]),
-                    _ => bytes[at] = random.next_u64().to_le_bytes()[0],
-                }
-            }
-            if let Ok(variables) = NtpVariables::parse(&String::from_utf8_lossy(&bytes)) {
-                read_count += 1;
-                assert!(variables.bound_ns() <= Some(3 * 86_400_000_000_000));
-            }
-        }
-        assert!(read_count > 1_000, "{read_count}");
     }
 }

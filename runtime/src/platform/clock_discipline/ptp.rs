@@ -86,7 +86,6 @@ impl PtpStatus {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use hil_models::random::RandomStream;
 
     /// Printed by `pmc -u -b 0` of linuxptp 3.1.1 (Debian 12) beside a `ptp4l` with software stamps and
     /// `free_running 1` that hears another over a veth.
@@ -145,27 +144,5 @@ sending: GET CURRENT_DATA_SET
         let odd = RECORDED.replace("true", "perhaps");
         let error = PtpStatus::parse(&odd).unwrap_err();
         assert_eq!(error, "gmPresent \"perhaps\" is neither true nor false");
-    }
-
-    #[test]
-    fn mutated_answers_give_a_bound_or_an_error() {
-        let mut random = RandomStream::new(4, "pmc");
-        let mut read_count = 0_u32;
-        for _ in 0..100_000 {
-            let mut bytes = RECORDED.as_bytes().to_vec();
-            for _ in 0..=random.next_u64() % 6 {
-                let at = usize::try_from(random.next_u64()).unwrap() % bytes.len();
-                match random.next_u64() % 4 {
-                    0 => bytes.truncate(at.max(1)),
-                    1 => bytes.insert(at, b"0123456789.-einf \n"[at % 18]),
-                    _ => bytes[at] = random.next_u64().to_le_bytes()[0],
-                }
-            }
-            if let Ok(status) = PtpStatus::parse(&String::from_utf8_lossy(&bytes)) {
-                read_count += 1;
-                assert!(status.bound_ns() <= 2_000_000_000_000_000);
-            }
-        }
-        assert!(read_count > 1_000, "{read_count}");
     }
 }

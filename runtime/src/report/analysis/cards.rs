@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use hil_models::measure::card_clock::CardTimeline;
+use hil_models::account::card_clock::CardTimeline;
 
 use super::records::RunRecords;
 use crate::report::card_figures::{CardSummary, HardwareStamps, Places, channel_stamps};

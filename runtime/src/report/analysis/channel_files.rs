@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 
 use bytemuck::Pod;
-use hil_models::measure::record::{
+use hil_models::record::{
     EgressRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
 };
 

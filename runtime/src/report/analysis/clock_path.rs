@@ -180,7 +180,7 @@ pub(super) fn warning(pair: &HostPairClock) -> Option<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use hil_models::measure::record::RoundTripRecord;
+    use hil_models::record::RoundTripRecord;
 
     const SECOND_NS: i64 = 1_000_000_000;
 

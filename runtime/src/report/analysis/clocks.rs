@@ -3,8 +3,8 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use hil_models::account::ChannelPath;
 use hil_models::clock::{ClockFigures, ClockMap, ClockSettings, Exchange, Requester};
-use hil_models::measure::account::ChannelPath;
 use hil_models::time::{Alignment, Instant, RemoteInstant};
 
 use super::clock_path;
@@ -305,7 +305,7 @@ pub(super) fn hosts_of(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use hil_models::measure::record::RoundTripRecord;
+    use hil_models::record::RoundTripRecord;
 
     /// Exchanges every 10 ms for 4 s from `from_s` on of `here`; the other clock is `ahead_ns`
     /// ahead by then, and the way takes 100 us in either direction.

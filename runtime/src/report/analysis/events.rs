@@ -3,8 +3,8 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use hil_models::account::{Happening, MessageFate, MessageStory, Side};
 use hil_models::case_study::{ChannelSpec, MessageRef, Score, ScoreEvent};
-use hil_models::measure::account::{Happening, MessageFate, MessageStory, Side};
 use hil_models::time::{Instant, RemoteInstant};
 
 use super::axis::RunAxis;

@@ -3,8 +3,8 @@
 
 use std::time::Duration;
 
-use hil_models::measure::account::{Interruption, PathProcess};
-use hil_models::measure::record::{IngressRecord, UNAVAILABLE};
+use hil_models::account::{Interruption, PathProcess};
+use hil_models::record::{IngressRecord, UNAVAILABLE};
 use hil_models::time::{Instant, duration_ns};
 
 use super::channel_files::{ChannelFiles, all};

@@ -9,13 +9,13 @@ use std::path::Path;
 use std::process::Command;
 
 use bytemuck::Pod;
-use hil_models::measure::account::MessageFate;
-use hil_models::measure::record::{
+use hil_models::account::MessageFate;
+use hil_models::message::Envelope;
+use hil_models::random::RandomStream;
+use hil_models::record::{
     EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
     UNAVAILABLE,
 };
-use hil_models::message::Envelope;
-use hil_models::random::RandomStream;
 use hil_models::shuttle::{Shuttle, ShuttleCommand, ShuttleStatus};
 use hil_models::time::Instant;
 

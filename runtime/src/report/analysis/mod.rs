@@ -26,8 +26,8 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
+use hil_models::account::MessageFate;
 use hil_models::case_study::Score;
-use hil_models::measure::account::MessageFate;
 use hil_models::plot::PlotSeries;
 
 use axis::RunAxis;

@@ -4,17 +4,17 @@
 
 use std::collections::BTreeMap;
 
-use hil_models::case_study::ErrorSeries;
-use hil_models::measure::account::{Side, passages};
-use hil_models::measure::correlation::{self, LagWindow};
-use hil_models::measure::network::{
+use hil_models::account::network::{
     Moment, NetworkBin, NetworkBins, NetworkContext, NetworkEvent, NetworkEventKind,
     NetworkFigures, PackedPassages, Place, bin_width_ns, clock_steps, interruptions,
     network_events,
 };
-use hil_models::measure::record::IngressRecord;
+use hil_models::account::{Side, passages};
+use hil_models::case_study::ErrorSeries;
 use hil_models::plot::PlotSeries;
 use hil_models::random::RandomStream;
+use hil_models::record::IngressRecord;
+use hil_models::stats::correlation::{self, LagWindow};
 
 use super::axis::RunAxis;
 use super::events::start_on;

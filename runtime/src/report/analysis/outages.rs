@@ -1,7 +1,7 @@
 //! The outages of each channel of a finished run, and which of them went before an event. They are
 //! found in the records of the messages alone; no link is asked what it did.
 
-use hil_models::measure::account::{Happening, Outage, OutageFigures, Side, Standing, foregoing};
+use hil_models::account::{Happening, Outage, OutageFigures, Side, Standing, foregoing};
 use hil_models::time::Instant;
 
 use std::collections::BTreeMap;

@@ -8,16 +8,16 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-use hil_models::link::condition::LinkConditionRecord;
-use hil_models::measure::account::{
+use hil_models::account::card_clock::{CardClockRecord, CardTimeline};
+use hil_models::account::radio::{
+    RadioFigures, TransmitStampFigures, radio_figures, transmit_stamps,
+};
+use hil_models::account::{
     AccountContext, ChannelAccount, ChannelPath, ChannelRecords, FLIGHT_TIME_MAX, Interruption,
     MessageStory, ORDER_TOLERANCE_NS, Outage, RunSpan, account, outages, stories,
 };
-use hil_models::measure::card_clock::{CardClockRecord, CardTimeline};
-use hil_models::measure::radio::{
-    RadioFigures, TransmitStampFigures, radio_figures, transmit_stamps,
-};
-use hil_models::measure::record::{EgressRecord, IngressRecord, RoundTripRecord};
+use hil_models::link::condition::LinkConditionRecord;
+use hil_models::record::{EgressRecord, IngressRecord, RoundTripRecord};
 use hil_models::run_log::RunLog;
 
 use super::AnalysisError;

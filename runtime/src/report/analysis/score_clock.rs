@@ -84,8 +84,8 @@ fn bring(
 mod tests {
     use super::*;
     use hil_models::clock::{ClockMap, ClockSettings, Exchange, Requester};
-    use hil_models::measure::record::RoundTripRecord;
     use hil_models::message::Envelope;
+    use hil_models::record::RoundTripRecord;
 
     const SECOND: i64 = 1_000_000_000;
 

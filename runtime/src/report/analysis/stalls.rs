@@ -2,8 +2,8 @@
 //! them die, and no later message shows that they passed an earlier one over, so without this what
 //! waited for them would count as vanished. It looks at the last sign of life in the records.
 
-use hil_models::measure::account::{FLIGHT_TIME_MAX, Interruption, PathProcess};
-use hil_models::measure::record::{IngressRecord, PublishedRecord, UNAVAILABLE};
+use hil_models::account::{FLIGHT_TIME_MAX, Interruption, PathProcess};
+use hil_models::record::{IngressRecord, PublishedRecord, UNAVAILABLE};
 use hil_models::time::{Instant, duration_ns};
 
 use super::channel_files::all;

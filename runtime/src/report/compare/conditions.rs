@@ -5,7 +5,7 @@
 
 use core::fmt;
 
-use hil_models::measure::statistics::Interval;
+use hil_models::stats::statistics::Interval;
 use serde::Serialize;
 
 use super::figures::END_TO_END;

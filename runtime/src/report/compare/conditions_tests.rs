@@ -1,6 +1,6 @@
 //! Conditions on made-up figures.
 
-use hil_models::measure::comparison::Estimate;
+use hil_models::stats::comparison::Estimate;
 
 use super::*;
 use crate::report::compare::Verdict;

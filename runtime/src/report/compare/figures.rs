@@ -3,12 +3,12 @@
 
 use std::collections::BTreeMap;
 
-use hil_models::measure::account::{ChannelAccount, FateCounts, MessageFate};
-use hil_models::measure::comparison::{
+use hil_models::account::{ChannelAccount, FateCounts, MessageFate};
+use hil_models::stats::comparison::{
     Estimate, Share, binned_quantile_interval, difference, mean_interval, ratio, welch,
 };
-use hil_models::measure::histogram::{Distribution, DurationBin, LatencySummary};
-use hil_models::measure::statistics::{CONFIDENCE, Interval, IntervalNs};
+use hil_models::stats::histogram::{Distribution, DurationBin, LatencySummary};
+use hil_models::stats::statistics::{CONFIDENCE, Interval, IntervalNs};
 
 use super::{ComparedFigure, ComparedRun, FigureKind, Verdict};
 use crate::report::summary::ScoreMetric;

@@ -11,8 +11,8 @@ pub(crate) mod work;
 
 use std::path::{Path, PathBuf};
 
-use hil_models::measure::comparison::Estimate;
-use hil_models::measure::statistics::Interval;
+use hil_models::stats::comparison::Estimate;
+use hil_models::stats::statistics::Interval;
 use serde::Serialize;
 
 use crate::report::summary::{RunSummary, SummaryError};

@@ -1,7 +1,7 @@
 //! A comparison in words: for a terminal and as Markdown. It computes nothing.
 
-use hil_models::measure::comparison::Estimate;
-use hil_models::measure::statistics::Interval;
+use hil_models::stats::comparison::Estimate;
+use hil_models::stats::statistics::Interval;
 
 use super::conditions::Verdicts;
 use super::{ComparedFigure, Comparison, FigureKind};

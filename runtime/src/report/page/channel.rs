@@ -1,12 +1,10 @@
 //! One channel of a page: its figures, tables and drawings, from the account and the network's figures
 //! of a summary. Nothing is computed anew but shares of counts.
 
-use hil_models::measure::account::{
-    ChannelAccount, Coverage, MessageFate, OutageFigures, SegmentFigures,
-};
-use hil_models::measure::histogram::{Distribution, LatencySummary};
-use hil_models::measure::network::{DelayQuantile, Figure as Measured, NetworkFigures};
-use hil_models::measure::statistics::{CONFIDENCE, IntervalNs, wilson};
+use hil_models::account::network::{DelayQuantile, Figure as Measured, NetworkFigures};
+use hil_models::account::{ChannelAccount, Coverage, MessageFate, OutageFigures, SegmentFigures};
+use hil_models::stats::histogram::{Distribution, LatencySummary};
+use hil_models::stats::statistics::{CONFIDENCE, IntervalNs, wilson};
 
 use super::data::{Channel, Figure, Table};
 use super::figures::waterfall::Bar;

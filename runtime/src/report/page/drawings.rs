@@ -6,8 +6,8 @@ use super::figures::bursts::loss_bursts;
 use super::figures::cdf::{Curve, delay_cdf};
 use super::figures::histogram::delay_histogram;
 use super::figures::waterfall::{Bar, waterfall};
+use hil_models::account::ChannelAccount;
 use hil_models::case_study::Severity;
-use hil_models::measure::account::ChannelAccount;
 
 use crate::platform::text::grouped;
 

@@ -1,8 +1,8 @@
 //! The events of a run as lists: those of the score with what stood beside them, those of the network,
 //! and what follows what.
 
+use hil_models::account::network::NetworkEventKind;
 use hil_models::case_study::Severity;
-use hil_models::measure::network::NetworkEventKind;
 
 use super::data::{Event, EventList};
 use super::drawings;

@@ -3,8 +3,8 @@
 
 use core::time::Duration;
 
+use hil_models::account::{Happening, MessageFate, Outage, Side};
 use hil_models::case_study::{ChannelSpec, MessageRef, Score, ScoreEvent};
-use hil_models::measure::account::{Happening, MessageFate, Outage, Side};
 use hil_models::run_log::{LoggedMessage, RunLog};
 use hil_models::time::Instant;
 
@@ -127,8 +127,8 @@ fn published_ns(message: &MessageRef, log: &RunLog) -> Option<i64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use hil_models::account::Standing;
     use hil_models::case_study::{CaseStudy, Severity};
-    use hil_models::measure::account::Standing;
     use hil_models::message::Envelope;
     use hil_models::shuttle::Shuttle;
 

@@ -1,9 +1,9 @@
 //! The network of a run in virtual time: the link models' fates as passages, for the same report as
 //! of a live run. What a model delays counts from publication, as no gateway stands between.
 
+use hil_models::account::ChannelPath;
+use hil_models::account::network::{Moment, NetworkContext};
 use hil_models::case_study::ErrorSeries;
-use hil_models::measure::account::ChannelPath;
-use hil_models::measure::network::{Moment, NetworkContext};
 use hil_models::plot::PlotSeries;
 use hil_models::run_log::RunLog;
 use hil_models::time::{Instant, duration_ns};

@@ -6,8 +6,8 @@ use std::rc::Rc;
 
 use hil_gateways::protocol::wire;
 use hil_models::link::{LinkModel, LossCauses};
-use hil_models::measure::account::{Outage, OutageFinder};
-use hil_models::measure::network::{Crossing, Passage};
+use hil_models::account::{Outage, OutageFinder};
+use hil_models::account::network::{Crossing, Passage};
 use hil_models::message::Envelope;
 use hil_models::simulation::Carrier;
 use hil_models::time::Instant;
@@ -112,7 +112,7 @@ fn passage(now: Instant, envelope: &Envelope, arrival: Option<Instant>) -> Passa
 #[cfg(test)]
 mod tests {
     use super::*;
-    use hil_models::link::Fate;
+    use hil_models::link_model::Fate;
 
     /// Down from 10 to 19 ms, otherwise 3 ms late.
     #[derive(Debug)]

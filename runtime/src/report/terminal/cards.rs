@@ -3,7 +3,7 @@
 
 use core::fmt::Write as _;
 
-use hil_models::measure::card_clock::CardClockFigures;
+use hil_models::account::card_clock::CardClockFigures;
 
 use super::canvas::{Canvas, INDENT, Tone};
 use super::units::{duration, percent};
@@ -128,10 +128,10 @@ fn segment_words(segment: &CardSegment) -> String {
             text
         }
         _ => match &segment.distribution {
-            hil_models::measure::histogram::Distribution::Unavailable { reason } => {
+            hil_models::stats::histogram::Distribution::Unavailable { reason } => {
                 format!("{}: unavailable: {reason}", segment.name)
             }
-            hil_models::measure::histogram::Distribution::Measured(_) => segment.name.clone(),
+            hil_models::stats::histogram::Distribution::Measured(_) => segment.name.clone(),
         },
     };
     if segment.unplaced_count > 0 {

@@ -1,11 +1,11 @@
 //! One channel of a report: fates, the way of a message as a waterfall, closing, stamps and
 //! silences.
 
-use hil_models::measure::account::{
+use hil_models::account::{
     BurstCount, ChannelAccount, Closing, ClosingFigures, Coverage, Gap, MessageFate, SegmentFigures,
 };
-use hil_models::measure::histogram::{Distribution, LatencySummary};
-use hil_models::measure::statistics::IntervalNs;
+use hil_models::stats::histogram::{Distribution, LatencySummary};
+use hil_models::stats::statistics::IntervalNs;
 
 use super::canvas::{Canvas, INDENT, Tone, bar, left, right};
 use super::clocks;

@@ -1,9 +1,10 @@
 //! How the hosts' clocks relate, and what that means for figures that cross from one host to the
 //! other. It computes no alignment.
 
-use hil_models::clock::{BoundFigures, ClockFigures, StampKind};
-use hil_models::measure::account::ChannelAccount;
-use hil_models::measure::histogram::Distribution;
+use hil_models::account::ChannelAccount;
+use hil_models::clock::{ClockFigures, StampKind};
+use hil_models::stats::bounds::BoundFigures;
+use hil_models::stats::histogram::Distribution;
 
 use super::canvas::{Canvas, INDENT, Tone};
 use super::units::{duration, duration_s};
@@ -233,7 +234,7 @@ mod tests {
     use crate::report::clock_summary::ClockPathEnd;
     use crate::report::terminal::Style;
     use hil_models::clock::{ClockMap, ClockSettings, Exchange, Requester};
-    use hil_models::measure::record::RoundTripRecord;
+    use hil_models::record::RoundTripRecord;
 
     fn figures() -> ClockFigures {
         let exchange = |index: i64| {

@@ -1,8 +1,8 @@
 //! How an emulated link was kept, as lines of a report. What follows from it is decided in
 //! `assessment`.
 
-use hil_models::link::trace::ReplayCounts;
-use hil_models::measure::histogram::LatencySummary;
+use hil_models::link_model::ReplayCounts;
+use hil_models::stats::histogram::LatencySummary;
 
 use super::canvas::{Canvas, Tone};
 use super::units::duration;
@@ -66,7 +66,7 @@ pub(super) fn replay(canvas: &mut Canvas, counts: &ReplayCounts) {
 #[cfg(test)]
 mod tests {
     use bytemuck::Zeroable;
-    use hil_models::measure::record::IngressRecord;
+    use hil_models::record::IngressRecord;
 
     use super::*;
     use crate::report::terminal::Style;

@@ -1,8 +1,8 @@
 //! What happened to the robot and, beside it, to the messages concerned. Which events matter most
 //! is said by their severity alone.
 
+use hil_models::account::MessageFate;
 use hil_models::case_study::Severity;
-use hil_models::measure::account::MessageFate;
 
 use super::canvas::{Canvas, INDENT, Tone};
 use super::units::{duration_s, seconds};

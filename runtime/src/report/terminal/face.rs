@@ -1,7 +1,7 @@
 //! The arms that a foreign program drove, or that were driven in a foreign robot: state, answers,
 //! and where time went in our face, held against the controller's cycle.
 
-use hil_models::measure::histogram::Distribution;
+use hil_models::stats::histogram::Distribution;
 
 use super::canvas::{Canvas, INDENT, Tone, left, right};
 use super::units::{duration, percent};
@@ -123,7 +123,7 @@ mod tests {
     use crate::report::face::Answers;
     use crate::report::summary::{CountByName, Fact};
     use crate::report::terminal::Style;
-    use hil_models::measure::histogram::LatencyHistogram;
+    use hil_models::stats::histogram::LatencyHistogram;
 
     fn summary() -> FaceSummary {
         let mut histogram = LatencyHistogram::default();

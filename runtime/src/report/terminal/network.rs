@@ -4,7 +4,7 @@
 use core::cmp::Ordering;
 use core::fmt::Write;
 
-use hil_models::measure::network::{
+use hil_models::account::network::{
     DelayFigures, DelayQuantile, Figure, InterarrivalJitter, LossFigures, NetworkFigures,
     SuccessiveVariation,
 };
@@ -254,7 +254,7 @@ fn jitter_bound_words(jitter: InterarrivalJitter) -> String {
 }
 
 fn loss_words(loss: &LossFigures) -> String {
-    let bounds = |interval: hil_models::measure::statistics::Interval| {
+    let bounds = |interval: hil_models::stats::statistics::Interval| {
         format!("[{}, {}]", percent(interval.low), percent(interval.high))
     };
     let (count, of) = (grouped(loss.lost_count), grouped(loss.of_count));

@@ -1,6 +1,6 @@
 //! The outages of one channel: how many of which length, and the longest.
 
-use hil_models::measure::account::{LongestOutage, OutageClass, OutageFigures};
+use hil_models::account::{LongestOutage, OutageClass, OutageFigures};
 
 use super::canvas::{Canvas, INDENT, Tone, bar, right};
 use super::units::{duration, seconds};
@@ -104,7 +104,7 @@ fn border(ns: i64) -> String {
 mod tests {
     use super::*;
     use crate::report::terminal::Style;
-    use hil_models::measure::account::{Outage, OutageFigures};
+    use hil_models::account::{Outage, OutageFigures};
 
     const MS: i64 = 1_000_000;
 

@@ -1,6 +1,6 @@
 //! What a report says of radios. It returns nothing on a wired run whose drivers stamp departures.
 
-use hil_models::measure::radio::{RadioFigures, Share, TransmitStampFigures};
+use hil_models::account::radio::{RadioFigures, Share, TransmitStampFigures};
 
 use super::canvas::{Canvas, Tone};
 use super::units::percent;
@@ -179,7 +179,7 @@ fn station_words(station: &StationSummary) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use hil_models::measure::radio::{RadioFates, RadioRow};
+    use hil_models::account::radio::{RadioFates, RadioRow};
 
     #[test]
     fn a_wired_channel_stamped_at_departure_needs_no_line() {

@@ -181,7 +181,7 @@ fn memory_words(memory: Option<&Memory>) -> String {
 }
 
 fn delay_words(figures: &TraceFigures) -> String {
-    use hil_models::measure::histogram::Distribution;
+    use hil_models::stats::histogram::Distribution;
     match &figures.delay {
         Distribution::Unavailable { reason } => format!("unavailable: {reason}"),
         Distribution::Measured(delay) => {
@@ -210,7 +210,7 @@ fn delay_words(figures: &TraceFigures) -> String {
 
 /// Of messages that arrived and were not published.
 fn late_words(figures: &TraceFigures) -> String {
-    use hil_models::measure::histogram::Distribution;
+    use hil_models::stats::histogram::Distribution;
     match &figures.late_delay {
         Distribution::Unavailable { reason } => format!("unavailable: {reason}"),
         Distribution::Measured(late) => format!(

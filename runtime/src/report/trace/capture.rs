@@ -5,7 +5,7 @@ use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
-use hil_models::measure::account::{TraceChannel, each_traced, link_trace};
+use hil_models::trace::from_records::{TraceChannel, each_traced, link_trace};
 use hil_models::trace::wire::TraceEncoder;
 use hil_models::trace::{TraceArrival, TraceDirection, TraceHeader, TraceRecord, UNAVAILABLE_NS};
 

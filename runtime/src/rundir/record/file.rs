@@ -15,12 +15,12 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use bytemuck::Pod;
+use hil_models::account::card_clock::CardClockRecord;
 use hil_models::link::condition::LinkConditionRecord;
-use hil_models::measure::card_clock::CardClockRecord;
-use hil_models::measure::record::{
+use hil_models::message::Envelope;
+use hil_models::record::{
     EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
 };
-use hil_models::message::Envelope;
 use hil_models::run_log::RunLog;
 
 use crate::rundir::face_record::{FaceReceivedRecord, FaceSentRecord};
@@ -366,7 +366,6 @@ impl RecordFile {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use hil_models::random::RandomStream;
 
     fn sample() -> Vec<u8> {
         let header = RecordHeader {
@@ -436,23 +435,5 @@ mod tests {
             text.contains("message records of 1 bytes, where this program has at least"),
             "{text}"
         );
-    }
-
-    #[test]
-    fn mutated_files_are_refused_or_read_without_panic() {
-        let mut random = RandomStream::new(5, "record files");
-        let good = sample();
-        for _ in 0..100_000 {
-            let mut bytes = good.clone();
-            for _ in 0..=random.next_u64() % 4 {
-                let at = usize::try_from(random.next_u64()).unwrap() % bytes.len();
-                bytes[at] = random.next_u64().to_le_bytes()[0];
-            }
-            bytes.truncate(usize::try_from(random.next_u64()).unwrap() % (bytes.len() + 1));
-            if let Ok(file) = RecordFile::from_bytes(Path::new("x"), bytes) {
-                assert!(file.records::<PublishedRecord>().count() <= 3);
-                file.append_messages(&mut RunLog::default());
-            }
-        }
     }
 }

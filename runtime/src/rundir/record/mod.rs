@@ -1,5 +1,5 @@
 //! Recording: fixed-size records go through a bounded ring to a file, off the measured path.
-//! What the records mean is in `hil_models::measure::record`; nothing here computes a figure.
+//! What the records mean is in `hil_models::record`; nothing here computes a figure.
 
 pub mod file;
 pub mod ring;

@@ -8,7 +8,7 @@ use std::slice;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use bytemuck::Pod;
-use hil_models::measure::account::RecordSource;
+use hil_models::account::RecordSource;
 use hil_models::message::Envelope;
 use hil_models::run_log::{MessageReader, StoredMessages};
 
@@ -227,8 +227,8 @@ pub fn file_bytes(path: &Path) -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::rundir::record::RecordKind;
-    use hil_models::measure::record::PublishedRecord;
+use crate::rundir::record::RecordKind;
+use hil_models::record::PublishedRecord;
     use std::io::Write;
     use std::{env, process};
 

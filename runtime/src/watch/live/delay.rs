@@ -4,9 +4,9 @@
 use core::fmt::Write as _;
 use std::time::Duration;
 
+use hil_models::account::{ChannelAccount, Closing, MessageFate};
 use hil_models::clock::ClockMap;
-use hil_models::measure::account::{ChannelAccount, Closing, MessageFate};
-use hil_models::measure::histogram::{Distribution, LatencySummary};
+use hil_models::stats::histogram::{Distribution, LatencySummary};
 use serde::Serialize;
 use serde_json::{Value, json};
 
@@ -259,8 +259,8 @@ fn row(name: &str, distribution: &Distribution) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use hil_models::measure::account::{AccountContext, ChannelPath, ChannelRecords, account};
-    use hil_models::measure::record::{PublishedRecord, TakenRecord, UNAVAILABLE};
+    use hil_models::account::{AccountContext, ChannelPath, ChannelRecords, account};
+    use hil_models::record::{PublishedRecord, TakenRecord, UNAVAILABLE};
 
     const ONE_CLOCK: Clock = Clock {
         relation: "one clock",

@@ -7,13 +7,11 @@ use std::collections::BTreeMap;
 use std::thread;
 use std::time::{Duration, Instant as WallInstant};
 
+use hil_models::account::{AccountContext, ChannelAccount, ChannelPath, FLIGHT_TIME_MAX, RunSpan};
 use hil_models::link::condition::{LinkCondition, LinkConditionRecord};
 use hil_models::link::spec::Way;
-use hil_models::measure::account::{
-    AccountContext, ChannelAccount, ChannelPath, FLIGHT_TIME_MAX, RunSpan,
-};
-use hil_models::measure::record::RoundTripRecord;
 use hil_models::message::Envelope;
+use hil_models::record::RoundTripRecord;
 use hil_models::time::{Alignment, Instant};
 
 use super::conditions::LinkConditions;

@@ -1,8 +1,8 @@
 //! How regularly messages come: rate, gaps, jitter and what is missing by number. It is given
 //! times and reads no clock.
 
-use hil_models::measure::histogram::LatencyHistogram;
 use hil_models::message::Envelope;
+use hil_models::stats::histogram::LatencyHistogram;
 use serde::Serialize;
 
 use super::observer::Arrival;

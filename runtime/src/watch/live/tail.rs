@@ -3,8 +3,8 @@
 
 use core::ops::RangeInclusive;
 
-use hil_models::measure::account::{AccountContext, ChannelAccount, ChannelRecords, account};
-use hil_models::measure::record::{
+use hil_models::account::{AccountContext, ChannelAccount, ChannelRecords, account};
+use hil_models::record::{
     EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE,
 };
 
@@ -269,7 +269,7 @@ fn renumber<R: OfMessage>(records: Option<&[R]>, lowest: &[(u32, u64)]) -> Optio
 #[cfg(test)]
 mod tests {
     use super::*;
-    use hil_models::measure::account::{ChannelPath, MessageFate};
+    use hil_models::account::{ChannelPath, MessageFate};
     use hil_models::time::Alignment;
 
     const MS: i64 = 1_000_000;

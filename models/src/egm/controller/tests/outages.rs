@@ -3,7 +3,7 @@
 use super::rig::{AMPLITUDE_RAD, PERIOD_S, Rig, open_settings, swing};
 use crate::egm::messages::EndCause;
 use crate::egm::parameters::{ControllerSettings, RestartPolicy};
-use crate::measure::series::{Sample, peaks};
+use crate::stats::series::{Sample, peaks};
 use crate::yumi::arm::RIGHT_START_RAD;
 
 /// Between two outages: long enough that each is judged by itself.

@@ -10,7 +10,7 @@ use bytemuck::Zeroable;
 use super::*;
 use crate::case_study::CaseStudy;
 use crate::egm::messages::{EgmEvent, EgmEventKind, EndCause, SessionState, Side};
-use crate::link::{Fate, LinkModel};
+use crate::link_model::{Fate, LinkModel};
 use crate::message::{Envelope, Message};
 use crate::score::Severity;
 use crate::simulation::{Carrier, Simulation};

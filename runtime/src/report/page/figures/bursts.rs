@@ -1,6 +1,6 @@
 //! How many messages were lost in a row, and how often.
 
-use hil_models::measure::account::BurstCount;
+use hil_models::account::BurstCount;
 
 use super::{Frame, HALF_WIDTH};
 use crate::platform::text::grouped;

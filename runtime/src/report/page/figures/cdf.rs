@@ -1,7 +1,7 @@
 //! How delays are distributed: one step curve per segment, over a logarithmic axis of time and an
 //! axis of shares whose steps are nines, so that the tail is as readable as the median.
 
-use hil_models::measure::histogram::{DurationBin, LatencySummary};
+use hil_models::stats::histogram::{DurationBin, LatencySummary};
 
 use super::{Frame, HALF_WIDTH, legend, legend_height, path_through};
 use crate::report::page::axis::{Axis, Unit};

@@ -1,7 +1,7 @@
 //! How often which delays occurred: the bins of the summary as they are, never thinned. Bins are equally
 //! wide on the logarithmic axis.
 
-use hil_models::measure::histogram::DurationBin;
+use hil_models::stats::histogram::DurationBin;
 
 use super::{Frame, HALF_WIDTH};
 use crate::platform::text::grouped;

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use hil_models::clock::{ClockMap, ClockSettings, Exchange, Requester};
-use hil_models::measure::record::RoundTripRecord;
+use hil_models::record::RoundTripRecord;
 
 use super::Observer;
 use crate::report::clock_summary::ClockRung;

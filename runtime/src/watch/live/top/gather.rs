@@ -5,11 +5,11 @@ use std::collections::BTreeMap;
 use std::io;
 use std::time::Duration;
 
+use hil_models::account::{ChannelAccount, MessageFate};
 use hil_models::clock::ClockMap;
 use hil_models::link::condition::LinkCondition;
 use hil_models::link::spec::{LinkSpec, Way};
-use hil_models::measure::account::{ChannelAccount, MessageFate};
-use hil_models::measure::histogram::Distribution;
+use hil_models::stats::histogram::Distribution;
 use hil_models::time::Instant;
 
 use super::draw::HISTORY_COLUMNS;
