@@ -6,7 +6,7 @@ use std::fs;
 use std::io;
 use std::time::SystemTime;
 
-use hil_gateways::transport::clock_pair::ClockPair;
+use hil_gateways::net::clock_pair::ClockPair;
 use hil_models::layout::{Field, FieldKind, RESERVED};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};

@@ -33,11 +33,11 @@ const IMPURE_WORDS: [&str; 15] = [
 ];
 /// The only files that may hold `unsafe`, each for a kernel or shared-memory border.
 const UNSAFE_FILES: [&str; 8] = [
-    "gateways/src/transport/card_clock.rs",
-    "gateways/src/transport/packet_ring.rs",
-    "gateways/src/transport/packet_socket.rs",
-    "gateways/src/transport/tcp/info.rs",
-    "gateways/src/transport/timestamping.rs",
+    "gateways/src/net/card_clock.rs",
+    "gateways/src/net/packet_ring.rs",
+    "gateways/src/net/packet_socket.rs",
+    "gateways/src/net/tcp_info.rs",
+    "gateways/src/net/timestamping.rs",
     "runtime/src/channel/raw.rs",
     "runtime/src/channel/shm.rs",
     "runtime/src/realtime.rs",

@@ -4,7 +4,7 @@ use std::fs;
 use std::io::IsTerminal;
 use std::path::Path;
 
-use hil_gateways::transport::timestamping::TimestampCapabilities;
+use hil_gateways::net::timestamping::TimestampCapabilities;
 
 use super::{exit, hosts_here, interrupted, load, signals};
 use crate::console::Console;

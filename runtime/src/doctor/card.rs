@@ -91,7 +91,7 @@ mod tests {
     use crate::doctor::StampCapabilities;
     use crate::doctor::finding::Severity;
     use crate::doctor::network::Interface;
-    use hil_gateways::transport::card_clock::CardPair;
+    use hil_gateways::net::card_clock::CardPair;
 
     fn probe(tx_hardware: Result<Delivery, String>) -> CardProbe {
         CardProbe {

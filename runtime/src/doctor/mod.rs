@@ -32,7 +32,7 @@ mod wakeup;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use hil_gateways::transport::interface::interface_with_address;
+use hil_gateways::net::interface::interface_with_address;
 use serde::{Deserialize, Serialize};
 
 pub use self::finding::{Finding, Severity};

@@ -6,8 +6,9 @@ use super::super::flow::FlowFilter;
 use super::super::observe::Observer;
 use super::super::reader::{CaptureReader, Step};
 use super::super::writer::{self, PacketToWrite};
-use super::super::{CaptureInterface, Direction, esl, link, link_type};
+use super::super::{CaptureInterface, esl, link};
 use super::{message, read, udp_frame};
+use crate::net::{Direction, link_type};
 
 const CASE_COUNT: u64 = 100_000;
 const SEED: u64 = 20_261_122;
