@@ -22,12 +22,12 @@ use hil_benches::gateway::hosts::SetupError;
 use hil_benches::gateway::network::Network;
 use hil_benches::gateway::parties::{MachineTime, stolen_text};
 use hil_benches::{HostFacts, Quantiles, TypicalRatio};
+use hil_gateways::net::timestamping::TimestampMode;
 use hil_gateways::protocol::seal::{
     Association, Initiator, Opened, Responder, Rotation, RunSecret, Suite,
 };
 use hil_gateways::protocol::wire::{HEADER_BYTES, Header, Kind, TAG_BYTES};
 use hil_gateways::transport::sealed::{SealedReceiver, SealedSender};
-use hil_gateways::transport::timestamping::TimestampMode;
 use hil_gateways::transport::udp::{UdpReceiver, UdpSender, UdpSettings};
 use hil_gateways::transport::{DatagramReceiver, DatagramSender};
 use hil_models::random::RandomStream;

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-use hil_gateways::transport::timestamping::TimestampMode;
+use hil_gateways::net::timestamping::TimestampMode;
 use hil_gateways::transport::udp::{UdpReceiver, UdpSender, UdpSettings};
 use hil_gateways::transport::{DatagramReceiver, DatagramSender};
 use hil_models::endpoint::InputPort;

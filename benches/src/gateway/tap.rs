@@ -74,14 +74,15 @@ impl Drainer {
         places: &[(usize, &str)],
         work: impl FnOnce() -> T,
     ) -> Result<(T, RingCounters), SetupError> {
-        let flows = [FlowFilter::hil()];
+        let flow = FlowFilter::hil();
+        let filters = [flow.packets];
         let settings = RingSettings {
-            snap_bytes: u32::try_from(flows[0].snap_bytes())?,
+            snap_bytes: u32::try_from(flow.snap_bytes())?,
             ring_bytes: 8 << 20,
             stamps: RingStamps::Kernel,
         };
         let open = |(host, name): &(usize, &str)| {
-            network.on(*host, || PacketRing::open(name, &flows, &settings))
+            network.on(*host, || PacketRing::open(name, &filters, &settings))
         };
         let taps: Result<Vec<PacketRing>, _> = places.iter().map(open).collect();
         let taps = taps?;

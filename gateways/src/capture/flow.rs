@@ -14,10 +14,11 @@ use hil_models::message::{FNV_OFFSET, fnv1a};
 use thiserror::Error;
 
 use super::link::UdpDatagram;
+use crate::net::filter::PacketFilter;
 use crate::protocol::wire::{HEADER_BYTES, Header, Kind};
 
-/// Flows one probe may follow.
-pub const FLOW_COUNT_MAX: usize = 16;
+/// What our own datagrams begin with.
+const MAGIC: [u8; 4] = *b"HILG";
 /// Bytes of a frame before the payload of a UDP datagram at most, with a tag and IP options.
 const BEFORE_PAYLOAD_BYTES: usize = 18 + 60 + 8;
 
@@ -53,16 +54,8 @@ pub enum UdpIdentity {
 pub struct FlowFilter {
     /// What it holds.
     pub kind: FlowKind,
-    /// Port of either end.
-    pub port: Option<u16>,
-    /// Port of the sender.
-    pub source_port: Option<u16>,
-    /// Port of the receiver.
-    pub destination_port: Option<u16>,
-    /// Address of the sender.
-    pub source: Option<IpAddr>,
-    /// Address of the receiver.
-    pub destination: Option<IpAddr>,
+    /// Which packets are of it, as far as a tap can tell.
+    pub packets: PacketFilter,
 }
 
 /// Why words of the command line name no flow.
@@ -108,16 +101,17 @@ impl FromStr for FlowFilter {
                 .split_once('=')
                 .ok_or_else(|| FlowError::Condition(condition.to_owned()))?;
             match (key, &mut filter.kind) {
-                ("port", _) => filter.port = Some(port("port", value)?),
-                ("sport", _) => filter.source_port = Some(port("sport", value)?),
-                ("dport", _) => filter.destination_port = Some(port("dport", value)?),
-                ("src", _) => filter.source = Some(address("src", value)?),
-                ("dst", _) => filter.destination = Some(address("dst", value)?),
+                ("port", _) => filter.packets.port = Some(port("port", value)?),
+                ("sport", _) => filter.packets.source_port = Some(port("sport", value)?),
+                ("dport", _) => filter.packets.destination_port = Some(port("dport", value)?),
+                ("src", _) => filter.packets.source = Some(address("src", value)?),
+                ("dst", _) => filter.packets.destination = Some(address("dst", value)?),
                 ("id", FlowKind::Udp(identity)) => *identity = number(value)?,
                 _ => return Err(FlowError::Condition(condition.to_owned())),
             }
         }
-        if let (Some(source), Some(destination)) = (filter.source, filter.destination)
+        if let (Some(source), Some(destination)) =
+            (filter.packets.source, filter.packets.destination)
             && source.is_ipv4() != destination.is_ipv4()
         {
             return Err(FlowError::Families);
@@ -185,12 +179,13 @@ impl fmt::Display for FlowFilter {
                 ("udp", Some(format!("id={offset}+{bytes}{order}")))
             }
         };
+        let packets = &self.packets;
         let conditions = [
-            self.port.map(|port| format!("port={port}")),
-            self.source_port.map(|port| format!("sport={port}")),
-            self.destination_port.map(|port| format!("dport={port}")),
-            self.source.map(|address| format!("src={address}")),
-            self.destination.map(|address| format!("dst={address}")),
+            packets.port.map(|port| format!("port={port}")),
+            packets.source_port.map(|port| format!("sport={port}")),
+            packets.destination_port.map(|port| format!("dport={port}")),
+            packets.source.map(|address| format!("src={address}")),
+            packets.destination.map(|address| format!("dst={address}")),
             identity,
         ];
         let conditions: Vec<String> = conditions.into_iter().flatten().collect();
@@ -258,11 +253,17 @@ impl FlowFilter {
     const fn of(kind: FlowKind) -> Self {
         Self {
             kind,
-            port: None,
-            source_port: None,
-            destination_port: None,
-            source: None,
-            destination: None,
+            packets: PacketFilter {
+                port: None,
+                source_port: None,
+                destination_port: None,
+                source: None,
+                destination: None,
+                magic: match kind {
+                    FlowKind::Hil => Some(MAGIC),
+                    FlowKind::Egm | FlowKind::Udp(_) => None,
+                },
+            },
         }
     }
 
@@ -275,12 +276,14 @@ impl FlowFilter {
     pub fn has_addresses_of(&self, datagram: &UdpDatagram<'_>) -> bool {
         let (from, to) = (datagram.source, datagram.destination);
         let is = |wanted: Option<u16>, port: u16| wanted.is_none_or(|one| one == port);
-        self.port
+        let wanted = &self.packets;
+        wanted
+            .port
             .is_none_or(|port| from.port() == port || to.port() == port)
-            && is(self.source_port, from.port())
-            && is(self.destination_port, to.port())
-            && self.source.is_none_or(|address| address == from.ip())
-            && self.destination.is_none_or(|address| address == to.ip())
+            && is(wanted.source_port, from.port())
+            && is(wanted.destination_port, to.port())
+            && wanted.source.is_none_or(|address| address == from.ip())
+            && wanted.destination.is_none_or(|address| address == to.ip())
     }
 
     /// By what the datagram is known again.
@@ -309,7 +312,7 @@ impl FlowFilter {
 
 fn own(datagram: &UdpDatagram<'_>) -> Result<DatagramIdentity, Unidentified> {
     let payload = datagram.payload;
-    let is_ours = payload.len() < 4 || payload.starts_with(b"HILG");
+    let is_ours = payload.len() < 4 || payload.starts_with(&MAGIC);
     let Some(bytes) = payload.get(..HEADER_BYTES).filter(|_| is_ours) else {
         return Err(if is_ours && datagram.is_cut_short() {
             Unidentified::CutShort

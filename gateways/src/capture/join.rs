@@ -20,8 +20,8 @@ use hil_models::stats::statistics::{
 };
 use serde::{Deserialize, Serialize};
 
-use super::Direction;
 use super::observe::{Observation, Point, Seen, Stream};
+use crate::net::Direction;
 
 /// Farthest that two stamps of one datagram may lie apart unless told otherwise.
 pub const WINDOW_NS: i64 = 5_000_000_000;

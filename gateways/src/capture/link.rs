@@ -5,7 +5,7 @@
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 
 use super::bytes::{array_at, net_u16};
-use super::link_type;
+use crate::net::link_type;
 
 const UDP: u8 = 17;
 const UDP_HEADER_BYTES: usize = 8;

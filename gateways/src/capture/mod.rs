@@ -1,6 +1,6 @@
 //! A second opinion on the wire: captures of packets read and written, and what they say of a
 //! flow seen at two points. Bytes go in and figures come out; no file is opened, no socket, and no
-//! clock is read. The live tap is [`crate::transport::packet_ring`].
+//! clock is read. The live tap is [`crate::net::packet_ring`].
 //!
 //! ```text
 //! file bytes -> CaptureReader -> packet -> esl -> link -> flow -> Observation
@@ -18,53 +18,15 @@ pub mod pairing;
 mod pcap;
 mod pcapng;
 pub mod point;
-pub mod program;
 pub mod reader;
 pub mod writer;
 
 #[cfg(test)]
-pub(crate) mod tests;
+mod tests;
 
 use thiserror::Error;
 
-/// Numbers of `https://www.tcpdump.org/linktypes.html` that [`link`] reads.
-pub mod link_type {
-    /// Ethernet.
-    pub const ETHERNET: u16 = 1;
-    /// IPv4 or IPv6 without anything before it.
-    pub const RAW: u16 = 101;
-    /// Linux cooked capture, version 1.
-    pub const LINUX_SLL: u16 = 113;
-    /// IPv4.
-    pub const IPV4: u16 = 228;
-    /// IPv6.
-    pub const IPV6: u16 = 229;
-    /// Linux cooked capture, version 2.
-    pub const LINUX_SLL2: u16 = 276;
-}
-
-/// Which way a packet passed its interface.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
-pub enum Direction {
-    /// The capture does not say.
-    #[default]
-    Unknown,
-    /// It came in.
-    Inbound,
-    /// It went out.
-    Outbound,
-}
-
-impl Direction {
-    /// The word a report prints.
-    pub const fn label(self) -> &'static str {
-        match self {
-            Self::Unknown => "unknown",
-            Self::Inbound => "in",
-            Self::Outbound => "out",
-        }
-    }
-}
+use crate::net::Direction;
 
 /// How the description of an interface begins whose packets have the card's stamps.
 pub const CARD_CLOCK: &str = "stamps of the network card's own clock";
@@ -76,7 +38,7 @@ pub struct CaptureInterface {
     pub name: Option<String>,
     /// What the file says of it; see [`CARD_CLOCK`].
     pub description: Option<String>,
-    /// See [`link_type`].
+    /// See [`crate::net::link_type`].
     pub link_type: u16,
     /// Bytes kept of a packet; 0 without limit.
     pub snap_bytes: u32,
@@ -110,7 +72,7 @@ pub struct CapturedPacket<'a> {
     pub offset: u64,
     /// Which of [`reader::CaptureReader::interfaces`].
     pub interface_index: usize,
-    /// That interface's [`link_type`].
+    /// That interface's [`crate::net::link_type`].
     pub link_type: u16,
     /// Nanoseconds since 1970, on the clock of the capturing host; `None` in a simple packet
     /// block, which has none.

@@ -9,7 +9,8 @@ use serde::{Deserialize, Serialize};
 
 use super::flow::{DatagramIdentity, FlowFilter, FlowKind, Unidentified};
 use super::link::{NoDatagram, udp_datagram};
-use super::{CaptureInterface, CapturedPacket, Direction, esl, link_type};
+use super::{CaptureInterface, CapturedPacket, esl};
+use crate::net::{Direction, link_type};
 use crate::protocol::wire::Kind;
 
 /// A place where datagrams were seen.

@@ -7,9 +7,9 @@
 //! file that saw no followed datagram at all counts too: whoever names two captures means two points
 //! of one way.
 
-use super::Direction;
 use super::join::{Joined, join};
 use super::observe::{Observer, Point, Seen, Stream};
+use crate::net::Direction;
 
 /// Every stream at every two points it passed or should have passed. Stamps of one datagram lie at
 /// most `window_ns` apart.

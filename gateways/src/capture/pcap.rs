@@ -3,7 +3,8 @@
 
 use super::bytes::ByteOrder;
 use super::reader::{Found, Next, Window};
-use super::{CaptureInterface, Direction, Problem};
+use super::{CaptureInterface, Problem};
+use crate::net::Direction;
 
 /// Largest record taken for one: the largest that libpcap writes.
 const CAPTURED_BYTES_MAX: u32 = 262_144;

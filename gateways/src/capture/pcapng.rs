@@ -5,7 +5,8 @@
 use super::bytes::{ByteOrder, array_at};
 use super::pcap::missing;
 use super::reader::{Found, Next, Window};
-use super::{CaptureInterface, Direction, Problem};
+use super::{CaptureInterface, Problem};
+use crate::net::Direction;
 
 const SECTION: u32 = 0x0a0d_0d0a;
 const INTERFACE: u32 = 1;

@@ -10,6 +10,7 @@ use super::bytes::ByteOrder;
 use super::pcap::PcapFile;
 use super::pcapng::PcapngFile;
 use super::{CaptureFault, CaptureInterface, CapturedPacket, Problem};
+use crate::net::Direction;
 
 /// What [`CaptureReader::next_step`] found.
 #[derive(Debug, PartialEq, Eq)]
@@ -96,7 +97,7 @@ pub(super) struct Found {
     pub(super) interface_index: usize,
     pub(super) stamp_ns: Option<i64>,
     pub(super) original_bytes: u32,
-    pub(super) direction: super::Direction,
+    pub(super) direction: Direction,
     pub(super) data: (usize, usize),
     pub(super) record_bytes: u64,
 }

@@ -2,7 +2,8 @@
 //! packets with their direction, and statistics at the end. Little-endian; appends to a buffer that
 //! the owner writes out. It decides nothing about which packets are kept.
 
-use super::{CaptureInterface, Direction};
+use super::CaptureInterface;
+use crate::net::Direction;
 
 const NANOSECONDS: u8 = 9;
 

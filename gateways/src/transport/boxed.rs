@@ -6,12 +6,12 @@ use std::os::fd::BorrowedFd;
 
 use hil_models::time::Instant;
 
-use super::radio::RadioReport;
 use super::tcp::StreamFigures;
 use super::{
     DatagramReceiver, DatagramSender, Received, ReceiverCounters, SendRefusal, SenderCounters,
-    TransmitStamp, TxToken,
 };
+use crate::net::radio::RadioReport;
+use crate::net::{TransmitStamp, TxToken};
 use crate::protocol::seal::SealCounts;
 
 impl<S: DatagramSender + ?Sized> DatagramSender for Box<S> {

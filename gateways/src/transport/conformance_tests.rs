@@ -11,15 +11,14 @@ use std::time::Duration;
 use hil_models::link_model::PerfectLink;
 use hil_models::time::Instant;
 
-use super::clock_pair::monotonic_now;
 use super::emulated::{EmulatedReceiver, EmulatedSettings};
 use super::queue::{QueueSettings, queue_pair};
 use super::tcp::{TcpReceiver, TcpSender, TcpSettings};
-use super::timestamping::TimestampMode;
 use super::udp::{UdpReceiver, UdpSender, UdpSettings};
-use super::{
-    DatagramReceiver, DatagramSender, KernelStamps, Received, SendRefusal, TransmitStamp, TxToken,
-};
+use super::{DatagramReceiver, DatagramSender, Received, SendRefusal};
+use crate::net::clock_pair::monotonic_now;
+use crate::net::timestamping::TimestampMode;
+use crate::net::{KernelStamps, TransmitStamp, TxToken};
 
 const BUFFER_BYTES: usize = 256;
 

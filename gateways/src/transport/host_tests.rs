@@ -8,13 +8,13 @@ use std::time::Duration;
 use nix::sched::{CloneFlags, CpuSet, sched_getaffinity, sched_setaffinity, unshare};
 use nix::unistd::{Pid, gettid};
 
-use super::clock_pair::{ClockPair, monotonic_now};
 use super::conformance_tests::{udp_pair, within_bound};
 use super::probe::{Availability, DISCARD_PORT, ProbeSettings, arm_and_probe};
-use super::timestamping::TimestampMode;
 use super::trap_tests::{count_waiting, loopback_settings, sentinel, take_stamps};
 use super::udp::{UdpReceiver, UdpSender};
 use super::{DatagramReceiver, DatagramSender, ReceiverCounters, SendRefusal};
+use crate::net::clock_pair::{ClockPair, monotonic_now};
+use crate::net::timestamping::TimestampMode;
 
 /// Gives `thread` the policy `SCHED_FIFO`; false when the host refuses or lacks `chrt`.
 fn make_realtime(thread: Pid) -> bool {

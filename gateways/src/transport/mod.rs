@@ -4,34 +4,20 @@
 //! - [`udp`]: the real network, with separate sockets for sending and receiving.
 //! - [`tcp`]: the real network as a stream, with what it costs in waiting.
 //! - [`udp_server`]: one socket that hears anyone and answers, for foreign protocols.
-//! - [`radio`]: whether the peer radio acknowledged each datagram.
 //! - [`queue`]: an in-process pair, for tests.
 //! - [`emulated`]: any receiver behind a link model.
 //! - [`sealed`]: any sender or receiver behind encryption and authentication.
-//! - [`timestamping`] and [`probe`]: what the kernel and the network card can stamp, and whether
-//!   they really do.
-//! - [`clock_pair`]: from the real-time clock of the stamps to the monotonic clock of the run.
+//! - [`probe`]: which stamps really arrive, by sending.
 //!
 //! A refused send or a report of the network is a state the caller sees, never an exit.
 
 mod boxed;
-pub mod card_arming;
-pub mod card_clock;
-pub mod clock_pair;
-pub mod control;
 mod counters;
 pub mod emulated;
-pub mod interface;
-pub mod packet_ring;
-mod packet_socket;
 pub mod probe;
 pub mod queue;
-pub mod radio;
-mod reply_stamps;
-pub mod ring_frame;
 pub mod sealed;
 pub mod tcp;
-pub mod timestamping;
 pub mod udp;
 mod udp_receiver;
 pub mod udp_server;
@@ -55,21 +41,11 @@ use hil_models::time::Instant;
 use thiserror::Error;
 
 pub use counters::{ReceiverCounters, SenderCounters};
-use radio::RadioReport;
 use tcp::StreamFigures;
 
+use crate::net::radio::RadioReport;
+use crate::net::{KernelStamps, TransmitStamp, TxToken};
 use crate::protocol::seal::SealCounts;
-
-/// The stamps the kernel attached to one datagram.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct KernelStamps {
-    /// Taken by the kernel, in nanoseconds of this host's `CLOCK_REALTIME`; `None` when the
-    /// kernel gave none. [`clock_pair`] relates it to the monotonic clock.
-    pub software_ns: Option<i64>,
-    /// Taken by the network card, in nanoseconds of the card's own clock; `None` when the card
-    /// gave none.
-    pub hardware_ns: Option<i64>,
-}
 
 /// When a link model took a datagram and when it gave it back.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -93,31 +69,6 @@ pub struct Received {
     pub stamps: KernelStamps,
     /// Set when a link model held the datagram.
     pub emulated: Option<EmulatedDelay>,
-}
-
-/// Names one successful send of one sender: 0, 1, 2, … modulo 2^32. A refused send takes none,
-/// as the kernel's own counter (`SOF_TIMESTAMPING_OPT_ID`) does not advance then either.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
-pub struct TxToken(pub u32);
-
-/// Where on its way out a datagram was when the kernel stamped it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum TransmitStage {
-    /// Before the queueing discipline (`SCM_TSTAMP_SCHED`).
-    Scheduled,
-    /// After it: by the driver just before the card took it, or by the card (`SCM_TSTAMP_SND`).
-    Sent,
-}
-
-/// A transmit stamp. One datagram may yield several: per stage, and software and hardware apart.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct TransmitStamp {
-    /// Which send it belongs to.
-    pub token: TxToken,
-    /// Where it was taken.
-    pub stage: TransmitStage,
-    /// The stamps.
-    pub stamps: KernelStamps,
 }
 
 /// Why a datagram did not leave. Each is a state of the peer or of the network, to be counted
@@ -186,8 +137,9 @@ impl SendRefusal {
 /// back. Nothing here blocks.
 ///
 /// ```
+/// use hil_gateways::net::TxToken;
 /// use hil_gateways::transport::queue::{QueueSettings, queue_pair};
-/// use hil_gateways::transport::{DatagramReceiver, DatagramSender, TxToken};
+/// use hil_gateways::transport::{DatagramReceiver, DatagramSender};
 /// use hil_models::time::Instant;
 ///
 /// let (mut sender, mut receiver) = queue_pair(&QueueSettings::default());

@@ -13,11 +13,12 @@ use hil_models::time::Instant;
 use nix::poll::{PollFd, PollFlags, ppoll};
 use thiserror::Error;
 
-use super::clock_pair::monotonic_now;
-use super::interface::interface_with_address;
-use super::timestamping::{TimestampCapabilities, TimestampMode};
 use super::udp::{UdpError, UdpReceiver, UdpSender, UdpSettings};
-use super::{DatagramReceiver, DatagramSender, SendRefusal, TransmitStage, TxToken};
+use super::{DatagramReceiver, DatagramSender, SendRefusal};
+use crate::net::clock_pair::monotonic_now;
+use crate::net::interface::interface_with_address;
+use crate::net::timestamping::{TimestampCapabilities, TimestampMode};
+use crate::net::{TransmitStage, TxToken};
 
 /// How long one probe datagram may take to come back with its stamps.
 const STAMP_WAIT: Duration = Duration::from_millis(20);

@@ -10,9 +10,9 @@ use std::sync::mpsc::{Receiver, SyncSender, TryRecvError, TrySendError, sync_cha
 use hil_models::time::Instant;
 
 use super::{
-    DatagramReceiver, DatagramSender, KernelStamps, Received, ReceiverCounters, SendRefusal,
-    SenderCounters, TransmitStage, TransmitStamp, TxToken,
+    DatagramReceiver, DatagramSender, Received, ReceiverCounters, SendRefusal, SenderCounters,
 };
+use crate::net::{KernelStamps, TransmitStage, TransmitStamp, TxToken};
 
 /// Bounds, addresses and stamps of a pair.
 #[derive(Debug, Clone)]

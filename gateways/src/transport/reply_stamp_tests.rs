@@ -8,11 +8,11 @@ use hil_models::time::Instant;
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 
 use super::DatagramReceiver;
-use super::clock_pair::{ClockPair, monotonic_now};
 use super::conformance_tests::within_bound;
-use super::timestamping::TimestampMode;
 use super::trap_tests::{count_waiting, loopback_settings};
 use super::udp::UdpReceiver;
+use crate::net::clock_pair::{ClockPair, monotonic_now};
+use crate::net::timestamping::TimestampMode;
 
 const UNFETCHED_REPLY_COUNT: u64 = 2000;
 const ARRIVAL_COUNT: u32 = 50;

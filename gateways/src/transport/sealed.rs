@@ -7,12 +7,12 @@ use std::os::fd::BorrowedFd;
 
 use hil_models::time::Instant;
 
-use super::radio::RadioReport;
 use super::tcp::StreamFigures;
 use super::{
     DatagramReceiver, DatagramSender, Received, ReceiverCounters, SendRefusal, SenderCounters,
-    TransmitStamp, TxToken,
 };
+use crate::net::radio::RadioReport;
+use crate::net::{TransmitStamp, TxToken};
 use crate::protocol::seal::{Heard, Initiator, Opened, Responder, SealCounts, SealRefusal};
 use crate::protocol::wire::{Kind, TAG_BYTES};
 
@@ -236,3 +236,7 @@ impl<R: DatagramReceiver> DatagramReceiver for SealedReceiver<R> {
         Some(self.seal.counts())
     }
 }
+
+#[cfg(test)]
+#[path = "sealed_tests.rs"]
+mod tests;

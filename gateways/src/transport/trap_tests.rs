@@ -6,12 +6,13 @@ use std::time::Duration;
 
 use hil_models::time::Instant;
 
-use super::clock_pair::{ClockPair, monotonic_now};
 use super::conformance_tests::{udp_pair, within_bound};
 use super::probe::{Availability, ProbeSettings, Sentinel, arm_and_probe};
-use super::timestamping::{TimestampMode, arm_transmit};
 use super::udp::{UdpReceiver, UdpSender, UdpSettings};
-use super::{DatagramReceiver, DatagramSender, SendRefusal, TxToken};
+use super::{DatagramReceiver, DatagramSender, SendRefusal};
+use crate::net::TxToken;
+use crate::net::clock_pair::{ClockPair, monotonic_now};
+use crate::net::timestamping::{TimestampMode, arm_transmit};
 
 const UNDRAINED_SEND_COUNT: u32 = 2000;
 const ARRIVAL_COUNT: u32 = 50;

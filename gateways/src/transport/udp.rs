@@ -9,16 +9,17 @@ use std::os::fd::{AsFd, BorrowedFd};
 use nix::sys::socket::{setsockopt, sockopt};
 use socket2::{SockAddr, Socket};
 
-use super::control::{ControlData, QueueEntry, SCM_WIFI_STATUS};
-use super::radio::{RETURNED_BYTES, RadioLedger, RadioReport};
-use super::timestamping::{
-    MessageReader, Queue, TimestampMode, arm_transmit, int_option, restart_send_count,
-    set_int_option,
-};
 pub use super::udp_receiver::UdpReceiver;
 pub use super::udp_socket::{GrantedOptions, UdpError, UdpSettings};
 use super::udp_socket::{bind, granted_options, local_address, open_socket, refuse};
-use super::{DatagramSender, Received, SendRefusal, SenderCounters, TransmitStamp, TxToken};
+use super::{DatagramSender, Received, SendRefusal, SenderCounters};
+use crate::net::control::{ControlData, QueueEntry, SCM_WIFI_STATUS};
+use crate::net::radio::{RETURNED_BYTES, RadioLedger, RadioReport};
+use crate::net::timestamping::{
+    MessageReader, Queue, TimestampMode, arm_transmit, int_option, restart_send_count,
+    set_int_option,
+};
+use crate::net::{TransmitStamp, TxToken};
 
 /// `IPV6_MTU` of `linux/in6.h`.
 const IPV6_MTU: i32 = 24;

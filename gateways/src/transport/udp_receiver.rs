@@ -9,15 +9,15 @@ use hil_models::time::Instant;
 use nix::sys::socket::{setsockopt, sockopt};
 use socket2::{SockAddr, Socket};
 
-use super::control::ControlData;
-use super::reply_stamps::ReplyStamps;
-use super::timestamping::{MessageReader, Queue, arm_receive, set_int_option};
 use super::udp::RECEIVE_ATTEMPT_COUNT_MAX;
 use super::udp_socket::{
     GrantedOptions, UdpError, UdpSettings, bind, granted_options, local_address, open_socket,
     refuse,
 };
 use super::{DatagramReceiver, Received, ReceiverCounters, SendRefusal};
+use crate::net::control::ControlData;
+use crate::net::reply_stamps::ReplyStamps;
+use crate::net::timestamping::{MessageReader, Queue, arm_receive, set_int_option};
 
 /// The receiving socket, open to anyone.
 #[derive(Debug)]

@@ -12,7 +12,8 @@ use std::os::fd::BorrowedFd;
 use socket2::SockAddr;
 
 use super::udp::{GrantedOptions, UdpError, UdpSender, UdpSettings};
-use super::{DatagramSender, Received, SendRefusal, SenderCounters, TransmitStamp, TxToken};
+use super::{DatagramSender, Received, SendRefusal, SenderCounters};
+use crate::net::{TransmitStamp, TxToken};
 
 /// The socket.
 #[derive(Debug)]
@@ -86,7 +87,7 @@ mod tests {
     use std::thread;
 
     use super::*;
-    use crate::transport::TransmitStage;
+    use crate::net::TransmitStage;
 
     fn server() -> UdpServer {
         let local = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));

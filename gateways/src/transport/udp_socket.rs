@@ -9,7 +9,7 @@ use nix::sys::socket::{setsockopt, sockopt};
 use socket2::{Domain, Protocol, SockAddr, Socket, Type};
 use thiserror::Error;
 
-use super::timestamping::{TimestampMode, set_int_option};
+use crate::net::timestamping::{TimestampMode, set_int_option};
 
 /// `IPV6_MTU_DISCOVER` of `linux/in6.h`.
 const IPV6_MTU_DISCOVER: i32 = 23;

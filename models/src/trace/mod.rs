@@ -5,7 +5,6 @@
 //! [`wire`] is the binary form, [`csv`] the textual one, [`opportunities`] that of Mahimahi,
 //! [`netem`] an export; [`figures`] describes a trace, [`fit`] sets link models beside it.
 
-mod checksum;
 pub mod csv;
 pub mod fault;
 pub mod figures;

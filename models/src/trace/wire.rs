@@ -1,14 +1,15 @@
 //! The binary form of a trace: a header of 384 bytes and records of 64, all little-endian, each
-//! with its place and a check sum of its own. So damage is found where it is, and everything
+//! with its place and a check sum of its own: CRC-32 of ISO/IEC 3309, that of Ethernet and zip, which
+//! guards against damage, not against an adversary. So damage is found where it is, and everything
 //! before it is kept. Bytes in, bytes out: it opens no file.
 
-use super::checksum::crc32;
 use super::csv::SIZE_BYTES_MAX;
 use super::fault::{EncodeError, FaultKind, TraceFault};
 use super::{
     Trace, TraceArrival, TraceDirection, TraceFate, TraceHeader, TraceRecord, UNAVAILABLE_NS,
     UNBOUNDED_NS,
 };
+use crc32fast::hash as crc32;
 
 /// First bytes of a trace.
 pub const MAGIC: [u8; 8] = *b"HILTRACE";

@@ -50,6 +50,11 @@ fn fault_of(bytes: &[u8]) -> (usize, u64, FaultKind) {
 
 #[test]
 fn the_layout_is_the_documented_one() {
+    assert_eq!(
+        crc32(b"123456789"),
+        0xcbf4_3926,
+        "the published check value"
+    );
     let bytes = bytes();
     assert_eq!(bytes.len(), 384 + 4 * 64);
     assert_eq!(&bytes[..8], b"HILTRACE");

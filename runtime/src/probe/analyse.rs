@@ -63,7 +63,7 @@ impl Reading {
         if let Some(port) = point.esl_port {
             let _infallible = write!(text, ":port{port}");
         }
-        if point.direction != hil_gateways::capture::Direction::Unknown {
+        if point.direction != hil_gateways::net::Direction::Unknown {
             let _infallible = write!(text, " ({})", point.direction.label());
         }
         text

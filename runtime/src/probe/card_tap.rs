@@ -5,10 +5,11 @@
 use hil_gateways::capture::flow::FlowFilter;
 use hil_gateways::capture::writer;
 use hil_gateways::capture::{CARD_CLOCK, CaptureInterface};
-use hil_gateways::transport::card_clock::{CardClock, CardPair};
-use hil_gateways::transport::packet_ring::{PacketRing, RingCounters, RingSettings, RingStamps};
-use hil_gateways::transport::ring_frame::StampSource;
-use hil_gateways::transport::timestamping::TimestampCapabilities;
+use hil_gateways::net::card_clock::{CardClock, CardPair};
+use hil_gateways::net::filter::PacketFilter;
+use hil_gateways::net::packet_ring::{PacketRing, RingCounters, RingSettings, RingStamps};
+use hil_gateways::net::ring_frame::StampSource;
+use hil_gateways::net::timestamping::TimestampCapabilities;
 
 use super::live::{LiveError, flow_list, told};
 use super::output::{Output, append};
@@ -52,7 +53,7 @@ impl CardTap {
     pub(super) fn open(
         name: &str,
         is_guarded: bool,
-        flows: &[FlowFilter],
+        filters: &[PacketFilter],
         settings: &RingSettings,
     ) -> Result<Self, LiveError> {
         let card = GuardedCard::arm(name, is_guarded).map_err(|reason| LiveError::Card {
@@ -65,7 +66,7 @@ impl CardTap {
         };
         Ok(Self {
             name: name.to_owned(),
-            ring: PacketRing::open(name, flows, &settings)?,
+            ring: PacketRing::open(name, filters, &settings)?,
             result: CardResult {
                 granted: card.armed().describe(),
                 stamps_all_arrivals: card.armed().stamps_all_arrivals(),
@@ -202,7 +203,7 @@ fn on_card(system_ns: u64, pair: Option<CardPair>) -> u64 {
 #[cfg(test)]
 mod tests {
     use hil_gateways::capture::writer::PacketToWrite;
-    use hil_gateways::capture::{Direction, link_type};
+    use hil_gateways::net::{Direction, link_type};
 
     use super::super::analyse::{Reading, Report};
     use super::*;
@@ -295,7 +296,8 @@ mod tests {
             ring_bytes: 1 << 16,
             stamps: RingStamps::Card,
         };
-        let error = CardTap::open("lo", false, &[FlowFilter::hil()], &settings).unwrap_err();
+        let error =
+            CardTap::open("lo", false, &[FlowFilter::hil().packets], &settings).unwrap_err();
         let text = error.to_string();
         assert!(
             text.contains("lo") && text.contains("as on loopback"),

@@ -8,10 +8,10 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
-use hil_gateways::capture::Direction;
 use hil_gateways::capture::flow::OwnHeader;
 use hil_gateways::capture::join::Joined;
 use hil_gateways::capture::observe::{Observation, Stream};
+use hil_gateways::net::Direction;
 use hil_gateways::protocol::wire::Kind;
 use hil_models::record::{EgressRecord, IngressRecord, UNAVAILABLE};
 use hil_models::stats::histogram::{Distribution, LatencyHistogram};

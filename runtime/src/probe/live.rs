@@ -6,13 +6,15 @@ use std::path::PathBuf;
 use std::thread;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
+use hil_gateways::capture::CaptureInterface;
 use hil_gateways::capture::flow::FlowFilter;
 use hil_gateways::capture::writer;
-use hil_gateways::capture::{CaptureInterface, Direction};
-use hil_gateways::transport::packet_ring::{
+use hil_gateways::net::Direction;
+use hil_gateways::net::filter::PacketFilter;
+use hil_gateways::net::packet_ring::{
     PacketRing, RingCounters, RingError, RingSettings, RingStamps,
 };
-use hil_gateways::transport::ring_frame::StampSource;
+use hil_gateways::net::ring_frame::StampSource;
 
 use super::card_tap::{CardResult, CardTap};
 use super::output::{Output, append};
@@ -152,15 +154,16 @@ fn open_taps(request: &Request, console: &mut Console) -> Result<Vec<Tap>, LiveE
         ring_bytes: request.ring_bytes,
         stamps: RingStamps::Kernel,
     };
+    let filters: Vec<PacketFilter> = request.flows.iter().map(|flow| flow.packets).collect();
     let mut taps: Vec<Tap> = Vec::with_capacity(request.interfaces.len());
     for name in &request.interfaces {
         let index = nix::net::if_::if_nametoindex(name.as_str()).ok();
-        let ring = PacketRing::open(name, &request.flows, &settings)?;
+        let ring = PacketRing::open(name, &filters, &settings)?;
         let card = match request.stamps {
             RingStamps::Kernel => None,
             RingStamps::Card => {
                 let is_guarded = taps.iter().any(|tap| tap.result.name == *name);
-                let card = CardTap::open(name, is_guarded, &request.flows, &settings)?;
+                let card = CardTap::open(name, is_guarded, &filters, &settings)?;
                 let granted = format!("{name}: the card grants {}", card.granted());
                 if card.stamps_all_arrivals() {
                     console.say(&granted);

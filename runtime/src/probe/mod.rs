@@ -15,8 +15,9 @@ use std::fs;
 use std::path::Path;
 use std::time::Duration;
 
-use hil_gateways::capture::flow::{FLOW_COUNT_MAX, FlowFilter};
-use hil_gateways::transport::packet_ring::{RingError, RingStamps};
+use hil_gateways::capture::flow::FlowFilter;
+use hil_gateways::net::filter::FILTER_COUNT_MAX;
+use hil_gateways::net::packet_ring::{RingError, RingStamps};
 
 use self::analyse::{Reading, Report};
 use self::arguments::{LiveArgs, ProbeArgs, ProbeWork, ReadingArgs, Stamps};
@@ -184,9 +185,9 @@ fn capture(args: &LiveArgs) -> u8 {
         ));
         return exit::USAGE;
     }
-    if args.flow.len() > FLOW_COUNT_MAX {
+    if args.flow.len() > FILTER_COUNT_MAX {
         console.error(&format!(
-            "{} flows are more than the {FLOW_COUNT_MAX} one probe follows",
+            "{} flows are more than the {FILTER_COUNT_MAX} one probe follows",
             args.flow.len()
         ));
         return exit::USAGE;

@@ -5,9 +5,9 @@ use std::fs::File;
 use std::io::{self, Seek, Write};
 use std::path::{Path, PathBuf};
 
-use hil_gateways::capture::link_type as link;
 use hil_gateways::capture::writer::{self, PacketToWrite};
-use hil_gateways::transport::ring_frame::RingPacket;
+use hil_gateways::net::link_type as link;
+use hil_gateways::net::ring_frame::RingPacket;
 
 use super::live::LiveError;
 

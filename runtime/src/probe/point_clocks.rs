@@ -91,7 +91,7 @@ impl WireClocks {
 
 #[cfg(test)]
 mod tests {
-    use hil_gateways::capture::Direction;
+    use hil_gateways::net::Direction;
 
     use super::*;
 

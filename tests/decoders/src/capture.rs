@@ -4,9 +4,8 @@ use hil_gateways::capture::flow::FlowFilter;
 use hil_gateways::capture::observe::Observer;
 use hil_gateways::capture::reader::{CaptureReader, Step};
 use hil_gateways::capture::writer::{self, PacketToWrite};
-use hil_gateways::capture::{
-    CaptureFault, CaptureInterface, CapturedPacket, Direction, esl, link, link_type,
-};
+use hil_gateways::capture::{CaptureFault, CaptureInterface, CapturedPacket, esl, link};
+use hil_gateways::net::{Direction, link_type};
 
 use crate::Verdict;
 use crate::input::Input;

@@ -4,10 +4,10 @@
 use std::cell::RefCell;
 use std::time::Duration;
 
+use hil_gateways::net::control::ControlData;
 use hil_gateways::protocol::fragment::{Fragment, FragmentPlan, Reassembler};
 use hil_gateways::protocol::sequence::Stream;
 use hil_gateways::protocol::wire::{Body, Datagram, HEADER_BYTES, decode};
-use hil_gateways::transport::control::ControlData;
 use hil_gateways::transport::tcp::frame::{DATAGRAM_BYTES_MAX, FrameReader, PREFIX_BYTES, prefix};
 use hil_models::time::Instant;
 
@@ -184,7 +184,7 @@ fn plain_frames(mut stream: &[u8]) -> (Vec<&[u8]>, bool) {
 pub(crate) fn control_messages(bytes: &[u8]) -> Verdict {
     let data = ControlData::decode(bytes);
     assert_eq!(ControlData::decode(bytes), data);
-    let is_told = data.stamps != hil_gateways::transport::KernelStamps::default()
+    let is_told = data.stamps != hil_gateways::net::KernelStamps::default()
         || data.drop_count.is_some()
         || data.extended_error.is_some()
         || data.is_acknowledged.is_some()

@@ -7,7 +7,8 @@ use std::process::Command;
 use std::time::Duration;
 
 use hil_gateways::capture::reader::{CaptureReader, Step};
-use hil_gateways::transport::packet_ring::{PacketRing, RingSettings, RingStamps};
+use hil_gateways::net::filter::PacketFilter;
+use hil_gateways::net::packet_ring::{PacketRing, RingSettings, RingStamps};
 use hil_runtime::report::summary::Outcome;
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::child::{ChildGuard, Finished};
@@ -442,7 +443,10 @@ fn what_came_before_the_taps_begin_is_neither_kept_nor_counted() {
         ring_bytes: 1 << 20,
         stamps: RingStamps::Kernel,
     };
-    let flows = ["udp:dport=7000".parse().unwrap()];
+    let filters = [PacketFilter {
+        destination_port: Some(7000),
+        ..PacketFilter::default()
+    }];
     lab.host(0).on_network(|| {
         let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).unwrap();
         let send = |count: u64| {
@@ -451,7 +455,7 @@ fn what_came_before_the_taps_begin_is_neither_kept_nor_counted() {
                 let _refused = socket.send_to(b"", (lab.host(1).address(), 7000)).is_ok();
             }
         };
-        let mut tap = PacketRing::open(INTERFACE, &flows, &settings).unwrap();
+        let mut tap = PacketRing::open(INTERFACE, &filters, &settings).unwrap();
         let said = |tap: &mut PacketRing| {
             let counters = tap.counters().unwrap();
             (counters.matched_count, counters.dropped_count)

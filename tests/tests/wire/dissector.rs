@@ -7,10 +7,11 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Duration;
 
+use hil_gateways::capture::CaptureInterface;
 use hil_gateways::capture::esl::{self, EslHeader};
 use hil_gateways::capture::reader::{CaptureReader, Step};
 use hil_gateways::capture::writer::{self, PacketToWrite};
-use hil_gateways::capture::{CaptureInterface, Direction, link_type};
+use hil_gateways::net::{Direction, link_type};
 use hil_gateways::protocol::StampSource;
 use hil_gateways::protocol::body::{Hello, HelloAck, HelloStatus, ReceivedWindow, SyncResponse};
 use hil_gateways::protocol::wire::{FollowUpField, HEADER_BYTES, Header, Kind};

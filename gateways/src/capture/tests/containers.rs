@@ -1,8 +1,9 @@
 //! pcap and pcapng, whole and broken.
 
 use super::super::writer::{self, PacketToWrite};
-use super::super::{CARD_CLOCK, CaptureInterface, Direction, Problem, link_type};
+use super::super::{CARD_CLOCK, CaptureInterface, Problem};
 use super::read;
+use crate::net::{Direction, link_type};
 
 /// Numbers of either byte order.
 #[derive(Clone, Copy)]

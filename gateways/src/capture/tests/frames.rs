@@ -3,8 +3,8 @@
 use super::super::esl::{self, EslHeader};
 use super::super::flow::{FlowError, FlowFilter, Unidentified};
 use super::super::link::{NoDatagram, udp_datagram};
-use super::super::link_type;
 use super::{message, udp_frame};
+use crate::net::link_type;
 
 #[test]
 fn the_same_datagram_is_found_behind_every_link_layer() {

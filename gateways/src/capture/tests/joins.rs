@@ -9,8 +9,9 @@ use super::super::join::{Joined, OrderSource, WINDOW_NS, join};
 use super::super::observe::{Observation, Observer, Point, Seen, Stream};
 use super::super::pairing::join_all;
 use super::super::point::{NumberFigures, single_point_figures};
-use super::super::{CaptureInterface, CapturedPacket, Direction, link_type};
+use super::super::{CaptureInterface, CapturedPacket};
 use super::udp_frame;
+use crate::net::{Direction, link_type};
 
 fn observation(stamp_ns: i64, number: u64) -> Observation {
     Observation {

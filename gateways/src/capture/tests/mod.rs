@@ -4,10 +4,11 @@
 mod containers;
 mod frames;
 mod joins;
-pub(crate) mod programs;
+mod programs;
 
 use super::reader::{CaptureReader, Step};
-use super::{CaptureFault, CaptureInterface, Direction};
+use super::{CaptureFault, CaptureInterface};
+use crate::net::Direction;
 use crate::protocol::wire::{HEADER_BYTES, Header, Kind};
 
 /// A packet of a file, owned.

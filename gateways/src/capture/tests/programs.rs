@@ -5,12 +5,12 @@ use hil_models::random::RandomStream;
 
 use super::super::flow::FlowFilter;
 use super::super::link::udp_datagram;
-use super::super::link_type;
-use super::super::program::{Instruction, code, compile};
 use super::{message, udp_frame};
+use crate::net::filter::{Instruction, PacketFilter, code, compile};
+use crate::net::link_type;
 
 /// Bytes the program keeps of `packet`.
-pub(crate) fn run(program: &[Instruction], packet: &[u8]) -> u32 {
+pub(super) fn run(program: &[Instruction], packet: &[u8]) -> u32 {
     let load = |at: u32, count: usize| -> Option<u32> {
         let bytes = packet.get(at as usize..at as usize + count)?;
         Some(
@@ -55,7 +55,7 @@ pub(crate) fn run(program: &[Instruction], packet: &[u8]) -> u32 {
 }
 
 /// Whether the analyser finds a packet to be of the flows.
-pub(crate) fn is_of(flows: &[FlowFilter], link: u16, packet: &[u8]) -> bool {
+pub(super) fn is_of(flows: &[FlowFilter], link: u16, packet: &[u8]) -> bool {
     let Ok(datagram) = udp_datagram(link, packet) else {
         return false;
     };
@@ -67,7 +67,7 @@ pub(crate) fn is_of(flows: &[FlowFilter], link: u16, packet: &[u8]) -> bool {
 }
 
 /// Flows to try, so that every condition and every mixture is there.
-pub(crate) const FLOW_SETS: [&[&str]; 4] = [
+pub(super) const FLOW_SETS: [&[&str]; 4] = [
     &["hil"],
     &["hil:dst=10.77.0.2", "udp:port=7000"],
     &[
@@ -79,7 +79,7 @@ pub(crate) const FLOW_SETS: [&[&str]; 4] = [
 ];
 
 /// A packet with or without what the flows ask for: tags, fragments, IPv6, other protocols.
-pub(crate) fn made_up_frame(random: &mut RandomStream, case: u64, link: u16) -> Vec<u8> {
+pub(super) fn made_up_frame(random: &mut RandomStream, case: u64, link: u16) -> Vec<u8> {
     let ports = [9, 6510, 7000, 7001];
     let mut pick = || ports[usize::try_from(random.next_u64() % 4).unwrap()];
     let payload = if case.is_multiple_of(3) {
@@ -120,8 +120,9 @@ fn the_kernels_filter_and_the_analyser_agree_on_every_packet() {
     let mut pass_count = 0;
     for set in FLOW_SETS {
         let flows: Vec<FlowFilter> = set.iter().map(|text| text.parse().unwrap()).collect();
+        let filters: Vec<PacketFilter> = flows.iter().map(|flow| flow.packets).collect();
         for link in [link_type::ETHERNET, link_type::RAW] {
-            let program = compile(link, &flows, 99).unwrap();
+            let program = compile(link, &filters, 99).unwrap();
             assert!(program.len() < 256);
             for case in 0..25_000_u64 {
                 let frame = made_up_frame(&mut random, case, link);
@@ -139,5 +140,5 @@ fn the_kernels_filter_and_the_analyser_agree_on_every_packet() {
         (40_000..160_000).contains(&pass_count),
         "{pass_count} passed"
     );
-    assert_eq!(compile(113, &[FlowFilter::hil()], 1), None);
+    assert_eq!(compile(113, &[FlowFilter::hil().packets], 1), None);
 }

@@ -27,7 +27,7 @@ pub(super) fn channel(size_max_bytes: u32) -> ChannelIdentity {
     ChannelIdentity::new(3, "arm/command", "test.Command.v1", size_max_bytes, 8)
 }
 
-pub(in crate::protocol) fn egress_settings(session: u32, size_max_bytes: u32) -> EgressSettings {
+pub(super) fn egress_settings(session: u32, size_max_bytes: u32) -> EgressSettings {
     EgressSettings {
         channel: channel(size_max_bytes),
         session,
@@ -38,7 +38,7 @@ pub(in crate::protocol) fn egress_settings(session: u32, size_max_bytes: u32) ->
     }
 }
 
-pub(in crate::protocol) fn ingress_settings(session: u32, size_max_bytes: u32) -> IngressSettings {
+pub(super) fn ingress_settings(session: u32, size_max_bytes: u32) -> IngressSettings {
     IngressSettings::new(channel(size_max_bytes), session, [2; 16], 22)
 }
 

@@ -3,7 +3,7 @@
 use core::sync::atomic::{AtomicU64, Ordering};
 use core::time::Duration;
 
-use super::info::ConnectionInfo;
+use crate::net::tcp_info::ConnectionInfo;
 
 /// How often connections came and went, for a thread that tells of it while another carries
 /// messages.

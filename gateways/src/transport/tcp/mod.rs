@@ -14,7 +14,6 @@
 
 mod figures;
 pub mod frame;
-mod info;
 mod receiver;
 mod sender;
 mod socket;

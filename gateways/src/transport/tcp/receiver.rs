@@ -13,10 +13,11 @@ use super::TcpSettings;
 use super::figures::StreamFigures;
 use super::socket::{abort, listen, tune};
 use super::stream::{Ending, Stream};
+use crate::net::KernelStamps;
 use crate::transport::udp_socket::{
     GrantedOptions, UdpError, granted_options, local_address, refuse,
 };
-use crate::transport::{DatagramReceiver, KernelStamps, Received, ReceiverCounters, SendRefusal};
+use crate::transport::{DatagramReceiver, Received, ReceiverCounters, SendRefusal};
 
 /// Waiting connections looked at in one call: a crowd at the door must not keep the channel
 /// waiting.

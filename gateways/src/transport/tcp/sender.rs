@@ -14,10 +14,9 @@ use super::socket::{
 };
 use super::stream::Stream;
 use super::{TcpSettings, frame};
+use crate::net::{KernelStamps, TransmitStamp, TxToken};
 use crate::transport::udp_socket::{GrantedOptions, UdpError, granted_options, refuse};
-use crate::transport::{
-    DatagramSender, KernelStamps, Received, SendRefusal, SenderCounters, TransmitStamp, TxToken,
-};
+use crate::transport::{DatagramSender, Received, SendRefusal, SenderCounters};
 
 /// Where the connection stands.
 #[derive(Debug)]

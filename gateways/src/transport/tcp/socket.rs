@@ -9,7 +9,7 @@ use hil_models::time::Instant;
 use socket2::{Domain, Protocol, SockAddr, Socket, TcpKeepalive, Type};
 
 use super::TcpSettings;
-use crate::transport::timestamping::TimestampMode;
+use crate::net::timestamping::TimestampMode;
 use crate::transport::udp_socket::{UdpError, UdpSettings, bind, mark, refuse, set_buffers};
 
 /// Silence after which the kernel asks whether the peer is still there.

@@ -11,9 +11,9 @@ use socket2::Socket;
 
 use super::figures::{ConnectionTally, StreamFigures};
 use super::frame::{Backlog, FRAME_BYTES_MAX, FrameReader, prefix};
-use super::info::{ConnectionInfo, unacknowledged_bytes};
 use super::socket::abort;
 use super::stall::StallWatch;
+use crate::net::tcp_info::{ConnectionInfo, unacknowledged_bytes};
 use crate::transport::SendRefusal;
 
 /// What the kernel has not taken waits here: two of the longest frames, so that one always fits

@@ -14,9 +14,9 @@ use hil_models::random::RandomStream;
 use hil_models::time::Instant;
 
 use super::frame::{DATAGRAM_BYTES_MAX, FrameReader, PREFIX_BYTES, prefix};
-use super::info::{ConnectionInfo, unacknowledged_bytes};
 use super::{TcpReceiver, TcpSender, TcpSettings};
-use crate::transport::clock_pair::monotonic_now;
+use crate::net::clock_pair::monotonic_now;
+use crate::net::tcp_info::{ConnectionInfo, unacknowledged_bytes};
 use crate::transport::conformance_tests::{tcp_pair, within_bound};
 use crate::transport::{DatagramReceiver, DatagramSender, SendRefusal};
 

@@ -1,11 +1,10 @@
 //! The socket of one arm with the transmit stamps that are still to come from it. It knows no
 //! message: robot and sensor face do.
 
+use hil_gateways::net::{TransmitStage, TxToken};
 use hil_gateways::transport::udp::UdpSender;
 use hil_gateways::transport::udp_server::UdpServer;
-use hil_gateways::transport::{
-    DatagramSender, Received, SendRefusal, SenderCounters, TransmitStage, TxToken,
-};
+use hil_gateways::transport::{DatagramSender, Received, SendRefusal, SenderCounters};
 use hil_models::record::UNAVAILABLE;
 use hil_models::time::Instant;
 use std::net::SocketAddr;

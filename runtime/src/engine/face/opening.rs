@@ -5,7 +5,7 @@ use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64};
 
-use hil_gateways::transport::timestamping::TimestampMode;
+use hil_gateways::net::timestamping::TimestampMode;
 use hil_gateways::transport::udp::{GrantedOptions, UdpSender, UdpSettings};
 use hil_gateways::transport::udp_server::UdpServer;
 use hil_models::egm::messages::{EgmCommand, EgmFeedback};

@@ -5,11 +5,11 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
-use hil_gateways::transport::interface::interface_with_address;
+use hil_gateways::net::interface::interface_with_address;
+use hil_gateways::net::timestamping::TimestampMode;
 use hil_gateways::transport::probe::{
     Availability, ProbeReport, ProbeSettings, Sentinel, arm_and_probe,
 };
-use hil_gateways::transport::timestamping::TimestampMode;
 
 use super::GatewayError;
 use super::direction;

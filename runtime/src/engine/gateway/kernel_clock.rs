@@ -2,9 +2,9 @@
 
 use std::time::Duration;
 
+use hil_gateways::net::clock_pair::ClockPair;
 use hil_gateways::protocol::{ArrivalStamps, StampSource};
 use hil_gateways::transport::Received;
-use hil_gateways::transport::clock_pair::ClockPair;
 use hil_models::time::Instant;
 
 use super::GatewayError;

@@ -3,11 +3,12 @@
 
 use std::time::Duration;
 
+use hil_gateways::net::radio::RadioReport;
+use hil_gateways::net::{TransmitStage, TransmitStamp, TxToken};
 use hil_gateways::protocol::egress::TransmitFailure;
 use hil_gateways::protocol::wire::Kind;
 use hil_gateways::protocol::{EgressBridge, PeerState};
-use hil_gateways::transport::radio::RadioReport;
-use hil_gateways::transport::{DatagramSender, SendRefusal, TransmitStage, TransmitStamp, TxToken};
+use hil_gateways::transport::{DatagramSender, SendRefusal};
 use hil_models::record::{EgressRecord, UNAVAILABLE};
 use hil_models::time::Instant;
 
@@ -378,7 +379,7 @@ mod tests {
     use std::io;
     use std::os::fd::BorrowedFd;
 
-    use hil_gateways::transport::timestamping::TimestampMode;
+    use hil_gateways::net::timestamping::TimestampMode;
     use hil_gateways::transport::{Received, SenderCounters};
 
     use super::*;

@@ -5,6 +5,7 @@ use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
+use hil_gateways::net::timestamping::TimestampMode;
 use hil_gateways::protocol::wire::{self, Kind};
 use hil_gateways::transport::emulated::{EmulatedReceiver, EmulatedSettings};
 use hil_gateways::transport::sealed::{SealedReceiver, SealedSender};
@@ -12,7 +13,6 @@ use hil_gateways::transport::tcp::{
     ConnectionTally, KEEP_ALIVE_COUNT, KEEP_ALIVE_IDLE, KEEP_ALIVE_INTERVAL, TcpReceiver,
     TcpSender, TcpSettings, USER_TIMEOUT,
 };
-use hil_gateways::transport::timestamping::TimestampMode;
 use hil_gateways::transport::udp::{GrantedOptions, PathMtu, UdpReceiver, UdpSender, UdpSettings};
 use hil_gateways::transport::{DatagramReceiver, DatagramSender};
 use hil_models::link_model::ReplayTally;

@@ -1,8 +1,8 @@
 //! Which stamps and reports a hop's sockets ask for, and which of them a message may wait for: what
 //! the topology wants, less what the probe found never to come. It probes nothing itself.
 
+use hil_gateways::net::timestamping::TimestampMode;
 use hil_gateways::transport::probe::{Availability, ProbeReport};
-use hil_gateways::transport::timestamping::TimestampMode;
 
 /// Whether a card's stamps of what is sent are to come.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

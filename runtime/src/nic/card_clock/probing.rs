@@ -4,10 +4,10 @@
 use std::net::{Ipv4Addr, SocketAddr};
 use std::time::Duration;
 
-use hil_gateways::transport::card_arming::describe_setting;
-use hil_gateways::transport::card_clock::{CardClock, CardPair};
+use hil_gateways::net::card_arming::describe_setting;
+use hil_gateways::net::card_clock::{CardClock, CardPair};
+use hil_gateways::net::timestamping::{HardwareStamping, TimestampMode};
 use hil_gateways::transport::probe::{Availability, DISCARD_PORT, ProbeSettings, arm_and_probe};
-use hil_gateways::transport::timestamping::{HardwareStamping, TimestampMode};
 
 use super::guard::GuardedCard;
 

@@ -3,7 +3,8 @@
 use std::time::Duration;
 
 use hil_gateways::capture::writer::{self, PacketToWrite};
-use hil_gateways::capture::{CaptureInterface, Direction, esl, link_type};
+use hil_gateways::capture::{CaptureInterface, esl};
+use hil_gateways::net::{Direction, link_type};
 use hil_gateways::protocol::{ArrivalStamps, EgressBridge, IngressBridge};
 use hil_gateways::transport::tcp::frame::prefix;
 use hil_models::egm::face::{

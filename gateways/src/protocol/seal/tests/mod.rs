@@ -3,7 +3,6 @@
 mod agreement;
 mod forgery;
 mod rotation;
-mod transports;
 
 use super::*;
 use crate::protocol::wire::{HEADER_BYTES, Header, Kind};

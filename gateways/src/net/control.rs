@@ -18,7 +18,7 @@ const ALIGNMENT_BYTES: usize = 8;
 /// `SO_TIMESTAMPING_NEW`, the variant with 64-bit seconds; same bytes on a 64-bit kernel.
 const SCM_TIMESTAMPING_NEW: i32 = 65;
 /// `SCM_WIFI_STATUS` of `asm-generic/socket.h`, the value of `SO_WIFI_STATUS`.
-pub(super) const SCM_WIFI_STATUS: i32 = 41;
+pub const SCM_WIFI_STATUS: i32 = 41;
 /// `IPV6_RECVERR` as a control message type.
 const IPV6_RECVERR: i32 = libc::IPV6_RECVERR;
 /// `ee_info` of a stamp taken on the way to the wire (`SCM_TSTAMP_SND`).

@@ -1,14 +1,33 @@
-//! The filter that the kernel applies for a probe, so that it copies the followed flows and nothing
-//! else: classic BPF (Linux `Documentation/networking/filter.rst`). It compiles [`FlowFilter`]s; it
-//! runs nothing, but for its tests.
+//! The filter that the kernel applies for a tap, so that it copies the wanted packets and nothing
+//! else: classic BPF (Linux `Documentation/networking/filter.rst`). It compiles [`PacketFilter`]s and
+//! runs nothing.
 //!
 //! One VLAN tag and IPv4 options are followed. IPv6 extension headers and later fragments are not:
 //! such packets do not pass.
 
 use std::net::IpAddr;
 
-use super::flow::{FlowFilter, FlowKind};
 use super::link_type;
+
+/// Filters one tap may have.
+pub const FILTER_COUNT_MAX: usize = 16;
+
+/// Which UDP packets to keep: those that meet every condition given.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct PacketFilter {
+    /// Port of either end.
+    pub port: Option<u16>,
+    /// Port of the sender.
+    pub source_port: Option<u16>,
+    /// Port of the receiver.
+    pub destination_port: Option<u16>,
+    /// Address of the sender.
+    pub source: Option<IpAddr>,
+    /// Address of the receiver; of the sender's family.
+    pub destination: Option<IpAddr>,
+    /// What the payload begins with.
+    pub magic: Option<[u8; 4]>,
+}
 
 /// One instruction, laid out as the kernel's `sock_filter`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -24,23 +43,39 @@ pub struct Instruction {
 }
 
 /// Operation codes, by their names in the kernel's documentation.
-pub(crate) mod code {
-    pub(crate) const LD_H_ABS: u16 = 0x28;
-    pub(crate) const LD_B_ABS: u16 = 0x30;
-    pub(crate) const LD_W_IND: u16 = 0x40;
-    pub(crate) const LD_H_IND: u16 = 0x48;
-    pub(crate) const LD_B_IND: u16 = 0x50;
-    pub(crate) const LD_IMM: u16 = 0x00;
-    pub(crate) const LD_MEM: u16 = 0x60;
-    pub(crate) const LDX_MEM: u16 = 0x61;
-    pub(crate) const ST: u16 = 0x02;
-    pub(crate) const AND: u16 = 0x54;
-    pub(crate) const LSH: u16 = 0x64;
-    pub(crate) const ADD_X: u16 = 0x0c;
-    pub(crate) const JA: u16 = 0x05;
-    pub(crate) const JEQ: u16 = 0x15;
-    pub(crate) const JSET: u16 = 0x45;
-    pub(crate) const RET: u16 = 0x06;
+pub mod code {
+    /// Load a half-word at `k`.
+    pub const LD_H_ABS: u16 = 0x28;
+    /// Load a byte at `k`.
+    pub const LD_B_ABS: u16 = 0x30;
+    /// Load a word at the index register and `k`.
+    pub const LD_W_IND: u16 = 0x40;
+    /// Load a half-word there.
+    pub const LD_H_IND: u16 = 0x48;
+    /// Load a byte there.
+    pub const LD_B_IND: u16 = 0x50;
+    /// Load `k`.
+    pub const LD_IMM: u16 = 0x00;
+    /// Load a scratch cell.
+    pub const LD_MEM: u16 = 0x60;
+    /// Load a scratch cell into the index register.
+    pub const LDX_MEM: u16 = 0x61;
+    /// Store into a scratch cell.
+    pub const ST: u16 = 0x02;
+    /// Keep the bits of `k`.
+    pub const AND: u16 = 0x54;
+    /// Shift left by `k`.
+    pub const LSH: u16 = 0x64;
+    /// Add the index register.
+    pub const ADD_X: u16 = 0x0c;
+    /// Skip `k` instructions.
+    pub const JA: u16 = 0x05;
+    /// Compare with `k`.
+    pub const JEQ: u16 = 0x15;
+    /// Compare the bits of `k` with none.
+    pub const JSET: u16 = 0x45;
+    /// Keep `k` bytes of the packet.
+    pub const RET: u16 = 0x06;
 }
 
 /// Scratch cells: where IP begins, its ethertype, where UDP begins.
@@ -49,7 +84,6 @@ const ETHERTYPE: u32 = 1;
 const UDP_AT: u32 = 2;
 const IPV4: u32 = 0x0800;
 const IPV6: u32 = 0x86dd;
-const MAGIC: u32 = u32::from_be_bytes(*b"HILG");
 
 /// Stands for "to the end of this part" until the part is complete.
 const FAIL: u8 = u8::MAX;
@@ -96,24 +130,24 @@ impl Part {
     }
 }
 
-/// The program that keeps `snap_bytes` of each packet of one of the flows and drops the rest;
-/// `None` for a link layer it does not know.
+/// The program that keeps `snap_bytes` of each packet that passes one of the filters and drops the
+/// rest; `None` for a link layer it does not know.
 ///
 /// # Panics
-/// When there are more than [`super::flow::FLOW_COUNT_MAX`] flows.
-pub fn compile(link: u16, flows: &[FlowFilter], snap_bytes: u32) -> Option<Vec<Instruction>> {
+/// When there are more than [`FILTER_COUNT_MAX`] filters.
+pub fn compile(link: u16, filters: &[PacketFilter], snap_bytes: u32) -> Option<Vec<Instruction>> {
     assert!(
-        flows.len() <= super::flow::FLOW_COUNT_MAX,
-        "{} flows are too many",
-        flows.len()
+        filters.len() <= FILTER_COUNT_MAX,
+        "{} filters are too many",
+        filters.len()
     );
     let mut program = find_ip(link)?;
     program.extend(find_udp());
     // A load behind the end of a packet rejects it at once, so what looks into payloads is last.
-    let (with_magic, without): (Vec<&FlowFilter>, Vec<&FlowFilter>) =
-        flows.iter().partition(|flow| flow.kind == FlowKind::Hil);
-    for flow in without.into_iter().chain(with_magic) {
-        program.extend(accept(flow, snap_bytes));
+    let (with_magic, without): (Vec<&PacketFilter>, Vec<&PacketFilter>) =
+        filters.iter().partition(|filter| filter.magic.is_some());
+    for filter in without.into_iter().chain(with_magic) {
+        program.extend(accept(filter, snap_bytes));
     }
     program.extend(reject());
     Some(program)
@@ -188,10 +222,10 @@ fn find_udp() -> Vec<Instruction> {
     part.0
 }
 
-/// Accepts one flow; falls through when the packet is not of it.
-fn accept(flow: &FlowFilter, snap_bytes: u32) -> Vec<Instruction> {
+/// Accepts what passes one filter; falls through when the packet does not.
+fn accept(filter: &PacketFilter, snap_bytes: u32) -> Vec<Instruction> {
     let mut part = Part::default();
-    for (address, at) in [(flow.source, [12, 8]), (flow.destination, [16, 24])] {
+    for (address, at) in [(filter.source, [12, 8]), (filter.destination, [16, 24])] {
         let Some(address) = address else { continue };
         part.op(code::LD_MEM, ETHERTYPE);
         let (ethertype, offset, octets): (u32, u32, Vec<u8>) = match address {
@@ -205,22 +239,22 @@ fn accept(flow: &FlowFilter, snap_bytes: u32) -> Vec<Instruction> {
             part.equals(u32::from_be_bytes(*word));
         }
     }
-    for (port, offset) in [(flow.source_port, 0), (flow.destination_port, 2)] {
+    for (port, offset) in [(filter.source_port, 0), (filter.destination_port, 2)] {
         if let Some(port) = port {
             part.udp_half(offset);
             part.equals(port.into());
         }
     }
-    if let Some(port) = flow.port {
+    if let Some(port) = filter.port {
         part.udp_half(0);
         part.jump(code::JEQ, port.into(), 2, 0);
         part.op(code::LD_H_IND, 2);
         part.equals(port.into());
     }
-    if flow.kind == FlowKind::Hil {
+    if let Some(magic) = filter.magic {
         part.op(code::LDX_MEM, UDP_AT);
         part.op(code::LD_W_IND, 8);
-        part.equals(MAGIC);
+        part.equals(u32::from_be_bytes(magic));
     }
     part.op(code::RET, snap_bytes);
     part.finish()

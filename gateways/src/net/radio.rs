@@ -1,6 +1,6 @@
 //! What a radio says of each datagram: whether the peer radio acknowledged it (`SO_WIFI_STATUS`).
 //! The report names no send; it brings back the packet, and by its content the send is found. Bytes
-//! only: the socket is in [`super::udp`].
+//! only, no socket.
 
 use std::collections::VecDeque;
 
@@ -23,7 +23,7 @@ const REPORT_COUNT_MAX: usize = 256;
 /// Bytes of a datagram that tell it from others: a gateway's header is shorter.
 const PREFIX_BYTES: usize = 96;
 /// Room for the beginning of a returned packet: link layer, IP and UDP headers and the prefix.
-pub(super) const RETURNED_BYTES: usize = 256;
+pub const RETURNED_BYTES: usize = 256;
 
 const ETHERNET_BYTES: usize = 14;
 const VLAN_BYTES: usize = 4;
@@ -33,7 +33,7 @@ const UDP: u8 = 17;
 /// The datagram inside a returned packet: what there is of its content, and its whole length.
 /// `None` when the bytes are no UDP packet in one piece. They begin with an Ethernet header, as
 /// wireless drivers return them, or with the IP header.
-pub(super) fn datagram(packet: &[u8]) -> Option<(&[u8], usize)> {
+fn datagram(packet: &[u8]) -> Option<(&[u8], usize)> {
     let network = match ether_type(packet) {
         Some((0x0800, offset)) if version(packet, offset) == Some(4) => offset,
         Some((0x86dd, offset)) if version(packet, offset) == Some(6) => offset,
@@ -91,17 +91,24 @@ fn fingerprint(content: &[u8], length_bytes: usize) -> u64 {
 
 /// The sends of one socket whose reports are still to come, and the reports that came.
 #[derive(Debug)]
-pub(super) struct RadioLedger {
+pub struct RadioLedger {
     sent: VecDeque<(u64, TxToken)>,
     reports: VecDeque<RadioReport>,
     /// Sends forgotten because a later one needed their place; each would have a report unmatched.
-    pub(super) forgotten_count: u64,
+    pub forgotten_count: u64,
     /// Reports dropped because nobody took them.
-    pub(super) overflow_count: u64,
+    pub overflow_count: u64,
+}
+
+impl Default for RadioLedger {
+    fn default() -> Self {
+        Self::new()
+    }
 }
 
 impl RadioLedger {
-    pub(super) fn new() -> Self {
+    /// Nothing sent and nothing heard.
+    pub fn new() -> Self {
         Self {
             sent: VecDeque::with_capacity(SENT_COUNT_MAX),
             reports: VecDeque::with_capacity(REPORT_COUNT_MAX),
@@ -111,7 +118,7 @@ impl RadioLedger {
     }
 
     /// Notes a send. Allocates nothing.
-    pub(super) fn note(&mut self, datagram: &[u8], token: TxToken) {
+    pub fn note(&mut self, datagram: &[u8], token: TxToken) {
         if self.sent.len() == SENT_COUNT_MAX {
             self.sent.pop_front();
             self.forgotten_count += 1;
@@ -121,7 +128,7 @@ impl RadioLedger {
     }
 
     /// Takes a report with the packet it brought back; `None` when that is no send that waits.
-    pub(super) fn settle(&mut self, packet: &[u8], is_acknowledged: bool) -> Option<RadioReport> {
+    pub fn settle(&mut self, packet: &[u8], is_acknowledged: bool) -> Option<RadioReport> {
         let (content, length_bytes) = datagram(packet)?;
         if content.len() < length_bytes.min(PREFIX_BYTES) {
             return None;
@@ -143,7 +150,7 @@ impl RadioLedger {
     }
 
     /// The oldest report nobody has taken.
-    pub(super) fn take(&mut self) -> Option<RadioReport> {
+    pub fn take(&mut self) -> Option<RadioReport> {
         self.reports.pop_front()
     }
 }

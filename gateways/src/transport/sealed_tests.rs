@@ -6,11 +6,37 @@ use hil_models::message::Envelope;
 use hil_models::time::Instant;
 
 use super::*;
-use crate::protocol::tests::network::{egress_settings, ingress_settings};
-use crate::protocol::{ArrivalStamps, EgressBridge, IngressBridge, PeerState};
+use crate::protocol::seal::{Association, Rotation, RunSecret, Suite};
+use crate::protocol::wire::{HEADER_BYTES, Header};
+use crate::protocol::{
+    ArrivalStamps, ChannelIdentity, EgressBridge, EgressSettings, IngressBridge, IngressSettings,
+    PeerState,
+};
 use crate::transport::queue::{QueueReceiver, QueueSender, QueueSettings, queue_pair};
-use crate::transport::sealed::{SealedReceiver, SealedSender};
-use crate::transport::{DatagramReceiver, DatagramSender};
+
+fn association() -> Association {
+    Association {
+        secret: RunSecret::new(&mut [9; 32]),
+        suite: Suite::Aes256Gcm,
+        channel: 3,
+        channel_name: "arm/command".to_owned(),
+    }
+}
+
+fn channel() -> ChannelIdentity {
+    ChannelIdentity::new(3, "arm/command", "test.Command.v1", 3_000, 8)
+}
+
+fn egress_settings() -> EgressSettings {
+    EgressSettings {
+        channel: channel(),
+        session: 100,
+        domain: [1; 16],
+        clock_id: 11,
+        datagram_max_bytes: 1472,
+        sync_period: Duration::from_millis(20),
+    }
+}
 
 struct Hop {
     egress: EgressBridge,
@@ -25,12 +51,12 @@ impl Hop {
     fn new() -> Self {
         let settings = QueueSettings::default();
         let (sender, receiver) = queue_pair(&settings);
-        let known = association(Suite::Aes256Gcm);
+        let known = association();
         let rotation = Rotation::default();
         Self {
-            egress: EgressBridge::new(egress_settings(100, 3_000)).unwrap(),
+            egress: EgressBridge::new(egress_settings()).unwrap(),
             sender: SealedSender::new(sender, Initiator::new(&known, [1; 16], rotation)),
-            ingress: IngressBridge::new(ingress_settings(200, 3_000)).unwrap(),
+            ingress: IngressBridge::new(IngressSettings::new(channel(), 200, [2; 16], 22)).unwrap(),
             receiver: SealedReceiver::new(
                 receiver,
                 Responder::new(&known, &[2; 32], rotation),
@@ -109,11 +135,13 @@ fn a_conversation_with_pieces_exchanges_and_farewell_goes_through_whole() {
 fn a_stranger_is_refused_before_the_seal_and_a_copy_before_the_bridge() {
     let settings = QueueSettings::default();
     let (mut sender, receiver) = queue_pair(&settings);
-    let known = association(Suite::Aes256Gcm);
+    let known = association();
     let responder = Responder::new(&known, &[2; 32], Rotation::default());
     let elsewhere = "127.0.0.1:9".parse().unwrap();
     let mut receiver = SealedReceiver::new(receiver, responder, elsewhere);
-    sender.send(&hello()).unwrap();
+    let mut hello = [5; HEADER_BYTES + 60];
+    Header::new(Kind::Hello, 77, 3).encode(&mut hello);
+    sender.send(&hello).unwrap();
     let mut buffer = [0; 2_000];
     assert!(
         receiver

@@ -1,6 +1,6 @@
 //! The kernel side of time stamps: which to ask for, the receive call that brings them, and what
 //! an interface claims to offer. The control messages are decoded in a sibling file; whether a
-//! claim holds is found out by [`super::probe`].
+//! claim holds only sending shows.
 //!
 //! `unsafe` is allowed here because `recvmsg`, two socket options and one `ioctl` have no safe form
 //! that does not allocate.
@@ -31,7 +31,7 @@ pub enum TimestampMode {
 
 impl TimestampMode {
     /// True where the driver is to stamp what leaves, and not known never to.
-    pub(super) const fn stamps_departures(self) -> bool {
+    pub const fn stamps_departures(self) -> bool {
         matches!(self, Self::Software | Self::Hardware)
     }
 
@@ -74,7 +74,10 @@ impl TimestampMode {
 }
 
 /// Asks for the stamps of `mode` on a sending socket; its send counter starts at 0 here.
-pub(super) fn arm_transmit(socket: &impl AsFd, mode: TimestampMode) -> io::Result<()> {
+///
+/// # Errors
+/// What the kernel answered.
+pub fn arm_transmit(socket: &impl AsFd, mode: TimestampMode) -> io::Result<()> {
     Ok(setsockopt(
         socket,
         sockopt::Timestamping,
@@ -83,7 +86,10 @@ pub(super) fn arm_transmit(socket: &impl AsFd, mode: TimestampMode) -> io::Resul
 }
 
 /// Makes the kernel count the next send of an armed socket as 0 again.
-pub(super) fn restart_send_count(socket: &impl AsFd, mode: TimestampMode) -> io::Result<()> {
+///
+/// # Errors
+/// What the kernel answered.
+pub fn restart_send_count(socket: &impl AsFd, mode: TimestampMode) -> io::Result<()> {
     // The count restarts when the option is set anew. Everything else stays on, for the kernel
     // switches receive stamps off and on with a delay.
     let uncounted = mode.transmit_flags() - TimestampingFlag::SOF_TIMESTAMPING_OPT_ID;
@@ -93,7 +99,10 @@ pub(super) fn restart_send_count(socket: &impl AsFd, mode: TimestampMode) -> io:
 
 /// Asks for the stamps of `mode` on a receiving socket, and how to bring those of replies that ask
 /// for one themselves: with their number, counted from 0 here, and no copy.
-pub(super) fn arm_receive(socket: &impl AsFd, mode: TimestampMode) -> io::Result<()> {
+///
+/// # Errors
+/// What the kernel answered.
+pub fn arm_receive(socket: &impl AsFd, mode: TimestampMode) -> io::Result<()> {
     let mut flags = mode.receive_flags();
     if mode.stamps_departures() {
         flags |= TimestampingFlag::SOF_TIMESTAMPING_OPT_ID
@@ -122,7 +131,7 @@ const _: () = assert!(size_of::<c_int>() == 4);
 /// Preallocated buffers of the receive call, aligned as the kernel's structures are.
 #[derive(Debug)]
 #[repr(C, align(16))]
-pub(super) struct MessageReader {
+pub struct MessageReader {
     control: [u8; CONTROL_BYTES],
     address: [u8; ADDRESS_BYTES],
     control_length: usize,
@@ -130,23 +139,35 @@ pub(super) struct MessageReader {
 
 /// One datagram or entry of the error queue, as `recvmsg` returned it.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Message {
+pub struct Message {
+    /// Bytes written to the buffer.
     pub length_bytes: usize,
     /// The sender; `None` when the kernel gave no IP address.
     pub source: Option<SocketAddr>,
+    /// The message was longer than the buffer and its end is gone.
     pub is_truncated: bool,
+    /// Its control messages found no room, so stamps may be missing.
     pub is_control_truncated: bool,
 }
 
 /// Which queue of a socket to read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Queue {
+pub enum Queue {
+    /// What arrived.
     Arrivals,
+    /// The error queue: transmit stamps and reports of the network.
     Errors,
 }
 
+impl Default for MessageReader {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
 impl MessageReader {
-    pub(super) fn new() -> Self {
+    /// With empty buffers.
+    pub fn new() -> Self {
         Self {
             control: [0; CONTROL_BYTES],
             address: [0; ADDRESS_BYTES],
@@ -155,11 +176,14 @@ impl MessageReader {
     }
 
     /// Takes the next message of `queue`, or `None` when there is none. Never blocks.
+    ///
+    /// # Errors
+    /// What the kernel answered.
     #[allow(
         unsafe_code,
         reason = "no safe receive call takes preallocated control memory"
     )]
-    pub(super) fn read(
+    pub fn read(
         &mut self,
         socket: BorrowedFd<'_>,
         buffer: &mut [u8],
@@ -206,7 +230,7 @@ impl MessageReader {
     }
 
     /// The control messages of the message read last.
-    pub(super) fn control(&self) -> &[u8] {
+    pub fn control(&self) -> &[u8] {
         &self.control[..self.control_length]
     }
 }
@@ -231,8 +255,11 @@ fn decode_address(bytes: &[u8]) -> Option<SocketAddr> {
 }
 
 /// Sets a socket option with an `int` value.
+///
+/// # Errors
+/// What the kernel answered.
 #[allow(unsafe_code, reason = "no crate wraps IP_MTU_DISCOVER")]
-pub(super) fn set_int_option(
+pub fn set_int_option(
     socket: &impl AsFd,
     level: c_int,
     name: c_int,
@@ -251,8 +278,11 @@ pub(super) fn set_int_option(
 }
 
 /// Reads a socket option with an `int` value.
+///
+/// # Errors
+/// What the kernel answered.
 #[allow(unsafe_code, reason = "no crate wraps IPV6_MTU")]
-pub(super) fn int_option(socket: &impl AsFd, level: c_int, name: c_int) -> io::Result<c_int> {
+pub fn int_option(socket: &impl AsFd, level: c_int, name: c_int) -> io::Result<c_int> {
     let mut value: c_int = 0;
     let mut length = INT_LENGTH;
     let pointer = (&raw mut value).cast();

@@ -8,7 +8,7 @@ use core::ffi::{c_int, c_uint};
 use std::io;
 use std::os::fd::{AsRawFd, FromRawFd, OwnedFd};
 
-use crate::capture::link_type;
+use super::link_type;
 
 /// `AF_PACKET` as a link address has it, and `PACKET_MR_PROMISC`.
 const PACKET_FAMILY: u16 = 17;

@@ -1,7 +1,7 @@
 //! One frame of a packet ring (`TPACKET_V2`): where the kernel puts the packet, its time, and who gave
 //! that time. It reads bytes; whose turn it is, is the ring's business.
 
-use crate::capture::Direction;
+use super::Direction;
 
 /// Who stamped a packet.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

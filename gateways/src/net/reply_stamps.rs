@@ -48,7 +48,7 @@ struct Awaited {
 
 /// The stamps of one socket's replies.
 #[derive(Debug)]
-pub(super) struct ReplyStamps {
+pub struct ReplyStamps {
     mode: TimestampMode,
     is_asking: bool,
     request: [u8; REQUEST_BYTES],
@@ -58,14 +58,14 @@ pub(super) struct ReplyStamps {
     /// When the error queue was last looked through; `None` before the first request.
     looked: Option<Instant>,
     /// Stamps handed out.
-    pub(super) stamp_count: u64,
+    pub stamp_count: u64,
     /// Stamps that did not come in time.
-    pub(super) missing_count: u64,
+    pub missing_count: u64,
 }
 
 impl ReplyStamps {
     /// For a socket armed with [`super::timestamping::arm_receive`] in `mode`.
-    pub(super) fn new(mode: TimestampMode) -> Self {
+    pub fn new(mode: TimestampMode) -> Self {
         Self {
             mode,
             is_asking: mode.stamps_departures(),
@@ -79,12 +79,15 @@ impl ReplyStamps {
     }
 
     /// Whether a reply may be asked a stamp of at all.
-    pub(super) const fn are_asked_for(&self) -> bool {
+    pub const fn are_asked_for(&self) -> bool {
         self.is_asking
     }
 
     /// Sends one reply and asks for its stamp. The one of the reply before is given up.
-    pub(super) fn send(
+    ///
+    /// # Errors
+    /// What the kernel answered.
+    pub fn send(
         &mut self,
         socket: &Socket,
         now: Instant,
@@ -116,7 +119,7 @@ impl ReplyStamps {
     }
 
     /// Whether a look at the error queue is worth its system call.
-    pub(super) fn is_look_due(&self, now: Instant) -> bool {
+    pub fn is_look_due(&self, now: Instant) -> bool {
         self.awaited.is_some()
             || self
                 .looked
@@ -125,7 +128,7 @@ impl ReplyStamps {
 
     /// Empties the error queue as far as is bounded; the awaited stamp, nanoseconds of
     /// `CLOCK_REALTIME`, when it was there.
-    pub(super) fn take(
+    pub fn take(
         &mut self,
         socket: &Socket,
         reader: &mut MessageReader,

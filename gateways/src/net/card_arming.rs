@@ -1,5 +1,5 @@
 //! Switches the stamps of a network card on for a run and puts the card back as it was. What the
-//! card then really delivers is found out by [`super::probe`].
+//! card then really delivers only sending shows.
 
 use core::fmt;
 use std::io;

@@ -17,33 +17,36 @@ const UNSEEN: u32 = u32::MAX;
 
 /// One reading of `TCP_INFO`. What the running kernel does not tell is `None`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct ConnectionInfo {
+pub struct ConnectionInfo {
     /// Segments sent and not acknowledged.
-    pub(super) unacknowledged_segments: Option<u32>,
+    pub unacknowledged_segments: Option<u32>,
     /// Segments sent again, since the beginning.
-    pub(super) retransmitted_segments: Option<u32>,
+    pub retransmitted_segments: Option<u32>,
     /// Segments that came before their turn, since the beginning.
-    pub(super) out_of_order_segments: Option<u32>,
+    pub out_of_order_segments: Option<u32>,
     /// Smoothed round trip.
-    pub(super) rtt_us: Option<u32>,
+    pub rtt_us: Option<u32>,
     /// Its mean deviation.
-    pub(super) rtt_variation_us: Option<u32>,
+    pub rtt_variation_us: Option<u32>,
     /// The smallest round trip seen.
-    pub(super) rtt_min_us: Option<u32>,
+    pub rtt_min_us: Option<u32>,
     /// Time with data under way or waiting, since the beginning.
-    pub(super) busy_us: Option<u64>,
+    pub busy_us: Option<u64>,
     /// Of that, while the receiver's window was closed.
-    pub(super) window_limited_us: Option<u64>,
+    pub window_limited_us: Option<u64>,
     /// Of that, while the send buffer was full.
-    pub(super) buffer_limited_us: Option<u64>,
+    pub buffer_limited_us: Option<u64>,
     /// Bytes received in order.
-    pub(super) received_bytes: Option<u64>,
+    pub received_bytes: Option<u64>,
 }
 
 impl ConnectionInfo {
     /// Reads it from the kernel.
+    ///
+    /// # Errors
+    /// What the kernel answered.
     #[allow(unsafe_code, reason = "no crate wraps the newer fields of TCP_INFO")]
-    pub(super) fn read(socket: &Socket) -> io::Result<Self> {
+    pub fn read(socket: &Socket) -> io::Result<Self> {
         let mut bytes = [0_u8; INFO_BYTES];
         let mut length = libc::socklen_t::try_from(INFO_BYTES).expect("256 fits");
         let descriptor = socket.as_fd().as_raw_fd();
@@ -84,8 +87,11 @@ impl ConnectionInfo {
 }
 
 /// Bytes given to the kernel that the peer has not acknowledged (`SIOCOUTQ`).
+///
+/// # Errors
+/// What the kernel answered.
 #[allow(unsafe_code, reason = "no crate wraps SIOCOUTQ")]
-pub(super) fn unacknowledged_bytes(socket: &Socket) -> io::Result<u64> {
+pub fn unacknowledged_bytes(socket: &Socket) -> io::Result<u64> {
     let mut count: c_int = 0;
     let descriptor = socket.as_fd().as_raw_fd();
     // SAFETY: TIOCOUTQ, which SIOCOUTQ is on sockets, writes one int at the pointer, a live int.

@@ -1,6 +1,6 @@
-//! The live tap of a probe: an `AF_PACKET` socket that copies packets of followed flows, both ways,
+//! The live tap of a probe: an `AF_PACKET` socket that copies the packets that are asked for, both ways,
 //! with nanosecond stamps into memory shared with the kernel (`TPACKET_V2`). It sends nothing and takes
-//! no part in any flow; what the packets mean is read by [`crate::capture`].
+//! no part in any flow; what the packets mean is for others.
 //!
 //! Version 2 of the ring, not 3: version 3 hands over blocks, and where every block times out with
 //! one packet in it, it runs out of them. Nobody is woken for a packet unless somebody waits on the
@@ -22,10 +22,9 @@ use nix::sys::mman::{MapFlags, ProtFlags, mmap, munmap};
 use nix::sys::socket::{getsockopt, setsockopt, sockopt};
 use thiserror::Error;
 
+use super::filter::{Instruction, PacketFilter, compile};
 use super::packet_socket::{self, bind, link_of, listen_to_all, option_length, set_option};
 use super::ring_frame::RingPacket;
-use crate::capture::flow::FlowFilter;
-use crate::capture::program::compile;
 
 /// Smallest and largest ring, bytes.
 pub const RING_BYTES: core::ops::RangeInclusive<usize> = (1 << 16)..=(1 << 28);
@@ -118,7 +117,7 @@ pub enum RingError {
 /// [`PacketRing::begin`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct RingCounters {
-    /// Packets of the followed flows, dropped ones included.
+    /// Packets that passed the filters, dropped ones included.
     pub matched_count: u64,
     /// Of those, dropped because the ring was full.
     pub dropped_count: u64,
@@ -148,7 +147,7 @@ impl PacketRing {
     /// See [`RingError`].
     pub fn open(
         interface: &str,
-        flows: &[FlowFilter],
+        filters: &[PacketFilter],
         settings: &RingSettings,
     ) -> Result<Self, RingError> {
         check("snap_bytes", settings.snap_bytes as usize, SNAP_BYTES)?;
@@ -183,7 +182,7 @@ impl PacketRing {
             hardware_type,
         };
         let link = link_of(hardware_type).ok_or_else(unknown)?;
-        let program = compile(link, flows, settings.snap_bytes).ok_or_else(unknown)?;
+        let program = compile(link, filters, settings.snap_bytes).ok_or_else(unknown)?;
         let version = tpacket_version();
         set_option(&socket, libc::SOL_PACKET, libc::PACKET_VERSION, &version)
             .map_err(refused("PACKET_VERSION"))?;
@@ -223,7 +222,7 @@ impl PacketRing {
         })
     }
 
-    /// The link layer its packets begin with; see [`crate::capture::link_type`].
+    /// The link layer its packets begin with; see [`super::link_type`].
     pub fn link_type(&self) -> u16 {
         self.link_type
     }
@@ -350,7 +349,7 @@ fn prefer_card(socket: &OwnedFd) -> io::Result<()> {
     set_option(socket, libc::SOL_PACKET, PACKET_IGNORE_OUTGOING, &ignore)
 }
 
-fn attach(socket: &OwnedFd, program: &[crate::capture::program::Instruction]) -> io::Result<()> {
+fn attach(socket: &OwnedFd, program: &[Instruction]) -> io::Result<()> {
     let mut filter: Vec<libc::sock_filter> = program
         .iter()
         .map(|one| libc::sock_filter {
@@ -361,7 +360,7 @@ fn attach(socket: &OwnedFd, program: &[crate::capture::program::Instruction]) ->
         })
         .collect();
     let program = libc::sock_fprog {
-        len: u16::try_from(filter.len()).expect("sixteen flows take a few hundred instructions"),
+        len: u16::try_from(filter.len()).expect("sixteen filters take a few hundred instructions"),
         filter: filter.as_mut_ptr(),
     };
     // The kernel copies the program before it returns.
