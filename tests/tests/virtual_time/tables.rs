@@ -77,7 +77,7 @@ fn the_tables_are_printed_and_written_with_what_they_are_held_against() {
         "HiL, long-range Wi-Fi 6",
         "What causes collisions, warehouse",
         "safe: no collision by any checker",
-        "of processor time",
+        "of wall time",
         "seed 1, 100 CS per cell",
     ] {
         assert!(finished.stdout.contains(words), "{words}: {finished:?}");
