@@ -90,8 +90,8 @@ mod tests {
     use super::*;
     use crate::doctor::finding::Severity;
     use crate::doctor::network::Interface;
-use hil_gateways::transport::card_clock::CardPair;
-use hil_gateways::transport::timestamping::TimestampCapabilities;
+use hil_gateways::net::card_clock::CardPair;
+use hil_gateways::net::timestamping::TimestampCapabilities;
 
     fn probe(tx_hardware: Result<Delivery, String>) -> CardProbe {
         CardProbe {

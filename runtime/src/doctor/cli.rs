@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use clap::Args;
 
-use crate::cli::arguments::whole;
+use crate::platform::argument::whole;
 use crate::topology::duration_within;
 
 const EXAMPLES: &str = "\

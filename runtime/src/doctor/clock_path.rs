@@ -64,7 +64,7 @@ pub(super) fn examine(
 
 #[cfg(test)]
 mod tests {
-    use hil_gateways::transport::timestamping::TimestampCapabilities;
+    use hil_gateways::net::timestamping::TimestampCapabilities;
 
     use super::*;
     use crate::doctor::finding::Severity;

@@ -32,8 +32,8 @@ mod wakeup;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use hil_gateways::transport::interface::interface_with_address;
-use hil_gateways::transport::timestamping::TimestampCapabilities;
+use hil_gateways::net::interface::interface_with_address;
+use hil_gateways::net::timestamping::TimestampCapabilities;
 use serde::{Deserialize, Serialize};
 
 pub use self::finding::{Finding, Severity};

@@ -6,8 +6,7 @@ use std::time::Duration;
 use clap::{Args, Subcommand, ValueEnum};
 use hil_gateways::capture::flow::FlowFilter;
 
-use super::tap::TapChoice;
-use crate::cli::arguments::whole;
+use crate::platform::argument::whole;
 use crate::topology::duration_within;
 
 const EXAMPLES: &str = "\

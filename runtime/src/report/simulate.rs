@@ -11,8 +11,8 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use hil_models::link::LinkModel;
-use hil_models::link::trace::ReplayTally;
+use hil_models::link_model::LinkModel;
+use hil_models::link_model::ReplayTally;
 use hil_models::account::{
     ChannelAccount, Closing, EndToEnd, FateCounts, Gaps, MessageFate, StampCoverage,
 };

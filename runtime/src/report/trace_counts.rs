@@ -2,7 +2,7 @@
 
 use core::fmt::Write;
 
-use hil_models::link::trace::{ReplayCounts, TraceMatch};
+use hil_models::link_model::{ReplayCounts, TraceMatch};
 
 /// `counts` as a line.
 pub(crate) fn replay_words(counts: &ReplayCounts) -> String {

@@ -4,7 +4,7 @@
 use std::time::Duration;
 
 use hil_models::case_study::ParameterError;
-use hil_models::link::LinkModel;
+use hil_models::link_model::LinkModel;
 use hil_models::link::spec::{LinkPlace, LinkSpec, Way};
 use serde::{Deserialize, Serialize};
 

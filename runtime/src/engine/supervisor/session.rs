@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::thread;
 use std::time::{Duration, Instant as WallInstant, SystemTime};
 
-use hil_gateways::transport::clock_pair::ClockPair;
+use hil_gateways::net::clock_pair::ClockPair;
 use hil_models::time::Instant;
 
 use super::crew::{self, Crew, Verdict};

@@ -13,8 +13,8 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use clap::Args;
-use hil_gateways::transport::card_arming::{ArmedCard, CardControl, InterfaceCard, describe_setting};
-use hil_gateways::transport::timestamping::HardwareStamping;
+use hil_gateways::net::card_arming::{ArmedCard, CardControl, InterfaceCard, describe_setting};
+use hil_gateways::net::timestamping::HardwareStamping;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM};
 use signal_hook::flag;
 

@@ -14,10 +14,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use hil_gateways::transport::card_clock::CardClock;
-use hil_gateways::transport::clock_pair::ClockPair;
-use hil_gateways::transport::interface::interface_with_address;
-use hil_gateways::transport::timestamping::TimestampCapabilities;
+use hil_gateways::net::card_clock::CardClock;
+use hil_gateways::net::clock_pair::ClockPair;
+use hil_gateways::net::interface::interface_with_address;
+use hil_gateways::net::timestamping::TimestampCapabilities;
 use hil_models::account::card_clock::CardClockRecord;
 
 use self::guard::GuardedCard;

@@ -15,9 +15,9 @@ use crate::report::summary::{
     ProcessSummary, RealtimeFacts, RunEvent, RunFacts,
 };
 use crate::rundir::event::{Event, ProcessStory};
-use crate::engine::supervisor::{RunResult, self};
+
 use crate::topology::{Channel, Topology};
-use crate::rundir::run_result::self;
+use crate::rundir::run_result::{self, RunResult};
 
 /// Datagrams that came while the socket's receive buffer was full; see [`NO_ROOM`].
 const NO_ROOM_COUNTER: &str = "socket: kernel_drop_count";

@@ -3,7 +3,7 @@
 
 use serde::Serialize;
 
-use crate::series::{SeriesColumn, SeriesEntry};
+use crate::rundir::series::{SeriesColumn, SeriesEntry};
 
 /// A table of numbers with named columns.
 #[derive(Debug, Clone, Default, PartialEq)]

@@ -5,7 +5,7 @@ use std::cell::RefCell;
 use std::rc::Rc;
 
 use hil_gateways::protocol::wire;
-use hil_models::link::{LinkModel, LossCauses};
+use hil_models::link_model::{LinkModel, LossCauses};
 use hil_models::account::{Outage, OutageFinder};
 use hil_models::account::network::{Crossing, Passage};
 use hil_models::message::Envelope;

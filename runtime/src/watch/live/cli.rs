@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use clap::{Args, Subcommand};
 
-use crate::cli::arguments::whole;
+use crate::platform::argument::whole;
 use crate::topology::duration_within;
 
 const CHANNEL_EXAMPLES: &str = "\
