@@ -136,6 +136,9 @@ impl Files {
 }
 
 /// The message `sequence` of a producer started at 0.
+///
+/// # Panics
+/// When it would be published after 292 years.
 pub fn at(epoch: u32, sequence: u64) -> Written {
     let published_ns = i64::try_from(sequence).expect("a test has few messages") * PERIOD_NS;
     Written {

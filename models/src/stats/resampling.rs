@@ -24,6 +24,9 @@ const PIVOT_COUNT: usize = 256;
 
 impl BlockResampling {
     /// `None` below 100 samples.
+    ///
+    /// # Panics
+    /// When a block has 2^32 samples.
     pub fn of(samples: &Samples) -> Option<Self> {
         let length = samples.len().isqrt();
         if length < BLOCK_COUNT_MIN {

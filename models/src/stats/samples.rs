@@ -48,6 +48,11 @@ impl Samples {
         }
     }
 
+    /// True of none.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
     /// How many.
     pub fn len(&self) -> usize {
         match self {
@@ -83,6 +88,7 @@ impl Samples {
     }
 
     /// In ascending order.
+    #[must_use]
     pub fn ascending(&self) -> Self {
         let mut ascending = self.clone();
         ascending.sort();

@@ -165,7 +165,7 @@ fn delay_limit_ns<P: Passages + ?Sized>(passages: &P) -> Option<i64> {
     }
     let (first_ns, last_ns) = ends?;
     let period_ns = last_ns.saturating_sub(first_ns) / count;
-    if delays_ns.len() == 0 || period_ns == 0 {
+    if delays_ns.is_empty() || period_ns == 0 {
         return None;
     }
     delays_ns.sort();
