@@ -40,7 +40,7 @@ const UNSAFE_FILES: [&str; 9] = [
     "gateways/src/transport/tcp/info.rs",
     "gateways/src/transport/timestamping.rs",
     "runtime/src/shm/raw.rs",
-    "runtime/src/shm/shm.rs",
+    "runtime/src/shm/ports.rs",
     "runtime/src/platform/realtime.rs",
 ];
 
