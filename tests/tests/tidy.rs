@@ -35,9 +35,9 @@ const UNSAFE_FILES: [&str; 8] = [
     "card_clock.rs",
     "packet_ring.rs",
     "packet_socket.rs",
+    "ports.rs",
     "raw.rs",
     "realtime.rs",
-    "shm.rs",
     "tcp_info.rs",
     "timestamping.rs",
 ];

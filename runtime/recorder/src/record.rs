@@ -9,7 +9,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use hil_runtime::rundir::live_run::LiveRun;
-use hil_runtime::rundir::select;
+use hil_runtime::rundir::select::select;
 use hil_runtime::rundir::select::{SelectError, select_below};
 use hil_runtime::watch::{Event, Feed, FeedError, Poll};
 

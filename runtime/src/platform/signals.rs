@@ -22,7 +22,7 @@ const LOOK_PERIOD: Duration = Duration::from_millis(20);
 
 /// While it lives a signal ends the program; see [`Signals::end_program_unless_over`].
 #[derive(Debug)]
-pub(crate) struct EndWatch {
+pub struct EndWatch {
     is_over: Arc<AtomicBool>,
 }
 

@@ -60,10 +60,10 @@ Exit code 1 when counts differ, or medians lie farther apart than --limit.";
 pub struct ProbeArgs {
     /// What to do, if not to capture.
     #[command(subcommand)]
-    pub work: Option<ProbeWork>,
+    pub(crate) work: Option<ProbeWork>,
     /// Capture.
     #[command(flatten)]
-    pub live: LiveArgs,
+    pub(crate) live: LiveArgs,
 }
 
 /// Arguments of a live capture.

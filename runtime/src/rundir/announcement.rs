@@ -25,6 +25,9 @@ impl Announcement {
     /// Announces the run of `topology` in `folder`; `domains` are the hosts that run here with the
     /// addresses of their shared memory, `processes` what runs here; `has_one_clock` as far as it is
     /// known before all hosts have begun.
+    ///
+    /// # Errors
+    /// When it cannot be written.
     pub fn make(
         topology: &Topology,
         folder: &RunFolder,
@@ -69,6 +72,9 @@ impl Announcement {
     }
 
     /// Says how the clocks of the run's hosts stand to each other.
+    ///
+    /// # Errors
+    /// When it cannot be written.
     pub fn say_clock(&mut self, has_one_clock: bool) -> io::Result<()> {
         self.run.has_one_clock = Some(has_one_clock);
         self.write()

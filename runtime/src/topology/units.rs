@@ -24,20 +24,28 @@ fn allowed() -> String {
 
 /// Why a text is no duration.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub(crate) enum DurationError {
+pub enum DurationError {
+    /// No number.
     #[error("has no number before its unit")]
     NoNumber,
+    /// No unit.
     #[error("has no unit; allowed: {}", allowed())]
     NoUnit,
+    /// A unit that is none.
     #[error("has the unknown unit `{0}`; allowed: {allowed}", allowed = allowed())]
     UnknownUnit(String),
+    /// Too fine.
     #[error("is finer than 1 ns")]
     TooFine,
+    /// Too long.
     #[error("is too long to count in nanoseconds")]
     TooLong,
 }
 
 /// Reads `20 s`, `4ms`, `1.5 us`.
+///
+/// # Errors
+/// When it is no duration.
 pub fn parse_duration(text: &str) -> Result<Duration, DurationError> {
     let text = text.trim();
     let end = text

@@ -6,8 +6,8 @@ use std::thread;
 use std::time::Duration;
 
 use hil_runtime::rundir::live_run::Source;
-use hil_runtime::rundir::select;
 use hil_runtime::rundir::select::running_runs;
+use hil_runtime::rundir::select::select;
 use hil_runtime::watch::{Event, Feed, Origin, Poll};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::{Trial, wait_until};

@@ -12,8 +12,8 @@ use hil_models::message::Envelope;
 use hil_runtime::platform::clock::MonotonicClock;
 use hil_runtime::rundir::live_run::LiveRun;
 use hil_runtime::rundir::manifest::{ChannelDescription, Manifest};
-use hil_runtime::rundir::select;
 use hil_runtime::rundir::select::SelectError;
+use hil_runtime::rundir::select::select;
 use hil_runtime::rundir::status::has_begun;
 use hil_runtime::shm::{Census, ChannelError, Domain, DomainError, RawOutput};
 use serde_json::Value;
@@ -105,7 +105,7 @@ impl Target {
         let card = env::var_os("HIL_CARD").map(PathBuf::from);
         let (run, is_ours) = match (into, card) {
             (None, Some(card)) => (run_of_card(&card)?, true),
-            (into, _) => (select::select(into)?, false),
+            (into, _) => (select(into)?, false),
         };
         let manifest = run.manifest().map_err(|source| TargetError::Manifest {
             run: run.name.clone(),

@@ -28,8 +28,8 @@ use hil_runtime::platform::progress::Progress;
 use hil_runtime::platform::signals::{EXIT_INTERRUPTED, Signals};
 use hil_runtime::rundir::live_run::LiveRun;
 use hil_runtime::rundir::run_folder::RunFolder;
-use hil_runtime::rundir::select;
 use hil_runtime::rundir::select::SelectError;
+use hil_runtime::rundir::select::select;
 use hil_runtime::watch::FeedError;
 use tokio::runtime::Runtime;
 

@@ -7,9 +7,9 @@ use std::time::Duration;
 
 use hil_runtime::platform::clock::MonotonicClock;
 use hil_runtime::report::summary::RunSummary;
+use hil_runtime::rundir::live_run;
 use hil_runtime::rundir::live_run::LiveRun;
 use hil_runtime::watch::{Event, Feed, FeedError, Origin, Poll, self};
-use hil_runtime::rundir::live_run::Source;
 
 use super::engine::REST;
 use super::playback::how_ended;
@@ -63,7 +63,7 @@ impl Running {
             // A foreign program keeps no records of what it publishes.
             channel.is_by_message |= matches!(
                 source,
-                Some(Source::SharedMemory {
+                Some(live_run::Source::SharedMemory {
                     is_forwarded: false,
                     ..
                 })

@@ -100,10 +100,15 @@ pub enum GatewayError {
 /// What a direction's thread needs from the process around it.
 #[derive(Debug)]
 pub struct Surroundings {
+    /// The host's shared memory.
     pub domain: Domain,
+    /// Number of this start.
     pub session: u32,
+    /// Which memory it is.
     pub fingerprint: [u8; 16],
+    /// Which clock is read.
     pub(crate) clock_id: u64,
+    /// Set when the threads are to end.
     pub stop: Arc<AtomicBool>,
 }
 

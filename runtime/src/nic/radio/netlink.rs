@@ -56,6 +56,9 @@ impl Request<'_> {
 }
 
 /// Attributes one after the other, as a message or another attribute holds them: number and content.
+///
+/// # Panics
+/// When one is longer than an attribute can be.
 pub fn encode_attributes(attributes: &[(u16, &[u8])]) -> Vec<u8> {
     let mut bytes = Vec::new();
     for (number, content) in attributes {
@@ -157,7 +160,7 @@ impl<'a> IntoIterator for Attributes<'a> {
 
 /// Goes through [`Attributes`].
 #[derive(Debug, Clone)]
-pub(crate) struct AttributeIter<'a>(Attributes<'a>);
+pub struct AttributeIter<'a>(Attributes<'a>);
 
 impl<'a> Iterator for AttributeIter<'a> {
     type Item = (u16, &'a [u8]);

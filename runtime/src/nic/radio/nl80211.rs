@@ -41,11 +41,11 @@ pub(crate) fn family(attributes: Attributes<'_>, group: &[u8]) -> Option<(u16, O
 
 /// What a wireless interface is used as.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Wireless {
+pub struct Wireless {
     /// `enum nl80211_iftype`.
-    pub(crate) kind: u32,
+    pub kind: u32,
     /// Its channel, MHz.
-    pub(crate) frequency_mhz: Option<u32>,
+    pub frequency_mhz: Option<u32>,
 }
 
 impl Wireless {
@@ -57,7 +57,7 @@ impl Wireless {
     }
 
     /// The kind in words.
-    pub(crate) const fn label(self) -> &'static str {
+    pub const fn label(self) -> &'static str {
         match self.kind {
             1 => "ad-hoc station",
             2 => "station",

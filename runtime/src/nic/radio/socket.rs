@@ -38,7 +38,9 @@ pub enum RadioError {
     /// A call failed.
     #[error("cannot ask about the radio of {interface}: {source}")]
     Io {
+        /// Which.
         interface: String,
+        /// What the system said.
         source: io::Error,
     },
 }

@@ -111,13 +111,13 @@ impl PreemptionMode {
 
 /// How the kernel preempts, and who says so.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Preemption {
+pub struct Preemption {
     /// The mode in force; why it is not known.
-    pub(crate) mode: Fact<PreemptionMode>,
+    pub mode: Fact<PreemptionMode>,
     /// For people: `PREEMPT_DYNAMIC, mode full`.
-    pub(crate) words: String,
+    pub words: String,
     /// The file that tells.
-    pub(crate) source: String,
+    pub source: String,
 }
 
 const REALTIME_FLAG: &str = "/sys/kernel/realtime";
@@ -253,6 +253,7 @@ pub struct RealtimeThrottle {
 }
 
 impl RealtimeThrottle {
+    /// What the kernel says.
     pub fn read(files: &HostFiles) -> Fact<Self> {
         let number = |name: &str| files.read_number(&format!("/proc/sys/kernel/{name}"));
         number("sched_rt_runtime_us").and_then(|runtime_us| {

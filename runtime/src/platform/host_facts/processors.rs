@@ -167,6 +167,7 @@ impl ProcessorTicks {
     }
 
     /// What passed since `earlier`.
+    #[must_use]
     pub fn since(self, earlier: Self) -> Self {
         Self {
             total: self.total.saturating_sub(earlier.total),

@@ -50,28 +50,53 @@ use crate::topology::registry::{Case, CaseError, Registry};
 /// Why no summary could be made.
 #[derive(Debug, thiserror::Error)]
 pub enum AnalysisError {
+    /// The records cannot be read.
     #[error("records folder {folder}: {source}")]
-    Folder { folder: PathBuf, source: io::Error },
+    Folder {
+        /// Where they are.
+        folder: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// The case cannot be made.
     #[error(transparent)]
     Case(#[from] CaseError),
+    /// The summary cannot be written.
     #[error(transparent)]
     Summary(#[from] SummaryError),
+    /// The manifest cannot be read.
     #[error("{path}: {source}")]
-    Manifest { path: PathBuf, source: io::Error },
+    Manifest {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        source: io::Error,
+    },
+    /// The manifest does not give back the topology.
     #[error("{path}: {source}")]
     Topology {
+        /// The manifest.
         path: PathBuf,
+        /// Why not.
         source: ManifestTopologyError,
     },
+    /// The result of the run cannot be read or written.
     #[error(transparent)]
     Result(#[from] RunResultError),
+    /// A file of the report cannot be written.
     #[error("cannot write {path}: {source}")]
-    Write { path: PathBuf, source: io::Error },
+    Write {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
 }
 
 /// The account of a finished run.
 #[derive(Debug)]
 pub struct Concluded {
+    /// Every figure of the report.
     pub summary: RunSummary,
     /// Why the run folder lacks it, e.g. because its disk is full; it can be shown all the same.
     pub unwritten: Option<AnalysisError>,

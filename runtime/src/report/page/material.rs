@@ -9,9 +9,9 @@ pub struct Material {
     /// The folder's own name.
     pub folder: String,
     /// What was found there.
-    pub found: Found,
+    pub(crate) found: Found,
     /// What there is to plot.
-    pub series: Vec<Series>,
+    pub(crate) series: Vec<Series>,
     /// `report.txt`.
     pub(crate) printed: Option<String>,
     /// What could not be read, in words.

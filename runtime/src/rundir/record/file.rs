@@ -216,6 +216,12 @@ impl RecordHeader {
     }
 
     /// Reads a header off the beginning of a file.
+    ///
+    /// # Errors
+    /// When they are none.
+    ///
+    /// # Panics
+    /// Never: the fields lie within the header.
     pub fn decode(path: &Path, bytes: &[u8]) -> Result<Self, RecordFileError> {
         let Some(header) = bytes.first_chunk::<HEADER_BYTES>() else {
             return Err(malformed(

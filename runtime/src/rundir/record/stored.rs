@@ -42,6 +42,7 @@ impl ReadFaults {
 #[derive(Debug, Clone)]
 pub struct StoredFile {
     path: PathBuf,
+    /// What it says it holds.
     pub header: RecordHeader,
     /// Whole records in it.
     count: u64,

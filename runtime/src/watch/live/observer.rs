@@ -42,7 +42,7 @@ const WRITING: Duration = Duration::from_millis(100);
 
 /// Why a run cannot be observed.
 #[derive(Debug, thiserror::Error)]
-pub(crate) enum ObserveError {
+pub enum ObserveError {
     /// None, or not one.
     #[error(transparent)]
     Select(#[from] SelectError),
