@@ -211,7 +211,7 @@ fn short(name: &str) -> &str {
     name.strip_prefix("hil-").unwrap_or(name)
 }
 
-/// The lines of the block that begins with "```crates".
+/// The lines of the fenced block whose language is `crates`.
 fn crates_drawn_in(document: &str) -> Vec<String> {
     let (_, rest) = document
         .split_once("```crates\n")

@@ -12,6 +12,8 @@ use socket2::Socket;
 
 /// Room for `struct tcp_info` of `linux/tcp.h`; kernels write as much of it as they know.
 const INFO_BYTES: usize = 256;
+/// The same, as the kernel takes it.
+const INFO_LENGTH: libc::socklen_t = 256;
 /// What the kernel writes for a smallest round trip it has not seen yet.
 const UNSEEN: u32 = u32::MAX;
 
@@ -48,7 +50,7 @@ impl ConnectionInfo {
     #[allow(unsafe_code, reason = "no crate wraps the newer fields of TCP_INFO")]
     pub fn read(socket: &Socket) -> io::Result<Self> {
         let mut bytes = [0_u8; INFO_BYTES];
-        let mut length = libc::socklen_t::try_from(INFO_BYTES).expect("256 fits");
+        let mut length = INFO_LENGTH;
         let descriptor = socket.as_fd().as_raw_fd();
         let pointer = bytes.as_mut_ptr().cast();
         let (level, name) = (libc::IPPROTO_TCP, libc::TCP_INFO);
