@@ -18,10 +18,10 @@ use std::thread;
 use std::time::Duration;
 
 use hil_models::random::RandomStream;
+use hil_models::record::{TakenRecord, UNAVAILABLE};
 use hil_runtime::platform::clock::MonotonicClock;
 use hil_runtime::platform::signals::EXIT_INTERRUPTED;
 use hil_runtime::rundir::record::{RecordFile, RecordKind};
-use hil_models::record::{TakenRecord, UNAVAILABLE};
 use hil_tests::child::ChildGuard;
 use hil_tests::lab::Lab;
 use hil_tests::run_folder::RunFolder;

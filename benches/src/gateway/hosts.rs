@@ -11,6 +11,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use hil_models::message::MessageType;
+use hil_models::record::{EgressRecord, IngressRecord};
 use hil_runtime::engine::gateway::Surroundings;
 use hil_runtime::engine::gateway::direction;
 use hil_runtime::engine::gateway::direction::{Direction, Opened};

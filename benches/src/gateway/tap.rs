@@ -9,8 +9,7 @@ use std::time::Duration;
 
 use hil_gateways::capture::flow::FlowFilter;
 use hil_gateways::capture::writer::{self, PacketToWrite};
-use hil_gateways::transport::live_tap::{LiveTap, TapEngine};
-use hil_gateways::net::packet_ring::{RingCounters, RingSettings, RingStamps};
+use hil_gateways::net::packet_ring::{PacketRing, RingCounters, RingSettings, RingStamps};
 
 use super::hosts::SetupError;
 use super::network::Network;

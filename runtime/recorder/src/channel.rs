@@ -2,7 +2,7 @@
 //! the verdicts of its link. When each was is decided by whoever reads the run.
 
 use hil_models::trace::TraceRecord;
-use hil_runtime::manifest::ChannelDescription;
+use hil_runtime::rundir::manifest::ChannelDescription;
 use prost::Message as _;
 
 use crate::encode::Encoder;

@@ -6,9 +6,9 @@ use std::time::Instant;
 
 use hil_models::link::condition::LinkConditionRecord;
 use hil_models::message::Envelope;
+use hil_models::record::UNAVAILABLE;
 use hil_runtime::rundir::live_run::Source;
 use hil_runtime::watch::{Event, Feed, Origin, Record, Seen, WatchedChannel};
-use hil_models::record::UNAVAILABLE;
 
 use crate::channel::{ChannelTopics, Wanted, typed};
 use crate::conditions::Conditions;

@@ -2,8 +2,8 @@
 //! comes back when something is sent, and where their clock stands. Other interfaces have no
 //! finding here; what they claim is said beside.
 
-use super::network::{Interfaces, StampQuery};
 use super::Finding;
+use super::network::{Interfaces, StampQuery};
 use crate::nic::card_clock::probing::{CardProbe, Delivery};
 
 /// Offsets above this are no matter of accuracy but of another time scale or an unset clock.
@@ -90,8 +90,8 @@ mod tests {
     use super::*;
     use crate::doctor::finding::Severity;
     use crate::doctor::network::Interface;
-use hil_gateways::net::card_clock::CardPair;
-use hil_gateways::net::timestamping::TimestampCapabilities;
+    use hil_gateways::net::card_clock::CardPair;
+    use hil_gateways::net::timestamping::TimestampCapabilities;
 
     fn probe(tx_hardware: Result<Delivery, String>) -> CardProbe {
         CardProbe {

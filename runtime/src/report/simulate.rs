@@ -11,29 +11,32 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use hil_models::link_model::LinkModel;
-use hil_models::link_model::ReplayTally;
 use hil_models::account::{
     ChannelAccount, Closing, EndToEnd, FateCounts, Gaps, MessageFate, StampCoverage,
 };
-use hil_models::stats::histogram::Distribution;
+use hil_models::link_model::LinkModel;
+use hil_models::link_model::ReplayTally;
 use hil_models::plot::PlotSeries;
 use hil_models::run_log::RunLog;
 use hil_models::simulation::{
     Carrier, ChannelCounts, Simulation, SimulationError, SimulationResult,
 };
+use hil_models::stats::histogram::Distribution;
 use hil_models::time::Instant;
 
 use crate::report::analysis::figures::shell_words;
 use crate::report::analysis::outages::OutageStory;
-use crate::topology::registry::{Case, Registry};
 use crate::report::event_log;
-use crate::report::summary::{ChannelSummary, CountByName, DirectionSummary, Fact, LinkKind, Outcome, RecordedFigures, RunFacts, RunSummary, ScoreMetric};
-use crate::report::terminal::{Style, percent, self};
+use crate::report::summary::{
+    ChannelSummary, CountByName, DirectionSummary, Fact, LinkKind, Outcome, RecordedFigures,
+    RunFacts, RunSummary, ScoreMetric,
+};
+use crate::report::terminal::{self, Style, percent};
 use crate::rundir::run_folder::RunFolder;
 use crate::rundir::series;
-use crate::topology::{Channel, Crossing, Program, Topology};
 use crate::topology::emulation::EmulationLaunch;
+use crate::topology::registry::{Case, Registry};
+use crate::topology::{Channel, Crossing, Program, Topology};
 
 use self::watched::Watch;
 

@@ -4,8 +4,8 @@
 use std::time::Duration;
 
 use hil_models::case_study::ParameterError;
-use hil_models::link_model::LinkModel;
 use hil_models::link::spec::{LinkPlace, LinkSpec, Way};
+use hil_models::link_model::LinkModel;
 use serde::{Deserialize, Serialize};
 
 use super::emulation_room::EmulationRoom;

@@ -24,7 +24,7 @@ fn allowed() -> String {
 
 /// Why a text is no duration.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum DurationError {
+pub(super) enum DurationError {
     /// No number.
     #[error("has no number before its unit")]
     NoNumber,
@@ -46,7 +46,7 @@ pub enum DurationError {
 ///
 /// # Errors
 /// When it is no duration.
-pub fn parse_duration(text: &str) -> Result<Duration, DurationError> {
+pub(super) fn parse_duration(text: &str) -> Result<Duration, DurationError> {
     let text = text.trim();
     let end = text
         .find(|letter: char| !letter.is_ascii_digit() && letter != '.')

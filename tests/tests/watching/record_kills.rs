@@ -7,8 +7,8 @@ use std::thread;
 use std::time::Duration;
 
 use hil_models::random::RandomStream;
-use hil_runtime::platform::clock::MonotonicClock;
 use hil_models::record::PublishedRecord;
+use hil_runtime::platform::clock::MonotonicClock;
 use hil_runtime::report::summary::Outcome;
 use hil_runtime::rundir::record::RecordFile;
 use hil_tests::account::{assert_accounts_close, assert_every_message_is_accounted_for};

@@ -99,7 +99,7 @@ fn a_live_run_loses_the_spans_that_virtual_time_loses() {
         }
         assert!(certain_count > 50, "{certain_count}");
         let lost_count = messages.iter().filter(|(_, has_come)| !has_come).count() as u64;
-        let virtually = crate::account(&virtual_time, name);
+        let virtually = hil_tests::account::account(&virtual_time, name);
         let lost_virtually = virtually.fates.lost_count();
         let counters = channel(&summary, name).directions.iter();
         let emulated_count: u64 = counters

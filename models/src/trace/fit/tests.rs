@@ -303,11 +303,3 @@ fn what_no_link_takes_is_no_fit_and_the_reason_is_said() {
         assert!(!fit.toml.is_empty(), "{fit:?}");
     }
 }
-
-/// The largest difference between two samples' distributions, both ascending.
-fn ks_of_two(a: &[f64], b: &[f64]) -> f64 {
-    let share = |of: &[f64], x: f64| of.partition_point(|y| *y <= x) as f64 / of.len() as f64;
-    let all = a.iter().chain(b);
-    all.map(|x| (share(a, *x) - share(b, *x)).abs())
-        .fold(0.0, f64::max)
-}

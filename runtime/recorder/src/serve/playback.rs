@@ -8,6 +8,7 @@ use hil_models::time::duration_ns;
 use hil_runtime::report::assessment::Assessment;
 use hil_runtime::report::summary::RunSummary;
 use hil_runtime::rundir::live_run::Stage;
+use hil_runtime::rundir::record::{RecordFile, RecordKind};
 use hil_runtime::watch::Record;
 
 use super::source::{Progress, Source, Warning};

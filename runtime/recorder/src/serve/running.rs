@@ -9,7 +9,8 @@ use hil_runtime::platform::clock::MonotonicClock;
 use hil_runtime::report::summary::RunSummary;
 use hil_runtime::rundir::live_run;
 use hil_runtime::rundir::live_run::LiveRun;
-use hil_runtime::watch::{Event, Feed, FeedError, Origin, Poll, self};
+use hil_runtime::rundir::status::{self, Overruns};
+use hil_runtime::watch::{Event, Feed, FeedError, Origin, Poll};
 
 use super::engine::REST;
 use super::playback::how_ended;

@@ -7,15 +7,15 @@ use std::path::Path;
 use crate::cli::arguments::{BatchArgs, CalibrateArgs};
 use crate::platform::console::Console;
 use crate::platform::progress::Progress;
-use crate::topology::registry::Registry;
+use crate::platform::signals::Signals;
 use crate::report::replay;
-use hil_models::study::Batch;
+use crate::report::simulate;
+use crate::report::study::{self, StudyEnd, StudyError, Wanted};
 use crate::report::terminal::{self, Style};
 use crate::rundir::run_folder::RunFolder;
-use crate::platform::signals::Signals;
-use crate::report::simulate;
-use crate::report::study::{StudyEnd, StudyError, Wanted, self};
+use crate::topology::registry::Registry;
 use crate::topology::{self, Topology, TopologyErrors};
+use hil_models::study::Batch;
 
 use super::{columns, exit, interrupted, load, signals};
 

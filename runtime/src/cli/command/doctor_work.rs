@@ -7,7 +7,7 @@ use std::path::Path;
 use super::{exit, hosts_here, interrupted, load, signals};
 use crate::doctor::cli::DoctorArgs;
 use crate::doctor::latency::{LatencyReport, LatencyRequest, Watch, measure};
-use crate::doctor::{DoctorReport, DoctorRequest, Plan, Severity, self};
+use crate::doctor::{self, DoctorReport, DoctorRequest, Plan, Severity};
 use crate::platform::console::Console;
 use crate::platform::host_facts::{HostFiles, isolated_or_online};
 use crate::platform::progress::Progress;

@@ -72,8 +72,8 @@ impl KernelClock {
 #[cfg(test)]
 mod tests {
     use super::*;
-use crate::platform::wait::WAIT_MAX;
-use hil_models::account::network::CLOCK_READING_AGE_NS_MAX;
+    use crate::platform::wait::WAIT_MAX;
+    use hil_models::account::network::CLOCK_READING_AGE_NS_MAX;
     use hil_models::time::duration_ns;
 
     #[test]

@@ -16,8 +16,8 @@ use crate::report::summary::{
 };
 use crate::rundir::event::{Event, ProcessStory};
 
-use crate::topology::{Channel, Topology};
 use crate::rundir::run_result::{self, RunResult};
+use crate::topology::{Channel, Topology};
 
 /// Datagrams that came while the socket's receive buffer was full; see [`NO_ROOM`].
 const NO_ROOM_COUNTER: &str = "socket: kernel_drop_count";

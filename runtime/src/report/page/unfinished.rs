@@ -3,8 +3,8 @@
 use super::data::{FactGroup, Run, Verdict};
 use super::material::Manifest;
 use super::words::UNAVAILABLE;
+use crate::platform::text::grouped;
 use crate::report::summary::Fact;
-use crate::platform::words::grouped;
 
 /// A run without a summary.
 pub(super) fn unfinished(key: &str, manifest: &Manifest, folder: &str) -> Run {

@@ -5,9 +5,9 @@ use std::cell::RefCell;
 use std::rc::Rc;
 
 use hil_gateways::protocol::wire;
-use hil_models::link_model::{LinkModel, LossCauses};
-use hil_models::account::{Outage, OutageFinder};
 use hil_models::account::network::{Crossing, Passage};
+use hil_models::account::{Outage, OutageFinder};
+use hil_models::link_model::{LinkModel, LossCauses};
 use hil_models::message::Envelope;
 use hil_models::simulation::Carrier;
 use hil_models::time::Instant;

@@ -13,9 +13,9 @@ use std::time::Duration;
 
 use hil_models::study::{Batch, StudyReport};
 
+use crate::cli::arguments::BatchArgs;
 use crate::platform::console::Console;
 use crate::platform::signals::Signals;
-use crate::cli::arguments::BatchArgs;
 use crate::topology::Topology;
 use crate::topology::registry::Registry;
 

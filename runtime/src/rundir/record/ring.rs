@@ -224,8 +224,8 @@ fn flush(drain: &mut Drain) -> io::Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
-use crate::rundir::record::RecordFile;
-use hil_models::record::PublishedRecord;
+    use crate::rundir::record::RecordFile;
+    use hil_models::record::PublishedRecord;
     use std::env;
     use std::fs;
     use std::process;

@@ -228,8 +228,8 @@ pub fn file_bytes(path: &Path) -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-use crate::rundir::record::RecordKind;
-use hil_models::record::PublishedRecord;
+    use crate::rundir::record::RecordKind;
+    use hil_models::record::PublishedRecord;
     use std::io::Write;
     use std::{env, process};
 
