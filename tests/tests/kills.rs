@@ -11,7 +11,7 @@ use std::time::Duration;
 use hil_models::measure::account::{InterruptionFigures, MessageFate};
 use hil_models::measure::record::IngressRecord;
 use hil_runtime::report::assessment::{Assessment, NetworkVerdict};
-use hil_runtime::report::summary::{NO_ROOM, Outcome, RunSummary};
+use hil_runtime::report::summary::{Outcome, RunSummary};
 use hil_tests::account::{account, assert_every_message_is_accounted_for, carried, describe};
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::child::{ChildGuard, Finished};
@@ -254,8 +254,7 @@ fn a_receiver_that_stood_still_is_no_network_result() {
         let channel = "shuttle/command";
         let said = describe(channel, account(&summary, channel));
         let of_channel = summary.channels.iter().find(|one| one.name == channel);
-        let mut causes = of_channel.unwrap().refusals.iter();
-        let no_room = causes.find(|cause| cause.name == NO_ROOM).unwrap().count;
+        let no_room = of_channel.unwrap().no_room_count;
         let lost = account(&summary, channel).fates.of(MessageFate::LostOnWire);
         println!("{said}; {no_room} datagrams without room");
         assert!(lost > 0 && lost <= no_room, "{lost} of {no_room}: {said}");

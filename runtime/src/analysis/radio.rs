@@ -14,7 +14,7 @@ use super::records::RunRecords;
 use crate::radio::nl80211::command;
 use crate::radio::record::{NO_CODE, NO_RATE, NO_SIGNAL, RadioRecord, RateRecord, SAMPLE};
 use crate::report::radio::{ChannelRadio, RadioHopSummary, RadioReport, Spread, StationSummary};
-use crate::report::summary::{Fact, RunEvent, RunSummary};
+use crate::report::summary::{CounterGroup, Fact, RunEvent, RunSummary};
 use crate::supervisor::RunResult;
 use crate::topology::Topology;
 
@@ -75,15 +75,12 @@ fn add_mark_warnings(summary: &mut RunSummary) {
     let mut warnings = Vec::new();
     for channel in &summary.channels {
         for direction in &channel.directions {
-            let counters = &direction.counters;
-            let changed = counters
-                .iter()
-                .find(|one| one.name == "socket: mark_changed_count");
-            if let Some(changed) = changed.filter(|one| one.count > 0) {
+            let changed = direction.count(CounterGroup::Socket, "mark_changed_count");
+            if let Some(changed) = changed.filter(|count| *count > 0) {
                 warnings.push(format!(
                     "{}: {} datagrams arrived with another code point than they should: {}",
                     channel.name,
-                    changed.count,
+                    changed,
                     "something on the way changes marks, or the other host sets another dscp"
                 ));
             }

@@ -14,6 +14,7 @@ use super::line::Line;
 use crate::channel::Waiter;
 use crate::clock::MonotonicClock;
 use crate::gateway::poll_descriptors;
+use crate::process::pipe::{CountByName, RefusalCount};
 use crate::process::pulse::Pulse;
 use crate::process::recording::{RecordedInput, RecordedOutput};
 use crate::wait::{Pause, WaitStrategy};
@@ -60,8 +61,11 @@ pub(super) trait Work: Debug {
     /// The face's own next appointment.
     fn next_due(&self) -> Option<Instant>;
 
-    /// What it counted, by name.
-    fn counters(&self) -> Vec<(String, u64)>;
+    /// What it counted but what it refused.
+    fn counters(&self) -> Vec<CountByName>;
+
+    /// What it refused, by cause.
+    fn refusals(&self) -> Vec<RefusalCount>;
 
     /// How the foreign program stood to it, in words.
     fn peer_state(&self) -> String;

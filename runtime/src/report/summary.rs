@@ -22,7 +22,14 @@ use super::link_change::LinkChange;
 use super::network::NetworkReport;
 use super::radio::RadioReport;
 use super::score_event::ScoreEvents;
+use super::terminal::grouped;
 use crate::card_clock::figures::HardwareStamps;
+use crate::process::launch::Side;
+use crate::process::pipe::StallFigures;
+use crate::security::RunSecurity;
+use crate::supervisor::event::ProcessKind;
+
+pub use crate::process::pipe::{CountByName, CounterGroup};
 
 /// Version of the `summary.json` layout.
 pub const SCHEMA_VERSION: u32 = 1;
@@ -186,9 +193,9 @@ pub struct RunFacts {
     pub topology_hash: String,
     /// Seed of every random stream.
     pub seed: u64,
-    /// How the hops between hosts were protected, in words; `None` when there were none.
+    /// How the hops between hosts were protected; `None` when there were none.
     #[serde(default)]
-    pub security: Option<String>,
+    pub security: Option<RunSecurity>,
     /// The host that wrote this summary.
     pub host: String,
     /// Wall-clock time of the start, with its zone.
@@ -260,8 +267,10 @@ pub struct ProcessSummary {
     pub name: String,
     /// The host it ran on.
     pub host: String,
-    /// Its role in the case study, or `gateway`.
-    pub role: String,
+    /// What it was.
+    pub kind: ProcessKind,
+    /// The role of the case study that it played, or that a foreign program played through it.
+    pub role: Option<String>,
     /// How it ended, in words.
     pub exit: String,
     /// Starts after the first.
@@ -285,6 +294,13 @@ pub struct ProcessSummary {
     pub outbox_drop_count: Option<u64>,
     /// Records it could not write because the recorder was full.
     pub recorder_drop_count: Option<u64>,
+}
+
+impl ProcessSummary {
+    /// What a report calls it.
+    pub(crate) fn label(&self) -> String {
+        self.kind.label(self.role.as_deref())
+    }
 }
 
 /// Something that happened during the run.
@@ -327,9 +343,6 @@ impl LinkKind {
     }
 }
 
-/// How a report calls datagrams that came while a socket's receive buffer was full: their receiver was late.
-pub const NO_ROOM: &str = "no room in the receive buffer";
-
 impl LinkKind {
     /// The words for a fate of a message on it: what an emulated link lost, no wire did.
     pub const fn fate_label(self, fate: MessageFate) -> &'static str {
@@ -368,8 +381,12 @@ pub struct ChannelSummary {
     /// What was recorded of a channel that is only recorded; `None` when nothing was.
     #[serde(default)]
     pub recorded: Option<RecordedFigures>,
-    /// Datagrams the gateways refused, or the kernel for want of room, by reason; only reasons that occurred.
+    /// Datagrams the gateways refused, by cause; only causes that occurred.
     pub refusals: Vec<CountByName>,
+    /// Datagrams that came while a socket's receive buffer was full: their receiver was late. They may have
+    /// been anything, also messages.
+    #[serde(default)]
+    pub no_room_count: u64,
     /// The gateway threads that carried it; empty on a direct channel.
     pub directions: Vec<DirectionSummary>,
 }
@@ -384,28 +401,51 @@ pub struct RecordedFigures {
     pub missing_count: u64,
 }
 
+impl ChannelSummary {
+    /// What its gateways counted by this name, together.
+    pub fn count(&self, group: CounterGroup, name: &str) -> u64 {
+        let counts = self.directions.iter();
+        counts.filter_map(|one| one.count(group, name)).sum()
+    }
+
+    /// What became of datagrams that are no messages of it, in words, each cause with its count.
+    pub(crate) fn refusal_words(&self) -> Vec<String> {
+        let refused = self.refusals.iter();
+        let refused = refused.map(|one| format!("{} {}", one.name, grouped(one.count)));
+        let no_room = Some(self.no_room_count).filter(|count| *count > 0);
+        let no_room = no_room.map(|count| format!("{NO_ROOM} {}", grouped(count)));
+        refused.chain(no_room).collect()
+    }
+}
+
+/// What reports say of [`ChannelSummary::no_room_count`].
+pub(super) const NO_ROOM: &str = "no room in the receive buffer";
+
 /// One gateway thread of a channel.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DirectionSummary {
     /// The gateway process.
     pub process: String,
-    /// `egress` or `ingress`.
-    pub direction: String,
+    /// Which way it carried it.
+    pub direction: Side,
     /// The peer's state at the end, in words.
     pub peer_state: String,
     /// Everything it counted.
     pub counters: Vec<CountByName>,
     /// What was granted and found: buffers, stamp probe, path MTU.
     pub facts: Vec<Fact>,
+    /// How often its stream stood still; `None` where it is none, or receives.
+    #[serde(default)]
+    pub stalls: Option<StallFigures>,
 }
 
-/// A named count.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct CountByName {
-    /// What was counted.
-    pub name: String,
-    /// How often.
-    pub count: u64,
+impl DirectionSummary {
+    /// What it counted by this name; `None` where it counts no such thing.
+    pub fn count(&self, group: CounterGroup, name: &str) -> Option<u64> {
+        let mut counters = self.counters.iter();
+        let found = counters.find(|one| one.group == group && one.name == name);
+        found.map(|one| one.count)
+    }
 }
 
 /// One figure of the score.

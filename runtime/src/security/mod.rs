@@ -6,6 +6,7 @@ mod channel;
 pub mod cli;
 pub(crate) mod greeting;
 pub mod key_file;
+mod protection;
 mod run_seal;
 
 use std::fs::File;
@@ -14,6 +15,7 @@ use std::io::{self, Read};
 pub(crate) use channel::{SecureReader, SecureWriter};
 pub(crate) use greeting::TimedStream;
 pub use key_file::{KeyFileError, PreSharedKey};
+pub use protection::{HopProtection, RunSecurity};
 pub use run_seal::RunSeal;
 pub(crate) use run_seal::{has_fast_aes, suite_for};
 

@@ -3,7 +3,7 @@
 
 use std::time::Duration;
 
-use super::plan::{ProcessKind, ProcessPlan};
+use super::plan::{ProcessPlan, ProcessTask};
 use crate::process::launch::{DirectionLaunch, Side, SocketLaunch, Transport};
 use crate::realtime::RealtimeRequest;
 use crate::topology::{ClockPath, Host, OnExit, Timestamps, Topology, end_name};
@@ -47,7 +47,7 @@ pub(super) fn on<'a>(
         Some(ProcessPlan {
             name: process_name(&path, &host.name),
             host: host.name.clone(),
-            kind: ProcessKind::ClockPath {
+            task: ProcessTask::ClockPath {
                 directions: vec![direction(&path, host, side)],
                 ready_within: READY_WITHIN_MAX.min(start_timeout / 2),
             },
@@ -101,6 +101,7 @@ mod tests {
 
     use super::*;
     use crate::registry::Registry;
+    use crate::supervisor::event::ProcessKind;
     use crate::topology;
     use hil_models::shuttle::Shuttle;
 
@@ -115,8 +116,8 @@ mod tests {
 
     fn ends(topology: &Topology, host: &str) -> Vec<(String, DirectionLaunch, Duration)> {
         let host = topology.host(host).unwrap();
-        let plans = on(topology, host).map(|plan| match plan.kind {
-            ProcessKind::ClockPath {
+        let plans = on(topology, host).map(|plan| match plan.task {
+            ProcessTask::ClockPath {
                 mut directions,
                 ready_within,
             } => (plan.name, directions.remove(0), ready_within),
@@ -169,8 +170,13 @@ mod tests {
         ]);
         let host = topology.host("robot-pc").unwrap();
         let plan = super::super::plan::plan(&topology, &[host]);
-        let roles: Vec<String> = plan.processes.iter().map(ProcessPlan::role).collect();
-        assert_eq!(roles, ["clock path", "gateway", "robot"]);
+        let kinds: Vec<ProcessKind> = plan.processes.iter().map(ProcessPlan::kind).collect();
+        let expected = [
+            ProcessKind::ClockPath,
+            ProcessKind::Gateway,
+            ProcessKind::Component,
+        ];
+        assert_eq!(kinds, expected);
         let turns = plan.processes.iter().map(|process| {
             [
                 process.is_clock_path(),

@@ -15,7 +15,7 @@ use hil_models::time::{Instant, duration_ns};
 use super::child::{Child, Word, describe_exit, last_line};
 use super::event::{Event, Interruption};
 use super::launching::write_launch;
-use super::plan::{ProcessKind, ProcessPlan};
+use super::plan::{ProcessPlan, ProcessTask};
 use crate::clock::MonotonicClock;
 use crate::process::launch::{LaunchError, write};
 use crate::process::own_program;
@@ -138,11 +138,11 @@ impl Crew {
         let (name, instance) = (member.plan.name.clone(), member.restart_count);
         let log = self.folder.log(&name);
         let domain = self.places[&member.plan.host].clone();
-        let spawned = if let ProcessKind::Foreign {
+        let spawned = if let ProcessTask::Foreign {
             card,
             command,
             environment,
-        } = &member.plan.kind
+        } = &member.plan.task
         {
             let card_path = self.folder.card(&name);
             write(&card_path, card)?;
@@ -439,7 +439,7 @@ impl Crew {
 /// Names the process and the program that is not there.
 pub(crate) fn find_programs(plans: &[ProcessPlan]) -> Result<(), CrewError> {
     for plan in plans {
-        if let ProcessKind::Foreign { command, .. } = &plan.kind {
+        if let ProcessTask::Foreign { command, .. } = &plan.task {
             own_program::find(&command[0]).map_err(|source| CrewError::Spawn {
                 process: plan.name.clone(),
                 program: command[0].clone(),

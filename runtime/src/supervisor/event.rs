@@ -34,6 +34,45 @@ pub struct Interruption {
     pub until: Option<Instant>,
 }
 
+/// What a process of a run is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ProcessKind {
+    /// Plays a role of the case in this program.
+    Component,
+    /// Carries the messages of a link.
+    Gateway,
+    /// Exchanges clocks over a path of their own and carries no message.
+    ClockPath,
+    /// Lets a foreign program play a role over that program's own protocol.
+    Adapter,
+    /// A program of the user's.
+    OwnProgram,
+}
+
+impl ProcessKind {
+    /// True for what runs by a timer whose ticks this program counts. Without that count nobody can tell
+    /// the host's delays from the network's.
+    pub const fn counts_ticks(self) -> bool {
+        match self {
+            Self::Component => true,
+            Self::Gateway | Self::ClockPath | Self::Adapter | Self::OwnProgram => false,
+        }
+    }
+
+    /// What a report calls a process of this kind that plays `role`.
+    pub fn label(self, role: Option<&str>) -> String {
+        let role = role.unwrap_or_default();
+        match self {
+            Self::Component => role.to_owned(),
+            Self::Gateway => "gateway".to_owned(),
+            Self::ClockPath => "clock path".to_owned(),
+            Self::Adapter => format!("{role} by foreign program"),
+            Self::OwnProgram => "own program".to_owned(),
+        }
+    }
+}
+
 /// One process of the run, as its supervisor knows it at the end.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ProcessStory {
@@ -41,8 +80,10 @@ pub struct ProcessStory {
     pub name: String,
     /// The host it ran on.
     pub host: String,
-    /// The role it played.
-    pub role: String,
+    /// What it was.
+    pub kind: ProcessKind,
+    /// The role of the case that it played, or that a foreign program played through it.
+    pub role: Option<String>,
     /// How it ended, in words.
     pub end: String,
     /// How often it was started again.

@@ -8,7 +8,7 @@ use std::time::Duration;
 use hil_models::time::Instant;
 
 use super::crew::{Crew, Member};
-use super::plan::ProcessKind;
+use super::plan::ProcessTask;
 
 /// A process that gets a processor now and then speaks within this time.
 const SILENCE_MAX: Duration = Duration::from_secs(3);
@@ -58,7 +58,7 @@ impl Heartbeats {
 
 /// How long `member` has been silent; `None` of one that owes no sign of life.
 fn silence(member: &Member, now: Instant) -> Option<Duration> {
-    let is_foreign = matches!(member.plan.kind, ProcessKind::Foreign { .. });
+    let is_foreign = matches!(member.plan.task, ProcessTask::Foreign { .. });
     let owes = member.child.is_some() && member.is_ready && !is_foreign;
     owes.then(|| now.saturating_duration_since(member.heard))
 }

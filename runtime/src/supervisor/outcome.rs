@@ -19,7 +19,7 @@ use crate::clock_discipline::HostDiscipline;
 use crate::host_facts::HostFacts;
 use crate::process::launch::EmulationError;
 use crate::run_folder::RunFolder;
-use crate::security::KeyFileError;
+use crate::security::{KeyFileError, RunSecurity};
 
 /// What the command line asks of a run beyond the topology.
 #[derive(Debug, Clone, Default)]
@@ -151,8 +151,8 @@ pub struct RunResult {
     pub cards: Vec<CardStory>,
     /// True when all hosts read one clock.
     pub has_one_clock: bool,
-    /// How the hops between hosts are protected, in words; `None` when there are none.
-    pub security: Option<String>,
+    /// How the hops between hosts are protected; `None` when there are none.
+    pub security: Option<RunSecurity>,
     /// Who steers each host's system clock, of the hosts that told.
     pub disciplines: BTreeMap<String, HostDiscipline>,
     /// Hosts that ran here.

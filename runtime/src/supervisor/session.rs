@@ -28,6 +28,7 @@ use crate::live::status::Phase;
 use crate::manifest;
 use crate::process::emulation_room::check_emulation;
 use crate::run_folder::{RunFolder, utc_text};
+use crate::security::RunSecurity;
 use crate::signals::Signals;
 use crate::topology::{Host, Topology};
 use crate::watch::Announcement;
@@ -157,7 +158,7 @@ struct Session<'a> {
     /// Who steered the system clock before the run.
     discipline: Option<HostDiscipline>,
     /// How the hops are protected, in words.
-    security: Option<String>,
+    security: Option<RunSecurity>,
     cleaned: WallInstant,
     greeted: WallInstant,
     teller: Teller,
@@ -458,6 +459,7 @@ impl Session<'_> {
             .map(|member| ProcessStory {
                 name: member.plan.name.clone(),
                 host: member.plan.host.clone(),
+                kind: member.plan.kind(),
                 role: member.plan.role(),
                 end: member
                     .end

@@ -179,7 +179,7 @@ fn live_facts(summary: &RunSummary) -> Vec<FactGroup> {
         Fact::new("folder", &run.folder),
     ];
     let security = run.security.iter();
-    facts.extend(security.map(|text| Fact::new("hops between hosts", text)));
+    facts.extend(security.map(|one| Fact::new("hops between hosts", one.to_string())));
     let group = |title: &str, facts: Vec<Fact>| FactGroup {
         title: title.to_owned(),
         facts,
@@ -270,21 +270,21 @@ fn notes(one: &ChannelSummary) -> Vec<String> {
              p99, limit {limit}"
         ));
     }
-    let refusals = one
-        .refusals
-        .iter()
-        .map(|one| format!("{} {}", one.name, grouped(one.count)));
-    let refusals: Vec<_> = refusals.collect();
+    let refusals = one.refusal_words();
     if !refusals.is_empty() {
         notes.push(format!("datagrams refused: {}", refusals.join(", ")));
     }
     for direction in &one.directions {
         let facts = direction.facts.iter();
         let facts = facts.map(|fact| format!("{}: {}", fact.label, fact.value));
+        let stalls = direction.stalls.iter();
+        let stalls = stalls.map(|stalls| format!("stalls: {}", terminal::stall_words(stalls)));
         let words: Vec<String> = core::iter::once(format!("peer {}", direction.peer_state))
             .chain(facts)
+            .chain(stalls)
             .collect();
-        notes.push(format!("{}: {}", direction.direction, words.join(", ")));
+        let way = direction.direction.word();
+        notes.push(format!("{way}: {}", words.join(", ")));
     }
     notes
 }
@@ -316,16 +316,21 @@ fn processes(summary: &RunSummary) -> Option<Table> {
     let mut table = Table::new("Processes", &columns);
     for one in &summary.processes {
         let ticks = |count_of: Option<u64>| {
-            if one.role == "gateway" {
-                "–".to_owned()
-            } else {
+            if one.kind.counts_ticks() {
                 count(count_of)
+            } else {
+                "–".to_owned()
             }
         };
         let cpu = one
             .cpu_time_s
             .map_or_else(|| UNAVAILABLE.to_owned(), terminal::duration_s);
-        let words = [&one.name, &one.host, &one.role, &one.exit].map(Clone::clone);
+        let words = [
+            one.name.clone(),
+            one.host.clone(),
+            one.label(),
+            one.exit.clone(),
+        ];
         let figures = [
             grouped(one.restart_count),
             ticks(one.tick_count),

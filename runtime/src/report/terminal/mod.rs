@@ -19,7 +19,7 @@ mod units;
 pub(crate) use crate::words::counted;
 pub use canvas::Style;
 pub(crate) use canvas::{Tone, shortened, wrapped};
-pub(crate) use channel::closing_text;
+pub(crate) use channel::{closing_text, stall_words};
 pub(crate) use trace::{render_fit, render_trace, render_trace_plots};
 pub(crate) use units::{JOINT, duration, duration_s, figure, grouped, percent, seconds};
 
@@ -32,6 +32,7 @@ use super::link_change::LinkChange;
 use super::network::NetworkReport;
 use super::score_event::ScoreEvents;
 use super::summary::{Outcome, RunSummary, ScoreMetric};
+use crate::security::HopProtection;
 
 /// The report of a run as text of at most `width_columns` columns (clamped to 80..=120).
 pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> String {
@@ -149,10 +150,12 @@ fn verdict(canvas: &mut Canvas, summary: &RunSummary, assessment: &Assessment) {
     );
     let (tone, text) = network_words(&assessment.network);
     canvas.field("Network", tone, &text);
-    if let Some(text) = &summary.run.security {
-        let is_plain = text.starts_with("PLAIN");
-        let tone = if is_plain { Tone::Caution } else { Tone::Good };
-        canvas.field("Security", tone, text);
+    if let Some(security) = &summary.run.security {
+        let tone = match security.hops {
+            HopProtection::Plain => Tone::Caution,
+            HopProtection::Sealed { .. } => Tone::Good,
+        };
+        canvas.field("Security", tone, &security.to_string());
     }
     for (index, warning) in assessment.warnings.iter().enumerate() {
         let label = if index == 0 { "Warnings" } else { "" };

@@ -111,7 +111,10 @@ pub(super) fn processes(canvas: &mut Canvas, processes: &[ProcessSummary]) {
             "{:INDENT$}{}{}{}{}{}{}{}",
             "",
             column(&process.name, name_width),
-            left(&format!("{} on {}", process.role, process.host), name_width),
+            left(
+                &format!("{} on {}", process.label(), process.host),
+                name_width
+            ),
             canvas.paint(caution(process.restart_count > 0), &restarts),
             right(&count(process.tick_count), 9),
             canvas.paint(

@@ -13,7 +13,7 @@ use hil_runtime::record::RecordKind;
 use hil_runtime::record::file::RecordHeader;
 use hil_runtime::report::summary::{Fact, Outcome, RunFacts, RunSummary};
 use hil_runtime::supervisor::elsewhere::HostTicks;
-use hil_runtime::supervisor::event::{Event, HostStory, Interruption, ProcessStory};
+use hil_runtime::supervisor::event::{Event, HostStory, Interruption, ProcessKind, ProcessStory};
 use hil_runtime::supervisor::frame::{
     EndMeaning, PeerHello, PeerMessage, write_chunk, write_message,
 };
@@ -106,7 +106,8 @@ pub(crate) fn peer_frames() -> Vec<Seed> {
         processes: vec![ProcessStory {
             name: "robot".to_owned(),
             host: "robot-pc".to_owned(),
-            role: "robot".to_owned(),
+            kind: ProcessKind::Component,
+            role: Some("robot".to_owned()),
             end: "ended".to_owned(),
             restart_count: 1,
             report: None,
