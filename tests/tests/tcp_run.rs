@@ -225,7 +225,7 @@ fn a_killed_gateway_comes_back_and_what_was_under_way_is_counted_as_lost() {
             summary
                 .events
                 .iter()
-                .any(|event| event.what.contains(words))
+                .any(|event| event.what().contains(words))
         };
         assert!(told("and is back (reconnect 1)"), "{:?}", summary.events);
     }

@@ -11,8 +11,8 @@ use super::records::RunRecords;
 use crate::realtime::GrantOutcome;
 use crate::report::emulation::EmulationFigures;
 use crate::report::summary::{
-    ChannelSummary, CounterGroup, DirectionSummary, Fact, LinkKind, Outcome, ProcessSummary,
-    RealtimeFacts, RunEvent, RunFacts,
+    Absence, ChannelSummary, CounterGroup, DirectionSummary, Fact, LinkKind, Outcome,
+    ProcessSummary, RealtimeFacts, RunEvent, RunEventKind, RunFacts,
 };
 use crate::supervisor::event::{Event, ProcessStory};
 use crate::supervisor::{self, RunResult};
@@ -153,14 +153,14 @@ pub(super) fn process_summary(process: &ProcessStory) -> ProcessSummary {
 }
 
 pub(super) fn run_event(axis: &RunAxis<'_>, event: &Event) -> RunEvent {
-    let gap = event.interruption.map(|gap| match gap.until {
-        Some(until) => format!("away for {:.0} ms", until.seconds_since(gap.from) * 1e3),
-        None => "never came back".to_owned(),
+    let absence = event.interruption.map(|gap| Absence {
+        length_s: gap.until.map(|until| until.seconds_since(gap.from)),
     });
     RunEvent {
         at_s: axis.shown_s(&event.host, event.at),
-        what: format!("{}: {}", event.process, event.what),
-        cause: gap.unwrap_or_default(),
+        process: event.process.clone(),
+        kind: RunEventKind::Process(event.kind.clone()),
+        absence,
     }
 }
 

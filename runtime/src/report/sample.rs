@@ -16,12 +16,13 @@ use super::sample_events::{few_events, many_events, recorded_channel};
 use super::sample_network::network;
 use super::sample_records::Files;
 use super::summary::{
-    ChannelSummary, CountByName, CounterGroup, DirectionSummary, Fact, LinkKind, Outcome,
-    ProcessSummary, RealtimeFacts, RunEvent, RunFacts, RunSummary, ScoreMetric, SummaryError,
+    Absence, ChannelSummary, CountByName, CounterGroup, DirectionSummary, Fact, LinkKind, Outcome,
+    ProcessSummary, RadioChange, RealtimeFacts, RunEvent, RunEventKind, RunFacts, RunSummary,
+    ScoreMetric, SummaryError,
 };
 use super::terminal::{Style, render};
 use crate::process::launch::Side;
-use crate::supervisor::event::ProcessKind;
+use crate::supervisor::event::{EventKind, ProcessKind};
 use crate::topology::FaceKind;
 
 fn run_facts() -> RunFacts {
@@ -156,8 +157,15 @@ pub(super) fn full() -> RunSummary {
         ],
         events: vec![RunEvent {
             at_s: Some(8.0),
-            what: "robot gateway ended and was restarted after 0.757 s".to_owned(),
-            cause: "killed by signal 9".to_owned(),
+            process: "robot gateway".to_owned(),
+            kind: RunEventKind::Process(EventKind::Restarted {
+                end: "was killed by SIGKILL".to_owned(),
+                restart: 1,
+                limit: 3,
+            }),
+            absence: Some(Absence {
+                length_s: Some(0.757),
+            }),
         }],
         channels: channels(),
         score: vec![
@@ -204,7 +212,7 @@ pub(super) fn awkward() -> RunSummary {
     summary.channels[0].from.clone_from(&long);
     summary.score[0].label.clone_from(&long);
     summary.score[0].value = Some(-123_456_789.123);
-    summary.events[0].what.clone_from(&long);
+    summary.events[0].process.clone_from(&long);
     summary.score_events = many_events(&long);
     summary.network = Some(network([&long, "arm/status"], &mut summary.score_events));
     summary
@@ -370,6 +378,33 @@ fn a_host_that_overran_is_not_a_network_result() {
     );
     summary.channels.truncate(0);
     assert_eq!(Assessment::of(&summary).network, NetworkVerdict::NoNetwork);
+}
+
+#[test]
+fn an_event_keeps_its_kind_and_numbers_in_json() {
+    let radio = RunEvent {
+        at_s: None,
+        process: "robot gateway".to_owned(),
+        kind: RunEventKind::Radio {
+            interface: "wlan0".to_owned(),
+            change: RadioChange::StationLeft,
+            station: Some("02:00:00:00:00:01".to_owned()),
+            code: Some(3),
+        },
+        absence: None,
+    };
+    for (event, kind) in [
+        (&full().events[0], ["process", "restarted"]),
+        (&radio, ["radio", "station_left"]),
+    ] {
+        let json = serde_json::to_value(event).unwrap();
+        let found = json.get("kind").or(json.get("change")).unwrap();
+        assert_eq!([&json["source"], found], kind);
+        assert_eq!(&serde_json::from_value::<RunEvent>(json).unwrap(), event);
+    }
+    let what = "robot gateway: wlan0 station left (02:00:00:00:00:01)";
+    assert_eq!(radio.what(), what);
+    assert_eq!(radio.cause().unwrap(), "802.11 code 3");
 }
 
 #[test]

@@ -27,7 +27,7 @@ use crate::card_clock::figures::HardwareStamps;
 use crate::process::launch::Side;
 use crate::process::pipe::StallFigures;
 use crate::security::RunSecurity;
-use crate::supervisor::event::ProcessKind;
+use crate::supervisor::event::{EventKind, ProcessKind};
 
 pub use crate::process::pipe::{CountByName, CounterGroup};
 
@@ -308,10 +308,101 @@ impl ProcessSummary {
 pub struct RunEvent {
     /// When, seconds after the start; `None` when the run's start on its host is unknown.
     pub at_s: Option<f64>,
-    /// What, in words.
-    pub what: String,
-    /// Why, in words; empty when unknown.
-    pub cause: String,
+    /// The process concerned.
+    pub process: String,
+    /// What happened.
+    #[serde(flatten)]
+    pub kind: RunEventKind,
+    /// Set when the process carried no messages for a while.
+    pub absence: Option<Absence>,
+}
+
+/// How long a process carried no messages.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Absence {
+    /// Seconds; `None` when it never came back.
+    pub length_s: Option<f64>,
+}
+
+/// What happened during a run.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(tag = "source", rename_all = "snake_case")]
+pub enum RunEventKind {
+    /// Its supervisor saw it in a process.
+    Process(EventKind),
+    /// A gateway's radio reported it.
+    Radio {
+        /// The network interface.
+        interface: String,
+        /// What the radio did.
+        change: RadioChange,
+        /// The station concerned, as its address; `None` where the kernel named none.
+        station: Option<String>,
+        /// Status or reason code of IEEE 802.11; `None` where the kernel gave none.
+        code: Option<u16>,
+    },
+}
+
+/// What a radio did.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RadioChange {
+    /// It associated.
+    Associated,
+    /// It went to another access point.
+    Roamed,
+    /// It lost its association.
+    Disconnected,
+    /// A station left it.
+    StationLeft,
+    /// The quality of its connection changed.
+    QualityChanged,
+}
+
+impl RadioChange {
+    const fn label(self) -> &'static str {
+        match self {
+            Self::Associated => "associated",
+            Self::Roamed => "roamed",
+            Self::Disconnected => "disconnected",
+            Self::StationLeft => "station left",
+            Self::QualityChanged => "connection quality changed",
+        }
+    }
+}
+
+impl RunEvent {
+    /// What happened, for a reader.
+    pub fn what(&self) -> String {
+        let process = &self.process;
+        match &self.kind {
+            RunEventKind::Process(kind) => format!("{process}: {kind}"),
+            RunEventKind::Radio {
+                interface,
+                change,
+                station,
+                ..
+            } => {
+                let station = station.iter();
+                let station: String = station.map(|one| format!(" ({one})")).collect();
+                format!("{process}: {interface} {}{station}", change.label())
+            }
+        }
+    }
+
+    /// Why, or for how long, for a reader; `None` when nothing is known.
+    pub fn cause(&self) -> Option<String> {
+        if let Some(absence) = self.absence {
+            return Some(absence.length_s.map_or_else(
+                || "never came back".to_owned(),
+                |length_s| format!("away for {:.0} ms", length_s * 1e3),
+            ));
+        }
+        match self.kind {
+            RunEventKind::Radio { code, .. } => Some(format!("802.11 code {}", code?)),
+            RunEventKind::Process(_) => None,
+        }
+    }
 }
 
 /// How a channel is carried.

@@ -276,7 +276,7 @@ impl Session<'_> {
         let verdict = self.crew.watch();
         for event in &self.crew.events()[known..] {
             self.console
-                .warn(&format!("{}: {}", event.process, event.what));
+                .warn(&format!("{}: {}", event.process, event.kind));
         }
         match verdict {
             Verdict::GoesOn => None,

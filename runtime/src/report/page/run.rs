@@ -2,7 +2,7 @@
 //! nothing is measured here.
 
 use super::channel::{self, Sources};
-use super::data::{Channel, FactGroup, Figure, Run, Table, Verdict};
+use super::data::{Channel, FactGroup, Figure, Run, RunKind, Table, Verdict};
 use super::drawings;
 use super::events::{correlation, network_events, score_events};
 use super::material::{Found, Material};
@@ -57,7 +57,7 @@ pub(super) fn of(material: &Material, index: usize, steps: usize) -> Run {
         ));
         run.network_events = network_events(report);
         run.correlation = correlation(report);
-    } else if run.kind != "unfinished" {
+    } else if run.kind != RunKind::Unfinished {
         run.missing.push(
             "Network over time: no channel crossed a network, so there is nothing to draw."
                 .to_owned(),
@@ -65,7 +65,7 @@ pub(super) fn of(material: &Material, index: usize, steps: usize) -> Run {
     }
     run.score_events = score_events(events);
     let (drawing, left_out) = timeline::of_case(&key, &material.series, steps);
-    if drawing.is_none() && run.kind != "unfinished" {
+    if drawing.is_none() && run.kind != RunKind::Unfinished {
         run.missing
             .push("The robot over time: the case left no series, or they are empty.".to_owned());
     }
@@ -89,7 +89,7 @@ fn live(key: &str, summary: &RunSummary) -> Run {
         key: key.to_owned(),
         name: facts.name.clone(),
         case: facts.case.clone(),
-        kind: "live",
+        kind: RunKind::Live,
         outcome: Verdict {
             tone: tone.word(),
             word: word.to_owned(),
@@ -97,7 +97,7 @@ fn live(key: &str, summary: &RunSummary) -> Run {
         },
         network_verdict: Verdict {
             tone: network_tone.word(),
-            word: String::new(),
+            word: terminal::network_word(&assessment.network).to_owned(),
             text: network_text,
         },
         warnings: assessment.warnings,
@@ -374,6 +374,13 @@ fn has_a_hundredth(channel: &Channel) -> bool {
     delivered.and_then(|one| one.value).unwrap_or(0.0) >= 100.0
 }
 
+/// Figures of which the channel with the largest is shown first, and what they are called.
+pub(super) const WORST: [(&str, &str); 3] = [
+    ("loss_ratio", "largest loss"),
+    ("p99", "largest p99"),
+    ("network_p99", "network's largest p99"),
+];
+
 /// The figures to see first: what the case is about, the worst of the network, and how often the
 /// robot came to harm.
 fn headline(run: &Run) -> Vec<Figure> {
@@ -387,11 +394,7 @@ fn headline(run: &Run) -> Vec<Figure> {
         .cloned()
         .into_iter()
         .collect();
-    for (name, words) in [
-        ("loss_ratio", "largest loss"),
-        ("p99", "largest p99"),
-        ("network_p99", "network's largest p99"),
-    ] {
+    for (name, words) in WORST {
         let is_quantile = name != "loss_ratio";
         let channels = run.channels.iter();
         let told = channels.filter(|one| !is_quantile || has_a_hundredth(one));

@@ -1,7 +1,7 @@
 //! Runs that were not live: in virtual time, or begun and never finished.
 
 use super::channel::{self, Sources};
-use super::data::{Channel, FactGroup, Run, Verdict};
+use super::data::{Channel, FactGroup, Run, RunKind, Verdict};
 use super::drawings;
 use super::material::{Manifest, VirtualCounts, VirtualReport};
 use super::paper;
@@ -16,7 +16,7 @@ pub(super) fn virtual_time(key: &str, report: &VirtualReport, folder: &str) -> R
         key: key.to_owned(),
         name: report.name.clone(),
         case: UNAVAILABLE.to_owned(),
-        kind: "virtual",
+        kind: RunKind::Virtual,
         outcome: Verdict {
             tone: "good",
             word: "simulated".to_owned(),
@@ -24,7 +24,7 @@ pub(super) fn virtual_time(key: &str, report: &VirtualReport, folder: &str) -> R
         },
         network_verdict: Verdict {
             tone: "plain",
-            word: String::new(),
+            word: "virtual time".to_owned(),
             text: "virtual time: a result about the link models, not about a network".to_owned(),
         },
         facts: vec![FactGroup {
@@ -119,7 +119,7 @@ pub(super) fn unfinished(key: &str, manifest: &Manifest, folder: &str) -> Run {
         key: key.to_owned(),
         name: manifest.name.clone(),
         case: manifest.case.clone(),
-        kind: "unfinished",
+        kind: RunKind::Unfinished,
         outcome: Verdict {
             tone: "bad",
             word: "unfinished".to_owned(),
@@ -127,7 +127,7 @@ pub(super) fn unfinished(key: &str, manifest: &Manifest, folder: &str) -> Run {
         },
         network_verdict: Verdict {
             tone: "caution",
-            word: String::new(),
+            word: "no verdict".to_owned(),
             text: "no verdict: there are no figures".to_owned(),
         },
         missing: vec![

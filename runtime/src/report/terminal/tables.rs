@@ -147,10 +147,10 @@ pub(super) fn events(canvas: &mut Canvas, events: &[RunEvent]) {
     }
     canvas.heading("Events", "");
     for event in events {
-        let text = if event.cause.is_empty() {
-            event.what.clone()
-        } else {
-            format!("{} ({})", event.what, event.cause)
+        let what = event.what();
+        let text = match event.cause() {
+            Some(cause) => format!("{what} ({cause})"),
+            None => what,
         };
         let at = event
             .at_s

@@ -13,7 +13,9 @@ use hil_runtime::record::RecordKind;
 use hil_runtime::record::file::RecordHeader;
 use hil_runtime::report::summary::{Fact, Outcome, RunFacts, RunSummary};
 use hil_runtime::supervisor::elsewhere::HostTicks;
-use hil_runtime::supervisor::event::{Event, HostStory, Interruption, ProcessKind, ProcessStory};
+use hil_runtime::supervisor::event::{
+    Event, EventKind, HostStory, Interruption, ProcessKind, ProcessStory,
+};
 use hil_runtime::supervisor::frame::{
     EndMeaning, PeerHello, PeerMessage, write_chunk, write_message,
 };
@@ -96,7 +98,9 @@ pub(crate) fn peer_frames() -> Vec<Seed> {
             at: at(7),
             host: "robot-pc".to_owned(),
             process: "robot".to_owned(),
-            what: "was killed by SIGKILL".to_owned(),
+            kind: EventKind::EndedRun {
+                end: "was killed by SIGKILL".to_owned(),
+            },
             interruption: Some(Interruption {
                 from: at(6),
                 until: None,
