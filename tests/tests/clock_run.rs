@@ -122,7 +122,7 @@ fn check_bounds(summary: &RunSummary) {
         let rows = network.timeline.rows.iter();
         let mut rows = rows.filter(|row| {
             let quantity = NetworkQuantity::Delay;
-            let channel = name.to_string();
+            let channel = name.clone();
             row.subject == TimelineSubject::Channel { channel, quantity }
         });
         assert!(rows.next().unwrap().bound.unwrap() > 0.0, "{name}");

@@ -21,6 +21,7 @@ use super::summary::{
     ScoreMetric, SummaryError,
 };
 use super::terminal::{Style, render};
+use crate::host_facts::{self, HostFact, HostFacts};
 use crate::process::launch::Side;
 use crate::supervisor::event::{EventKind, ProcessKind};
 use crate::topology::FaceKind;
@@ -142,10 +143,17 @@ pub(super) fn full() -> RunSummary {
     let mut score_events = few_events();
     let network = network(["arm/command", "arm/status"], &mut score_events);
     RunSummary {
-        host_facts: vec![
-            Fact::new("processor", "2 × a virtual core"),
-            Fact::new("kernel", "6.18, PREEMPT_DYNAMIC"),
-        ],
+        host_facts: HostFacts {
+            facts: [
+                ("processor", "2 × a virtual core"),
+                ("kernel", "6.18, PREEMPT_DYNAMIC"),
+            ]
+            .map(|(label, value)| HostFact {
+                label: label.to_owned(),
+                value: host_facts::Fact::Available(value.to_owned()),
+            })
+            .to_vec(),
+        },
         realtime: RealtimeFacts {
             granted: vec![Fact::new("controller", "SCHED_FIFO 50 on core 0")],
             refused: vec![Fact::new("robot gateway", "spin: core 1 is not isolated")],

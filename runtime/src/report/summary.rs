@@ -24,6 +24,7 @@ use super::radio::RadioReport;
 use super::score_event::ScoreEvents;
 use super::terminal::grouped;
 use crate::card_clock::figures::HardwareStamps;
+use crate::host_facts::HostFacts;
 use crate::process::launch::Side;
 use crate::process::pipe::StallFigures;
 use crate::security::RunSecurity;
@@ -41,8 +42,8 @@ pub struct RunSummary {
     pub schema_version: u32,
     /// What was run, when, and how it ended.
     pub run: RunFacts,
-    /// What the host is, as label and value.
-    pub host_facts: Vec<Fact>,
+    /// What the host is.
+    pub host_facts: HostFacts,
     /// What real-time settings the kernel granted and refused.
     pub realtime: RealtimeFacts,
     /// How the hosts' clocks relate, and what that rests on.
@@ -85,7 +86,7 @@ impl RunSummary {
         Self {
             schema_version: SCHEMA_VERSION,
             run,
-            host_facts: Vec::new(),
+            host_facts: HostFacts::default(),
             realtime: RealtimeFacts::default(),
             clocks: None,
             processes: Vec::new(),
@@ -251,6 +252,13 @@ impl Fact {
     }
 }
 
+/// The facts of a host, for a reader.
+pub(crate) fn host_words(host: &HostFacts) -> Vec<Fact> {
+    let facts = host.facts.iter();
+    let words = facts.map(|one| Fact::new(one.label.replace('_', " "), one.value.to_text()));
+    words.collect()
+}
+
 /// What real-time settings the kernel granted and refused.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RealtimeFacts {
@@ -383,9 +391,11 @@ impl RunEvent {
                 station,
                 ..
             } => {
-                let station = station.iter();
-                let station: String = station.map(|one| format!(" ({one})")).collect();
-                format!("{process}: {interface} {}{station}", change.label())
+                let what = format!("{process}: {interface} {}", change.label());
+                match station {
+                    Some(station) => format!("{what} ({station})"),
+                    None => what,
+                }
             }
         }
     }

@@ -28,6 +28,7 @@ mod layers;
 mod limits;
 mod model;
 mod model_links;
+mod parameter_reader;
 mod reader;
 mod resolved;
 mod resolved_impairments;

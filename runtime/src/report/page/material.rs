@@ -7,9 +7,10 @@ use hil_models::measure::histogram::LatencySummary;
 use serde::Deserialize;
 
 use super::series::Series;
+use crate::host_facts::HostFacts;
 use crate::report::network::NetworkReport;
 use crate::report::score_event::ScoreEvents;
-use crate::report::summary::{Fact, RunSummary, ScoreMetric};
+use crate::report::summary::{RunSummary, ScoreMetric};
 
 /// One folder.
 #[derive(Debug, Clone)]
@@ -86,7 +87,7 @@ pub(crate) struct Manifest {
     pub(crate) created: String,
     pub(crate) seed: Option<u64>,
     pub(crate) command_line: Vec<String>,
-    pub(crate) host_facts: Vec<Fact>,
+    pub(crate) host_facts: HostFacts,
     /// Files of records that there are, and what they hold in all, bytes.
     pub(crate) records: (u64, u64),
 }

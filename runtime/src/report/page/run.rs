@@ -13,7 +13,7 @@ use super::words::{UNAVAILABLE, count};
 use crate::report::assessment::Assessment;
 use crate::report::clock_summary::ClockSection;
 use crate::report::score_event::ScoreEvents;
-use crate::report::summary::{ChannelSummary, Fact, LinkKind, RunSummary, ScoreMetric};
+use crate::report::summary::{ChannelSummary, Fact, LinkKind, RunSummary, ScoreMetric, host_words};
 use crate::report::terminal::{self, duration, grouped, seconds};
 use crate::words::counted;
 
@@ -208,7 +208,7 @@ fn live_facts(summary: &RunSummary) -> Vec<FactGroup> {
         ),
         group(
             "Host that wrote this",
-            or_none(&summary.host_facts, UNAVAILABLE),
+            or_none(&host_words(&summary.host_facts), UNAVAILABLE),
         ),
     ];
     groups.into_iter().chain(by_hand).collect()

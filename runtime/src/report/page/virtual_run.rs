@@ -7,7 +7,7 @@ use super::material::{Manifest, VirtualCounts, VirtualReport};
 use super::paper;
 use super::run::{METHOD, score};
 use super::words::UNAVAILABLE;
-use crate::report::summary::Fact;
+use crate::report::summary::{Fact, host_words};
 use crate::report::terminal::{duration, grouped, percent, seconds};
 
 /// A run of `simulate`.
@@ -150,7 +150,7 @@ pub(super) fn unfinished(key: &str, manifest: &Manifest, folder: &str) -> Run {
             },
             FactGroup {
                 title: "Host".to_owned(),
-                facts: manifest.host_facts.clone(),
+                facts: host_words(&manifest.host_facts),
             },
         ],
         repeat_command: Some(manifest.command_line.join(" ")).filter(|line| !line.is_empty()),

@@ -2,8 +2,9 @@
 
 use super::canvas::{Canvas, INDENT, Tone, columns, left, right};
 use super::units::{duration_s, figure, grouped, seconds};
+use crate::host_facts::HostFacts;
 use crate::report::alike::joined_labels;
-use crate::report::summary::{Fact, ProcessSummary, RealtimeFacts, RunEvent, ScoreMetric};
+use crate::report::summary::{ProcessSummary, RealtimeFacts, RunEvent, ScoreMetric, host_words};
 
 /// Shorter preparations concern nobody.
 const PREPARATION_S_MIN: f64 = 0.01;
@@ -174,12 +175,12 @@ pub(super) fn realtime(canvas: &mut Canvas, realtime: &RealtimeFacts) {
     }
 }
 
-pub(super) fn host(canvas: &mut Canvas, facts: &[Fact]) {
-    if facts.is_empty() {
+pub(super) fn host(canvas: &mut Canvas, facts: &HostFacts) {
+    if facts.facts.is_empty() {
         return;
     }
     canvas.heading("Host", "");
-    for fact in facts {
+    for fact in host_words(facts) {
         canvas.field_of(22, &fact.label, Tone::Plain, &fact.value);
     }
 }
