@@ -11,7 +11,7 @@ use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use bytemuck::{Zeroable, bytes_of};
-use hil_models::egm::messages::{EgmCommand, EgmFeedback, SessionState};
+use hil_models::egm::messages::{EgmCommand, EgmFeedback, SessionState, Side as ArmSide};
 use hil_models::endpoint::InputPort;
 use hil_models::message::MessageType;
 use hil_models::time::Instant;
@@ -371,7 +371,7 @@ fn launch(
             dscp: 0,
             interface: None,
             arms: vec![ArmLaunch {
-                arm: "right".to_owned(),
+                arm: ArmSide::Right,
                 address: listens_at,
                 input,
                 output,

@@ -5,7 +5,7 @@
 use std::time::Duration;
 
 use hil_models::record::TakenRecord;
-use hil_runtime::report::summary::{DirectionSummary, Outcome, RunSummary};
+use hil_runtime::report::summary::{CounterGroup, DirectionSummary, Outcome, RunSummary};
 
 use crate::account::{account, assert_every_message_is_accounted_for, channel, describe};
 use crate::child::ChildGuard;
@@ -106,20 +106,20 @@ impl<'a> Split<'a> {
 /// When the summary has none.
 pub fn direction<'a>(summary: &'a RunSummary, name: &str, which: &str) -> &'a DirectionSummary {
     let mut all = channel(summary, name).directions.iter();
-    let found = all.find(|one| one.direction.contains(which));
+    let found = all.find(|one| one.direction.word() == which);
     found.unwrap_or_else(|| panic!("{name} has no {which}"))
 }
 
 /// The counter `name` of a direction; 0 when there is none.
 pub fn count(direction: &DirectionSummary, name: &str) -> u64 {
-    let counters = direction.counters.iter().filter(|one| one.name == name);
+    let counters = direction.counters.iter().filter(|one| one.label() == name);
     counters.map(|one| one.count).sum()
 }
 
 /// Datagrams that a direction refused, whatever the cause.
 pub fn refused(direction: &DirectionSummary) -> u64 {
     let counters = direction.counters.iter();
-    let refused = counters.filter(|one| one.name.starts_with("refused: "));
+    let refused = counters.filter(|one| one.group == CounterGroup::Refused);
     refused.map(|one| one.count).sum()
 }
 

@@ -256,8 +256,8 @@ impl GatewaySide {
     /// The receiving direction's counter; `None` when it counts no such thing.
     fn counter(&self, name: &str) -> Option<u64> {
         let counters = self.ingress.1.report(&self.ingress.0).counters;
-        let found = counters.into_iter().find(|(known, _)| known == name);
-        found.map(|(_, count)| count)
+        let found = counters.into_iter().find(|known| known.label() == name);
+        found.map(|known| known.count)
     }
 }
 

@@ -10,13 +10,15 @@ pub use motion::{
 };
 
 use bytemuck::{Pod, Zeroable};
+use serde::{Deserialize, Serialize};
 
 use crate::layout::Field;
 use crate::message::Message;
 use crate::yumi::{Joints, Pose};
 
 /// One of the robot's two arms, each a motion task of its own.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Side {
     /// The robot's right arm.
     Right,

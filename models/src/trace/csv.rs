@@ -58,6 +58,10 @@ pub fn encode(trace: &Trace) -> String {
         ("clock", Some(one_line(&header.clock))),
         ("direction", Some(header.direction.word().to_owned())),
         ("arrival", Some(header.arrival.word().to_owned())),
+        (
+            "link_change_count",
+            (header.link_change_count > 0).then(|| header.link_change_count.to_string()),
+        ),
         ("origin_ns", instant(header.origin_ns)),
         ("duration_ns", instant(header.duration_ns)),
         ("record_count", Some(trace.records.len().to_string())),
@@ -185,6 +189,7 @@ fn read_remark(
             let words = TraceArrival::ALL.map(TraceArrival::word);
             header.arrival = TraceArrival::ALL[word(key, value, &words)?];
         }
+        "link_change_count" => header.link_change_count = number(key, value)?,
         "origin_ns" => header.origin_ns = number(key, value)?,
         "duration_ns" => header.duration_ns = number(key, value)?,
         "record_count" => *promised = Some(number(key, value)?),

@@ -231,6 +231,9 @@ pub struct TraceHeader {
     pub direction: TraceDirection,
     /// Where delays end.
     pub arrival: TraceArrival,
+    /// How often the link was changed while the run went on: above 0, its model alone does not explain the
+    /// trace.
+    pub link_change_count: u16,
     /// The run's start on the sender's monotonic clock; [`UNAVAILABLE_NS`] when it has none.
     pub origin_ns: i64,
     /// Length of the run; [`UNAVAILABLE_NS`] when it is not known.
@@ -256,6 +259,7 @@ impl TraceHeader {
             clock: String::new(),
             direction: TraceDirection::Unknown,
             arrival: TraceArrival::Unknown,
+            link_change_count: 0,
             origin_ns: UNAVAILABLE_NS,
             duration_ns: UNAVAILABLE_NS,
         }

@@ -107,6 +107,7 @@ fn encode_header(header: &TraceHeader, count: u64) -> Result<[u8; HEADER_BYTES],
     put(&mut bytes, 16, &to_u32(RECORD_BYTES).to_le_bytes());
     bytes[20] = header.direction as u8;
     bytes[21] = header.arrival as u8;
+    put(&mut bytes, 22, &header.link_change_count.to_le_bytes());
     put(&mut bytes, 24, &count.to_le_bytes());
     put(&mut bytes, 32, &header.origin_ns.to_le_bytes());
     put(&mut bytes, 40, &header.duration_ns.to_le_bytes());
@@ -372,6 +373,7 @@ fn decode_header(bytes: &[u8]) -> Result<(TraceHeader, u64), (u64, FaultKind)> {
         clock: text_at(bytes, "clock", CLOCK_AT, TraceHeader::CLOCK_BYTES)?,
         direction: code(&TraceDirection::ALL, bytes, 20, "direction")?,
         arrival: code(&TraceArrival::ALL, bytes, 21, "arrival")?,
+        link_change_count: u16::from_le_bytes(array_at(bytes, 22)),
         origin_ns: i64::from_le_bytes(array_at(bytes, 32)),
         duration_ns: i64::from_le_bytes(array_at(bytes, 40)),
     };

@@ -20,7 +20,8 @@ use serde::Serialize;
 use super::analyse::{Reading, quantiles};
 use super::point_clocks::WireClocks;
 use crate::platform::progress::Stage;
-use crate::report::summary::{RunSummary, SummaryError};
+use crate::report::summary::{CounterGroup, RunSummary, SummaryError};
+use crate::rundir::launch::Side;
 use crate::rundir::record::{RecordFile, RecordFileError, RecordKind};
 use crate::rundir::run_folder::RunFolder;
 
@@ -280,20 +281,21 @@ fn summary(folder: &RunFolder) -> Result<Option<RunSummary>, CompareError> {
 /// Datagrams sent and received by the sockets of a channel, by the run's summary. Farewells received
 /// are left out: whether one is depends on which gateway ends first.
 fn socket_counts(summary: &RunSummary, channel: &str) -> (Option<u64>, Option<u64>) {
-    let of = |direction: &str, counter: &str| {
+    let of = |side: Side, group: CounterGroup, name: &str| {
         let channel = summary.channels.iter().find(|one| one.name == channel)?;
         let ways = channel.directions.iter();
-        let counters = ways
-            .filter(|one| one.direction == direction)
-            .flat_map(|one| &one.counters);
-        let named = counters
-            .filter(|one| one.name == counter)
-            .map(|one| one.count);
-        named.reduce(|a, b| a + b)
+        let counts = ways
+            .filter(|one| one.direction == side)
+            .filter_map(|one| one.count(group, name));
+        counts.reduce(|a, b| a + b)
     };
-    let received = of("ingress", "socket: received_count").zip(of("ingress", "bye_count"));
+    let received = of(Side::Ingress, CounterGroup::Socket, "received_count").zip(of(
+        Side::Ingress,
+        CounterGroup::Own,
+        "bye_count",
+    ));
     (
-        of("egress", "socket: sent_count"),
+        of(Side::Egress, CounterGroup::Socket, "sent_count"),
         received.and_then(|(all, farewells)| all.checked_sub(farewells)),
     )
 }

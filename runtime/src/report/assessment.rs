@@ -106,12 +106,9 @@ impl Assessment {
 fn verdict(summary: &RunSummary, overruns: Vec<Overrun>) -> NetworkVerdict {
     let has = |link: LinkKind| summary.channels.iter().any(|channel| channel.link == link);
     let has_face = !summary.faces.is_empty();
-    let is_face = |name: &str| summary.faces.iter().any(|face| face.process == name);
-    // A gateway or face keeps no ticks; a component that was killed took its count with it.
-    let is_silent = |process: &ProcessSummary| {
-        let keeps_ticks = process.role != "gateway" && process.role != "own program";
-        keeps_ticks && !is_face(&process.name) && process.cpu_time_s.is_none()
-    };
+    // A component that was killed took its count with it; other kinds have none to take.
+    let is_silent =
+        |process: &ProcessSummary| process.kind.counts_ticks() && process.cpu_time_s.is_none();
     let has_ticks = |process: &ProcessSummary| process.tick_count.is_some();
     if summary.run.outcome == Outcome::Failed {
         NetworkVerdict::RunFailed
@@ -164,19 +161,14 @@ fn received_late(summary: &RunSummary) -> Vec<String> {
     let is_late = |channel: &&ChannelSummary| {
         let account = channel.account.as_ref();
         let published_count = account.map_or(0, |account| account.published_count);
-        no_room_count(channel) as f64 > SKIPPED_TICK_RATIO_MAX * published_count as f64
+        channel.no_room_count as f64 > SKIPPED_TICK_RATIO_MAX * published_count as f64
     };
     let channels = summary.channels.iter().filter(is_late);
     channels.map(|channel| channel.name.clone()).collect()
 }
 
-fn no_room_count(channel: &ChannelSummary) -> u64 {
-    let causes = channel.refusals.iter().filter(|one| one.name == NO_ROOM);
-    causes.map(|cause| cause.count).sum()
-}
-
 fn no_room_warning(channel: &ChannelSummary) -> Option<String> {
-    let count = Some(no_room_count(channel)).filter(|count| *count > 0)?;
+    let count = Some(channel.no_room_count).filter(|count| *count > 0)?;
     let account = channel.account.as_ref();
     let lost = account.map_or(0, |account| account.fates.of(MessageFate::LostOnWire));
     let lost = match lost.min(count) {

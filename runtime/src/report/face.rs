@@ -1,10 +1,12 @@
 //! What a summary says of the foreign programs that played a role through an EGM face. It holds
 //! figures; `crate::report::face_figures` computes them.
 
+use hil_models::egm::messages::Side as ArmSide;
 use hil_models::stats::histogram::Distribution;
 use serde::{Deserialize, Serialize};
 
 use super::summary::{CountByName, Fact};
+use crate::rundir::pipe::RefusalCount;
 use crate::topology::FaceKind;
 
 /// One arm of a face.
@@ -14,10 +16,10 @@ pub struct FaceSummary {
     pub process: String,
     /// The host it ran on.
     pub host: String,
-    /// `EGM robot face` (we were the robot) or `EGM sensor face` (we were the sensor).
-    pub kind: String,
-    /// `right` or `left`.
-    pub arm: String,
+    /// Whether we were the robot or the sensor.
+    pub kind: FaceKind,
+    /// Which arm.
+    pub arm: ArmSide,
     /// Where the foreign program listens, or where we did.
     pub address: String,
     /// How the foreign program stood to us at the end, in words.
@@ -29,9 +31,9 @@ pub struct FaceSummary {
     pub answers: Answers,
     /// Where time went, in the order of the way.
     pub segments: Vec<FaceSegment>,
-    /// Datagrams that were not what the protocol allows, by reason; only reasons that occurred.
-    pub refusals: Vec<CountByName>,
-    /// Everything it counted.
+    /// Datagrams that could not be used, by cause; only causes that occurred.
+    pub refusals: Vec<RefusalCount>,
+    /// Everything else it counted.
     pub counters: Vec<CountByName>,
     /// What was granted and found: socket, buffers, stamp probe.
     pub facts: Vec<Fact>,
@@ -45,11 +47,10 @@ impl FaceSummary {
 
     /// True when something that the protocol allows came from the foreign program.
     pub fn has_usable_messages(&self) -> bool {
-        if self.kind == FaceKind::Sensor.to_string() {
-            self.answers.robot_message_count > 0
-        } else {
+        match self.kind {
+            FaceKind::Sensor => self.answers.robot_message_count > 0,
             // From the first answer to the last there is at least the message it follows.
-            self.answers.attended_count > 0
+            FaceKind::Robot => self.answers.attended_count > 0,
         }
     }
 }

@@ -4,12 +4,12 @@
 use hil_models::egm::wire::Cause;
 
 use super::face::FaceSummary;
-use super::summary::CountByName;
 use crate::platform::text::grouped;
+use crate::rundir::pipe::{FaceRefusal, RefusalCount};
 
 /// The warnings of one arm, most important first.
 pub(super) fn face_warnings(face: &FaceSummary) -> Vec<String> {
-    let at = format!("{}, {} arm", face.process, face.arm);
+    let at = format!("{}, {} arm", face.process, face.arm.word());
     if face.is_unanswered() {
         return vec![format!(
             "{at}: no foreign program answered at {}: {}",
@@ -28,20 +28,22 @@ pub(super) fn face_warnings(face: &FaceSummary) -> Vec<String> {
     warnings
 }
 
-fn refusal_warning(at: &str, refusal: &CountByName, face: &FaceSummary) -> String {
+fn refusal_warning(at: &str, refusal: &RefusalCount, face: &FaceSummary) -> String {
     let count = grouped(refusal.count);
     let plural = if refusal.count == 1 { "" } else { "s" };
-    let advice = advice(&refusal.name, face);
+    let advice = advice(refusal.cause, face);
     let advice = advice.map_or_else(String::new, |advice| format!("; {advice}"));
     format!(
         "{at}: {count} datagram{plural} refused: {}{advice}",
-        refusal.name
+        refusal.cause.label()
     )
 }
 
 /// What to do about a cause; `None` where only its sender can know.
-fn advice(cause: &str, face: &FaceSummary) -> Option<String> {
-    let cause = Cause::ALL.into_iter().find(|one| one.label() == cause)?;
+fn advice(cause: FaceRefusal, face: &FaceSummary) -> Option<String> {
+    let FaceRefusal::Protocol(cause) = cause else {
+        return None;
+    };
     let advice = match cause {
         Cause::WrongArity => {
             let process = &face.process;
@@ -71,17 +73,18 @@ mod tests {
     use super::*;
     use crate::report::face::Answers;
     use crate::topology::FaceKind;
+    use hil_models::egm::messages::Side;
 
-    fn face(kind: FaceKind, answers: Answers, refusals: &[(&str, u64)]) -> FaceSummary {
-        let refusals = refusals.iter().map(|(name, count)| CountByName {
-            name: (*name).to_owned(),
+    fn face(kind: FaceKind, answers: Answers, refusals: &[(Cause, u64)]) -> FaceSummary {
+        let refusals = refusals.iter().map(|(cause, count)| RefusalCount {
+            cause: FaceRefusal::Protocol(*cause),
             count: *count,
         });
         FaceSummary {
             process: "client".to_owned(),
             host: "local".to_owned(),
-            kind: kind.to_string(),
-            arm: "right".to_owned(),
+            kind,
+            arm: Side::Right,
             address: "127.0.0.1:6510".to_owned(),
             peer_state: "never answered".to_owned(),
             cycle_ns: None,
@@ -123,7 +126,7 @@ mod tests {
 
     #[test]
     fn each_cause_is_told_with_its_count_and_what_to_do() {
-        let causes = [("wrong number of joints", 1_200), ("no session", 1)];
+        let causes = [(Cause::WrongArity, 1_200), (Cause::NoSession, 1)];
         let refused = face(FaceKind::Robot, answers(1_000, 0), &causes);
         assert!(!refused.is_unanswered());
         assert_eq!(

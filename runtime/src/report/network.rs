@@ -1,6 +1,7 @@
 //! The network of a run as a summary keeps it: figures of each channel, what happened, both on the
 //! time of the run beside what the robot did. Figures are computed elsewhere.
 
+use core::fmt;
 use hil_models::account::network::{NetworkEventKind, NetworkFigures};
 use hil_models::stats::correlation::PairCorrelation;
 use serde::{Deserialize, Serialize};
@@ -239,13 +240,73 @@ pub struct Timeline {
     pub rows: Vec<TimelineRow>,
 }
 
+/// What is bad about a network, as one number over time.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum NetworkQuantity {
+    /// The share of messages that were lost.
+    Loss,
+    /// The largest delay, seconds.
+    Delay,
+    /// The longest time without an arrival, seconds.
+    Silence,
+}
+
+impl NetworkQuantity {
+    /// All of them.
+    pub const ALL: [Self; 3] = [Self::Loss, Self::Delay, Self::Silence];
+
+    /// `1` for a share, else the SI unit.
+    pub const fn unit(self) -> &'static str {
+        match self {
+            Self::Loss => "1",
+            Self::Delay | Self::Silence => "s",
+        }
+    }
+}
+
+impl fmt::Display for NetworkQuantity {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str(match self {
+            Self::Loss => "loss",
+            Self::Delay => "delay",
+            Self::Silence => "silence",
+        })
+    }
+}
+
+/// What a quantity over time is of.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(tag = "of", rename_all = "snake_case")]
+pub enum TimelineSubject {
+    /// A channel over a network.
+    Channel {
+        /// Its name.
+        channel: String,
+        /// Which quantity.
+        quantity: NetworkQuantity,
+    },
+    /// The robot.
+    Robot {
+        /// Its error, or the events of its score, in words.
+        label: String,
+    },
+}
+
+impl TimelineSubject {
+    /// True for `quantity` of `channel`.
+    pub(crate) fn is_of(&self, channel: &str, quantity: NetworkQuantity) -> bool {
+        matches!(self, Self::Channel { channel: name, quantity: found }
+            if name == channel && *found == quantity)
+    }
+}
+
 /// One quantity over time.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TimelineRow {
-    /// The channel, or `robot`.
-    pub of: String,
-    /// What: `lost`, `delay`, `silence`, `events`, or the words of a robot's error.
-    pub what: String,
+    /// What it is of.
+    #[serde(flatten)]
+    pub subject: TimelineSubject,
     /// `1` for a share or a number, else the unit.
     pub unit: String,
     /// The largest value of each step; `None` where there was none.
@@ -293,8 +354,8 @@ pub struct CorrelationTests {
 pub struct TestedPair {
     /// The channel.
     pub channel: String,
-    /// `loss`, `delay` or `silence`.
-    pub network: String,
+    /// What of the network.
+    pub network: NetworkQuantity,
     /// What of the robot.
     pub robot: String,
     /// Lag of the highest coefficient, seconds; above zero when the robot comes later.
@@ -430,7 +491,7 @@ mod tests {
     fn a_pair_says_who_follows_whom_and_never_why() {
         let pair = |lag_bins: i64| TestedPair {
             channel: "shuttle/command".to_owned(),
-            network: "silence".to_owned(),
+            network: NetworkQuantity::Silence,
             robot: "joint error".to_owned(),
             lag_s: lag_bins as f64 * 0.1,
             correlation: PairCorrelation {

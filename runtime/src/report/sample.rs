@@ -7,6 +7,7 @@ use std::collections::BTreeMap;
 use hil_models::account::{
     AccountContext, ChannelAccount, ChannelPath, ChannelRecords, Coverage, account,
 };
+use hil_models::egm::messages::Side as ArmSide;
 use hil_models::time::Alignment;
 
 use super::assessment::{Assessment, NetworkVerdict};
@@ -15,10 +16,15 @@ use super::sample_events::{few_events, many_events, recorded_channel};
 use super::sample_network::network;
 use super::sample_records::Files;
 use super::summary::{
-    ChannelSummary, CountByName, DirectionSummary, Fact, LinkKind, NO_ROOM, Outcome,
-    ProcessSummary, RealtimeFacts, RunEvent, RunFacts, RunSummary, ScoreMetric, SummaryError,
+    Absence, ChannelSummary, CountByName, CounterGroup, DirectionSummary, Fact, LinkKind, Outcome,
+    ProcessSummary, RadioChange, RealtimeFacts, RunEvent, RunEventKind, RunFacts, RunSummary,
+    ScoreMetric, SummaryError,
 };
 use super::terminal::{Style, render};
+use crate::platform::host_facts::{self, HostFact, HostFacts};
+use crate::rundir::event::{EventKind, ProcessKind};
+use crate::rundir::launch::Side;
+use crate::topology::FaceKind;
 
 fn run_facts() -> RunFacts {
     RunFacts {
@@ -44,14 +50,16 @@ fn run_facts() -> RunFacts {
     }
 }
 
-fn process(name: &str, role: &str, skipped_tick_count: Option<u64>) -> ProcessSummary {
+fn process(name: &str, kind: ProcessKind, skipped_tick_count: Option<u64>) -> ProcessSummary {
+    let is_component = kind == ProcessKind::Component;
     ProcessSummary {
         name: name.to_owned(),
         host: "operator".to_owned(),
-        role: role.to_owned(),
+        kind,
+        role: is_component.then(|| name.to_owned()),
         exit: "ended by itself, code 0".to_owned(),
         restart_count: 0,
-        preparation_s: (role != "gateway").then_some(0.812),
+        preparation_s: is_component.then_some(0.812),
         tick_count: skipped_tick_count.map(|_| 5_000),
         skipped_tick_count,
         cpu_time_s: Some(1.234),
@@ -91,6 +99,7 @@ fn channel(
         trace_replay: None,
         recorded: None,
         refusals: Vec::new(),
+        no_room_count: 0,
         directions: Vec::new(),
     }
 }
@@ -102,15 +111,17 @@ fn channels() -> Vec<ChannelSummary> {
     let exact = files.account(Some(Alignment::SAME_CLOCK));
     let mut command = channel("arm/command", there, LinkKind::Udp, exact);
     command.refusals.push(CountByName {
+        group: CounterGroup::Refused,
         name: "type hash differs".to_owned(),
         count: 3,
     });
     command.directions.push(DirectionSummary {
         process: "robot gateway".to_owned(),
-        direction: "ingress".to_owned(),
+        direction: Side::Ingress,
         peer_state: "said farewell".to_owned(),
         counters: Vec::new(),
         facts: vec![Fact::new("receive buffer granted", "425984 bytes")],
+        stalls: None,
     });
     command.outages = Some(files.outages());
     let status = channel("arm/status", back, LinkKind::Udp, files.account(None));
@@ -126,30 +137,44 @@ fn channels() -> Vec<ChannelSummary> {
 
 /// A whole report.
 pub(super) fn full() -> RunSummary {
-    let mut killed = process("robot gateway", "gateway", None);
+    let mut killed = process("robot gateway", ProcessKind::Gateway, None);
     killed.restart_count = 1;
     killed.cpu_time_s = None;
     killed.exit = "first killed by signal 9, then ended by itself, code 0".to_owned();
     let mut score_events = few_events();
     let network = network(["arm/command", "arm/status"], &mut score_events);
     RunSummary {
-        host_facts: vec![
-            Fact::new("processor", "2 × a virtual core"),
-            Fact::new("kernel", "6.18, PREEMPT_DYNAMIC"),
-        ],
+        host_facts: HostFacts {
+            facts: [
+                ("processor", "2 × a virtual core"),
+                ("kernel", "6.18, PREEMPT_DYNAMIC"),
+            ]
+            .map(|(label, value)| HostFact {
+                label: label.to_owned(),
+                value: host_facts::Fact::Available(value.to_owned()),
+            })
+            .to_vec(),
+        },
         realtime: RealtimeFacts {
             granted: vec![Fact::new("controller", "SCHED_FIFO 50 on core 0")],
             refused: vec![Fact::new("robot gateway", "spin: core 1 is not isolated")],
         },
         processes: vec![
-            process("controller", "controller", Some(2)),
-            process("robot", "robot", Some(0)),
+            process("controller", ProcessKind::Component, Some(2)),
+            process("robot", ProcessKind::Component, Some(0)),
             killed,
         ],
         events: vec![RunEvent {
             at_s: Some(8.0),
-            what: "robot gateway ended and was restarted after 0.757 s".to_owned(),
-            cause: "killed by signal 9".to_owned(),
+            process: "robot gateway".to_owned(),
+            kind: RunEventKind::Process(EventKind::Restarted {
+                end: "was killed by SIGKILL".to_owned(),
+                restart: 1,
+                limit: 3,
+            }),
+            absence: Some(Absence {
+                length_s: Some(0.757),
+            }),
         }],
         channels: channels(),
         score: vec![
@@ -184,19 +209,19 @@ pub(super) fn awkward() -> RunSummary {
     summary.processes = vec![
         ProcessSummary {
             name: long.clone(),
-            role: long.clone(),
+            role: Some(long.clone()),
             host: long.clone(),
             recorder_drop_count: Some(12_345),
-            ..process("", "", Some(308))
+            ..process("", ProcessKind::Component, Some(308))
         },
-        process("robot", "robot", None),
+        process("robot", ProcessKind::Component, None),
     ];
     summary.channels.truncate(1);
     summary.channels[0].name.clone_from(&long);
     summary.channels[0].from.clone_from(&long);
     summary.score[0].label.clone_from(&long);
     summary.score[0].value = Some(-123_456_789.123);
-    summary.events[0].what.clone_from(&long);
+    summary.events[0].process.clone_from(&long);
     summary.score_events = many_events(&long);
     summary.network = Some(network([&long, "arm/status"], &mut summary.score_events));
     summary
@@ -226,6 +251,7 @@ pub(super) fn empty() -> RunSummary {
             trace_replay: None,
             recorded: None,
             refusals: Vec::new(),
+            no_room_count: 0,
             directions: Vec::new(),
         });
     }
@@ -364,6 +390,50 @@ fn a_host_that_overran_is_not_a_network_result() {
 }
 
 #[test]
+fn an_event_keeps_its_kind_and_numbers_in_json() {
+    let radio = RunEvent {
+        at_s: None,
+        process: "robot gateway".to_owned(),
+        kind: RunEventKind::Radio {
+            interface: "wlan0".to_owned(),
+            change: RadioChange::StationLeft,
+            station: Some("02:00:00:00:00:01".to_owned()),
+            code: Some(3),
+        },
+        absence: None,
+    };
+    for (event, kind) in [
+        (&full().events[0], ["process", "restarted"]),
+        (&radio, ["radio", "station_left"]),
+    ] {
+        let json = serde_json::to_value(event).unwrap();
+        let found = json.get("kind").or(json.get("change")).unwrap();
+        assert_eq!([&json["source"], found], kind);
+        assert_eq!(&serde_json::from_value::<RunEvent>(json).unwrap(), event);
+    }
+    let what = "robot gateway: wlan0 station left (02:00:00:00:00:01)";
+    assert_eq!(radio.what(), what);
+    assert_eq!(radio.cause().unwrap(), "802.11 code 3");
+}
+
+#[test]
+fn only_a_lost_count_of_ticks_leaves_the_verdict_open() {
+    for (kind, expected) in [
+        (ProcessKind::Component, NetworkVerdict::TicksUnknown),
+        (ProcessKind::Gateway, NetworkVerdict::NetworkResult),
+        (ProcessKind::ClockPath, NetworkVerdict::NetworkResult),
+        (ProcessKind::Adapter, NetworkVerdict::NetworkResult),
+        (ProcessKind::OwnProgram, NetworkVerdict::NetworkResult),
+    ] {
+        let mut summary = full();
+        let mut silent = process("silent", kind, None);
+        silent.cpu_time_s = None;
+        summary.processes.push(silent);
+        assert_eq!(Assessment::of(&summary).network, expected, "{kind:?}");
+    }
+}
+
+#[test]
 fn what_had_no_room_in_a_receive_buffer_is_not_put_down_to_the_network() {
     let mut summary = full();
     let account = summary.channels[0].account.as_mut();
@@ -371,10 +441,7 @@ fn what_had_no_room_in_a_receive_buffer_is_not_put_down_to_the_network() {
     // 0.1 % of 5 000 messages is 5: at the limit it still counts, and is told.
     for (count, is_result) in [(0, true), (5, true), (6, false)] {
         let channel = &mut summary.channels[0];
-        channel.refusals = vec![CountByName {
-            name: NO_ROOM.to_owned(),
-            count,
-        }];
+        channel.no_room_count = count;
         let name = channel.name.clone();
         let assessment = Assessment::of(&summary);
         let expected = if is_result {
@@ -398,8 +465,8 @@ fn a_run_whose_face_nobody_answered_does_not_claim_a_foreign_program() {
     summary.faces.push(FaceSummary {
         process: "client".to_owned(),
         host: "local".to_owned(),
-        kind: "EGM robot face".to_owned(),
-        arm: "right".to_owned(),
+        kind: FaceKind::Robot,
+        arm: ArmSide::Right,
         address: "127.0.0.1:6510".to_owned(),
         peer_state: "never answered".to_owned(),
         cycle_ns: Some(4_000_000),

@@ -12,6 +12,7 @@ use super::summary::{
     ChannelSummary, Fact, LinkKind, Outcome, ProcessSummary, RecordedFigures, RunFacts, RunSummary,
 };
 use super::terminal::{Style, render};
+use crate::rundir::event::ProcessKind;
 
 fn message(sequence: u64, fate: Option<MessageFate>, words: &str) -> ExplainedMessage {
     ExplainedMessage {
@@ -125,6 +126,7 @@ pub(super) fn recorded_channel() -> ChannelSummary {
             missing_count: 0,
         }),
         refusals: Vec::new(),
+        no_room_count: 0,
         directions: Vec::new(),
     }
 }
@@ -198,7 +200,8 @@ pub(super) fn ticking() -> ProcessSummary {
     ProcessSummary {
         name: "robots".to_owned(),
         host: "robot-pc".to_owned(),
-        role: "robots".to_owned(),
+        kind: ProcessKind::Component,
+        role: Some("robots".to_owned()),
         exit: "ended".to_owned(),
         restart_count: 0,
         preparation_s: Some(0.001),

@@ -9,7 +9,7 @@ use hil_models::case_study::ErrorSeries;
 use hil_models::random::RandomStream;
 use hil_models::time::{Alignment, Instant};
 
-use super::network::{Correlation, NetworkReport};
+use super::network::{Correlation, NetworkQuantity, NetworkReport};
 use super::score_event::ScoreEvents;
 use crate::report::analysis::network::{AxisClocks, ChannelPassages, NetworkBuilder, RobotSeries};
 
@@ -127,7 +127,9 @@ fn the_robots_error_is_found_to_follow_the_silence_by_what_was_put_in() {
         panic!("{:?}", report.correlation);
     };
     let pair = tests.pairs.iter().find(|pair| {
-        pair.channel == "arm/command" && pair.network == "loss" && pair.robot.contains("joint")
+        pair.channel == "arm/command"
+            && pair.network == NetworkQuantity::Loss
+            && pair.robot.contains("joint")
     });
     let pair = pair.unwrap();
     assert!((0.25..=0.75).contains(&pair.lag_s), "{pair:?}");

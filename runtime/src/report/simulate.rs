@@ -32,6 +32,8 @@ use crate::report::summary::{
     RunFacts, RunSummary, ScoreMetric,
 };
 use crate::report::terminal::{self, Style, percent};
+use crate::rundir::launch::Side;
+use crate::rundir::pipe::CounterGroup;
 use crate::rundir::run_folder::RunFolder;
 use crate::rundir::series;
 use crate::topology::emulation::EmulationLaunch;
@@ -289,6 +291,7 @@ fn channel_summary(
             missing_count: 0,
         }),
         refusals: Vec::new(),
+        no_room_count: 0,
         directions: link.map(WatchedLink::direction).into_iter().collect(),
     }
 }
@@ -370,15 +373,18 @@ impl WatchedLink {
         let counters = all.into_iter().chain(causes);
         DirectionSummary {
             process: "simulate".to_owned(),
-            direction: "link model".to_owned(),
+            // Where a real run has its link model: behind the receiving socket.
+            direction: Side::Ingress,
             peer_state: "none, in virtual time".to_owned(),
             counters: counters
                 .map(|(name, count)| CountByName {
+                    group: CounterGroup::Own,
                     name: name.to_owned(),
                     count,
                 })
                 .collect(),
             facts,
+            stalls: None,
         }
     }
 }

@@ -22,7 +22,14 @@ use super::link_change::LinkChange;
 use super::network::NetworkReport;
 use super::radio::RadioReport;
 use super::score_event::ScoreEvents;
+use crate::platform::host_facts::HostFacts;
+use crate::platform::text::grouped;
 use crate::report::card_figures::HardwareStamps;
+use crate::rundir::event::{EventKind, ProcessKind};
+use crate::rundir::launch::Side;
+use crate::rundir::pipe::StallFigures;
+pub use crate::rundir::pipe::{CountByName, CounterGroup};
+use crate::rundir::protection::RunSecurity;
 use crate::topology::{Channel, Topology, Via};
 
 /// Version of the `summary.json` layout.
@@ -35,8 +42,8 @@ pub struct RunSummary {
     pub schema_version: u32,
     /// What was run, when, and how it ended.
     pub run: RunFacts,
-    /// What the host is, as label and value.
-    pub host_facts: Vec<Fact>,
+    /// What the host is.
+    pub host_facts: HostFacts,
     /// What real-time settings the kernel granted and refused.
     pub realtime: RealtimeFacts,
     /// How the hosts' clocks relate, and what that rests on.
@@ -79,7 +86,7 @@ impl RunSummary {
         Self {
             schema_version: SCHEMA_VERSION,
             run,
-            host_facts: Vec::new(),
+            host_facts: HostFacts::default(),
             realtime: RealtimeFacts::default(),
             clocks: None,
             processes: Vec::new(),
@@ -187,9 +194,9 @@ pub struct RunFacts {
     pub topology_hash: String,
     /// Seed of every random stream.
     pub seed: u64,
-    /// How the hops between hosts were protected, in words; `None` when there were none.
+    /// How the hops between hosts were protected; `None` when there were none.
     #[serde(default)]
-    pub security: Option<String>,
+    pub security: Option<RunSecurity>,
     /// True for a run in virtual time, which has no host, no process and no record.
     #[serde(default)]
     pub is_virtual: bool,
@@ -248,6 +255,13 @@ impl Fact {
     }
 }
 
+/// The facts of a host, for a reader.
+pub(crate) fn host_words(host: &HostFacts) -> Vec<Fact> {
+    let facts = host.facts.iter();
+    let words = facts.map(|one| Fact::new(one.label.replace('_', " "), one.value.to_text()));
+    words.collect()
+}
+
 /// What real-time settings the kernel granted and refused.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RealtimeFacts {
@@ -264,8 +278,10 @@ pub struct ProcessSummary {
     pub name: String,
     /// The host it ran on.
     pub host: String,
-    /// Its role in the case study, or `gateway`.
-    pub role: String,
+    /// What it was.
+    pub kind: ProcessKind,
+    /// The role of the case study that it played, or that a foreign program played through it.
+    pub role: Option<String>,
     /// How it ended, in words.
     pub exit: String,
     /// Starts after the first.
@@ -291,15 +307,115 @@ pub struct ProcessSummary {
     pub recorder_drop_count: Option<u64>,
 }
 
+impl ProcessSummary {
+    /// What a report calls it.
+    pub(crate) fn label(&self) -> String {
+        self.kind.label(self.role.as_deref())
+    }
+}
+
 /// Something that happened during the run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RunEvent {
     /// When, seconds after the start; `None` when the run's start on its host is unknown.
     pub at_s: Option<f64>,
-    /// What, in words.
-    pub what: String,
-    /// Why, in words; empty when unknown.
-    pub cause: String,
+    /// The process concerned.
+    pub process: String,
+    /// What happened.
+    #[serde(flatten)]
+    pub kind: RunEventKind,
+    /// Set when the process carried no messages for a while.
+    pub absence: Option<Absence>,
+}
+
+/// How long a process carried no messages.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Absence {
+    /// Seconds; `None` when it never came back.
+    pub length_s: Option<f64>,
+}
+
+/// What happened during a run.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(tag = "source", rename_all = "snake_case")]
+pub enum RunEventKind {
+    /// Its supervisor saw it in a process.
+    Process(EventKind),
+    /// A gateway's radio reported it.
+    Radio {
+        /// The network interface.
+        interface: String,
+        /// What the radio did.
+        change: RadioChange,
+        /// The station concerned, as its address; `None` where the kernel named none.
+        station: Option<String>,
+        /// Status or reason code of IEEE 802.11; `None` where the kernel gave none.
+        code: Option<u16>,
+    },
+}
+
+/// What a radio did.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RadioChange {
+    /// It associated.
+    Associated,
+    /// It went to another access point.
+    Roamed,
+    /// It lost its association.
+    Disconnected,
+    /// A station left it.
+    StationLeft,
+    /// The quality of its connection changed.
+    QualityChanged,
+}
+
+impl RadioChange {
+    const fn label(self) -> &'static str {
+        match self {
+            Self::Associated => "associated",
+            Self::Roamed => "roamed",
+            Self::Disconnected => "disconnected",
+            Self::StationLeft => "station left",
+            Self::QualityChanged => "connection quality changed",
+        }
+    }
+}
+
+impl RunEvent {
+    /// What happened, for a reader.
+    pub fn what(&self) -> String {
+        let process = &self.process;
+        match &self.kind {
+            RunEventKind::Process(kind) => format!("{process}: {kind}"),
+            RunEventKind::Radio {
+                interface,
+                change,
+                station,
+                ..
+            } => {
+                let what = format!("{process}: {interface} {}", change.label());
+                match station {
+                    Some(station) => format!("{what} ({station})"),
+                    None => what,
+                }
+            }
+        }
+    }
+
+    /// Why, or for how long, for a reader; `None` when nothing is known.
+    pub fn cause(&self) -> Option<String> {
+        if let Some(absence) = self.absence {
+            return Some(absence.length_s.map_or_else(
+                || "never came back".to_owned(),
+                |length_s| format!("away for {:.0} ms", length_s * 1e3),
+            ));
+        }
+        match self.kind {
+            RunEventKind::Radio { code, .. } => Some(format!("802.11 code {}", code?)),
+            RunEventKind::Process(_) => None,
+        }
+    }
 }
 
 /// How a channel is carried.
@@ -345,9 +461,6 @@ impl LinkKind {
     }
 }
 
-/// How a report calls datagrams that came while a socket's receive buffer was full: their receiver was late.
-pub const NO_ROOM: &str = "no room in the receive buffer";
-
 impl LinkKind {
     /// The words for a fate of a message on it: what an emulated link lost, no wire did.
     pub const fn fate_label(self, fate: MessageFate) -> &'static str {
@@ -386,8 +499,12 @@ pub struct ChannelSummary {
     /// What was recorded of a channel that is only recorded; `None` when nothing was.
     #[serde(default)]
     pub recorded: Option<RecordedFigures>,
-    /// Datagrams the gateways refused, or the kernel for want of room, by reason; only reasons that occurred.
+    /// Datagrams the gateways refused, by cause; only causes that occurred.
     pub refusals: Vec<CountByName>,
+    /// Datagrams that came while a socket's receive buffer was full: their receiver was late. They may have
+    /// been anything, also messages.
+    #[serde(default)]
+    pub no_room_count: u64,
     /// The gateway threads that carried it; empty on a direct channel.
     pub directions: Vec<DirectionSummary>,
 }
@@ -402,28 +519,51 @@ pub struct RecordedFigures {
     pub missing_count: u64,
 }
 
+impl ChannelSummary {
+    /// What its gateways counted by this name, together.
+    pub fn count(&self, group: CounterGroup, name: &str) -> u64 {
+        let counts = self.directions.iter();
+        counts.filter_map(|one| one.count(group, name)).sum()
+    }
+
+    /// What became of datagrams that are no messages of it, in words, each cause with its count.
+    pub(crate) fn refusal_words(&self) -> Vec<String> {
+        let refused = self.refusals.iter();
+        let refused = refused.map(|one| format!("{} {}", one.name, grouped(one.count)));
+        let no_room = Some(self.no_room_count).filter(|count| *count > 0);
+        let no_room = no_room.map(|count| format!("{NO_ROOM} {}", grouped(count)));
+        refused.chain(no_room).collect()
+    }
+}
+
+/// What reports say of [`ChannelSummary::no_room_count`].
+pub(super) const NO_ROOM: &str = "no room in the receive buffer";
+
 /// One gateway thread of a channel.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DirectionSummary {
     /// The gateway process.
     pub process: String,
-    /// `egress` or `ingress`.
-    pub direction: String,
+    /// Which way it carried it.
+    pub direction: Side,
     /// The peer's state at the end, in words.
     pub peer_state: String,
     /// Everything it counted.
     pub counters: Vec<CountByName>,
     /// What was granted and found: buffers, stamp probe, path MTU.
     pub facts: Vec<Fact>,
+    /// How often its stream stood still; `None` where it is none, or receives.
+    #[serde(default)]
+    pub stalls: Option<StallFigures>,
 }
 
-/// A named count.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct CountByName {
-    /// What was counted.
-    pub name: String,
-    /// How often.
-    pub count: u64,
+impl DirectionSummary {
+    /// What it counted by this name; `None` where it counts no such thing.
+    pub fn count(&self, group: CounterGroup, name: &str) -> Option<u64> {
+        let mut counters = self.counters.iter();
+        let found = counters.find(|one| one.group == group && one.name == name);
+        found.map(|one| one.count)
+    }
 }
 
 /// One figure of the score.

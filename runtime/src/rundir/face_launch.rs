@@ -82,8 +82,8 @@ impl FaceSettings {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ArmLaunch {
-    /// `right` or `left`.
-    pub arm: String,
+    /// Which arm.
+    pub arm: Side,
     /// Where the foreign program listens (robot face), or where we do (sensor face).
     pub address: SocketAddr,
     /// The channel whose messages go out.
@@ -92,12 +92,4 @@ pub struct ArmLaunch {
     pub output: CardChannel,
     /// What to ask of the kernel.
     pub realtime: RealtimeRequest,
-}
-
-impl ArmLaunch {
-    /// Which arm.
-    pub fn side(&self) -> Side {
-        let is_it = |side: &Side| side.word() == self.arm;
-        Side::BOTH.into_iter().find(is_it).unwrap_or(Side::Right)
-    }
 }

@@ -12,6 +12,7 @@ pub mod link_orders;
 pub mod live_run;
 pub mod manifest;
 pub mod pipe;
+pub mod protection;
 pub mod radio_record;
 pub mod record;
 pub mod run_folder;

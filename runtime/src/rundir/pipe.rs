@@ -8,11 +8,14 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::Duration;
 
+use hil_models::egm::messages::Side as ArmSide;
+use hil_models::egm::wire::Cause;
 use hil_models::link_model::ReplayCounts;
 use hil_models::time::Instant;
 use serde::{Deserialize, Serialize};
 use zeroize::Zeroizing;
 
+use super::launch::Side;
 use crate::platform::realtime::RealtimeGrant;
 use crate::rundir::run_seal::RunSeal;
 
@@ -100,41 +103,156 @@ pub struct ProcessReport {
     pub faces: Vec<FaceReport>,
 }
 
+/// What of a direction or arm counted something.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum CounterGroup {
+    /// The direction or arm itself.
+    Own,
+    /// What it refused, by cause.
+    Refused,
+    /// Its socket.
+    Socket,
+    /// Its stream, where the transport is one.
+    Stream,
+    /// Its seal, where its hop is sealed.
+    Seal,
+    /// The order of messages.
+    Messages,
+    /// The pieces of messages.
+    Pieces,
+    /// Its replies.
+    Replies,
+    /// Commands that were not sent, by cause.
+    NotSent,
+}
+
+impl CounterGroup {
+    const fn prefix(self) -> &'static str {
+        match self {
+            Self::Own => "",
+            Self::Refused => "refused: ",
+            Self::Socket => "socket: ",
+            Self::Stream => "stream: ",
+            Self::Seal => "seal: ",
+            Self::Messages => "messages: ",
+            Self::Pieces => "pieces: ",
+            Self::Replies => "replies: ",
+            Self::NotSent => "commands not sent: ",
+        }
+    }
+}
+
+/// How often something was counted.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct CountByName {
+    /// By what.
+    pub group: CounterGroup,
+    /// What was counted.
+    pub name: String,
+    /// How often.
+    pub count: u64,
+}
+
+impl CountByName {
+    /// Of each of `counts`.
+    pub fn all<'a>(
+        group: CounterGroup,
+        counts: impl IntoIterator<Item = (&'a str, u64)>,
+    ) -> impl Iterator<Item = Self> {
+        counts.into_iter().map(move |(name, count)| Self {
+            group,
+            name: name.to_owned(),
+            count,
+        })
+    }
+
+    /// What a report calls it.
+    pub fn label(&self) -> String {
+        format!("{}{}", self.group.prefix(), self.name)
+    }
+}
+
+/// Why a face could not use a datagram.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum FaceRefusal {
+    /// The protocol does not allow it.
+    Protocol(Cause),
+    /// It came from another address than the robot's.
+    ForeignAddress,
+}
+
+impl FaceRefusal {
+    /// A few words for a report.
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Protocol(cause) => cause.label(),
+            Self::ForeignAddress => "another address than the robot's",
+        }
+    }
+}
+
+/// How many datagrams a face could not use, and why.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RefusalCount {
+    /// Why.
+    pub cause: FaceRefusal,
+    /// How many.
+    pub count: u64,
+}
+
 /// One arm of a face.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct FaceReport {
-    /// `right` or `left`.
-    pub arm: String,
-    /// `EGM robot face` or `EGM sensor face`.
-    pub kind: String,
+    /// Which arm.
+    pub arm: ArmSide,
     /// The channel whose messages went out.
     pub outgoing: String,
     /// The channel that what came in went to.
     pub incoming: String,
     /// How the foreign program stood to it at the end, in words.
     pub peer_state: String,
-    /// Counters by name.
-    pub counters: Vec<(String, u64)>,
+    /// Everything it counted but what it refused.
+    pub counters: Vec<CountByName>,
+    /// What it refused; causes that did not occur may be among it.
+    pub refusals: Vec<RefusalCount>,
     /// Facts in words: addresses, granted buffers, stamp probe.
     pub facts: Vec<(String, String)>,
 }
 
 /// One direction of one channel through a gateway.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DirectionReport {
     /// The channel.
     pub channel: String,
-    /// `egress` or `ingress`.
-    pub direction: String,
+    /// Which way.
+    pub direction: Side,
     /// The peer's state in words at the end.
     pub peer_state: String,
-    /// Counters by name; zero ones are left out by whoever prints.
-    pub counters: Vec<(String, u64)>,
+    /// Everything it counted; zeros are left out by whoever prints.
+    pub counters: Vec<CountByName>,
     /// Facts in words: granted buffers, stamp probe, path MTU.
     pub facts: Vec<(String, String)>,
+    /// How often its stream stood still; `None` where it is none, or receives.
+    #[serde(default)]
+    pub stalls: Option<StallFigures>,
     /// What its link model met of the trace that it replays; `None` where it replays none.
     #[serde(default)]
     pub replay: Option<ReplayCounts>,
+}
+
+/// How often a stream stood still.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct StallFigures {
+    /// Times that a byte was not acknowledged within the limit.
+    pub count: u64,
+    /// All of them together, nanoseconds.
+    pub total_ns: u64,
+    /// The longest of them, nanoseconds.
+    pub longest_ns: u64,
+    /// The limit: twice the smallest round trip and 50 ms, nanoseconds.
+    pub threshold_ns: u64,
 }
 
 const WAITING: u8 = 0;

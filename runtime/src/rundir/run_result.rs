@@ -15,6 +15,7 @@ use super::event::{Event, ProcessStory};
 use super::run_folder::RunFolder;
 use crate::platform::clock_discipline::HostDiscipline;
 use crate::platform::host_facts::HostFacts;
+use crate::rundir::protection::RunSecurity;
 
 /// What `result.json` says it is.
 pub const RUN_RESULT_FORMAT: &str = "hil-run-result";
@@ -83,8 +84,8 @@ pub struct RunResult {
     pub cards: Vec<CardStory>,
     /// True when all hosts read one clock.
     pub has_one_clock: bool,
-    /// How the hops between hosts are protected, in words; `None` when there are none.
-    pub security: Option<String>,
+    /// How the hops between hosts are protected; `None` when there are none.
+    pub security: Option<RunSecurity>,
     /// Who steers each host's system clock, of the hosts that told.
     pub disciplines: BTreeMap<String, HostDiscipline>,
     /// Hosts that ran here.

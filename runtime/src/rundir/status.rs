@@ -2,6 +2,7 @@
 //! folder, twice a second. It is for people who look on; nothing in the run reads it.
 
 use std::collections::BTreeSet;
+use std::fmt;
 use std::fs;
 use std::io;
 use std::path::Path;
@@ -9,6 +10,8 @@ use std::time::Duration;
 
 use hil_models::time::Instant;
 use serde::{Deserialize, Serialize};
+
+use crate::rundir::event::ProcessKind;
 
 /// Name of the file.
 pub(crate) const FILE_NAME: &str = "status.json";
@@ -69,14 +72,35 @@ pub enum Phase {
     Ending,
 }
 
-impl Phase {
-    /// The word for it.
-    pub const fn word(self) -> &'static str {
-        match self {
+/// How far a process is.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ProcessState {
+    /// It was not started yet.
+    NotStarted,
+    /// It makes itself ready.
+    Starting,
+    /// It runs.
+    Running,
+    /// It ended, in this way.
+    Ended(String),
+}
+
+impl ProcessState {
+    /// True while the process is there.
+    pub const fn is_alive(&self) -> bool {
+        matches!(self, Self::Starting | Self::Running)
+    }
+}
+
+impl fmt::Display for ProcessState {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str(match self {
+            Self::NotStarted => "not started",
             Self::Starting => "starting",
             Self::Running => "running",
-            Self::Ending => "ending",
-        }
+            Self::Ended(how) => how,
+        })
     }
 }
 
@@ -87,10 +111,12 @@ pub struct ProcessStatus {
     pub name: String,
     /// Its host.
     pub host: String,
-    /// Its role, or what else it is.
-    pub role: String,
-    /// `starting`, `running`, or how it ended.
-    pub state: String,
+    /// What it is.
+    pub kind: ProcessKind,
+    /// The role of the case that it plays, or that a foreign program plays through it.
+    pub role: Option<String>,
+    /// How far it is.
+    pub state: ProcessState,
     /// `None` while it does not run.
     pub pid: Option<u32>,
     /// How often it was started again.
@@ -230,8 +256,9 @@ mod tests {
         let process = ProcessStatus {
             name: "robot".to_owned(),
             host: "here".to_owned(),
-            role: "robot".to_owned(),
-            state: "running".to_owned(),
+            kind: ProcessKind::Component,
+            role: Some("robot".to_owned()),
+            state: ProcessState::Running,
             pid: Some(7),
             restart_count: 1,
             skipped_tick_count: None,

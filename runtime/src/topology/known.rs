@@ -6,6 +6,8 @@ use std::collections::BTreeMap;
 use hil_models::case_study::{CaseStudy, ChannelSpec, ParameterError};
 use serde::Deserialize;
 
+use super::parameter_reader::{ReadError, read};
+
 /// The case studies that `[case] name` may say.
 #[derive(Debug, Clone, Default)]
 pub struct KnownCases {
@@ -105,7 +107,7 @@ pub fn check_parameters_with<C: CaseStudy>(
     seed: u64,
     prepare: &mut dyn FnMut(&mut C::Parameters) -> Result<(), ParameterError>,
 ) -> Result<toml::Table, Vec<ParameterFault>> {
-    let mut parameters = match C::Parameters::deserialize(table.clone()) {
+    let mut parameters = match C::Parameters::deserialize(read(table)) {
         Ok(parameters) => parameters,
         Err(error) => return Err(faults_of_each_key::<C>(table, &error)),
     };
@@ -130,59 +132,18 @@ pub fn check_parameters_with<C: CaseStudy>(
 }
 
 /// Tries each key on its own, because a deserialiser stops at the first fault.
-fn faults_of_each_key<C: CaseStudy>(
-    table: &toml::Table,
-    first: &toml::de::Error,
-) -> Vec<ParameterFault> {
+fn faults_of_each_key<C: CaseStudy>(table: &toml::Table, first: &ReadError) -> Vec<ParameterFault> {
     let single = |(key, value): (&String, &toml::Value)| {
         let alone = toml::Table::from_iter([(key.clone(), value.clone())]);
-        let error = C::Parameters::deserialize(alone).err()?;
+        let error = C::Parameters::deserialize(read(&alone)).err()?;
         // A case without defaults misses the other keys here; that is no fault of this key.
-        (!error.message().starts_with("missing field")).then(|| fault_of(&error, Some(key)))
+        (!error.is_missing_field()).then(|| error.to_fault())
     };
     let faults: Vec<_> = table.iter().filter_map(single).collect();
     if faults.is_empty() {
-        vec![fault_of(first, None)]
+        vec![first.to_fault()]
     } else {
         faults
-    }
-}
-
-/// Reads the path and the valid names out of the deserialiser's error.
-fn fault_of(error: &toml::de::Error, key: Option<&String>) -> ParameterFault {
-    let text = error.to_string();
-    let location = text
-        .lines()
-        .last()
-        .and_then(|line| line.strip_prefix("in `"));
-    let mut path: Vec<String> = match (location.and_then(|line| line.strip_suffix('`')), key) {
-        (Some(keys), _) => keys.split('.').map(str::to_owned).collect(),
-        (None, Some(key)) => vec![key.clone()],
-        (None, None) => Vec::new(),
-    };
-    let unknown = error.message().strip_prefix("unknown field `");
-    let Some((name, expected)) = unknown.and_then(|rest| rest.split_once('`')) else {
-        return ParameterFault {
-            key: path,
-            message: format!("cannot be read: {}", error.message()),
-            is_unknown_key: false,
-            valid_keys: Vec::new(),
-        };
-    };
-    if path.last().map(String::as_str) != Some(name) {
-        path.push(name.to_owned());
-    }
-    ParameterFault {
-        key: path,
-        message: error.message().to_owned(),
-        is_unknown_key: true,
-        // Names stand between backquotes: every second piece.
-        valid_keys: expected
-            .split('`')
-            .skip(1)
-            .step_by(2)
-            .map(str::to_owned)
-            .collect(),
     }
 }
 

@@ -32,6 +32,7 @@ mod limits;
 mod model;
 mod model_links;
 mod names;
+mod parameter_reader;
 mod reader;
 pub mod registry;
 mod resolved;

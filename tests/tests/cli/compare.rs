@@ -56,7 +56,7 @@ fn found<'a>(json: &'a Value, channel: &str, metric: &str) -> &'a Value {
     let is_meant = |one: &&Value| {
         one["channel"] == channel
             && one["metric"] == metric
-            && (metric == "loss" || one["part"] == "end to end")
+            && (metric == "loss" || one["part"]["kind"] == "end_to_end")
     };
     figures.iter().find(is_meant).unwrap()
 }

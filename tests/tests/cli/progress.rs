@@ -116,6 +116,7 @@ fn trace() -> Vec<u8> {
         clock: "one clock".to_owned(),
         direction: TraceDirection::Forward,
         arrival: TraceArrival::Received,
+        link_change_count: 0,
         origin_ns: 0,
         duration_ns: 1_000_000_000,
     };

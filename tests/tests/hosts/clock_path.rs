@@ -6,7 +6,8 @@ use std::time::Duration;
 
 use hil_models::clock::{ClockFigures, StampKind};
 use hil_runtime::report::clock_summary::{ClockPathSummary, ClockRung, HostPairClock};
-use hil_runtime::report::summary::{Outcome, RunSummary};
+use hil_runtime::report::summary::{Outcome, RunEventKind, RunSummary};
+use hil_runtime::rundir::event::EventKind;
 use hil_tests::account::assert_every_message_is_accounted_for;
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::child::ChildGuard;
@@ -205,8 +206,9 @@ fn without_its_cable_a_clock_path_is_given_up_and_the_report_says_so() {
         assert_eq!(told.len(), 1, "{:?}", summary.warnings);
         for end in ENDS {
             let events = summary.events.iter().filter(|event| {
-                event.what.starts_with(&format!("{end}:"))
-                    && event.what.contains("policy: the run goes on")
+                let is_given_up =
+                    matches!(event.kind, RunEventKind::Process(EventKind::GivenUp { .. }));
+                event.process == end && is_given_up
             });
             assert_eq!(events.count(), 1, "{:?}", summary.events);
         }
@@ -226,9 +228,10 @@ fn a_cable_that_is_never_plugged_in_delays_the_run_and_does_not_stop_it() {
         assert!(!path(pair).has_exchanges(), "{pair:?}");
         let told = warnings(summary, "gave no exchange");
         assert_eq!(told.len(), 1, "{:?}", summary.warnings);
-        let waited = summary.events.iter().filter(|event| {
-            event.what.starts_with(&format!("{}:", ENDS[0])) && event.what.contains("no answer")
-        });
+        let waited = summary
+            .events
+            .iter()
+            .filter(|event| event.process == ENDS[0] && event.what().contains("no answer"));
         assert_eq!(waited.count(), 1, "{:?}", summary.events);
     }
 }
@@ -268,7 +271,11 @@ fn a_killed_end_comes_back_and_a_cable_pulled_in_the_run_leaves_a_gap_that_is_to
             let restarts = summary.processes.iter().find(|process| process.name == end);
             assert_eq!(restarts.unwrap().restart_count, 1);
             let events = summary.events.iter().filter(|event| {
-                event.what.starts_with(&format!("{end}:")) && event.what.contains("restart 1 of")
+                let is_restart = matches!(
+                    event.kind,
+                    RunEventKind::Process(EventKind::Restarted { restart: 1, .. })
+                );
+                event.process == end && is_restart
             });
             assert_eq!(events.count(), 1, "{:?}", summary.events);
         }

@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use hil_models::clock::StampKind;
 use hil_runtime::report::clock_summary::{ClockRung, HostPairClock};
+use hil_runtime::report::network::{NetworkQuantity, TimelineSubject};
 use hil_runtime::report::summary::{LinkKind, Outcome, RunSummary};
 use hil_tests::account::{account, assert_every_message_is_accounted_for, carried};
 use hil_tests::lab::Lab;
@@ -118,7 +119,11 @@ fn check_bounds(summary: &RunSummary) {
         assert!(bound_ns > 0 && variation.bound_ns > 0 && successive.bound_ns > 0);
         assert!(variation.bound_ns <= 2 * bound_ns, "{variation:?}");
         let rows = network.timeline.rows.iter();
-        let mut rows = rows.filter(|row| row.of == *name && row.what == "delay");
+        let mut rows = rows.filter(|row| {
+            let quantity = NetworkQuantity::Delay;
+            let channel = name.clone();
+            row.subject == TimelineSubject::Channel { channel, quantity }
+        });
         assert!(rows.next().unwrap().bound.unwrap() > 0.0, "{name}");
     }
     let metric = summary

@@ -172,7 +172,7 @@ fn a_gateway_that_comes_back_while_the_path_is_away_waits_for_it() {
     }
     for summary in stopped(&lab, &mut hosts, &files) {
         let mut events = summary.events.iter();
-        assert!(events.any(|event| event.what.contains("waiting for the link")));
+        assert!(events.any(|event| event.what().contains("waiting for the link")));
     }
 }
 

@@ -43,13 +43,13 @@ fn loops(arm: &Arm, joints: impl Iterator<Item = Joints>) -> u32 {
 
 fn face<'a>(summary: &'a RunSummary, arm: &str) -> &'a FaceSummary {
     let mut faces = summary.faces.iter();
-    let found = faces.find(|face| face.arm == arm);
+    let found = faces.find(|face| face.arm.word() == arm);
     found.unwrap_or_else(|| panic!("no face of the {arm} arm"))
 }
 
 fn count(face: &FaceSummary, name: &str) -> u64 {
     let mut counters = face.counters.iter();
-    let found = counters.find(|counter| counter.name == name);
+    let found = counters.find(|counter| counter.label() == name);
     found
         .unwrap_or_else(|| panic!("{name} is not counted"))
         .count
@@ -163,7 +163,7 @@ fn judge([sensor, robot]: [&RunSummary; 2]) {
                 assert_account_closes(summary, &format!("egm/{arm}/{what}"));
             }
             let face = face(summary, arm);
-            assert_eq!(face.kind, kind);
+            assert_eq!(face.kind.to_string(), kind);
             let ratio = face.answers.ratio().unwrap();
             println!("{kind}, {arm} arm: {ratio} answered within the cycle");
             let [back, out] = way;

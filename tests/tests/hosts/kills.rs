@@ -9,7 +9,7 @@ use std::time::Duration;
 use hil_models::account::{InterruptionFigures, MessageFate};
 use hil_models::record::IngressRecord;
 use hil_runtime::report::assessment::{Assessment, NetworkVerdict};
-use hil_runtime::report::summary::{NO_ROOM, Outcome, RunSummary};
+use hil_runtime::report::summary::{Outcome, RunEvent, RunSummary};
 use hil_tests::account::{account, assert_every_message_is_accounted_for, carried, describe};
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::child::{ChildGuard, Finished};
@@ -89,10 +89,11 @@ fn code(finished: &Finished) -> i32 {
     code.unwrap_or_else(|| panic!("{finished:?}"))
 }
 
-fn event<'a>(summary: &'a RunSummary, process: &str) -> &'a str {
-    let mut events = summary.events.iter().map(|event| event.what.as_str());
-    let found = events.find(|what| what.starts_with(&format!("{process}:")));
-    found.unwrap_or_else(|| panic!("no event of {process} in {:?}", summary.events))
+fn event(summary: &RunSummary, process: &str) -> String {
+    let mut events = summary.events.iter();
+    let found = events.find(|event| event.process == process);
+    let found = found.unwrap_or_else(|| panic!("no event of {process} in {:?}", summary.events));
+    found.what()
 }
 
 fn interruption<'a>(
@@ -242,8 +243,7 @@ fn a_receiver_that_stood_still_is_no_network_result() {
         let channel = "shuttle/command";
         let said = describe(channel, account(&summary, channel));
         let of_channel = summary.channels.iter().find(|one| one.name == channel);
-        let mut causes = of_channel.unwrap().refusals.iter();
-        let no_room = causes.find(|cause| cause.name == NO_ROOM).unwrap().count;
+        let no_room = of_channel.unwrap().no_room_count;
         let lost = account(&summary, channel).fates.of(MessageFate::LostOnWire);
         println!("{said}; {no_room} datagrams without room");
         assert!(lost > 0 && lost <= no_room, "{lost} of {no_room}: {said}");
@@ -407,7 +407,7 @@ fn a_process_that_dies_too_often_ends_the_run() {
     assert_eq!(code(&finished), 1, "{finished:?}");
     files.assert_nothing_left_here();
     let summary = files.summary();
-    let events: Vec<&str> = summary.events.iter().map(|one| one.what.as_str()).collect();
+    let events: Vec<String> = summary.events.iter().map(RunEvent::what).collect();
     let expected = [
         "robot: was killed by SIGKILL; restart 1 of at most 1",
         "robot: was killed by SIGKILL; policy: end the run",

@@ -7,6 +7,7 @@ use std::process::Command;
 use std::time::Duration;
 
 use hil_runtime::engine::security::PreSharedKey;
+use hil_runtime::rundir::protection::HopProtection;
 use hil_tests::account::{account, assert_accounts_close};
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::child::{ChildGuard, Finished};
@@ -35,11 +36,14 @@ fn an_ordinary_run_is_sealed_and_its_account_closes() {
     let report = split.files(1).clone();
     for summary in &split.finish() {
         assert_accounts_close(summary);
-        let security = summary.run.security.as_deref().unwrap();
-        assert!(
-            security.starts_with("sealed (") && security.contains(&key.fingerprint()),
-            "{security}"
-        );
+        let security = summary.run.security.as_ref().unwrap();
+        let HopProtection::Sealed {
+            key_fingerprint, ..
+        } = &security.hops
+        else {
+            panic!("{security}");
+        };
+        assert_eq!(*key_fingerprint, key.fingerprint());
         for name in CHANNELS {
             let (egress, ingress) = (
                 direction(summary, name, "egress"),

@@ -425,7 +425,8 @@ fn connections_that_never_become_a_greeting_keep_no_run_from_its_start_or_end() 
     }
     println!("the listening supervisor first: {first:?}\nand at most: {most:?}");
     let [control, _] = &summaries;
-    let security = control.run.security.as_deref().unwrap();
+    let security = control.run.security.as_ref().unwrap();
+    let security = security.to_string();
     println!("{security}");
     for words in [
         "connections came to nothing",

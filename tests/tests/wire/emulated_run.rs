@@ -58,7 +58,7 @@ fn an_emulated_link_loses_and_delays_what_it_was_told_to() {
 fn check_loss(channel: &ChannelSummary, account: &ChannelAccount) {
     let counters = channel.directions.iter().flat_map(|one| &one.counters);
     let count_of = |name: &str| -> u64 {
-        let chosen = counters.clone().filter(|counter| counter.name == name);
+        let chosen = counters.clone().filter(|counter| counter.label() == name);
         chosen.map(|counter| counter.count).sum()
     };
     let emulated_count = count_of("socket: link_lost_count");

@@ -280,7 +280,8 @@ fn check_report(files: &RunFiles) {
     let line = format!("{at_s:.6} notice {words}");
     assert!(plain("events.log").contains(&line), "{line}");
     let trace = trace_of(files, BACKWARD);
-    assert_eq!(trace.header.link, "hop (changed by hand 3 times)");
+    assert_eq!(trace.header.link, "hop");
+    assert_eq!(trace.header.link_change_count, 3);
     let page = files.root().join("page.html");
     let written = Command::new(hil_runtime_binary())
         .arg("report")

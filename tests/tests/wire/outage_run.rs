@@ -104,7 +104,7 @@ fn a_live_run_loses_the_spans_that_virtual_time_loses() {
         let counters = channel(&summary, name).directions.iter();
         let emulated_count: u64 = counters
             .flat_map(|one| &one.counters)
-            .filter(|one| one.name == "socket: link_lost_count")
+            .filter(|one| one.label() == "socket: link_lost_count")
             .map(|one| one.count)
             .sum();
         println!(

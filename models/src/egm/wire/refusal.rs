@@ -1,6 +1,8 @@
 //! Why a datagram, or a command to be sent, is not taken: the causes and their counts. It decides
 //! nothing: the faces do.
 
+use serde::{Deserialize, Serialize};
+
 use crate::egm::wire::joints::ROBOT_JOINT_COUNT;
 use crate::egm::wire::{DATAGRAM_BYTES_MAX, WireError};
 
@@ -96,7 +98,8 @@ impl From<WireError> for Refusal {
 }
 
 /// A [`Refusal`] without its numbers: what is counted.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 #[repr(usize)]
 pub enum Cause {
     /// [`Refusal::TooLong`].

@@ -3,7 +3,7 @@
 
 use crate::fleet::coordinator::parameters::CoordinatorMode;
 use crate::fleet::experiment::published::{
-    Condition, HARBOR, LONG_RANGE, PublishedRow, SHORT_RANGE, WAREHOUSE,
+    Condition, HARBOR, PublishedNetwork, PublishedRow, WAREHOUSE,
 };
 use crate::fleet::experiment::setup::{Links, Setup, StatusPath};
 use crate::fleet::messages::MessageOrder;
@@ -54,7 +54,7 @@ pub(crate) enum Place {
     Variant { text: &'static str },
     /// In the table of mechanisms.
     Mechanism {
-        row: &'static str,
+        mechanism: Mechanism,
         mode: CoordinatorMode,
     },
 }
@@ -95,8 +95,8 @@ impl Cell {
                 Condition::HardwareInTheLoop(network) => format!("{scenario}, {network}"),
             },
             Place::Variant { text } => format!("{scenario}, {text}"),
-            Place::Mechanism { row, mode } => {
-                format!("{scenario}, {row}, {}", mode_name(*mode))
+            Place::Mechanism { mechanism, mode } => {
+                format!("{scenario}, {}, {}", mechanism.label(), mode_name(*mode))
             }
         }
     }
@@ -176,12 +176,12 @@ fn original(
 fn wifi_cell(
     base: &Setup,
     scenario: Scenario,
-    (row, network): (PublishedRow, &str),
+    (row, network): (PublishedRow, PublishedNetwork),
 ) -> Option<Cell> {
     let preset = match network {
-        SHORT_RANGE => WifiPreset::ShortRange,
-        LONG_RANGE => WifiPreset::LongRange,
-        _ => return None,
+        PublishedNetwork::ShortRange => WifiPreset::ShortRange,
+        PublishedNetwork::LongRange => WifiPreset::LongRange,
+        PublishedNetwork::Ethernet => return None,
     };
     let mut setup = original(base, (0.0, DelayLaw::Constant), (0.0, 1));
     setup.robot.step_inflation = false;
@@ -250,45 +250,98 @@ fn variants(base: &Setup, law: DelayLaw) -> Vec<Cell> {
     ]
 }
 
-/// One impairment of the table of mechanisms.
-type Mechanism = (&'static str, fn(&mut Setup));
+/// What the network, or the controller's host, does in a row of the table of mechanisms.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Mechanism {
+    /// Nothing.
+    Clean,
+    /// Every message takes 300 ms.
+    Delay300Ms,
+    /// Every message takes 1 s.
+    Delay1S,
+    /// Messages take 0 to 1 s.
+    DelayTo1S,
+    /// A tenth of the commands is lost.
+    CommandLoss10,
+    /// A tenth of the status is lost.
+    StatusLoss10,
+    /// A tenth of both is lost.
+    Loss10,
+    /// Three tenths of both are lost.
+    Loss30,
+    /// The network stalls for 1 s in 30 s.
+    Stall1S,
+    /// The network stalls for 3 s in 30 s.
+    Stall3S,
+    /// The controller's host overruns.
+    Overrun,
+    /// A tenth of the messages comes twice.
+    Repeated,
+    /// A tenth of the messages is held back.
+    HeldBack,
+}
 
-/// What the network, or the controller's host, does in each row of the table of mechanisms.
-pub(crate) const MECHANISMS: [Mechanism; 13] = [
-    ("clean", |_| {}),
-    ("delay 300 ms", |setup| {
-        delay_both(setup, 300.0, DelayLaw::Constant);
-    }),
-    ("delay 1 s", |setup| {
-        delay_both(setup, 1000.0, DelayLaw::Constant);
-    }),
-    ("delay 0 to 1 s", |setup| {
-        delay_both(setup, 1000.0, DelayLaw::Uniform);
-    }),
-    ("loss 10 %, commands", |setup| {
-        setup.links.commands.loss_ratio = 0.1;
-    }),
-    ("loss 10 %, status", |setup| {
-        setup.links.status.loss_ratio = 0.1;
-    }),
-    ("loss 10 %, both", |setup| lose_both(setup, 0.1)),
-    ("loss 30 %, both", |setup| lose_both(setup, 0.3)),
-    ("stalls, mean 1 s in 30 s", |setup| stall_both(setup, 1.0)),
-    ("stalls, mean 3 s in 30 s", |setup| stall_both(setup, 3.0)),
-    ("overrun to 4 s", |setup| setup.overrun_max_s = 4.0),
-    ("10 % repeated to 3 s late", |setup| {
-        both(setup, |channel| {
-            channel.duplicate_ratio = 0.1;
-            channel.duplicate_lag_ms = 3000.0;
-        });
-    }),
-    ("10 % held back to 3 s", |setup| {
-        both(setup, |channel| {
-            channel.hold_ratio = 0.1;
-            channel.hold_ms = 3000.0;
-        });
-    }),
-];
+impl Mechanism {
+    /// All of them, in the order of the table.
+    pub(crate) const ALL: [Self; 13] = [
+        Self::Clean,
+        Self::Delay300Ms,
+        Self::Delay1S,
+        Self::DelayTo1S,
+        Self::CommandLoss10,
+        Self::StatusLoss10,
+        Self::Loss10,
+        Self::Loss30,
+        Self::Stall1S,
+        Self::Stall3S,
+        Self::Overrun,
+        Self::Repeated,
+        Self::HeldBack,
+    ];
+
+    /// What a table calls it; the seeds of its cells are drawn from it too.
+    pub(crate) const fn label(self) -> &'static str {
+        match self {
+            Self::Clean => "clean",
+            Self::Delay300Ms => "delay 300 ms",
+            Self::Delay1S => "delay 1 s",
+            Self::DelayTo1S => "delay 0 to 1 s",
+            Self::CommandLoss10 => "loss 10 %, commands",
+            Self::StatusLoss10 => "loss 10 %, status",
+            Self::Loss10 => "loss 10 %, both",
+            Self::Loss30 => "loss 30 %, both",
+            Self::Stall1S => "stalls, mean 1 s in 30 s",
+            Self::Stall3S => "stalls, mean 3 s in 30 s",
+            Self::Overrun => "overrun to 4 s",
+            Self::Repeated => "10 % repeated to 3 s late",
+            Self::HeldBack => "10 % held back to 3 s",
+        }
+    }
+
+    fn apply(self, setup: &mut Setup) {
+        match self {
+            Self::Clean => {}
+            Self::Delay300Ms => delay_both(setup, 300.0, DelayLaw::Constant),
+            Self::Delay1S => delay_both(setup, 1000.0, DelayLaw::Constant),
+            Self::DelayTo1S => delay_both(setup, 1000.0, DelayLaw::Uniform),
+            Self::CommandLoss10 => setup.links.commands.loss_ratio = 0.1,
+            Self::StatusLoss10 => setup.links.status.loss_ratio = 0.1,
+            Self::Loss10 => lose_both(setup, 0.1),
+            Self::Loss30 => lose_both(setup, 0.3),
+            Self::Stall1S => stall_both(setup, 1.0),
+            Self::Stall3S => stall_both(setup, 3.0),
+            Self::Overrun => setup.overrun_max_s = 4.0,
+            Self::Repeated => both(setup, |channel| {
+                channel.duplicate_ratio = 0.1;
+                channel.duplicate_lag_ms = 3000.0;
+            }),
+            Self::HeldBack => both(setup, |channel| {
+                channel.hold_ratio = 0.1;
+                channel.hold_ms = 3000.0;
+            }),
+        }
+    }
+}
 
 fn both(setup: &mut Setup, change: impl Fn(&mut Impairments)) {
     change(&mut setup.links.commands);
@@ -314,7 +367,7 @@ fn stall_both(setup: &mut Setup, mean_s: f64) {
 /// stop where they mean to, and a coordinator that knows of no delay.
 pub(crate) fn mechanism_cells(base: &Setup) -> Vec<Cell> {
     let mut cells = Vec::new();
-    for (row, change) in MECHANISMS {
+    for mechanism in Mechanism::ALL {
         for scenario in SCENARIOS {
             for mode in [CoordinatorMode::Legacy, CoordinatorMode::Safe] {
                 let mut setup = base.clone();
@@ -326,10 +379,10 @@ pub(crate) fn mechanism_cells(base: &Setup) -> Vec<Cell> {
                     CoordinatorMode::Safe => MessageOrder::Strict,
                 };
                 setup.links = Links::default();
-                change(&mut setup);
+                mechanism.apply(&mut setup);
                 cells.push(Cell {
                     scenario,
-                    place: Place::Mechanism { row, mode },
+                    place: Place::Mechanism { mechanism, mode },
                     setup,
                     demand: match mode {
                         CoordinatorMode::Legacy => Demand::None,

@@ -3,7 +3,9 @@
 
 use crate::fleet::coordinator::counters::SafeCounts;
 use crate::fleet::coordinator::parameters::CoordinatorMode;
-use crate::fleet::experiment::cells::{Cell, Demand, Place, SCENARIOS, mode_name, scenario_name};
+use crate::fleet::experiment::cells::{
+    Cell, Demand, Mechanism, Place, SCENARIOS, mode_name, scenario_name,
+};
 use crate::fleet::experiment::report::Results;
 use crate::fleet::experiment::study::FleetStudy;
 use crate::fleet::experiment::tally::FleetTally;
@@ -74,16 +76,16 @@ pub(crate) fn criteria(study: &FleetStudy, results: &Results<'_>) -> Vec<Criteri
         criteria.extend(safe_criteria(results));
         criteria.extend(SCENARIOS.map(|scenario| {
             throughput(scenario_name(scenario), {
-                let of = |mode| results.mechanism(scenario, "clean", mode);
+                let of = |mode| results.mechanism(scenario, Mechanism::Clean, mode);
                 (of(CoordinatorMode::Legacy), of(CoordinatorMode::Safe))
             })
         }));
         criteria.extend(SCENARIOS.map(|scenario| {
-            let of = |row| results.mechanism(scenario, row, CoordinatorMode::Legacy);
+            let of = |mechanism| results.mechanism(scenario, mechanism, CoordinatorMode::Legacy);
             loss_exceeds_delay(
                 scenario_name(scenario),
-                of("loss 10 %, commands"),
-                of("delay 300 ms"),
+                of(Mechanism::CommandLoss10),
+                of(Mechanism::Delay300Ms),
             )
         }));
     }

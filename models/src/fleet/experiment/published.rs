@@ -22,7 +22,29 @@ pub enum Condition {
         delay_ms: f64,
     },
     /// Hardware in the loop, over this network.
-    HardwareInTheLoop(&'static str),
+    HardwareInTheLoop(PublishedNetwork),
+}
+
+/// A network of the paper's own measurements.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum PublishedNetwork {
+    /// A wire.
+    Ethernet,
+    /// A radio at 20 m.
+    ShortRange,
+    /// A radio at 35 m.
+    LongRange,
+}
+
+impl core::fmt::Display for PublishedNetwork {
+    /// What the paper calls it.
+    fn fmt(&self, formatter: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        formatter.write_str(match self {
+            Self::Ethernet => "Ethernet",
+            Self::ShortRange => "short-range Wi-Fi 6",
+            Self::LongRange => "long-range Wi-Fi 6",
+        })
+    }
 }
 
 const fn fixed(loss_ratio: f64, delay_ms: f64, sections: u64, collisions: u64) -> PublishedRow {
@@ -36,18 +58,13 @@ const fn fixed(loss_ratio: f64, delay_ms: f64, sections: u64, collisions: u64) -
     }
 }
 
-const fn measured(network: &'static str, sections: u64, collisions: u64) -> PublishedRow {
+const fn measured(network: PublishedNetwork, sections: u64, collisions: u64) -> PublishedRow {
     PublishedRow {
         condition: Condition::HardwareInTheLoop(network),
         sections,
         collisions,
     }
 }
-
-/// What the paper calls its radio at 20 m.
-pub const SHORT_RANGE: &str = "short-range Wi-Fi 6";
-/// What it calls its radio at 35 m.
-pub const LONG_RANGE: &str = "long-range Wi-Fi 6";
 
 /// Table II, harbor.
 pub const HARBOR: [PublishedRow; 11] = [
@@ -59,9 +76,9 @@ pub const HARBOR: [PublishedRow; 11] = [
     fixed(0.1, 10.0, 10_007, 0),
     fixed(0.1, 50.0, 10_092, 0),
     fixed(0.1, 100.0, 10_061, 18),
-    measured("Ethernet", 10_819, 0),
-    measured(SHORT_RANGE, 15_489, 14),
-    measured(LONG_RANGE, 10_004, 23),
+    measured(PublishedNetwork::Ethernet, 10_819, 0),
+    measured(PublishedNetwork::ShortRange, 15_489, 14),
+    measured(PublishedNetwork::LongRange, 10_004, 23),
 ];
 
 /// Table III, warehouse.
@@ -74,9 +91,9 @@ pub const WAREHOUSE: [PublishedRow; 11] = [
     fixed(0.1, 10.0, 10_001, 0),
     fixed(0.1, 50.0, 10_037, 0),
     fixed(0.1, 100.0, 21_645, 0),
-    measured("Ethernet", 10_004, 1),
-    measured(SHORT_RANGE, 10_155, 15),
-    measured(LONG_RANGE, 17_394, 40),
+    measured(PublishedNetwork::Ethernet, 10_004, 1),
+    measured(PublishedNetwork::ShortRange, 10_155, 15),
+    measured(PublishedNetwork::LongRange, 17_394, 40),
 ];
 
 #[cfg(test)]

@@ -3,7 +3,7 @@
 
 use crate::fleet::coordinator::parameters::CoordinatorMode;
 use crate::fleet::experiment::cells::{
-    Cell as Experiment, Demand, MECHANISMS, Place, SCENARIOS, published_rows, scenario_name,
+    Cell as Experiment, Demand, Mechanism, Place, SCENARIOS, published_rows, scenario_name,
 };
 use crate::fleet::experiment::judgement::{self, verdict_of};
 use crate::fleet::experiment::published::{Condition, PublishedRow};
@@ -36,13 +36,11 @@ impl<'a> Results<'a> {
     pub(crate) fn mechanism(
         &self,
         scenario: Scenario,
-        row: &str,
+        mechanism: Mechanism,
         mode: CoordinatorMode,
     ) -> Option<&FleetTally> {
         let is_it = |cell: &Experiment| {
-            cell.scenario == scenario
-                && matches!(&cell.place, Place::Mechanism { row: known, mode: known_mode }
-                    if *known == row && *known_mode == mode)
+            cell.scenario == scenario && cell.place == Place::Mechanism { mechanism, mode }
         };
         let (_, tally) = self.cells.iter().find(|(cell, _)| is_it(cell))?;
         tally.as_ref()
@@ -329,9 +327,9 @@ const MECHANISM_COLUMNS: [Column; 12] = [
 /// What each impairment does to each coordinator.
 fn mechanism_table(scenario: Scenario, results: &Results<'_>) -> Table {
     let absent = || vec![Cell::Absent; 6];
-    let rows = MECHANISMS.iter().map(|(row, _)| {
-        let of = |mode| results.mechanism(scenario, row, mode);
-        let mut cells = vec![Cell::text(*row)];
+    let rows = Mechanism::ALL.into_iter().map(|mechanism| {
+        let of = |mode| results.mechanism(scenario, mechanism, mode);
+        let mut cells = vec![Cell::text(mechanism.label())];
         cells.extend(of(CoordinatorMode::Legacy).map_or_else(absent, |tally| {
             let mut cells = figures(Some(tally)).to_vec();
             cells.push(Cell::Count(tally.coordinator.resets));

@@ -16,6 +16,7 @@ use crate::engine::process::pulse::Pulse;
 use crate::engine::process::recording::{RecordedInput, RecordedOutput};
 use crate::platform::clock::MonotonicClock;
 use crate::platform::wait::{Pause, WaitStrategy};
+use crate::rundir::pipe::{CountByName, RefusalCount};
 use crate::shm::Waiter;
 
 /// Longer than any message of the protocol, which stays below 1 kB; what is longer is cut off and
@@ -60,8 +61,11 @@ pub(super) trait Work: Debug {
     /// The face's own next appointment.
     fn next_due(&self) -> Option<Instant>;
 
-    /// What it counted, by name.
-    fn counters(&self) -> Vec<(String, u64)>;
+    /// What it counted but what it refused.
+    fn counters(&self) -> Vec<CountByName>;
+
+    /// What it refused, by cause.
+    fn refusals(&self) -> Vec<RefusalCount>;
 
     /// How the foreign program stood to it, in words.
     fn peer_state(&self) -> String;

@@ -24,7 +24,7 @@ use crate::platform::clock::MonotonicClock;
 use crate::platform::wait::{WaitMode, WaitStrategy};
 use crate::rundir::face_launch::{ArmLaunch, FaceLaunch};
 use crate::rundir::face_record::{FaceReceivedRecord, FaceSentRecord};
-use crate::rundir::pipe::FaceReport;
+use crate::rundir::pipe::{CountByName, CounterGroup, FaceReport};
 use crate::rundir::record::{RecordKind, RecordSink, Recorder};
 use crate::shm::{Domain, OutputSettings, ShmInput, ShmOutput, Waiter};
 use crate::topology::FaceKind;
@@ -103,18 +103,19 @@ impl OpenedArm {
         domain: &Domain,
     ) -> Result<JoinedArm, FaceError> {
         let report = FaceReport {
-            arm: arm.arm.clone(),
-            kind: launch.face.kind.to_string(),
+            arm: arm.arm,
             outgoing: arm.input.name.clone(),
             incoming: arm.output.name.clone(),
+            peer_state: String::new(),
+            counters: Vec::new(),
+            refusals: Vec::new(),
             facts: self.facts.clone(),
-            ..FaceReport::default()
         };
         Ok(JoinedArm {
             arm: self.join(launch, arm, domain)?,
             work: match launch.face.kind {
-                FaceKind::Robot => Box::new(RobotWork::new(&launch.face, arm.side())),
-                FaceKind::Sensor => Box::new(SensorWork::new(&launch.face, arm.side())),
+                FaceKind::Robot => Box::new(RobotWork::new(&launch.face, arm.arm)),
+                FaceKind::Sensor => Box::new(SensorWork::new(&launch.face, arm.arm)),
             },
             report,
         })
@@ -198,15 +199,16 @@ impl JoinedArm {
     pub fn report(&self) -> FaceReport {
         let mut counters = self.work.counters();
         let socket = self.arm.line.counters();
-        let named = socket.iter();
-        counters.extend(named.map(|(name, count)| (format!("socket: {name}"), count)));
-        let early = self.arm.early_count;
-        counters.push(("datagrams before the run, dropped".to_owned(), early));
-        let steps = self.arm.line.clock_step_count();
-        counters.push(("clock_step_count".to_owned(), steps));
+        counters.extend(CountByName::all(CounterGroup::Socket, socket.iter()));
+        let own = [
+            ("datagrams before the run, dropped", self.arm.early_count),
+            ("clock_step_count", self.arm.line.clock_step_count()),
+        ];
+        counters.extend(CountByName::all(CounterGroup::Own, own));
         FaceReport {
             peer_state: self.work.peer_state(),
             counters,
+            refusals: self.work.refusals(),
             ..self.report.clone()
         }
     }

@@ -4,6 +4,7 @@ use hil_models::egm::wire::DatagramCounts;
 use hil_models::time::Instant;
 
 use crate::platform::clock::MonotonicClock;
+use crate::rundir::pipe::{FaceRefusal, RefusalCount};
 
 /// A program that was silent for longer when the run ended is reported as such.
 const SILENCE_S: f64 = 0.5;
@@ -48,19 +49,12 @@ impl Peer {
     }
 }
 
-/// Counters with owned names.
-pub(super) fn named<const N: usize>(
-    counts: [(&str, u64); N],
-) -> impl Iterator<Item = (String, u64)> {
-    counts
-        .into_iter()
-        .map(|(name, count)| (name.to_owned(), count))
-}
-
 /// Refused datagrams by cause.
-pub(super) fn refusals(counts: &DatagramCounts) -> impl Iterator<Item = (String, u64)> {
-    let causes = counts.causes();
-    causes.map(|(cause, count)| (format!("refused: {}", cause.label()), count))
+pub(super) fn refusals(counts: &DatagramCounts) -> impl Iterator<Item = RefusalCount> {
+    counts.causes().map(|(cause, count)| RefusalCount {
+        cause: FaceRefusal::Protocol(cause),
+        count,
+    })
 }
 
 #[cfg(test)]

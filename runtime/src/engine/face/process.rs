@@ -75,7 +75,7 @@ fn prepare_and_live(path: &Path) -> Result<(), FaceError> {
     let (sender, ready) = channel();
     let mut threads = Vec::new();
     for (arm, one) in opened {
-        warn_of_spinning(&arm.arm, launch.wait, arm.realtime.cpu);
+        warn_of_spinning(arm.arm.word(), launch.wait, arm.realtime.cpu);
         let around = (Arc::clone(&launch), Arc::clone(&domain), Arc::clone(&gate));
         threads.push(spawn(arm, one, around, sender.clone())?);
     }
@@ -138,7 +138,8 @@ fn counters(arm: &ArmLaunch, opened: &OpenedArm) -> [Counter; 2] {
 /// One arm's thread: its real-time grant, then its counters and outcome.
 struct Lived {
     grant: RealtimeGrant,
-    report: FaceReport,
+    /// `None` when it could not connect.
+    report: Option<FaceReport>,
     outcome: Result<(), FaceError>,
 }
 
@@ -150,7 +151,7 @@ fn spawn(
     around: Around,
     ready: Sender<bool>,
 ) -> Result<JoinHandle<Lived>, FaceError> {
-    let name = format!("egm {}", arm.arm);
+    let name = format!("egm {}", arm.arm.word());
     let spawned = thread::Builder::new()
         .name(name)
         .spawn(move || live(&arm, opened, &around, &ready));
@@ -160,7 +161,7 @@ fn spawn(
 fn live(arm: &ArmLaunch, opened: OpenedArm, around: &Around, ready: &Sender<bool>) -> Lived {
     let (launch, domain, gate) = around;
     let grant = realtime::apply(&arm.realtime);
-    let mut report = FaceReport::default();
+    let mut report = None;
     let outcome = opened.connect(launch, arm, domain).and_then(|mut joined| {
         // The process waits for this word; it cannot have left.
         let _left = ready.send(true).is_err();
@@ -169,7 +170,7 @@ fn live(arm: &ArmLaunch, opened: OpenedArm, around: &Around, ready: &Sender<bool
         } else {
             Ok(())
         };
-        report = joined.report();
+        report = Some(joined.report());
         outcome
     });
     if outcome.is_err() {
@@ -192,10 +193,12 @@ fn finish(
     for thread in threads {
         let name = thread.thread().name().unwrap_or("egm").to_owned();
         match thread.join() {
-            Ok(mut lived) => {
+            Ok(lived) => {
                 report.realtime.push((name, lived.grant));
-                lived.report.facts.extend_from_slice(stamp_facts);
-                report.faces.push(lived.report);
+                report.faces.extend(lived.report.map(|mut face| {
+                    face.facts.extend_from_slice(stamp_facts);
+                    face
+                }));
                 outcome = outcome.and(lived.outcome);
             }
             Err(_) => outcome = outcome.and(Err(GatewayError::Panicked.into())),

@@ -12,10 +12,11 @@ use hil_models::time::Instant;
 
 use super::FaceError;
 use super::arm::{Arm, DATAGRAM_BYTES_MAX, Work, published_here_ns, since_1970};
-use super::peer::{Peer, named, refusals};
+use super::peer::{Peer, refusals};
 use crate::platform::clock::MonotonicClock;
 use crate::rundir::face_launch::FaceSettings;
 use crate::rundir::face_record::FaceSentRecord;
+use crate::rundir::pipe::{CountByName, CounterGroup, RefusalCount};
 
 /// The robot's side of one arm.
 #[derive(Debug)]
@@ -104,7 +105,7 @@ impl Work for RobotWork {
         None
     }
 
-    fn counters(&self) -> Vec<(String, u64)> {
+    fn counters(&self) -> Vec<CountByName> {
         let received = self.face.received();
         let own = [
             ("datagrams encoded", self.face.sent_count()),
@@ -114,7 +115,11 @@ impl Work for RobotWork {
             ("commands published", received.accepted()),
             ("malformed feedbacks", self.malformed_count),
         ];
-        named(own).chain(refusals(received)).collect()
+        CountByName::all(CounterGroup::Own, own).collect()
+    }
+
+    fn refusals(&self) -> Vec<RefusalCount> {
+        refusals(self.face.received()).collect()
     }
 
     fn peer_state(&self) -> String {

@@ -15,10 +15,11 @@ use hil_models::yumi::arm::{LEFT_START_RAD, RIGHT_START_RAD};
 
 use super::FaceError;
 use super::arm::{Arm, DATAGRAM_BYTES_MAX, Work, published_here_ns};
-use super::peer::{Peer, named, refusals};
+use super::peer::{Peer, refusals};
 use crate::platform::clock::MonotonicClock;
 use crate::rundir::face_launch::FaceSettings;
 use crate::rundir::face_record::FaceSentRecord;
+use crate::rundir::pipe::{CountByName, CounterGroup, FaceRefusal, RefusalCount};
 use crate::topology::FaceSend;
 
 /// An address that was silent for so long gives way to another one that speaks the protocol: a
@@ -198,7 +199,7 @@ impl Work for SensorWork {
         self.face.next_transmit().filter(|_| !is_stale)
     }
 
-    fn counters(&self) -> Vec<(String, u64)> {
+    fn counters(&self) -> Vec<CountByName> {
         let (received, commands) = (self.face.received(), self.face.commands());
         let transmit = self.face.transmit();
         let own = [
@@ -206,10 +207,6 @@ impl Work for SensorWork {
             ("feedbacks published", received.accepted()),
             ("sessions seen", self.session_count),
             ("changes of the robot's address", self.address_change_count),
-            (
-                "refused: another address than the robot's",
-                self.foreign_count,
-            ),
             ("commands taken", commands.total()),
             (
                 "commands overtaken before they were sent",
@@ -229,11 +226,20 @@ impl Work for SensorWork {
             ("malformed commands", self.malformed_count),
         ];
         let not_sent = commands.causes();
-        let not_sent =
-            not_sent.map(|(cause, count)| (format!("commands not sent: {}", cause.label()), count));
-        named(own)
-            .chain(refusals(received))
-            .chain(not_sent)
+        let not_sent = not_sent.map(|(cause, count)| (cause.label(), count));
+        CountByName::all(CounterGroup::Own, own)
+            .chain(CountByName::all(CounterGroup::NotSent, not_sent))
+            .collect()
+    }
+
+    fn refusals(&self) -> Vec<RefusalCount> {
+        let foreign = RefusalCount {
+            cause: FaceRefusal::ForeignAddress,
+            count: self.foreign_count,
+        };
+        [foreign]
+            .into_iter()
+            .chain(refusals(self.face.received()))
             .collect()
     }
 

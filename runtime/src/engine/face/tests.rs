@@ -14,6 +14,7 @@ use hil_models::egm::face::{
     Axes, RobotFace, RobotFaceSettings, RobotWare, SendPolicy, SensorFace, SensorFaceSettings,
 };
 use hil_models::egm::messages::{EgmCommand, EgmFeedback, SessionState, Side};
+use hil_models::egm::wire::Cause;
 use hil_models::endpoint::InputPort;
 use hil_models::message::MessageType;
 use hil_models::time::Instant;
@@ -24,6 +25,7 @@ use crate::platform::clock::MonotonicClock;
 use crate::platform::realtime::RealtimeRequest;
 use crate::platform::wait::WaitMode;
 use crate::rundir::face_launch::{ArmLaunch, FaceLaunch, FaceSettings};
+use crate::rundir::pipe::FaceRefusal;
 use crate::rundir::record::Recorder;
 use crate::shm::{ChannelHolder, ChannelSettings, Domain, OutputSettings, ShmInput, ShmOutput};
 use crate::topology::{CardChannel, FaceKind, FaceSend, Timestamps};
@@ -132,8 +134,14 @@ impl Bench {
 
     fn count(&self, name: &str) -> u64 {
         let counters = self.joined.report().counters;
-        let found = counters.iter().find(|(counter, _)| counter == name);
-        found.map_or(0, |(_, count)| *count)
+        let found = counters.iter().find(|counter| counter.label() == name);
+        found.map_or(0, |counter| counter.count)
+    }
+
+    fn refused(&self, cause: FaceRefusal) -> u64 {
+        let refusals = self.joined.report().refusals;
+        let found = refusals.iter().find(|refusal| refusal.cause == cause);
+        found.map_or(0, |refusal| refusal.count)
     }
 
     fn finish(self) {
@@ -178,7 +186,7 @@ fn launch(kind: FaceKind, address: SocketAddr, folder: &std::path::Path) -> Face
             dscp: 0,
             interface: None,
             arms: vec![ArmLaunch {
-                arm: "right".to_owned(),
+                arm: Side::Right,
                 address,
                 input,
                 output,
@@ -249,7 +257,7 @@ fn each_feedback_goes_out_at_once_and_only_proper_answers_come_in() {
     // A stranger is not heard: the socket is connected.
     assert_eq!(bench.count("commands published"), 3);
     assert_eq!(bench.count("datagrams received"), 6);
-    assert_eq!(bench.count("refused: not protobuf"), 3);
+    assert_eq!(bench.refused(FaceRefusal::Protocol(Cause::NotProtobuf)), 3);
     assert_eq!(bench.count("socket: sent_count"), 3);
     bench.until(|bench| (bench.count("socket: stamp_count") == 3).then_some(()));
     bench.finish();
@@ -303,7 +311,7 @@ fn a_sensor_answers_where_the_robot_speaks_from_and_to_one_robot_at_a_time() {
     robot.encode(&feedback(3), Duration::from_secs(1), &mut datagram);
     other.send_to(&datagram, face).unwrap();
     bench.until(|bench| {
-        let refused = bench.count("refused: another address than the robot's");
+        let refused = bench.refused(FaceRefusal::ForeignAddress);
         let changed = bench.count("changes of the robot's address");
         (refused + changed == 1).then_some(())
     });

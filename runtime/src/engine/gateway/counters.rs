@@ -1,12 +1,13 @@
 //! The counters of one channel direction under the names a report prints. It counts nothing itself.
 
+use hil_gateways::protocol::PeerState;
 use hil_gateways::protocol::seal::SealCounts;
-use hil_gateways::protocol::{PeerState, RefusalCounts};
 use hil_gateways::transport::ReceiverCounters;
 
 use super::egress::Egress;
 use super::ingress::Ingress;
 use crate::platform::clock::MonotonicClock;
+use crate::rundir::pipe::{CountByName, CounterGroup};
 
 /// A peer that was silent for longer when the run ended is reported as such.
 const SILENCE_NS: i64 = 1_000_000_000;
@@ -57,19 +58,6 @@ pub(super) fn ingress_state(ingress: &Ingress) -> String {
     }
 }
 
-fn named<'a>(
-    prefix: &str,
-    counts: impl IntoIterator<Item = (&'a str, u64)>,
-) -> impl Iterator<Item = (String, u64)> {
-    counts
-        .into_iter()
-        .map(move |(name, count)| (format!("{prefix}{name}"), count))
-}
-
-fn refusals(counts: &RefusalCounts) -> impl Iterator<Item = (String, u64)> {
-    named("refused: ", counts.iter())
-}
-
 /// Whether the sender's mark survived the way; `None` where nothing arrived to tell.
 pub(super) fn mark_fact(dscp: u8, counters: &ReceiverCounters) -> Option<(String, String)> {
     let (kept, changed) = (counters.mark_kept_count, counters.mark_changed_count);
@@ -86,35 +74,59 @@ pub(super) fn mark_fact(dscp: u8, counters: &ReceiverCounters) -> Option<(String
 }
 
 /// Everything a sending direction counted.
-pub(super) fn of_egress(egress: &Egress) -> Vec<(String, u64)> {
+pub(super) fn of_egress(egress: &Egress) -> Vec<CountByName> {
     let steps = ("clock_step_count", egress.line.clock_step_count());
-    named("", egress.bridge.counts().iter())
-        .chain(named("socket: ", egress.line.sender().counters().iter()))
-        .chain(named("", [steps]))
-        .chain(refusals(egress.bridge.refusals()))
+    CountByName::all(CounterGroup::Own, egress.bridge.counts().iter())
+        .chain(CountByName::all(
+            CounterGroup::Socket,
+            egress.line.sender().counters().iter(),
+        ))
+        .chain(CountByName::all(CounterGroup::Own, [steps]))
+        .chain(CountByName::all(
+            CounterGroup::Refused,
+            egress.bridge.refusals().iter(),
+        ))
         .collect()
 }
 
 /// Everything a receiving direction counted.
-pub(super) fn of_ingress(ingress: &Ingress) -> Vec<(String, u64)> {
+pub(super) fn of_ingress(ingress: &Ingress) -> Vec<CountByName> {
     let bridge = &ingress.bridge;
     let steps = ("clock_step_count", ingress.clock.step_count());
-    let foreign = ("refused: foreign source", ingress.foreign_count);
-    let stray = ("refused: message on a clock path", ingress.stray_count);
+    let foreign = ("foreign source", ingress.foreign_count);
+    let stray = ("message on a clock path", ingress.stray_count);
     let stray = ingress.output.is_none().then_some(stray);
-    named("", bridge.counts().iter())
-        .chain(named("messages: ", bridge.sequence_counts().iter()))
-        .chain(named("pieces: ", bridge.reassembly_counts().iter()))
-        .chain(named("replies: ", bridge.reply_counts().iter()))
-        .chain(named("socket: ", ingress.receiver.counters().iter()))
-        .chain(named("", [steps, foreign]))
-        .chain(named("", stray))
-        .chain(refusals(bridge.refusals()))
+    CountByName::all(CounterGroup::Own, bridge.counts().iter())
+        .chain(CountByName::all(
+            CounterGroup::Messages,
+            bridge.sequence_counts().iter(),
+        ))
+        .chain(CountByName::all(
+            CounterGroup::Pieces,
+            bridge.reassembly_counts().iter(),
+        ))
+        .chain(CountByName::all(
+            CounterGroup::Replies,
+            bridge.reply_counts().iter(),
+        ))
+        .chain(CountByName::all(
+            CounterGroup::Socket,
+            ingress.receiver.counters().iter(),
+        ))
+        .chain(CountByName::all(CounterGroup::Own, [steps]))
+        .chain(CountByName::all(
+            CounterGroup::Refused,
+            [foreign].into_iter().chain(stray),
+        ))
+        .chain(CountByName::all(
+            CounterGroup::Refused,
+            bridge.refusals().iter(),
+        ))
         .collect()
 }
 
 /// What the seal of a direction counted.
-pub(super) fn of_seal(counts: &SealCounts) -> Vec<(String, u64)> {
+pub(super) fn of_seal(counts: &SealCounts) -> Vec<CountByName> {
     let kept = [
         ("sealed_count", counts.sealed_count),
         ("opened_count", counts.opened_count),
@@ -122,8 +134,8 @@ pub(super) fn of_seal(counts: &SealCounts) -> Vec<(String, u64)> {
         ("agreement_count", counts.agreement_count),
         ("rotation_count", counts.rotation_count),
     ];
-    named("seal: ", kept)
-        .chain(named("refused: ", counts.refusals()))
+    CountByName::all(CounterGroup::Seal, kept)
+        .chain(CountByName::all(CounterGroup::Refused, counts.refusals()))
         .collect()
 }
 

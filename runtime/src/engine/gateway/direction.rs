@@ -312,7 +312,7 @@ impl Direction {
         let now = MonotonicClock::now();
         let (direction, peer_state, mut counters, (stream, seal)) = match &self.way {
             Way::Egress(egress) => (
-                "egress",
+                Side::Egress,
                 counters::egress_state(egress),
                 counters::of_egress(egress),
                 (
@@ -321,7 +321,7 @@ impl Direction {
                 ),
             ),
             Way::Ingress(ingress) => (
-                "ingress",
+                Side::Ingress,
                 counters::ingress_state(ingress),
                 counters::of_ingress(ingress),
                 (
@@ -338,16 +338,18 @@ impl Direction {
             facts.extend(counters::mark_fact(launch.socket.dscp, &counters));
         }
         counters.extend(seal.iter().flat_map(counters::of_seal));
-        if let Some(figures) = stream {
-            counters.extend(stream::counters(&figures));
-            facts.extend(stream::facts(&figures, launch.side));
+        if let Some(figures) = &stream {
+            counters.extend(stream::counters(figures));
+            facts.extend(stream::facts(figures, launch.side));
         }
+        let stalls = stream.filter(|_| direction == Side::Egress);
         DirectionReport {
             channel: launch.channel.clone(),
-            direction: direction.to_owned(),
+            direction,
             peer_state,
             counters,
             facts,
+            stalls: stalls.as_ref().map(stream::stalls),
             replay: self.replay.as_ref().map(ReplayTally::counts),
         }
     }

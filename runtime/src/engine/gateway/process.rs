@@ -213,7 +213,8 @@ pub(crate) fn report_progress(counters: &[Counter]) {
 /// One direction's thread: its real-time grant, then its counters and outcome.
 struct Lived {
     grant: RealtimeGrant,
-    report: DirectionReport,
+    /// `None` when it could not connect.
+    report: Option<DirectionReport>,
     outcome: Result<(), GatewayError>,
 }
 
@@ -236,7 +237,7 @@ fn spawn(
                 let outcome = direction.run();
                 Lived {
                     grant,
-                    report: direction.report(&launch),
+                    report: Some(direction.report(&launch)),
                     outcome,
                 }
             }
@@ -244,7 +245,7 @@ fn spawn(
                 let _left = ready.send(false).is_err();
                 Lived {
                     grant,
-                    report: DirectionReport::default(),
+                    report: None,
                     outcome: Err(error),
                 }
             }
@@ -272,10 +273,12 @@ fn finish(
     for thread in threads {
         let name = thread.thread().name().unwrap_or("gateway").to_owned();
         match thread.join() {
-            Ok(mut lived) => {
+            Ok(lived) => {
                 report.realtime.push((name, lived.grant));
-                lived.report.facts.extend_from_slice(stamp_facts);
-                report.directions.push(lived.report);
+                report.directions.extend(lived.report.map(|mut direction| {
+                    direction.facts.extend_from_slice(stamp_facts);
+                    direction
+                }));
                 outcome = outcome.and(lived.outcome);
             }
             Err(_) => outcome = outcome.and(Err(GatewayError::Panicked)),

@@ -3,21 +3,31 @@
 use std::time::Duration;
 
 use hil_gateways::transport::tcp::StreamFigures;
+use hil_models::time::duration_ns;
 
 use crate::rundir::launch::Side;
+use crate::rundir::pipe::{CountByName, CounterGroup, StallFigures};
 
 /// Every count under the name a report prints.
-pub(super) fn counters(figures: &StreamFigures) -> impl Iterator<Item = (String, u64)> + use<> {
-    figures
-        .iter()
-        .map(|(name, count)| (format!("stream: {name}"), count))
+pub(super) fn counters(figures: &StreamFigures) -> Vec<CountByName> {
+    CountByName::all(CounterGroup::Stream, figures.iter()).collect()
+}
+
+/// How often a sending stream stood still.
+pub(super) fn stalls(figures: &StreamFigures) -> StallFigures {
+    let nanoseconds = |time: Duration| duration_ns(time).unsigned_abs();
+    StallFigures {
+        count: figures.stall_count,
+        total_ns: nanoseconds(figures.stalled),
+        longest_ns: nanoseconds(figures.stall_longest),
+        threshold_ns: nanoseconds(figures.stall_threshold),
+    }
 }
 
 /// What a reader has to know of the connection, in words.
 pub(super) fn facts(figures: &StreamFigures, side: Side) -> Vec<(String, String)> {
     let mut facts = vec![("connections", connections(figures))];
     if side == Side::Egress {
-        facts.push(("stalls", stalls(figures)));
         facts.push(("waiting for acknowledgement", waiting(figures)));
         facts.push(("TCP round trip", round_trip(figures)));
     }
@@ -55,22 +65,6 @@ fn connections(figures: &StreamFigures) -> String {
         words.push(format!("the newest failure: {error}"));
     }
     words.join("; ")
-}
-
-fn stalls(figures: &StreamFigures) -> String {
-    let threshold = milliseconds(figures.stall_threshold);
-    let rule = format!(
-        "a byte unacknowledged for over {threshold}: twice the smallest round trip and 50 ms"
-    );
-    if figures.stall_count == 0 {
-        return format!("none ({rule})");
-    }
-    format!(
-        "{}, {} together, longest {} ({rule})",
-        figures.stall_count,
-        milliseconds(figures.stalled),
-        milliseconds(figures.stall_longest)
-    )
 }
 
 fn waiting(figures: &StreamFigures) -> String {
@@ -119,7 +113,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_the_kernel_does_not_tell_is_unavailable_and_a_stall_is_told_with_its_rule() {
+    fn what_the_kernel_does_not_tell_is_unavailable_and_stalls_are_numbers() {
         let figures = StreamFigures {
             connection_count: 2,
             stall_count: 1,
@@ -140,8 +134,13 @@ mod tests {
             "{}",
             of("connections")
         );
-        assert!(of("stalls").starts_with("1, 300.0 ms together, longest 300.0 ms"));
-        assert!(of("stalls").contains("over 44.0 ms"));
+        let expected = StallFigures {
+            count: 1,
+            total_ns: 300_000_000,
+            longest_ns: 300_000_000,
+            threshold_ns: 44_000_000,
+        };
+        assert_eq!(stalls(&figures), expected);
         assert!(of("TCP round trip").starts_with("unavailable smoothed"));
         assert_eq!(of("segments"), "unavailable sent again");
     }

@@ -3,12 +3,11 @@
 
 use std::time::Duration;
 
-use super::plan::{ProcessKind, ProcessPlan};
+use super::plan::{ProcessPlan, ProcessTask};
 use crate::platform::realtime::RealtimeRequest;
 use crate::platform::wait::WaitMode;
 use crate::rundir::launch::{DirectionLaunch, Side, SocketLaunch, Transport};
-use crate::topology::clock_process_name;
-use crate::topology::{ClockPath, Host, OnExit, Timestamps, Topology};
+use crate::topology::{ClockPath, Host, OnExit, Timestamps, Topology, clock_process_name};
 
 /// Name of the message type that a clock path announces and never sends.
 const MESSAGE: &str = "hil.ClockPath.v1";
@@ -38,7 +37,7 @@ pub(super) fn on<'a>(
         Some(ProcessPlan {
             name: clock_process_name(&path, &host.name),
             host: host.name.clone(),
-            kind: ProcessKind::ClockPath {
+            task: ProcessTask::ClockPath {
                 directions: vec![direction(&path, host, side)],
                 ready_within: READY_WITHIN_MAX.min(start_timeout / 2),
             },
@@ -91,6 +90,7 @@ mod tests {
     use std::path::Path;
 
     use super::*;
+    use crate::rundir::event::ProcessKind;
     use crate::topology;
     use crate::topology::registry::Registry;
     use hil_models::shuttle::Shuttle;
@@ -106,8 +106,8 @@ mod tests {
 
     fn ends(topology: &Topology, host: &str) -> Vec<(String, DirectionLaunch, Duration)> {
         let host = topology.host(host).unwrap();
-        let plans = on(topology, host).map(|plan| match plan.kind {
-            ProcessKind::ClockPath {
+        let plans = on(topology, host).map(|plan| match plan.task {
+            ProcessTask::ClockPath {
                 mut directions,
                 ready_within,
             } => (plan.name, directions.remove(0), ready_within),
@@ -160,8 +160,13 @@ mod tests {
         ]);
         let host = topology.host("robot-pc").unwrap();
         let plan = super::super::plan::plan(&topology, &[host]);
-        let roles: Vec<String> = plan.processes.iter().map(ProcessPlan::role).collect();
-        assert_eq!(roles, ["clock path", "gateway", "robot"]);
+        let kinds: Vec<ProcessKind> = plan.processes.iter().map(ProcessPlan::kind).collect();
+        let expected = [
+            ProcessKind::ClockPath,
+            ProcessKind::Gateway,
+            ProcessKind::Component,
+        ];
+        assert_eq!(kinds, expected);
         let turns = plan.processes.iter().map(|process| {
             [
                 process.is_clock_path(),

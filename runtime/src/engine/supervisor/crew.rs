@@ -14,9 +14,10 @@ use hil_models::time::{Instant, duration_ns};
 
 use super::child::{Child, Word, describe_exit, last_line};
 use super::launching::write_launch;
-use super::plan::{ProcessKind, ProcessPlan};
+use super::plan::{ProcessPlan, ProcessTask};
 use crate::engine::process::own_program;
 use crate::platform::clock::MonotonicClock;
+use crate::rundir::event::EventKind;
 use crate::rundir::event::{Event, Interruption};
 use crate::rundir::launch::{LaunchError, write};
 use crate::rundir::pipe::{ChannelProgress, FromProcess, ProcessReport, ToProcess};
@@ -138,11 +139,11 @@ impl Crew {
         let (name, instance) = (member.plan.name.clone(), member.restart_count);
         let log = self.folder.log(&name);
         let domain = self.places[&member.plan.host].clone();
-        let spawned = if let ProcessKind::Foreign {
+        let spawned = if let ProcessTask::Foreign {
             card,
             command,
             environment,
-        } = &member.plan.kind
+        } = &member.plan.task
         {
             let card_path = self.folder.card(&name);
             write(&card_path, card)?;
@@ -269,34 +270,34 @@ impl Crew {
         };
         if self.started.is_some() && member.restart_count < limit && member.complaint.is_none() {
             member.restart_count += 1;
-            let text = format!(
-                "{what}; restart {} of at most {limit}",
-                member.restart_count
-            );
-            self.note(now, index, text, Some(interruption));
+            let kind = EventKind::Restarted {
+                end: what,
+                restart: member.restart_count,
+                limit,
+            };
+            self.note(now, index, kind, Some(interruption));
             return match self.spawn(index) {
                 Ok(()) => Verdict::GoesOn,
                 Err(error) if self.members[index].plan.is_clock_path() => {
-                    self.go_on_without(now, index, &error.to_string())
+                    self.go_on_without(now, index, error.to_string())
                 }
                 Err(error) => {
-                    self.note(now, index, error.to_string(), None);
-                    Verdict::Failed(error.to_string())
+                    let error = error.to_string();
+                    let kind = EventKind::StartFailed {
+                        error: error.clone(),
+                    };
+                    self.note(now, index, kind, None);
+                    Verdict::Failed(error)
                 }
             };
         }
         if self.members[index].plan.is_clock_path() {
-            return self.go_on_without(now, index, &what);
+            return self.go_on_without(now, index, what);
         }
         // What it had in its queues, or came for it until the end, is lost with it.
         let interruption = Some(interruption).filter(|_| !is_orderly);
-        self.note(
-            now,
-            index,
-            format!("{what}; policy: end the run"),
-            interruption,
-        );
         let text = format!("process {name} {what}");
+        self.note(now, index, EventKind::EndedRun { end: what }, interruption);
         if is_orderly {
             Verdict::Finished(text)
         } else {
@@ -305,11 +306,9 @@ impl Crew {
     }
 
     /// A clock path that is gone for good: nothing waits for it, and no message depends on it.
-    fn go_on_without(&mut self, now: Instant, index: usize, what: &str) -> Verdict {
+    fn go_on_without(&mut self, now: Instant, index: usize, end: String) -> Verdict {
         self.members[index].is_ready = true;
-        let text =
-            format!("{what}; policy: the run goes on, with the clock exchanges of the data path");
-        self.note(now, index, text, None);
+        self.note(now, index, EventKind::GivenUp { end }, None);
         Verdict::GoesOn
     }
 
@@ -337,7 +336,9 @@ impl Crew {
                 }
                 FromProcess::Progress(progress) => member.progress = progress,
                 FromProcess::SkippedTicks(count) => member.skipped_tick_count = Some(count),
-                FromProcess::Warning(text) => self.note(now, index, text, None),
+                FromProcess::Warning(text) => {
+                    self.note(now, index, EventKind::Warning { text }, None);
+                }
                 FromProcess::Finished(report) => member.report = Some(*report),
                 FromProcess::Failed(text) => member.complaint = Some(text),
             }
@@ -362,7 +363,7 @@ impl Crew {
         &mut self,
         at: Instant,
         index: usize,
-        what: String,
+        kind: EventKind,
         interruption: Option<Interruption>,
     ) {
         let plan = &self.members[index].plan;
@@ -370,7 +371,7 @@ impl Crew {
             at,
             host: plan.host.clone(),
             process: plan.name.clone(),
-            what,
+            kind,
             interruption,
         });
     }
@@ -405,11 +406,9 @@ impl Crew {
                 None => "ended".to_owned(),
             };
             if !ended_by_itself {
-                let text = format!(
-                    "did not stop within {} s and was killed",
-                    patience.as_secs()
-                );
-                self.note(MonotonicClock::now(), index, text, None);
+                let patience_s = patience.as_secs();
+                let kind = EventKind::Killed { patience_s };
+                self.note(MonotonicClock::now(), index, kind, None);
             }
             self.members[index].end = Some(end);
         }
@@ -439,7 +438,7 @@ impl Crew {
 /// Names the process and the program that is not there.
 pub(crate) fn find_programs(plans: &[ProcessPlan]) -> Result<(), CrewError> {
     for plan in plans {
-        if let ProcessKind::Foreign { command, .. } = &plan.kind {
+        if let ProcessTask::Foreign { command, .. } = &plan.task {
             own_program::find(&command[0]).map_err(|source| CrewError::Spawn {
                 process: plan.name.clone(),
                 program: command[0].clone(),

@@ -13,6 +13,7 @@ use super::session::is_here;
 use crate::engine::security::PreSharedKey;
 use crate::platform::console::Console;
 use crate::platform::signals::Signals;
+use crate::rundir::protection::{HopProtection, RunSecurity};
 use crate::rundir::run_seal::{RunSeal, has_fast_aes, suite_for};
 use crate::shm::clock_id;
 use crate::topology::{Host, Topology};
@@ -26,8 +27,8 @@ pub(super) struct Gathered {
     pub(super) peers: Vec<Peer>,
     /// `None` when no datagram leaves the host, or hops are plain.
     pub(super) seal: Option<RunSeal>,
-    /// How the hops are protected, in words; `None` when all hosts are here.
-    pub(super) security: Option<String>,
+    /// How the hops are protected; `None` when all hosts are here.
+    pub(super) security: Option<RunSecurity>,
 }
 
 /// The key of the topology's hops, if hosts of it are elsewhere and its hops are sealed.
@@ -105,32 +106,25 @@ pub(super) fn gather(
         Some(_) => Some(be_handed(&mut peers, meeting.timeout, signals)?),
     };
     let names: Vec<&str> = peers.iter().map(|peer| peer.hello.host.as_str()).collect();
-    let secured = protection(key, seal.as_ref());
-    console.say(&format!(
-        "connected with {}; hops {secured}",
-        names.join(", ")
-    ));
+    let hops = protection(key, seal.as_ref());
+    console.say(&format!("connected with {}; hops {hops}", names.join(", ")));
     if let Some(strangers) = &strangers {
         console.warn(strangers);
     }
-    let security = [Some(secured), strangers].into_iter().flatten();
     Ok(Gathered {
         peers,
         seal,
-        security: Some(security.collect::<Vec<_>>().join("; ")),
+        security: Some(RunSecurity { hops, strangers }),
     })
 }
 
-/// How the hops are protected, in words.
-fn protection(key: Option<&PreSharedKey>, seal: Option<&RunSeal>) -> String {
+fn protection(key: Option<&PreSharedKey>, seal: Option<&RunSeal>) -> HopProtection {
     match (key, seal) {
-        (Some(key), Some(seal)) => format!(
-            "sealed ({}) with the key {}",
-            seal.suite().label(),
-            key.fingerprint()
-        ),
-        _ => "PLAIN, as the topology says: whoever reaches the network can read and forge messages"
-            .to_owned(),
+        (Some(key), Some(seal)) => HopProtection::Sealed {
+            suite: seal.suite().label().to_owned(),
+            key_fingerprint: key.fingerprint(),
+        },
+        _ => HopProtection::Plain,
     }
 }
 

@@ -8,7 +8,8 @@ use std::time::Duration;
 use hil_models::time::Instant;
 
 use super::crew::{Crew, Member};
-use super::plan::ProcessKind;
+use super::plan::ProcessTask;
+use crate::rundir::event::EventKind;
 
 /// A process that gets a processor now and then speaks within this time.
 const SILENCE_MAX: Duration = Duration::from_secs(3);
@@ -29,23 +30,23 @@ impl Heartbeats {
             let name = member.plan.name.clone();
             let silence = silence(member, now).filter(|_| crew.started.is_some());
             let is_silent = silence.is_some_and(|silence| silence > SILENCE_MAX);
-            let what = match (is_silent, self.silent.contains(&index)) {
+            let kind = match (is_silent, self.silent.contains(&index)) {
                 (true, false) => {
                     self.silent.insert(index);
                     let limit_s = SILENCE_MAX.as_secs();
-                    format!("gave no sign of life for {limit_s} s: it hangs, or gets no processor")
+                    EventKind::Silent { limit_s }
                 }
                 (false, true) => {
                     self.silent.remove(&index);
                     if silence.is_none() {
                         continue;
                     }
-                    "gives signs of life again".to_owned()
+                    EventKind::Responsive
                 }
                 _ => continue,
             };
-            words.push(format!("{name}: {what}"));
-            crew.note(now, index, what, None);
+            words.push(format!("{name}: {kind}"));
+            crew.note(now, index, kind, None);
         }
         words
     }
@@ -58,7 +59,7 @@ impl Heartbeats {
 
 /// How long `member` has been silent; `None` of one that owes no sign of life.
 fn silence(member: &Member, now: Instant) -> Option<Duration> {
-    let is_foreign = matches!(member.plan.kind, ProcessKind::Foreign { .. });
+    let is_foreign = matches!(member.plan.task, ProcessTask::Foreign { .. });
     let owes = member.child.is_some() && member.is_ready && !is_foreign;
     owes.then(|| now.saturating_duration_since(member.heard))
 }

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use super::crew::Member;
-use super::plan::ProcessKind;
+use super::plan::ProcessTask;
 use crate::rundir::face_launch::FaceLaunch;
 use crate::rundir::launch::{ComponentLaunch, GatewayLaunch, LaunchError, write};
 use crate::rundir::run_folder::RunFolder;
@@ -20,8 +20,8 @@ pub(super) fn write_launch(
 ) -> Result<&'static str, LaunchError> {
     let plan = &member.plan;
     let (process, instance) = (plan.name.clone(), member.restart_count);
-    match &plan.kind {
-        ProcessKind::Component(card) => {
+    match &plan.task {
+        ProcessTask::Component(card) => {
             let card_path = folder.card(&process);
             write(&card_path, card)?;
             let launch = ComponentLaunch {
@@ -36,9 +36,9 @@ pub(super) fn write_launch(
             write(path, &launch)?;
             Ok("component")
         }
-        ProcessKind::Gateway(directions) | ProcessKind::ClockPath { directions, .. } => {
-            let ready_within = match &plan.kind {
-                ProcessKind::ClockPath { ready_within, .. } => Some(*ready_within),
+        ProcessTask::Gateway(directions) | ProcessTask::ClockPath { directions, .. } => {
+            let ready_within = match &plan.task {
+                ProcessTask::ClockPath { ready_within, .. } => Some(*ready_within),
                 _ => None,
             };
             let launch = GatewayLaunch {
@@ -53,7 +53,7 @@ pub(super) fn write_launch(
             write(path, &launch)?;
             Ok("gateway")
         }
-        ProcessKind::Face(face) => {
+        ProcessTask::Face(face) => {
             let launch = FaceLaunch {
                 process,
                 instance,
@@ -65,6 +65,6 @@ pub(super) fn write_launch(
             write(path, &launch)?;
             Ok("face")
         }
-        ProcessKind::Foreign { .. } => Ok("foreign"),
+        ProcessTask::Foreign { .. } => Ok("foreign"),
     }
 }

@@ -17,6 +17,7 @@ use crate::platform::domain_address::domain_base_candidates;
 use crate::platform::realtime::{RealtimeRequest, SchedulingPolicy};
 use crate::platform::wait::WaitMode;
 use crate::rundir::announcement;
+use crate::rundir::event::ProcessKind;
 use crate::rundir::face_launch::{ArmLaunch, FaceSettings};
 use crate::rundir::launch::{DirectionLaunch, Side, SocketLaunch, Transport};
 use crate::rundir::live_run::Source;
@@ -55,7 +56,7 @@ pub(crate) struct HostPlan {
 pub(crate) struct ProcessPlan {
     pub(crate) name: String,
     pub(crate) host: String,
-    pub(crate) kind: ProcessKind,
+    pub(crate) task: ProcessTask,
     pub(crate) realtime: RealtimeRequest,
     pub(crate) wait: WaitMode,
     pub(crate) on_exit: OnExit,
@@ -63,7 +64,7 @@ pub(crate) struct ProcessPlan {
 
 /// What it executes.
 #[derive(Debug)]
-pub(crate) enum ProcessKind {
+pub(crate) enum ProcessTask {
     /// A role of the case, in this binary.
     Component(ProcessCard),
     /// The gateway of one link, in this binary.
@@ -93,33 +94,39 @@ impl ProcessPlan {
 
     /// True for what exchanges clocks and nothing else.
     pub(crate) fn is_clock_path(&self) -> bool {
-        matches!(self.kind, ProcessKind::ClockPath { .. })
+        matches!(self.task, ProcessTask::ClockPath { .. })
     }
 
     /// True for what has datagrams of ours on the network.
     pub(crate) fn is_gateway(&self) -> bool {
-        matches!(self.kind, ProcessKind::Gateway(_)) || self.is_clock_path()
+        matches!(self.task, ProcessTask::Gateway(_)) || self.is_clock_path()
     }
 
     /// True for what carries messages instead of making them: a gateway, or a face.
     pub(crate) fn is_carrier(&self) -> bool {
-        matches!(self.kind, ProcessKind::Gateway(_) | ProcessKind::Face(_))
+        matches!(self.task, ProcessTask::Gateway(_) | ProcessTask::Face(_))
     }
 
-    /// The role's name, or what else it is.
-    pub(crate) fn role(&self) -> String {
-        match &self.kind {
-            ProcessKind::Component(card) => card.role.clone().unwrap_or_default(),
-            ProcessKind::Gateway(_) => "gateway".to_owned(),
-            ProcessKind::ClockPath { .. } => "clock path".to_owned(),
-            ProcessKind::Face(face) => format!("{} by {FACE_ROLE}", face.role),
-            ProcessKind::Foreign { .. } => "own program".to_owned(),
+    /// What it is.
+    pub(crate) fn kind(&self) -> ProcessKind {
+        match &self.task {
+            ProcessTask::Component(_) => ProcessKind::Component,
+            ProcessTask::Gateway(_) => ProcessKind::Gateway,
+            ProcessTask::ClockPath { .. } => ProcessKind::ClockPath,
+            ProcessTask::Face(_) => ProcessKind::Adapter,
+            ProcessTask::Foreign { .. } => ProcessKind::OwnProgram,
+        }
+    }
+
+    /// The role of the case that it plays, or that a foreign program plays through it.
+    pub(crate) fn role(&self) -> Option<String> {
+        match &self.task {
+            ProcessTask::Component(card) | ProcessTask::Foreign { card, .. } => card.role.clone(),
+            ProcessTask::Face(face) => Some(face.role.clone()),
+            ProcessTask::Gateway(_) | ProcessTask::ClockPath { .. } => None,
         }
     }
 }
-
-/// Who plays a role behind a face, in reports.
-pub(crate) const FACE_ROLE: &str = "foreign program";
 
 /// What to run on `hosts`, all of them on this PC.
 pub(crate) fn plan(topology: &Topology, hosts: &[&Host]) -> Plan {
@@ -175,13 +182,13 @@ fn component(topology: &Topology, process: &Process) -> ProcessPlan {
     let card = topology
         .process_card(&process.name)
         .expect("the process is of this topology");
-    let kind = match &process.program {
-        Program::BuiltIn { .. } => ProcessKind::Component(card),
+    let task = match &process.program {
+        Program::BuiltIn { .. } => ProcessTask::Component(card),
         Program::Command {
             command,
             environment,
             ..
-        } => ProcessKind::Foreign {
+        } => ProcessTask::Foreign {
             card,
             command: command.clone(),
             environment: environment.clone(),
@@ -189,13 +196,13 @@ fn component(topology: &Topology, process: &Process) -> ProcessPlan {
         Program::Egm { role, face } => {
             let host = topology.host(&process.host);
             let interface = host.and_then(|host| host.interface.clone());
-            ProcessKind::Face(face_settings(role, face, (&card, process), interface))
+            ProcessTask::Face(face_settings(role, face, (&card, process), interface))
         }
     };
     ProcessPlan {
         name: process.name.clone(),
         host: process.host.clone(),
-        kind,
+        task,
         realtime: realtime(&process.execution, 0),
         wait: wait_mode(process.execution.wait),
         on_exit: process.on_exit,
@@ -230,7 +237,7 @@ fn face_settings(
             continue;
         };
         arms.push(ArmLaunch {
-            arm: side.word().to_owned(),
+            arm: side,
             address,
             input,
             output,
@@ -300,7 +307,7 @@ fn gateways_on(topology: &Topology, host: &Host) -> Vec<ProcessPlan> {
             plans.push(ProcessPlan {
                 name: gateway_name(&link.name, &host.name),
                 host: host.name.clone(),
-                kind: ProcessKind::Gateway(directions),
+                task: ProcessTask::Gateway(directions),
                 realtime: RealtimeRequest::default(),
                 wait: wait_mode(hop.gateway.execution.wait),
                 on_exit: hop.gateway.on_exit,

@@ -28,6 +28,7 @@ use crate::platform::signals::Signals;
 use crate::rundir::announcement::Announcement;
 use crate::rundir::event::{Event, HostStory, ProcessStory, disciplines};
 use crate::rundir::manifest::{self, ManifestContent};
+use crate::rundir::protection::RunSecurity;
 use crate::rundir::run_folder::{RunFolder, utc_text};
 use crate::rundir::run_result::{Outcome, RunResult};
 use crate::rundir::status::Phase;
@@ -183,7 +184,7 @@ struct Session<'a> {
     /// Who steered the system clock before the run.
     discipline: Option<HostDiscipline>,
     /// How the hops are protected, in words.
-    security: Option<String>,
+    security: Option<RunSecurity>,
     cleaned: WallInstant,
     greeted: WallInstant,
     teller: Teller,
@@ -301,7 +302,7 @@ impl Session<'_> {
         let verdict = self.crew.watch();
         for event in &self.crew.events()[known..] {
             self.console
-                .warn(&format!("{}: {}", event.process, event.what));
+                .warn(&format!("{}: {}", event.process, event.kind));
         }
         match verdict {
             Verdict::GoesOn => None,
@@ -485,6 +486,7 @@ impl Session<'_> {
             .map(|member| ProcessStory {
                 name: member.plan.name.clone(),
                 host: member.plan.host.clone(),
+                kind: member.plan.kind(),
                 role: member.plan.role(),
                 end: member
                     .end

@@ -13,7 +13,7 @@ use super::heartbeat::Heartbeats;
 use super::progress_line;
 use crate::platform::clock::MonotonicClock;
 use crate::platform::console::Console;
-use crate::rundir::status::{Phase, ProcessStatus, RunStatus};
+use crate::rundir::status::{Phase, ProcessState, ProcessStatus, RunStatus};
 use crate::rundir::status_file::StatusFile;
 use crate::topology::Topology;
 
@@ -93,14 +93,15 @@ impl Teller {
 fn process(member: &Member) -> ProcessStatus {
     let pid = member.child.as_ref().map(Child::id);
     let state = match (&member.end, pid) {
-        (_, Some(_)) if member.is_ready => "running".to_owned(),
-        (_, Some(_)) => "starting".to_owned(),
-        (Some(end), None) => end.clone(),
-        (None, None) => "not started".to_owned(),
+        (_, Some(_)) if member.is_ready => ProcessState::Running,
+        (_, Some(_)) => ProcessState::Starting,
+        (Some(end), None) => ProcessState::Ended(end.clone()),
+        (None, None) => ProcessState::NotStarted,
     };
     ProcessStatus {
         name: member.plan.name.clone(),
         host: member.plan.host.clone(),
+        kind: member.plan.kind(),
         role: member.plan.role(),
         state,
         pid,

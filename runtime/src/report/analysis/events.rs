@@ -13,7 +13,7 @@ use super::outages::OutageStory;
 use super::records::RunRecords;
 use crate::report::network::within;
 use crate::report::score_event::{EventOutage, ExplainedEvent, ExplainedMessage, ScoreEvents};
-use crate::report::summary::{ChannelSummary, LinkKind};
+use crate::report::summary::{ChannelSummary, CounterGroup, LinkKind};
 use crate::report::terminal::duration_s;
 use crate::rundir::run_result::RunResult;
 use crate::topology::{Channel, Topology};
@@ -245,17 +245,10 @@ impl Way<'_> {
     /// True when the link's model counted at least as many losses as the account has: then none
     /// is left that anything else could have caused.
     fn is_all_loss_emulated(&self) -> bool {
-        let counters = self.summary.directions.iter().flat_map(|one| &one.counters);
-        let emulated_count: u64 = counters
-            .filter(|counter| counter.name == EMULATED_LOSS_COUNTER)
-            .map(|counter| counter.count)
-            .sum();
+        let emulated_count = self.summary.count(CounterGroup::Socket, "link_lost_count");
         let account = self.summary.account.as_ref();
         let lost_count = account.map(|account| account.fates.of(MessageFate::LostOnWire));
         self.summary.link == LinkKind::Emulated
             && lost_count.is_some_and(|lost_count| lost_count <= emulated_count)
     }
 }
-
-/// What the receiving gateway calls the messages that the link's model dropped.
-const EMULATED_LOSS_COUNTER: &str = "socket: link_lost_count";

@@ -3,7 +3,7 @@
 use super::records::RunRecords;
 use crate::report::face::FaceSummary;
 use crate::report::face_figures::figures;
-use crate::report::summary::{CountByName, Fact};
+use crate::report::summary::Fact;
 use crate::rundir::pipe::FaceReport;
 use crate::rundir::run_result::RunResult;
 use crate::topology::{
@@ -43,19 +43,11 @@ fn face_summary(
     let (sent, received) = records.of_face(out, back);
     let figures = figures(face.kind, &sent, &received);
     let report = report_of(result, &process.name, side);
-    let counters: Vec<CountByName> = report
-        .iter()
-        .flat_map(|report| &report.counters)
-        .map(|(name, count)| CountByName {
-            name: name.clone(),
-            count: *count,
-        })
-        .collect();
     FaceSummary {
         process: process.name.clone(),
         host: process.host.clone(),
-        kind: face.kind.to_string(),
-        arm: side.word().to_owned(),
+        kind: face.kind,
+        arm: side,
         address: face
             .address(side)
             .map(|one| one.to_string())
@@ -67,8 +59,13 @@ fn face_summary(
         cycle_ns: figures.cycle_ns,
         answers: figures.answers,
         segments: figures.segments,
-        refusals: refusals(&counters),
-        counters,
+        refusals: report
+            .iter()
+            .flat_map(|report| &report.refusals)
+            .filter(|refusal| refusal.count > 0)
+            .copied()
+            .collect(),
+        counters: report.map_or_else(Vec::new, |report| report.counters.clone()),
         facts: report
             .iter()
             .flat_map(|report| &report.facts)
@@ -77,21 +74,9 @@ fn face_summary(
     }
 }
 
-fn refusals(counters: &[CountByName]) -> Vec<CountByName> {
-    let named = counters.iter().filter(|counter| counter.count > 0);
-    named
-        .filter_map(|counter| {
-            Some(CountByName {
-                name: counter.name.strip_prefix("refused: ")?.to_owned(),
-                count: counter.count,
-            })
-        })
-        .collect()
-}
-
 fn report_of<'a>(result: &'a RunResult, process: &str, side: Side) -> Option<&'a FaceReport> {
     let mut stories = result.processes.iter();
     let story = stories.find(|story| story.name == process)?;
     let mut faces = story.report.as_ref()?.faces.iter();
-    faces.find(|face| face.arm == side.word())
+    faces.find(|face| face.arm == side)
 }

@@ -11,19 +11,13 @@ use super::records::RunRecords;
 use crate::platform::realtime::GrantOutcome;
 use crate::report::emulation::EmulationFigures;
 use crate::report::summary::{
-    ChannelSummary, CountByName, DirectionSummary, Fact, LinkKind, NO_ROOM, Outcome,
-    ProcessSummary, RealtimeFacts, RunEvent, RunFacts,
+    Absence, ChannelSummary, CounterGroup, DirectionSummary, Fact, LinkKind, Outcome,
+    ProcessSummary, RealtimeFacts, RunEvent, RunEventKind, RunFacts,
 };
 use crate::rundir::event::{Event, ProcessStory};
 
 use crate::rundir::run_result::{self, RunResult};
 use crate::topology::{Channel, Topology};
-
-/// Datagrams that came while the socket's receive buffer was full; see [`NO_ROOM`].
-const NO_ROOM_COUNTER: &str = "socket: kernel_drop_count";
-
-/// What a receiving gateway calls the datagrams that its emulated link had no room for.
-const OVERFLOW_COUNTER: &str = "socket: link_overflow_count";
 
 pub(super) fn run_facts(
     topology: &Topology,
@@ -144,6 +138,7 @@ pub(super) fn process_summary(process: &ProcessStory) -> ProcessSummary {
     ProcessSummary {
         name: process.name.clone(),
         host: process.host.clone(),
+        kind: process.kind,
         role: process.role.clone(),
         exit: process.end.clone(),
         restart_count: u64::from(process.restart_count),
@@ -160,14 +155,14 @@ pub(super) fn process_summary(process: &ProcessStory) -> ProcessSummary {
 }
 
 pub(super) fn run_event(axis: &RunAxis<'_>, event: &Event) -> RunEvent {
-    let gap = event.interruption.map(|gap| match gap.until {
-        Some(until) => format!("away for {:.0} ms", until.seconds_since(gap.from) * 1e3),
-        None => "never came back".to_owned(),
+    let absence = event.interruption.map(|gap| Absence {
+        length_s: gap.until.map(|until| until.seconds_since(gap.from)),
     });
     RunEvent {
         at_s: axis.shown_s(&event.host, event.at),
-        what: format!("{}: {}", event.process, event.what),
-        cause: gap.unwrap_or_default(),
+        process: event.process.clone(),
+        kind: RunEventKind::Process(event.kind.clone()),
+        absence,
     }
 }
 
@@ -186,24 +181,16 @@ pub(super) fn channel_summary(
     let refusals = directions
         .iter()
         .flat_map(|direction| &direction.counters)
-        .filter(|counter| counter.count > 0)
-        .filter_map(|counter| {
-            // What the kernel dropped for want of room may have been anything, also a message.
-            let name = match counter.name.as_str() {
-                NO_ROOM_COUNTER => NO_ROOM,
-                name => name.strip_prefix("refused: ")?,
-            };
-            Some(CountByName {
-                name: name.to_owned(),
-                count: counter.count,
-            })
-        })
+        .filter(|counter| counter.group == CounterGroup::Refused && counter.count > 0)
+        .cloned()
         .collect();
-    let overflow_count = directions
-        .iter()
-        .flat_map(|direction| &direction.counters)
-        .find(|counter| counter.name == OVERFLOW_COUNTER)
-        .map(|counter| counter.count);
+    let of_socket = |name: &'static str| {
+        directions
+            .iter()
+            .filter_map(move |direction| direction.count(CounterGroup::Socket, name))
+    };
+    let overflow_count = of_socket("link_overflow_count").next();
+    let no_room_count = of_socket("kernel_drop_count").sum();
     ChannelSummary {
         name: channel.name.clone(),
         from: channel.from.clone(),
@@ -219,6 +206,7 @@ pub(super) fn channel_summary(
             .then(|| records.recorded(&channel.name))
             .flatten(),
         refusals,
+        no_room_count,
         directions,
     }
 }
@@ -236,21 +224,15 @@ fn directions(result: &RunResult, channel: &str) -> Vec<DirectionSummary> {
         {
             found.push(DirectionSummary {
                 process: process.name.clone(),
-                direction: direction.direction.clone(),
+                direction: direction.direction,
                 peer_state: direction.peer_state.clone(),
-                counters: direction
-                    .counters
-                    .iter()
-                    .map(|(name, count)| CountByName {
-                        name: name.clone(),
-                        count: *count,
-                    })
-                    .collect(),
+                counters: direction.counters.clone(),
                 facts: direction
                     .facts
                     .iter()
                     .map(|(label, value)| Fact::new(label.clone(), value.clone()))
                     .collect(),
+                stalls: direction.stalls,
             });
         }
     }

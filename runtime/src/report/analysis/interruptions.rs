@@ -75,7 +75,7 @@ pub(super) fn noted(
                 place: *place,
                 from: gap.from,
                 until,
-                cause: event.what.clone(),
+                cause: event.kind.to_string(),
             });
         }
     }

@@ -143,12 +143,7 @@ pub(crate) fn conclude(
     let score_host = score_clock::host(topology, case.as_ref());
     let axis = RunAxis::of(records.clocks(), &result.spans, score_host);
     let mut summary = RunSummary::new(run_facts(topology, result, topology_file, command_line));
-    summary.host_facts = result
-        .facts
-        .facts
-        .iter()
-        .map(|fact| Fact::new(fact.label.replace('_', " "), fact.value.to_text()))
-        .collect();
+    summary.host_facts = result.facts.clone();
     for process in &result.processes {
         summary.processes.push(process_summary(process));
     }

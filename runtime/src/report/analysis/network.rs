@@ -23,7 +23,7 @@ pub(crate) use super::robot_series::RobotSeries;
 use super::robot_series::{index_of, without_holes};
 use crate::report::network::{
     ChannelNetwork, Correlation, CorrelationTests, FOREGOING_S, ForegoingEvent, ForegoingNetwork,
-    NetworkReport, TestedPair, TimedEvent, Timeline, TimelineRow,
+    NetworkQuantity, NetworkReport, TestedPair, TimedEvent, Timeline, TimelineRow, TimelineSubject,
 };
 use crate::report::score_event::ScoreEvents;
 use crate::rundir::run_result::RunResult;
@@ -249,20 +249,13 @@ fn covered_s(events: &[TimedEvent], (run_s, clock_bound_s): (f64, f64)) -> f64 {
     covered_s
 }
 
-/// What is bad about a network, as one number per bin.
-const TROUBLES: [(&str, &str, &str); 3] = [
-    ("lost", "loss", "1"),
-    ("delay", "delay", "s"),
-    ("silence", "silence", "s"),
-];
-
-fn trouble(bin: &NetworkBin, index: usize) -> Option<f64> {
+fn quantity_of(bin: &NetworkBin, quantity: NetworkQuantity) -> Option<f64> {
     let seconds = |ns: i64| ns as f64 * 1e-9;
-    match index {
-        0 if bin.sent_count == 0 => None,
-        0 => Some(bin.lost_count as f64 / bin.sent_count as f64),
-        1 => bin.delay_max_ns.map(seconds),
-        _ => bin.silence_max_ns.map(seconds),
+    match quantity {
+        NetworkQuantity::Loss if bin.sent_count == 0 => None,
+        NetworkQuantity::Loss => Some(bin.lost_count as f64 / bin.sent_count as f64),
+        NetworkQuantity::Delay => bin.delay_max_ns.map(seconds),
+        NetworkQuantity::Silence => bin.silence_max_ns.map(seconds),
     }
 }
 
@@ -285,30 +278,34 @@ fn timeline(all: &[(String, NetworkBins)], robot: &RobotBins, width_s: f64) -> T
     let count = all.first().map_or(0, |(_, bins)| bins.bins.len());
     let per_step = count.div_ceil(STEPS_MAX).max(1);
     let largest = |values: &[Option<f64>]| values.iter().flatten().copied().reduce(f64::max);
-    let row = |of: &str, what: &str, unit: &str, values: Vec<Option<f64>>| TimelineRow {
-        of: of.to_owned(),
-        what: what.to_owned(),
+    let row = |subject, unit: &str, values: Vec<Option<f64>>| TimelineRow {
+        subject,
         unit: unit.to_owned(),
         values: values.chunks(per_step).map(largest).collect(),
         bound: None,
     };
     let mut rows = Vec::new();
     for (channel, bins) in all {
-        for (index, (what, _, unit)) in TROUBLES.iter().enumerate() {
-            if *what == "silence" && speaks_seldom(bins) {
+        for quantity in NetworkQuantity::ALL {
+            if quantity == NetworkQuantity::Silence && speaks_seldom(bins) {
                 continue;
             }
-            let values = bins.bins.iter().map(|bin| trouble(bin, index));
-            let bound = (*what == "delay").then(|| delay_bound_s(bins)).flatten();
+            let values = bins.bins.iter().map(|bin| quantity_of(bin, quantity));
+            let is_delay = quantity == NetworkQuantity::Delay;
+            let subject = TimelineSubject::Channel {
+                channel: channel.clone(),
+                quantity,
+            };
             rows.push(TimelineRow {
-                bound,
-                ..row(channel, what, unit, values.collect())
+                bound: is_delay.then(|| delay_bound_s(bins)).flatten(),
+                ..row(subject, quantity.unit(), values.collect())
             });
         }
     }
     for (one, bins) in robot {
         let values = bins.iter().map(|value| Some(*value)).collect();
-        rows.push(row("robot", one.label(), one.unit(), values));
+        let label = one.label().to_owned();
+        rows.push(row(TimelineSubject::Robot { label }, one.unit(), values));
     }
     Timeline {
         step_s: per_step as f64 * width_s,
@@ -324,13 +321,13 @@ fn correlate(
     let mut names = Vec::new();
     let mut causes = Vec::new();
     for (channel, bins) in all {
-        for (index, (what, network, _)) in TROUBLES.iter().enumerate() {
-            if *what == "silence" && speaks_seldom(bins) {
+        for quantity in NetworkQuantity::ALL {
+            if quantity == NetworkQuantity::Silence && speaks_seldom(bins) {
                 continue;
             }
-            let values = bins.bins.iter().map(|bin| trouble(bin, index));
+            let values = bins.bins.iter().map(|bin| quantity_of(bin, quantity));
             causes.push(without_holes(values.collect()));
-            names.push((channel, *network));
+            names.push((channel, quantity));
         }
     }
     let effects: Vec<Vec<f64>> = robot.iter().map(|(_, bins)| bins.clone()).collect();
@@ -353,7 +350,7 @@ fn correlate(
         for ((channel, network), pair) in names.iter().zip(row) {
             pairs.extend(pair.map(|correlation| TestedPair {
                 channel: (*channel).clone(),
-                network: (*network).to_owned(),
+                network: *network,
                 robot: one.label().to_owned(),
                 lag_s: correlation.lag_bins as f64 * width_s,
                 correlation,

@@ -12,9 +12,10 @@ use hil_models::time::Instant;
 use super::axis::RunAxis;
 use super::records::RunRecords;
 use crate::report::radio::{ChannelRadio, RadioHopSummary, RadioReport, Spread, StationSummary};
-use crate::report::summary::{Fact, RunEvent, RunSummary};
-use crate::rundir::radio_record::command;
-use crate::rundir::radio_record::{NO_CODE, NO_RATE, NO_SIGNAL, RadioRecord, RateRecord, SAMPLE};
+use crate::report::summary::{CounterGroup, Fact, RadioChange, RunEvent, RunEventKind, RunSummary};
+use crate::rundir::radio_record::{
+    NO_CODE, NO_RATE, NO_SIGNAL, RadioRecord, RateRecord, SAMPLE, command,
+};
 use crate::rundir::run_result::RunResult;
 use crate::topology::Topology;
 
@@ -75,15 +76,12 @@ fn add_mark_warnings(summary: &mut RunSummary) {
     let mut warnings = Vec::new();
     for channel in &summary.channels {
         for direction in &channel.directions {
-            let counters = &direction.counters;
-            let changed = counters
-                .iter()
-                .find(|one| one.name == "socket: mark_changed_count");
-            if let Some(changed) = changed.filter(|one| one.count > 0) {
+            let changed = direction.count(CounterGroup::Socket, "mark_changed_count");
+            if let Some(changed) = changed.filter(|count| *count > 0) {
                 warnings.push(format!(
                     "{}: {} datagrams arrived with another code point than they should: {}",
                     channel.name,
-                    changed.count,
+                    changed,
                     "something on the way changes marks, or the other host sets another dscp"
                 ));
             }
@@ -100,7 +98,7 @@ fn summarise(samples: &[RadioRecord]) -> RadioHopSummary {
     let stations = by_station
         .iter()
         .map(|(mac, samples)| station(*mac, samples));
-    let is_change = |one: &&RadioRecord| words_of(one).is_some();
+    let is_change = |one: &&RadioRecord| change_of(one).is_some();
     RadioHopSummary {
         process: String::new(),
         host: String::new(),
@@ -157,13 +155,13 @@ fn station(mac: [u8; 6], samples: &[&RadioRecord]) -> StationSummary {
 }
 
 /// What an event of the association is called; `None` for samples and what concerns nobody.
-fn words_of(record: &RadioRecord) -> Option<&'static str> {
+fn change_of(record: &RadioRecord) -> Option<RadioChange> {
     Some(match record.event {
-        command::CONNECT => "associated",
-        command::ROAM => "roamed",
-        command::DISCONNECT => "disconnected",
-        command::DEL_STATION => "station left",
-        command::NOTIFY_CQM => "connection quality changed",
+        command::CONNECT => RadioChange::Associated,
+        command::ROAM => RadioChange::Roamed,
+        command::DISCONNECT => RadioChange::Disconnected,
+        command::DEL_STATION => RadioChange::StationLeft,
+        command::NOTIFY_CQM => RadioChange::QualityChanged,
         _ => return None,
     })
 }
@@ -187,19 +185,19 @@ fn add_events(
     place_s: impl Fn(i64) -> Option<f64>,
 ) {
     for record in samples {
-        let Some(what) = words_of(record) else {
+        let Some(change) = change_of(record) else {
             continue;
         };
-        let whom = if record.mac == [0; 6] {
-            String::new()
-        } else {
-            format!(" ({})", mac_text(record.mac))
-        };
-        let code = (record.code != NO_CODE).then(|| format!("802.11 code {}", record.code));
         events.push(RunEvent {
             at_s: place_s(record.at_ns),
-            what: format!("{}: {} {what}{whom}", hop.process, hop.interface),
-            cause: code.unwrap_or_default(),
+            process: hop.process.clone(),
+            kind: RunEventKind::Radio {
+                interface: hop.interface.clone(),
+                change,
+                station: (record.mac != [0; 6]).then(|| mac_text(record.mac)),
+                code: (record.code != NO_CODE).then_some(record.code),
+            },
+            absence: None,
         });
     }
 }
@@ -299,8 +297,8 @@ mod tests {
         (hop.process, hop.interface) = ("gateway".to_owned(), "wlan0".to_owned());
         let mut events = Vec::new();
         add_events(&mut events, &hop, &samples, |ns| Some(ns as f64 * 1e-9));
-        assert_eq!(events[0].what, "gateway: wlan0 disconnected");
-        assert_eq!(events[0].cause, "802.11 code 3");
+        assert_eq!(events[0].what(), "gateway: wlan0 disconnected");
+        assert_eq!(events[0].cause().as_deref(), Some("802.11 code 3"));
         assert!((events[0].at_s.unwrap() - 1.5).abs() < 1e-9);
     }
 

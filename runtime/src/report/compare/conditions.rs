@@ -8,8 +8,7 @@ use core::fmt;
 use hil_models::stats::statistics::Interval;
 use serde::Serialize;
 
-use super::figures::END_TO_END;
-use super::{ComparedFigure, Comparison, FigureKind};
+use super::{ComparedFigure, Comparison, FigureKind, Part};
 
 /// Why a condition cannot be judged.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -193,8 +192,9 @@ impl Condition {
         verdicts: &mut Verdicts,
     ) -> Result<(), ConditionError> {
         let figures = &comparison.figures;
-        let is_whole =
-            |one: &&ComparedFigure| one.kind != FigureKind::Delay || one.part == END_TO_END;
+        let is_whole = |one: &&ComparedFigure| {
+            one.kind != FigureKind::Delay || one.part == Some(Part::EndToEnd)
+        };
         let named: Vec<&ComparedFigure> = figures
             .iter()
             .filter(is_whole)

@@ -12,8 +12,8 @@ fn figure(metric: &str, kind: FigureKind, ratio: (f64, f64, f64)) -> ComparedFig
     ComparedFigure {
         channel: (kind != FigureKind::Score).then(|| "a/b".to_owned()),
         part: match kind {
-            FigureKind::Delay => END_TO_END.to_owned(),
-            FigureKind::Loss | FigureKind::Score => String::new(),
+            FigureKind::Delay => Some(Part::EndToEnd),
+            FigureKind::Loss | FigureKind::Score => None,
         },
         metric: metric.to_owned(),
         kind,

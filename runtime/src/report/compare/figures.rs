@@ -10,11 +10,9 @@ use hil_models::stats::comparison::{
 use hil_models::stats::histogram::{Distribution, DurationBin, LatencySummary};
 use hil_models::stats::statistics::{CONFIDENCE, Interval, IntervalNs};
 
-use super::{ComparedFigure, ComparedRun, FigureKind, Verdict};
+use super::{ComparedFigure, ComparedRun, FigureKind, Part, Verdict};
 use crate::report::summary::ScoreMetric;
 
-/// The part of a channel's way that is the whole of it.
-pub(super) const END_TO_END: &str = "end to end";
 const BOOTSTRAP: &str = "block bootstrap of each run, ratio by MOVER of the logarithms";
 const ORDER: &str = "order statistics of each run's histogram, which take messages as independent, ratio \
                      by MOVER of the logarithms";
@@ -31,7 +29,7 @@ const NO_OWN: &str = "no interval: the score has none of its own; repeat the run
 const ABSENT: &str = "unavailable on one side";
 
 /// What a delay is: which part of which channel, and which quantile.
-type DelayKey = (String, usize, String, usize);
+type DelayKey = (String, Part, usize);
 const METRICS: [&str; 4] = ["p50", "p99", "p99.9", "max"];
 
 /// So many runs of the base, and so many new ones.
@@ -51,11 +49,11 @@ pub(super) fn cautions(figures: &[ComparedFigure], of: Counts) -> Vec<String> {
         if !is_partial(have, of) {
             continue;
         }
-        let name = match (&one.channel, one.part.as_str()) {
+        let name = match (&one.channel, one.part) {
             (None, _) => one.metric.clone(),
-            (Some(channel), "") => format!("{channel} {}", one.metric),
+            (Some(channel), None) => format!("{channel} {}", one.metric),
             // Its quantiles are there together or not at all.
-            (Some(channel), part) => format!("{channel} {part}"),
+            (Some(channel), Some(part)) => format!("{channel} {part}"),
         };
         let text = format!(
             "{name}: only {} of {} base and {} of {} new runs have it",
@@ -115,18 +113,22 @@ fn delays_of(run: &ComparedRun) -> BTreeMap<DelayKey, (Estimate, &'static str)> 
     for (channel, account) in accounts(run) {
         let whole = &account.end_to_end;
         let own = [whole.p50_interval, whole.p99_interval, None, None];
-        let mut add = |place: usize, name: &str, parts: Parts<'_>| {
+        let mut add = |part: Part, parts: Parts<'_>| {
             for (index, metric) in METRICS.iter().enumerate() {
                 if let Some(estimate) = delay(metric, index, &parts) {
-                    let key = (channel.to_owned(), place, name.to_owned(), index);
+                    let key = (channel.to_owned(), part, index);
                     found.insert(key, estimate);
                 }
             }
         };
-        add(0, END_TO_END, (&whole.distribution, &whole.bins, own));
-        for (index, segment) in account.segments.iter().enumerate() {
+        add(Part::EndToEnd, (&whole.distribution, &whole.bins, own));
+        for segment in &account.segments {
             let parts = (&segment.distribution, segment.bins.as_slice(), [None; 4]);
-            add(index + 1, &segment.name(), parts);
+            let part = Part::Segment {
+                from: segment.from,
+                to: segment.to,
+            };
+            add(part, parts);
         }
     }
     found
@@ -194,7 +196,7 @@ fn delays(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedFigure> {
 type Side<'a> = &'a [(Estimate, &'static str)];
 
 fn delay_figure(
-    (channel, _, part, metric): &DelayKey,
+    (channel, part, metric): &DelayKey,
     (base, new): (Side<'_>, Side<'_>),
     of: Counts,
 ) -> ComparedFigure {
@@ -209,7 +211,7 @@ fn delay_figure(
     let is_repeated = base.len() > 1 && new.len() > 1;
     ComparedFigure {
         channel: Some(channel.clone()),
-        part: part.clone(),
+        part: Some(*part),
         metric: METRICS[*metric].to_owned(),
         kind: FigureKind::Delay,
         unit: "ns".to_owned(),
@@ -376,7 +378,7 @@ fn loss_figure(channel: &str, (base, new): (&[Share], &[Share]), of: Counts) -> 
     };
     ComparedFigure {
         channel: Some(channel.to_owned()),
-        part: String::new(),
+        part: None,
         metric: "loss".to_owned(),
         kind: FigureKind::Loss,
         unit: "1".to_owned(),
@@ -430,7 +432,7 @@ fn score_figure(
     let quotient = both.and_then(|(b, n)| (b.value > 0.0).then(|| n.value / b.value));
     ComparedFigure {
         channel: None,
-        part: String::new(),
+        part: None,
         metric: metric.name.clone(),
         kind: FigureKind::Score,
         unit: metric.unit.clone(),

@@ -9,8 +9,10 @@ mod origin;
 mod render;
 pub(crate) mod work;
 
+use std::fmt;
 use std::path::{Path, PathBuf};
 
+use hil_models::account::Stage;
 use hil_models::stats::comparison::Estimate;
 use hil_models::stats::statistics::Interval;
 use serde::Serialize;
@@ -109,13 +111,37 @@ pub(crate) enum FigureKind {
     Score,
 }
 
+/// A part of a channel's way.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(tag = "kind", rename_all = "snake_case")]
+pub(crate) enum Part {
+    /// The whole of it.
+    EndToEnd,
+    /// From one stage to another.
+    Segment {
+        /// Where it begins.
+        from: Stage,
+        /// Where it ends.
+        to: Stage,
+    },
+}
+
+impl fmt::Display for Part {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::EndToEnd => formatter.write_str("end to end"),
+            Self::Segment { from, to } => write!(formatter, "{from} → {to}"),
+        }
+    }
+}
+
 /// One figure of both sides.
 #[derive(Debug, Clone, Serialize)]
 pub(crate) struct ComparedFigure {
     /// The channel; `None` for a score.
     pub(crate) channel: Option<String>,
-    /// `end to end`, the segment's name, or empty for losses and scores.
-    pub(crate) part: String,
+    /// Which part of the channel's way a delay is of; `None` for losses and scores.
+    pub(crate) part: Option<Part>,
     /// `p50`, `p99`, `p99.9`, `max`, `loss`, or the score's name.
     pub(crate) metric: String,
     pub(crate) kind: FigureKind,

@@ -3,11 +3,17 @@
 use std::collections::BTreeSet;
 
 use super::ComparedRun;
+use crate::platform::host_facts::Fact;
 use crate::report::assessment::{Assessment, NetworkVerdict};
 use crate::report::summary::{Outcome, RunSummary};
 
-/// Facts of a host that change what it can measure.
-const HOST_FACTS: [&str; 4] = ["kernel", "cpu model", "governor", "virtual machine"];
+/// Facts of a host that change what it can measure, and their words.
+const HOST_FACTS: [(&str, &str); 4] = [
+    ("kernel", "kernel"),
+    ("cpu_model", "cpu model"),
+    ("governor", "governor"),
+    ("virtual_machine", "virtual machine"),
+];
 
 /// What both sides share, and what they do not.
 pub(super) fn of(base: &[ComparedRun], new: &[ComparedRun]) -> (Vec<String>, Vec<String>) {
@@ -30,18 +36,12 @@ pub(super) fn of(base: &[ComparedRun], new: &[ComparedRun]) -> (Vec<String>, Vec
     });
     check("length", &|one| format!("{:.0} s", one.run.duration_s));
     check("links", &links);
-    let labels = base
-        .iter()
-        .chain(new)
-        .flat_map(|run| &run.summary.host_facts);
-    let labels: BTreeSet<&str> = labels.map(|fact| fact.label.as_str()).collect();
-    for label in labels {
-        let lower = label.to_lowercase();
-        if HOST_FACTS.contains(&lower.as_str()) {
-            check(label, &|one| {
-                let mut facts = one.host_facts.iter();
-                let found = facts.find(|fact| fact.label == label);
-                found.map_or_else(|| "unavailable".to_owned(), |fact| fact.value.clone())
+    for (label, words) in HOST_FACTS {
+        let mut runs = base.iter().chain(new);
+        if runs.any(|run| run.summary.host_facts.find(label).is_some()) {
+            check(words, &|one| {
+                let found = one.host_facts.find(label);
+                found.map_or_else(|| "unavailable".to_owned(), Fact::to_text)
             });
         }
     }

@@ -4,7 +4,7 @@ use hil_models::stats::comparison::Estimate;
 use hil_models::stats::statistics::Interval;
 
 use super::conditions::Verdicts;
-use super::{ComparedFigure, Comparison, FigureKind};
+use super::{ComparedFigure, Comparison, FigureKind, Part};
 use crate::report::terminal::{duration, figure, percent};
 
 const UNAVAILABLE: &str = "unavailable";
@@ -29,10 +29,9 @@ fn rows(comparison: &Comparison) -> Vec<Row> {
 }
 
 fn cells(one: &ComparedFigure) -> [String; 6] {
-    let name = if one.part.is_empty() {
-        one.metric.clone()
-    } else {
-        format!("{} {}", one.part, one.metric)
+    let name = match one.part {
+        None => one.metric.clone(),
+        Some(part) => format!("{part} {}", one.metric),
     };
     let (change, interval) = match one.kind {
         FigureKind::Delay => (
@@ -159,7 +158,7 @@ fn methods(comparison: &Comparison) -> Vec<String> {
     let mut found: Vec<(&str, Vec<&str>)> = Vec::new();
     for one in &comparison.figures {
         let whom = match one.kind {
-            FigureKind::Delay if one.part == super::figures::END_TO_END => one.metric.as_str(),
+            FigureKind::Delay if one.part == Some(Part::EndToEnd) => one.metric.as_str(),
             FigureKind::Delay => "segments",
             FigureKind::Loss => "loss",
             FigureKind::Score => "scores",

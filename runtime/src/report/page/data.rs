@@ -21,6 +21,19 @@ pub(crate) struct Page {
     pub(crate) runs: Vec<Run>,
 }
 
+/// Where a run on a page comes from.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum RunKind {
+    /// It ran in real time.
+    #[default]
+    Live,
+    /// It ran in virtual time.
+    Virtual,
+    /// It left no summary.
+    Unfinished,
+}
+
 /// One run.
 #[derive(Debug, Clone, Default, Serialize)]
 pub(crate) struct Run {
@@ -28,8 +41,8 @@ pub(crate) struct Run {
     pub(crate) key: String,
     pub(crate) name: String,
     pub(crate) case: String,
-    /// `live`, `virtual` or `unfinished`.
-    pub(crate) kind: &'static str,
+    /// Where it comes from.
+    pub(crate) kind: RunKind,
     /// How it ended.
     pub(crate) outcome: Verdict,
     /// Whether it says anything about a network.

@@ -1,7 +1,8 @@
 //! What a run's folder holds, as far as a page needs it: read by [`super::read`], judged by nobody yet.
 
 use super::series::Series;
-use crate::report::summary::{Fact, RunSummary};
+use crate::platform::host_facts::HostFacts;
+use crate::report::summary::RunSummary;
 
 /// One folder.
 #[derive(Debug, Clone)]
@@ -35,7 +36,7 @@ pub(crate) struct Manifest {
     pub(crate) created: String,
     pub(crate) seed: Option<u64>,
     pub(crate) command_line: Vec<String>,
-    pub(crate) host_facts: Vec<Fact>,
+    pub(crate) host_facts: HostFacts,
     /// Files of records that there are, and what they hold in all, bytes.
     pub(crate) records: (u64, u64),
 }

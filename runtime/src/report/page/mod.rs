@@ -28,7 +28,7 @@ use std::path::Path;
 
 use clap::ValueEnum;
 
-use self::data::{Drawing, Page, Run, SCHEMA_VERSION, Table};
+use self::data::{Drawing, Page, Run, RunKind, SCHEMA_VERSION, Table};
 use self::material::Material;
 use super::terminal::JOINT;
 use crate::platform::text::grouped;
@@ -98,13 +98,11 @@ pub(crate) fn page_of(materials: &[Material], steps: usize) -> Page {
 fn overview(runs: &[Run]) -> Table {
     let mut columns = vec!["run", "outcome", "network"];
     let mut names: Vec<(&str, &str)> = Vec::new();
-    let labels = ["largest loss", "largest p99", "network's largest p99"];
     for figure in runs.iter().flat_map(|run| &run.headline) {
         if names.iter().all(|(name, _)| *name != figure.name) {
-            let worst = labels
-                .iter()
-                .find(|label| figure.label.starts_with(**label));
-            names.push((&figure.name, worst.copied().unwrap_or(&figure.label)));
+            let worst = run::WORST.iter().find(|(name, _)| *name == figure.name);
+            let label = worst.map_or(figure.label.as_str(), |(_, label)| label);
+            names.push((&figure.name, label));
         }
     }
     columns.extend(names.iter().map(|(_, label)| *label));
@@ -114,12 +112,7 @@ fn overview(runs: &[Run]) -> Table {
         let mut row = vec![
             run.name.clone(),
             run.outcome.word.clone(),
-            run.network_verdict
-                .text
-                .split([':', ';'])
-                .next()
-                .unwrap_or_default()
-                .to_owned(),
+            run.network_verdict.word.clone(),
         ];
         for (name, _) in &names {
             let found = run.headline.iter().find(|figure| figure.name == *name);
@@ -132,8 +125,8 @@ fn overview(runs: &[Run]) -> Table {
             ));
         }
         let count = match run.kind {
-            "unfinished" => words::UNAVAILABLE.to_owned(),
-            _ => grouped(run.score_events.grave_count),
+            RunKind::Unfinished => words::UNAVAILABLE.to_owned(),
+            RunKind::Live | RunKind::Virtual => grouped(run.score_events.grave_count),
         };
         row.push(count);
         table.rows.push(row);

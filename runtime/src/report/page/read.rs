@@ -4,11 +4,13 @@ use std::fs;
 use std::io;
 use std::path::Path;
 
+use serde::Deserialize;
 use serde_json::Value;
 
 use super::material::{Found, Manifest, Material};
 use super::series::{self, Series};
-use crate::report::summary::{Fact, RunSummary};
+use crate::platform::host_facts::HostFacts;
+use crate::report::summary::RunSummary;
 use crate::rundir::run_folder::RunFolder;
 use crate::rundir::series::list;
 
@@ -104,14 +106,6 @@ fn found(folder: &RunFolder) -> Result<Found, ReadError> {
 
 fn manifest_of(manifest: &Value, folder: &RunFolder) -> Manifest {
     let text = |value: &Value| value.as_str().unwrap_or("unavailable").to_owned();
-    let fact = |one: &Value| {
-        let value = &one["value"];
-        let reason = value["unavailable"]
-            .as_str()
-            .map(|reason| format!("unavailable ({reason})"));
-        let value = value["available"].as_str().map(str::to_owned).or(reason)?;
-        Some(Fact::new(one["label"].as_str()?.replace('_', " "), value))
-    };
     let list = |value: &Value| value.as_array().cloned().unwrap_or_default();
     let records = fs::read_dir(folder.records())
         .into_iter()
@@ -124,10 +118,7 @@ fn manifest_of(manifest: &Value, folder: &RunFolder) -> Manifest {
         created: text(&manifest["created"]),
         seed: manifest["seed"].as_u64(),
         command_line: list(&manifest["command_line"]).iter().map(text).collect(),
-        host_facts: list(&manifest["host_facts"])
-            .iter()
-            .filter_map(fact)
-            .collect(),
+        host_facts: HostFacts::deserialize(&manifest["host_facts"]).unwrap_or_default(),
         records: sizes.fold((0, 0), |(count, bytes), size| (count + 1, bytes + size)),
     }
 }

@@ -2,7 +2,7 @@
 //! nothing is measured here.
 
 use super::channel::{self, Sources};
-use super::data::{Channel, FactGroup, Figure, Run, Table, Verdict};
+use super::data::{Channel, FactGroup, Figure, Run, RunKind, Table, Verdict};
 use super::drawings;
 use super::events::{correlation, network_events, score_events};
 use super::material::{Found, Material};
@@ -15,7 +15,7 @@ use crate::platform::words::counted;
 use crate::report::assessment::Assessment;
 use crate::report::clock_summary::ClockSection;
 use crate::report::score_event::ScoreEvents;
-use crate::report::summary::{ChannelSummary, Fact, LinkKind, RunSummary, ScoreMetric};
+use crate::report::summary::{ChannelSummary, Fact, LinkKind, RunSummary, ScoreMetric, host_words};
 use crate::report::terminal;
 use crate::report::terminal::{duration, seconds};
 
@@ -57,7 +57,7 @@ pub(super) fn of(material: &Material, index: usize, steps: usize) -> Run {
         ));
         run.network_events = network_events(report);
         run.correlation = correlation(report);
-    } else if run.kind != "unfinished" {
+    } else if run.kind != RunKind::Unfinished {
         run.missing.push(
             "Network over time: no channel crossed a network, so there is nothing to draw."
                 .to_owned(),
@@ -65,7 +65,7 @@ pub(super) fn of(material: &Material, index: usize, steps: usize) -> Run {
     }
     run.score_events = score_events(events);
     let (drawing, left_out) = timeline::of_case(&key, &material.series, steps);
-    if drawing.is_none() && run.kind != "unfinished" {
+    if drawing.is_none() && run.kind != RunKind::Unfinished {
         run.missing
             .push("The robot over time: the case left no series, or they are empty.".to_owned());
     }
@@ -89,7 +89,11 @@ fn live(key: &str, summary: &RunSummary) -> Run {
         key: key.to_owned(),
         name: facts.name.clone(),
         case: facts.case.clone(),
-        kind: if facts.is_virtual { "virtual" } else { "live" },
+        kind: if facts.is_virtual {
+            RunKind::Virtual
+        } else {
+            RunKind::Live
+        },
         outcome: Verdict {
             tone: tone.word(),
             word: word.to_owned(),
@@ -97,7 +101,7 @@ fn live(key: &str, summary: &RunSummary) -> Run {
         },
         network_verdict: Verdict {
             tone: network_tone.word(),
-            word: String::new(),
+            word: terminal::network_word(&assessment.network).to_owned(),
             text: network_text,
         },
         warnings: assessment.warnings,
@@ -179,7 +183,7 @@ fn live_facts(summary: &RunSummary) -> Vec<FactGroup> {
         Fact::new("folder", &run.folder),
     ];
     let security = run.security.iter();
-    facts.extend(security.map(|text| Fact::new("hops between hosts", text)));
+    facts.extend(security.map(|one| Fact::new("hops between hosts", one.to_string())));
     let group = |title: &str, facts: Vec<Fact>| FactGroup {
         title: title.to_owned(),
         facts,
@@ -208,7 +212,7 @@ fn live_facts(summary: &RunSummary) -> Vec<FactGroup> {
         ),
         group(
             "Host that wrote this",
-            or_none(&summary.host_facts, UNAVAILABLE),
+            or_none(&host_words(&summary.host_facts), UNAVAILABLE),
         ),
     ];
     groups.into_iter().chain(by_hand).collect()
@@ -269,21 +273,21 @@ fn notes(one: &ChannelSummary) -> Vec<String> {
              p99, limit {limit}"
         ));
     }
-    let refusals = one
-        .refusals
-        .iter()
-        .map(|one| format!("{} {}", one.name, grouped(one.count)));
-    let refusals: Vec<_> = refusals.collect();
+    let refusals = one.refusal_words();
     if !refusals.is_empty() {
         notes.push(format!("datagrams refused: {}", refusals.join(", ")));
     }
     for direction in &one.directions {
         let facts = direction.facts.iter();
         let facts = facts.map(|fact| format!("{}: {}", fact.label, fact.value));
+        let stalls = direction.stalls.iter();
+        let stalls = stalls.map(|stalls| format!("stalls: {}", terminal::stall_words(stalls)));
         let words: Vec<String> = core::iter::once(format!("peer {}", direction.peer_state))
             .chain(facts)
+            .chain(stalls)
             .collect();
-        notes.push(format!("{}: {}", direction.direction, words.join(", ")));
+        let way = direction.direction.word();
+        notes.push(format!("{way}: {}", words.join(", ")));
     }
     notes
 }
@@ -315,16 +319,21 @@ fn processes(summary: &RunSummary) -> Option<Table> {
     let mut table = Table::new("Processes", &columns);
     for one in &summary.processes {
         let ticks = |count_of: Option<u64>| {
-            if one.role == "gateway" {
-                "–".to_owned()
-            } else {
+            if one.kind.counts_ticks() {
                 count(count_of)
+            } else {
+                "–".to_owned()
             }
         };
         let cpu = one
             .cpu_time_s
             .map_or_else(|| UNAVAILABLE.to_owned(), terminal::duration_s);
-        let words = [&one.name, &one.host, &one.role, &one.exit].map(Clone::clone);
+        let words = [
+            one.name.clone(),
+            one.host.clone(),
+            one.label(),
+            one.exit.clone(),
+        ];
         let figures = [
             grouped(one.restart_count),
             ticks(one.tick_count),
@@ -368,6 +377,13 @@ fn has_a_hundredth(channel: &Channel) -> bool {
     delivered.and_then(|one| one.value).unwrap_or(0.0) >= 100.0
 }
 
+/// Figures of which the channel with the largest is shown first, and what they are called.
+pub(super) const WORST: [(&str, &str); 3] = [
+    ("loss_ratio", "largest loss"),
+    ("p99", "largest p99"),
+    ("network_p99", "network's largest p99"),
+];
+
 /// The figures to see first: what the case is about, the worst of the network, and how often the
 /// robot came to harm.
 fn headline(run: &Run) -> Vec<Figure> {
@@ -381,11 +397,7 @@ fn headline(run: &Run) -> Vec<Figure> {
         .cloned()
         .into_iter()
         .collect();
-    for (name, words) in [
-        ("loss_ratio", "largest loss"),
-        ("p99", "largest p99"),
-        ("network_p99", "network's largest p99"),
-    ] {
+    for (name, words) in WORST {
         let is_quantile = name != "loss_ratio";
         let channels = run.channels.iter();
         let told = channels.filter(|one| !is_quantile || has_a_hundredth(one));

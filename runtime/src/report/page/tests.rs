@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use super::material::{Found, Manifest, Material};
 use super::series::{Series, parse};
 use super::{Format, PAGE_BYTES_MAX, figure_files, page_of, render};
+use crate::report::network::TimelineSubject;
 use crate::report::sample::{awkward, empty, full};
 use crate::report::summary::RunSummary;
 use crate::report::terminal::{JOINT, Style};
@@ -133,7 +134,10 @@ fn hostile_texts_stay_texts() {
     if let Some(network) = &mut summary.network {
         network.channels[0].channel = HOSTILE.to_owned();
         for row in &mut network.timeline.rows {
-            row.of = HOSTILE.to_owned();
+            match &mut row.subject {
+                TimelineSubject::Channel { channel: name, .. }
+                | TimelineSubject::Robot { label: name } => *name = HOSTILE.to_owned(),
+            }
         }
     }
     for event in &mut summary.score_events.events {

@@ -1,12 +1,14 @@
 //! Figures over time: the network and the robot on the axis of the run, and the case's own series on
 //! theirs.
 
+use hil_models::case_study::Severity;
+
 use super::data::Drawing;
-use super::drawings::{name_of, severity_word};
-use super::figures::time::{Mark, over_time};
+use super::drawings::name_of;
+use super::figures::time::{Mark, MarkClass, over_time};
 use super::series::{Plot, PlotPanel, Series, Thinned, thinned};
 use crate::report::link_change::LinkChange;
-use crate::report::network::{NetworkReport, TimelineRow};
+use crate::report::network::{NetworkQuantity, NetworkReport, TimelineRow, TimelineSubject};
 use crate::report::score_event::{ExplainedEvent, ScoreEvents};
 use crate::report::terminal::duration_s;
 
@@ -30,16 +32,19 @@ pub(super) fn over_run(
     let until_s = ends.fold(0.0, f64::max);
     let span = (0.0, if until_s > 0.0 { until_s } else { 1.0 });
     let (mut panels, width_s) = network_panels(report, series, (span, point_count));
-    for row in rows.iter().filter(|row| row.of == "robot") {
+    for row in rows {
+        let TimelineSubject::Robot { label } = &row.subject else {
+            continue;
+        };
         // A number of events has no unit; an error has.
         let (title, unit) = match row.unit.as_str() {
-            "1" => (format!("Robot: {}", row.what), "count"),
-            unit => (format!("Robot: {} ({unit})", row.what), unit),
+            "1" => (format!("Robot: {label}"), "count"),
+            unit => (format!("Robot: {label} ({unit})"), unit),
         };
         panels.push(PlotPanel {
             title,
             unit: unit.to_owned(),
-            series: vec![of_row(&row.what, row)],
+            series: vec![of_row(label, row)],
         });
     }
     let bands = bands(report);
@@ -78,7 +83,7 @@ fn bands(report: &NetworkReport) -> Vec<Mark> {
         .map(|event| Mark {
             from_s: event.from_s,
             until_s: event.until_s,
-            class: "band",
+            class: MarkClass::Band,
             channel: event.channel.clone(),
             words: event.words(),
         })
@@ -115,7 +120,11 @@ fn moment(event: &ExplainedEvent) -> Option<Mark> {
     Some(Mark {
         from_s: event.at_s?,
         until_s: None,
-        class: severity_word(event.severity),
+        class: match event.severity {
+            Severity::Notice => MarkClass::Notice,
+            Severity::Hazard => MarkClass::Hazard,
+            Severity::Incident => MarkClass::Incident,
+        },
         channel: String::new(),
         words: event.what.clone(),
     })
@@ -126,7 +135,7 @@ fn changed_at(change: &LinkChange) -> Option<Mark> {
     Some(Mark {
         from_s: change.at_s.filter(|_| change.is_in_force())?,
         until_s: None,
-        class: "change",
+        class: MarkClass::Change,
         channel: String::new(),
         words: change.what(),
     })
@@ -135,22 +144,21 @@ fn changed_at(change: &LinkChange) -> Option<Mark> {
 fn of_row(name: &str, row: &TimelineRow) -> Thinned {
     Thinned {
         name: name.to_owned(),
-        channel: if row.of == "robot" {
-            String::new()
-        } else {
-            row.of.clone()
+        channel: match &row.subject {
+            TimelineSubject::Channel { channel, .. } => channel.clone(),
+            TimelineSubject::Robot { .. } => String::new(),
         },
         high: row.values.clone(),
         low: Vec::new(),
     }
 }
 
-/// What of the network is drawn: title, unit, the timeline's word for it.
-const PANELS: [(&str, &str, &str); 4] = [
-    ("Delay, median", "s", ""),
-    ("Delay, largest", "s", "delay"),
-    ("Share lost", "share", "lost"),
-    ("Longest silence", "s", "silence"),
+/// What of the network is drawn: title, unit, what the timeline has of it.
+const PANELS: [(&str, &str, Option<NetworkQuantity>); 4] = [
+    ("Delay, median", "s", None),
+    ("Delay, largest", "s", Some(NetworkQuantity::Delay)),
+    ("Share lost", "share", Some(NetworkQuantity::Loss)),
+    ("Longest silence", "s", Some(NetworkQuantity::Silence)),
 ];
 
 /// From the series where they are, else from the summary's timeline; with the width of a step.
@@ -176,13 +184,13 @@ fn network_panels(
             let steps = steps.min(found.rows.len()).max(1);
             width_s = width_s.max((span.1 - span.0) / steps as f64);
             // A channel that speaks seldom has no silence to tell of; see the summary's timeline.
-            let told = |what: &str| {
+            let told = |quantity: Option<NetworkQuantity>| {
                 let mut rows = report.timeline.rows.iter();
-                what.is_empty() || rows.any(|row| row.of == channel && row.what == what)
+                quantity.is_none_or(|quantity| rows.any(|row| row.subject.is_of(channel, quantity)))
             };
             let points = network_points(found).into_iter().zip(PANELS);
-            for (panel, (points, (_, _, what))) in panels.iter_mut().zip(points) {
-                if !told(what) {
+            for (panel, (points, (_, _, quantity))) in panels.iter_mut().zip(points) {
+                if !told(quantity) {
                     continue;
                 }
                 let thin = thinned((channel, channel), points.into_iter(), span, steps);
@@ -191,12 +199,11 @@ fn network_panels(
             continue;
         }
         width_s = width_s.max(report.timeline.step_s);
-        for (panel, (_, _, what)) in panels.iter_mut().zip(PANELS) {
-            let row = report
-                .timeline
-                .rows
-                .iter()
-                .find(|row| row.of == channel && row.what == what);
+        for (panel, (_, _, quantity)) in panels.iter_mut().zip(PANELS) {
+            let row = quantity.and_then(|quantity| {
+                let mut rows = report.timeline.rows.iter();
+                rows.find(|row| row.subject.is_of(channel, quantity))
+            });
             panel.series.extend(row.map(|row| of_row(channel, row)));
         }
     }

@@ -1,10 +1,10 @@
 //! A run that was begun and never finished.
 
-use super::data::{FactGroup, Run, Verdict};
+use super::data::{FactGroup, Run, RunKind, Verdict};
 use super::material::Manifest;
 use super::words::UNAVAILABLE;
 use crate::platform::text::grouped;
-use crate::report::summary::Fact;
+use crate::report::summary::{Fact, host_words};
 
 /// A run without a summary.
 pub(super) fn unfinished(key: &str, manifest: &Manifest, folder: &str) -> Run {
@@ -16,7 +16,7 @@ pub(super) fn unfinished(key: &str, manifest: &Manifest, folder: &str) -> Run {
         key: key.to_owned(),
         name: manifest.name.clone(),
         case: manifest.case.clone(),
-        kind: "unfinished",
+        kind: RunKind::Unfinished,
         outcome: Verdict {
             tone: "bad",
             word: "unfinished".to_owned(),
@@ -24,7 +24,7 @@ pub(super) fn unfinished(key: &str, manifest: &Manifest, folder: &str) -> Run {
         },
         network_verdict: Verdict {
             tone: "caution",
-            word: String::new(),
+            word: "no verdict".to_owned(),
             text: "no verdict: there are no figures".to_owned(),
         },
         missing: vec![
@@ -47,7 +47,7 @@ pub(super) fn unfinished(key: &str, manifest: &Manifest, folder: &str) -> Run {
             },
             FactGroup {
                 title: "Host".to_owned(),
-                facts: manifest.host_facts.clone(),
+                facts: host_words(&manifest.host_facts),
             },
         ],
         repeat_command: Some(manifest.command_line.join(" ")).filter(|line| !line.is_empty()),

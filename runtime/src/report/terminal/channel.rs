@@ -12,15 +12,13 @@ use super::clocks;
 use super::units::{duration, percent};
 use crate::platform::text::grouped;
 use crate::platform::words::counted;
-use crate::report::summary::{ChannelSummary, CountByName, LinkKind, RecordedFigures};
+use crate::report::summary::{ChannelSummary, LinkKind, RecordedFigures};
+use crate::rundir::pipe::StallFigures;
 
 /// Columns of a stage's name, of each of the four figures, and between figures and bar.
 const NAME_WIDTH: usize = 22;
 const FIGURE_WIDTH: usize = 9;
 const BAR_GAP: usize = 2;
-
-/// The fact that gets a line of its own.
-const STALLS: &str = "stalls";
 
 pub(super) fn channel(canvas: &mut Canvas, channel: &ChannelSummary) {
     let link = channel.link.label();
@@ -56,36 +54,41 @@ pub(super) fn channel(canvas: &mut Canvas, channel: &ChannelSummary) {
     if let Some(figures) = &channel.outages {
         super::outages::outages(canvas, figures);
     }
-    let list = |counts: &[CountByName]| {
-        let words = counts
-            .iter()
-            .map(|c| format!("{} {}", c.name, grouped(c.count)));
-        words.collect::<Vec<_>>().join(" · ")
-    };
-    if !channel.refusals.is_empty() {
-        canvas.field(
-            "refused",
-            Tone::Caution,
-            &format!("datagrams: {}", list(&channel.refusals)),
-        );
+    let refused = channel.refusal_words();
+    if !refused.is_empty() {
+        let text = format!("datagrams: {}", refused.join(" · "));
+        canvas.field("refused", Tone::Caution, &text);
     }
     for direction in &channel.directions {
-        // Whether a stream stood still is a result, and not one to be looked for among options.
-        let (stalls, facts): (Vec<_>, Vec<_>) = direction
-            .facts
-            .iter()
-            .partition(|fact| fact.label == STALLS);
-        let facts = facts
-            .iter()
-            .map(|fact| format!("{}: {}", fact.label, fact.value));
+        let facts = direction.facts.iter();
+        let facts = facts.map(|fact| format!("{}: {}", fact.label, fact.value));
         let words: Vec<_> = core::iter::once(format!("peer {}", direction.peer_state))
             .chain(facts)
             .collect();
-        canvas.field(&direction.direction, Tone::Faint, &words.join(" · "));
-        for stalls in stalls {
-            canvas.field(STALLS, Tone::Plain, &stalls.value);
+        canvas.field(direction.direction.word(), Tone::Faint, &words.join(" · "));
+        // Whether a stream stood still is a result, and not one to be looked for among options.
+        if let Some(stalls) = &direction.stalls {
+            canvas.field("stalls", Tone::Plain, &stall_words(stalls));
         }
     }
+}
+
+/// How often a stream stood still, and what counts as that.
+pub(crate) fn stall_words(stalls: &StallFigures) -> String {
+    let time = |ns: u64| duration(i64::try_from(ns).unwrap_or(i64::MAX));
+    let threshold = time(stalls.threshold_ns);
+    let rule = format!(
+        "a byte unacknowledged for over {threshold}: twice the smallest round trip and 50 ms"
+    );
+    if stalls.count == 0 {
+        return format!("none ({rule})");
+    }
+    format!(
+        "{}, {} together, longest {} ({rule})",
+        grouped(stalls.count),
+        time(stalls.total_ns),
+        time(stalls.longest_ns)
+    )
 }
 
 fn recorded(canvas: &mut Canvas, figures: Option<RecordedFigures>) {

@@ -14,7 +14,8 @@ const ANSWERED_RATIO_MIN: f64 = 0.95;
 const FIGURE_WIDTH: usize = 10;
 
 pub(super) fn face(canvas: &mut Canvas, face: &FaceSummary) {
-    let title = format!("{} of {}, {} arm", face.kind, face.process, face.arm);
+    let arm = face.arm.word();
+    let title = format!("{} of {}, {arm} arm", face.kind, face.process);
     canvas.heading(&title, &face.address);
     canvas.field("peer", Tone::Plain, &face.peer_state);
     answers(canvas, face);
@@ -23,14 +24,13 @@ pub(super) fn face(canvas: &mut Canvas, face: &FaceSummary) {
         let words: Vec<_> = face
             .refusals
             .iter()
-            .map(|one| format!("{} {}", one.name, grouped(one.count)))
+            .map(|one| format!("{} {}", one.cause.label(), grouped(one.count)))
             .collect();
         canvas.field("refused", Tone::Caution, &words.join(" · "));
     }
     let counted = face.counters.iter().filter(|one| one.count > 0);
     let words: Vec<_> = counted
-        .filter(|one| !one.name.starts_with("refused: "))
-        .map(|one| format!("{} {}", one.name, grouped(one.count)))
+        .map(|one| format!("{} {}", one.label(), grouped(one.count)))
         .collect();
     if !words.is_empty() {
         canvas.field("counted", Tone::Faint, &words.join(" · "));
@@ -121,8 +121,12 @@ fn segment_line(
 mod tests {
     use super::*;
     use crate::report::face::Answers;
-    use crate::report::summary::{CountByName, Fact};
+    use crate::report::summary::Fact;
     use crate::report::terminal::Style;
+    use crate::rundir::pipe::{FaceRefusal, RefusalCount};
+    use crate::topology::FaceKind;
+    use hil_models::egm::messages::Side;
+    use hil_models::egm::wire::Cause;
     use hil_models::stats::histogram::LatencyHistogram;
 
     fn summary() -> FaceSummary {
@@ -131,8 +135,8 @@ mod tests {
         FaceSummary {
             process: "client".to_owned(),
             host: "local".to_owned(),
-            kind: "EGM robot face".to_owned(),
-            arm: "right".to_owned(),
+            kind: FaceKind::Robot,
+            arm: Side::Right,
             address: "127.0.0.1:6510".to_owned(),
             peer_state: "never answered".to_owned(),
             cycle_ns: Some(4_000_000),
@@ -150,8 +154,8 @@ mod tests {
                     distribution: Distribution::unavailable("nothing passed"),
                 },
             ],
-            refusals: vec![CountByName {
-                name: "not protobuf".to_owned(),
+            refusals: vec![RefusalCount {
+                cause: FaceRefusal::Protocol(Cause::NotProtobuf),
                 count: 3,
             }],
             counters: Vec::new(),

@@ -19,7 +19,7 @@ mod units;
 use crate::platform::text::{grouped, shortened};
 pub use canvas::Style;
 pub(crate) use canvas::{Tone, wrapped};
-pub(crate) use channel::closing_text;
+pub(crate) use channel::{closing_text, stall_words};
 pub(crate) use trace::{render_fit, render_trace, render_trace_plots};
 pub use units::{JOINT, duration, percent};
 pub(crate) use units::{duration_s, figure, seconds};
@@ -31,6 +31,7 @@ use super::link_change::LinkChange;
 use super::network::NetworkReport;
 use super::score_event::ScoreEvents;
 use super::summary::{Outcome, RunSummary};
+use crate::rundir::protection::HopProtection;
 
 /// The report of a run as text of at most `width_columns` columns (clamped to 80..=120).
 pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> String {
@@ -108,10 +109,12 @@ fn verdict(canvas: &mut Canvas, summary: &RunSummary, assessment: &Assessment) {
     );
     let (tone, text) = network_words(&assessment.network);
     canvas.field("Network", tone, &text);
-    if let Some(text) = &summary.run.security {
-        let is_plain = text.starts_with("PLAIN");
-        let tone = if is_plain { Tone::Caution } else { Tone::Good };
-        canvas.field("Security", tone, text);
+    if let Some(security) = &summary.run.security {
+        let tone = match security.hops {
+            HopProtection::Plain => Tone::Caution,
+            HopProtection::Sealed { .. } => Tone::Good,
+        };
+        canvas.field("Security", tone, &security.to_string());
     }
     for (index, warning) in assessment.warnings.iter().enumerate() {
         let label = if index == 0 { "Warnings" } else { "" };
@@ -132,6 +135,22 @@ pub(crate) const fn outcome_words(outcome: Outcome) -> (Tone, &'static str) {
 fn no_result(why: &str) -> (Tone, String) {
     let cure = "repeat on an idle host or at a lower rate";
     (Tone::Bad, format!("NOT a network result{why}; {cure}"))
+}
+
+/// What a run says about a network, in a few words.
+pub(crate) const fn network_word(verdict: &NetworkVerdict) -> &'static str {
+    match verdict {
+        NetworkVerdict::RunFailed | NetworkVerdict::TicksUnknown => "no verdict",
+        NetworkVerdict::VirtualTime => "virtual time",
+        NetworkVerdict::EmulatedLink => "an emulated link",
+        NetworkVerdict::NoNetwork => "no channel went over a network",
+        NetworkVerdict::ForeignProgram => "a foreign program took part over its own protocol",
+        NetworkVerdict::NoForeignProgram => "no foreign program answered",
+        NetworkVerdict::NetworkResult => "a network result",
+        NetworkVerdict::EmulationNotKept { .. }
+        | NetworkVerdict::HostOverran { .. }
+        | NetworkVerdict::ReceiverLate { .. } => "NOT a network result",
+    }
 }
 
 /// What a run says about a network, in words.

@@ -2,10 +2,10 @@
 
 use super::canvas::{Canvas, INDENT, Tone, left, right};
 use super::units::{duration_s, figure, seconds};
-use crate::platform::text::columns;
-use crate::platform::text::grouped;
+use crate::platform::host_facts::HostFacts;
+use crate::platform::text::{columns, grouped};
 use crate::report::alike::joined_labels;
-use crate::report::summary::{Fact, ProcessSummary, RealtimeFacts, RunEvent, ScoreMetric};
+use crate::report::summary::{ProcessSummary, RealtimeFacts, RunEvent, ScoreMetric, host_words};
 
 /// Shorter preparations concern nobody.
 const PREPARATION_S_MIN: f64 = 0.01;
@@ -113,7 +113,10 @@ pub(super) fn processes(canvas: &mut Canvas, processes: &[ProcessSummary]) {
             "{:INDENT$}{}{}{}{}{}{}{}",
             "",
             column(&process.name, name_width),
-            left(&format!("{} on {}", process.role, process.host), name_width),
+            left(
+                &format!("{} on {}", process.label(), process.host),
+                name_width
+            ),
             canvas.paint(caution(process.restart_count > 0), &restarts),
             right(&count(process.tick_count), 9),
             canvas.paint(
@@ -146,10 +149,10 @@ pub(super) fn events(canvas: &mut Canvas, events: &[RunEvent]) {
     }
     canvas.heading("Events", "");
     for event in events {
-        let text = if event.cause.is_empty() {
-            event.what.clone()
-        } else {
-            format!("{} ({})", event.what, event.cause)
+        let what = event.what();
+        let text = match event.cause() {
+            Some(cause) => format!("{what} ({cause})"),
+            None => what,
         };
         let at = event
             .at_s
@@ -173,12 +176,12 @@ pub(super) fn realtime(canvas: &mut Canvas, realtime: &RealtimeFacts) {
     }
 }
 
-pub(super) fn host(canvas: &mut Canvas, facts: &[Fact]) {
-    if facts.is_empty() {
+pub(super) fn host(canvas: &mut Canvas, facts: &HostFacts) {
+    if facts.facts.is_empty() {
         return;
     }
     canvas.heading("Host", "");
-    for fact in facts {
+    for fact in host_words(facts) {
         canvas.field_of(22, &fact.label, Tone::Plain, &fact.value);
     }
 }

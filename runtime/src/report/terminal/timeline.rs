@@ -4,7 +4,7 @@
 use super::canvas::{Canvas, INDENT, Tone, left, right};
 use super::units::{duration_s, figure, percent, seconds};
 use crate::report::link_change::LinkChange;
-use crate::report::network::{Timeline, TimelineRow};
+use crate::report::network::{NetworkQuantity, Timeline, TimelineRow, TimelineSubject};
 
 /// Columns of the row's name, of what it shows, and of its scale behind it.
 const WHAT_WIDTH: usize = 9;
@@ -28,20 +28,24 @@ pub(super) fn timeline(canvas: &mut Canvas, all: &Timeline, changes: &[LinkChang
     canvas.heading("Timeline", &aside);
     let mut last = "";
     for row in &all.rows {
-        let is_robot = row.of == "robot";
-        let name = if row.of == last { "" } else { &row.of };
-        last = &row.of;
-        let label = if is_robot {
+        let (label, tone) = match &row.subject {
             // A robot's rows have names of their own.
-            format!("{} ", left(&row.what, name_width + WHAT_WIDTH - 1))
-        } else {
-            format!(
-                "{} {}",
-                left(name, name_width - 1),
-                left(&row.what, WHAT_WIDTH)
-            )
+            TimelineSubject::Robot { label } => {
+                let label = format!("{} ", left(label, name_width + WHAT_WIDTH - 1));
+                (label, Tone::Bad)
+            }
+            TimelineSubject::Channel { channel, quantity } => {
+                let name = if channel == last { "" } else { channel };
+                last = channel;
+                let what = match quantity {
+                    NetworkQuantity::Loss => "lost",
+                    NetworkQuantity::Delay => "delay",
+                    NetworkQuantity::Silence => "silence",
+                };
+                let label = format!("{} {}", left(name, name_width - 1), left(what, WHAT_WIDTH));
+                (label, Tone::Bar)
+            }
         };
-        let tone = if is_robot { Tone::Bad } else { Tone::Bar };
         let line = format!(
             "{:INDENT$}{}{}  {}",
             "",
@@ -142,7 +146,7 @@ fn scale(row: &TimelineRow) -> String {
     match row.unit.as_str() {
         _ if largest <= 0.0 => "none".to_owned(),
         "s" => duration_s(largest) + &bound_words(row.bound),
-        "1" if row.of != "robot" => percent(largest),
+        "1" if matches!(row.subject, TimelineSubject::Channel { .. }) => percent(largest),
         "1" => figure(largest),
         unit => format!("{} {unit}", figure(largest)),
     }
@@ -166,21 +170,27 @@ mod tests {
 
     #[test]
     fn network_and_robot_share_one_axis() {
-        let row = |of: &str, what: &str, unit: &str, at: usize, value: f64| TimelineRow {
-            of: of.to_owned(),
-            what: what.to_owned(),
+        let row = |subject, unit: &str, at: usize, value: f64| TimelineRow {
+            subject,
             unit: unit.to_owned(),
             values: (0..120)
                 .map(|step| Some(if step == at { value } else { 0.0 }))
                 .collect(),
-            bound: (what == "silence").then_some(15e-6),
+            bound: (unit == "s").then_some(15e-6),
+        };
+        let of_channel = |quantity| TimelineSubject::Channel {
+            channel: "shuttle/command".to_owned(),
+            quantity,
+        };
+        let robot = TimelineSubject::Robot {
+            label: "error of the cart's speed".to_owned(),
         };
         let all = Timeline {
             step_s: 0.1,
             rows: vec![
-                row("shuttle/command", "lost", "1", 30, 1.0),
-                row("shuttle/command", "silence", "s", 35, 0.812),
-                row("robot", "error of the cart's speed", "m/s", 40, 1.1),
+                row(of_channel(NetworkQuantity::Loss), "1", 30, 1.0),
+                row(of_channel(NetworkQuantity::Silence), "s", 35, 0.812),
+                row(robot, "m/s", 40, 1.1),
             ],
         };
         for width in [80, 100] {

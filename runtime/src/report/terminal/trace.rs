@@ -96,8 +96,13 @@ fn heading(canvas: &mut Canvas, header: &TraceHeader) {
             name.to_owned()
         }
     };
+    let changed = match header.link_change_count {
+        0 => String::new(),
+        1 => " (changed by hand once)".to_owned(),
+        count => format!(" (changed by hand {count} times)"),
+    };
     let aside = format!(
-        "link {}, {}, run {}; {}",
+        "link {}{changed}, {}, run {}; {}",
         of(&header.link, "unknown"),
         header.direction.word(),
         of(&header.run, "unknown"),

@@ -18,8 +18,6 @@ use crate::topology::{Crossing, Direction, Topology, Via};
 
 /// What a trace of clocks without a relation says of them.
 pub(crate) const NOT_ALIGNED: &str = "clocks not aligned";
-/// What follows the name of a link that was changed while the run went on, before how often.
-pub(super) const CHANGED_BY_HAND: &str = " (changed by hand";
 
 /// Writes the traces of a finished run and says so in its summary.
 pub(crate) fn write(
@@ -66,8 +64,9 @@ fn write_one(
         if seen.count == 0 {
             return Ok(false);
         }
+        let change_count = link_changes::in_force_on(run.0, records, crossing).count();
         let header = TraceHeader {
-            link: link_words(run.0, crossing, records),
+            link_change_count: u16::try_from(change_count).unwrap_or(u16::MAX),
             ..header(run.1, crossing, seen.has_delay)
         };
         fs::create_dir_all(folder).map_err(|error| format!("{}: {error}", folder.display()))?;
@@ -182,23 +181,10 @@ fn header(result: &RunResult, crossing: &Crossing<'_>, has_delay: bool) -> Trace
             Direction::Backward => TraceDirection::Backward,
         },
         arrival: TraceArrival::Received,
+        link_change_count: 0,
         origin_ns: span.map_or(UNAVAILABLE_NS, |(start, _)| start.as_ns()),
         duration_ns: span.map_or(UNAVAILABLE_NS, |(start, end)| end.ns_since(*start)),
     }
-}
-
-/// The link, and how often it was changed while the run went on: its model alone does not explain the
-/// trace then.
-fn link_words(topology: &Topology, crossing: &Crossing<'_>, records: &RunRecords) -> String {
-    let name = &crossing.link.name;
-    let count = link_changes::in_force_on(topology, records, crossing).count();
-    let words = match count {
-        0 => return cut(name, TraceHeader::LINK_BYTES),
-        1 => format!("{CHANGED_BY_HAND} once)"),
-        count => format!("{CHANGED_BY_HAND} {count} times)"),
-    };
-    let room = TraceHeader::LINK_BYTES - words.len();
-    cut(name, room) + &words
 }
 
 /// As much of a name as fits, at the border of a character.

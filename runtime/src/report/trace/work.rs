@@ -13,7 +13,6 @@ use hil_models::trace::netem::NetemTable;
 use hil_models::trace::{Trace, TraceDirection, csv, netem, opportunities, wire};
 use serde_json::{Value, json};
 
-use super::capture::CHANGED_BY_HAND;
 use super::cli::{TraceCommand, TraceFiles, TraceForm};
 use super::open::{Opened, files, open};
 use super::plots;
@@ -109,13 +108,9 @@ impl FittedLinks {
     /// The lines for one trace, and above them where they come from.
     fn toml(&mut self, opened: &Opened, fit: &TraceFit) -> String {
         let header = &opened.trace.header;
-        let (own, is_changed) = match header.link.split_once(CHANGED_BY_HAND) {
-            Some((name, _)) => (name, true),
-            None => (header.link.as_str(), false),
-        };
-        let own = Some(own).filter(|name| !name.is_empty());
+        let own = Some(header.link.as_str()).filter(|name| !name.is_empty());
         let link = key(self.named.as_deref().or(own).unwrap_or("hop"));
-        let changed = if is_changed {
+        let changed = if header.link_change_count > 0 {
             "# the link was changed by hand: the fit mixes its conditions\n"
         } else {
             ""
@@ -268,6 +263,7 @@ fn info_json(opened: &Opened, figures: &TraceFigures) -> Value {
         "clock": header.clock,
         "direction": header.direction,
         "arrival": header.arrival,
+        "link_change_count": header.link_change_count,
         "figures": figures,
     })
 }

@@ -13,7 +13,9 @@ use hil_runtime::engine::supervisor::frame::{
     EndMeaning, PeerHello, PeerMessage, write_chunk, write_message,
 };
 use hil_runtime::report::summary::{Fact, Outcome, RunFacts, RunSummary};
-use hil_runtime::rundir::event::{Event, HostStory, Interruption, ProcessStory};
+use hil_runtime::rundir::event::{
+    Event, EventKind, HostStory, Interruption, ProcessKind, ProcessStory,
+};
 use hil_runtime::rundir::manifest::describe_fields;
 use hil_runtime::rundir::record::RecordKind;
 use hil_runtime::rundir::record::file::RecordHeader;
@@ -96,7 +98,9 @@ pub(crate) fn peer_frames() -> Vec<Seed> {
             at: at(7),
             host: "robot-pc".to_owned(),
             process: "robot".to_owned(),
-            what: "was killed by SIGKILL".to_owned(),
+            kind: EventKind::EndedRun {
+                end: "was killed by SIGKILL".to_owned(),
+            },
             interruption: Some(Interruption {
                 from: at(6),
                 until: None,
@@ -106,7 +110,8 @@ pub(crate) fn peer_frames() -> Vec<Seed> {
         processes: vec![ProcessStory {
             name: "robot".to_owned(),
             host: "robot-pc".to_owned(),
-            role: "robot".to_owned(),
+            kind: ProcessKind::Component,
+            role: Some("robot".to_owned()),
             end: "ended".to_owned(),
             restart_count: 1,
             report: None,

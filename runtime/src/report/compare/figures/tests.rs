@@ -15,7 +15,7 @@ fn p99(base_ms: &[f64], new_ms: &[f64], of: Counts) -> ComparedFigure {
         };
         all.iter().map(|ms| (estimate(ms), BOOTSTRAP)).collect()
     };
-    let key = ("a/b".to_owned(), 0, END_TO_END.to_owned(), 1);
+    let key = ("a/b".to_owned(), Part::EndToEnd, 1);
     delay_figure(&key, (&side(base_ms), &side(new_ms)), of)
 }
 

@@ -16,10 +16,38 @@ pub(in crate::report::page) struct Mark {
     pub(in crate::report::page) from_s: f64,
     /// `None` for a moment.
     pub(in crate::report::page) until_s: Option<f64>,
-    /// `incident`, `hazard`, `notice` or `band`.
-    pub(in crate::report::page) class: &'static str,
+    /// What it marks.
+    pub(in crate::report::page) class: MarkClass,
     pub(in crate::report::page) channel: String,
     pub(in crate::report::page) words: String,
+}
+
+/// What a mark of a figure over time stands for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(in crate::report::page) enum MarkClass {
+    /// A grave event of the score.
+    Incident,
+    /// A dangerous one.
+    Hazard,
+    /// Any other one.
+    Notice,
+    /// A link that was changed by hand.
+    Change,
+    /// A time in which nothing got through.
+    Band,
+}
+
+impl MarkClass {
+    /// The class in the page's style sheet.
+    const fn word(self) -> &'static str {
+        match self {
+            Self::Incident => "incident",
+            Self::Hazard => "hazard",
+            Self::Notice => "notice",
+            Self::Change => "change",
+            Self::Band => "band",
+        }
+    }
 }
 
 /// The figure: panels, and below them a row of marks for what happened to the robot.
@@ -87,7 +115,7 @@ pub(in crate::report::page) fn over_time(
 }
 
 fn draw_moments(svg: &mut Svg, moments: &[Mark], top: f64, (axis, url): (&Axis, &str)) {
-    let is_change = |mark: &Mark| mark.class == "change";
+    let is_change = |mark: &Mark| mark.class == MarkClass::Change;
     let title = if moments.iter().all(is_change) {
         "Links changed by hand (dashed)"
     } else if moments.iter().any(is_change) {
@@ -96,21 +124,16 @@ fn draw_moments(svg: &mut Svg, moments: &[Mark], top: f64, (axis, url): (&Axis, 
         "What happened to the robot"
     };
     svg.text("strong", (8.0, top + 15.0), Anchor::Start, title);
-    let rows = [
-        ("incident", top + 22.0),
-        ("hazard", top + 22.0),
-        ("notice", top + 30.0),
-        ("change", top + 18.0),
-    ];
     svg.open(&[("clip-path", url)]);
     svg.open(&[("class", "zoom")]);
     for mark in moments {
-        let y = rows
-            .iter()
-            .find(|row| row.0 == mark.class)
-            .map_or(top + 22.0, |row| row.1);
+        let y = match mark.class {
+            MarkClass::Change => top + 18.0,
+            MarkClass::Incident | MarkClass::Hazard | MarkClass::Band => top + 22.0,
+            MarkClass::Notice => top + 30.0,
+        };
         let x = axis.at(mark.from_s);
-        svg.line(mark.class, (x, y), (x, top + 44.0));
+        svg.line(mark.class.word(), (x, y), (x, top + 44.0));
     }
     svg.close();
     svg.close();
@@ -280,7 +303,7 @@ mod tests {
         let mark = Mark {
             from_s: 5.0,
             until_s: None,
-            class: "incident",
+            class: MarkClass::Incident,
             channel: String::new(),
             words: String::new(),
         };

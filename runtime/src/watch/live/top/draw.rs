@@ -225,8 +225,8 @@ fn processes(view: &View, lines: &mut Vec<Line>) {
             one.restart_count,
             state_of(one),
         );
-        let is_well = matches!(one.state.as_str(), "running" | "starting");
-        lines.push(line(text, if is_well { NORMAL } else { BAD }));
+        let style = if one.state.is_alive() { NORMAL } else { BAD };
+        lines.push(line(text, style));
     }
 }
 
@@ -261,7 +261,8 @@ fn elsewhere(view: &View, lines: &mut Vec<Line>) {
 }
 
 fn state_of(process: &ProcessRow) -> String {
-    format!("{} ({} on {})", process.state, process.role, process.host)
+    let label = process.kind.label(process.role.as_deref());
+    format!("{} ({label} on {})", process.state, process.host)
 }
 
 fn channels(view: &View, frame: Frame, columns: usize, lines: &mut Vec<Line>) {
@@ -329,7 +330,7 @@ fn links(view: &View, lines: &mut Vec<Line>) {
             "{:name_columns$} {:13} {:8} {:>8}  {}",
             shortened(&one.name, name_columns),
             one.via,
-            one.state,
+            one.state.label(),
             known(one.loss_ratio.map(percent)),
             one.condition.as_deref().unwrap_or("-"),
         );

@@ -6,20 +6,24 @@ use ratatui::Terminal;
 use ratatui::backend::TestBackend;
 
 use super::*;
-use crate::rundir::status::HostHearing;
-use crate::watch::live::top::view::{ClockRow, ElsewhereRow, LinkRow, RunView, SegmentRow};
+use crate::rundir::event::ProcessKind;
+use crate::rundir::status::{HostHearing, ProcessState};
+use crate::watch::live::top::view::{
+    ClockRow, ElsewhereRow, LinkRow, LinkState, RunState, RunView, SegmentRow,
+};
 
 fn quantiles(p50_ns: i64, p99_ns: i64) -> Quantiles {
     Quantiles { p50_ns, p99_ns }
 }
 
-fn process(name: &str, state: &str, restart_count: u32) -> ProcessRow {
-    let is_running = state == "running";
+fn process(name: &str, state: ProcessState, restart_count: u32) -> ProcessRow {
+    let is_running = state == ProcessState::Running;
     ProcessRow {
         name: name.to_owned(),
         host: "control-pc".to_owned(),
-        role: name.to_owned(),
-        state: state.to_owned(),
+        kind: ProcessKind::Component,
+        role: Some(name.to_owned()),
+        state,
         pid: is_running.then_some(4711),
         cpu_ratio: is_running.then_some(0.0312),
         cpus: is_running.then(|| "1".to_owned()),
@@ -63,14 +67,18 @@ fn view() -> View {
             name: "teleop-1".to_owned(),
             folder: PathBuf::from("/runs/teleop-1"),
             hosts_here: vec!["control-pc".to_owned()],
-            state: "running".to_owned(),
+            state: RunState::Running,
             elapsed_s: Some(15.0),
             duration_s: Some(60.0),
             window_s: 1.0,
         },
         processes: vec![
-            process("controller", "running", 1),
-            process("human", "killed by signal 9", 0),
+            process("controller", ProcessState::Running, 1),
+            process(
+                "human",
+                ProcessState::Ended("killed by signal 9".to_owned()),
+                0,
+            ),
         ],
         elsewhere: elsewhere_rows(),
         channels: vec![
@@ -106,7 +114,7 @@ fn view() -> View {
         links: vec![LinkRow {
             name: "hop".to_owned(),
             via: "emulated".to_owned(),
-            state: "carries".to_owned(),
+            state: LinkState::Carries,
             condition: Some("delay 2 ms, loss 1 %".to_owned()),
             loss_ratio: Some(0.012),
         }],
@@ -180,7 +188,7 @@ fn a_low_terminal_keeps_the_chosen_channel_in_sight() {
 #[test]
 fn a_run_that_is_over_keeps_its_last_figures_and_says_so() {
     let mut over = view();
-    over.run.state = View::ENDED.to_owned();
+    over.run.state = RunState::Ended;
     let page = plain(&over, 100);
     assert!(page.contains("ended"), "{page}");
     assert!(page.contains("over; the figures are the last"), "{page}");

@@ -14,7 +14,8 @@ use hil_models::time::Instant;
 
 use super::draw::HISTORY_COLUMNS;
 use super::view::{
-    ChannelRow, ClockRow, ElsewhereRow, LinkRow, ProcessRow, Quantiles, RunView, SegmentRow, View,
+    ChannelRow, ClockRow, ElsewhereRow, LinkRow, LinkState, ProcessRow, Quantiles, RunState,
+    RunView, SegmentRow, View,
 };
 use crate::platform::clock::MonotonicClock;
 use crate::rundir::status;
@@ -45,7 +46,7 @@ impl Gatherer {
     pub(crate) fn look(&mut self, observer: &Observer, window: Duration) -> View {
         let is_over = observer.is_over();
         if is_over && let Some(mut last) = self.last.clone() {
-            state_of(observer, None).clone_into(&mut last.run.state);
+            last.run.state = state_of(observer, None);
             return last;
         }
         let status = RunStatus::read(&observer.run().folder);
@@ -159,13 +160,13 @@ fn status_problem(status: Result<&RunStatus, &io::Error>) -> Option<String> {
     })
 }
 
-fn state_of(observer: &Observer, status: Option<&RunStatus>) -> &'static str {
+fn state_of(observer: &Observer, status: Option<&RunStatus>) -> RunState {
     let run = observer.run();
     match status {
-        _ if run.is_supervisor_gone() => View::SUPERVISOR_GONE,
-        _ if !run.is_announced() => View::ENDED,
-        Some(status) => status.phase.word(),
-        None => "unknown",
+        _ if run.is_supervisor_gone() => RunState::SupervisorGone,
+        _ if !run.is_announced() => RunState::Ended,
+        Some(status) => status.phase.into(),
+        None => RunState::Unknown,
     }
 }
 
@@ -179,7 +180,7 @@ fn run_view(observer: &Observer, status: Option<&RunStatus>, window: Duration) -
         name: run.name.clone(),
         folder: run.folder.clone(),
         hosts_here: run.hosts().map(str::to_owned).collect(),
-        state: state.to_owned(),
+        state,
         elapsed_s: start_ns.map(|start_ns| seconds(now_ns.saturating_sub(start_ns))),
         duration_s: status.map(|status| Duration::from_nanos(status.duration_ns).as_secs_f64()),
         window_s: window.as_secs_f64(),
@@ -202,6 +203,7 @@ fn process_row(
     ProcessRow {
         name: status.name.clone(),
         host: status.host.clone(),
+        kind: status.kind,
         role: status.role.clone(),
         state: status.state.clone(),
         pid: status.pid,
@@ -316,14 +318,14 @@ fn link_row(
         known_count += fates.total().saturating_sub(unknown + never_sent);
     }
     let state = match came_count {
-        None => "unknown",
-        Some(0) => "silent",
-        Some(_) => "carries",
+        None => LinkState::Unknown,
+        Some(0) => LinkState::Silent,
+        Some(_) => LinkState::Carries,
     };
     LinkRow {
         name: link.name.clone(),
         via: link.via.word().to_owned(),
-        state: state.to_owned(),
+        state,
         condition: link.emulation().map(|emulation| {
             let words = |way, spec| condition_words(observer, (topology, link), (way, spec));
             let there = words(Way::Forward, &emulation.forward);

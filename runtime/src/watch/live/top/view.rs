@@ -2,11 +2,13 @@
 //! known is `None`. Nothing here gathers or draws.
 
 use std::collections::BTreeMap;
+use std::fmt;
 use std::path::PathBuf;
 
 use serde::Serialize;
 
-use crate::rundir::status::HostHearing;
+use crate::rundir::event::ProcessKind;
+use crate::rundir::status::{HostHearing, Phase, ProcessState};
 
 /// One look at a run.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -27,6 +29,47 @@ pub(crate) struct View {
     pub(crate) problems: Vec<String>,
 }
 
+/// How far a run is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum RunState {
+    /// Its processes make themselves ready.
+    Starting,
+    /// It runs.
+    Running,
+    /// Its processes are being ended.
+    Ending,
+    /// It is over.
+    Ended,
+    /// Its supervisor was killed.
+    SupervisorGone,
+    /// Its supervisor does not tell.
+    Unknown,
+}
+
+impl From<Phase> for RunState {
+    fn from(phase: Phase) -> Self {
+        match phase {
+            Phase::Starting => Self::Starting,
+            Phase::Running => Self::Running,
+            Phase::Ending => Self::Ending,
+        }
+    }
+}
+
+impl fmt::Display for RunState {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str(match self {
+            Self::Starting => "starting",
+            Self::Running => "running",
+            Self::Ending => "ending",
+            Self::Ended => "ended",
+            Self::SupervisorGone => "supervisor gone",
+            Self::Unknown => "unknown",
+        })
+    }
+}
+
 /// The run as a whole.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub(crate) struct RunView {
@@ -36,8 +79,8 @@ pub(crate) struct RunView {
     pub(crate) folder: PathBuf,
     /// Hosts of it that run here.
     pub(crate) hosts_here: Vec<String>,
-    /// `starting`, `running`, `ending`, `ended`, or `supervisor gone`.
-    pub(crate) state: String,
+    /// How far it is.
+    pub(crate) state: RunState,
     /// Since it began, seconds.
     pub(crate) elapsed_s: Option<f64>,
     /// How long it is to be, seconds.
@@ -53,10 +96,12 @@ pub(crate) struct ProcessRow {
     pub(crate) name: String,
     /// Its host.
     pub(crate) host: String,
-    /// Its role, or what else it is.
-    pub(crate) role: String,
-    /// `starting`, `running`, `waiting to restart`, or how it ended.
-    pub(crate) state: String,
+    /// What it is.
+    pub(crate) kind: ProcessKind,
+    /// The role of the case that it plays, or that a foreign program plays through it.
+    pub(crate) role: Option<String>,
+    /// How far it is.
+    pub(crate) state: ProcessState,
     /// Its process id.
     pub(crate) pid: Option<u32>,
     /// Processor time over time, 1 for one whole processor.
@@ -124,6 +169,28 @@ pub(crate) struct SegmentRow {
     pub(crate) time: Option<Quantiles>,
 }
 
+/// Whether a link carries anything.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum LinkState {
+    /// Messages came over it within the window.
+    Carries,
+    /// None did.
+    Silent,
+    /// None of its messages come to this host.
+    Unknown,
+}
+
+impl LinkState {
+    pub(crate) const fn label(self) -> &'static str {
+        match self {
+            Self::Carries => "carries",
+            Self::Silent => "silent",
+            Self::Unknown => "unknown",
+        }
+    }
+}
+
 /// One link.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub(crate) struct LinkRow {
@@ -131,8 +198,8 @@ pub(crate) struct LinkRow {
     pub(crate) name: String,
     /// `udp`, `tcp`, `emulated` or `shared-memory`.
     pub(crate) via: String,
-    /// `carries`, `silent`: nothing came over it within the window, or `unknown`.
-    pub(crate) state: String,
+    /// Whether it carries anything.
+    pub(crate) state: LinkState,
     /// What its emulation does, each way in words.
     pub(crate) condition: Option<String>,
     /// Messages sent in the window that were lost on the way, of those whose fate is known.
@@ -157,14 +224,9 @@ pub(crate) struct ClockRow {
 }
 
 impl View {
-    /// State of a run that is over.
-    pub(crate) const ENDED: &str = "ended";
-    /// State of a run whose supervisor was killed.
-    pub(crate) const SUPERVISOR_GONE: &str = "supervisor gone";
-
     /// True when nothing of the run goes on: the figures are the last ones from while it did.
     pub(crate) fn is_over(&self) -> bool {
-        [Self::ENDED, Self::SUPERVISOR_GONE].contains(&self.run.state.as_str())
+        matches!(self.run.state, RunState::Ended | RunState::SupervisorGone)
     }
 
     /// How much of the run is over, 0 to 1.
