@@ -19,8 +19,8 @@ use hil_benches::gateway::notices::{announce, ended};
 use hil_benches::gateway::parties::{MachineTime, PRIORITY, claim, stolen_text};
 use hil_benches::gateway::verdict::Verdict;
 use hil_benches::{Case, Comparison, compare, json_line, table};
-use hil_runtime::platform::clock::MonotonicClock;
-use hil_runtime::report::face::FaceSegment;
+use hil_platform::clock::MonotonicClock;
+use hil_report::face::FaceSegment;
 use serde_json::json;
 
 const BENCH: &str = "egm_face";

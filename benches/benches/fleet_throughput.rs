@@ -14,12 +14,12 @@
 )]
 
 use hil_benches::{HostFacts, pin_to_cpu};
-use hil_models::fleet::coordinator::parameters::CoordinatorMode;
-use hil_models::fleet::experiment::{Experiment, Links, Setup, StatusPath};
-use hil_models::fleet::messages::MessageOrder;
-use hil_models::fleet::robot::TrackerKind;
-use hil_models::fleet::scenario::{Scenario, Scene, WorldParameters};
-use hil_models::time::Instant;
+use hil_core::time::Instant;
+use hil_fleet::coordinator::parameters::CoordinatorMode;
+use hil_fleet::experiment::{Experiment, Links, Setup, StatusPath};
+use hil_fleet::messages::MessageOrder;
+use hil_fleet::robot::TrackerKind;
+use hil_fleet::scenario::{Scenario, Scene, WorldParameters};
 use nix::time::{ClockId, clock_gettime};
 
 const ROBOTS: [u32; 6] = [7, 14, 28, 56, 112, 224];

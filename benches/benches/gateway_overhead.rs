@@ -21,7 +21,7 @@ use hil_benches::gateway::segments::{SEGMENTS, WAKE_UPS, segments};
 use hil_benches::gateway::turns::{STOP, Turns, pace, ping};
 use hil_benches::gateway::verdict::Verdict;
 use hil_benches::{Case, Comparison, compare, json_line, table};
-use hil_runtime::platform::wait::WaitMode;
+use hil_platform::wait::WaitMode;
 use serde_json::json;
 
 const BENCH: &str = "gateway_overhead";

@@ -19,12 +19,12 @@ use hil_benches::gateway::parties::{MachineTime, PRIORITY, claim, stolen_text};
 use hil_benches::gateway::stages::{BATCH, STAGES, Stage, Workbench};
 use hil_benches::gateway::verdict::Verdict;
 use hil_benches::{Case, Comparison, Row, compare, json_line, table};
-use hil_models::endpoint::InputPort;
-use hil_models::time::Instant;
-use hil_runtime::engine::gateway::direction::Direction;
-use hil_runtime::platform::clock::MonotonicClock;
-use hil_runtime::platform::wait::WaitMode;
-use hil_runtime::rundir::launch::DirectionLaunch;
+use hil_core::endpoint::InputPort;
+use hil_core::time::Instant;
+use hil_engine::gateway::direction::Direction;
+use hil_platform::clock::MonotonicClock;
+use hil_platform::wait::WaitMode;
+use hil_rundir::launch::DirectionLaunch;
 use serde_json::json;
 
 const BENCH: &str = "gateway_stages";

@@ -22,16 +22,14 @@ use hil_benches::gateway::hosts::SetupError;
 use hil_benches::gateway::network::Network;
 use hil_benches::gateway::parties::{MachineTime, stolen_text};
 use hil_benches::{HostFacts, Quantiles, TypicalRatio};
-use hil_gateways::net::timestamping::TimestampMode;
-use hil_gateways::protocol::seal::{
-    Association, Initiator, Opened, Responder, Rotation, RunSecret, Suite,
-};
-use hil_gateways::protocol::wire::{HEADER_BYTES, Header, Kind, TAG_BYTES};
-use hil_gateways::transport::sealed::{SealedReceiver, SealedSender};
-use hil_gateways::transport::udp::{UdpReceiver, UdpSender, UdpSettings};
-use hil_gateways::transport::{DatagramReceiver, DatagramSender};
-use hil_models::random::RandomStream;
-use hil_models::time::Instant;
+use hil_core::random::RandomStream;
+use hil_core::time::Instant;
+use hil_net::timestamping::TimestampMode;
+use hil_protocol::seal::{Association, Initiator, Opened, Responder, Rotation, RunSecret, Suite};
+use hil_protocol::wire::{HEADER_BYTES, Header, Kind, TAG_BYTES};
+use hil_transport::sealed::{SealedReceiver, SealedSender};
+use hil_transport::udp::{UdpReceiver, UdpSender, UdpSettings};
+use hil_transport::{DatagramReceiver, DatagramSender};
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use serde_json::json;
 

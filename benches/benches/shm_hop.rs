@@ -18,12 +18,12 @@ use std::time::{Duration, Instant};
 
 use bytemuck::{Pod, Zeroable};
 use hil_benches::{Case, Comparison, HostFacts, compare, json_line, pin_to_cpu, table};
-use hil_models::endpoint::{InputPort, OutputPort};
-use hil_models::message::{Message, MessageType};
-use hil_models::time::Instant as HostInstant;
-use hil_runtime::platform::clock::MonotonicClock;
-use hil_runtime::platform::domain_address::DomainAddress;
-use hil_runtime::shm::{
+use hil_core::endpoint::{InputPort, OutputPort};
+use hil_core::message::{Message, MessageType};
+use hil_core::time::Instant as HostInstant;
+use hil_platform::clock::MonotonicClock;
+use hil_platform::domain_address::DomainAddress;
+use hil_shm::{
     ChannelHolder, ChannelSettings, Domain, OutputSettings, ShmInput, ShmOutput, TypedInput,
     TypedOutput, Waiter,
 };

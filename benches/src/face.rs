@@ -11,23 +11,23 @@ use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use bytemuck::{Zeroable, bytes_of};
-use hil_models::egm::messages::{EgmCommand, EgmFeedback, SessionState, Side as ArmSide};
-use hil_models::endpoint::InputPort;
-use hil_models::message::MessageType;
-use hil_models::time::Instant;
-use hil_models::yumi::arm::{Arm, RIGHT_START_RAD};
-use hil_runtime::engine::face::OpenedArm;
-use hil_runtime::platform::clock::{MonotonicClock, Wake};
-use hil_runtime::platform::domain_address::DomainAddress;
-use hil_runtime::platform::realtime::RealtimeRequest;
-use hil_runtime::platform::wait::WaitMode;
-use hil_runtime::report::face_figures::{FaceFigures, figures};
-use hil_runtime::rundir::face_launch::{ArmLaunch, FaceLaunch, FaceSettings};
-use hil_runtime::rundir::record::{RecordFile, Recorder};
-use hil_runtime::shm::{
+use hil_arm::egm::messages::{EgmCommand, EgmFeedback, SessionState, Side as ArmSide};
+use hil_arm::yumi::arm::{Arm, RIGHT_START_RAD};
+use hil_core::endpoint::InputPort;
+use hil_core::message::MessageType;
+use hil_core::time::Instant;
+use hil_engine::face::OpenedArm;
+use hil_platform::clock::{MonotonicClock, Wake};
+use hil_platform::domain_address::DomainAddress;
+use hil_platform::realtime::RealtimeRequest;
+use hil_platform::wait::WaitMode;
+use hil_report::face_figures::{FaceFigures, figures};
+use hil_rundir::face_launch::{ArmLaunch, FaceLaunch, FaceSettings};
+use hil_rundir::record::{RecordFile, Recorder};
+use hil_shm::{
     ChannelHolder, ChannelSettings, Domain, OutputSettings, ShmInput, ShmOutput, Waiter,
 };
-use hil_runtime::topology::{CardChannel, FaceKind, FaceSend, Timestamps};
+use hil_topology::{CardChannel, FaceKind, FaceSend, Timestamps};
 
 use crate::gateway::hosts::{Hosts, Joint, Plan, SetupError};
 use crate::gateway::network::Network;

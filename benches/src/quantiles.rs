@@ -1,7 +1,7 @@
 //! Quantiles of nanosecond samples and ratios paired by round. Exact: samples are sorted, not
 //! binned.
 
-use hil_models::random::RandomStream;
+use hil_core::random::RandomStream;
 use serde_json::{Value, json};
 
 /// Quantiles of a set of samples.

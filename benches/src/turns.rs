@@ -17,11 +17,11 @@ use std::process::ExitCode;
 use std::thread;
 use std::time::Duration;
 
-use hil_models::random::RandomStream;
-use hil_models::record::{TakenRecord, UNAVAILABLE};
-use hil_runtime::platform::clock::MonotonicClock;
-use hil_runtime::platform::signals::EXIT_INTERRUPTED;
-use hil_runtime::rundir::record::{RecordFile, RecordKind};
+use hil_core::random::RandomStream;
+use hil_core::record::{TakenRecord, UNAVAILABLE};
+use hil_platform::clock::MonotonicClock;
+use hil_platform::signals::EXIT_INTERRUPTED;
+use hil_rundir::record::{RecordFile, RecordKind};
 use hil_tests::child::ChildGuard;
 use hil_tests::lab::Lab;
 use hil_tests::run_folder::RunFolder;

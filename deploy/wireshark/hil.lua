@@ -1,5 +1,5 @@
 -- Wireshark dissector of hil-runtime's datagrams, version 1 of the wire format
--- (gateways/src/protocol/wire.rs and body.rs). It recognises them by their magic number on any UDP
+-- (gateways/protocol/src/wire.rs and body.rs). It recognises them by their magic number on any UDP
 -- port and judges nothing that the gateways would judge from state.
 --
 -- Use: copy to ~/.local/lib/wireshark/plugins/, or: tshark -X lua_script:deploy/wireshark/hil.lua

@@ -3,8 +3,8 @@
 
 use std::fmt::Write;
 
-use hil_models::account::{ChannelAccount, ClosingFigures, MessageFate, RESIDUAL_LIMIT_NS};
-use hil_runtime::report::summary::{ChannelSummary, LinkKind, RunSummary};
+use hil_account::{ChannelAccount, ClosingFigures, MessageFate, RESIDUAL_LIMIT_NS};
+use hil_report::summary::{ChannelSummary, LinkKind, RunSummary};
 
 /// Share of messages whose account must close.
 pub const CLOSED_RATIO_MIN: f64 = 0.999;

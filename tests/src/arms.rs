@@ -3,12 +3,10 @@
 
 use std::fs;
 
-use hil_models::egm::messages::{
-    EgmArrival, EgmCommand, EgmEvent, EgmEventKind, EgmFeedback, Side,
-};
-use hil_models::run_log::RunLog;
-use hil_models::yumi::JOINT_COUNT;
-use hil_runtime::rundir::record::{RecordFile, RecordKind};
+use hil_arm::egm::messages::{EgmArrival, EgmCommand, EgmEvent, EgmEventKind, EgmFeedback, Side};
+use hil_arm::yumi::JOINT_COUNT;
+use hil_core::run_log::RunLog;
+use hil_rundir::record::{RecordFile, RecordKind};
 
 use crate::trial::RunFiles;
 

@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use hil_models::random::RandomStream;
+use hil_core::random::RandomStream;
 use socket2::{Domain, Socket, Type};
 
 use crate::lab::LabHost;

@@ -6,8 +6,8 @@ use std::fs;
 use std::ops::Range;
 use std::path::Path;
 
-use hil_models::record::TakenRecord;
-use hil_runtime::rundir::record::{RecordFile, RecordKind};
+use hil_core::record::TakenRecord;
+use hil_rundir::record::{RecordFile, RecordKind};
 
 /// What belongs to a moment, nanoseconds from it on: a killed process goes on dying for a while.
 const NEAR_NS: Range<i64> = -10_000_000..250_000_000;

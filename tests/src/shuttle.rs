@@ -5,9 +5,9 @@ use std::collections::BTreeSet;
 use std::fs;
 
 use bytemuck::Pod;
-use hil_models::record::{IngressRecord, UNAVAILABLE};
-use hil_models::trace::{Trace, wire};
-use hil_runtime::rundir::record::RecordFile;
+use hil_core::record::{IngressRecord, UNAVAILABLE};
+use hil_rundir::record::RecordFile;
+use hil_trace::{Trace, wire};
 
 use crate::ports::own_ports;
 use crate::trial::RunFiles;

@@ -4,8 +4,8 @@
 
 use std::time::Duration;
 
-use hil_models::record::TakenRecord;
-use hil_runtime::report::summary::{CounterGroup, DirectionSummary, Outcome, RunSummary};
+use hil_core::record::TakenRecord;
+use hil_report::summary::{CounterGroup, DirectionSummary, Outcome, RunSummary};
 
 use crate::account::{account, assert_every_message_is_accounted_for, channel, describe};
 use crate::child::ChildGuard;

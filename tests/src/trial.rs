@@ -8,9 +8,9 @@ use std::process::Command;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use hil_runtime::engine::security::PreSharedKey;
-use hil_runtime::platform::domain_address::DomainAddress;
-use hil_runtime::report::summary::RunSummary;
+use hil_engine::security::PreSharedKey;
+use hil_platform::domain_address::DomainAddress;
+use hil_report::summary::RunSummary;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use serde_json::Value;

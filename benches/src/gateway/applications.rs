@@ -7,12 +7,12 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle, Thread};
 use std::time::Duration;
 
-use hil_models::endpoint::InputPort;
-use hil_models::message::Envelope;
-use hil_models::time::Instant;
-use hil_runtime::platform::clock::{MonotonicClock, Wake};
-use hil_runtime::platform::domain_address::DomainAddress;
-use hil_runtime::platform::wait::{Pause, WaitMode, WaitStrategy};
+use hil_core::endpoint::InputPort;
+use hil_core::message::Envelope;
+use hil_core::time::Instant;
+use hil_platform::clock::{MonotonicClock, Wake};
+use hil_platform::domain_address::DomainAddress;
+use hil_platform::wait::{Pause, WaitMode, WaitStrategy};
 
 use super::hosts::{Joint, Loose, Plan, Ports, SetupError, greet};
 use super::parties::{Party, Usage, claim};

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use hil_runtime::platform::wait::WaitMode;
+use hil_platform::wait::WaitMode;
 
 use super::applications::PARTY_COUNT;
 use super::hosts::Plan;

@@ -8,7 +8,7 @@ use std::sync::mpsc::{Sender, channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 
-use hil_runtime::platform::clock::MonotonicClock;
+use hil_platform::clock::MonotonicClock;
 
 use super::applications::Crew;
 use super::cases::{CasePlan, Kind};

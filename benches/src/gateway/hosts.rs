@@ -10,21 +10,21 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use hil_models::message::MessageType;
-use hil_models::record::{EgressRecord, IngressRecord};
-use hil_runtime::engine::gateway::Surroundings;
-use hil_runtime::engine::gateway::direction;
-use hil_runtime::engine::gateway::direction::{Direction, Opened};
-use hil_runtime::platform::domain_address::DomainAddress;
-use hil_runtime::platform::realtime::RealtimeRequest;
-use hil_runtime::platform::wait::WaitMode;
-use hil_runtime::rundir::launch::{DirectionLaunch, Side, SocketLaunch, Transport};
-use hil_runtime::rundir::pipe::RunStart;
-use hil_runtime::rundir::record::{RecordFile, RecordKind, RecordSink, Recorder};
-use hil_runtime::shm::{
+use hil_core::message::MessageType;
+use hil_core::record::{EgressRecord, IngressRecord};
+use hil_engine::gateway::Surroundings;
+use hil_engine::gateway::direction;
+use hil_engine::gateway::direction::{Direction, Opened};
+use hil_platform::domain_address::DomainAddress;
+use hil_platform::realtime::RealtimeRequest;
+use hil_platform::wait::WaitMode;
+use hil_rundir::launch::{DirectionLaunch, Side, SocketLaunch, Transport};
+use hil_rundir::pipe::RunStart;
+use hil_rundir::record::{RecordFile, RecordKind, RecordSink, Recorder};
+use hil_shm::{
     ChannelHolder, ChannelSettings, Domain, OutputSettings, ShmInput, ShmOutput, Waiter,
 };
-use hil_runtime::topology::Timestamps;
+use hil_topology::Timestamps;
 
 use super::network::Network;
 

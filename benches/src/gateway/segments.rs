@@ -3,7 +3,7 @@
 
 use std::collections::BTreeMap;
 
-use hil_models::record::{EgressRecord, IngressRecord, UNAVAILABLE};
+use hil_core::record::{EgressRecord, IngressRecord, UNAVAILABLE};
 
 use super::hosts::{Hosts, Plan, SetupError};
 use crate::quantiles::Quantiles;

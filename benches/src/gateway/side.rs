@@ -8,15 +8,15 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-use hil_gateways::net::timestamping::TimestampMode;
-use hil_gateways::transport::udp::{UdpReceiver, UdpSender, UdpSettings};
-use hil_gateways::transport::{DatagramReceiver, DatagramSender};
-use hil_models::endpoint::InputPort;
-use hil_models::time::Instant;
-use hil_runtime::engine::gateway::direction::Direction;
-use hil_runtime::platform::clock::MonotonicClock;
-use hil_runtime::platform::wait::WaitMode;
-use hil_runtime::rundir::launch::DirectionLaunch;
+use hil_core::endpoint::InputPort;
+use hil_core::time::Instant;
+use hil_engine::gateway::direction::Direction;
+use hil_net::timestamping::TimestampMode;
+use hil_platform::clock::MonotonicClock;
+use hil_platform::wait::WaitMode;
+use hil_rundir::launch::DirectionLaunch;
+use hil_transport::udp::{UdpReceiver, UdpSender, UdpSettings};
+use hil_transport::{DatagramReceiver, DatagramSender};
 use nix::poll::{PollFd, PollFlags, ppoll};
 use nix::sys::time::TimeSpec;
 

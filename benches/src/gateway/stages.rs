@@ -4,18 +4,18 @@
 use std::time::Instant as Stopwatch;
 
 use bytemuck::Zeroable;
-use hil_gateways::protocol::{
+use hil_core::endpoint::InputPort;
+use hil_core::message::Envelope;
+use hil_core::record::{EgressRecord, IngressRecord};
+use hil_core::time::Instant;
+use hil_platform::clock::MonotonicClock;
+use hil_protocol::{
     ArrivalStamps, ChannelIdentity, EgressBridge, EgressSettings, IngressBridge, IngressSettings,
 };
-use hil_gateways::transport::udp::{UdpReceiver, UdpSender};
-use hil_gateways::transport::{DatagramReceiver, DatagramSender};
-use hil_models::endpoint::InputPort;
-use hil_models::message::Envelope;
-use hil_models::record::{EgressRecord, IngressRecord};
-use hil_models::time::Instant;
-use hil_runtime::platform::clock::MonotonicClock;
-use hil_runtime::rundir::record::RecordSink;
-use hil_runtime::shm::{Domain, RawInput, RawOutput};
+use hil_rundir::record::RecordSink;
+use hil_shm::{Domain, RawInput, RawOutput};
+use hil_transport::udp::{UdpReceiver, UdpSender};
+use hil_transport::{DatagramReceiver, DatagramSender};
 
 use super::hosts::{Hosts, Plan, Ports, SetupError};
 use super::side::EchoSide;
@@ -231,7 +231,7 @@ impl Workbench {
         timed(|| {
             let mut is_delivered = false;
             if let Some(datagram) = slots.next() {
-                let mut deliver = |_: hil_gateways::protocol::Delivery<'_>| is_delivered = true;
+                let mut deliver = |_: hil_protocol::Delivery<'_>| is_delivered = true;
                 ingress
                     .on_datagram(now, arrival, datagram, &mut deliver)
                     .ok();
@@ -290,7 +290,7 @@ fn bridges(
 ) -> Result<(EgressBridge, IngressBridge), SetupError> {
     let size = u32::try_from(plan.size_bytes)?;
     let channel = ChannelIdentity::new(1, &plan.channel_of(0), plan.message().name, size, 8);
-    let clock_id = hil_runtime::shm::clock_id()?;
+    let clock_id = hil_shm::clock_id()?;
     let now = MonotonicClock::now();
     let mut egress = EgressBridge::new(EgressSettings {
         channel: channel.clone(),

@@ -7,9 +7,10 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use hil_gateways::capture::flow::FlowFilter;
-use hil_gateways::capture::writer::{self, PacketToWrite};
-use hil_gateways::net::packet_ring::{PacketRing, RingCounters, RingSettings, RingStamps};
+use hil_capture::flow::FlowFilter;
+use hil_capture::writer;
+use hil_capture::writer::PacketToWrite;
+use hil_net::packet_ring::{PacketRing, RingCounters, RingSettings, RingStamps};
 
 use super::hosts::SetupError;
 use super::network::Network;

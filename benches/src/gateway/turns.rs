@@ -6,7 +6,7 @@ use std::sync::{Mutex, PoisonError};
 use std::thread::{self, Thread};
 use std::time::{Duration, Instant};
 
-use hil_runtime::platform::clock::{MonotonicClock, Wake};
+use hil_platform::clock::{MonotonicClock, Wake};
 
 use super::parties::{Party, Used};
 use super::side::Side;

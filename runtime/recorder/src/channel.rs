@@ -1,8 +1,8 @@
 //! One channel of a run as topics: its messages, what viewers make of them, the stamps of each, and
 //! the verdicts of its link. When each was is decided by whoever reads the run.
 
-use hil_models::trace::TraceRecord;
-use hil_runtime::rundir::manifest::ChannelDescription;
+use hil_rundir::manifest::ChannelDescription;
+use hil_trace::TraceRecord;
 use prost::Message as _;
 
 use crate::encode::Encoder;

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand};
-use hil_runtime::topology::read_duration;
+use hil_topology::read_duration;
 
 const EXAMPLES: &str = "\
 Examples:

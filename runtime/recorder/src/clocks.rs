@@ -3,9 +3,9 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use hil_models::record::UNAVAILABLE;
-use hil_runtime::rundir::manifest::Manifest;
-use hil_runtime::watch::Record;
+use hil_core::record::UNAVAILABLE;
+use hil_rundir::manifest::Manifest;
+use hil_watch::Record;
 
 use crate::facts::Words;
 use crate::net;

@@ -5,11 +5,11 @@ use std::path::Path;
 use std::process::ExitCode;
 
 use clap::{CommandFactory as _, Parser};
-use hil_runtime::platform::console::Console;
-use hil_runtime::platform::progress::Progress;
-use hil_runtime::platform::signals::{EXIT_INTERRUPTED, Signals};
-use hil_runtime::platform::words::counted_plainly;
-use hil_runtime::topology::documents;
+use hil_platform::console::Console;
+use hil_platform::progress::Progress;
+use hil_platform::signals::{EXIT_INTERRUPTED, Signals};
+use hil_platform::words::counted_plainly;
+use hil_topology::documents;
 
 use crate::cli::{Cli, Command, PlayOptions, ServeOptions};
 use crate::convert::{ConvertError, convert};

@@ -3,7 +3,7 @@
 
 use std::collections::BTreeMap;
 
-use hil_models::link::condition::{LinkCondition, LinkConditionRecord, OrderOutcome};
+use hil_link::condition::{LinkCondition, LinkConditionRecord, OrderOutcome};
 use prost::Message as _;
 use serde_json::Value;
 

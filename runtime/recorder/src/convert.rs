@@ -5,10 +5,10 @@ use std::path::Path;
 use std::thread;
 use std::time::Duration;
 
-use hil_models::link::condition::LinkConditionRecord;
-use hil_models::message::Envelope;
-use hil_models::trace::Trace;
-use hil_runtime::rundir::record::{RecordFile, RecordKind};
+use hil_core::message::Envelope;
+use hil_link::condition::LinkConditionRecord;
+use hil_rundir::record::{RecordFile, RecordKind};
+use hil_trace::Trace;
 
 use crate::channel::{ChannelTopics, Typed, Wanted, typed};
 use crate::clocks::Clocks;

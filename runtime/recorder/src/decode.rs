@@ -2,8 +2,8 @@
 //! where a field is reserved. The layout is the live channel's, and the file's schema must be the
 //! one that this layout gives, so that nothing is read as something else.
 
-use hil_runtime::rundir::layout::{LayoutFault, checked_element_bytes};
-use hil_runtime::rundir::manifest::{FieldDescription, KindDescription};
+use hil_rundir::layout::{LayoutFault, checked_element_bytes};
+use hil_rundir::manifest::{FieldDescription, KindDescription};
 use prost::encoding::{WireType, decode_key, decode_varint};
 
 use crate::schema::{self, Schema};
@@ -294,11 +294,11 @@ fn write_value(
 mod tests {
     use super::*;
     use crate::encode::Encoder;
-    use hil_models::egm::messages::{EgmArrival, EgmCommand, EgmFeedback};
-    use hil_models::fleet::messages::State;
-    use hil_models::message::Message;
-    use hil_models::random::RandomStream;
-    use hil_runtime::rundir::manifest::describe_fields;
+    use hil_arm::egm::messages::{EgmArrival, EgmCommand, EgmFeedback};
+    use hil_core::message::Message;
+    use hil_core::random::RandomStream;
+    use hil_fleet::messages::State;
+    use hil_rundir::manifest::describe_fields;
 
     fn pair<M: Message>() -> (Encoder, Decoder) {
         let fields = describe_fields(M::FIELDS);

@@ -1,8 +1,8 @@
 //! What the recorder reads that others sent or wrote, for tests from outside the crate: the head of
 //! a request, a file, a message in one. The program itself calls the modules behind this one.
 
-use hil_runtime::rundir::layout::LayoutFault;
-use hil_runtime::rundir::manifest::FieldDescription;
+use hil_rundir::layout::LayoutFault;
+use hil_rundir::manifest::FieldDescription;
 use mcap::records::Record;
 
 use crate::decode::Decoder;

@@ -1,8 +1,8 @@
 //! Messages as they lie in memory, written as protobuf by their layout. Schemas are made in
 //! [`crate::schema`]; the two agree because both number fields by position.
 
-use hil_runtime::rundir::layout::{LayoutFault, checked_element_bytes};
-use hil_runtime::rundir::manifest::{FieldDescription, KindDescription};
+use hil_rundir::layout::{LayoutFault, checked_element_bytes};
+use hil_rundir::manifest::{FieldDescription, KindDescription};
 use prost::encoding::{WireType, encode_key, encode_varint};
 
 use crate::schema::{self, Schema};
@@ -121,9 +121,9 @@ const fn zigzag(value: i64) -> u64 {
 mod tests {
     use super::*;
     use bytemuck::Zeroable;
-    use hil_models::egm::messages::{EgmArrival, EgmFeedback};
-    use hil_models::message::Message;
-    use hil_runtime::rundir::manifest::describe_fields;
+    use hil_arm::egm::messages::{EgmArrival, EgmFeedback};
+    use hil_core::message::Message;
+    use hil_rundir::manifest::describe_fields;
     use prost::Message as _;
 
     #[derive(prost::Message)]

@@ -9,8 +9,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::Duration;
 
-use hil_runtime::platform::console::Console;
-use hil_runtime::platform::signals::{EXIT_INTERRUPTED, Signals};
+use hil_platform::console::Console;
+use hil_platform::signals::{EXIT_INTERRUPTED, Signals};
 
 /// How often it looks for a signal.
 const LOOK_PERIOD: Duration = Duration::from_millis(20);

@@ -5,9 +5,9 @@ use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fs;
 
-use hil_models::yumi::description::Urdf;
-use hil_runtime::rundir::manifest::Manifest;
-use hil_runtime::rundir::run_folder::RunFolder;
+use hil_arm::yumi::description::Urdf;
+use hil_rundir::manifest::Manifest;
+use hil_rundir::run_folder::RunFolder;
 use mcap::Attachment;
 use serde_json::Value;
 

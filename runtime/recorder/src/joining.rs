@@ -8,8 +8,8 @@
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-use hil_runtime::rundir::live_run::Stage;
-use hil_runtime::watch::{Record, Seen};
+use hil_rundir::live_run::Stage;
+use hil_watch::{Record, Seen};
 
 use crate::net::{self, Latencies, MessageId, MessageLatency, Noted};
 use crate::newest::Newest;

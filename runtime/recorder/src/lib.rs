@@ -9,6 +9,7 @@
 //! makes of them into a run. `view` is the state of a run that goes on, `serve` shows it.
 //!
 //! The program is [`run()`]; nothing else is for other crates but [`decoders`], for tests.
+#![forbid(unsafe_code)]
 
 mod channel;
 mod cli;

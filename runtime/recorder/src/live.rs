@@ -4,11 +4,11 @@
 use std::collections::BTreeMap;
 use std::time::Instant;
 
-use hil_models::link::condition::LinkConditionRecord;
-use hil_models::message::Envelope;
-use hil_models::record::UNAVAILABLE;
-use hil_runtime::rundir::live_run::Source;
-use hil_runtime::watch::{Event, Feed, Origin, Record, Seen, WatchedChannel};
+use hil_core::message::Envelope;
+use hil_core::record::UNAVAILABLE;
+use hil_link::condition::LinkConditionRecord;
+use hil_rundir::live_run::Source;
+use hil_watch::{Event, Feed, Origin, Record, Seen, WatchedChannel};
 
 use crate::channel::{ChannelTopics, Wanted, typed};
 use crate::conditions::Conditions;

@@ -3,9 +3,9 @@
 
 use std::collections::BTreeMap;
 
-use hil_models::message::Envelope;
-use hil_models::record::UNAVAILABLE;
-use hil_runtime::watch::Feed;
+use hil_core::message::Envelope;
+use hil_core::record::UNAVAILABLE;
+use hil_watch::Feed;
 
 use crate::clocks::{self, Basis, UNKNOWN_HOST, at};
 use crate::facts::Words;

@@ -3,11 +3,11 @@
 
 use std::collections::BTreeMap;
 
-use hil_models::record::{FollowUpRecord, IngressRecord, UNAVAILABLE};
-use hil_models::trace::{Trace, TraceFate, TraceRecord, UNAVAILABLE_NS, UNBOUNDED_NS};
-use hil_runtime::rundir::live_run::Stage;
-use hil_runtime::rundir::record::{RecordFile, RecordKind};
-use hil_runtime::watch::Record;
+use hil_core::record::{FollowUpRecord, IngressRecord, UNAVAILABLE};
+use hil_rundir::live_run::Stage;
+use hil_rundir::record::{RecordFile, RecordKind};
+use hil_trace::{Trace, TraceFate, TraceRecord, UNAVAILABLE_NS, UNBOUNDED_NS};
+use hil_watch::Record;
 
 use crate::schema::own_message;
 

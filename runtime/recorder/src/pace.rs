@@ -4,7 +4,7 @@
 
 use std::time::Duration;
 
-use hil_runtime::watch::Feed;
+use hil_watch::Feed;
 
 /// The share of its room that a channel may take between two looks. The rest is for a look that comes
 /// late, and for what a network lets through all at once.

@@ -8,10 +8,10 @@ use std::path::PathBuf;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use hil_runtime::rundir::live_run::LiveRun;
-use hil_runtime::rundir::select::select;
-use hil_runtime::rundir::select::{SelectError, select_below};
-use hil_runtime::watch::{Event, Feed, FeedError, Poll};
+use hil_rundir::live_run::LiveRun;
+use hil_rundir::select::select;
+use hil_rundir::select::{SelectError, select_below};
+use hil_watch::{Event, Feed, FeedError, Poll};
 
 use crate::facts::{self, Words};
 use crate::live::LiveTopics;

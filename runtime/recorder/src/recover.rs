@@ -11,7 +11,7 @@ use mcap::{Attachment, Channel, Schema};
 use crate::scan::{Loss, ScanEnd, ScanError, scan};
 use crate::sink::Sink as _;
 use crate::writer::{Recording, Stamp, WriteError};
-use hil_runtime::platform::words::counted_plainly;
+use hil_platform::words::counted_plainly;
 
 /// How a recovery went wrong.
 #[derive(Debug, thiserror::Error)]

@@ -6,12 +6,12 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
-use hil_models::trace::{Trace, wire};
-use hil_runtime::platform::words::counted_plainly;
-use hil_runtime::report::summary::RunSummary;
-use hil_runtime::rundir::manifest::{ChannelDescription, Manifest};
-use hil_runtime::rundir::record::{RecordFile, RecordKind};
-use hil_runtime::rundir::run_folder::RunFolder;
+use hil_platform::words::counted_plainly;
+use hil_report::summary::RunSummary;
+use hil_rundir::manifest::{ChannelDescription, Manifest};
+use hil_rundir::record::{RecordFile, RecordKind};
+use hil_rundir::run_folder::RunFolder;
+use hil_trace::{Trace, wire};
 use serde_json::Value;
 
 /// The kinds of records that end in a recording.

@@ -7,9 +7,9 @@
 
 use std::collections::BTreeSet;
 
-use hil_runtime::rundir::layout;
-use hil_runtime::rundir::layout::LayoutFault;
-use hil_runtime::rundir::manifest::{FieldDescription, KindDescription};
+use hil_rundir::layout;
+use hil_rundir::layout::LayoutFault;
+use hil_rundir::manifest::{FieldDescription, KindDescription};
 use prost::Message as _;
 use prost_types::field_descriptor_proto::{Label, Type};
 use prost_types::{
@@ -259,10 +259,10 @@ fn unique(mut name: String, taken: &mut BTreeSet<String>) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use hil_models::egm::messages::EgmFeedback;
-    use hil_models::fleet::messages::State;
-    use hil_models::message::Message;
-    use hil_runtime::rundir::manifest::describe_fields;
+    use hil_arm::egm::messages::EgmFeedback;
+    use hil_core::message::Message;
+    use hil_fleet::messages::State;
+    use hil_rundir::manifest::describe_fields;
 
     fn descriptor(schema: &Schema) -> DescriptorProto {
         let set = FileDescriptorSet::decode(schema.data.as_slice()).unwrap();

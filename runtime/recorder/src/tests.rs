@@ -7,11 +7,11 @@ use std::process;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use bytemuck::Zeroable;
-use hil_models::message::Envelope;
-use hil_models::random::RandomStream;
-use hil_runtime::rundir::manifest::{ChannelDescription, FieldDescription, KindDescription};
-use hil_runtime::rundir::record::RecordKind;
-use hil_runtime::rundir::record::file::RecordHeader;
+use hil_core::message::Envelope;
+use hil_core::random::RandomStream;
+use hil_rundir::manifest::{ChannelDescription, FieldDescription, KindDescription};
+use hil_rundir::record::RecordKind;
+use hil_rundir::record::file::RecordHeader;
 use serde_json::json;
 
 use crate::convert::{ConvertError, Converted, convert};

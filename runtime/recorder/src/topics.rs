@@ -8,12 +8,12 @@ use foxglove::messages::{
     Color, CubePrimitive, Duration, JointState, JointStates, Log, Pose, PoseInFrame, Quaternion,
     SceneEntity, SceneUpdate, TextPrimitive, Timestamp, Vector3, log,
 };
-use hil_models::case_study::Severity;
-use hil_models::egm::messages::{EgmCommand, EgmFeedback, Side};
-use hil_models::fleet::messages::State;
-use hil_models::message::Message;
-use hil_models::yumi::description::joint_name;
-use hil_runtime::report::score_event::ExplainedEvent;
+use hil_arm::egm::messages::{EgmCommand, EgmFeedback, Side};
+use hil_arm::yumi::description::joint_name;
+use hil_core::case_study::Severity;
+use hil_core::message::Message;
+use hil_fleet::messages::State;
+use hil_report::score_event::ExplainedEvent;
 use prost::Message as _;
 
 use crate::schema::Schema;

@@ -10,12 +10,12 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::time::Duration;
 
-use hil_gateways::protocol::wire::decode;
-use hil_gateways::protocol::{
+use hil_core::message::Envelope;
+use hil_core::time::Instant;
+use hil_protocol::wire::decode;
+use hil_protocol::{
     ArrivalStamps, ChannelIdentity, EgressBridge, EgressSettings, IngressBridge, IngressSettings,
 };
-use hil_models::message::Envelope;
-use hil_models::time::Instant;
 
 use crate::Verdict;
 use crate::input::Input;

@@ -1,11 +1,12 @@
 //! Captures of packets: files, and the frames in them.
 
-use hil_gateways::capture::flow::FlowFilter;
-use hil_gateways::capture::observe::Observer;
-use hil_gateways::capture::reader::{CaptureReader, Step};
-use hil_gateways::capture::writer::{self, PacketToWrite};
-use hil_gateways::capture::{CaptureFault, CaptureInterface, CapturedPacket, esl, link};
-use hil_gateways::net::{Direction, link_type};
+use hil_capture::flow::FlowFilter;
+use hil_capture::observe::Observer;
+use hil_capture::reader::{CaptureReader, Step};
+use hil_capture::writer;
+use hil_capture::writer::PacketToWrite;
+use hil_capture::{CaptureFault, CaptureInterface, CapturedPacket, esl, link};
+use hil_net::{Direction, link_type};
 
 use crate::Verdict;
 use crate::input::Input;

@@ -2,15 +2,15 @@
 
 use std::time::Duration;
 
-use hil_models::egm::face::{
+use hil_arm::egm::face::{
     Axes, RobotFace, RobotFaceSettings, RobotWare, SendPolicy, SensorFace, SensorFaceSettings,
 };
-use hil_models::egm::messages::{EgmCommand, EgmFeedback, SessionState, Side};
-use hil_models::egm::wire::{
+use hil_arm::egm::messages::{EgmCommand, EgmFeedback, SessionState, Side};
+use hil_arm::egm::wire::{
     DATAGRAM_BYTES_MAX, decode_path_correction, decode_robot, decode_sensor, encode, message_type,
 };
-use hil_models::time::Instant;
-use hil_models::yumi::arm::{POSITION_MAX_RAD, POSITION_MIN_RAD, RIGHT_START_RAD};
+use hil_arm::yumi::arm::{POSITION_MAX_RAD, POSITION_MIN_RAD, RIGHT_START_RAD};
+use hil_core::time::Instant;
 
 use crate::Verdict;
 use crate::input::Input;
@@ -164,7 +164,7 @@ pub(crate) fn feedback(cycle_index: u32, session: u32) -> EgmFeedback {
         reference_age_ns: 0,
         measured_rad: RIGHT_START_RAD,
         planned_rad: RIGHT_START_RAD,
-        tool: hil_models::yumi::arm::Arm::right()
+        tool: hil_arm::yumi::arm::Arm::right()
             .tool(&RIGHT_START_RAD)
             .into(),
         clock_ms: 4 * cycle_index,

@@ -4,12 +4,12 @@
 use std::cell::RefCell;
 use std::time::Duration;
 
-use hil_gateways::net::control::ControlData;
-use hil_gateways::protocol::fragment::{Fragment, FragmentPlan, Reassembler};
-use hil_gateways::protocol::sequence::Stream;
-use hil_gateways::protocol::wire::{Body, Datagram, HEADER_BYTES, decode};
-use hil_gateways::transport::tcp::frame::{DATAGRAM_BYTES_MAX, FrameReader, PREFIX_BYTES, prefix};
-use hil_models::time::Instant;
+use hil_core::time::Instant;
+use hil_net::control::ControlData;
+use hil_protocol::fragment::{Fragment, FragmentPlan, Reassembler};
+use hil_protocol::sequence::Stream;
+use hil_protocol::wire::{Body, Datagram, HEADER_BYTES, decode};
+use hil_transport::tcp::frame::{DATAGRAM_BYTES_MAX, FrameReader, PREFIX_BYTES, prefix};
 
 use crate::Verdict;
 use crate::input::Input;
@@ -184,7 +184,7 @@ fn plain_frames(mut stream: &[u8]) -> (Vec<&[u8]>, bool) {
 pub(crate) fn control_messages(bytes: &[u8]) -> Verdict {
     let data = ControlData::decode(bytes);
     assert_eq!(ControlData::decode(bytes), data);
-    let is_told = data.stamps != hil_gateways::net::KernelStamps::default()
+    let is_told = data.stamps != hil_net::KernelStamps::default()
         || data.drop_count.is_some()
         || data.extended_error.is_some()
         || data.is_acknowledged.is_some()

@@ -1,6 +1,6 @@
 //! Motion files.
 
-use hil_models::teleoperation::bvh::Bvh;
+use hil_teleoperation::bvh::Bvh;
 
 use crate::Verdict;
 

@@ -3,20 +3,20 @@
 
 use std::path::Path;
 
-use hil_gateways::capture::flow::FlowFilter;
-use hil_models::record::{IngressRecord, PublishedRecord};
-use hil_runtime::engine::supervisor::frame::{
+use hil_capture::flow::FlowFilter;
+use hil_core::record::{IngressRecord, PublishedRecord};
+use hil_engine::supervisor::frame::{
     FRAME_BYTES_MAX, Frame, is_plain_record_name, read_frame, write_chunk, write_message,
 };
-use hil_runtime::nic::radio;
-use hil_runtime::platform::clock_discipline::{ChronyTracking, NtpVariables, PtpStatus};
-use hil_runtime::platform::domain_address::DomainAddress;
-use hil_runtime::report::summary::RunSummary;
-use hil_runtime::rundir::layout::{Decoder, Value};
-use hil_runtime::rundir::manifest::FieldDescription;
-use hil_runtime::rundir::record::RecordFile;
-use hil_runtime::rundir::record::file::HEADER_BYTES;
-use hil_runtime::topology::read_duration;
+use hil_nic::radio;
+use hil_platform::clock_discipline::{ChronyTracking, NtpVariables, PtpStatus};
+use hil_platform::domain_address::DomainAddress;
+use hil_report::summary::RunSummary;
+use hil_rundir::layout::{Decoder, Value};
+use hil_rundir::manifest::FieldDescription;
+use hil_rundir::record::RecordFile;
+use hil_rundir::record::file::HEADER_BYTES;
+use hil_topology::read_duration;
 
 use crate::Verdict;
 use crate::input::Input;
@@ -44,7 +44,7 @@ pub(crate) fn record_file(bytes: &[u8]) -> Verdict {
     if file.message(0).is_some() {
         for index in 0..file.record_count() {
             let (_, payload) = file.message(index).expect("each record is a message");
-            let envelope_bytes = size_of::<hil_models::message::Envelope>();
+            let envelope_bytes = size_of::<hil_core::message::Envelope>();
             assert_eq!(payload.len() + envelope_bytes, record_bytes);
         }
     }

@@ -1,9 +1,9 @@
 //! Topology files.
 
-use hil_models::fleet::Fleet;
-use hil_models::shuttle::Shuttle;
-use hil_models::teleoperation::Teleoperation;
-use hil_runtime::topology::{KnownCases, Topology, TopologyErrors, parse};
+use hil_fleet::Fleet;
+use hil_shuttle::Shuttle;
+use hil_teleoperation::Teleoperation;
+use hil_topology::{KnownCases, Topology, TopologyErrors, parse};
 
 use crate::Verdict;
 

@@ -1,9 +1,9 @@
 //! Traces of what a link did: the binary form, the text, and delivery opportunities.
 
-use hil_models::trace::fault::{FaultKind, TraceFault};
-use hil_models::trace::figures::TraceFigures;
-use hil_models::trace::wire::{Decoded, HEADER_BYTES, RECORD_BYTES, TraceDecoder};
-use hil_models::trace::{Trace, TraceHeader, csv, netem, opportunities as mahimahi, wire};
+use hil_trace::fault::{FaultKind, TraceFault};
+use hil_trace::figures::TraceFigures;
+use hil_trace::wire::{Decoded, HEADER_BYTES, RECORD_BYTES, TraceDecoder};
+use hil_trace::{Trace, TraceHeader, csv, netem, opportunities as mahimahi, wire};
 
 use crate::Verdict;
 use crate::input::Input;

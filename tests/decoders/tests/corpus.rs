@@ -6,8 +6,8 @@ use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
 
+use hil_core::random::RandomStream;
 use hil_decoders::{Seed, TARGETS, Target, Verdict};
-use hil_models::random::RandomStream;
 
 /// What the corpus may take of the repository.
 const CORPUS_BYTES_MAX: usize = 200_000;

@@ -7,7 +7,7 @@ use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4, TcpStream, UdpSocket};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use hil_models::random::RandomStream;
+use hil_core::random::RandomStream;
 use socket2::{Domain, Protocol, Socket, Type};
 
 use crate::lab::LabHost;

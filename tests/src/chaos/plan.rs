@@ -3,7 +3,7 @@
 use std::fmt;
 use std::time::Duration;
 
-use hil_models::random::RandomStream;
+use hil_core::random::RandomStream;
 
 /// Length of a run, from its begin.
 pub const RUN_LENGTH: Duration = Duration::from_secs(2);

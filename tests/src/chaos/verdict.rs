@@ -6,10 +6,10 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::Path;
 
-use hil_models::account::MessageFate;
-use hil_models::record::TakenRecord;
-use hil_runtime::report::summary::{Outcome, RunSummary};
-use hil_runtime::rundir::record::{RecordFile, RecordKind};
+use hil_account::MessageFate;
+use hil_core::record::TakenRecord;
+use hil_report::summary::{Outcome, RunSummary};
+use hil_rundir::record::{RecordFile, RecordKind};
 use nix::unistd::Pid;
 
 use super::episode::{Ends, HOSTS, Stage};
@@ -214,7 +214,7 @@ impl Verdict {
             return;
         }
         for (here, there) in carried(first).zip(carried(second)) {
-            let of = |channel: &hil_runtime::report::summary::ChannelSummary| {
+            let of = |channel: &hil_report::summary::ChannelSummary| {
                 channel.account.as_ref().map(|account| {
                     let fates: Vec<_> = account.fates.iter().collect();
                     (account.published_count, fates)
@@ -288,7 +288,7 @@ pub fn leftovers(stage: &Stage, host: usize) -> Vec<String> {
 mod tests {
     use super::*;
     use crate::run_folder::RunFolder;
-    use hil_runtime::rundir::record::file::RecordHeader;
+    use hil_rundir::record::file::RecordHeader;
 
     fn taken(epoch: u32, sequence: u64) -> TakenRecord {
         TakenRecord {

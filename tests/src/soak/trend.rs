@@ -87,7 +87,7 @@ impl Slope {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use hil_models::random::RandomStream;
+    use hil_core::random::RandomStream;
 
     fn samples(seed: u64, per_s: f64, noise: f64) -> Vec<(f64, f64)> {
         let mut random = RandomStream::new(seed, "trend");

@@ -7,8 +7,8 @@ use std::path::Path;
 use std::process::Command;
 use std::time::Duration;
 
-use hil_models::teleoperation::bvh::Bvh;
-use hil_runtime::report::summary::{Outcome, RunSummary};
+use hil_report::summary::{Outcome, RunSummary};
+use hil_teleoperation::bvh::Bvh;
 use hil_tests::account::{account, assert_accounts_close, assert_every_message_is_accounted_for};
 use hil_tests::binary::{hil_runtime_binary, workspace_folder};
 use hil_tests::child::{ChildGuard, Finished};
@@ -416,7 +416,7 @@ fn an_own_program_is_told_its_card_and_its_channels_and_is_asked_to_stop() {
     let (domain, mood) = told.trim().split_once(' ').unwrap();
     assert!(
         domain
-            .parse::<hil_runtime::platform::domain_address::DomainAddress>()
+            .parse::<hil_platform::domain_address::DomainAddress>()
             .is_ok(),
         "{domain}"
     );

@@ -6,11 +6,11 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Duration;
 
-use hil_models::account::MessageFate;
-use hil_models::egm::messages::EgmCommand;
-use hil_runtime::report::summary::Outcome;
-use hil_runtime::rundir::layout::hex;
-use hil_runtime::rundir::record::RecordFile;
+use hil_account::MessageFate;
+use hil_arm::egm::messages::EgmCommand;
+use hil_report::summary::Outcome;
+use hil_rundir::layout::hex;
+use hil_rundir::record::RecordFile;
 use hil_tests::account::{account, assert_accounts_close, assert_every_message_is_accounted_for};
 use hil_tests::binary::{hil_recorder_binary, hil_runtime_binary};
 use hil_tests::child::{ChildGuard, Finished};

@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Duration;
 
-use hil_models::account::MessageFate;
-use hil_runtime::report::summary::RunSummary;
+use hil_account::MessageFate;
+use hil_report::summary::RunSummary;
 use hil_tests::account::account;
 use hil_tests::binary::{hil_runtime_binary, workspace_folder};
 use hil_tests::child::{ChildGuard, Finished};

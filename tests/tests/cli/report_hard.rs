@@ -7,8 +7,8 @@ use std::path::Path;
 use std::process::Command;
 use std::time::{Duration, Instant};
 
-use hil_models::account::{MessageFate, Stage};
-use hil_runtime::report::summary::RunSummary;
+use hil_account::{MessageFate, Stage};
+use hil_report::summary::RunSummary;
 use hil_tests::account::{account, assert_every_message_is_accounted_for};
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::browser::Browser;

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use hil_runtime::report::summary::Outcome;
+use hil_report::summary::Outcome;
 use hil_tests::account::{account, assert_accounts_close, assert_every_message_is_accounted_for};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::{RunFiles, Trial};

@@ -4,10 +4,10 @@
 use std::process::Command;
 use std::time::Duration;
 
-use hil_models::clock::{ClockFigures, StampKind};
-use hil_runtime::report::clock_summary::{ClockPathSummary, ClockRung, HostPairClock};
-use hil_runtime::report::summary::{Outcome, RunEventKind, RunSummary};
-use hil_runtime::rundir::event::EventKind;
+use hil_clock::{ClockFigures, StampKind};
+use hil_report::clock_summary::{ClockPathSummary, ClockRung, HostPairClock};
+use hil_report::summary::{Outcome, RunEventKind, RunSummary};
+use hil_rundir::event::EventKind;
 use hil_tests::account::assert_every_message_is_accounted_for;
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::child::ChildGuard;

@@ -3,10 +3,10 @@
 
 use std::time::Duration;
 
-use hil_models::clock::StampKind;
-use hil_runtime::report::clock_summary::{ClockRung, HostPairClock};
-use hil_runtime::report::network::{NetworkQuantity, TimelineSubject};
-use hil_runtime::report::summary::{LinkKind, Outcome, RunSummary};
+use hil_clock::StampKind;
+use hil_report::clock_summary::{ClockRung, HostPairClock};
+use hil_report::network::{NetworkQuantity, TimelineSubject};
+use hil_report::summary::{LinkKind, Outcome, RunSummary};
 use hil_tests::account::{account, assert_every_message_is_accounted_for, carried};
 use hil_tests::lab::Lab;
 use hil_tests::run_folder::RunFolder;

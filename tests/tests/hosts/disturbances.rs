@@ -8,8 +8,8 @@ use std::process::Command;
 use std::thread;
 use std::time::Duration;
 
-use hil_models::account::MessageFate;
-use hil_runtime::report::summary::{Outcome, RunSummary};
+use hil_account::MessageFate;
+use hil_report::summary::{Outcome, RunSummary};
 use hil_tests::account::{account, assert_every_message_is_accounted_for, describe};
 use hil_tests::child::{ChildGuard, Finished};
 use hil_tests::lab::{INTERFACE, Lab};

@@ -3,11 +3,11 @@
 
 use std::time::Duration;
 
-use hil_models::egm::messages::{EgmEventKind, Side};
-use hil_models::yumi::Joints;
-use hil_models::yumi::arm::Arm;
-use hil_runtime::report::face::FaceSummary;
-use hil_runtime::report::summary::{Outcome, RunSummary};
+use hil_arm::egm::messages::{EgmEventKind, Side};
+use hil_arm::yumi::Joints;
+use hil_arm::yumi::arm::Arm;
+use hil_report::face::FaceSummary;
+use hil_report::summary::{Outcome, RunSummary};
 use hil_tests::account::assert_account_closes;
 use hil_tests::arms::{Arms, of_kind};
 use hil_tests::lab::{ADDRESSES, Lab};

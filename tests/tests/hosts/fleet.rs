@@ -7,10 +7,10 @@
 use std::env;
 use std::time::Duration;
 
-use hil_models::account::MessageFate;
-use hil_runtime::report::assessment::{Assessment, NetworkVerdict};
-use hil_runtime::report::score_event::ExplainedMessage;
-use hil_runtime::report::summary::{LinkKind, Outcome, RunSummary};
+use hil_account::MessageFate;
+use hil_report::assessment::{Assessment, NetworkVerdict};
+use hil_report::score_event::ExplainedMessage;
+use hil_report::summary::{LinkKind, Outcome, RunSummary};
 use hil_tests::account::{
     account, assert_accounts_close, assert_every_message_is_accounted_for, carried, channel,
     describe,

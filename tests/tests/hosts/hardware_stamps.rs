@@ -6,7 +6,7 @@ use std::io::{BufRead, BufReader, Read, Write};
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
-use hil_runtime::report::summary::Outcome;
+use hil_report::summary::Outcome;
 use hil_tests::account::{account, assert_accounts_close, assert_every_message_is_accounted_for};
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::child::ChildGuard;

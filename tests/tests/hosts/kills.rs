@@ -6,10 +6,10 @@ use std::process::Command;
 use std::thread;
 use std::time::Duration;
 
-use hil_models::account::{InterruptionFigures, MessageFate};
-use hil_models::record::IngressRecord;
-use hil_runtime::report::assessment::{Assessment, NetworkVerdict};
-use hil_runtime::report::summary::{Outcome, RunEvent, RunSummary};
+use hil_account::{InterruptionFigures, MessageFate};
+use hil_core::record::IngressRecord;
+use hil_report::assessment::{Assessment, NetworkVerdict};
+use hil_report::summary::{Outcome, RunEvent, RunSummary};
 use hil_tests::account::{account, assert_every_message_is_accounted_for, carried, describe};
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::child::{ChildGuard, Finished};

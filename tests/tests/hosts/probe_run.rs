@@ -6,10 +6,10 @@ use std::path::Path;
 use std::process::Command;
 use std::time::Duration;
 
-use hil_gateways::capture::reader::{CaptureReader, Step};
-use hil_gateways::net::filter::PacketFilter;
-use hil_gateways::net::packet_ring::{PacketRing, RingSettings, RingStamps};
-use hil_runtime::report::summary::Outcome;
+use hil_capture::reader::{CaptureReader, Step};
+use hil_net::filter::PacketFilter;
+use hil_net::packet_ring::{PacketRing, RingSettings, RingStamps};
+use hil_report::summary::Outcome;
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::child::{ChildGuard, Finished};
 use hil_tests::lab::{INTERFACE, Lab, LabHost};

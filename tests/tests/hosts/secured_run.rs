@@ -6,8 +6,8 @@ use std::os::unix::fs::PermissionsExt;
 use std::process::Command;
 use std::time::Duration;
 
-use hil_runtime::engine::security::PreSharedKey;
-use hil_runtime::rundir::protection::HopProtection;
+use hil_engine::security::PreSharedKey;
+use hil_rundir::protection::HopProtection;
 use hil_tests::account::{account, assert_accounts_close};
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::child::{ChildGuard, Finished};

@@ -9,7 +9,7 @@ use std::path::Path;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use hil_models::account::MessageFate;
+use hil_account::MessageFate;
 use hil_tests::account::{account, assert_every_message_is_accounted_for, carried, describe};
 use hil_tests::child::ChildGuard;
 use hil_tests::lab::{Lab, LabHost};

@@ -6,8 +6,8 @@ use std::os::unix::fs::MetadataExt;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use hil_models::account::ChannelAccount;
-use hil_runtime::report::summary::{LinkKind, Outcome, RunSummary};
+use hil_account::ChannelAccount;
+use hil_report::summary::{LinkKind, Outcome, RunSummary};
 use hil_tests::account::{
     account, assert_accounts_close, assert_both_ends_are_stamped,
     assert_every_message_is_accounted_for, carried, channel, describe,
@@ -179,7 +179,7 @@ fn same_on_both_hosts(account: &ChannelAccount) -> ChannelAccount {
         &mut account.gaps.longest,
         &mut account.gaps.longest_unattributed,
     ] {
-        *gap = gap.map(|gap| hil_models::account::Gap { start_ns: 0, ..gap });
+        *gap = gap.map(|gap| hil_account::Gap { start_ns: 0, ..gap });
     }
     account
 }

@@ -14,10 +14,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use hil_models::account::MessageFate;
-use hil_models::random::RandomStream;
-use hil_runtime::platform::clock::MonotonicClock;
-use hil_runtime::report::summary::{DirectionSummary, RunSummary};
+use hil_account::MessageFate;
+use hil_core::random::RandomStream;
+use hil_platform::clock::MonotonicClock;
+use hil_report::summary::{DirectionSummary, RunSummary};
 use hil_tests::account::{account, assert_accounts_close};
 use hil_tests::attacker::{Attacker, Flood};
 use hil_tests::child;

@@ -5,8 +5,8 @@ use std::process::Command;
 use std::thread;
 use std::time::Duration;
 
-use hil_models::account::MessageFate;
-use hil_runtime::report::summary::{DirectionSummary, LinkKind, Outcome, RunSummary};
+use hil_account::MessageFate;
+use hil_report::summary::{DirectionSummary, LinkKind, Outcome, RunSummary};
 use hil_tests::account::{
     account, assert_accounts_close, assert_every_message_is_accounted_for, channel, describe,
 };

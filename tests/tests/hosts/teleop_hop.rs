@@ -3,10 +3,10 @@
 
 use std::time::Duration;
 
-use hil_models::link::outages::{Outage, OutageSchedule, Outages};
-use hil_models::random::RandomStream;
-use hil_models::time::Instant;
-use hil_runtime::report::summary::{Outcome, RunSummary};
+use hil_core::random::RandomStream;
+use hil_core::time::Instant;
+use hil_link::outages::{Outage, OutageSchedule, Outages};
+use hil_report::summary::{Outcome, RunSummary};
 use hil_tests::account::{
     account, assert_accounts_close, assert_every_message_is_accounted_for, describe,
 };

@@ -7,20 +7,20 @@ use std::collections::BTreeMap;
 use std::rc::Rc;
 use std::time::Duration;
 
-use hil_gateways::protocol::wire::Kind;
-use hil_gateways::protocol::{
+use hil_core::case_study::{CaseStudy, ChannelSpec};
+use hil_core::link_model::{Fate, LinkModel, PerfectLink};
+use hil_core::message::Envelope;
+use hil_core::random::RandomStream;
+use hil_core::simulation::{Carrier, Simulation, SimulationResult};
+use hil_core::time::{Instant, duration_ns};
+use hil_link::bernoulli::BernoulliLink;
+use hil_protocol::wire::Kind;
+use hil_protocol::{
     ArrivalStamps, ChannelIdentity, Delivery, EgressBridge, EgressSettings, IngressBridge,
     IngressSettings, PeerState,
 };
-use hil_models::case_study::{CaseStudy, ChannelSpec};
-use hil_models::link::bernoulli::BernoulliLink;
-use hil_models::link_model::{Fate, LinkModel, PerfectLink};
-use hil_models::message::Envelope;
-use hil_models::random::RandomStream;
-use hil_models::shuttle::{Shuttle, ShuttleParameters};
-use hil_models::simulation::{Carrier, Simulation, SimulationResult};
-use hil_models::teleoperation::{Teleoperation, TeleoperationParameters};
-use hil_models::time::{Instant, duration_ns};
+use hil_shuttle::{Shuttle, ShuttleParameters};
+use hil_teleoperation::{Teleoperation, TeleoperationParameters};
 
 const RUN: Duration = Duration::from_mins(1);
 /// The gateways are up this long before the robot is: their greetings come first.

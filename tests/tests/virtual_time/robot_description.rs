@@ -5,10 +5,10 @@ use std::fs;
 use std::process::Command;
 use std::time::Duration;
 
-use hil_models::random::RandomStream;
-use hil_models::yumi::arm::{Arm, POSITION_MAX_RAD, POSITION_MIN_RAD, SPEED_MAX_RAD_PER_S};
-use hil_models::yumi::description::{Urdf, joint_name};
-use hil_models::yumi::{JOINT_COUNT, Joints};
+use hil_arm::yumi::arm::{Arm, POSITION_MAX_RAD, POSITION_MIN_RAD, SPEED_MAX_RAD_PER_S};
+use hil_arm::yumi::description::{Urdf, joint_name};
+use hil_arm::yumi::{JOINT_COUNT, Joints};
+use hil_core::random::RandomStream;
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::child;
 use hil_tests::run_folder::RunFolder;

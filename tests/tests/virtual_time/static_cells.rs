@@ -5,9 +5,9 @@ use std::fs;
 use std::process::Command;
 use std::time::Duration;
 
-use hil_models::account::MessageFate;
-use hil_models::stats::statistics::clopper_pearson;
-use hil_runtime::report::summary::RunSummary;
+use hil_account::MessageFate;
+use hil_report::summary::RunSummary;
+use hil_stats::statistics::clopper_pearson;
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::child::ChildGuard;
 use hil_tests::run_folder::RunFolder;

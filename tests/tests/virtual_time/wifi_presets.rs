@@ -4,10 +4,10 @@
 use std::fs;
 use std::time::Duration;
 
-use hil_models::link::spec::{LinkPlace, LinkSpec, Way};
-use hil_models::link::wifi::WifiPreset;
-use hil_models::link_model::Fate;
-use hil_models::time::Instant;
+use hil_core::link_model::Fate;
+use hil_core::time::Instant;
+use hil_link::spec::{LinkPlace, LinkSpec, Way};
+use hil_link::wifi::WifiPreset;
 use hil_tests::binary::workspace_folder;
 
 const MESSAGE_COUNT: u32 = 1_000_000;

@@ -9,11 +9,11 @@ use std::path::Path;
 use std::process::{Command, Output};
 use std::time::Duration;
 
-use hil_models::account::MessageFate;
-use hil_models::egm::messages::EgmFeedback;
-use hil_models::message::Envelope;
-use hil_runtime::report::summary::RunSummary;
-use hil_runtime::rundir::record::RecordFile;
+use hil_account::MessageFate;
+use hil_arm::egm::messages::EgmFeedback;
+use hil_core::message::Envelope;
+use hil_report::summary::RunSummary;
+use hil_rundir::record::RecordFile;
 use hil_tests::binary::hil_recorder_binary;
 use hil_tests::child::ChildGuard;
 use hil_tests::mcap_file::{assert_code, metadata, python, read_back, recorder, words};

@@ -6,11 +6,11 @@ use std::path::{Path, PathBuf};
 use std::thread;
 use std::time::Duration;
 
-use hil_models::random::RandomStream;
-use hil_models::record::PublishedRecord;
-use hil_runtime::platform::clock::MonotonicClock;
-use hil_runtime::report::summary::Outcome;
-use hil_runtime::rundir::record::RecordFile;
+use hil_core::random::RandomStream;
+use hil_core::record::PublishedRecord;
+use hil_platform::clock::MonotonicClock;
+use hil_report::summary::Outcome;
+use hil_rundir::record::RecordFile;
 use hil_tests::account::{assert_accounts_close, assert_every_message_is_accounted_for};
 use hil_tests::child::ChildGuard;
 use hil_tests::latency::assert_undisturbed;

@@ -6,7 +6,7 @@ use std::path::Path;
 use std::thread;
 use std::time::Duration;
 
-use hil_runtime::report::summary::RunSummary;
+use hil_report::summary::RunSummary;
 use hil_tests::account::{assert_accounts_close, assert_every_message_is_accounted_for};
 use hil_tests::binary::hil_recorder_binary;
 use hil_tests::child::ChildGuard;

@@ -6,8 +6,8 @@ use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use hil_runtime::report::summary::RunSummary;
-use hil_runtime::rundir::record::RecordFile;
+use hil_report::summary::RunSummary;
+use hil_rundir::record::RecordFile;
 use hil_tests::account::{account, describe};
 use hil_tests::binary::hil_recorder_binary;
 use hil_tests::child::ChildGuard;

@@ -5,12 +5,12 @@ use std::collections::BTreeMap;
 use std::thread;
 use std::time::Duration;
 
-use hil_runtime::rundir::live_run::Source;
-use hil_runtime::rundir::select::running_runs;
-use hil_runtime::rundir::select::select;
-use hil_runtime::watch::{Event, Feed, Origin, Poll};
+use hil_rundir::live_run::Source;
+use hil_rundir::select::running_runs;
+use hil_rundir::select::select;
 use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::{Trial, wait_until};
+use hil_watch::{Event, Feed, Origin, Poll};
 
 const LIMIT: Duration = Duration::from_mins(1);
 

@@ -7,26 +7,24 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
-use hil_gateways::protocol::body::HelloStatus;
-use hil_gateways::protocol::{
+use hil_account::MessageFate;
+use hil_core::message::{Envelope, MessageType};
+use hil_core::time::Instant;
+use hil_platform::realtime::RealtimeRequest;
+use hil_platform::wait::WaitMode;
+use hil_protocol::body::HelloStatus;
+use hil_protocol::{
     ArrivalStamps, ChannelIdentity, EgressBridge, EgressEvent, EgressSettings, IngressBridge,
     IngressSettings, LocalRefusal, PeerState, Refusal,
 };
-use hil_models::account::MessageFate;
-use hil_models::message::{Envelope, MessageType};
-use hil_models::shuttle::ShuttleCommand;
-use hil_models::time::Instant;
-use hil_runtime::platform::realtime::RealtimeRequest;
-use hil_runtime::platform::wait::WaitMode;
-use hil_runtime::rundir::launch::{
-    DirectionLaunch, GatewayLaunch, Side, SocketLaunch, Transport, write,
-};
-use hil_runtime::shm::{ChannelHolder, ChannelSettings, Domain};
-use hil_runtime::topology::Timestamps;
+use hil_rundir::launch::{DirectionLaunch, GatewayLaunch, Side, SocketLaunch, Transport, write};
+use hil_shm::{ChannelHolder, ChannelSettings, Domain};
+use hil_shuttle::ShuttleCommand;
 use hil_tests::account::{account, assert_every_message_is_accounted_for};
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::run_folder::RunFolder;
 use hil_tests::trial::{Trial, wait_until};
+use hil_topology::Timestamps;
 
 const CHANNEL: &str = "shuttle/command";
 const LIMIT: Duration = Duration::from_mins(1);

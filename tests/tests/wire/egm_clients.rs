@@ -10,8 +10,8 @@ use std::process::Command;
 use std::thread;
 use std::time::Duration;
 
-use hil_models::account::MessageFate;
-use hil_models::egm::messages::{EgmEvent, EgmEventKind, EndCause, MotionKind, Side};
+use hil_account::MessageFate;
+use hil_arm::egm::messages::{EgmEvent, EgmEventKind, EndCause, MotionKind, Side};
 use hil_tests::account::{account, assert_account_closes};
 use hil_tests::arms::{Arms, of_kind};
 use hil_tests::binary::workspace_folder;

@@ -3,9 +3,9 @@
 
 use std::time::Duration;
 
-use hil_models::account::{ChannelAccount, MessageFate, Stage};
-use hil_models::stats::statistics::clopper_pearson;
-use hil_runtime::report::summary::{ChannelSummary, LinkKind, Outcome};
+use hil_account::{ChannelAccount, MessageFate, Stage};
+use hil_report::summary::{ChannelSummary, LinkKind, Outcome};
+use hil_stats::statistics::clopper_pearson;
 use hil_tests::account::{
     account, assert_accounts_close, assert_every_message_is_accounted_for, carried, channel,
     describe,

@@ -6,11 +6,11 @@ use std::process::{Command, Output};
 use std::thread;
 use std::time::Duration;
 
-use hil_models::link::condition::LinkConditionRecord;
-use hil_models::record::{EgressRecord, IngressRecord, UNAVAILABLE};
-use hil_models::stats::statistics::clopper_pearson;
-use hil_runtime::report::link_change::ChangedTo;
-use hil_runtime::report::summary::Outcome;
+use hil_core::record::{EgressRecord, IngressRecord, UNAVAILABLE};
+use hil_link::condition::LinkConditionRecord;
+use hil_report::link_change::ChangedTo;
+use hil_report::summary::Outcome;
+use hil_stats::statistics::clopper_pearson;
 use hil_tests::account::assert_every_message_is_accounted_for;
 use hil_tests::binary::{hil_recorder_binary, hil_runtime_binary};
 use hil_tests::child::ChildGuard;

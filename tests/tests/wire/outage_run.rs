@@ -6,12 +6,12 @@ use std::fs;
 use std::process::Command;
 use std::time::Duration;
 
-use hil_models::account::MessageFate;
-use hil_models::link::outages::{Outage, OutageSchedule, Outages};
-use hil_models::random::RandomStream;
-use hil_models::record::{IngressRecord, PublishedRecord};
-use hil_models::time::Instant;
-use hil_runtime::report::summary::{LinkKind, RunSummary};
+use hil_account::MessageFate;
+use hil_core::random::RandomStream;
+use hil_core::record::{IngressRecord, PublishedRecord};
+use hil_core::time::Instant;
+use hil_link::outages::{Outage, OutageSchedule, Outages};
+use hil_report::summary::{LinkKind, RunSummary};
 use hil_tests::account::{account, assert_every_message_is_accounted_for, channel, describe};
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::run_folder::RunFolder;

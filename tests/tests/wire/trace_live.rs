@@ -7,14 +7,14 @@ use std::fs;
 use std::path::Path;
 use std::time::Duration;
 
-use hil_models::link_model::{ReplayCounts, TraceMatch};
-use hil_models::random::RandomStream;
-use hil_models::record::IngressRecord;
-use hil_models::trace::{Trace, TraceFate, TraceHeader, TraceRecord, wire};
+use hil_core::link_model::{ReplayCounts, TraceMatch};
+use hil_core::random::RandomStream;
+use hil_core::record::IngressRecord;
 use hil_tests::account::{assert_every_message_is_accounted_for, channel};
 use hil_tests::run_folder::RunFolder;
 use hil_tests::shuttle::{CHANNELS, PERIOD_NS, emulated_shuttle, forwarded, records, trace_of};
 use hil_tests::trial::{RunFiles, Trial};
+use hil_trace::{Trace, TraceFate, TraceHeader, TraceRecord, wire};
 
 const LIMIT: Duration = Duration::from_mins(1);
 const RUN_S: u64 = 8;

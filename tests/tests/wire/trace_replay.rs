@@ -8,13 +8,13 @@ use std::path::Path;
 use std::process::{Command, Output};
 use std::time::Duration;
 
-use hil_models::trace::{Trace, TraceFate, TraceHeader, TraceRecord, wire};
-use hil_runtime::report::summary::{RunSummary, ScoreMetric};
+use hil_report::summary::{RunSummary, ScoreMetric};
 use hil_tests::account::{account, assert_every_message_is_accounted_for, describe};
 use hil_tests::binary::hil_runtime_binary;
 use hil_tests::run_folder::RunFolder;
 use hil_tests::shuttle::{CHANNELS, emulated_shuttle, forwarded, trace_of};
 use hil_tests::trial::{RunFiles, Trial};
+use hil_trace::{Trace, TraceFate, TraceHeader, TraceRecord, wire};
 use serde_json::Value;
 
 /// Names how long the live runs last, e.g. 60.

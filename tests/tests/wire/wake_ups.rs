@@ -4,12 +4,10 @@
 use std::os::fd::{AsFd, AsRawFd};
 use std::time::Duration;
 
-use hil_models::message::MessageType;
-use hil_models::shuttle::ShuttleStatus;
-use hil_runtime::platform::clock::MonotonicClock;
-use hil_runtime::shm::{
-    ChannelHolder, ChannelSettings, Domain, OutputSettings, TypedOutput, Waiter, Wake,
-};
+use hil_core::message::MessageType;
+use hil_platform::clock::MonotonicClock;
+use hil_shm::{ChannelHolder, ChannelSettings, Domain, OutputSettings, TypedOutput, Waiter, Wake};
+use hil_shuttle::ShuttleStatus;
 use hil_tests::run_folder::RunFolder;
 use nix::errno::Errno;
 use nix::sys::socket::{MsgFlags, recv};

@@ -1,7 +1,7 @@
 //! Stamps in the orders in which processes and networks bring them, and what is made of them.
 
 use super::*;
-use hil_models::record::{IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE};
+use hil_core::record::{IngressRecord, PublishedRecord, TakenRecord, UNAVAILABLE};
 
 const MS: u64 = 1_000_000;
 const HOLD_MS: u64 = HOLD_NS.unsigned_abs() / MS;

@@ -9,12 +9,12 @@ use std::path::PathBuf;
 use std::thread;
 use std::time::Duration;
 
-use hil_models::time::Instant;
-use hil_runtime::platform::clock::{MonotonicClock, Wake};
-use hil_runtime::platform::console::Console;
-use hil_runtime::platform::signals::Signals;
-use hil_runtime::platform::words::counted_plainly;
-use hil_runtime::rundir::manifest::ChannelDescription;
+use hil_core::time::Instant;
+use hil_platform::clock::{MonotonicClock, Wake};
+use hil_platform::console::Console;
+use hil_platform::signals::Signals;
+use hil_platform::words::counted_plainly;
+use hil_rundir::manifest::ChannelDescription;
 
 use crate::cli::PlayOptions;
 use schedule::{Punctuality, Schedule};

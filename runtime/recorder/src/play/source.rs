@@ -3,9 +3,9 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use hil_runtime::platform::words::counted_plainly;
-use hil_runtime::rundir::layout::LayoutFault;
-use hil_runtime::rundir::manifest::ChannelDescription;
+use hil_platform::words::counted_plainly;
+use hil_rundir::layout::LayoutFault;
+use hil_rundir::manifest::ChannelDescription;
 use mcap::records::Record;
 
 use crate::decode::{DecodeFault, Decoder};

@@ -8,14 +8,14 @@ use std::path::{Path, PathBuf};
 use std::thread;
 use std::time::{Duration, Instant as WallInstant};
 
-use hil_models::message::Envelope;
-use hil_runtime::platform::clock::MonotonicClock;
-use hil_runtime::rundir::live_run::LiveRun;
-use hil_runtime::rundir::manifest::{ChannelDescription, Manifest};
-use hil_runtime::rundir::select::SelectError;
-use hil_runtime::rundir::select::select;
-use hil_runtime::rundir::status::has_begun;
-use hil_runtime::shm::{Census, ChannelError, Domain, DomainError, RawOutput};
+use hil_core::message::Envelope;
+use hil_platform::clock::MonotonicClock;
+use hil_rundir::live_run::LiveRun;
+use hil_rundir::manifest::{ChannelDescription, Manifest};
+use hil_rundir::select::SelectError;
+use hil_rundir::select::select;
+use hil_rundir::status::has_begun;
+use hil_shm::{Census, ChannelError, Domain, DomainError, RawOutput};
 use serde_json::Value;
 
 /// How long a writer that died may take to lose its place: supervisors look ten times a second.

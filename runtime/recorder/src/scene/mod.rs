@@ -15,9 +15,9 @@ use foxglove::messages::{
     FrameTransforms, SceneEntity, SceneEntityDeletion, SceneUpdate, Timestamp,
     scene_entity_deletion,
 };
-use hil_models::egm::messages::{EgmCommand, EgmFeedback};
-use hil_models::fleet::messages::{Mission, State, Truth};
-use hil_models::message::Message;
+use hil_arm::egm::messages::{EgmCommand, EgmFeedback};
+use hil_core::message::Message;
+use hil_fleet::messages::{Mission, State, Truth};
 use prost::Message as _;
 use serde_json::Value;
 

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use bytemuck::Zeroable;
-use hil_models::yumi::arm::RIGHT_START_RAD;
+use hil_arm::yumi::arm::RIGHT_START_RAD;
 use serde_json::json;
 
 use super::waiting::LiveScene;
@@ -51,7 +51,7 @@ impl Kept {
 
 fn crossing() -> Scene {
     let parameters = json!({ "world": { "scenario": "crossing" } });
-    let parameters: hil_models::fleet::FleetParameters =
+    let parameters: hil_fleet::FleetParameters =
         serde_json::from_value(parameters).unwrap_or_default();
     let parameters = serde_json::to_value(parameters).unwrap();
     Scene::new(Some("fleet"), &parameters, &mut Names::default())

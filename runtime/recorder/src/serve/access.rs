@@ -13,7 +13,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use super::head::{Head, only};
 
-use hil_runtime::platform::words::counted_plainly;
+use hil_platform::words::counted_plainly;
 
 /// What programs with pages of their own in them send, as Lichtblick's desktop application does. So does
 /// any saved page in some browsers and web views, those of iOS among them; others say `null` of a file.

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use foxglove::websocket::Parameter;
-use hil_runtime::platform::console::Console;
+use hil_platform::console::Console;
 use serde_json::{Value, json};
 
 use super::parameters::Links;

@@ -23,14 +23,14 @@ use std::sync::Arc;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use hil_runtime::platform::console::Console;
-use hil_runtime::platform::progress::Progress;
-use hil_runtime::platform::signals::{EXIT_INTERRUPTED, Signals};
-use hil_runtime::rundir::live_run::LiveRun;
-use hil_runtime::rundir::run_folder::RunFolder;
-use hil_runtime::rundir::select::SelectError;
-use hil_runtime::rundir::select::select;
-use hil_runtime::watch::FeedError;
+use hil_platform::console::Console;
+use hil_platform::progress::Progress;
+use hil_platform::signals::{EXIT_INTERRUPTED, Signals};
+use hil_rundir::live_run::LiveRun;
+use hil_rundir::run_folder::RunFolder;
+use hil_rundir::select::SelectError;
+use hil_rundir::select::select;
+use hil_watch::FeedError;
 use tokio::runtime::Runtime;
 
 use crate::cli::ServeOptions;

@@ -21,9 +21,9 @@ use foxglove::websocket::{
     AnyClient, GetParametersResponder, Parameter, ParameterHandler, ParameterType, ParameterValue,
     SetParametersResponder,
 };
-use hil_models::link::condition::LinkCondition;
-use hil_runtime::topology::read_duration;
-use hil_runtime::watch::link::{LinkDirection, RunLinks};
+use hil_link::condition::LinkCondition;
+use hil_topology::read_duration;
+use hil_watch::link::{LinkDirection, RunLinks};
 use serde_json::{Value, json};
 
 /// How often it is looked whether somebody else changed a link.

@@ -3,13 +3,13 @@
 use std::path::Path;
 use std::time::Instant;
 
-use hil_models::record::UNAVAILABLE;
-use hil_models::time::duration_ns;
-use hil_runtime::report::assessment::Assessment;
-use hil_runtime::report::summary::RunSummary;
-use hil_runtime::rundir::live_run::Stage;
-use hil_runtime::rundir::record::{RecordFile, RecordKind};
-use hil_runtime::watch::Record;
+use hil_core::record::UNAVAILABLE;
+use hil_core::time::duration_ns;
+use hil_report::assessment::Assessment;
+use hil_report::summary::RunSummary;
+use hil_rundir::live_run::Stage;
+use hil_rundir::record::{RecordFile, RecordKind};
+use hil_watch::Record;
 
 use super::source::{Progress, Source, Warning};
 use crate::clocks::Clocks;

@@ -7,8 +7,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use hil_runtime::platform::console::Console;
-use hil_runtime::platform::words::counted_plainly;
+use hil_platform::console::Console;
+use hil_platform::words::counted_plainly;
 
 use crate::record::{RecordError, Recorded, Request, Which, record};
 use crate::split::another;

@@ -5,12 +5,13 @@ use std::io::{self, Read, Seek, SeekFrom};
 use std::path::Path;
 use std::time::Duration;
 
-use hil_runtime::platform::clock::MonotonicClock;
-use hil_runtime::report::summary::RunSummary;
-use hil_runtime::rundir::live_run;
-use hil_runtime::rundir::live_run::LiveRun;
-use hil_runtime::rundir::status::{self, Overruns};
-use hil_runtime::watch::{Event, Feed, FeedError, Origin, Poll};
+use hil_platform::clock::MonotonicClock;
+use hil_report::summary::RunSummary;
+use hil_rundir::live_run;
+use hil_rundir::live_run::LiveRun;
+use hil_rundir::status;
+use hil_rundir::status::Overruns;
+use hil_watch::{Event, Feed, FeedError, Origin, Poll};
 
 use super::engine::REST;
 use super::playback::how_ended;

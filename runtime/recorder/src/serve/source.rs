@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use hil_runtime::rundir::status::Overruns;
+use hil_rundir::status::Overruns;
 use serde::Serialize;
 
 use crate::view::LiveRecord;

@@ -3,8 +3,8 @@
 
 use std::collections::BTreeMap;
 
-use hil_runtime::rundir::live_run::Stage;
-use hil_runtime::watch::Record;
+use hil_rundir::live_run::Stage;
+use hil_watch::Record;
 use serde_json::{Value, json};
 
 use super::facts::ChannelFacts;

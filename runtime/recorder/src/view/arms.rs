@@ -1,11 +1,12 @@
 //! The arms as their messages tell of them: commanded and measured joints, and where these put the
 //! links. Kinematics and shapes are those of the models, as in the robot's URDF.
 
-use hil_models::egm::messages::{EgmCommand, EgmFeedback, Side};
-use hil_models::message::Message;
-use hil_models::yumi::arm::Arm;
-use hil_models::yumi::description::{self, Rod};
-use hil_models::yumi::{Joints, Pose};
+use hil_arm::egm::messages::{EgmCommand, EgmFeedback, Side};
+use hil_arm::yumi::arm::Arm;
+use hil_arm::yumi::description;
+use hil_arm::yumi::description::Rod;
+use hil_arm::yumi::{Joints, Pose};
+use hil_core::message::Message;
 use serde_json::{Value, json};
 
 use super::{rounded, seconds};
@@ -93,7 +94,7 @@ impl OneArm {
         let state = feedback.and_then(EgmFeedback::session_state);
         json!({
             "side": self.side.word(),
-            "state": state.map(hil_models::egm::messages::SessionState::word),
+            "state": state.map(hil_arm::egm::messages::SessionState::word),
             "session": feedback.map(|one| one.session),
             "queue_count": feedback.map(|one| one.queue_count),
             "flags": self.flags(),
@@ -162,7 +163,7 @@ fn is_finite(joints: &Joints) -> bool {
 mod tests {
     use super::*;
     use bytemuck::Zeroable;
-    use hil_models::yumi::arm::RIGHT_START_RAD;
+    use hil_arm::yumi::arm::RIGHT_START_RAD;
 
     #[test]
     fn an_arm_that_is_where_it_shall_be_has_no_error_and_its_tool_at_its_last_frame() {

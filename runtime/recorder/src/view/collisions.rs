@@ -3,10 +3,10 @@
 
 use std::collections::{BTreeSet, VecDeque};
 
-use hil_models::fleet::geometry::{Footprint, Pose};
-use hil_models::fleet::messages::Truth;
-use hil_models::fleet::referee::{Referee, SCAN_PERIOD};
-use hil_models::time::Instant;
+use hil_core::time::Instant;
+use hil_fleet::geometry::{Footprint, Pose};
+use hil_fleet::messages::Truth;
+use hil_fleet::referee::{Referee, SCAN_PERIOD};
 use serde_json::{Value, json};
 
 use super::ground::Ground;

@@ -3,11 +3,11 @@
 
 use std::time::Duration;
 
-use hil_models::fleet::Fleet;
-use hil_models::shuttle::Shuttle;
-use hil_models::teleoperation::Teleoperation;
-use hil_runtime::rundir::manifest::{ChannelDescription, Manifest};
-use hil_runtime::topology::registry::Registry;
+use hil_fleet::Fleet;
+use hil_rundir::manifest::{ChannelDescription, Manifest};
+use hil_shuttle::Shuttle;
+use hil_teleoperation::Teleoperation;
+use hil_topology::registry::Registry;
 use serde_json::{Value, json};
 
 use crate::clocks::Clocks;
@@ -125,7 +125,7 @@ impl RunFacts {
         self.case = text(&topology["case"]["name"]);
         self.parameters = topology["case"]["parameters"].clone();
         let duration = topology["run"]["duration"].as_str();
-        self.duration = duration.and_then(hil_runtime::topology::read_duration);
+        self.duration = duration.and_then(hil_topology::read_duration);
         self.hosts_here.clone_from(&manifest.hosts_here);
         self.hosts = names(&topology["hosts"]);
         self.identity = Some((manifest.topology_hash.clone(), manifest.seed));

@@ -2,11 +2,11 @@
 
 use std::collections::BTreeMap;
 
-use hil_models::fleet::geometry::{Footprint, Pose};
-use hil_models::fleet::messages::{Mission, NO_AUTHORITY, Phase, State, TO_GOAL, Truth};
-use hil_models::fleet::path::{Path, PathId};
-use hil_models::fleet::scenario::Scene;
-use hil_models::message::Message;
+use hil_core::message::Message;
+use hil_fleet::geometry::{Footprint, Pose};
+use hil_fleet::messages::{Mission, NO_AUTHORITY, Phase, State, TO_GOAL, Truth};
+use hil_fleet::path::{Path, PathId};
+use hil_fleet::scenario::Scene;
 use serde_json::{Value, json};
 
 use super::collisions::Collisions;
@@ -73,8 +73,7 @@ impl Robot {
 impl FleetView {
     /// A fleet with these `[case.parameters]`; its ground is made from now on.
     pub(crate) fn new(parameters: &Value) -> Self {
-        let world =
-            serde_json::from_value::<hil_models::fleet::FleetParameters>(parameters.clone());
+        let world = serde_json::from_value::<hil_fleet::FleetParameters>(parameters.clone());
         let vehicle = world.as_ref().ok().map(|one| one.world.vehicle().footprint);
         Self {
             robots: BTreeMap::new(),
@@ -241,7 +240,7 @@ impl FleetView {
     }
 }
 
-fn on_path(id: u32, robot: &Robot, world: &hil_models::fleet::world::World) -> Option<OnPath> {
+fn on_path(id: u32, robot: &Robot, world: &hil_fleet::world::World) -> Option<OnPath> {
     let (state, _) = robot.state?;
     let is_under_way = matches!(
         Phase::of(state.phase),

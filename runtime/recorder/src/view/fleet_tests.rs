@@ -2,7 +2,7 @@
 
 use super::*;
 use bytemuck::Zeroable;
-use hil_models::fleet::messages::{Header, TruthKind};
+use hil_fleet::messages::{Header, TruthKind};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 

@@ -4,10 +4,10 @@
 use std::sync::mpsc::{Receiver, TryRecvError, channel};
 use std::thread;
 
-use hil_models::fleet::FleetParameters;
-use hil_models::fleet::geometry::{Bounds, Footprint, Pose};
-use hil_models::fleet::path::{Path, PathId};
-use hil_models::fleet::scenario::Scene;
+use hil_fleet::FleetParameters;
+use hil_fleet::geometry::{Bounds, Footprint, Pose};
+use hil_fleet::path::{Path, PathId};
+use hil_fleet::scenario::Scene;
 use serde_json::{Value, json};
 
 use super::rounded;
@@ -85,7 +85,7 @@ fn make(parameters: Value) -> Result<Box<Ground>, String> {
 fn map(
     parameters: &FleetParameters,
     scene: &Scene,
-) -> Result<Value, hil_models::case_study::ParameterError> {
+) -> Result<Value, hil_core::case_study::ParameterError> {
     let known = parameters.world.map()?;
     let world = &scene.world;
     let vehicle = &world.vehicle.footprint;

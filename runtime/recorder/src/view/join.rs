@@ -1,8 +1,8 @@
 //! The stages of one message as its records come in, in any order, and which of the way's segments
 //! they complete. The stages are those of the account of a finished run.
 
-use hil_models::record::EgressRecord;
-use hil_runtime::watch::Record;
+use hil_core::record::EgressRecord;
+use hil_watch::Record;
 
 use crate::net::{MessageId, MessageLatency};
 

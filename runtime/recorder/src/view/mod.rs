@@ -17,7 +17,7 @@ mod sections;
 pub(crate) mod state;
 mod window;
 
-use hil_runtime::watch::Record;
+use hil_watch::Record;
 
 /// Something that a process of the run recorded.
 #[derive(Debug, Clone)]

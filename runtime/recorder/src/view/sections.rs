@@ -3,10 +3,10 @@
 
 use std::collections::BTreeMap;
 
-use hil_models::fleet::geometry::{Footprint, Pose};
-use hil_models::fleet::path::{Path, PathId};
-use hil_models::fleet::section::Side;
-use hil_models::fleet::world::World;
+use hil_fleet::geometry::{Footprint, Pose};
+use hil_fleet::path::{Path, PathId};
+use hil_fleet::section::Side;
+use hil_fleet::world::World;
 use serde_json::{Value, json};
 
 use super::polygon::{Point, hull, shared};
@@ -177,7 +177,7 @@ pub(crate) fn of_pair(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use hil_models::fleet::scenario::{Scenario, Scene, WorldParameters};
+    use hil_fleet::scenario::{Scenario, Scene, WorldParameters};
 
     fn crossing() -> Scene {
         let parameters = WorldParameters {

@@ -3,7 +3,7 @@
 
 use std::collections::VecDeque;
 
-use hil_models::stats::histogram::LatencySummary;
+use hil_stats::histogram::LatencySummary;
 use serde_json::{Value, json};
 
 /// How far back figures look, nanoseconds.

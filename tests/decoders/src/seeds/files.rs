@@ -1,7 +1,7 @@
 //! Seeds of traces and motion files.
 
-use hil_models::teleoperation::swing::swing_bvh;
-use hil_models::trace::{Trace, TraceFate, TraceRecord, csv, wire};
+use hil_teleoperation::swing::swing_bvh;
+use hil_trace::{Trace, TraceFate, TraceRecord, csv, wire};
 
 use super::{behind, numbered};
 use crate::Seed;

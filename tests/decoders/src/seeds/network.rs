@@ -2,18 +2,19 @@
 
 use std::time::Duration;
 
-use hil_gateways::capture::writer::{self, PacketToWrite};
-use hil_gateways::capture::{CaptureInterface, esl};
-use hil_gateways::net::{Direction, link_type};
-use hil_gateways::protocol::{ArrivalStamps, EgressBridge, IngressBridge};
-use hil_gateways::transport::tcp::frame::prefix;
-use hil_models::egm::face::{
+use hil_arm::egm::face::{
     Axes, RobotFace, RobotFaceSettings, RobotWare, SendPolicy, SensorFace, SensorFaceSettings,
 };
-use hil_models::egm::messages::{EgmCommand, Side};
-use hil_models::message::Envelope;
-use hil_models::time::Instant;
-use hil_models::yumi::arm::RIGHT_START_RAD;
+use hil_arm::egm::messages::{EgmCommand, Side};
+use hil_arm::yumi::arm::RIGHT_START_RAD;
+use hil_capture::writer;
+use hil_capture::writer::PacketToWrite;
+use hil_capture::{CaptureInterface, esl};
+use hil_core::message::Envelope;
+use hil_core::time::Instant;
+use hil_net::{Direction, link_type};
+use hil_protocol::{ArrivalStamps, EgressBridge, IngressBridge};
+use hil_transport::tcp::frame::prefix;
 
 use super::{behind, numbered};
 use crate::Seed;

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::io::Cursor;
 
 use hil_recorder::decoders::RecordedMessages;
-use hil_runtime::rundir::manifest::describe_fields;
+use hil_rundir::manifest::describe_fields;
 use mcap::records::MessageHeader;
 use mcap::{Compression, WriteOptions, Writer};
 

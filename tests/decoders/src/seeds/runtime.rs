@@ -3,23 +3,21 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use hil_models::egm::messages::{EgmCommand, EgmFeedback};
-use hil_models::layout::Field;
-use hil_models::message::Message;
-use hil_models::shuttle::{ShuttleCommand, ShuttleStatus};
-use hil_models::time::Instant;
-use hil_runtime::engine::supervisor::elsewhere::HostTicks;
-use hil_runtime::engine::supervisor::frame::{
+use hil_arm::egm::messages::{EgmCommand, EgmFeedback};
+use hil_core::layout::Field;
+use hil_core::message::Message;
+use hil_core::time::Instant;
+use hil_engine::supervisor::elsewhere::HostTicks;
+use hil_engine::supervisor::frame::{
     EndMeaning, PeerHello, PeerMessage, write_chunk, write_message,
 };
-use hil_runtime::report::summary::{Fact, Outcome, RunFacts, RunSummary};
-use hil_runtime::rundir::event::{
-    Event, EventKind, HostStory, Interruption, ProcessKind, ProcessStory,
-};
-use hil_runtime::rundir::manifest::describe_fields;
-use hil_runtime::rundir::record::RecordKind;
-use hil_runtime::rundir::record::file::RecordHeader;
-use hil_runtime::topology::load;
+use hil_report::summary::{Fact, Outcome, RunFacts, RunSummary};
+use hil_rundir::event::{Event, EventKind, HostStory, Interruption, ProcessKind, ProcessStory};
+use hil_rundir::manifest::describe_fields;
+use hil_rundir::record::RecordKind;
+use hil_rundir::record::file::RecordHeader;
+use hil_shuttle::{ShuttleCommand, ShuttleStatus};
+use hil_topology::load;
 use serde_json::json;
 
 use super::{behind, numbered};
@@ -201,7 +199,7 @@ pub(crate) fn summaries() -> Vec<Seed> {
 pub(crate) fn radio_answers() -> Vec<Seed> {
     macro_rules! recorded {
         ($($name:literal),*) => {[$(
-            include_bytes!(concat!("../../../../runtime/src/nic/radio/recorded/", $name, ".netlink"))
+            include_bytes!(concat!("../../../../runtime/nic/src/radio/recorded/", $name, ".netlink"))
                 .to_vec(),
         )*]};
     }

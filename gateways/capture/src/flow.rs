@@ -1,0 +1,428 @@
+//! Which datagrams a probe follows, and by what it knows one of them again at another point. The
+//! words of the command line are read here; nothing is captured or counted.
+//!
+//! `hil`, `egm` or `udp`, then `:` and conditions with commas between: `port=N` (either end),
+//! `sport=N`, `dport=N`, `src=ADDRESS`, `dst=ADDRESS`, and for `udp` also `id=OFFSET+BYTES[le]`, a
+//! number of 1 to 8 bytes in the payload that counts up. Without `id` the whole payload is hashed.
+
+use core::fmt;
+use core::str::FromStr;
+use std::net::IpAddr;
+
+use hil_arm::egm::wire;
+use hil_core::message::{FNV_OFFSET, fnv1a};
+use thiserror::Error;
+
+use super::link::UdpDatagram;
+use hil_net::filter::PacketFilter;
+use hil_protocol::wire::{HEADER_BYTES, Header, Kind};
+
+/// What our own datagrams begin with.
+const MAGIC: [u8; 4] = *b"HILG";
+/// Bytes of a frame before the payload of a UDP datagram at most, with a tag and IP options.
+const BEFORE_PAYLOAD_BYTES: usize = 18 + 60 + 8;
+
+/// What a flow's datagrams hold.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum FlowKind {
+    /// Our own.
+    Hil,
+    /// Externally guided motion, either direction.
+    Egm,
+    /// Anything.
+    Udp(UdpIdentity),
+}
+
+/// By what a datagram of any protocol is known again.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum UdpIdentity {
+    /// Its whole payload.
+    Payload,
+    /// A number in it.
+    Number {
+        /// First byte, from the start of the payload.
+        offset: u16,
+        /// 1..=8.
+        bytes: u8,
+        /// Lowest byte first.
+        is_little_endian: bool,
+    },
+}
+
+/// One flow to follow.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct FlowFilter {
+    /// What it holds.
+    pub kind: FlowKind,
+    /// Which packets are of it, as far as a tap can tell.
+    pub packets: PacketFilter,
+}
+
+/// Why words of the command line name no flow.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+pub enum FlowError {
+    /// Unknown first word.
+    #[error("`{0}` is no flow; use hil, egm or udp, e.g. udp:dport=5004,id=2+2")]
+    Kind(String),
+    /// Unknown condition.
+    #[error("`{0}` is no condition; use port, sport, dport, src, dst or, with udp, id")]
+    Condition(String),
+    /// A value that cannot be.
+    #[error("{key}={value}: {expected}")]
+    Value {
+        /// Which condition.
+        key: &'static str,
+        /// What was given.
+        value: String,
+        /// What it should be.
+        expected: &'static str,
+    },
+    /// Nothing but `udp` or `egm`: that would follow everything.
+    #[error("`{0}` needs a port or an address: otherwise it would follow every datagram")]
+    Everything(String),
+    /// IPv4 and IPv6 mixed.
+    #[error("src and dst are of different address families")]
+    Families,
+}
+
+impl FromStr for FlowFilter {
+    type Err = FlowError;
+
+    fn from_str(text: &str) -> Result<Self, FlowError> {
+        let (kind, conditions) = text.split_once(':').unwrap_or((text, ""));
+        let mut filter = Self::of(match kind {
+            "hil" => FlowKind::Hil,
+            "egm" => FlowKind::Egm,
+            "udp" => FlowKind::Udp(UdpIdentity::Payload),
+            other => return Err(FlowError::Kind(other.to_owned())),
+        });
+        for condition in conditions.split(',').filter(|part| !part.is_empty()) {
+            let (key, value) = condition
+                .split_once('=')
+                .ok_or_else(|| FlowError::Condition(condition.to_owned()))?;
+            match (key, &mut filter.kind) {
+                ("port", _) => filter.packets.port = Some(port("port", value)?),
+                ("sport", _) => filter.packets.source_port = Some(port("sport", value)?),
+                ("dport", _) => filter.packets.destination_port = Some(port("dport", value)?),
+                ("src", _) => filter.packets.source = Some(address("src", value)?),
+                ("dst", _) => filter.packets.destination = Some(address("dst", value)?),
+                ("id", FlowKind::Udp(identity)) => *identity = number(value)?,
+                _ => return Err(FlowError::Condition(condition.to_owned())),
+            }
+        }
+        if let (Some(source), Some(destination)) =
+            (filter.packets.source, filter.packets.destination)
+            && source.is_ipv4() != destination.is_ipv4()
+        {
+            return Err(FlowError::Families);
+        }
+        if filter.kind != FlowKind::Hil && filter == Self::of(filter.kind) {
+            return Err(FlowError::Everything(kind.to_owned()));
+        }
+        Ok(filter)
+    }
+}
+
+fn port(key: &'static str, value: &str) -> Result<u16, FlowError> {
+    let parsed = value.parse().ok().filter(|port| *port != 0);
+    parsed.ok_or_else(|| FlowError::Value {
+        key,
+        value: value.to_owned(),
+        expected: "a port is 1 to 65535",
+    })
+}
+
+fn address(key: &'static str, value: &str) -> Result<IpAddr, FlowError> {
+    value.parse().map_err(|_unsaid| FlowError::Value {
+        key,
+        value: value.to_owned(),
+        expected: "an IPv4 or IPv6 address without port",
+    })
+}
+
+fn number(value: &str) -> Result<UdpIdentity, FlowError> {
+    let expected = "`payload`, or OFFSET+BYTES[le] with 0 to 1400 and 1 to 8, e.g. 2+2";
+    let wrong = || FlowError::Value {
+        key: "id",
+        value: value.to_owned(),
+        expected,
+    };
+    if value == "payload" {
+        return Ok(UdpIdentity::Payload);
+    }
+    let (digits, is_little_endian) = match value.strip_suffix("le") {
+        Some(digits) => (digits, true),
+        None => (value, false),
+    };
+    let (offset, bytes) = digits.split_once('+').ok_or_else(wrong)?;
+    let offset = offset.parse().ok().filter(|at| *at <= 1400);
+    let bytes = bytes.parse().ok().filter(|count| (1..=8).contains(count));
+    Ok(UdpIdentity::Number {
+        offset: offset.ok_or_else(wrong)?,
+        bytes: bytes.ok_or_else(wrong)?,
+        is_little_endian,
+    })
+}
+
+impl fmt::Display for FlowFilter {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (word, identity) = match self.kind {
+            FlowKind::Hil => ("hil", None),
+            FlowKind::Egm => ("egm", None),
+            FlowKind::Udp(UdpIdentity::Payload) => ("udp", None),
+            FlowKind::Udp(UdpIdentity::Number {
+                offset,
+                bytes,
+                is_little_endian,
+            }) => {
+                let order = if is_little_endian { "le" } else { "" };
+                ("udp", Some(format!("id={offset}+{bytes}{order}")))
+            }
+        };
+        let packets = &self.packets;
+        let conditions = [
+            packets.port.map(|port| format!("port={port}")),
+            packets.source_port.map(|port| format!("sport={port}")),
+            packets.destination_port.map(|port| format!("dport={port}")),
+            packets.source.map(|address| format!("src={address}")),
+            packets.destination.map(|address| format!("dst={address}")),
+            identity,
+        ];
+        let conditions: Vec<String> = conditions.into_iter().flatten().collect();
+        let colon = if conditions.is_empty() { "" } else { ":" };
+        write!(f, "{word}{colon}{}", conditions.join(","))
+    }
+}
+
+/// What a followed datagram is known by.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct DatagramIdentity {
+    /// Equal at two points for the same datagram, otherwise different but for chance (2^-64).
+    pub key: u64,
+    /// What it counts, and within which count; `None` when it counts nothing.
+    pub number: Option<Numbered>,
+    /// Its header, when it is ours.
+    pub own: Option<OwnHeader>,
+}
+
+/// A sequence number and the series it belongs to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Numbered {
+    /// Differs when the counting begins anew: another session or producer.
+    pub series: u64,
+    /// The number.
+    pub number: u64,
+    /// Bits it has on the wire, 8..=64: behind the highest number comes 0. `None` for one that never
+    /// wraps, and whose `series` is always another when it begins anew.
+    pub bits: Option<u8>,
+    /// True when further datagrams bear the same number: pieces of a message.
+    pub is_piece: bool,
+}
+
+/// What a report needs of our own header.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct OwnHeader {
+    /// What it is for.
+    pub kind: Kind,
+    /// Start of the sending-side gateway.
+    pub session: u32,
+    /// Number of the channel.
+    pub channel: u16,
+    /// Producer's start.
+    pub epoch: u32,
+    /// Its number.
+    pub sequence: u64,
+    /// When it was handed to the kernel, sender's monotonic clock, nanoseconds.
+    pub handed_ns: i64,
+    /// Which piece of the message.
+    pub fragment_index: u16,
+    /// Of how many.
+    pub fragment_count: u16,
+}
+
+/// Why a datagram that meets a filter's conditions cannot be followed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Unidentified {
+    /// The capture cut it off before its identity ended.
+    CutShort,
+    /// It is not of the protocol.
+    Foreign,
+}
+
+impl FlowFilter {
+    const fn of(kind: FlowKind) -> Self {
+        Self {
+            kind,
+            packets: PacketFilter {
+                port: None,
+                source_port: None,
+                destination_port: None,
+                source: None,
+                destination: None,
+                magic: match kind {
+                    FlowKind::Hil => Some(MAGIC),
+                    FlowKind::Egm | FlowKind::Udp(_) => None,
+                },
+            },
+        }
+    }
+
+    /// Our own datagrams, whatever their addresses.
+    pub const fn hil() -> Self {
+        Self::of(FlowKind::Hil)
+    }
+
+    /// True when addresses and ports are as asked.
+    pub fn has_addresses_of(&self, datagram: &UdpDatagram<'_>) -> bool {
+        let (from, to) = (datagram.source, datagram.destination);
+        let is = |wanted: Option<u16>, port: u16| wanted.is_none_or(|one| one == port);
+        let wanted = &self.packets;
+        wanted
+            .port
+            .is_none_or(|port| from.port() == port || to.port() == port)
+            && is(wanted.source_port, from.port())
+            && is(wanted.destination_port, to.port())
+            && wanted.source.is_none_or(|address| address == from.ip())
+            && wanted.destination.is_none_or(|address| address == to.ip())
+    }
+
+    /// By what the datagram is known again.
+    ///
+    /// # Errors
+    /// When it is of another protocol, or too little of it was captured.
+    pub fn identify(&self, datagram: &UdpDatagram<'_>) -> Result<DatagramIdentity, Unidentified> {
+        match self.kind {
+            FlowKind::Hil => own(datagram),
+            FlowKind::Egm => egm(datagram),
+            FlowKind::Udp(identity) => any(identity, datagram),
+        }
+    }
+
+    /// Bytes of a frame that are enough to identify its datagram.
+    pub fn snap_bytes(&self) -> usize {
+        match self.kind {
+            FlowKind::Hil => BEFORE_PAYLOAD_BYTES + HEADER_BYTES,
+            FlowKind::Udp(UdpIdentity::Number { offset, bytes, .. }) => {
+                BEFORE_PAYLOAD_BYTES + usize::from(offset) + usize::from(bytes)
+            }
+            FlowKind::Egm | FlowKind::Udp(UdpIdentity::Payload) => BEFORE_PAYLOAD_BYTES + 1472,
+        }
+    }
+}
+
+fn own(datagram: &UdpDatagram<'_>) -> Result<DatagramIdentity, Unidentified> {
+    let payload = datagram.payload;
+    let is_ours = payload.len() < 4 || payload.starts_with(&MAGIC);
+    let Some(bytes) = payload.get(..HEADER_BYTES).filter(|_| is_ours) else {
+        return Err(if is_ours && datagram.is_cut_short() {
+            Unidentified::CutShort
+        } else {
+            Unidentified::Foreign
+        });
+    };
+    // A sealed header is as readable as a plain one.
+    let (header, _is_sealed) = Header::read(bytes).map_err(|_refusal| Unidentified::Foreign)?;
+    let series = [
+        header.session.to_le_bytes(),
+        header.epoch.to_le_bytes(),
+        (u32::from(header.channel) << 8 | header.kind as u32).to_le_bytes(),
+    ];
+    Ok(DatagramIdentity {
+        key: hash(bytes),
+        number: Some(Numbered {
+            series: hash(series.as_flattened()),
+            number: header.sequence,
+            bits: None,
+            is_piece: header.fragment_count > 1,
+        }),
+        own: Some(OwnHeader {
+            kind: header.kind,
+            session: header.session,
+            channel: header.channel,
+            epoch: header.epoch,
+            sequence: header.sequence,
+            handed_ns: header.handed_ns,
+            fragment_index: header.fragment_index,
+            fragment_count: header.fragment_count,
+        }),
+    })
+}
+
+fn egm(datagram: &UdpDatagram<'_>) -> Result<DatagramIdentity, Unidentified> {
+    if datagram.is_cut_short() {
+        return Err(Unidentified::CutShort);
+    }
+    let payload = datagram.payload;
+    // Robot and sensor messages both carry the header in field 1, so the wrong one may decode.
+    let header = match wire::message_type(payload) {
+        Some(wire::MessageType::Data) => wire::decode_robot(payload).ok().and_then(|m| m.header),
+        Some(wire::MessageType::Correction) => {
+            wire::decode_sensor(payload).ok().and_then(|m| m.header)
+        }
+        Some(wire::MessageType::PathCorrection) => wire::decode_path_correction(payload)
+            .ok()
+            .and_then(|m| m.header),
+        _ => None,
+    };
+    let header = header.ok_or(Unidentified::Foreign)?;
+    Ok(DatagramIdentity {
+        key: hash(payload),
+        number: header.seqno.map(|seqno| Numbered {
+            series: 0,
+            number: seqno.into(),
+            bits: Some(32),
+            is_piece: false,
+        }),
+        own: None,
+    })
+}
+
+fn any(
+    identity: UdpIdentity,
+    datagram: &UdpDatagram<'_>,
+) -> Result<DatagramIdentity, Unidentified> {
+    let UdpIdentity::Number {
+        offset,
+        bytes,
+        is_little_endian,
+    } = identity
+    else {
+        if datagram.is_cut_short() {
+            return Err(Unidentified::CutShort);
+        }
+        return Ok(DatagramIdentity {
+            key: hash(datagram.payload),
+            number: None,
+            own: None,
+        });
+    };
+    let (from, to) = (
+        usize::from(offset),
+        usize::from(offset) + usize::from(bytes),
+    );
+    if datagram.payload_bytes < to {
+        return Err(Unidentified::Foreign);
+    }
+    let field = datagram.payload.get(from..to);
+    let field = field.ok_or(Unidentified::CutShort)?;
+    let add = |sum: u64, byte: &u8| sum << 8 | u64::from(*byte);
+    let number = if is_little_endian {
+        field.iter().rev().fold(0, add)
+    } else {
+        field.iter().fold(0, add)
+    };
+    Ok(DatagramIdentity {
+        key: number,
+        number: Some(Numbered {
+            series: 0,
+            number,
+            bits: Some(8 * bytes),
+            is_piece: false,
+        }),
+        own: None,
+    })
+}
+
+fn hash(bytes: &[u8]) -> u64 {
+    fnv1a(FNV_OFFSET, bytes)
+}

@@ -1,0 +1,408 @@
+//! The same datagrams at two points: delay, its variation, loss, repetition and reordering. What a
+//! gateway says of them plays no part here.
+//!
+//! **Delay** is the difference of the two stamps, so it is one-way only if both points read one
+//! clock; otherwise it is off by a constant and drift that nobody here can know.
+//! **Variation** is the delay less the smallest one (PDV, RFC 5481 section 4.2) and needs only
+//! that the clocks run alike. **Jitter** is RFC 3550's running estimate, section 6.4.1.
+//! **Reordering** is RFC 4737's: a datagram is late when one that left after it came before it.
+//! **Loss** counts what was seen at the first point and not at the second, without the *edges*:
+//! what left when the second point was not watched, or so near to its end that the slowest datagram
+//! would not have come in time. An *unexplained* datagram was seen at the second point only, while
+//! the first was watched: the first point's capture has missed it.
+
+use std::collections::BTreeMap;
+
+use hil_core::random::RandomStream;
+use hil_stats::histogram::{Distribution, LatencyHistogram};
+use hil_stats::statistics::{CONFIDENCE, Interval, IntervalNs, block_bootstrap_quantile, wilson};
+use serde::{Deserialize, Serialize};
+
+use super::observe::{Observation, Point, Seen, Stream};
+use hil_net::Direction;
+
+/// Farthest that two stamps of one datagram may lie apart unless told otherwise.
+pub const WINDOW_NS: i64 = 5_000_000_000;
+
+/// By what the first point was told from the second.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum OrderSource {
+    /// The packets' direction: out here, in there.
+    PacketDirection,
+    /// Most stamps here were earlier; sound only when the points read one clock.
+    Stamps,
+}
+
+/// Figures of a stream between two points.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct JoinFigures {
+    /// How first and second were told apart.
+    pub order: OrderSource,
+    /// Datagrams at the first point.
+    pub first_count: u64,
+    /// Datagrams at the second point.
+    pub second_count: u64,
+    /// Seen at both.
+    pub matched_count: u64,
+    /// Seen at the first only.
+    pub lost_count: u64,
+    /// Seen at one only, when the other was not watched or not long enough.
+    pub edge_count: u64,
+    /// Seen more often at the second than at the first.
+    pub duplicated_count: u64,
+    /// Seen at the second only: the first capture has gaps.
+    pub unexplained_count: u64,
+    /// Lost of those that were judged.
+    pub loss_ratio: Option<f64>,
+    /// 95 % interval of it (Wilson), as if losses were independent.
+    pub loss_interval: Option<(f64, f64)>,
+    /// Runs of losses in the order of departure: length and how many.
+    pub loss_bursts: Vec<(u64, u64)>,
+    /// Second stamp minus first.
+    pub delay: Distribution,
+    /// 95 % interval of its median (block bootstrap).
+    pub delay_p50_interval: Option<IntervalNs>,
+    /// 95 % interval of its 99th percentile (block bootstrap).
+    pub delay_p99_interval: Option<IntervalNs>,
+    /// Delay less the smallest delay.
+    pub variation: Distribution,
+    /// RFC 3550's estimate after the last datagram, nanoseconds.
+    pub jitter_last_ns: Option<f64>,
+    /// Its mean over all datagrams.
+    pub jitter_mean_ns: Option<f64>,
+    /// Late ones.
+    pub reordered_count: u64,
+    /// 95 % interval of their ratio (Wilson).
+    pub reordered_interval: Option<(f64, f64)>,
+    /// Farthest that one was overtaken: positions to the earliest of those that overtook it
+    /// (RFC 4737 section 4.2.2).
+    pub reordering_extent_max: u64,
+    /// Time between arrivals at the second point.
+    pub arrival_interval: Distribution,
+}
+
+/// A datagram seen at both points.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Pair {
+    /// At the first point.
+    pub first: Observation,
+    /// At the second.
+    pub second: Observation,
+}
+
+impl Pair {
+    /// Second stamp minus first, nanoseconds.
+    pub const fn delay_ns(&self) -> i64 {
+        self.second.stamp_ns.saturating_sub(self.first.stamp_ns)
+    }
+}
+
+/// A stream at two points, in the order in which it passes them.
+#[derive(Debug)]
+pub struct Joined {
+    /// Where it was seen first.
+    pub first_point: Point,
+    /// Where then.
+    pub second_point: Point,
+    /// What was seen at both, in the order of departure.
+    pub pairs: Vec<Pair>,
+    /// The figures.
+    pub figures: JoinFigures,
+}
+
+/// Joins what two points saw of `stream`; `None` when neither saw anything of it, or one did not and
+/// nothing tells that it was watched. Stamps of one datagram lie at most `window_ns` apart.
+///
+/// A point that was watched and saw nothing has lost everything. Whether the stream should have come
+/// by there at all is for the caller to know: see [`super::pairing`].
+pub fn join(
+    stream: &Stream,
+    (a, seen_a): (&Point, &Seen),
+    (b, seen_b): (&Point, &Seen),
+    window_ns: i64,
+) -> Option<Joined> {
+    let list = |seen: &Seen| {
+        let list = seen.streams.get(stream).map(|list| sorted(list));
+        list.or_else(|| seen.span_ns.map(|_watched| Vec::new()))
+    };
+    let mut sides = [(a, seen_a, list(seen_a)?), (b, seen_b, list(seen_b)?)];
+    let is_empty = [sides[0].2.is_empty(), sides[1].2.is_empty()];
+    if is_empty == [true; 2] {
+        return None;
+    }
+    // Through a host with two taps the way is in, then out; but both then read one clock.
+    let by_direction = match (a.direction, b.direction) {
+        _ if a.file_index == b.file_index => None,
+        (Direction::Outbound, Direction::Inbound) => Some(false),
+        (Direction::Inbound, Direction::Outbound) => Some(true),
+        _ => None,
+    };
+    let mut matches = Matches::of(&sides[0].2, &sides[1].2, window_ns);
+    let is_swapped = by_direction.unwrap_or_else(|| {
+        let is_early =
+            |pair: &&(usize, usize)| sides[1].2[pair.1].stamp_ns < sides[0].2[pair.0].stamp_ns;
+        // The one point that saw it is the first.
+        is_empty[0] || 2 * matches.pairs.iter().filter(is_early).count() > matches.pairs.len()
+    });
+    if is_swapped {
+        sides.reverse();
+        matches = Matches::of(&sides[0].2, &sides[1].2, window_ns);
+    }
+    let order = match by_direction {
+        Some(_) => OrderSource::PacketDirection,
+        None => OrderSource::Stamps,
+    };
+    let [
+        (first_point, seen_first, first),
+        (second_point, seen_second, second),
+    ] = sides;
+    let pairs: Vec<Pair> = matches
+        .pairs
+        .iter()
+        .map(|&(i, j)| Pair {
+            first: first[i],
+            second: second[j],
+        })
+        .collect();
+    let watched = (seen_first.span_ns, seen_second.span_ns);
+    let figures = Tally {
+        first: &first,
+        second: &second,
+        pairs: &pairs,
+        matches: &matches,
+    }
+    .figures(order, watched);
+    Some(Joined {
+        first_point: *first_point,
+        second_point: *second_point,
+        pairs,
+        figures,
+    })
+}
+
+fn sorted(list: &[Observation]) -> Vec<Observation> {
+    let mut list = list.to_vec();
+    list.sort_by_key(|one| one.stamp_ns);
+    list
+}
+
+/// Who belongs to whom, by positions.
+struct Matches {
+    /// In the order of the first point.
+    pairs: Vec<(usize, usize)>,
+    only_first: Vec<usize>,
+    only_second: Vec<usize>,
+    duplicates: Vec<usize>,
+}
+
+impl Matches {
+    /// Of equal keys the earliest at one point belongs to the earliest at the other that is within
+    /// the window; what remains at the second beside a match is a repetition.
+    fn of(first: &[Observation], second: &[Observation], window_ns: i64) -> Self {
+        let mut by_key: BTreeMap<u64, (Vec<usize>, Vec<usize>)> = BTreeMap::new();
+        for (index, one) in first.iter().enumerate() {
+            by_key.entry(one.identity.key).or_default().0.push(index);
+        }
+        for (index, one) in second.iter().enumerate() {
+            by_key.entry(one.identity.key).or_default().1.push(index);
+        }
+        let mut matches = Self {
+            pairs: Vec::with_capacity(first.len().min(second.len())),
+            only_first: Vec::new(),
+            only_second: Vec::new(),
+            duplicates: Vec::new(),
+        };
+        for (from, to) in by_key.values() {
+            matches.add_key((first, from), (second, to), window_ns);
+        }
+        matches.pairs.sort_unstable();
+        matches.only_first.sort_unstable();
+        matches
+    }
+
+    fn add_key(
+        &mut self,
+        (first, from): (&[Observation], &[usize]),
+        (second, to): (&[Observation], &[usize]),
+        window_ns: i64,
+    ) {
+        let (mut i, mut j, mut newest_match) = (0, 0, None);
+        while j < to.len() {
+            let arrival_ns = second[to[j]].stamp_ns;
+            let delay_ns = from
+                .get(i)
+                .map(|index| arrival_ns.saturating_sub(first[*index].stamp_ns));
+            match delay_ns {
+                Some(delay_ns) if delay_ns > window_ns => {
+                    self.only_first.push(from[i]);
+                    i += 1;
+                }
+                Some(delay_ns) if delay_ns >= -window_ns => {
+                    self.pairs.push((from[i], to[j]));
+                    newest_match = Some(arrival_ns);
+                    (i, j) = (i + 1, j + 1);
+                }
+                _ => {
+                    let is_again = newest_match
+                        .is_some_and(|at: i64| arrival_ns.saturating_sub(at) <= window_ns);
+                    let list = if is_again {
+                        &mut self.duplicates
+                    } else {
+                        &mut self.only_second
+                    };
+                    list.push(to[j]);
+                    j += 1;
+                }
+            }
+        }
+        self.only_first.extend(&from[i..]);
+    }
+}
+
+struct Tally<'a> {
+    first: &'a [Observation],
+    second: &'a [Observation],
+    pairs: &'a [Pair],
+    matches: &'a Matches,
+}
+
+type Span = Option<(i64, i64)>;
+
+impl Tally<'_> {
+    fn figures(&self, order: OrderSource, watched: (Span, Span)) -> JoinFigures {
+        let delays: Vec<i64> = self.pairs.iter().map(Pair::delay_ns).collect();
+        let extremes = (
+            delays.iter().min().copied().unwrap_or(0),
+            delays.iter().max().copied().unwrap_or(0),
+        );
+        let (lost, unexplained) = self.judged(extremes, watched);
+        let only_count = self.matches.only_first.len() + self.matches.only_second.len();
+        let judged = (self.pairs.len() + lost.len()) as u64;
+        let lost_count = lost.len() as u64;
+        let ratio = |count: u64, of: u64| wilson(count, of, CONFIDENCE).map(ends);
+        let (reordered_count, reordering_extent_max) = self.reordering();
+        let jitter = jitter_ns(&self.by_arrival());
+        let interval = |quantile: f64, name: &str| {
+            let mut random = RandomStream::new(0, name);
+            block_bootstrap_quantile(&delays, quantile, CONFIDENCE, &mut random)
+        };
+        JoinFigures {
+            order,
+            first_count: self.first.len() as u64,
+            second_count: self.second.len() as u64,
+            matched_count: self.pairs.len() as u64,
+            lost_count,
+            edge_count: (only_count - lost.len() - unexplained) as u64,
+            duplicated_count: self.matches.duplicates.len() as u64,
+            unexplained_count: unexplained as u64,
+            loss_ratio: (judged > 0).then(|| lost_count as f64 / judged as f64),
+            loss_interval: ratio(lost_count, judged),
+            loss_bursts: bursts(&lost),
+            delay: distribution(
+                delays.iter().copied(),
+                "no datagram was seen at both points",
+            ),
+            delay_p50_interval: interval(0.5, "probe delay p50"),
+            delay_p99_interval: interval(0.99, "probe delay p99"),
+            variation: distribution(
+                delays.iter().map(|delay| delay.saturating_sub(extremes.0)),
+                "no datagram was seen at both points",
+            ),
+            jitter_last_ns: jitter.map(|(last, _)| last),
+            jitter_mean_ns: jitter.map(|(_, mean)| mean),
+            reordered_count,
+            reordered_interval: ratio(reordered_count, self.pairs.len() as u64),
+            reordering_extent_max,
+            arrival_interval: distribution(
+                self.second
+                    .windows(2)
+                    .map(|pair| pair[1].stamp_ns.saturating_sub(pair[0].stamp_ns)),
+                "fewer than two arrivals",
+            ),
+        }
+    }
+
+    /// Positions of what was lost, and how many were unexplained; the rest of what was seen at one
+    /// point only lies at an edge.
+    fn judged(&self, (fastest, slowest): (i64, i64), watched: (Span, Span)) -> (Vec<usize>, usize) {
+        let is_lost = |index: &&usize| {
+            is_covered(self.first[**index].stamp_ns, (fastest, slowest), watched.1)
+        };
+        let back = (-slowest, -fastest);
+        let is_unexplained =
+            |index: &&usize| is_covered(self.second[**index].stamp_ns, back, watched.0);
+        let only_second = self.matches.only_second.iter();
+        (
+            self.matches
+                .only_first
+                .iter()
+                .filter(is_lost)
+                .copied()
+                .collect(),
+            only_second.filter(is_unexplained).count(),
+        )
+    }
+
+    /// Positions of departure, and pairs, in the order of arrival.
+    fn by_arrival(&self) -> Vec<(usize, Pair)> {
+        let mut list: Vec<(usize, Pair)> = self.pairs.iter().copied().enumerate().collect();
+        list.sort_by_key(|(_, pair)| pair.second.stamp_ns);
+        list
+    }
+
+    /// How many were overtaken, and the largest extent.
+    fn reordering(&self) -> (u64, u64) {
+        let arrivals = self.by_arrival();
+        // Running maxima only grow, so the earliest overtaker is found by bisection.
+        let mut tops: Vec<usize> = Vec::with_capacity(arrivals.len());
+        let (mut count, mut extent_max) = (0, 0);
+        for (position, (departure, _)) in arrivals.iter().enumerate() {
+            let earliest = tops.partition_point(|top| top < departure);
+            if earliest < position {
+                count += 1;
+                extent_max = extent_max.max((position - earliest) as u64);
+            }
+            tops.push(tops.last().map_or(*departure, |top| *top.max(departure)));
+        }
+        (count, extent_max)
+    }
+}
+
+/// True when a datagram stamped `at` would have had its other stamp within `watched`, however fast
+/// or slow it was among those seen.
+fn is_covered(at: i64, (fastest, slowest): (i64, i64), watched: Span) -> bool {
+    watched.is_some_and(|(from, to)| {
+        at.saturating_add(fastest) >= from && at.saturating_add(slowest) <= to
+    })
+}
+
+fn ends(interval: Interval) -> (f64, f64) {
+    (interval.low, interval.high)
+}
+
+/// Lengths of runs of neighbouring positions, and how many of each.
+fn bursts(lost: &[usize]) -> Vec<(u64, u64)> {
+    let mut lengths: BTreeMap<u64, u64> = BTreeMap::new();
+    for run in lost.chunk_by(|a, b| a + 1 == *b) {
+        *lengths.entry(run.len() as u64).or_default() += 1;
+    }
+    lengths.into_iter().collect()
+}
+
+fn distribution(values: impl Iterator<Item = i64>, reason: &str) -> Distribution {
+    let mut histogram = LatencyHistogram::default();
+    values.for_each(|value| histogram.record(value));
+    histogram.distribution(reason)
+}
+
+/// RFC 3550 section 6.4.1 over the arrivals: the last estimate and the mean of all.
+fn jitter_ns(arrivals: &[(usize, Pair)]) -> Option<(f64, f64)> {
+    let (mut jitter, mut sum) = (0.0, 0.0);
+    for pair in arrivals.windows(2) {
+        let difference = pair[1].1.delay_ns().saturating_sub(pair[0].1.delay_ns());
+        jitter += (difference.unsigned_abs() as f64 - jitter) / 16.0;
+        sum += jitter;
+    }
+    (arrivals.len() > 1).then(|| (jitter, sum / (arrivals.len() - 1) as f64))
+}

@@ -1,0 +1,293 @@
+//! From packets to observations: which followed datagram was seen at which point, and when. A point
+//! is an interface of a file, a port of a switch that names ports (ET2000), and a direction. What
+//! was seen at two points is compared in [`super::join`].
+
+use std::collections::BTreeMap;
+use std::net::SocketAddr;
+
+use serde::{Deserialize, Serialize};
+
+use super::flow::{DatagramIdentity, FlowFilter, FlowKind, Unidentified};
+use super::link::{NoDatagram, udp_datagram};
+use super::{CaptureInterface, CapturedPacket, esl};
+use hil_net::{Direction, link_type};
+use hil_protocol::wire::Kind;
+
+/// A place where datagrams were seen.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Point {
+    /// Which file.
+    pub file_index: usize,
+    /// Which interface of it.
+    pub interface_index: usize,
+    /// Which port of an ET2000; its stamps are on that device's clock.
+    pub esl_port: Option<u8>,
+    /// Which way.
+    pub direction: Direction,
+}
+
+/// Datagrams that go one way between two sockets and count together.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Stream {
+    /// Which of the filters it met first.
+    pub flow_index: usize,
+    /// Where from.
+    pub source: SocketAddr,
+    /// Where to.
+    pub destination: SocketAddr,
+    /// Of our own: channel number and kind.
+    pub own: Option<(u16, u8)>,
+}
+
+impl Stream {
+    /// The kind of our own datagrams, in the words of the wire format.
+    pub fn kind_label(&self) -> Option<&'static str> {
+        let (_, kind) = self.own?;
+        Some(match kind {
+            1 => "DATA",
+            2 => "SYNC_REQ",
+            3 => "SYNC_RSP",
+            4 => "HELLO",
+            5 => "HELLO_ACK",
+            _ => "BYE",
+        })
+    }
+}
+
+/// A datagram seen at a point.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Observation {
+    /// When, nanoseconds on the point's clock.
+    pub stamp_ns: i64,
+    /// Bytes of its UDP payload.
+    pub payload_bytes: u32,
+    /// By what it is known.
+    pub identity: DatagramIdentity,
+}
+
+/// What was seen at one point.
+#[derive(Debug, Clone, Default)]
+pub struct Seen {
+    /// Stamps of the first and last packet of any kind, in time.
+    pub span_ns: Option<(i64, i64)>,
+    /// Observations by stream, in the order of the file.
+    pub streams: BTreeMap<Stream, Vec<Observation>>,
+}
+
+/// What was met on the way.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct PacketCounts {
+    /// Packets in all.
+    pub packet_count: u64,
+    /// Of a followed flow.
+    pub followed_count: u64,
+    /// UDP of other flows.
+    pub other_flow_count: u64,
+    /// With the addresses of a flow, but of another protocol.
+    pub foreign_count: u64,
+    /// Of a flow, but captured too short to be known again.
+    pub unidentified_count: u64,
+    /// First fragments of a followed datagram: the time is that of the first piece.
+    pub fragmented_count: u64,
+    /// Not IP.
+    pub not_ip_count: u64,
+    /// Not UDP.
+    pub not_udp_count: u64,
+    /// Later fragments of any datagram.
+    pub later_fragment_count: u64,
+    /// Headers cut short or malformed, or of an unknown link layer.
+    pub unreadable_count: u64,
+    /// Without a time stamp.
+    pub stampless_count: u64,
+    /// Earlier than the packet before it at the same point: a file out of order.
+    pub backward_stamp_count: u64,
+    /// With the header of an ET2000.
+    pub esl_count: u64,
+    /// Of those, damaged according to the device (frame check sequence or alignment).
+    pub esl_damaged_count: u64,
+    /// Of those, with no port or several named.
+    pub esl_port_unclear_count: u64,
+}
+
+/// Takes packets and keeps what is followed.
+#[derive(Debug)]
+pub struct Observer {
+    flows: Vec<FlowFilter>,
+    seen: BTreeMap<Point, Seen>,
+    newest_ns: BTreeMap<Point, i64>,
+    counts: PacketCounts,
+}
+
+impl Observer {
+    /// An observer of these flows; a datagram belongs to the first one it meets.
+    pub fn new(flows: &[FlowFilter]) -> Self {
+        Self {
+            flows: flows.to_vec(),
+            seen: BTreeMap::new(),
+            newest_ns: BTreeMap::new(),
+            counts: PacketCounts::default(),
+        }
+    }
+
+    /// Takes a packet of a file.
+    pub fn take(&mut self, file_index: usize, packet: &CapturedPacket<'_>) {
+        self.counts.packet_count += 1;
+        let mut point = Point {
+            file_index,
+            interface_index: packet.interface_index,
+            esl_port: None,
+            direction: packet.direction,
+        };
+        let (mut frame, mut stamp_ns) = (packet.data, packet.stamp_ns);
+        if packet.link_type == link_type::ETHERNET
+            && let Some((header, inner)) = esl::split(frame)
+        {
+            self.count_esl(&header);
+            frame = inner;
+            point.esl_port = header.port();
+            stamp_ns = i64::try_from(header.stamp_ns).ok();
+        }
+        let Some(stamp_ns) = stamp_ns else {
+            self.counts.stampless_count += 1;
+            return;
+        };
+        let newest = self.newest_ns.entry(point).or_insert(stamp_ns);
+        self.counts.backward_stamp_count += u64::from(stamp_ns < *newest);
+        *newest = stamp_ns.max(*newest);
+        let seen = self.seen.entry(point).or_default();
+        let (first, last) = seen.span_ns.unwrap_or((stamp_ns, stamp_ns));
+        seen.span_ns = Some((first.min(stamp_ns), last.max(stamp_ns)));
+        self.follow(point, stamp_ns, packet.link_type, frame);
+    }
+
+    fn count_esl(&mut self, header: &esl::EslHeader) {
+        self.counts.esl_count += 1;
+        self.counts.esl_damaged_count += u64::from(header.is_damaged());
+        self.counts.esl_port_unclear_count += u64::from(header.port_count() != 1);
+    }
+
+    fn follow(&mut self, point: Point, stamp_ns: i64, link: u16, frame: &[u8]) {
+        let counts = &mut self.counts;
+        let datagram = match udp_datagram(link, frame) {
+            Ok(datagram) => datagram,
+            Err(reason) => {
+                *match reason {
+                    NoDatagram::NotIp => &mut counts.not_ip_count,
+                    NoDatagram::NotUdp => &mut counts.not_udp_count,
+                    NoDatagram::LaterFragment => &mut counts.later_fragment_count,
+                    NoDatagram::UnknownLinkType | NoDatagram::CutShort | NoDatagram::Malformed => {
+                        &mut counts.unreadable_count
+                    }
+                } += 1;
+                return;
+            }
+        };
+        let mut why = None;
+        for (flow_index, flow) in self.flows.iter().enumerate() {
+            if !flow.has_addresses_of(&datagram) {
+                continue;
+            }
+            match flow.identify(&datagram) {
+                Ok(identity) => {
+                    counts.followed_count += 1;
+                    counts.fragmented_count += u64::from(datagram.is_fragmented);
+                    let stream = Stream {
+                        flow_index,
+                        source: datagram.source,
+                        destination: datagram.destination,
+                        own: identity.own.map(|own| (own.channel, own.kind as u8)),
+                    };
+                    let seen = self.seen.entry(point).or_default();
+                    seen.streams.entry(stream).or_default().push(Observation {
+                        stamp_ns,
+                        payload_bytes: u32::try_from(datagram.payload_bytes).unwrap_or(u32::MAX),
+                        identity,
+                    });
+                    return;
+                }
+                Err(reason) => {
+                    let is_ours = flow.kind == FlowKind::Hil;
+                    // Following our own means looking at everything: what is not ours is nobody's.
+                    if !(is_ours && reason == Unidentified::Foreign) {
+                        why = Some(reason);
+                    }
+                }
+            }
+        }
+        *match why {
+            None => &mut counts.other_flow_count,
+            Some(Unidentified::Foreign) => &mut counts.foreign_count,
+            Some(Unidentified::CutShort) => &mut counts.unidentified_count,
+        } += 1;
+    }
+
+    /// The flows followed.
+    pub fn flows(&self) -> &[FlowFilter] {
+        &self.flows
+    }
+
+    /// What was counted so far.
+    pub const fn counts(&self) -> &PacketCounts {
+        &self.counts
+    }
+
+    /// What was seen so far at each point.
+    pub const fn seen(&self) -> &BTreeMap<Point, Seen> {
+        &self.seen
+    }
+
+    /// Widens the time a point was watched to what its file says; a file may have been watching
+    /// longer than its packets tell.
+    /// An interface of which the file has no packet but tells how long it was watched has points too.
+    pub fn widen(&mut self, file_index: usize, interfaces: &[CaptureInterface]) {
+        for (interface_index, interface) in interfaces.iter().enumerate() {
+            let (Some(start), Some(end)) = (interface.start_ns, interface.end_ns) else {
+                continue;
+            };
+            // Its packets are those of another interface once more, on another clock.
+            if interface.has_card_clock() {
+                continue;
+            }
+            let point = |direction| Point {
+                file_index,
+                interface_index,
+                esl_port: None,
+                direction,
+            };
+            let is_here = |one: &Point| (one.file_index, one.interface_index);
+            let mut here = self
+                .seen
+                .keys()
+                .filter(|one| is_here(one) == (file_index, interface_index));
+            if here.any(|one| one.esl_port.is_some() || one.direction == Direction::Unknown) {
+                continue;
+            }
+            for direction in [Direction::Inbound, Direction::Outbound] {
+                let seen = self.seen.entry(point(direction)).or_default();
+                seen.span_ns.get_or_insert((start, end));
+            }
+        }
+        for (point, seen) in &mut self.seen {
+            if point.file_index != file_index || point.esl_port.is_some() {
+                continue;
+            }
+            let Some(interface) = interfaces.get(point.interface_index) else {
+                continue;
+            };
+            if let Some((first, last)) = &mut seen.span_ns {
+                *first = interface.start_ns.map_or(*first, |start| start.min(*first));
+                *last = interface.end_ns.map_or(*last, |end| end.max(*last));
+            }
+        }
+    }
+
+    /// Datagrams of our own protocol seen at `point`, by kind.
+    pub fn own_count(&self, point: &Point, kind: Kind) -> u64 {
+        let streams = self.seen.get(point).map(|seen| seen.streams.iter());
+        let of_kind = |(stream, _): &(&Stream, &Vec<Observation>)| {
+            stream.own.is_some_and(|(_, code)| code == kind as u8)
+        };
+        let streams = streams.into_iter().flatten().filter(of_kind);
+        streams.map(|(_, list)| list.len() as u64).sum()
+    }
+}

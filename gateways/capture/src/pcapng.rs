@@ -1,0 +1,356 @@
+//! The pcapng file: blocks of a type, a length, a body and the length again
+//! (draft-ietf-opsawg-pcapng). Section, interface, packet, simple packet and statistics blocks are
+//! read; blocks of other types are passed over, as the draft asks.
+
+use super::bytes::{ByteOrder, array_at};
+use super::pcap::missing;
+use super::reader::{Found, Next, Window};
+use super::{CaptureInterface, Problem};
+use hil_net::Direction;
+
+const SECTION: u32 = 0x0a0d_0d0a;
+const INTERFACE: u32 = 1;
+const OBSOLETE_PACKET: u32 = 2;
+const SIMPLE_PACKET: u32 = 3;
+const STATISTICS: u32 = 5;
+const ENHANCED_PACKET: u32 = 6;
+const BYTE_ORDER_MAGIC: u32 = 0x1a2b_3c4d;
+const BLOCK_BYTES_MIN: u32 = 12;
+/// Largest block taken for one; the same as Wireshark's.
+const BLOCK_BYTES_MAX: u32 = 16 * 1024 * 1024;
+/// Interfaces a file may describe; a broken one could claim any number.
+const INTERFACE_COUNT_MAX: usize = 4096;
+const SECTION_BODY_BYTES: u64 = 16;
+
+/// Where in the file the reader is.
+#[derive(Debug, Default)]
+pub(super) struct PcapngFile {
+    order: Option<ByteOrder>,
+    /// First of this section's interfaces.
+    interface_base: usize,
+    /// Where the next section begins, if this one says.
+    section_end: Option<u64>,
+}
+
+impl PcapngFile {
+    pub(super) fn next(&mut self, window: &Window, interfaces: &mut Vec<CaptureInterface>) -> Next {
+        let bytes = window.bytes();
+        if bytes.is_empty() {
+            return Next::NeedsMore;
+        }
+        if bytes.len() < BLOCK_BYTES_MIN as usize {
+            return missing(window, "a block", BLOCK_BYTES_MIN.into());
+        }
+        if let Err(problem) = self.note_order(bytes) {
+            return self.lost(window, problem);
+        }
+        let Some(order) = self.order else {
+            return self.lost(
+                window,
+                Problem::Malformed("a block before the first section"),
+            );
+        };
+        let (Some(kind), Some(length)) = (order.u32(bytes, 0), order.u32(bytes, 4)) else {
+            return missing(window, "a block", BLOCK_BYTES_MIN.into());
+        };
+        let is_sound = (BLOCK_BYTES_MIN..=BLOCK_BYTES_MAX).contains(&length);
+        if !is_sound || !length.is_multiple_of(4) {
+            let problem = Problem::Length {
+                what: "a block's length (a multiple of 4)",
+                length: length.into(),
+                min: BLOCK_BYTES_MIN.into(),
+                max: BLOCK_BYTES_MAX.into(),
+            };
+            return self.lost(window, problem);
+        }
+        if bytes.len() < length as usize {
+            return missing(window, "a block", length.into());
+        }
+        let second = order.u32(bytes, length as usize - 4).unwrap_or(0);
+        if second != length {
+            let first = length;
+            return self.lost(window, Problem::LengthsDiffer { first, second });
+        }
+        let body = Body {
+            order,
+            bytes: &bytes[8..length as usize - 4],
+        };
+        let length = u64::from(length);
+        let outcome = match kind {
+            SECTION => return self.section(window, &body, interfaces.len(), length),
+            INTERFACE => describe(&body, interfaces),
+            ENHANCED_PACKET | OBSOLETE_PACKET | SIMPLE_PACKET => {
+                let base = self.interface_base;
+                return match packet(kind, &body, interfaces, base) {
+                    Ok(found) => Next::Packet(Found {
+                        offset: window.offset(),
+                        record_bytes: length,
+                        ..found
+                    }),
+                    Err(problem) => Next::Fault(problem, Some(length)),
+                };
+            }
+            STATISTICS => statistics(&body, interfaces, self.interface_base),
+            _ => Ok(()),
+        };
+        match outcome {
+            Ok(()) => Next::Passed(length),
+            Err(problem) => Next::Fault(problem, Some(length)),
+        }
+    }
+
+    /// A section says the order of its numbers.
+    fn note_order(&mut self, bytes: &[u8]) -> Result<(), Problem> {
+        if array_at(bytes, 0) != Some(SECTION.to_be_bytes()) {
+            return Ok(());
+        }
+        self.order = match array_at(bytes, 8).map(u32::from_le_bytes) {
+            Some(BYTE_ORDER_MAGIC) => Some(ByteOrder::Little),
+            Some(other) if other.swap_bytes() == BYTE_ORDER_MAGIC => Some(ByteOrder::Big),
+            _ => return Err(Problem::Malformed("no byte-order magic")),
+        };
+        Ok(())
+    }
+
+    fn section(
+        &mut self,
+        window: &Window,
+        body: &Body<'_>,
+        interface_count: usize,
+        length: u64,
+    ) -> Next {
+        let fields = (body.u16(4), body.u16(6), body.u64(8));
+        let (Some(major), Some(minor), Some(section_bytes)) = fields else {
+            let problem = Problem::Length {
+                what: "a section header's body",
+                length: body.bytes.len() as u64,
+                min: SECTION_BODY_BYTES,
+                max: BLOCK_BYTES_MAX.into(),
+            };
+            return self.lost(window, problem);
+        };
+        self.interface_base = interface_count;
+        self.section_end = (section_bytes.cast_signed() >= 0)
+            .then(|| {
+                window
+                    .offset()
+                    .checked_add(length)?
+                    .checked_add(section_bytes)
+            })
+            .flatten();
+        if major != 1 {
+            return self.lost(window, Problem::Version { major, minor });
+        }
+        Next::Passed(length)
+    }
+
+    /// The next block cannot be found from this one: go on at the next section, if it is known.
+    fn lost(&self, window: &Window, problem: Problem) -> Next {
+        let end = self.section_end.filter(|end| *end > window.offset());
+        Next::Fault(problem, end.map(|end| end - window.offset()))
+    }
+}
+
+struct Body<'a> {
+    order: ByteOrder,
+    bytes: &'a [u8],
+}
+
+impl<'a> Body<'a> {
+    fn u16(&self, offset: usize) -> Option<u16> {
+        self.order.u16(self.bytes, offset)
+    }
+
+    fn u32(&self, offset: usize) -> Option<u32> {
+        self.order.u32(self.bytes, offset)
+    }
+
+    fn u64(&self, offset: usize) -> Option<u64> {
+        self.order.u64(self.bytes, offset)
+    }
+
+    /// A stamp as two halves, the upper first, in either byte order.
+    fn stamp(&self, offset: usize) -> Option<u64> {
+        let (high, low) = (self.u32(offset)?, self.u32(offset + 4)?);
+        Some(u64::from(high) << 32 | u64::from(low))
+    }
+
+    /// Calls `take` with code and value of each option from `offset` to the end mark.
+    fn options(
+        &self,
+        offset: usize,
+        mut take: impl FnMut(u16, &'a [u8]) -> Result<(), Problem>,
+    ) -> Result<(), Problem> {
+        let mut at = offset;
+        while at < self.bytes.len() {
+            let (Some(code), Some(length)) = (self.u16(at), self.u16(at + 2)) else {
+                return Err(Problem::Malformed("an option is cut short"));
+            };
+            if code == 0 {
+                break;
+            }
+            let end = at + 4 + usize::from(length);
+            let Some(value) = self.bytes.get(at + 4..end) else {
+                return Err(Problem::Malformed("an option is longer than its block"));
+            };
+            take(code, value)?;
+            at = end.next_multiple_of(4);
+        }
+        Ok(())
+    }
+}
+
+fn describe(body: &Body<'_>, interfaces: &mut Vec<CaptureInterface>) -> Result<(), Problem> {
+    let (Some(link_type), Some(snap_bytes)) = (body.u16(0), body.u32(4)) else {
+        return Err(Problem::Malformed(
+            "an interface block shorter than 8 bytes",
+        ));
+    };
+    if interfaces.len() >= INTERFACE_COUNT_MAX {
+        return Err(Problem::Malformed("more than 4096 interfaces"));
+    }
+    let mut interface = CaptureInterface {
+        link_type,
+        snap_bytes,
+        unit_ns: (1000, 1),
+        ..CaptureInterface::default()
+    };
+    let outcome = body.options(8, |code, value| {
+        match (code, value) {
+            (2, name) => interface.name = Some(String::from_utf8_lossy(name).into_owned()),
+            (3, text) => {
+                interface.description = Some(String::from_utf8_lossy(text).into_owned());
+            }
+            (9, &[resolution]) => interface.unit_ns = unit_ns(resolution)?,
+            (14, seconds) => {
+                let seconds = body.order.u64(seconds, 0).map(u64::cast_signed);
+                let offset_ns = seconds.and_then(|s| s.checked_mul(1_000_000_000));
+                interface.offset_ns = offset_ns.ok_or(Problem::Malformed(
+                    "if_tsoffset does not fit into nanoseconds",
+                ))?;
+            }
+            (9, _) => return Err(Problem::Malformed("if_tsresol is not one byte long")),
+            _ => {}
+        }
+        Ok(())
+    });
+    // The interface keeps its number also when an option is broken.
+    interfaces.push(interface);
+    outcome
+}
+
+/// Nanoseconds to a unit, as a fraction: `if_tsresol` holds a negative power of 10, or of 2 with its
+/// top bit set.
+fn unit_ns(resolution: u8) -> Result<(u64, u64), Problem> {
+    let exponent = u32::from(resolution & 0x7f);
+    let base: u64 = if resolution & 0x80 == 0 { 10 } else { 2 };
+    let denominator = base
+        .checked_pow(exponent)
+        .ok_or(Problem::Malformed("if_tsresol is finer than 64 bits hold"))?;
+    Ok((1_000_000_000, denominator))
+}
+
+/// Nanoseconds since 1970.
+fn in_ns(units: u64, interface: &CaptureInterface) -> Result<i64, Problem> {
+    let (numerator, denominator) = interface.unit_ns;
+    let ns = u128::from(units) * u128::from(numerator) / u128::from(denominator);
+    i64::try_from(ns)
+        .ok()
+        .and_then(|ns| ns.checked_add(interface.offset_ns))
+        .ok_or(Problem::Stamp { units })
+}
+
+fn packet(
+    kind: u32,
+    body: &Body<'_>,
+    interfaces: &[CaptureInterface],
+    base: usize,
+) -> Result<Found, Problem> {
+    const SHORT: Problem = Problem::Malformed("a packet block shorter than its fixed part");
+    let index = match kind {
+        ENHANCED_PACKET => body.u32(0).ok_or(SHORT)?,
+        OBSOLETE_PACKET => body.u16(0).ok_or(SHORT)?.into(),
+        _ => 0,
+    };
+    let count = interfaces.len() - base;
+    let described = interfaces[base..].get(index as usize);
+    let interface = described.ok_or(Problem::UnknownInterface { index, count })?;
+    let interface_index = base + index as usize;
+    // A simple packet block says only how long the packet was; snap length or block cut it.
+    let (header_bytes, captured, original_bytes) = if kind == SIMPLE_PACKET {
+        let original = body.u32(0).ok_or(SHORT)?;
+        let limit = match interface.snap_bytes {
+            0 => u32::MAX,
+            snap_bytes => snap_bytes,
+        };
+        let there = u32::try_from(body.bytes.len() - 4).unwrap_or(u32::MAX);
+        (4, original.min(limit).min(there), original)
+    } else {
+        (20, body.u32(12).ok_or(SHORT)?, body.u32(16).ok_or(SHORT)?)
+    };
+    let end = header_bytes + captured as usize;
+    if body.bytes.len() < end {
+        return Err(Problem::Length {
+            what: "a packet's captured length",
+            length: captured.into(),
+            min: 0,
+            max: (body.bytes.len() - header_bytes) as u64,
+        });
+    }
+    let mut direction = Direction::Unknown;
+    let stamp_ns = if kind == SIMPLE_PACKET {
+        None
+    } else {
+        body.options(end.next_multiple_of(4), |code, value| {
+            if let (2, Some(flags)) = (code, body.order.u32(value, 0)) {
+                direction = match flags & 3 {
+                    1 => Direction::Inbound,
+                    2 => Direction::Outbound,
+                    _ => Direction::Unknown,
+                };
+            }
+            Ok(())
+        })?;
+        Some(in_ns(body.stamp(4).ok_or(SHORT)?, interface)?)
+    };
+    Ok(Found {
+        offset: 0,
+        interface_index,
+        stamp_ns,
+        original_bytes,
+        direction,
+        data: (8 + header_bytes, 8 + end),
+        record_bytes: 0,
+    })
+}
+
+fn statistics(
+    body: &Body<'_>,
+    interfaces: &mut [CaptureInterface],
+    base: usize,
+) -> Result<(), Problem> {
+    let Some(index) = body.u32(0) else {
+        return Err(Problem::Malformed(
+            "a statistics block shorter than 12 bytes",
+        ));
+    };
+    let count = interfaces.len() - base;
+    let Some(interface) = interfaces[base..].get_mut(index as usize) else {
+        return Err(Problem::UnknownInterface { index, count });
+    };
+    body.options(12, |code, value| {
+        let halves = Body {
+            order: body.order,
+            bytes: value,
+        };
+        match (code, value.len()) {
+            (2, 8) => interface.start_ns = Some(in_ns(halves.stamp(0).unwrap_or(0), interface)?),
+            (3, 8) => interface.end_ns = Some(in_ns(halves.stamp(0).unwrap_or(0), interface)?),
+            (4, 8) => interface.received_count = halves.u64(0),
+            // isb_osdrop: no room was left; isb_ifdrop (5) is the card's.
+            (7, 8) => interface.dropped_count = halves.u64(0),
+            _ => {}
+        }
+        Ok(())
+    })
+}

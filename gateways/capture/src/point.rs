@@ -1,0 +1,188 @@
+//! What one point alone tells of a stream: how many, how often, which numbers are missing. It knows
+//! neither delay nor loss; a missing number may be one that was never sent.
+
+use std::collections::BTreeMap;
+
+use hil_stats::histogram::{Distribution, LatencyHistogram};
+use serde::{Deserialize, Serialize};
+
+use super::flow::Numbered;
+use super::observe::Observation;
+
+/// Figures of one stream at one point.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PointFigures {
+    /// Datagrams seen, repetitions included.
+    pub datagram_count: u64,
+    /// Their payload, bytes.
+    pub payload_bytes: u64,
+    /// First stamp, nanoseconds on the point's clock.
+    pub first_ns: i64,
+    /// Last stamp.
+    pub last_ns: i64,
+    /// Time from one to the next.
+    pub interval: Distribution,
+    /// Longest such time and when it began.
+    pub longest_gap: Option<GapFigures>,
+    /// What the sequence numbers tell, where there are any.
+    pub numbers: Option<NumberFigures>,
+}
+
+/// A time without datagrams.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct GapFigures {
+    /// Stamp of the datagram before it.
+    pub from_ns: i64,
+    /// How long.
+    pub length_ns: i64,
+}
+
+/// Figures of sequence numbers, each series apart.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct NumberFigures {
+    /// Series met: a new one begins when a session or producer starts, or a number falls back too
+    /// far to be late.
+    pub series_count: u64,
+    /// What one number differs from the next by, most often.
+    pub step: u64,
+    /// Numbers between first and last of a series, on that step, that were not seen.
+    pub skipped_count: u64,
+    /// Datagrams with a number seen before; `None` when messages came in pieces, which bear one
+    /// number by design.
+    pub repeated_count: Option<u64>,
+    /// Datagrams with a number lower than one seen before (RFC 4737 section 3.3).
+    pub reordered_count: u64,
+}
+
+/// Figures of a stream; `None` without observations. They are put in order of time first.
+pub fn single_point_figures(observations: &[Observation]) -> Option<PointFigures> {
+    let mut stamps: Vec<i64> = observations.iter().map(|one| one.stamp_ns).collect();
+    stamps.sort_unstable();
+    let (first_ns, last_ns) = (*stamps.first()?, *stamps.last()?);
+    let mut interval = LatencyHistogram::default();
+    let mut longest: Option<GapFigures> = None;
+    for pair in stamps.windows(2) {
+        let length_ns = pair[1].saturating_sub(pair[0]);
+        interval.record(length_ns);
+        if longest.is_none_or(|gap| length_ns > gap.length_ns) {
+            longest = Some(GapFigures {
+                from_ns: pair[0],
+                length_ns,
+            });
+        }
+    }
+    Some(PointFigures {
+        datagram_count: observations.len() as u64,
+        payload_bytes: observations
+            .iter()
+            .map(|one| u64::from(one.payload_bytes))
+            .sum(),
+        first_ns,
+        last_ns,
+        interval: interval.distribution("fewer than two datagrams"),
+        longest_gap: longest,
+        numbers: number_figures(observations),
+    })
+}
+
+/// Numbers that a late datagram may lie behind the newest, and that may be missing where the count
+/// passes its end; farther back or on it has begun anew (RFC 3550 appendix A.1).
+const LATE_MAX: u64 = 100;
+const MISSING_AT_WRAP_MAX: u64 = 3000;
+
+/// A count without its wraps.
+#[derive(Debug)]
+struct Unwrapped {
+    /// Highest number so far, unwrapped. It starts one lap up, so that one may be late at once.
+    top: u64,
+    restart_count: u64,
+}
+
+impl Unwrapped {
+    fn from(first: &Numbered) -> Self {
+        let mut count = Self {
+            top: 0,
+            restart_count: 0,
+        };
+        count.begin(first);
+        count
+    }
+
+    fn begin(&mut self, first: &Numbered) {
+        self.top = match first.bits {
+            Some(bits @ ..64) => (1 << bits) + first.number,
+            _ => first.number,
+        };
+    }
+
+    /// The number as it would be if the count never wrapped.
+    fn take(&mut self, one: &Numbered) -> u64 {
+        let Some(bits) = one.bits else {
+            self.top = self.top.max(one.number);
+            return one.number;
+        };
+        // 64 bits never wrap in practice, so that half of them as a lap change nothing.
+        let lap = 1_u64 << bits.min(63);
+        let newest = self.top % lap;
+        let ahead = one.number.wrapping_sub(newest) % lap;
+        let behind = newest.wrapping_sub(one.number) % lap;
+        let has_wrapped = one.number < newest;
+        if behind <= LATE_MAX.min(lap / 4) {
+            return self.top - behind;
+        }
+        let may_be_missing = if has_wrapped {
+            MISSING_AT_WRAP_MAX.min(lap / 2)
+        } else {
+            lap / 2
+        };
+        if ahead <= may_be_missing {
+            self.top = self.top.saturating_add(ahead);
+        } else {
+            self.restart_count += 1;
+            self.begin(one);
+        }
+        self.top
+    }
+}
+
+fn number_figures(observations: &[Observation]) -> Option<NumberFigures> {
+    let mut in_time: Vec<&Observation> = observations.iter().collect();
+    in_time.sort_by_key(|one| one.stamp_ns);
+    // By what the datagrams say, and by how often the counting began anew unsaid.
+    let mut series: BTreeMap<(u64, u64), Vec<u64>> = BTreeMap::new();
+    let mut figures = NumberFigures::default();
+    let mut counts: BTreeMap<u64, Unwrapped> = BTreeMap::new();
+    let (mut has_pieces, mut repeated_count) = (false, 0);
+    for one in in_time {
+        let numbered = one.identity.number?;
+        let count = counts.entry(numbered.series);
+        let count = count.or_insert_with(|| Unwrapped::from(&numbered));
+        let number = count.take(&numbered);
+        figures.reordered_count += u64::from(number < count.top);
+        let list = series.entry((numbered.series, count.restart_count));
+        list.or_default().push(number);
+        has_pieces |= numbered.is_piece;
+    }
+    figures.series_count = series.len() as u64;
+    let mut steps: BTreeMap<u64, u64> = BTreeMap::new();
+    for list in series.values_mut() {
+        list.sort_unstable();
+        let before = list.len();
+        list.dedup();
+        repeated_count += (before - list.len()) as u64;
+        for pair in list.windows(2) {
+            *steps.entry(pair[1] - pair[0]).or_default() += 1;
+        }
+    }
+    figures.repeated_count = (!has_pieces).then_some(repeated_count);
+    // The smallest of the most frequent ones.
+    let most = steps.iter().max_by(|a, b| a.1.cmp(b.1).then(b.0.cmp(a.0)));
+    figures.step = most.map_or(1, |(step, _)| *step);
+    for (difference, count) in &steps {
+        let between = difference.div_ceil(figures.step).saturating_sub(1);
+        figures.skipped_count = figures
+            .skipped_count
+            .saturating_add(between.saturating_mul(*count));
+    }
+    Some(figures)
+}

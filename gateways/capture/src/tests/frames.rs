@@ -1,0 +1,172 @@
+//! Frames of every link layer that is read, headers of the ET2000, and what flows are known by.
+
+use super::super::esl::{self, EslHeader};
+use super::super::flow::{FlowError, FlowFilter, Unidentified};
+use super::super::link::{NoDatagram, udp_datagram};
+use super::{message, udp_frame};
+use hil_net::link_type;
+
+#[test]
+fn the_same_datagram_is_found_behind_every_link_layer() {
+    let frame = udp_frame((40_000, 5004), b"payload");
+    let bare = &frame[14..];
+    let tagged = [&frame[..12], &[0x81, 0, 0xe0, 7], &frame[12..]].concat();
+    let twice = [
+        &frame[..12],
+        &[0x88, 0xa8, 0, 1, 0x81, 0, 0xe0, 7],
+        &frame[12..],
+    ]
+    .concat();
+    let cooked = [&[0; 14][..], &[8, 0], bare].concat();
+    let cooked_2 = [&[8, 0][..], &[0; 18], bare].concat();
+    let padded = [&frame[..], &[0; 30]].concat();
+    for (link, bytes, vlan) in [
+        (link_type::ETHERNET, frame.as_slice(), None),
+        (link_type::ETHERNET, &tagged, Some(7)),
+        (link_type::ETHERNET, &twice, Some(7)),
+        (link_type::ETHERNET, &padded, None),
+        (link_type::LINUX_SLL, &cooked, None),
+        (link_type::LINUX_SLL2, &cooked_2, None),
+        (link_type::RAW, bare, None),
+        (link_type::IPV4, bare, None),
+    ] {
+        let datagram = udp_datagram(link, bytes).unwrap();
+        assert_eq!(datagram.source.to_string(), "10.77.0.1:40000");
+        assert_eq!(datagram.destination.to_string(), "10.77.0.2:5004");
+        assert_eq!((datagram.payload, datagram.vlan), (&b"payload"[..], vlan));
+        assert_eq!((datagram.dscp, datagram.is_cut_short()), (46, false));
+    }
+    assert_eq!(udp_datagram(105, &frame), Err(NoDatagram::UnknownLinkType));
+}
+
+#[test]
+fn options_fragments_and_extension_headers_are_followed_or_told() {
+    let frame = udp_frame((1, 2), b"payload");
+    let mut with_options = frame.clone();
+    with_options[14] = 0x46;
+    with_options[17] += 4;
+    with_options.splice(34..34, [1, 1, 1, 0]);
+    assert_eq!(udp_datagram(1, &with_options).unwrap().payload, b"payload");
+
+    let mut first = frame.clone();
+    first[20] = 0x20;
+    assert!(udp_datagram(1, &first).unwrap().is_fragmented);
+    let mut later = frame.clone();
+    later[21] = 9;
+    assert_eq!(udp_datagram(1, &later), Err(NoDatagram::LaterFragment));
+    let mut other = frame.clone();
+    other[23] = 6;
+    assert_eq!(udp_datagram(1, &other), Err(NoDatagram::NotUdp));
+    let short = udp_datagram(1, &frame[..44]).unwrap();
+    assert!(short.is_cut_short() && short.payload == b"pa");
+    assert_eq!(udp_datagram(1, &frame[..40]), Err(NoDatagram::CutShort));
+
+    // IPv6 with a hop-by-hop header.
+    let mut six = vec![0x6b, 0x80, 0, 0, 0, 8 + 15, 0, 64];
+    six.extend([0xfd; 32]);
+    six.extend([17, 0, 1, 4, 0, 0, 0, 0]);
+    six.extend(&frame[34..]);
+    let datagram = udp_datagram(link_type::RAW, &six).unwrap();
+    assert_eq!((datagram.payload, datagram.dscp), (&b"payload"[..], 46));
+    assert!(datagram.source.is_ipv6());
+}
+
+#[test]
+fn the_et2000_header_is_found_at_either_end_with_port_and_stamp() {
+    let frame = udp_frame((1, 2), b"payload");
+    for (port, bit) in (0..esl::PORT_COUNT).zip(esl::FLAG_BITS) {
+        let header = EslHeader {
+            flags: bit | esl::STAMP_ENABLED,
+            stamp_ns: 0x0102_0304_0506_0708,
+        };
+        let bytes = header.encode();
+        assert_eq!(bytes[8], 0x08, "the lowest byte comes first");
+        for whole in [[&bytes[..], &frame].concat(), [&frame[..], &bytes].concat()] {
+            let (found, inner) = esl::split(&whole).unwrap();
+            assert_eq!((found, inner), (header, frame.as_slice()));
+            assert_eq!((found.port(), found.port_count()), (Some(port), 1));
+            assert!(!found.is_damaged());
+        }
+    }
+    assert_eq!(esl::split(&frame), None);
+    let several = EslHeader {
+        flags: 0x00c0 | esl::CRC_ERROR,
+        stamp_ns: 0,
+    };
+    assert_eq!((several.port(), several.port_count()), (Some(0), 2));
+    assert!(several.is_damaged());
+}
+
+#[test]
+fn flows_are_written_as_they_are_read_and_nonsense_is_refused_by_name() {
+    for text in [
+        "hil",
+        "hil:port=4800",
+        "egm:port=6510",
+        "udp:sport=1,dport=65535,src=10.0.0.1,dst=10.0.0.2,id=2+2",
+        "udp:dst=fd00::1,id=0+8le",
+        "udp:port=9",
+    ] {
+        let flow: FlowFilter = text.parse().unwrap();
+        assert_eq!(flow.to_string(), text);
+    }
+    let refusal = |text: &str| text.parse::<FlowFilter>().unwrap_err();
+    assert_eq!(refusal("tcp"), FlowError::Kind("tcp".to_owned()));
+    assert_eq!(refusal("udp"), FlowError::Everything("udp".to_owned()));
+    assert_eq!(
+        refusal("hil:id=1+1"),
+        FlowError::Condition("id=1+1".to_owned())
+    );
+    assert_eq!(refusal("udp:src=10.0.0.1,dst=::1"), FlowError::Families);
+    for text in [
+        "udp:port=0",
+        "udp:port=65536",
+        "udp:src=10.0.0",
+        "udp:port=1,id=3+9",
+    ] {
+        assert!(matches!(refusal(text), FlowError::Value { .. }), "{text}");
+    }
+}
+
+#[test]
+fn a_datagram_is_known_by_what_its_flow_says() {
+    let flow = |text: &str| text.parse::<FlowFilter>().unwrap();
+    let identify = |text: &str, payload: &[u8]| {
+        let frame = udp_frame((7000, 2), payload);
+        flow(text).identify(&udp_datagram(1, &frame).unwrap())
+    };
+    let own = identify("hil", &message(77)).unwrap();
+    assert_eq!(own.number.unwrap().number, 77);
+    assert_eq!(own.own.unwrap().channel, 3);
+    assert_ne!(own.key, identify("hil", &message(78)).unwrap().key);
+    assert_eq!(identify("hil", b"HILG"), Err(Unidentified::Foreign));
+
+    let rtp = [0x80, 0, 0x12, 0x34, 9];
+    let by_number = identify("udp:port=7000,id=2+2", &rtp).unwrap();
+    assert_eq!(by_number.number.unwrap().number, 0x1234);
+    let swapped = identify("udp:port=7000,id=2+2le", &rtp).unwrap();
+    assert_eq!(swapped.number.unwrap().number, 0x3412);
+    assert_eq!(
+        identify("udp:port=7000,id=4+2", &rtp),
+        Err(Unidentified::Foreign)
+    );
+    let whole = identify("udp:port=7000", &rtp).unwrap();
+    assert_eq!(whole.number, None);
+
+    // A header with seqno 5, tm 2 and type 3 (correction); and bytes that are no message.
+    let egm = [10, 6, 8, 5, 16, 2, 24, 3];
+    let found = identify("egm:port=7000", &egm).unwrap();
+    assert_eq!(found.number.unwrap().number, 5);
+    assert_eq!(
+        identify("egm:port=7000", &[0xff; 9]),
+        Err(Unidentified::Foreign)
+    );
+
+    let frame = udp_frame((7000, 2), &message(1));
+    let cut = udp_datagram(1, &frame[..60]).unwrap();
+    assert_eq!(flow("hil").identify(&cut), Err(Unidentified::CutShort));
+    assert_eq!(
+        flow("udp:port=7000").identify(&cut),
+        Err(Unidentified::CutShort)
+    );
+}

@@ -1,0 +1,105 @@
+//! The one message an egress bridge holds, laid out as its datagrams, so that its payload is
+//! copied once. It is not a queue.
+
+use hil_core::time::Instant;
+
+use crate::fragment::FragmentPlan;
+use crate::wire::{FollowUpField, HEADER_BYTES, Header};
+
+#[derive(Debug)]
+pub(super) struct Staging {
+    budget_bytes: usize,
+    /// Header and piece of each fragment, back to back.
+    buffer: Box<[u8]>,
+    staged: Option<Staged>,
+    follow_up: Option<FollowUpField>,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Staged {
+    header: Header,
+    plan: FragmentPlan,
+    since: Instant,
+}
+
+impl Staging {
+    pub(super) fn new(size_max_bytes: usize, budget_bytes: usize) -> Self {
+        let count = size_max_bytes.div_ceil(budget_bytes).max(1);
+        Self {
+            budget_bytes,
+            buffer: vec![0; count * HEADER_BYTES + size_max_bytes].into_boxed_slice(),
+            staged: None,
+            follow_up: None,
+        }
+    }
+
+    /// `header` needs no length, fragment or hand-over fields yet.
+    pub(super) fn stage(&mut self, now: Instant, mut header: Header, payload: &[u8]) {
+        let plan = FragmentPlan::new(payload.len(), self.budget_bytes)
+            .expect("settings bound the fragments of the largest message");
+        header.total_len = u32::try_from(payload.len()).expect("size_max_bytes is a u32");
+        header.fragment_count = plan.count();
+        header.follow_up = self.follow_up.take();
+        for index in 0..plan.count() {
+            let range = plan.range(index).expect("index is below the count");
+            let start = place(&plan, index) + HEADER_BYTES;
+            self.buffer[start..start + range.len()].copy_from_slice(&payload[range]);
+        }
+        self.staged = Some(Staged {
+            header,
+            plan,
+            since: now,
+        });
+    }
+
+    /// Header of the next datagram, whether it is the last, and its bytes.
+    pub(super) fn next(&mut self, now: Instant) -> (Header, bool, &[u8]) {
+        let staged = self.staged.as_mut().expect("called only while pending");
+        let mut header = staged.header;
+        header.handed_ns = now.as_ns();
+        let index = header.fragment_index;
+        let range = staged.plan.range(index).expect("index is below the count");
+        let is_last = index + 1 == staged.plan.count();
+        let start = place(&staged.plan, index);
+        staged.header.fragment_index = index + 1;
+        if is_last {
+            self.staged = None;
+        }
+        let datagram = &mut self.buffer[start..start + HEADER_BYTES + range.len()];
+        header.encode(datagram);
+        (header, is_last, datagram)
+    }
+
+    pub(super) const fn is_pending(&self) -> bool {
+        self.staged.is_some()
+    }
+
+    pub(super) fn staged_at(&self) -> Option<Instant> {
+        self.staged.as_ref().map(|staged| staged.since)
+    }
+
+    /// Forgets the staged message; true when there was one.
+    pub(super) fn abandon(&mut self) -> bool {
+        self.staged.take().is_some()
+    }
+
+    pub(super) fn set_follow_up(&mut self, sequence: u64, handed_to_tx_ns: u32) {
+        #[expect(
+            clippy::cast_possible_truncation,
+            reason = "the low half is what travels"
+        )]
+        let sequence_low = sequence as u32;
+        self.follow_up = Some(FollowUpField {
+            sequence_low,
+            handed_to_tx_ns,
+        });
+    }
+
+    pub(super) fn forget_follow_up(&mut self) {
+        self.follow_up = None;
+    }
+}
+
+fn place(plan: &FragmentPlan, index: u16) -> usize {
+    usize::from(index) * (HEADER_BYTES + plan.fragment_bytes())
+}

@@ -1,0 +1,310 @@
+//! Messages above the path MTU: how they split, and how the pieces come together again in memory
+//! that is set aside beforehand. It never trusts a length from the network.
+//!
+//! Splitting is balanced: a message of `total` bytes that needs `count` datagrams is cut into
+//! pieces of `ceil(total / count)` bytes, the last one shorter. A piece's place and length thus
+//! follow from two numbers every fragment carries, so that pieces can neither overlap nor leave a
+//! hole, and a receiver need not know the sender's MTU.
+
+use core::ops::Range;
+use core::time::Duration;
+
+use hil_core::time::Instant;
+
+use super::counters::named_counts;
+use super::refusal::Refusal;
+use super::sequence::Stream;
+
+/// Most datagrams of one message.
+pub const FRAGMENT_COUNT_MAX: usize = 1024;
+const WORDS: usize = FRAGMENT_COUNT_MAX / 64;
+
+/// How one message is cut.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct FragmentPlan {
+    total_bytes: usize,
+    fragment_bytes: usize,
+    count: u16,
+}
+
+impl FragmentPlan {
+    /// Cuts `total_bytes` into pieces of at most `budget_bytes`; `None` when that takes more than
+    /// [`FRAGMENT_COUNT_MAX`] or no budget is given.
+    pub fn new(total_bytes: usize, budget_bytes: usize) -> Option<Self> {
+        let count = total_bytes.checked_div(budget_bytes).map(|_| {
+            let pieces = total_bytes.div_ceil(budget_bytes);
+            pieces.max(1)
+        })?;
+        if count > FRAGMENT_COUNT_MAX {
+            return None;
+        }
+        Some(Self {
+            total_bytes,
+            fragment_bytes: total_bytes.div_ceil(count),
+            count: u16::try_from(count).ok()?,
+        })
+    }
+
+    /// The cut that a header describes; `None` when no cut gives these numbers.
+    pub fn from_wire(total_len: u32, fragment_count: u16) -> Option<Self> {
+        let count = usize::from(fragment_count);
+        let total_bytes = total_len as usize;
+        if count == 0 || count > FRAGMENT_COUNT_MAX {
+            return None;
+        }
+        let fragment_bytes = total_bytes.div_ceil(count);
+        let is_last_empty = count > 1 && (count - 1) * fragment_bytes >= total_bytes;
+        (!is_last_empty).then_some(Self {
+            total_bytes,
+            fragment_bytes,
+            count: fragment_count,
+        })
+    }
+
+    /// Datagrams the message takes, 1..=1024.
+    pub const fn count(&self) -> u16 {
+        self.count
+    }
+
+    /// Bytes of the whole message.
+    pub const fn total_bytes(&self) -> usize {
+        self.total_bytes
+    }
+
+    /// Bytes of every piece but the last.
+    pub const fn fragment_bytes(&self) -> usize {
+        self.fragment_bytes
+    }
+
+    /// Which bytes of the message piece `index` carries; `None` when there is no such piece.
+    pub fn range(&self, index: u16) -> Option<Range<usize>> {
+        let start = usize::from(index) * self.fragment_bytes;
+        (index < self.count).then(|| start..(start + self.fragment_bytes).min(self.total_bytes))
+    }
+}
+
+/// One piece as it came from the network, its length already checked against its plan.
+#[derive(Debug, Clone, Copy)]
+pub struct Fragment<'a> {
+    /// Stream of the message.
+    pub stream: Stream,
+    /// Number of the message.
+    pub sequence: u64,
+    /// Bytes of the whole message.
+    pub total_len: u32,
+    /// Which piece.
+    pub index: u16,
+    /// Of how many.
+    pub count: u16,
+    /// When this piece was handed to the sender's kernel, the sender's monotonic clock.
+    pub handed_ns: i64,
+    /// Its bytes.
+    pub payload: &'a [u8],
+}
+
+/// A message put together again.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Assembled<'a> {
+    /// The whole message.
+    pub payload: &'a [u8],
+    /// When its first piece was handed to the sender's kernel, the sender's monotonic clock.
+    pub handed_ns: i64,
+}
+
+/// What became of the messages that came in pieces.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct ReassemblyCounts {
+    /// Messages of which a first piece came.
+    pub started_count: u64,
+    /// Messages put together.
+    pub completed_count: u64,
+    /// Incomplete messages that gave way to a newer one.
+    pub evicted_count: u64,
+    /// Incomplete messages whose time was up.
+    pub timed_out_count: u64,
+    /// Incomplete messages given up because their session was over.
+    pub abandoned_count: u64,
+}
+
+named_counts!(ReassemblyCounts {
+    started_count,
+    completed_count,
+    evicted_count,
+    timed_out_count,
+    abandoned_count,
+});
+
+/// Puts messages together in a fixed number of slots.
+#[derive(Debug)]
+pub struct Reassembler {
+    slots: Box<[Slot]>,
+    storage: Box<[u8]>,
+    size_max_bytes: usize,
+    timeout: Duration,
+    counts: ReassemblyCounts,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Slot {
+    message: Option<(Stream, u64)>,
+    total_len: u32,
+    count: u16,
+    missing: u16,
+    received: [u64; WORDS],
+    /// Of piece 0.
+    handed_ns: i64,
+    started_at: Instant,
+}
+
+impl Reassembler {
+    /// Sets aside `slot_count` messages of `size_max_bytes`; an incomplete one is given up after
+    /// `timeout`.
+    ///
+    /// # Panics
+    /// When `slot_count` is zero.
+    pub fn new(slot_count: usize, size_max_bytes: usize, timeout: Duration) -> Self {
+        assert!(slot_count > 0, "reassembly needs at least one slot");
+        let empty = Slot {
+            message: None,
+            total_len: 0,
+            count: 0,
+            missing: 0,
+            received: [0; WORDS],
+            handed_ns: 0,
+            started_at: Instant::ZERO,
+        };
+        Self {
+            slots: vec![empty; slot_count].into_boxed_slice(),
+            storage: vec![0; slot_count * size_max_bytes].into_boxed_slice(),
+            size_max_bytes,
+            timeout,
+            counts: ReassemblyCounts::default(),
+        }
+    }
+
+    /// Takes one piece; gives the message once it is whole.
+    ///
+    /// # Errors
+    /// [`Refusal::Oversize`], [`Refusal::FragmentInconsistent`], [`Refusal::LengthMismatch`] or
+    /// [`Refusal::DuplicateFragment`]; the slots are then as they were.
+    pub fn insert(
+        &mut self,
+        now: Instant,
+        fragment: &Fragment<'_>,
+    ) -> Result<Option<Assembled<'_>>, Refusal> {
+        if fragment.total_len as usize > self.size_max_bytes {
+            return Err(Refusal::Oversize);
+        }
+        let range = FragmentPlan::from_wire(fragment.total_len, fragment.count)
+            .and_then(|plan| plan.range(fragment.index))
+            .ok_or(Refusal::FragmentInconsistent)?;
+        if range.len() != fragment.payload.len() {
+            return Err(Refusal::LengthMismatch);
+        }
+        self.expire(now);
+        let index = self.find(fragment)?;
+        let index = index.unwrap_or_else(|| self.open(now, fragment));
+        let base = index * self.size_max_bytes;
+        self.storage[base + range.start..base + range.end].copy_from_slice(fragment.payload);
+        let slot = &mut self.slots[index];
+        slot.receive(fragment);
+        if slot.missing > 0 {
+            return Ok(None);
+        }
+        slot.message = None;
+        self.counts.completed_count += 1;
+        Ok(Some(Assembled {
+            payload: &self.storage[base..base + slot.total_len as usize],
+            handed_ns: slot.handed_ns,
+        }))
+    }
+
+    /// Gives up incomplete messages whose time is up.
+    pub fn expire(&mut self, now: Instant) {
+        for slot in &mut self.slots {
+            if slot.message.is_some() && slot.started_at + self.timeout <= now {
+                slot.message = None;
+                self.counts.timed_out_count += 1;
+            }
+        }
+    }
+
+    /// Gives up every incomplete message.
+    pub fn clear(&mut self) {
+        for slot in &mut self.slots {
+            if slot.message.take().is_some() {
+                self.counts.abandoned_count += 1;
+            }
+        }
+    }
+
+    /// When the next incomplete message is given up.
+    pub fn next_expiry(&self) -> Option<Instant> {
+        let open = self.slots.iter().filter(|slot| slot.message.is_some());
+        open.map(|slot| slot.started_at + self.timeout).min()
+    }
+
+    /// Incomplete messages.
+    pub fn open_count(&self) -> usize {
+        let open = self.slots.iter().filter(|slot| slot.message.is_some());
+        open.count()
+    }
+
+    /// What became of the messages so far.
+    pub const fn counts(&self) -> &ReassemblyCounts {
+        &self.counts
+    }
+
+    fn find(&self, fragment: &Fragment<'_>) -> Result<Option<usize>, Refusal> {
+        let message = Some((fragment.stream, fragment.sequence));
+        let Some(index) = self.slots.iter().position(|slot| slot.message == message) else {
+            return Ok(None);
+        };
+        let slot = &self.slots[index];
+        if (slot.total_len, slot.count) != (fragment.total_len, fragment.count) {
+            return Err(Refusal::FragmentInconsistent);
+        }
+        if slot.has(fragment.index) {
+            return Err(Refusal::DuplicateFragment);
+        }
+        Ok(Some(index))
+    }
+
+    /// A slot for a new message: a free one, or that of the oldest incomplete message.
+    fn open(&mut self, now: Instant, fragment: &Fragment<'_>) -> usize {
+        let order = |slot: &Slot| slot.message.map(|_| slot.started_at);
+        let (index, slot) = self
+            .slots
+            .iter_mut()
+            .enumerate()
+            .min_by_key(|(_, slot)| order(slot))
+            .expect("there is at least one slot");
+        self.counts.started_count += 1;
+        self.counts.evicted_count += u64::from(slot.message.is_some());
+        *slot = Slot {
+            message: Some((fragment.stream, fragment.sequence)),
+            total_len: fragment.total_len,
+            count: fragment.count,
+            missing: fragment.count,
+            received: [0; WORDS],
+            handed_ns: fragment.handed_ns,
+            started_at: now,
+        };
+        index
+    }
+}
+
+impl Slot {
+    fn has(&self, index: u16) -> bool {
+        self.received[usize::from(index) / 64] >> (index % 64) & 1 == 1
+    }
+
+    fn receive(&mut self, fragment: &Fragment<'_>) {
+        let index = fragment.index;
+        self.received[usize::from(index) / 64] |= 1 << (index % 64);
+        self.missing -= 1;
+        if index == 0 {
+            self.handed_ns = fragment.handed_ns;
+        }
+    }
+}

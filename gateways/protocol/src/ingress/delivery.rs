@@ -1,0 +1,209 @@
+//! What an ingress bridge says about a datagram and a message. It keeps no state of its own.
+
+use hil_core::message::Envelope;
+use hil_core::time::{Instant, RemoteInstant};
+
+use crate::counters::named_counts;
+use crate::sequence::{Order, Stream};
+use crate::wire::{FollowUpField, Header};
+
+/// Who a message is and when it was sent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct MessageInfo {
+    /// The sending gateway's start.
+    pub session: u32,
+    /// The producer's start.
+    pub epoch: u32,
+    /// The producer's number.
+    pub sequence: u64,
+    /// The producer's stamp; `RemoteInstant::from_ns(i64::MIN)` when it had none.
+    pub published: RemoteInstant,
+    /// When the sending gateway handed its first datagram to the kernel.
+    pub handed: RemoteInstant,
+    /// Datagrams it took.
+    pub fragment_count: u16,
+}
+
+impl MessageInfo {
+    /// The envelope under which a gateway publishes the message on this host at `forwarded`.
+    pub fn envelope(&self, forwarded: Instant) -> Envelope {
+        Envelope {
+            sequence: self.sequence,
+            published_ns: self.published.as_ns(),
+            forwarded_ns: forwarded.as_ns(),
+            epoch: self.epoch,
+            flags: Envelope::FORWARDED,
+            ..Envelope::default()
+        }
+    }
+}
+
+/// A sender's kernel transmit stamp of an earlier message.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct FollowUp {
+    /// The earlier message's number, of the same epoch.
+    pub sequence: u64,
+    /// Kernel transmit stamp minus handing over, both on the sending host.
+    pub handed_to_tx_ns: i64,
+}
+
+/// A message for the local channel.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Delivery<'a> {
+    /// Who it is.
+    pub message: MessageInfo,
+    /// Its bytes.
+    pub payload: &'a [u8],
+    /// [`Order::InOrder`] or [`Order::Reordered`].
+    pub order: Order,
+    /// A stamp of an earlier message that came along.
+    pub follow_up: Option<FollowUp>,
+}
+
+/// What became of an accepted datagram.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Disposition {
+    /// Its message was delivered.
+    Delivered(MessageInfo),
+    /// Its message is new but older than one delivered, and newest-wins is set: not delivered.
+    Superseded(MessageInfo),
+    /// A copy of a message that was received: not delivered.
+    Duplicate(MessageInfo),
+    /// Its message is too old to judge: not delivered.
+    Late(MessageInfo),
+    /// A piece of a message that is not whole yet.
+    FragmentStored,
+    /// A greeting was accepted.
+    Greeted {
+        /// An earlier session was replaced.
+        is_restart: bool,
+    },
+    /// A clock exchange will be answered.
+    SyncRequested,
+    /// The sender says that the session ends.
+    Farewell,
+}
+
+/// Counters of an ingress bridge, one per [`Disposition`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct IngressCounts {
+    /// Datagrams received.
+    pub datagram_count: u64,
+    /// Messages delivered.
+    pub delivered_count: u64,
+    /// Messages that gave way to a newer one.
+    pub superseded_count: u64,
+    /// Copies.
+    pub duplicate_count: u64,
+    /// Messages too old to judge.
+    pub late_count: u64,
+    /// Pieces stored.
+    pub fragment_count: u64,
+    /// Greetings accepted.
+    pub hello_count: u64,
+    /// Clock exchanges taken.
+    pub sync_count: u64,
+    /// Farewells.
+    pub bye_count: u64,
+    /// Sessions that replaced an earlier one; not a disposition of its own.
+    pub session_restart_count: u64,
+}
+
+named_counts!(IngressCounts {
+    datagram_count,
+    delivered_count,
+    superseded_count,
+    duplicate_count,
+    late_count,
+    fragment_count,
+    hello_count,
+    sync_count,
+    bye_count,
+    session_restart_count,
+});
+
+impl IngressCounts {
+    /// Datagrams accepted.
+    pub const fn accepted_count(&self) -> u64 {
+        self.delivered_count
+            + self.superseded_count
+            + self.duplicate_count
+            + self.late_count
+            + self.fragment_count
+            + self.hello_count
+            + self.sync_count
+            + self.bye_count
+    }
+
+    pub(super) fn count(&mut self, disposition: &Disposition) {
+        let counter = match disposition {
+            Disposition::Delivered(_) => &mut self.delivered_count,
+            Disposition::Superseded(_) => &mut self.superseded_count,
+            Disposition::Duplicate(_) => &mut self.duplicate_count,
+            Disposition::Late(_) => &mut self.late_count,
+            Disposition::FragmentStored => &mut self.fragment_count,
+            Disposition::Greeted { .. } => &mut self.hello_count,
+            Disposition::SyncRequested => &mut self.sync_count,
+            Disposition::Farewell => &mut self.bye_count,
+        };
+        *counter += 1;
+    }
+}
+
+impl Delivery<'_> {
+    /// Hands the message over unless its order forbids it.
+    pub(super) fn dispose(
+        self,
+        deliver_reordered: bool,
+        deliver: &mut dyn FnMut(Delivery<'_>),
+    ) -> Disposition {
+        let message = self.message;
+        match self.order {
+            Order::Duplicate => Disposition::Duplicate(message),
+            Order::Late => Disposition::Late(message),
+            Order::Reordered if !deliver_reordered => Disposition::Superseded(message),
+            Order::InOrder { .. } | Order::Reordered => {
+                deliver(self);
+                Disposition::Delivered(message)
+            }
+        }
+    }
+}
+
+pub(super) fn stream_of(header: &Header) -> Stream {
+    Stream {
+        session: header.session,
+        epoch: header.epoch,
+    }
+}
+
+pub(super) fn message_of(header: &Header, handed_ns: i64) -> MessageInfo {
+    MessageInfo {
+        session: header.session,
+        epoch: header.epoch,
+        sequence: header.sequence,
+        published: RemoteInstant::from_ns(header.published_ns),
+        handed: RemoteInstant::from_ns(handed_ns),
+        fragment_count: header.fragment_count,
+    }
+}
+
+pub(super) fn delivery_of<'a>(
+    header: &Header,
+    message: MessageInfo,
+    payload: &'a [u8],
+    order: Order,
+) -> Delivery<'a> {
+    let resolve = |field: FollowUpField| {
+        Some(FollowUp {
+            sequence: field.sequence(header.sequence)?,
+            handed_to_tx_ns: field.handed_to_tx_ns.into(),
+        })
+    };
+    Delivery {
+        message,
+        payload,
+        order,
+        follow_up: header.follow_up.and_then(resolve),
+    }
+}

@@ -1,0 +1,78 @@
+//! The gateway protocol, sans IO: datagram format, accounting and the two halves of a bridge.
+//!
+//! Nothing here opens a socket, reads a clock or owns a thread, and nothing allocates once a
+//! bridge is constructed. The loop that owns a bridge hands it messages, datagrams and `now`, and
+//! sends what `poll_transmit` gives. Read in this order:
+//!
+//! 1. [`wire`] and [`body`]: the datagram, byte by byte; [`refusal`]: every way to refuse one.
+//! 2. [`sequence`]: lost, reordered, duplicate, late; [`fragment`]: messages above the path MTU.
+//! 3. [`egress`]: the sending host's half of a channel.
+//! 4. [`ingress`]: the receiving host's half.
+//! 5. [`seal`]: encryption and authentication, between a bridge and its transport.
+//!
+//! One channel carries messages one way. Replies (acknowledged greetings, clock exchanges) travel
+//! the other way on the same pair of addresses.
+//!
+//! A message from one host to the other, without a network:
+//!
+//! ```
+//! use std::time::Duration;
+//! use crate::{
+//!     ArrivalStamps, ChannelIdentity, EgressBridge, EgressSettings, IngressBridge, IngressSettings,
+//! };
+//! use hil_core::message::Envelope;
+//! use hil_core::time::Instant;
+//!
+//! let channel = ChannelIdentity::new(0, "arm/command", "example.Command.v1", 8, 8);
+//! let mut ingress =
+//!     IngressBridge::new(IngressSettings::new(channel.clone(), 7, [2; 16], 22))?;
+//! let mut egress = EgressBridge::new(EgressSettings {
+//!     channel,
+//!     session: 5,
+//!     domain: [1; 16],
+//!     clock_id: 11,
+//!     datagram_max_bytes: 1472,
+//!     sync_period: Duration::from_millis(20),
+//! })?;
+//! let now = Instant::from_ns(1_000);
+//! let arrival = ArrivalStamps::application(1_000);
+//!
+//! let hello = egress.poll_transmit(now).expect("a greeting comes first").datagram;
+//! ingress.on_datagram(now, arrival, hello, &mut |_| {})?;
+//! let answer = ingress.poll_transmit(now).expect("a greeting is answered").datagram;
+//! egress.on_datagram(now, arrival, answer)?;
+//!
+//! let envelope = Envelope { published_ns: 900, ..Envelope::default() };
+//! egress.on_local(now, &envelope, &[42; 8])?;
+//! let data = egress.poll_transmit(now).expect("the message was staged").datagram;
+//! let mut received = Vec::new();
+//! ingress.on_datagram(now, arrival, data, &mut |delivery| {
+//!     received.extend_from_slice(delivery.payload);
+//! })?;
+//! assert_eq!(received, [42; 8]);
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+#![forbid(unsafe_code)]
+
+pub mod body;
+pub mod channel;
+mod counters;
+pub mod egress;
+pub mod fragment;
+pub mod ingress;
+pub mod refusal;
+pub mod seal;
+pub mod sequence;
+pub mod stamps;
+pub mod wire;
+
+pub use channel::{ChannelIdentity, SettingsError};
+pub use egress::{
+    EgressBridge, EgressEvent, EgressSettings, LocalRefusal, PeerState, Transmit, TransmitFailure,
+};
+pub use ingress::{Delivery, Disposition, IngressBridge, IngressSettings, MessageInfo, Reply};
+pub use refusal::{Refusal, RefusalCounts};
+pub use stamps::{ArrivalStamps, StampSource};
+
+#[cfg(test)]
+mod tests;

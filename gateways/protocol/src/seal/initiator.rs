@@ -1,0 +1,221 @@
+//! The sending gateway's end of the seal: asks for keys, seals what its bridge gives, and opens the
+//! replies. It owns no socket.
+
+use super::counts::{SealCounts, SealRefusal};
+use super::keys::{Association, Root, Salt};
+use super::layout::{
+    KEY_EXCHANGE_BYTES, KeyExchange, Marks, about, code_place, covered, handed_ns_of, kind_of,
+};
+use super::traffic::{OpeningWay, Rotation, SealingWay};
+use crate::wire::{Kind, TAG_BYTES, u32_at};
+
+/// Clock exchanges without an authentic reply after which keys are asked for again: the receiver may
+/// have started anew, and then knows the old ones no more.
+const UNANSWERED_MAX: u32 = 3;
+/// Starts of the receiver whose keys are never taken up again.
+const RETIRED_LENGTH: usize = 32;
+
+/// What a reply was.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Heard {
+    /// An authentic reply for the bridge; so long is the plain datagram.
+    Reply(usize),
+    /// Keys for a start of the receiver that was not known before.
+    Keys,
+    /// Nothing new.
+    Nothing,
+}
+
+#[derive(Debug)]
+struct Traffic {
+    answering: Salt,
+    forward: SealingWay,
+    backward: OpeningWay,
+}
+
+/// The sending end.
+#[derive(Debug)]
+pub struct Initiator {
+    root: Root,
+    salt: Salt,
+    rotation: Rotation,
+    session: u32,
+    traffic: Option<Traffic>,
+    /// Number of the newest request, from 1.
+    request: u64,
+    /// Number of the newest request whose answer was taken.
+    answered: u64,
+    retired: [Option<Salt>; RETIRED_LENGTH],
+    retired_next: usize,
+    unanswered_count: u32,
+    rotation_count: u64,
+    counts: SealCounts,
+}
+
+impl Initiator {
+    /// `salt` is drawn at random for each start of a gateway.
+    pub fn new(association: &Association, salt: Salt, rotation: Rotation) -> Self {
+        Self {
+            root: Root::new(association),
+            salt,
+            rotation,
+            session: 0,
+            traffic: None,
+            request: 0,
+            answered: 0,
+            retired: [None; RETIRED_LENGTH],
+            retired_next: 0,
+            unanswered_count: 0,
+            rotation_count: 0,
+            counts: SealCounts::default(),
+        }
+    }
+
+    /// A request for keys that is due before the bridge's `datagram`: with every greeting, and when
+    /// clock exchanges stay without an authentic reply.
+    pub fn request_before(&mut self, datagram: &[u8]) -> Option<[u8; KEY_EXCHANGE_BYTES]> {
+        self.session = u32_at(datagram, 8);
+        match kind_of(datagram) {
+            Kind::Hello => {}
+            Kind::SyncRequest => {
+                self.unanswered_count = self.unanswered_count.saturating_add(1);
+                if self.unanswered_count <= UNANSWERED_MAX {
+                    return None;
+                }
+            }
+            _ => return None,
+        }
+        self.request += 1;
+        self.counts.key_exchange_count += 1;
+        let request = KeyExchange {
+            kind: Kind::KeyRequest,
+            session: self.session,
+            channel: self.root.channel,
+            request: self.request,
+            generation: self.traffic.as_ref().map_or(0, |one| one.forward.index()),
+            handed_ns: handed_ns_of(datagram),
+            salt: self.salt,
+            about: self
+                .traffic
+                .as_ref()
+                .map_or([0; 8], |one| about(&one.answering)),
+        };
+        let mut bytes = [0; KEY_EXCHANGE_BYTES];
+        request.write(&mut bytes);
+        let code = ring::hmac::sign(&self.root.request, covered(&bytes).0);
+        code_place(&mut bytes).copy_from_slice(code.as_ref());
+        Some(bytes)
+    }
+
+    /// Seals the bridge's `datagram` into the start of `out` and gives the length; `None` without keys.
+    ///
+    /// # Panics
+    /// When `out` is not 16 bytes longer than `datagram`.
+    pub fn seal(&mut self, datagram: &[u8], out: &mut [u8]) -> Option<usize> {
+        let traffic = self.traffic.as_mut()?;
+        let length = datagram.len() + TAG_BYTES;
+        out[..datagram.len()].copy_from_slice(datagram);
+        traffic.forward.seal(&mut out[..length]);
+        self.counts.sealed_count += 1;
+        Some(length)
+    }
+
+    /// Opens a reply in place.
+    ///
+    /// # Errors
+    /// Why it is refused; it is counted.
+    pub fn open(&mut self, datagram: &mut [u8]) -> Result<Heard, SealRefusal> {
+        let result = self.accept(datagram);
+        match result {
+            Ok(Heard::Reply(_)) => {
+                self.counts.opened_count += 1;
+                self.unanswered_count = 0;
+            }
+            Ok(_) => {}
+            Err(cause) => self.counts.refuse(cause),
+        }
+        result
+    }
+
+    fn accept(&mut self, datagram: &mut [u8]) -> Result<Heard, SealRefusal> {
+        let marks = Marks::read(datagram, self.root.channel)?;
+        match marks.kind {
+            Kind::KeyAnswer => return self.take_keys(datagram),
+            Kind::HelloAck | Kind::SyncResponse => {}
+            _ => return Err(SealRefusal::WrongWay),
+        }
+        let traffic = self
+            .traffic
+            .as_mut()
+            .filter(|_| marks.session == self.session);
+        let traffic = traffic.ok_or(SealRefusal::ForeignSession)?;
+        traffic.backward.open(marks, datagram).map(Heard::Reply)
+    }
+
+    fn take_keys(&mut self, datagram: &[u8]) -> Result<Heard, SealRefusal> {
+        let answer = KeyExchange::read(datagram)?;
+        if answer.session != self.session {
+            return Err(SealRefusal::ForeignSession);
+        }
+        let (said, code) = covered(datagram);
+        let mut bound = [0; KEY_EXCHANGE_BYTES];
+        let length = said.len() + self.salt.len();
+        bound[..said.len()].copy_from_slice(said);
+        bound[said.len()..length].copy_from_slice(&self.salt);
+        if ring::hmac::verify(&self.root.answer, &bound[..length], code).is_err() {
+            return Err(SealRefusal::BadTag);
+        }
+        if answer.request <= self.answered || answer.request > self.request {
+            return Err(SealRefusal::Unsolicited);
+        }
+        if let Some(traffic) = &mut self.traffic
+            && traffic.answering == answer.salt
+        {
+            self.answered = answer.request;
+            let now_ns = answer.handed_ns;
+            traffic.backward.catch_up(answer.generation, now_ns);
+            return Ok(Heard::Nothing);
+        }
+        // Keys that were in use once must never be again: their numbers would begin anew.
+        if self.retired.contains(&Some(answer.salt)) {
+            return Err(SealRefusal::Unsolicited);
+        }
+        self.answered = answer.request;
+        self.adopt(answer.salt);
+        Ok(Heard::Keys)
+    }
+
+    fn adopt(&mut self, answering: Salt) {
+        if let Some(old) = self.traffic.take() {
+            self.rotation_count += old.forward.rotation_count + old.backward.rotation_count;
+            self.retired[self.retired_next] = Some(old.answering);
+            self.retired_next = (self.retired_next + 1) % RETIRED_LENGTH;
+        }
+        let forward = self.root.forward(&self.salt, &answering);
+        let backward = self.root.backward(&self.salt, &answering);
+        self.traffic = Some(Traffic {
+            answering,
+            forward: SealingWay::new(forward, self.rotation),
+            backward: OpeningWay::new(&backward, self.rotation),
+        });
+        self.counts.agreement_count += 1;
+        self.unanswered_count = 0;
+    }
+
+    /// Notes a datagram that its owner refused before it came here.
+    pub fn refuse(&mut self, cause: SealRefusal) {
+        self.counts.refuse(cause);
+    }
+
+    /// What was counted so far.
+    pub fn counts(&self) -> SealCounts {
+        let now = self.traffic.as_ref();
+        let turned = now.map_or(0, |one| {
+            one.forward.rotation_count + one.backward.rotation_count
+        });
+        SealCounts {
+            rotation_count: self.rotation_count + turned,
+            ..self.counts
+        }
+    }
+}

@@ -1,0 +1,178 @@
+//! Splitting and putting together, with every order, loss and lie.
+
+use core::time::Duration;
+
+use hil_core::random::RandomStream;
+use hil_core::time::Instant;
+
+use crate::fragment::{FRAGMENT_COUNT_MAX, Fragment, FragmentPlan, Reassembler};
+use crate::refusal::Refusal;
+use crate::sequence::Stream;
+
+const STREAM: Stream = Stream {
+    session: 1,
+    epoch: 1,
+};
+const TIMEOUT: Duration = Duration::from_millis(10);
+
+fn pieces(sequence: u64, message: &[u8], budget: usize) -> Vec<Fragment<'_>> {
+    let plan = FragmentPlan::new(message.len(), budget).unwrap();
+    (0..plan.count())
+        .map(|index| Fragment {
+            stream: STREAM,
+            sequence,
+            total_len: u32::try_from(message.len()).unwrap(),
+            index,
+            count: plan.count(),
+            handed_ns: 100 + i64::from(index),
+            payload: &message[plan.range(index).unwrap()],
+        })
+        .collect()
+}
+
+fn message(length: usize, seed: u64) -> Vec<u8> {
+    let mut random = RandomStream::new(seed, "message");
+    (0..length)
+        .map(|_| random.next_u64().to_le_bytes()[0])
+        .collect()
+}
+
+fn shuffle<T>(random: &mut RandomStream, items: &mut [T]) {
+    for last in (1..items.len()).rev() {
+        let other = usize::try_from(random.next_u64() % (last as u64 + 1)).unwrap();
+        items.swap(last, other);
+    }
+}
+
+#[test]
+fn a_cut_covers_every_byte_once_and_the_receiver_finds_the_same_cut() {
+    for total in (0..3000).chain([65_535, 65_536, 100_000]) {
+        for budget in [1, 2, 3, 7, 64, 512, 1400, 70_000] {
+            let Some(plan) = FragmentPlan::new(total, budget) else {
+                assert!(total > budget * FRAGMENT_COUNT_MAX);
+                continue;
+            };
+            let mut end = 0;
+            for index in 0..plan.count() {
+                let range = plan.range(index).unwrap();
+                assert_eq!(range.start, end, "{total} by {budget}");
+                assert!(range.len() <= budget);
+                assert!(!range.is_empty() || total == 0);
+                end = range.end;
+            }
+            assert_eq!(end, total);
+            assert_eq!(plan.range(plan.count()), None);
+            let total_len = u32::try_from(total).unwrap();
+            assert_eq!(FragmentPlan::from_wire(total_len, plan.count()), Some(plan));
+        }
+    }
+    assert_eq!(FragmentPlan::new(10, 0), None);
+    assert_eq!(FragmentPlan::from_wire(5, 0), None);
+    assert_eq!(FragmentPlan::from_wire(5, 4), None);
+    assert_eq!(FragmentPlan::from_wire(u32::MAX, 1025), None);
+}
+
+#[test]
+fn pieces_in_any_order_and_interleaved_come_together() {
+    for seed in 0..50 {
+        let mut random = RandomStream::new(seed, "reassembly");
+        let mut reassembler = Reassembler::new(3, 4000, TIMEOUT);
+        let messages: Vec<_> = (0..3).map(|m| message(3000 + m, seed)).collect();
+        let mut all: Vec<_> = (0..)
+            .zip(&messages)
+            .flat_map(|(sequence, message)| pieces(sequence, message, 97))
+            .collect();
+        shuffle(&mut random, &mut all);
+        let mut completed = 0;
+        for piece in &all {
+            let whole = reassembler.insert(Instant::ZERO, piece).unwrap();
+            if let Some(assembled) = whole {
+                let index = usize::try_from(piece.sequence).unwrap();
+                assert_eq!(assembled.payload, messages[index], "seed {seed}");
+                assert_eq!(assembled.handed_ns, 100);
+                completed += 1;
+            }
+        }
+        assert_eq!(completed, 3);
+        assert_eq!(reassembler.open_count(), 0);
+    }
+}
+
+#[test]
+fn a_second_copy_of_a_piece_is_refused_and_changes_nothing() {
+    let whole = message(300, 1);
+    let mut forged = whole.clone();
+    forged[0] ^= 0xff;
+    let mut reassembler = Reassembler::new(1, 300, TIMEOUT);
+    let (good, bad) = (pieces(0, &whole, 100), pieces(0, &forged, 100));
+    assert_eq!(reassembler.insert(Instant::ZERO, &good[0]), Ok(None));
+    let refused = Err(Refusal::DuplicateFragment);
+    assert_eq!(reassembler.insert(Instant::ZERO, &bad[0]), refused);
+    assert_eq!(reassembler.insert(Instant::ZERO, &good[1]), Ok(None));
+    let assembled = reassembler.insert(Instant::ZERO, &good[2]).unwrap();
+    assert_eq!(assembled.unwrap().payload, whole);
+}
+
+#[test]
+fn pieces_that_contradict_the_first_one_or_the_bound_are_refused() {
+    let whole = message(300, 1);
+    let mut reassembler = Reassembler::new(1, 300, TIMEOUT);
+    let good = pieces(0, &whole, 100);
+    assert_eq!(reassembler.insert(Instant::ZERO, &good[0]), Ok(None));
+    let other_cut = pieces(0, &whole, 60);
+    let other_length = pieces(0, &whole[..299], 100);
+    let refused = Err(Refusal::FragmentInconsistent);
+    assert_eq!(reassembler.insert(Instant::ZERO, &other_cut[1]), refused);
+    assert_eq!(reassembler.insert(Instant::ZERO, &other_length[1]), refused);
+    let long = message(301, 1);
+    let refused = Err(Refusal::Oversize);
+    assert_eq!(
+        reassembler.insert(Instant::ZERO, &pieces(1, &long, 100)[0]),
+        refused
+    );
+    let mut short = good[1];
+    short.payload = &short.payload[1..];
+    assert_eq!(
+        reassembler.insert(Instant::ZERO, &short),
+        Err(Refusal::LengthMismatch)
+    );
+    assert_eq!(reassembler.counts().started_count, 1);
+}
+
+#[test]
+fn the_oldest_incomplete_message_gives_way_and_is_counted() {
+    let whole = message(200, 1);
+    let mut reassembler = Reassembler::new(2, 200, TIMEOUT);
+    for sequence in 0..5 {
+        let now = Instant::from_ns(i64::try_from(sequence).unwrap());
+        let piece = pieces(sequence, &whole, 100)[0];
+        assert_eq!(reassembler.insert(now, &piece), Ok(None));
+    }
+    let counts = *reassembler.counts();
+    assert_eq!((counts.started_count, counts.evicted_count), (5, 3));
+    // The two newest are still there.
+    for sequence in 3..5 {
+        let piece = pieces(sequence, &whole, 100)[1];
+        assert!(
+            reassembler
+                .insert(Instant::from_ns(9), &piece)
+                .unwrap()
+                .is_some()
+        );
+    }
+}
+
+#[test]
+fn an_incomplete_message_is_given_up_in_time() {
+    let whole = message(200, 1);
+    let mut reassembler = Reassembler::new(2, 200, TIMEOUT);
+    let halves = pieces(0, &whole, 100);
+    assert_eq!(reassembler.insert(Instant::ZERO, &halves[0]), Ok(None));
+    let due = reassembler.next_expiry().unwrap();
+    assert_eq!(due, Instant::ZERO + TIMEOUT);
+    reassembler.expire(Instant::from_ns(due.as_ns() - 1));
+    assert_eq!(reassembler.open_count(), 1);
+    assert_eq!(reassembler.insert(due, &halves[1]), Ok(None));
+    assert_eq!(reassembler.counts().timed_out_count, 1);
+    assert_eq!(reassembler.counts().completed_count, 0);
+}

@@ -1,0 +1,305 @@
+//! Transports: how a datagram leaves one gateway and reaches the other, and when the kernel saw
+//! it. They know no datagram layout; that is [`hil_protocol`].
+//!
+//! - [`udp`]: the real network, with separate sockets for sending and receiving.
+//! - [`tcp`]: the real network as a stream, with what it costs in waiting.
+//! - [`udp_server`]: one socket that hears anyone and answers, for foreign protocols.
+//! - [`queue`]: an in-process pair, for tests.
+//! - [`emulated`]: any receiver behind a link model.
+//! - [`sealed`]: any sender or receiver behind encryption and authentication.
+//! - [`probe`]: which stamps really arrive, by sending.
+//!
+//! A refused send or a report of the network is a state the caller sees, never an exit.
+#![forbid(unsafe_code)]
+
+mod boxed;
+mod counters;
+pub mod emulated;
+pub mod probe;
+pub mod queue;
+pub mod sealed;
+pub mod tcp;
+pub mod udp;
+mod udp_receiver;
+pub mod udp_server;
+mod udp_socket;
+
+#[cfg(test)]
+mod conformance_tests;
+#[cfg(test)]
+mod host_tests;
+#[cfg(test)]
+mod reply_stamp_tests;
+#[cfg(test)]
+mod trap_tests;
+
+use core::fmt::Debug;
+use std::io;
+use std::net::SocketAddr;
+use std::os::fd::BorrowedFd;
+
+use hil_core::time::Instant;
+use thiserror::Error;
+
+pub use counters::{ReceiverCounters, SenderCounters};
+use tcp::StreamFigures;
+
+use hil_net::radio::RadioReport;
+use hil_net::{KernelStamps, TransmitStamp, TxToken};
+use hil_protocol::seal::SealCounts;
+
+/// When a link model took a datagram and when it gave it back.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct EmulatedDelay {
+    /// When the emulation took it from the transport below, monotonic clock.
+    pub arrived: Instant,
+    /// When the link model let it arrive, monotonic clock; never before `arrived`.
+    pub due: Instant,
+}
+
+/// One received datagram; its bytes are in the caller's buffer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Received {
+    /// Bytes written to the buffer.
+    pub length_bytes: usize,
+    /// The datagram was longer than the buffer and its end is gone.
+    pub is_truncated: bool,
+    /// Who sent it. A receiver takes datagrams of anyone: the caller checks.
+    pub source: SocketAddr,
+    /// Receive stamps.
+    pub stamps: KernelStamps,
+    /// Set when a link model held the datagram.
+    pub emulated: Option<EmulatedDelay>,
+}
+
+/// Why a datagram did not leave. Each is a state of the peer or of the network, to be counted
+/// and shown; the next send may succeed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
+pub enum SendRefusal {
+    /// The peer's host answered an *earlier* datagram that nobody listens (`ECONNREFUSED`).
+    #[error("nobody listens at the peer (ECONNREFUSED)")]
+    PeerRefused,
+    /// No way to the peer: `ENETUNREACH`, `EHOSTUNREACH`, `ENETDOWN`, `EHOSTDOWN`, `ENONET` or
+    /// `EACCES`.
+    #[error("peer is unreachable (errno {errno})")]
+    Unreachable {
+        /// Which of them.
+        errno: i32,
+    },
+    /// A queue on the way out is full: `ENOBUFS` or `EAGAIN`.
+    #[error("a send queue is full (errno {errno})")]
+    QueueFull {
+        /// Which of them.
+        errno: i32,
+    },
+    /// Longer than the path takes in one piece (`EMSGSIZE`).
+    #[error("datagram of {length_bytes} bytes is too long for the path (EMSGSIZE)")]
+    TooLong {
+        /// Its length; 0 when the refusal came later, as a report.
+        length_bytes: usize,
+    },
+    /// A transport with connections has none to the peer just now.
+    #[error("there is no connection to the peer")]
+    NotConnected,
+    /// Anything else the kernel answered.
+    #[error("send was refused (errno {errno})")]
+    Other {
+        /// What it answered.
+        errno: i32,
+    },
+}
+
+impl SendRefusal {
+    /// The refusal that `errno` stands for, for a datagram of `length_bytes`.
+    pub fn from_errno(errno: i32, length_bytes: usize) -> Self {
+        match errno {
+            libc::ECONNREFUSED => Self::PeerRefused,
+            // ENONET and EACCES are what ICMP reports of an unknown or forbidding network become.
+            libc::ENETUNREACH
+            | libc::EHOSTUNREACH
+            | libc::ENETDOWN
+            | libc::EHOSTDOWN
+            | libc::ENONET
+            | libc::EACCES => Self::Unreachable { errno },
+            // EWOULDBLOCK has the value of EAGAIN on Linux.
+            libc::ENOBUFS | libc::EAGAIN => Self::QueueFull { errno },
+            libc::EMSGSIZE => Self::TooLong { length_bytes },
+            _ => Self::Other { errno },
+        }
+    }
+
+    /// The refusal that `error` stands for; an error without an errno becomes errno 0.
+    pub(crate) fn from_io(error: &io::Error, length_bytes: usize) -> Self {
+        Self::from_errno(error.raw_os_error().unwrap_or(0), length_bytes)
+    }
+}
+
+/// The sending end of a transport: towards one peer, with stamps and the peer's replies coming
+/// back. Nothing here blocks.
+///
+/// ```
+/// use hil_net::TxToken;
+/// use crate::queue::{QueueSettings, queue_pair};
+/// use crate::{DatagramReceiver, DatagramSender};
+/// use hil_core::time::Instant;
+///
+/// let (mut sender, mut receiver) = queue_pair(&QueueSettings::default());
+/// assert_eq!(sender.send(b"stop"), Ok(TxToken(0)));
+/// while let Some(stamp) = sender.next_stamp() {
+///     println!("datagram {} left at {:?}", stamp.token.0, stamp.stamps.software_ns);
+/// }
+/// let mut buffer = [0; 16];
+/// let received = receiver.receive(Instant::ZERO, &mut buffer).unwrap().unwrap();
+/// assert_eq!(&buffer[..received.length_bytes], b"stop");
+/// ```
+pub trait DatagramSender: Debug + Send {
+    /// Hands one datagram to the transport.
+    ///
+    /// # Errors
+    /// The state that kept it from leaving; it is counted.
+    fn send(&mut self, datagram: &[u8]) -> Result<TxToken, SendRefusal>;
+
+    /// The next transmit stamp that has arrived. Call it until `None` after every send: the
+    /// kernel charges unfetched stamps to the receive buffer, so a sender that is never drained
+    /// hears no replies. Reports of the network are swallowed and counted on the way.
+    fn next_stamp(&mut self) -> Option<TransmitStamp>;
+
+    /// The next report of the radio that [`DatagramSender::next_stamp`] found on its way; call it
+    /// until `None` after that. A transport without a radio has none.
+    fn next_radio_report(&mut self) -> Option<RadioReport> {
+        None
+    }
+
+    /// The next reply of the peer, if one has arrived.
+    ///
+    /// # Errors
+    /// When the transport itself is broken; states of the peer are not errors.
+    fn receive(&mut self, buffer: &mut [u8]) -> io::Result<Option<Received>>;
+
+    /// What to wait on for stamps (`POLLERR`) and replies (`POLLIN`); `None` when the transport
+    /// has no descriptor.
+    fn poll_fd(&self) -> Option<BorrowedFd<'_>>;
+
+    /// What was counted since the start.
+    fn counters(&self) -> SenderCounters;
+
+    /// Does what is due beside sending, such as connecting: call it at
+    /// [`DatagramSender::next_due`] and whenever the descriptor has something.
+    fn attend(&mut self, _now: Instant) {}
+
+    /// When [`DatagramSender::attend`] is due without a word from the descriptor.
+    fn next_due(&self) -> Option<Instant> {
+        None
+    }
+
+    /// True while bytes of a datagram it took have not been given to the kernel.
+    fn has_unsent(&self) -> bool {
+        false
+    }
+
+    /// What a transport with connections saw until `now`; `None` for one without.
+    fn stream_figures(&self, _now: Instant) -> Option<StreamFigures> {
+        None
+    }
+
+    /// What a transport behind the seal counted; `None` for a plain one.
+    fn seal_counts(&self) -> Option<SealCounts> {
+        None
+    }
+}
+
+/// The receiving end of a transport. Nothing here blocks. See [`DatagramSender`] for an example.
+pub trait DatagramReceiver: Debug + Send {
+    /// The next datagram that has arrived, or was due, by `now`.
+    ///
+    /// # Errors
+    /// When the transport itself is broken; a bad or foreign datagram is not an error.
+    fn receive(&mut self, now: Instant, buffer: &mut [u8]) -> io::Result<Option<Received>>;
+
+    /// Sends `datagram` back to `to`, the source of an earlier datagram, without a transmit stamp:
+    /// stamps would compete with arrivals for the receive buffer.
+    ///
+    /// # Errors
+    /// The state that kept it from leaving; it is counted.
+    fn reply(&mut self, datagram: &[u8], to: SocketAddr) -> Result<(), SendRefusal>;
+
+    /// As [`DatagramReceiver::reply`], and asks for the stamp of its departure, where the
+    /// transport has stamps. It is for few replies, as each costs system calls.
+    ///
+    /// # Errors
+    /// As [`DatagramReceiver::reply`].
+    fn reply_stamped(
+        &mut self,
+        _now: Instant,
+        datagram: &[u8],
+        to: SocketAddr,
+    ) -> Result<(), SendRefusal> {
+        self.reply(datagram, to)
+    }
+
+    /// When the newest stamped reply left, nanoseconds of this host's `CLOCK_REALTIME`; once, and
+    /// `None` while it has not come. Call it after the reply and whenever nothing arrived; it
+    /// makes a system call only while a stamp may be there.
+    fn take_reply_stamp(&mut self, _now: Instant) -> Option<i64> {
+        None
+    }
+
+    /// When a datagram held back by a link model is due; `None` when none is held. A wait for
+    /// [`DatagramReceiver::poll_fd`] must end then.
+    fn next_due(&self) -> Option<Instant>;
+
+    /// What to wait on for arrivals (`POLLIN`); `None` when the transport has no descriptor.
+    fn poll_fd(&self) -> Option<BorrowedFd<'_>>;
+
+    /// What was counted since the start.
+    fn counters(&self) -> ReceiverCounters;
+
+    /// Does what is due beside receiving, such as taking connections: call it whenever the
+    /// descriptor has something and [`DatagramReceiver::receive`] gave nothing.
+    fn attend(&mut self, _now: Instant) {}
+
+    /// What a transport with connections saw until `now`; `None` for one without.
+    fn stream_figures(&self, _now: Instant) -> Option<StreamFigures> {
+        None
+    }
+
+    /// What a transport behind the seal counted; `None` for a plain one.
+    fn seal_counts(&self) -> Option<SealCounts> {
+        None
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_errno_of_the_network_is_a_state() {
+        let unreachable = |errno| SendRefusal::Unreachable { errno };
+        for (errno, expected) in [
+            (libc::ECONNREFUSED, SendRefusal::PeerRefused),
+            (libc::ENETUNREACH, unreachable(libc::ENETUNREACH)),
+            (libc::EHOSTUNREACH, unreachable(libc::EHOSTUNREACH)),
+            (libc::ENETDOWN, unreachable(libc::ENETDOWN)),
+            (
+                libc::ENOBUFS,
+                SendRefusal::QueueFull {
+                    errno: libc::ENOBUFS,
+                },
+            ),
+            (
+                libc::EWOULDBLOCK,
+                SendRefusal::QueueFull {
+                    errno: libc::EAGAIN,
+                },
+            ),
+            (libc::EMSGSIZE, SendRefusal::TooLong { length_bytes: 9 }),
+            (libc::EPERM, SendRefusal::Other { errno: libc::EPERM }),
+        ] {
+            assert_eq!(SendRefusal::from_errno(errno, 9), expected);
+            let mut counters = SenderCounters::default();
+            counters.count_refusal(expected);
+            assert_eq!(counters.refused_count(), 1);
+        }
+    }
+}

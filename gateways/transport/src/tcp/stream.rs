@@ -1,0 +1,316 @@
+//! One framed connection, either end: whole datagrams out of and into a non-blocking socket, with
+//! what it costs in waiting. Who connects to whom is the business of its owners; everything it
+//! works with but the socket survives a connection.
+
+use core::time::Duration;
+use std::io::{self, IoSlice, Read};
+use std::sync::Arc;
+
+use hil_core::time::Instant;
+use socket2::Socket;
+
+use super::figures::{ConnectionTally, StreamFigures};
+use super::frame::{Backlog, FRAME_BYTES_MAX, FrameReader, prefix};
+use super::socket::abort;
+use super::stall::StallWatch;
+use crate::SendRefusal;
+use hil_net::tcp_info::{ConnectionInfo, unacknowledged_bytes};
+
+/// What the kernel has not taken waits here: two of the longest frames, so that one always fits
+/// behind the rest of another.
+const BACKLOG_BYTES: usize = 2 * FRAME_BYTES_MAX;
+/// How often `TCP_INFO` is read.
+const INFO_PERIOD: Duration = Duration::from_millis(100);
+
+/// Why a connection ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Ending {
+    /// The peer closed it.
+    Closed,
+    /// The kernel says so.
+    Failed { errno: i32 },
+    /// It stated a length no frame has.
+    BadFrame,
+    /// A newer connection of the peer took its place.
+    Replaced,
+}
+
+/// One received datagram, in the caller's buffer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Taken {
+    pub(super) length_bytes: usize,
+    pub(super) is_truncated: bool,
+}
+
+/// The connection, if there is one, and what outlives it.
+#[derive(Debug)]
+pub(super) struct Stream {
+    socket: Option<Socket>,
+    connected: Instant,
+    reader: FrameReader,
+    backlog: Backlog,
+    backlogged: Option<Instant>,
+    watch: StallWatch,
+    looked: Instant,
+    informed: Instant,
+    info: Option<ConnectionInfo>,
+    /// Of connections that have ended, and counts of this side.
+    figures: StreamFigures,
+    tally: Arc<ConnectionTally>,
+    clock: fn() -> Instant,
+}
+
+impl Stream {
+    pub(super) fn new(clock: fn() -> Instant) -> Self {
+        Self {
+            socket: None,
+            connected: Instant::ZERO,
+            reader: FrameReader::default(),
+            backlog: Backlog::new(BACKLOG_BYTES),
+            backlogged: None,
+            watch: StallWatch::new(),
+            looked: Instant::ZERO,
+            informed: Instant::ZERO,
+            info: None,
+            figures: StreamFigures::default(),
+            tally: Arc::default(),
+            clock,
+        }
+    }
+
+    pub(super) fn tally(&self) -> Arc<ConnectionTally> {
+        Arc::clone(&self.tally)
+    }
+
+    pub(super) fn socket(&self) -> Option<&Socket> {
+        self.socket.as_ref()
+    }
+
+    pub(super) fn figures_mut(&mut self) -> &mut StreamFigures {
+        &mut self.figures
+    }
+
+    /// When the present connection came about.
+    pub(super) fn connected(&self) -> Instant {
+        self.connected
+    }
+
+    /// Takes a connected socket.
+    pub(super) fn adopt(&mut self, socket: Socket, now: Instant) {
+        self.socket = Some(socket);
+        self.connected = now;
+        self.figures.connection_count += 1;
+        self.tally.begin();
+        self.inform(now);
+    }
+
+    /// Ends the connection, if there is one; what it still held is lost and counted.
+    pub(super) fn end(&mut self, ending: Ending, now: Instant) {
+        self.inform(now);
+        let Some(socket) = self.socket.take() else {
+            return;
+        };
+        let left = unacknowledged_bytes(&socket).unwrap_or(0) + self.backlog.len_bytes() as u64;
+        abort(socket);
+        self.tally.end();
+        let figures = &mut self.figures;
+        figures.connection_ended_count += 1;
+        match ending {
+            Ending::Failed { errno } => figures.newest_errno = Some(errno),
+            Ending::Closed => figures.newest_errno = Some(0),
+            Ending::BadFrame | Ending::Replaced => {}
+        }
+        figures.bad_frame_count += u64::from(ending == Ending::BadFrame);
+        figures.cut_frame_count +=
+            u64::from(self.reader.waiting_bytes() > 0 && ending != Ending::BadFrame);
+        figures.abandoned_bytes += left;
+        if let Some(info) = self.info.take() {
+            figures.add(&info);
+        }
+        self.reader.clear();
+        self.backlog.clear();
+        self.note_backlog(now);
+        self.watch.on_lost(now);
+    }
+
+    /// Gives one datagram to the kernel, or keeps what the kernel does not take.
+    ///
+    /// # Errors
+    /// When it is too long, there is no connection or no room; it was not sent then, in no part.
+    pub(super) fn send(&mut self, datagram: &[u8]) -> Result<(), SendRefusal> {
+        let length_bytes = datagram.len();
+        let prefix = prefix(length_bytes).ok_or(SendRefusal::TooLong { length_bytes })?;
+        if !self.backlog.is_empty() {
+            let now = (self.clock)();
+            self.flush(now);
+        }
+        let Some(socket) = &self.socket else {
+            return Err(SendRefusal::NotConnected);
+        };
+        let whole = prefix.len() + length_bytes;
+        let mut taken = 0;
+        if self.backlog.is_empty() {
+            let parts = [IoSlice::new(&prefix), IoSlice::new(datagram)];
+            match socket.send_vectored_with_flags(&parts, libc::MSG_DONTWAIT | libc::MSG_NOSIGNAL) {
+                Ok(count) => taken = count,
+                Err(error) if is_for_later(&error) => {}
+                Err(error) => {
+                    let now = (self.clock)();
+                    self.end(failed(&error), now);
+                    return Err(SendRefusal::NotConnected);
+                }
+            }
+        }
+        let now = (self.clock)();
+        if taken < whole {
+            let rest = [
+                prefix.get(taken..).unwrap_or_default(),
+                &datagram[taken.saturating_sub(prefix.len())..],
+            ];
+            if !self.backlog.push(rest) {
+                // Nothing of it was taken: the rest of a frame always fits, as nothing else waits.
+                let errno = libc::ENOBUFS;
+                return Err(SendRefusal::QueueFull { errno });
+            }
+            self.note_backlog(now);
+        }
+        self.watch.on_accepted(whole, now);
+        Ok(())
+    }
+
+    /// Gives the kernel what waits here.
+    pub(super) fn flush(&mut self, now: Instant) {
+        while let Some(socket) = self.socket.as_ref().filter(|_| !self.backlog.is_empty()) {
+            let flags = libc::MSG_DONTWAIT | libc::MSG_NOSIGNAL;
+            match socket.send_with_flags(self.backlog.bytes(), flags) {
+                Ok(count) => self.backlog.consume(count),
+                Err(error) if is_for_later(&error) => break,
+                Err(error) => self.end(failed(&error), now),
+            }
+        }
+        self.note_backlog(now);
+    }
+
+    /// Takes the next datagram that is whole; says how the connection ended when it did.
+    pub(super) fn receive(&mut self, buffer: &mut [u8]) -> Result<Option<Taken>, Ending> {
+        loop {
+            match self.reader.next_datagram() {
+                Ok(Some(datagram)) => {
+                    let length_bytes = datagram.len().min(buffer.len());
+                    buffer[..length_bytes].copy_from_slice(&datagram[..length_bytes]);
+                    let is_truncated = length_bytes < datagram.len();
+                    return Ok(Some(Taken {
+                        length_bytes,
+                        is_truncated,
+                    }));
+                }
+                Ok(None) => {}
+                Err(_) => return self.broken(Ending::BadFrame),
+            }
+            let Some(mut socket) = self.socket.as_ref() else {
+                return Ok(None);
+            };
+            match socket.read(self.reader.room()) {
+                Ok(0) => return self.broken(Ending::Closed),
+                Ok(count) => self.reader.filled(count),
+                Err(error) if is_for_later(&error) => return Ok(None),
+                Err(error) => return self.broken(failed(&error)),
+            }
+        }
+    }
+
+    fn broken<T>(&mut self, ending: Ending) -> Result<T, Ending> {
+        let now = (self.clock)();
+        self.end(ending, now);
+        Err(ending)
+    }
+
+    /// Gives the kernel what waits and looks how long the oldest byte has waited.
+    pub(super) fn look(&mut self, now: Instant) {
+        self.flush(now);
+        let Some(socket) = &self.socket else { return };
+        if self.watch.is_waiting() {
+            self.looked = now;
+            if let Ok(in_kernel) = unacknowledged_bytes(socket) {
+                self.watch
+                    .on_look(in_kernel + self.backlog.len_bytes() as u64, now);
+            }
+        }
+        if now.saturating_duration_since(self.informed) >= INFO_PERIOD {
+            self.inform(now);
+        }
+    }
+
+    fn inform(&mut self, now: Instant) {
+        let Some(socket) = &self.socket else { return };
+        self.informed = now;
+        if let Ok(info) = ConnectionInfo::read(socket) {
+            if let Some(rtt_min_us) = info.rtt_min_us {
+                self.watch
+                    .set_rtt_min(Duration::from_micros(rtt_min_us.into()));
+            }
+            self.info = Some(info);
+        }
+    }
+
+    /// Keeps count of how long anything waits here.
+    fn note_backlog(&mut self, now: Instant) {
+        let waiting = self.backlog.len_bytes() as u64;
+        self.figures.backlog_bytes_max = self.figures.backlog_bytes_max.max(waiting);
+        match (self.backlogged, waiting) {
+            (Some(since), 0) => {
+                self.figures.backlogged += now.saturating_duration_since(since);
+                self.backlogged = None;
+            }
+            (None, 1..) => self.backlogged = Some(now),
+            (None, 0) | (Some(_), 1..) => {}
+        }
+    }
+
+    /// True while bytes wait here for the kernel to take them.
+    pub(super) fn has_backlog(&self) -> bool {
+        !self.backlog.is_empty()
+    }
+
+    /// When to look again without another reason to.
+    pub(super) fn next_look(&self) -> Option<Instant> {
+        self.socket.as_ref()?;
+        self.watch.next_look(self.looked)
+    }
+
+    /// Everything until `now`.
+    pub(super) fn figures(&self, now: Instant) -> StreamFigures {
+        let mut figures = self.figures;
+        let info = self
+            .socket
+            .as_ref()
+            .and_then(|socket| ConnectionInfo::read(socket).ok());
+        if let Some(info) = info.or(self.info) {
+            figures.add(&info);
+        }
+        let stalls = self.watch.figures(now);
+        figures.stall_threshold = self.watch.threshold();
+        figures.stall_count = stalls.count;
+        figures.stalled = stalls.total;
+        figures.stall_longest = stalls.longest;
+        figures.waiting_bytes_max = stalls.waiting_bytes_max;
+        if let Some(since) = self.backlogged {
+            figures.backlogged += now.saturating_duration_since(since);
+        }
+        figures
+    }
+}
+
+/// True for what passes by itself.
+fn is_for_later(error: &io::Error) -> bool {
+    matches!(
+        error.kind(),
+        io::ErrorKind::WouldBlock | io::ErrorKind::Interrupted
+    ) || error.raw_os_error() == Some(libc::ENOBUFS)
+}
+
+fn failed(error: &io::Error) -> Ending {
+    Ending::Failed {
+        errno: error.raw_os_error().unwrap_or(0),
+    }
+}

@@ -1,0 +1,367 @@
+//! UDP with kernel stamps. Sending and receiving have a socket each: transmit stamps that nobody
+//! fetched are charged to the *receive* buffer of their socket, so one socket for both goes deaf.
+//! It frames, encrypts and retries nothing.
+
+use std::io;
+use std::net::SocketAddr;
+use std::os::fd::{AsFd, BorrowedFd};
+
+use nix::sys::socket::{setsockopt, sockopt};
+use socket2::{SockAddr, Socket};
+
+pub use super::udp_receiver::UdpReceiver;
+pub use super::udp_socket::{GrantedOptions, UdpError, UdpSettings};
+use super::udp_socket::{bind, granted_options, local_address, open_socket, refuse};
+use super::{DatagramSender, Received, SendRefusal, SenderCounters};
+use hil_net::control::{ControlData, QueueEntry, SCM_WIFI_STATUS};
+use hil_net::radio::{RETURNED_BYTES, RadioLedger, RadioReport};
+use hil_net::timestamping::{
+    MessageReader, Queue, TimestampMode, arm_transmit, int_option, restart_send_count,
+    set_int_option,
+};
+use hil_net::{TransmitStamp, TxToken};
+
+/// `IPV6_MTU` of `linux/in6.h`.
+const IPV6_MTU: i32 = 24;
+/// Entries of the error queue read in one call at most, so that a flood of reports cannot hold
+/// up the sending thread.
+const DRAIN_COUNT_MAX: u32 = 256;
+/// Pending reports that one receive call passes over at most; each costs one system call.
+pub(super) const RECEIVE_ATTEMPT_COUNT_MAX: u32 = 8;
+
+/// The largest packet the path to the peer is known to take.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct PathMtu {
+    /// Bytes of an IP packet with its header.
+    pub packet_bytes: u32,
+    /// Bytes of a datagram's content that fit such a packet, without IP options.
+    pub datagram_bytes: u32,
+    /// The kernel did not say, so this is the size every path must take: 576 bytes for IPv4
+    /// (RFC 1122, 3.3.3), 1280 for IPv6 (RFC 8200, 5).
+    pub is_assumed: bool,
+}
+
+/// The sending socket, connected to the peer.
+#[derive(Debug)]
+pub struct UdpSender {
+    socket: Socket,
+    peer: SocketAddr,
+    reader: MessageReader,
+    counters: SenderCounters,
+    /// The kernel's drop count at the newest reply, modulo 2^32.
+    kernel_drop_count: u32,
+    granted: GrantedOptions,
+    mode: TimestampMode,
+    /// The token of the send that the kernel counts as 0; `None` when its count is unknown.
+    first_token: Option<TxToken>,
+    /// Where the radio is asked.
+    radio: Option<Box<RadioLedger>>,
+}
+
+impl UdpSender {
+    /// Opens and connects the socket; sends nothing.
+    ///
+    /// # Errors
+    /// When the settings contradict themselves or the kernel refuses a step.
+    pub fn open(settings: &UdpSettings) -> Result<Self, UdpError> {
+        Self::open_towards(settings, Some(settings.peer))
+    }
+
+    /// As [`UdpSender::open`], connected to `peer`, or to nobody.
+    pub(super) fn open_towards(
+        settings: &UdpSettings,
+        peer: Option<SocketAddr>,
+    ) -> Result<Self, UdpError> {
+        if let Some(peer) = peer.filter(|peer| peer.is_ipv4() != settings.local.is_ipv4()) {
+            return Err(UdpError::Family {
+                local: settings.local,
+                peer,
+            });
+        }
+        let socket = open_socket(settings)?;
+        let drops = setsockopt(&socket, sockopt::RxqOvfl, &1);
+        refuse("SO_RXQ_OVFL", 1, drops.map_err(io::Error::from))?;
+        bind(&socket, settings.local)?;
+        // Reports of the network go to the error queue, with their reason.
+        let reports = if settings.local.is_ipv4() {
+            setsockopt(&socket, sockopt::Ipv4RecvErr, &true)
+        } else {
+            setsockopt(&socket, sockopt::Ipv6RecvErr, &true)
+        };
+        refuse("IP_RECVERR", true, reports.map_err(io::Error::from))?;
+        if let Some(peer) = peer {
+            let connected = socket.connect(&SockAddr::from(peer));
+            refuse("connect", peer, connected)?;
+        }
+        // Last, so that the kernel's count of sends starts with ours.
+        let armed = arm_transmit(&socket, settings.timestamps);
+        refuse(
+            "SO_TIMESTAMPING",
+            format!("{:?}", settings.timestamps),
+            armed,
+        )?;
+        let mut radio = None;
+        if settings.wants_radio_reports {
+            let asked = set_int_option(&socket, libc::SOL_SOCKET, SCM_WIFI_STATUS, 1);
+            refuse("SO_WIFI_STATUS", 1, asked)?;
+            radio = Some(Box::new(RadioLedger::new()));
+        }
+        Ok(Self {
+            radio,
+            granted: granted_options(&socket, settings)?,
+            socket,
+            peer: settings.peer,
+            reader: MessageReader::new(),
+            counters: SenderCounters::default(),
+            kernel_drop_count: 0,
+            mode: settings.timestamps,
+            first_token: Some(TxToken(0)),
+        })
+    }
+
+    /// What the kernel granted.
+    pub fn granted(&self) -> GrantedOptions {
+        self.granted
+    }
+
+    /// The address the peer sees as the source.
+    ///
+    /// # Errors
+    /// When the kernel does not tell.
+    pub fn local_address(&self) -> io::Result<SocketAddr> {
+        local_address(&self.socket)
+    }
+
+    /// The largest packet the path is known to take now; it can shrink when the network reports
+    /// so, which shows as [`SendRefusal::TooLong`].
+    pub fn path_mtu(&self) -> PathMtu {
+        let (level, name, assumed, header_bytes) = if self.peer.is_ipv4() {
+            (libc::SOL_IP, libc::IP_MTU, 576, 20 + 8)
+        } else {
+            (libc::SOL_IPV6, IPV6_MTU, 1280, 40 + 8)
+        };
+        let known = int_option(&self.socket, level, name).ok();
+        let known = known.and_then(|bytes| u32::try_from(bytes).ok());
+        let known = known.filter(|bytes| *bytes > header_bytes);
+        let packet_bytes = known.unwrap_or(assumed);
+        // The length field of UDP counts its 8 bytes header in 16 bits, that of IPv4 all.
+        let longest = if self.peer.is_ipv4() { 65_507 } else { 65_527 };
+        PathMtu {
+            packet_bytes,
+            datagram_bytes: (packet_bytes - header_bytes).min(longest),
+            is_assumed: known.is_none(),
+        }
+    }
+
+    /// The send that the kernel counts as `id`. Should its count run ahead of ours, a stamp of
+    /// the future shows it and names no send.
+    fn token_of(&self, id: u32) -> Option<TxToken> {
+        let token = self.first_token?.0.wrapping_add(id);
+        let age = sent_modulo(self.counters.sent_count).wrapping_sub(token);
+        (1..=u32::MAX / 2).contains(&age).then_some(TxToken(token))
+    }
+
+    /// Makes both counts agree again after a refusal that may or may not have advanced the
+    /// kernel's: those of a packet filter or a full queueing discipline come after the count,
+    /// all others before. Stamps still pending are given up, as their numbers would now be
+    /// taken for later sends.
+    fn realign_send_count(&mut self) {
+        if self.mode == TimestampMode::Off {
+            return;
+        }
+        while self.next_stamp().is_some() {
+            self.counters.stamp_count -= 1;
+            self.counters.unmatched_stamp_count += 1;
+        }
+        let restarted = restart_send_count(&self.socket, self.mode).is_ok();
+        self.first_token = restarted.then_some(TxToken(sent_modulo(self.counters.sent_count)));
+    }
+
+    /// Matches a radio's report to its send by the packet it brought back.
+    fn absorb_report(&mut self, packet: &[u8], is_acknowledged: bool) {
+        let Some(radio) = &mut self.radio else {
+            self.counters.undecodable_report_count += 1;
+            return;
+        };
+        let matched = radio.settle(packet, is_acknowledged);
+        self.counters.radio_overflow_count = radio.overflow_count;
+        let counter = match matched {
+            None => &mut self.counters.radio_unmatched_count,
+            Some(report) if report.is_acknowledged => &mut self.counters.radio_acknowledged_count,
+            Some(_) => &mut self.counters.radio_unacknowledged_count,
+        };
+        *counter += 1;
+    }
+
+    /// Sorts one entry of the error queue; a stamp of one of our sends is handed on.
+    fn absorb_entry(&mut self, data: &ControlData) -> Option<TransmitStamp> {
+        let entry = data.extended_error.map(|error| error.entry());
+        match entry {
+            Some(QueueEntry::Stamp { id, stage }) => {
+                let Some(token) = self.token_of(id) else {
+                    self.counters.unmatched_stamp_count += 1;
+                    return None;
+                };
+                self.counters.stamp_count += 1;
+                return Some(TransmitStamp {
+                    token,
+                    stage,
+                    stamps: data.stamps,
+                });
+            }
+            Some(QueueEntry::NetworkReport { errno }) => {
+                self.counters.network_report_count += 1;
+                self.counters.newest_report = Some(SendRefusal::from_errno(errno, 0));
+            }
+            Some(QueueEntry::LocalReport { errno }) => {
+                self.counters.local_report_count += 1;
+                self.counters.newest_report = Some(SendRefusal::from_errno(errno, 0));
+            }
+            Some(QueueEntry::Unknown) | None => self.counters.undecodable_report_count += 1,
+        }
+        None
+    }
+}
+
+impl UdpSender {
+    /// Sends to the connected peer, or to `to` when there is none.
+    pub(super) fn send_towards(
+        &mut self,
+        datagram: &[u8],
+        to: Option<&SockAddr>,
+    ) -> Result<TxToken, SendRefusal> {
+        let flags = libc::MSG_DONTWAIT;
+        let sent = match to {
+            None => self.socket.send_with_flags(datagram, flags),
+            Some(to) => self.socket.send_to_with_flags(datagram, to, flags),
+        };
+        match sent {
+            Ok(_) => {
+                let token = TxToken(sent_modulo(self.counters.sent_count));
+                self.counters.sent_count += 1;
+                if let Some(radio) = &mut self.radio {
+                    radio.note(datagram, token);
+                }
+                Ok(token)
+            }
+            Err(error) => {
+                let refusal = SendRefusal::from_io(&error, datagram.len());
+                self.counters.count_refusal(refusal);
+                match refusal {
+                    SendRefusal::QueueFull {
+                        errno: libc::ENOBUFS,
+                    }
+                    | SendRefusal::Other { .. } => self.realign_send_count(),
+                    _ => {}
+                }
+                Err(refusal)
+            }
+        }
+    }
+
+    fn count_drops(&mut self, data: &ControlData) {
+        if let Some(count) = data.drop_count {
+            let new_count = count.wrapping_sub(self.kernel_drop_count);
+            self.counters.kernel_drop_count += u64::from(new_count);
+            self.kernel_drop_count = count;
+        }
+    }
+}
+
+impl DatagramSender for UdpSender {
+    fn send(&mut self, datagram: &[u8]) -> Result<TxToken, SendRefusal> {
+        self.send_towards(datagram, None)
+    }
+
+    fn next_stamp(&mut self) -> Option<TransmitStamp> {
+        let mut packet = [0; RETURNED_BYTES];
+        // Only a radio's reports bring something back.
+        let room = if self.radio.is_some() {
+            packet.len()
+        } else {
+            0
+        };
+        for _ in 0..DRAIN_COUNT_MAX {
+            match self
+                .reader
+                .read(self.socket.as_fd(), &mut packet[..room], Queue::Errors)
+            {
+                Ok(Some(message)) => {
+                    let data = ControlData::decode(self.reader.control());
+                    if let Some(is_acknowledged) = data.is_acknowledged {
+                        self.absorb_report(&packet[..message.length_bytes], is_acknowledged);
+                    } else if let Some(stamp) = self.absorb_entry(&data) {
+                        return Some(stamp);
+                    }
+                }
+                Ok(None) => return None,
+                Err(_) => {
+                    self.counters.undecodable_report_count += 1;
+                    return None;
+                }
+            }
+        }
+        None
+    }
+
+    fn next_radio_report(&mut self) -> Option<RadioReport> {
+        self.radio.as_mut()?.take()
+    }
+
+    fn receive(&mut self, buffer: &mut [u8]) -> io::Result<Option<Received>> {
+        for _ in 0..RECEIVE_ATTEMPT_COUNT_MAX {
+            match self
+                .reader
+                .read(self.socket.as_fd(), buffer, Queue::Arrivals)
+            {
+                Ok(Some(message)) => {
+                    let data = ControlData::decode(self.reader.control());
+                    self.count_drops(&data);
+                    self.counters.reply_count += 1;
+                    return Ok(Some(Received {
+                        length_bytes: message.length_bytes,
+                        is_truncated: message.is_truncated,
+                        source: message.source.unwrap_or(self.peer),
+                        stamps: data.stamps,
+                        emulated: None,
+                    }));
+                }
+                Ok(None) => return Ok(None),
+                // A report about an earlier datagram, handed to whichever call comes first. It
+                // stays in the error queue as well, where it is counted.
+                Err(error) if is_broken(&error) => return Err(error),
+                Err(error) => {
+                    self.counters.newest_report = Some(SendRefusal::from_io(&error, 0));
+                }
+            }
+        }
+        Ok(None)
+    }
+
+    fn poll_fd(&self) -> Option<BorrowedFd<'_>> {
+        Some(self.socket.as_fd())
+    }
+
+    fn counters(&self) -> SenderCounters {
+        self.counters
+    }
+}
+
+/// True for errors of the call itself; every other one is a report of the network.
+fn is_broken(error: &io::Error) -> bool {
+    let ours = [
+        libc::EBADF,
+        libc::EFAULT,
+        libc::EINVAL,
+        libc::ENOTSOCK,
+        libc::ENOMEM,
+    ];
+    error
+        .raw_os_error()
+        .is_none_or(|errno| ours.contains(&errno))
+}
+
+/// The number of the next send as the kernel counts it, modulo 2^32.
+fn sent_modulo(sent_count: u64) -> u32 {
+    u32::try_from(sent_count & u64::from(u32::MAX)).expect("masked to 32 bits")
+}

@@ -1,0 +1,401 @@
+//! The latency account of one channel: what became of every message, where its time went, and
+//! whether the parts add up to the whole. It reads records, not files, and it knows nothing of
+//! sockets or shared memory.
+//!
+//! Each message goes *published → taken by gateway → handed to kernel → TX stamp → RX stamp →
+//! received by gateway → forwarded → taken by consumer*. On one clock the wire segment is the
+//! difference of the two raw kernel stamps, while the segments beside it are converted to the
+//! monotonic clock with the offset each gateway read at its own time. So the sum of segments
+//! equals end-to-end only when records, stamps and both offsets agree: the closing check can
+//! fail, which is what makes it worth printing.
+//!
+//! Between hosts whose clocks are only aligned, raw stamps do not compare: the wire segment is of
+//! converted ones, in which the offsets of the gateways cancel out of the sum. The check proves
+//! less then: that records belong together, that no stage lies before its predecessor by more than
+//! the alignment's bound, and that no clock stepped while a message was under way. It cannot prove
+//! the alignment; the bound beside each figure that crosses hosts says how far that may be off.
+#![forbid(unsafe_code)]
+
+pub mod card_clock;
+mod fate;
+mod figures;
+mod follow_up;
+mod gaps;
+mod handed;
+mod join;
+pub mod network;
+mod outage;
+mod passage;
+pub mod radio;
+#[cfg(test)]
+mod random_fates;
+mod segments;
+mod source;
+mod stage;
+mod story;
+pub mod synthetic;
+#[cfg(test)]
+mod tests;
+
+use core::time::Duration;
+
+pub use figures::{
+    BurstCount, ChannelAccount, Closing, ClosingFigures, Coverage, EndToEnd, FateCounts, Gap, Gaps,
+    InterruptionFigures, SegmentFigures, StampCoverage,
+};
+pub use join::{Joined, Key};
+pub use outage::{
+    Foregoing, Happening, LongestOutage, OUTAGE_EFFECT_MAX, Outage, OutageClass, OutageFigures,
+    OutageFinder, Standing, foregoing, outages,
+};
+pub use passage::passages;
+pub use source::RecordSource;
+pub use source::each;
+pub use stage::{MessageFate, Side, Stage};
+pub use story::{MessageStory, stories};
+
+use hil_clock::{ClockMap, ClockSettings};
+use hil_core::random::RandomStream;
+use hil_core::record::{EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, TakenRecord};
+use hil_core::time::{Alignment, Instant, RemoteInstant};
+use hil_stats::histogram::LatencyHistogram;
+
+/// Largest difference between end-to-end and the sum of segments for a message that closes.
+pub const RESIDUAL_LIMIT_NS: i64 = 1_000;
+
+/// How far a stage may lie before its predecessor: two clocks of one host are read as a pair
+/// with an error below this.
+pub const ORDER_TOLERANCE_NS: i64 = 1_000;
+
+/// How long a message may travel before it counts as lost instead of in flight, unless the
+/// caller knows better.
+pub const FLIGHT_TIME_MAX: Duration = Duration::from_millis(50);
+
+/// The record files of one channel. `None` means the file is not at hand, which differs from an
+/// empty one: nothing is concluded from the absence of a record in an absent file.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct ChannelRecords<'a> {
+    /// The producer's.
+    pub published: Option<&'a dyn RecordSource<PublishedRecord>>,
+    /// The sending gateway's.
+    pub egress: Option<&'a dyn RecordSource<EgressRecord>>,
+    /// The receiving gateway's.
+    pub ingress: Option<&'a dyn RecordSource<IngressRecord>>,
+    /// Transmit stamps the sender reported to the receiver.
+    pub follow_up: Option<&'a dyn RecordSource<FollowUpRecord>>,
+    /// The consumer's.
+    pub taken: Option<&'a dyn RecordSource<TakenRecord>>,
+}
+
+impl ChannelRecords<'_> {
+    /// Those that a channel carried so can have.
+    fn on(self, path: ChannelPath<'_>) -> Self {
+        if path.is_gateway() {
+            return self;
+        }
+        Self {
+            egress: None,
+            ingress: None,
+            follow_up: None,
+            ..self
+        }
+    }
+}
+
+/// How a channel gets from its producer to its consumer.
+#[derive(Debug, Clone, Copy)]
+pub enum ChannelPath<'a> {
+    /// Shared memory of one host.
+    SharedMemory,
+    /// A gateway pair.
+    Gateway {
+        /// From the producer's host clock to the consumer's; [`Alignment::SAME_CLOCK`] on one
+        /// machine, `None` when the clocks are not aligned.
+        alignment: Option<Alignment>,
+    },
+    /// A gateway pair between hosts whose clocks are related differently at each instant.
+    Mapped {
+        /// From the producer's host clock to the consumer's.
+        map: &'a ClockMap,
+    },
+}
+
+impl ChannelPath<'_> {
+    /// An instant of the producer's host on the clock of the consumer's, with the largest error of
+    /// the conversion in nanoseconds; `None` when the clocks are not aligned, or not then.
+    pub fn localise(self, remote: RemoteInstant) -> Option<(Instant, u64)> {
+        match self {
+            Self::SharedMemory => Some((Alignment::SAME_CLOCK.localise(remote), 0)),
+            Self::Gateway { alignment } => {
+                let alignment = alignment?;
+                Some((alignment.localise(remote), alignment.bound_ns))
+            }
+            Self::Mapped { map } => {
+                let localised = map.localise(remote)?;
+                Some((localised.instant, localised.bound_ns()))
+            }
+        }
+    }
+
+    /// As [`Self::localise`], and further outside the exchanges too; see
+    /// [`ClockMap::localise_beyond`].
+    pub fn localise_beyond(self, remote: RemoteInstant) -> Option<(Instant, u64)> {
+        match self {
+            Self::Mapped { map } => {
+                let localised = map.localise_beyond(remote)?;
+                Some((localised.instant, localised.bound_ns()))
+            }
+            Self::SharedMemory | Self::Gateway { .. } => self.localise(remote),
+        }
+    }
+
+    /// As [`Self::localise`], and further before the first exchange too, with true beside those that only
+    /// this converts; see [`ClockMap::localise_early`].
+    pub fn localise_early(self, remote: RemoteInstant) -> Option<(Instant, u64, bool)> {
+        match self {
+            Self::Mapped { map } => {
+                let (localised, is_early) = map.localise_early(remote)?;
+                Some((localised.instant, localised.bound_ns(), is_early))
+            }
+            Self::SharedMemory | Self::Gateway { .. } => {
+                let (at, bound_ns) = self.localise(remote)?;
+                Some((at, bound_ns, false))
+            }
+        }
+    }
+
+    /// An instant of the consumer's host on the clock of the producer's, with the largest error.
+    pub fn to_remote(self, local: Instant) -> Option<(RemoteInstant, u64)> {
+        let shifted = |alignment: Alignment| {
+            let remote_ns = local.as_ns().saturating_sub(alignment.offset_ns);
+            (RemoteInstant::from_ns(remote_ns), alignment.bound_ns)
+        };
+        match self {
+            Self::SharedMemory => Some(shifted(Alignment::SAME_CLOCK)),
+            Self::Gateway { alignment } => alignment.map(shifted),
+            Self::Mapped { map } => map.to_remote(local),
+        }
+    }
+
+    /// How far the two hosts' clocks may have moved against each other between two instants of the
+    /// producer's, by the drift allowance of [`ClockSettings`], which needs no alignment; 0 on one
+    /// clock, `None` across a noticed step.
+    pub fn drift_ns(self, from: RemoteInstant, until: RemoteInstant) -> Option<u64> {
+        match self {
+            _ if self.has_one_clock() => Some(0),
+            Self::Mapped { map } => map.drift_ns(from, until),
+            Self::SharedMemory | Self::Gateway { .. } => {
+                let span_ns = until.as_ns().saturating_sub(from.as_ns());
+                Some(ClockSettings::default().drift_ns(span_ns).unsigned_abs())
+            }
+        }
+    }
+
+    /// True when instants of the two hosts compare at all.
+    pub const fn is_aligned(self) -> bool {
+        match self {
+            Self::SharedMemory => true,
+            Self::Gateway { alignment } => alignment.is_some(),
+            Self::Mapped { map } => map.figures().bound.is_some(),
+        }
+    }
+
+    /// True when both ends read one clock, so that raw kernel stamps compare.
+    pub fn has_one_clock(self) -> bool {
+        match self {
+            Self::SharedMemory => true,
+            Self::Gateway { alignment } => alignment == Some(Alignment::SAME_CLOCK),
+            Self::Mapped { .. } => false,
+        }
+    }
+
+    const fn is_gateway(self) -> bool {
+        !matches!(self, Self::SharedMemory)
+    }
+}
+
+/// A process on a channel's way.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum PathProcess {
+    /// Publishes the messages.
+    Producer,
+    /// Takes them to the network, on the producer's host.
+    SendingGateway,
+    /// Takes them from the network, on the consumer's host.
+    ReceivingGateway,
+    /// Takes the messages.
+    Consumer,
+}
+
+impl PathProcess {
+    /// The host it runs on.
+    pub const fn side(self) -> Side {
+        match self {
+            Self::Producer | Self::SendingGateway => Side::Producer,
+            Self::ReceivingGateway | Self::Consumer => Side::Consumer,
+        }
+    }
+}
+
+/// A time during which a process on the way was down.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Interruption {
+    /// Its name in the topology.
+    pub process: String,
+    /// Its place on this channel's way.
+    pub place: PathProcess,
+    /// When it went down, on the clock of its own host.
+    pub from: Instant,
+    /// When it worked again, or the end of the run, on the clock of its own host.
+    pub until: Instant,
+    /// Why, e.g. `killed by signal 9`.
+    pub cause: String,
+}
+
+/// The run on one host's clock.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct RunSpan {
+    /// First instant of the run.
+    pub start: Instant,
+    /// Last instant of the run.
+    pub end: Instant,
+}
+
+/// What the records alone do not say.
+#[derive(Debug, Clone, Copy)]
+pub struct AccountContext<'a> {
+    /// How the channel is carried.
+    pub path: ChannelPath<'a>,
+    /// Interruptions of processes on this channel's way.
+    pub interruptions: &'a [Interruption],
+    /// The run on the producer's host clock, if known.
+    pub producer_run: Option<RunSpan>,
+    /// The run on the consumer's host clock, if known.
+    pub consumer_run: Option<RunSpan>,
+    /// Longest time a message may travel; see [`FLIGHT_TIME_MAX`]. Messages seen last within
+    /// this time of the end of the run count as in flight, and those seen last within this time
+    /// before an interruption count as lost in it.
+    pub flight_time_max: Duration,
+    /// True when both network cards take their stamps from one hardware clock.
+    pub cards_share_clock: bool,
+    /// Round trips of the gateways' clock exchange, nanoseconds.
+    pub round_trips_ns: &'a [i64],
+    /// Seed of the run, for the bootstrap intervals.
+    pub seed: u64,
+}
+
+impl<'a> AccountContext<'a> {
+    /// The context of a channel about whose run nothing else is known.
+    pub const fn new(path: ChannelPath<'a>) -> Self {
+        Self {
+            path,
+            interruptions: &[],
+            producer_run: None,
+            consumer_run: None,
+            flight_time_max: FLIGHT_TIME_MAX,
+            cards_share_clock: false,
+            round_trips_ns: &[],
+            seed: 0,
+        }
+    }
+
+    /// The same with these interruptions.
+    #[must_use]
+    pub const fn with_interruptions(mut self, interruptions: &'a [Interruption]) -> Self {
+        self.interruptions = interruptions;
+        self
+    }
+}
+
+/// Draws up the account of one channel. Time grows with the number of records; so does memory, by the
+/// few bytes a message that exact quantiles take, unless the source holds its records itself.
+///
+/// # Panics
+/// Never for any records; it asserts its own invariant, that the fates sum to the published
+/// count.
+pub fn account(records: &ChannelRecords<'_>, context: &AccountContext<'_>) -> ChannelAccount {
+    let records = records.on(context.path);
+    let join = join::Join::new(&records);
+    let producer_restart_count = join.epoch_count().saturating_sub(1);
+    let mut judge = fate::Judge::new(&records, context, &join);
+    let mut book = segments::SegmentBook::new(&records, context);
+    let mut bursts = gaps::Bursts::default();
+    let mut fates = FateCounts::default();
+    let mut published_count = 0_u64;
+    for joined in join {
+        let fate = judge.judge(&joined);
+        fates.add(fate, joined.count);
+        bursts.count(joined.key, fate, joined.count);
+        book.count(&joined);
+        published_count = published_count.saturating_add(joined.count);
+    }
+    assert_eq!(
+        fates.total(),
+        published_count,
+        "every published message has exactly one fate"
+    );
+    let (gaps, gap_of_interruption) = gaps::gaps(&records, context);
+    let flags = [
+        IngressRecord::REORDERED,
+        IngressRecord::DUPLICATE,
+        IngressRecord::LATE,
+    ];
+    let [reordered_count, duplicated_count, late_count] = flag_counts(&records, flags);
+    let mut random = RandomStream::new(context.seed, "measure.account.bootstrap");
+    ChannelAccount {
+        published_count,
+        published_unrecorded_count: records
+            .published
+            .map(|published| published_count.saturating_sub(published.count())),
+        producer_restart_count,
+        fates,
+        reordered_count,
+        duplicated_count,
+        late_count,
+        segments: book.segments(),
+        hardware_wire: book.hardware_wire(),
+        end_to_end: book.end_to_end(&mut random),
+        closing: book.closing(),
+        coverage: book.coverage(),
+        round_trip: round_trip(context),
+        loss_bursts: bursts.finish(),
+        gaps,
+        interruptions: judge.interruptions(&gap_of_interruption),
+    }
+}
+
+/// Hands every message of a channel to `take`, in the order of the producer's starts and numbers: what
+/// is recorded of it, what became of it, and the interruption that cost it, by its place in the context.
+/// A judge remembers the message before, so it sees all of them, whatever the caller wants.
+pub fn each_judged(
+    records: &ChannelRecords<'_>,
+    context: &AccountContext<'_>,
+    mut take: impl FnMut(&Joined, MessageFate, Option<usize>),
+) {
+    let records = records.on(context.path);
+    let join = join::Join::new(&records);
+    let mut judge = fate::Judge::new(&records, context, &join);
+    for joined in join {
+        let fate = judge.judge(&joined);
+        take(&joined, fate, judge.last_interruption());
+    }
+}
+
+/// How many arrivals have each of `flags`; `None` without the receiving gateway's records.
+fn flag_counts<const N: usize>(records: &ChannelRecords<'_>, flags: [u32; N]) -> [Option<u64>; N] {
+    let mut counts = [records.ingress.map(|_| 0_u64); N];
+    for record in each(records.ingress) {
+        for (count, flag) in counts.iter_mut().flatten().zip(flags) {
+            *count += u64::from(record.flags & flag != 0);
+        }
+    }
+    counts
+}
+
+fn round_trip(context: &AccountContext<'_>) -> hil_stats::histogram::Distribution {
+    let mut histogram = LatencyHistogram::default();
+    for round_trip_ns in context.round_trips_ns {
+        histogram.record(*round_trip_ns);
+    }
+    histogram.distribution("no clock exchange took place")
+}

@@ -1,0 +1,270 @@
+//! Losses of the network: their share with an interval that knows of bursts, how many came in a
+//! row, bursts and gaps as in RFC 3611, and the longest time without a message. Losses of a host
+//! neither count nor interrupt anything here.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use super::{Crossing, Figure, Passages};
+use crate::BurstCount;
+use hil_stats::statistics::{CONFIDENCE, Interval, wilson, wilson_of};
+
+/// Messages received in a row that end a burst (`Gmin` of RFC 3611, section 4.7.2).
+pub const BURST_GAP_MIN: u64 = 16;
+
+/// Fewer runs of losses than this, or blocks, say too little about their own scatter.
+const RUN_COUNT_MIN: usize = 10;
+
+/// Losses of the network.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct LossFigures {
+    /// Messages lost.
+    pub lost_count: u64,
+    /// Of so many handed to the network.
+    pub of_count: u64,
+    /// Their share.
+    pub ratio: f64,
+    /// 95 % interval of the share: Wilson's on [`LossFigures::effective_count`].
+    pub interval: Interval,
+    /// How many independent messages would scatter as much as these did: all of them when losses
+    /// are independent, far fewer when they come in bursts. The variance is the larger one of two
+    /// estimates: between blocks of the square root of the count, and between cycles of a run of
+    /// losses and the run of arrivals after it; with fewer than ten runs, the second one takes
+    /// each run as one event of a Poisson process.
+    pub effective_count: f64,
+    /// 95 % interval if losses were independent (Wilson): too narrow when they come in bursts.
+    pub independent_interval: Interval,
+    /// How often how many were lost in a row.
+    pub runs: Vec<BurstCount>,
+    /// Bursts of losses and the gaps between them; `None` without a burst.
+    pub bursts: Option<BurstFigures>,
+    /// The longest time without a message that got through.
+    pub longest: Option<LongestLoss>,
+}
+
+/// Bursts: from a lost message to a lost message with fewer than [`BURST_GAP_MIN`] received in a
+/// row between, at least two lost; all the rest is gaps (RFC 3611, section 4.7.2).
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct BurstFigures {
+    /// Bursts.
+    pub count: u64,
+    /// Mean length, messages.
+    pub length_mean: f64,
+    /// Share of the messages in bursts that were lost (burst density).
+    pub loss_ratio: f64,
+    /// Mean length of what is between bursts, messages.
+    pub gap_length_mean: f64,
+    /// Share of the messages between bursts that were lost (gap density).
+    pub gap_loss_ratio: f64,
+}
+
+/// A time without a message that got through.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct LongestLoss {
+    /// The first lost message was handed over so long after the start of the run, or on the
+    /// producer's clock when that is unknown.
+    pub start_ns: i64,
+    /// To the next message that arrived, or to the end of the run.
+    pub length_ns: i64,
+    /// Messages lost in it.
+    pub lost_count: u64,
+    /// True when it lasted to the end of the run.
+    pub is_open: bool,
+}
+
+/// Some losses with no arrival between, in order of their numbers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct LossRun {
+    /// Place of the first among the messages handed to the network.
+    pub(super) place: u64,
+    pub(super) lost_count: u64,
+    pub(super) from_ns: Option<i64>,
+    /// When the next one that arrived was handed over.
+    pub(super) until_ns: Option<i64>,
+}
+
+/// Runs of losses, and how many messages the network was handed.
+pub(super) fn loss_runs<P: Passages + ?Sized>(passages: &P) -> (Vec<LossRun>, u64) {
+    let mut runs: Vec<LossRun> = Vec::new();
+    let (mut is_open, mut place) = (false, 0_u64);
+    for one in passages.each() {
+        match one.crossing {
+            Crossing::Arrived => {
+                if core::mem::take(&mut is_open)
+                    && let Some(run) = runs.last_mut()
+                {
+                    run.until_ns = one.offered_ns;
+                }
+            }
+            Crossing::LostByNetwork => {
+                if !core::mem::replace(&mut is_open, true) {
+                    runs.push(LossRun {
+                        place,
+                        lost_count: 0,
+                        from_ns: None,
+                        until_ns: None,
+                    });
+                }
+                if let Some(run) = runs.last_mut() {
+                    run.lost_count = run.lost_count.saturating_add(one.count);
+                    run.from_ns = run.from_ns.or(one.offered_ns);
+                }
+            }
+            Crossing::LostByHost | Crossing::Unknown => continue,
+        }
+        place = place.saturating_add(one.count);
+    }
+    (runs, place)
+}
+
+/// Runs of `runs` that belong to one burst each, single losses included.
+pub(super) fn clusters(runs: &[LossRun]) -> impl Iterator<Item = &[LossRun]> {
+    runs.chunk_by(|before, after| {
+        after
+            .place
+            .saturating_sub(before.place.saturating_add(before.lost_count))
+            < BURST_GAP_MIN
+    })
+}
+
+pub(super) fn losses<P: Passages + ?Sized>(
+    passages: &P,
+    run_ns: Option<(i64, i64)>,
+) -> Figure<LossFigures> {
+    let (runs, of_count) = loss_runs(passages);
+    let lost_count = runs
+        .iter()
+        .fold(0_u64, |sum, run| sum.saturating_add(run.lost_count));
+    let Some(independent_interval) = wilson(lost_count, of_count, CONFIDENCE) else {
+        return Figure::unavailable("no message is known to have been lost or to have arrived");
+    };
+    let ratio = lost_count as f64 / of_count as f64;
+    let effective_count = effective_count(&runs, of_count, ratio);
+    let mut lengths: BTreeMap<u64, u64> = BTreeMap::new();
+    for run in &runs {
+        *lengths.entry(run.lost_count).or_insert(0) += 1;
+    }
+    let lengths = lengths.into_iter();
+    Figure::Measured(LossFigures {
+        lost_count,
+        of_count,
+        ratio,
+        interval: if lost_count == 0 {
+            independent_interval
+        } else {
+            wilson_of(ratio, effective_count, CONFIDENCE)
+        },
+        effective_count,
+        independent_interval,
+        runs: lengths
+            .map(|(length_messages, count)| BurstCount {
+                length_messages,
+                count,
+            })
+            .collect(),
+        bursts: bursts(&runs, of_count, lost_count),
+        longest: longest(&runs, run_ns),
+    })
+}
+
+/// See [`LossFigures::effective_count`].
+fn effective_count(runs: &[LossRun], of_count: u64, ratio: f64) -> f64 {
+    let n = of_count as f64;
+    if runs.is_empty() {
+        return n;
+    }
+    let variance =
+        variance_between_runs(runs, n, ratio).max(variance_between_blocks(runs, of_count));
+    (n * n * ratio * (1.0 - ratio) / variance).clamp(1.0, n.max(1.0))
+}
+
+/// Variance of the number of losses, from the scatter of cycles (renewal reward: Cox 1962, section
+/// 8.2): a run of losses of length L and arrivals G after it contribute `L - p (L + G)`.
+fn variance_between_runs(runs: &[LossRun], n: f64, ratio: f64) -> f64 {
+    let length = |run: &LossRun| run.lost_count as f64;
+    if runs.len() < RUN_COUNT_MIN {
+        return runs.iter().map(|run| length(run).powi(2)).sum();
+    }
+    let cycles = runs.windows(2).map(|pair| {
+        let whole = pair[1].place.saturating_sub(pair[0].place) as f64;
+        (length(&pair[0]) - ratio * whole).powi(2)
+    });
+    let count = (runs.len() - 1) as f64;
+    let per_cycle = cycles.sum::<f64>() / count;
+    // What lies before the first and after the last run belongs to no cycle.
+    let covered = runs.last().map_or(0, |run| run.place) - runs[0].place;
+    per_cycle * count * (n / (covered as f64).max(1.0))
+}
+
+/// Variance of the number of losses, from the scatter of their numbers in equal blocks.
+fn variance_between_blocks(runs: &[LossRun], of_count: u64) -> f64 {
+    let length = of_count.isqrt().max(1);
+    let block_count = of_count / length;
+    let Ok(size) = usize::try_from(block_count) else {
+        return 0.0;
+    };
+    if size < RUN_COUNT_MIN {
+        return 0.0;
+    }
+    let mut sums = vec![0.0_f64; size];
+    for run in runs {
+        let (mut at, mut left) = (run.place, run.lost_count);
+        while left > 0 {
+            let index = at / length;
+            let here = left.min((index + 1) * length - at);
+            if let Some(sum) = usize::try_from(index)
+                .ok()
+                .and_then(|index| sums.get_mut(index))
+            {
+                *sum += here as f64;
+            }
+            at += here;
+            left -= here;
+        }
+    }
+    let m = block_count as f64;
+    let mean = sums.iter().sum::<f64>() / m;
+    let scatter = sums.iter().map(|sum| (sum - mean).powi(2)).sum::<f64>() / (m - 1.0);
+    scatter * of_count as f64 / length as f64
+}
+
+fn bursts(runs: &[LossRun], of_count: u64, lost_count: u64) -> Option<BurstFigures> {
+    let (mut count, mut length, mut lost_in_bursts) = (0_u64, 0_u64, 0_u64);
+    for cluster in clusters(runs) {
+        let lost_here: u64 = cluster.iter().map(|run| run.lost_count).sum();
+        let (first, last) = cluster.first().zip(cluster.last())?;
+        if lost_here < 2 {
+            continue;
+        }
+        count += 1;
+        lost_in_bursts += lost_here;
+        length += last.place + last.lost_count - first.place;
+    }
+    let rest = of_count.saturating_sub(length) as f64;
+    (count > 0).then(|| BurstFigures {
+        count,
+        length_mean: length as f64 / count as f64,
+        loss_ratio: lost_in_bursts as f64 / length as f64,
+        gap_length_mean: rest / count as f64,
+        gap_loss_ratio: if rest > 0.0 {
+            lost_count.saturating_sub(lost_in_bursts) as f64 / rest
+        } else {
+            0.0
+        },
+    })
+}
+
+fn longest(runs: &[LossRun], run_ns: Option<(i64, i64)>) -> Option<LongestLoss> {
+    let (start_ns, end_ns) = run_ns.map_or((0, None), |(start, end)| (start, Some(end)));
+    let all = runs.iter().filter_map(|run| {
+        let from_ns = run.from_ns?;
+        Some(LongestLoss {
+            start_ns: from_ns.saturating_sub(start_ns),
+            length_ns: run.until_ns.or(end_ns)?.saturating_sub(from_ns).max(0),
+            lost_count: run.lost_count,
+            is_open: run.until_ns.is_none(),
+        })
+    });
+    all.max_by_key(|one| one.length_ns)
+}

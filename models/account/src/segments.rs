@@ -1,0 +1,433 @@
+//! Where the time of each message went, and whether the parts add up. It judges no fate: see
+//! [`super::fate`].
+
+use super::figures::{Closing, ClosingFigures, Coverage, EndToEnd, SegmentFigures, StampCoverage};
+use super::join::Joined;
+use super::stage::{Side, Stage};
+use super::{AccountContext, ChannelPath, ChannelRecords, ORDER_TOLERANCE_NS, RESIDUAL_LIMIT_NS};
+use hil_core::random::RandomStream;
+use hil_core::record::EgressRecord;
+use hil_core::record::stamp;
+use hil_core::time::RemoteInstant;
+use hil_stats::bounds::Bounds;
+use hil_stats::histogram::{Distribution, LatencyHistogram};
+use hil_stats::resampling::BlockResampling;
+use hil_stats::samples::Samples;
+use hil_stats::statistics::CONFIDENCE;
+
+pub(super) const NOT_ALIGNED: &str = "clocks not aligned";
+const NO_CONSUMER: &str = "the consumer's records are not at hand";
+
+/// One stage of one message.
+#[derive(Debug, Clone, Copy)]
+struct Mark {
+    stage: Stage,
+    /// On the monotonic clock of the stage's own host.
+    host_ns: i64,
+    /// The kernel's own stamp, on the host's real-time clock.
+    raw_ns: Option<i64>,
+}
+
+/// The marks of one message in the order of the chain.
+struct Timeline {
+    marks: [Option<Mark>; Stage::CHAIN.len()],
+}
+
+impl Timeline {
+    /// A direct channel has no stages between its ends, whatever a record claims.
+    fn of(joined: &Joined, is_gateway: bool) -> Self {
+        let (egress, ingress, taken) = (joined.egress, joined.ingress, joined.taken);
+        let published_ns = joined
+            .published
+            .and_then(|record| stamp(record.published_ns))
+            .or_else(|| stamp(egress?.published_ns))
+            .or_else(|| stamp(ingress?.published_ns))
+            .or_else(|| stamp(taken?.published_ns));
+        let sender_handed_ns = ingress.and_then(|record| stamp(record.handed_ns));
+        let handed_ns = egress
+            .and_then(|record| stamp(record.handed_ns))
+            .or(sender_handed_ns);
+        let forwarded_ns = ingress
+            .and_then(|record| stamp(record.forwarded_ns))
+            .or_else(|| stamp(taken?.forwarded_ns))
+            .filter(|_| is_gateway);
+        let plain = |stage, ns: Option<i64>| {
+            ns.map(|host_ns| Mark {
+                stage,
+                host_ns,
+                raw_ns: None,
+            })
+        };
+        let kernel = |stage, raw_ns, offset_ns| {
+            let (raw_ns, offset_ns) = (stamp(raw_ns)?, stamp(offset_ns)?);
+            let host_ns = raw_ns.saturating_sub(offset_ns);
+            Some(Mark {
+                stage,
+                host_ns,
+                raw_ns: Some(raw_ns),
+            })
+        };
+        // A follow-up is a difference on the sender's host, so it needs no real-time clock.
+        let followed_up = || Some(sender_handed_ns?.saturating_add(joined.handed_to_tx_ns?));
+        let transmitted = egress
+            .and_then(|e| kernel(Stage::TxSoftware, e.tx_software_ns, e.realtime_offset_ns))
+            .or_else(|| plain(Stage::TxSoftware, followed_up()));
+        let marks = [
+            plain(Stage::Published, published_ns),
+            plain(
+                Stage::TakenByGateway,
+                egress.and_then(|record| stamp(record.taken_ns)),
+            ),
+            plain(Stage::HandedToKernel, handed_ns),
+            transmitted,
+            ingress.and_then(|i| kernel(Stage::RxSoftware, i.rx_software_ns, i.realtime_offset_ns)),
+            plain(
+                Stage::Received,
+                ingress.and_then(|record| stamp(record.received_ns)),
+            ),
+            plain(Stage::Forwarded, forwarded_ns),
+            plain(
+                Stage::Taken,
+                taken.and_then(|record| stamp(record.taken_ns)),
+            ),
+        ];
+        Self { marks }
+    }
+
+    fn pairs(&self) -> impl Iterator<Item = (Mark, Mark)> + '_ {
+        let present = self.marks.iter().flatten().copied();
+        present.clone().zip(present.skip(1))
+    }
+}
+
+/// Collects segments, closing and coverage over the messages of a channel.
+#[derive(Debug)]
+pub(super) struct SegmentBook<'a> {
+    files: ChannelRecords<'a>,
+    is_gateway: bool,
+    path: ChannelPath<'a>,
+    cards_share_clock: bool,
+    /// By first and last stage of the segment.
+    segments: Vec<Option<LatencyHistogram>>,
+    /// Of the segments that cross from host to host: how far each length may be off.
+    bounds_ns: Vec<Bounds>,
+    mark_counts: [u64; Stage::COUNT],
+    hardware: LatencyHistogram,
+    end_to_end: LatencyHistogram,
+    end_to_end_ns: Samples,
+    end_to_end_bounds_ns: Bounds,
+    residual: LatencyHistogram,
+    closing: ClosingFigures,
+    coverage: StampCoverage,
+}
+
+impl<'a> SegmentBook<'a> {
+    pub(super) fn new(records: &ChannelRecords<'a>, context: &AccountContext<'a>) -> Self {
+        let covers = |is_known: bool| is_known.then(Coverage::default);
+        let (egress, ingress) = (records.egress.is_some(), records.ingress.is_some());
+        Self {
+            files: *records,
+            is_gateway: context.path.is_gateway(),
+            path: context.path,
+            cards_share_clock: context.cards_share_clock,
+            segments: vec![None; Stage::COUNT * Stage::COUNT],
+            bounds_ns: vec![Bounds::default(); Stage::COUNT * Stage::COUNT],
+            mark_counts: [0; Stage::COUNT],
+            hardware: LatencyHistogram::default(),
+            end_to_end: LatencyHistogram::default(),
+            end_to_end_ns: Samples::default(),
+            end_to_end_bounds_ns: Bounds::default(),
+            residual: LatencyHistogram::default(),
+            closing: ClosingFigures {
+                checked_count: 0,
+                closed_count: 0,
+                closed_combined_count: 0,
+                missing_stage_count: 0,
+                negative_segment_count: 0,
+                residual_count: 0,
+                unaligned_count: 0,
+                is_converted: !context.path.has_one_clock(),
+                residual_limit_ns: RESIDUAL_LIMIT_NS,
+                residual: Distribution::unavailable("no message was taken"),
+            },
+            coverage: StampCoverage {
+                tx_software: covers(egress || (ingress && records.follow_up.is_some())),
+                tx_hardware: covers(egress),
+                rx_software: covers(ingress),
+                rx_hardware: covers(ingress),
+            },
+        }
+    }
+
+    /// Counts one message. Segments are of taken messages, so that they belong to the same
+    /// messages as end-to-end; of all messages when the consumer's records are not at hand.
+    pub(super) fn count(&mut self, joined: &Joined) {
+        self.cover(joined);
+        if self.files.taken.is_some() && joined.taken.is_none() {
+            return;
+        }
+        let timeline = Timeline::of(joined, self.is_gateway);
+        let (mut sum_ns, mut is_ordered) = (0_i64, true);
+        for mark in timeline.marks.iter().flatten() {
+            self.mark_counts[mark.stage.index()] += 1;
+        }
+        for (from, to) in timeline.pairs() {
+            let Some((length_ns, bound_ns)) = self.difference(from, to) else {
+                continue;
+            };
+            let cell = from.stage.index() * Stage::COUNT + to.stage.index();
+            let histogram = self.segments[cell].get_or_insert_with(LatencyHistogram::default);
+            histogram.record(length_ns);
+            sum_ns = sum_ns.saturating_add(length_ns);
+            if from.stage.side() != to.stage.side() {
+                self.bounds_ns[cell].push(bound_ns);
+            }
+            is_ordered &= length_ns >= -ORDER_TOLERANCE_NS.saturating_add_unsigned(bound_ns);
+        }
+        self.count_hardware(joined);
+        self.close(joined, &timeline, (sum_ns, is_ordered));
+    }
+
+    /// A length and how far it may be off. On one clock, two kernel stamps are compared raw, so
+    /// that an error in either host's offset shows as a residual instead of cancelling out.
+    fn difference(&self, from: Mark, to: Mark) -> Option<(i64, u64)> {
+        if from.stage.side() == to.stage.side() {
+            return Some((to.host_ns.saturating_sub(from.host_ns), 0));
+        }
+        if self.path.has_one_clock()
+            && let Some((sent_ns, received_ns)) = from.raw_ns.zip(to.raw_ns)
+        {
+            return Some((received_ns.saturating_sub(sent_ns), 0));
+        }
+        let remote = RemoteInstant::from_ns(from.host_ns);
+        let (local, bound_ns) = self.path.localise(remote)?;
+        Some((to.host_ns.saturating_sub(local.as_ns()), bound_ns))
+    }
+
+    fn close(&mut self, joined: &Joined, timeline: &Timeline, (sum_ns, is_ordered): (i64, bool)) {
+        let Some(taken) = joined.taken.filter(|_| self.path.is_aligned()) else {
+            return;
+        };
+        let published = stamp(taken.published_ns)
+            .map(|published_ns| self.path.localise(RemoteInstant::from_ns(published_ns)));
+        if published == Some(None) {
+            self.closing.unaligned_count += 1;
+            return;
+        }
+        self.closing.checked_count += 1;
+        let ends = stamp(taken.taken_ns).zip(published.flatten());
+        let residual_ns = ends.map(|(taken_ns, (published, bound_ns))| {
+            let end_to_end_ns = taken_ns.saturating_sub(published.as_ns());
+            self.end_to_end.record(end_to_end_ns);
+            self.end_to_end_ns.push(end_to_end_ns);
+            self.end_to_end_bounds_ns.push(bound_ns);
+            end_to_end_ns.saturating_sub(sum_ns).saturating_abs()
+        });
+        if let Some(residual_ns) = residual_ns {
+            self.residual.record(residual_ns);
+        }
+        match residual_ns {
+            Some(_) if self.misses_stage(joined, timeline) => self.closing.missing_stage_count += 1,
+            None => self.closing.missing_stage_count += 1,
+            Some(_) if !is_ordered => self.closing.negative_segment_count += 1,
+            Some(residual_ns) if residual_ns > RESIDUAL_LIMIT_NS => {
+                self.closing.residual_count += 1;
+            }
+            Some(_) => {
+                self.closing.closed_count += 1;
+                let is_stamped =
+                    |index: usize| timeline.marks[index].is_some_and(|mark| mark.raw_ns.is_some());
+                let is_combined = self.is_gateway && !(is_stamped(3) && is_stamped(4));
+                self.closing.closed_combined_count += u64::from(is_combined);
+            }
+        }
+    }
+
+    /// True when a file at hand lacks a stage the message must have passed. Kernel stamps may
+    /// be missing: their segments are combined.
+    fn misses_stage(&self, joined: &Joined, timeline: &Timeline) -> bool {
+        let lacks = |stage: Stage| {
+            let mut marks = timeline.marks.iter().flatten();
+            !marks.any(|mark| mark.stage == stage)
+        };
+        if self.files.published.is_some() && joined.published.is_none() {
+            return true;
+        }
+        if !self.is_gateway {
+            return false;
+        }
+        let sent = [Stage::TakenByGateway, Stage::HandedToKernel];
+        let arrived = [Stage::Received, Stage::Forwarded];
+        (self.files.egress.is_some() && (joined.egress.is_none() || sent.into_iter().any(lacks)))
+            || (self.files.ingress.is_some()
+                && (joined.ingress.is_none() || arrived.into_iter().any(lacks)))
+    }
+
+    fn cover(&mut self, joined: &Joined) {
+        let has = |ns: i64| stamp(ns).is_some();
+        let coverage = &mut self.coverage;
+        let handed = joined.egress.filter(|record| {
+            has(record.handed_ns) && record.flags & EgressRecord::REFUSED_BY_KERNEL == 0
+        });
+        if let Some(egress) = handed {
+            for (coverage, ns) in [
+                (&mut coverage.tx_software, egress.tx_software_ns),
+                (&mut coverage.tx_hardware, egress.tx_hardware_ns),
+            ] {
+                coverage.get_or_insert_default().count(has(ns));
+            }
+        } else if self.files.egress.is_none()
+            && joined.ingress.is_some()
+            && let Some(coverage) = &mut coverage.tx_software
+        {
+            coverage.count(joined.handed_to_tx_ns.is_some_and(has));
+        }
+        if let Some(ingress) = joined.ingress {
+            for (coverage, ns) in [
+                (&mut coverage.rx_software, ingress.rx_software_ns),
+                (&mut coverage.rx_hardware, ingress.rx_hardware_ns),
+            ] {
+                coverage.get_or_insert_default().count(has(ns));
+            }
+        }
+    }
+
+    fn count_hardware(&mut self, joined: &Joined) {
+        let sent_ns = joined
+            .egress
+            .and_then(|record| stamp(record.tx_hardware_ns));
+        let received_ns = joined
+            .ingress
+            .and_then(|record| stamp(record.rx_hardware_ns));
+        if let Some((sent_ns, received_ns)) = sent_ns.zip(received_ns)
+            && self.cards_share_clock
+        {
+            self.hardware.record(received_ns.saturating_sub(sent_ns));
+        }
+    }
+
+    /// Neighbouring stages first, measured or not, then combined segments that occurred.
+    pub(super) fn segments(&self) -> Vec<SegmentFigures> {
+        let chain: &[Stage] = if self.is_gateway {
+            &Stage::CHAIN
+        } else {
+            &[Stage::Published, Stage::Taken]
+        };
+        let histogram = |from: Stage, to: Stage| {
+            self.segments[from.index() * Stage::COUNT + to.index()].as_ref()
+        };
+        let neighbours = chain.windows(2).map(|pair| (pair[0], pair[1], false));
+        let combined = chain.iter().enumerate().flat_map(|(index, from)| {
+            let later = chain.iter().skip(index + 2);
+            later.map(move |to| (*from, *to, true))
+        });
+        neighbours
+            .chain(combined.filter(|(from, to, _)| histogram(*from, *to).is_some()))
+            .map(|(from, to, is_combined)| {
+                let distribution = histogram(from, to).map_or_else(
+                    || Distribution::unavailable(&self.reason(from, to)),
+                    |histogram| histogram.distribution(NOT_ALIGNED),
+                );
+                let cell = from.index() * Stage::COUNT + to.index();
+                SegmentFigures {
+                    from,
+                    to,
+                    is_combined,
+                    distribution,
+                    bins: histogram(from, to).map_or_else(Vec::new, LatencyHistogram::bins),
+                    bound: self.bounds_ns[cell].figures(),
+                }
+            })
+            .collect()
+    }
+
+    fn reason(&self, from: Stage, to: Stage) -> String {
+        if from.side() != to.side() && !self.path.is_aligned() {
+            return NOT_ALIGNED.to_owned();
+        }
+        for stage in [from, to] {
+            if self.mark_counts[stage.index()] > 0 {
+                continue;
+            }
+            let (owner, has_file) = match stage {
+                Stage::Published => ("producer", self.files.published.is_some()),
+                Stage::Received | Stage::RxSoftware | Stage::Forwarded => {
+                    ("receiving gateway", self.files.ingress.is_some())
+                }
+                Stage::Taken => ("consumer", self.files.taken.is_some()),
+                _ => ("sending gateway", self.files.egress.is_some()),
+            };
+            return if has_file {
+                format!("no message has \"{stage}\"")
+            } else {
+                format!("the {owner}'s records are not at hand")
+            };
+        }
+        "no message has both ends".to_owned()
+    }
+
+    /// Card to card; `None` on a direct channel.
+    pub(super) fn hardware_wire(&self) -> Option<Distribution> {
+        let stamps = [self.coverage.tx_hardware, self.coverage.rx_hardware];
+        let is_stamped = |coverage: Option<Coverage>| coverage.is_some_and(|c| c.stamped_count > 0);
+        let reason = if !stamps.into_iter().all(is_stamped) {
+            "no hardware stamps at both ends"
+        } else if self.cards_share_clock {
+            "no message has both hardware stamps"
+        } else {
+            "card clock not aligned"
+        };
+        self.is_gateway.then(|| self.hardware.distribution(reason))
+    }
+
+    pub(super) fn end_to_end(&self, random: &mut RandomStream) -> EndToEnd {
+        let reason = match (self.path.is_aligned(), self.files.taken.is_some()) {
+            (false, _) => NOT_ALIGNED,
+            (_, false) => NO_CONSUMER,
+            _ => "no message was taken",
+        };
+        let bound = self.end_to_end_bounds_ns.figures();
+        let exact = self.path.has_one_clock().then_some(0);
+        let resampling = BlockResampling::of(&self.end_to_end_ns);
+        let mut interval = |quantile| {
+            let resampling = resampling.as_ref()?;
+            Some(resampling.interval(quantile, CONFIDENCE, random))
+        };
+        let [p50_interval, p99_interval] = [0.5, 0.99].map(&mut interval);
+        // As large as the samples.
+        drop(resampling);
+        EndToEnd {
+            p50_interval,
+            p99_interval,
+            distribution: self.end_to_end_ns.distribution(reason),
+            bins: self.end_to_end.bins(),
+            alignment_bound_ns: bound.map(|bound| bound.largest_ns).or(exact),
+            bound,
+        }
+    }
+
+    pub(super) fn closing(&self) -> Closing {
+        let unavailable = |reason: &str| Closing::Unavailable {
+            reason: reason.to_owned(),
+        };
+        match (self.path.is_aligned(), self.files.taken.is_some()) {
+            (false, _) => unavailable(NOT_ALIGNED),
+            (_, false) => unavailable(NO_CONSUMER),
+            _ => Closing::Checked(ClosingFigures {
+                residual: self.residual.distribution("no message was taken"),
+                ..self.closing.clone()
+            }),
+        }
+    }
+
+    pub(super) const fn coverage(&self) -> StampCoverage {
+        self.coverage
+    }
+}
+
+const _: () = {
+    // `close` and `Timeline` rely on these places in the chain.
+    assert!(Stage::CHAIN[3].index() == Stage::TxSoftware.index());
+    assert!(Stage::CHAIN[4].index() == Stage::RxSoftware.index());
+    assert!(matches!(Stage::CHAIN[3].side(), Side::Producer));
+};

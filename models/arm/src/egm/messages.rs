@@ -1,0 +1,372 @@
+//! Messages of guided motion as they lie in shared memory. Layout only; SI units and radians; joints
+//! in chain order, see [`crate::yumi`]. The maker's own datagrams are in [`crate::egm::wire`].
+
+mod motion;
+mod numbers;
+
+pub use motion::{
+    EgmStartParameters, MotionArrival, MotionKind, MotionOutcome, MotionRefusal, MotionRequest,
+    MotionResponse,
+};
+
+use bytemuck::{Pod, Zeroable};
+use serde::{Deserialize, Serialize};
+
+use crate::yumi::{Joints, Pose};
+use hil_core::layout::Field;
+use hil_core::message::Message;
+
+/// One of the robot's two arms, each a motion task of its own.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Side {
+    /// The robot's right arm.
+    Right,
+    /// The robot's left arm.
+    Left,
+}
+
+impl Side {
+    /// Both, in the order of every list.
+    pub const BOTH: [Self; 2] = [Self::Right, Self::Left];
+
+    /// 0 for right, 1 for left: its number in messages.
+    pub const fn index(self) -> usize {
+        match self {
+            Self::Right => 0,
+            Self::Left => 1,
+        }
+    }
+
+    /// As [`Side::index`], as messages carry it.
+    pub const fn number(self) -> u32 {
+        match self {
+            Self::Right => 0,
+            Self::Left => 1,
+        }
+    }
+
+    /// `right` or `left`.
+    pub const fn word(self) -> &'static str {
+        match self {
+            Self::Right => "right",
+            Self::Left => "left",
+        }
+    }
+}
+
+/// To the robot: where one arm shall be.
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct EgmCommand {
+    /// The human frame this command answers; a foreign client's counts its datagrams instead.
+    pub frame_index: u64,
+    /// Time of that frame on the motion's own time axis; of a foreign client, zero.
+    pub source_time_ns: i64,
+    /// [`EgmFeedback::cycle_index`] of the newest feedback the sender had seen; meaningless
+    /// without [`EgmCommand::ANSWERS`].
+    pub answered_cycle: u64,
+    /// Desired joint positions.
+    pub position_rad: Joints,
+    /// Desired joint speeds; meaningless without [`EgmCommand::HAS_SPEED`].
+    pub speed_rad_per_s: Joints,
+    /// Sender's number of this message; foreign clients do not always count by one.
+    pub seqno: u32,
+    /// Bits below; all others are zero.
+    pub flags: u32,
+}
+
+impl EgmCommand {
+    /// [`EgmCommand::speed_rad_per_s`] is meant.
+    pub const HAS_SPEED: u32 = 1;
+    /// [`EgmCommand::answered_cycle`] is meant.
+    pub const ANSWERS: u32 = 1 << 1;
+    /// No joint position reaches the hand's target: the command holds.
+    pub const UNREACHABLE: u32 = 1 << 2;
+    /// On the way to the target but not there: a joint's speed or position limit binds.
+    pub const LIMITED: u32 = 1 << 3;
+    /// The hand moved farther in one frame than the mapping allows; the target follows slowly.
+    pub const JUMP_LIMITED: u32 = 1 << 4;
+    /// The sender follows no hand at the moment: it repeats where the arm is or was.
+    pub const PARKED: u32 = 1 << 5;
+}
+
+hil_core::layout!(EgmCommand {
+    frame_index,
+    source_time_ns,
+    answered_cycle,
+    position_rad,
+    speed_rad_per_s,
+    seqno,
+    flags
+});
+
+impl Message for EgmCommand {
+    const NAME: &'static str = "hil.EgmCommand.v1";
+    const FIELDS: &'static [Field] = Self::LAYOUT;
+}
+
+const _: () = assert!(size_of::<EgmCommand>() == 144);
+
+/// From the robot, every cycle: where one arm is.
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct EgmFeedback {
+    /// Controller cycle, counted from the robot's start; a skipped cycle leaves a gap.
+    pub cycle_index: u64,
+    /// [`EgmCommand::frame_index`] of the reference in use; meaningless without
+    /// [`EgmFeedback::HAS_REFERENCE`].
+    pub reference_frame_index: u64,
+    /// Time since the reference in use arrived at the robot, queueing included; without
+    /// [`EgmFeedback::HAS_REFERENCE`], since its session began to be set up or to run.
+    pub reference_age_ns: i64,
+    /// Joint positions as measured.
+    pub measured_rad: Joints,
+    /// Joint positions as the controller plans them, ahead of the measured by its own delay.
+    pub planned_rad: Joints,
+    /// Tool centre point (the flange frame `tool0`) in the robot's body frame: x forward, y to
+    /// the robot's left, z up.
+    pub tool: Pose,
+    /// The controller's clock in milliseconds, wrapping; the protocol's `tm`.
+    pub clock_ms: u32,
+    /// Counts the cycles since guided motion last began to run, from 0; the protocol's `seqno`. A
+    /// skipped cycle leaves a gap.
+    pub seqno: u32,
+    /// Counts the sessions (activations) since the robot's start, from 1; 0 before the first.
+    pub session: u32,
+    /// [`SessionState`] as a number.
+    pub state: u32,
+    /// Commands waiting after this cycle took its own.
+    pub queue_count: u32,
+    /// Bits below; all others are zero.
+    pub flags: u32,
+}
+
+impl EgmFeedback {
+    /// A command was taken in this session.
+    pub const HAS_REFERENCE: u32 = 1;
+    /// Commands came before in this session and have stopped: the last one goes on acting.
+    pub const HOLDING: u32 = 1 << 1;
+    /// A joint stands at its position limit.
+    pub const AT_POSITION_LIMIT: u32 = 1 << 2;
+    /// A joint's own speed limit binds.
+    pub const SPEED_LIMITED: u32 = 1 << 3;
+    /// `MaxSpeedDeviation` binds.
+    pub const SPEED_DEVIATION_LIMITED: u32 = 1 << 4;
+    /// Every joint is within the convergence window of its order.
+    pub const CONVERGED: u32 = 1 << 5;
+    /// This cycle took a command; without, it went on with the last one.
+    pub const TOOK_COMMAND: u32 = 1 << 6;
+
+    /// True when `bit` is set.
+    pub const fn has(&self, bit: u32) -> bool {
+        self.flags & bit != 0
+    }
+
+    /// The session's state; `None` for a number that is none.
+    pub fn session_state(&self) -> Option<SessionState> {
+        SessionState::from_number(self.state)
+    }
+}
+
+hil_core::layout!(EgmFeedback {
+    cycle_index,
+    reference_frame_index,
+    reference_age_ns,
+    measured_rad,
+    planned_rad,
+    tool,
+    clock_ms,
+    seqno,
+    session,
+    state,
+    queue_count,
+    flags
+});
+
+impl Message for EgmFeedback {
+    const NAME: &'static str = "hil.EgmFeedback.v1";
+    const FIELDS: &'static [Field] = Self::LAYOUT;
+}
+
+const _: () = assert!(size_of::<EgmFeedback>() == 216);
+
+/// What an arm's motion task is doing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[repr(u32)]
+pub enum SessionState {
+    /// No session, none coming by itself: a request must start one.
+    Idle = 0,
+    /// A motion of its own (joint, linear, home) is under way.
+    Moving = 1,
+    /// The last session ended; the program waits before it starts the next.
+    Waiting = 2,
+    /// Moving to the fine point from which guided motion starts, and setting it up.
+    Activating = 3,
+    /// Guided motion runs.
+    Running = 4,
+    /// A session is ending by its ramp.
+    Stopping = 5,
+}
+
+impl SessionState {
+    const ALL: [Self; 6] = [
+        Self::Idle,
+        Self::Moving,
+        Self::Waiting,
+        Self::Activating,
+        Self::Running,
+        Self::Stopping,
+    ];
+
+    /// The state with this number.
+    pub fn from_number(number: u32) -> Option<Self> {
+        Self::ALL.into_iter().find(|state| *state as u32 == number)
+    }
+
+    /// One word for a log line.
+    pub const fn word(self) -> &'static str {
+        match self {
+            Self::Idle => "idle",
+            Self::Moving => "moving",
+            Self::Waiting => "waiting",
+            Self::Activating => "activating",
+            Self::Running => "running",
+            Self::Stopping => "stopping",
+        }
+    }
+}
+
+/// To the record: something happened to an arm's session. What `value`, `limit` and `count` mean,
+/// `kind` says.
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct EgmEvent {
+    /// Grid time of the cycle in which it happened, the robot's clock.
+    pub at_ns: i64,
+    /// That cycle.
+    pub cycle_index: u64,
+    /// What was seen, in the unit of the kind.
+    pub value: f64,
+    /// What it was held against, in the same unit.
+    pub limit: f64,
+    /// A count that belongs to it.
+    pub count: u64,
+    /// [`EgmEventKind`] as a number.
+    pub kind: u32,
+    /// [`Side::index`].
+    pub side: u32,
+    /// The session it belongs to.
+    pub session: u32,
+    /// [`EndCause`] or refusal as a number, where the kind has one.
+    pub cause: u32,
+}
+
+hil_core::layout!(EgmEvent {
+    at_ns,
+    cycle_index,
+    value,
+    limit,
+    count,
+    kind,
+    side,
+    session,
+    cause
+});
+
+impl Message for EgmEvent {
+    const NAME: &'static str = "hil.EgmEvent.v1";
+    const FIELDS: &'static [Field] = Self::LAYOUT;
+}
+
+const _: () = assert!(size_of::<EgmEvent>() == 56);
+
+/// What an [`EgmEvent`] tells.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[repr(u32)]
+pub enum EgmEventKind {
+    /// The controller's first cycle: the origin of its grid.
+    Started = 0,
+    /// A session is being set up; `value`: seconds that takes.
+    Activating = 1,
+    /// Guided motion runs; `value`: seconds since the last session ended (or since the start).
+    Running = 2,
+    /// A session ended; `cause`: [`EndCause`]; `value` against `limit`: what tripped it, in the
+    /// cause's unit. Holding ends with it untold, throttling just before.
+    Ended = 3,
+    /// `MaxSpeedDeviation` began to bind; `value`: deg/s asked, `limit`: deg/s allowed.
+    SpeedThrottled = 4,
+    /// It has not bound for half a second, or the session ends; `value`: highest deg/s asked since
+    /// it began to bind, `limit`: deg/s allowed, `count`: nanoseconds from there to when it last did.
+    SpeedFree = 5,
+    /// Commands stopped coming: the last one goes on acting; `value`: seconds since it was taken.
+    HoldBegan = 6,
+    /// Commands are back; `value`: seconds without.
+    HoldEnded = 7,
+    /// A command was refused; `cause`: [`CommandRefusal`]; `value` against `limit`: joint value
+    /// (rad); `count`: joint, chain order from 0. Told for the first of a row of equal refusals.
+    CommandRefused = 8,
+    /// The queue of `limit` commands was full: `count` were dropped so far. Told again only after
+    /// it was half empty.
+    QueueOverflow = 9,
+    /// A motion of its own began; `cause`: the request's kind.
+    MotionBegan = 10,
+    /// A motion of its own ended; `value`: seconds it took.
+    MotionEnded = 11,
+}
+
+/// Why a session ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[repr(u32)]
+pub enum EndCause {
+    /// No command that was not refused came for `CommTimeout`; unit: s.
+    CommTimeout = 1,
+    /// All joints stayed within the convergence window for `CondTime`; unit: s.
+    ConditionTime = 2,
+    /// A joint went farther from the start than `MaxPosDeviation`; unit: deg; `count`: joint,
+    /// chain order from 0.
+    PositionDeviation = 3,
+    /// A request asked for it; unit: s from there to the end.
+    Requested = 4,
+}
+
+/// Why a command never reached the servo.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[repr(u32)]
+pub enum CommandRefusal {
+    /// A position or speed is not a number or infinite.
+    NotFinite = 1,
+    /// A position is outside the joint's limits.
+    OutsideLimits = 2,
+    /// Guided motion does not run: nobody takes commands.
+    NoSession = 3,
+}
+
+/// To the record: a command as it arrived at the controller, before anything was made of it. With
+/// [`MotionArrival`] and [`EgmEventKind::Started`] it is all that a replay needs.
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct EgmArrival {
+    /// When, on the robot's clock.
+    pub at_ns: i64,
+    /// [`Side::index`].
+    pub side: u32,
+    /// Zero.
+    pub reserved: u32,
+    /// The command.
+    pub command: EgmCommand,
+}
+
+hil_core::layout!(EgmArrival {
+    at_ns,
+    side,
+    reserved,
+    command
+});
+
+impl Message for EgmArrival {
+    const NAME: &'static str = "hil.EgmArrival.v1";
+    const FIELDS: &'static [Field] = Self::LAYOUT;
+}
+
+const _: () = assert!(size_of::<EgmArrival>() == 160);

@@ -1,0 +1,144 @@
+//! The maker's datagrams: messages of externally guided motion, encoded and decoded. A library by
+//! itself: it opens no socket, knows no session and judges no value; [`crate::egm::face`] does.
+//!
+//! 1. [`messages`] and [`robot`]: every message of the protocol, for `RobotWare` 6 and 7.
+//! 2. [`joints`]: which joint is where.
+//! 3. [`refusal`]: why a datagram is not taken, and the counts.
+//!
+//! **Bytes.** Decoding what a client or robot sent and encoding it again gives the same bytes for
+//! every message of the three clients in `testdata`, which is what the tests hold against. Two
+//! things do not survive: fields the protocol does not define (dropped), and repeated numbers that
+//! came packed (they go out unpacked, as the maker's own definition has it).
+//!
+//! **Allocation.** A message owns one `Vec` per list of joints, so decoding allocates unless the
+//! caller gives a message to decode into, as the faces do. A refused datagram allocates its error.
+//!
+//! Decoding a robot's datagram and answering it:
+//!
+//! ```
+//! use crate::egm::wire::{self, EgmSensor, MessageType, messages::*};
+//! # use crate::egm::wire::{EgmRobot, Release};
+//! # let mut datagram = Vec::new();
+//! # let joints = EgmJoints { joints: vec![0.0, -130.0, 30.0, 0.0, 40.0, 0.0] };
+//! # wire::encode(
+//! #     &EgmRobot {
+//! #         header: Some(EgmHeader { seqno: Some(7), tm: Some(28), mtype: Some(2) }),
+//! #         feed_back: Some(EgmFeedBack { joints: Some(joints), ..Default::default() }),
+//! #         ..Default::default()
+//! #     },
+//! #     &mut datagram,
+//! # );
+//!
+//! let robot = wire::decode_robot(&datagram)?;
+//! let joints = robot.feed_back.and_then(|part| part.joints).unwrap_or_default();
+//!
+//! // Hold the robot where it is.
+//! let answer = EgmSensor {
+//!     header: Some(EgmHeader {
+//!         seqno: Some(0),
+//!         tm: None,
+//!         mtype: Some(MessageType::Correction as i32),
+//!     }),
+//!     planned: Some(EgmPlanned { joints: Some(joints), ..Default::default() }),
+//!     ..Default::default()
+//! };
+//! let mut reply = Vec::new();
+//! wire::encode(&answer, &mut reply);
+//! assert_eq!(reply.len(), 64);
+//! # Ok::<(), wire::WireError>(())
+//! ```
+
+pub mod joints;
+pub mod messages;
+pub mod refusal;
+pub mod robot;
+
+use prost::Message;
+
+pub use crate::egm::wire::messages::{EgmSensor, EgmSensorPathCorr, MessageType};
+pub use crate::egm::wire::refusal::{Cause, DatagramCounts, Refusal};
+pub use crate::egm::wire::robot::{EgmRobot, Release};
+
+/// Longest datagram taken, bytes: what one Ethernet frame carries over UDP. Known clients and
+/// robots stay far below it.
+pub const DATAGRAM_BYTES_MAX: usize = 1472;
+
+/// A datagram that is no message.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum WireError {
+    /// Longer than [`DATAGRAM_BYTES_MAX`].
+    #[error("datagram of {length_bytes} bytes is longer than {DATAGRAM_BYTES_MAX}")]
+    TooLong {
+        /// Its length.
+        length_bytes: usize,
+    },
+    /// Not the bytes of that message.
+    #[error("datagram is not the protobuf message expected")]
+    NotProtobuf(#[source] prost::DecodeError),
+}
+
+/// Decodes a sensor's position guidance.
+///
+/// # Errors
+/// When the bytes are no such message. What the message says is not judged.
+pub fn decode_sensor(datagram: &[u8]) -> Result<EgmSensor, WireError> {
+    decode(datagram)
+}
+
+/// Decodes a robot's message.
+///
+/// # Errors
+/// When the bytes are no such message. What the message says is not judged.
+pub fn decode_robot(datagram: &[u8]) -> Result<EgmRobot, WireError> {
+    decode(datagram)
+}
+
+/// Decodes a sensor's path correction.
+///
+/// # Errors
+/// When the bytes are no such message. What the message says is not judged.
+pub fn decode_path_correction(datagram: &[u8]) -> Result<EgmSensorPathCorr, WireError> {
+    decode(datagram)
+}
+
+fn decode<M: Message + Default>(datagram: &[u8]) -> Result<M, WireError> {
+    let mut message = M::default();
+    merge(datagram, &mut message)?;
+    Ok(message)
+}
+
+/// Adds what the datagram says to `message`: with a cleared one, the same as decoding into it.
+pub(crate) fn merge<M: Message>(datagram: &[u8], message: &mut M) -> Result<(), WireError> {
+    if datagram.len() > DATAGRAM_BYTES_MAX {
+        return Err(WireError::TooLong {
+            length_bytes: datagram.len(),
+        });
+    }
+    message.merge(datagram).map_err(WireError::NotProtobuf)
+}
+
+/// Only the header: to tell a message of another type from bytes that are no message.
+#[derive(Clone, PartialEq, prost::Message)]
+struct AnyMessage {
+    #[prost(message, optional, tag = "1")]
+    header: Option<messages::EgmHeader>,
+}
+
+/// The type a datagram says it is, whatever the rest of it holds.
+pub fn message_type(datagram: &[u8]) -> Option<MessageType> {
+    let header = decode::<AnyMessage>(datagram).ok()?.header?;
+    MessageType::try_from(header.mtype?).ok()
+}
+
+/// Encodes `message` into `buffer`, replacing what it held; allocates only when its capacity is
+/// too small.
+#[expect(clippy::missing_panics_doc, reason = "a vector never lacks room")]
+pub fn encode(message: &impl Message, buffer: &mut Vec<u8>) {
+    buffer.clear();
+    message
+        .encode(buffer)
+        .expect("a vector grows, and that is the one thing encoding can lack");
+}
+
+#[cfg(test)]
+pub(crate) mod golden_tests;

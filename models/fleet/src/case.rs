@@ -1,0 +1,111 @@
+//! The case study `fleet`: which roles and channels there are, and what they share.
+
+use crate::controller::Controller;
+use crate::experiment::FleetStudy;
+use crate::messages::{Authority, Mission, State, Truth};
+use crate::parameters::FleetParameters;
+use crate::robots::Robots;
+use crate::scenario::Scene;
+use crate::score;
+use hil_core::case_study::{CaseStudy, ChannelSpec, ParameterError};
+use hil_core::component::{Role, into_role};
+use hil_core::run_log::RunLog;
+use hil_core::score::{ErrorSeries, Score};
+use hil_core::study::{Batch, into_batch};
+
+/// Channel from controller to robots: how far each may go.
+pub const FLEET_AUTHORITY: &str = "fleet/authority";
+/// Channel from controller to robots: which path each shall drive.
+pub const FLEET_MISSION: &str = "fleet/mission";
+/// Channel from robots to controller.
+pub const FLEET_STATE: &str = "fleet/state";
+/// Channel from robots to the recorder alone: what truly happened.
+pub const FLEET_TRUTH: &str = "fleet/truth";
+
+/// Case study 1.
+///
+/// ```text
+/// controller --fleet/authority--> robots
+///            --fleet/mission---->
+///            <----fleet/state----         robots --fleet/truth--> recorder
+/// ```
+#[derive(Debug, Clone)]
+pub struct Fleet {
+    parameters: FleetParameters,
+    scene: Scene,
+    seed: u64,
+}
+
+impl Fleet {
+    /// World, robots and starts.
+    pub fn scene(&self) -> &Scene {
+        &self.scene
+    }
+
+    /// What the user set.
+    pub fn parameters(&self) -> &FleetParameters {
+        &self.parameters
+    }
+}
+
+impl CaseStudy for Fleet {
+    const NAME: &'static str = "fleet";
+    const SUMMARY: &'static str = "seven guided vehicles share a harbor or a warehouse";
+    const ROLES: &'static [&'static str] = &["controller", "robots"];
+    const CHANNELS: &'static [ChannelSpec] = &[
+        ChannelSpec::of::<Authority>(FLEET_AUTHORITY, "controller", "robots"),
+        ChannelSpec::of::<Mission>(FLEET_MISSION, "controller", "robots"),
+        ChannelSpec::of::<State>(FLEET_STATE, "robots", "controller"),
+        ChannelSpec::recorded::<Truth>(FLEET_TRUTH, "robots"),
+    ];
+    /// A coordinator started anew would believe all robots in their first bays, and robots
+    /// started anew would be there while the coordinator believes them under way.
+    const MAY_RESTART: bool = false;
+    const SCORE_CLOCK: Option<&'static str> = Some(FLEET_TRUTH);
+    type Parameters = FleetParameters;
+
+    fn new(parameters: Self::Parameters, seed: u64) -> Result<Self, ParameterError> {
+        parameters.check()?;
+        let scene = parameters.world.build()?;
+        parameters.check_stop_error(&scene.world.vehicle)?;
+        Ok(Self {
+            parameters,
+            scene,
+            seed,
+        })
+    }
+
+    fn role(&self, name: &str) -> Option<Box<dyn Role>> {
+        let FleetParameters {
+            fleets,
+            robot,
+            coordinator,
+            missions,
+            ..
+        } = &self.parameters;
+        let (fleets, scene) = (*fleets, &self.scene);
+        match name {
+            "controller" => Some(into_role(Controller::new(
+                scene,
+                coordinator,
+                missions,
+                (fleets, self.seed),
+            ))),
+            "robots" => Some(into_role(Robots::new(scene, robot, fleets, self.seed))),
+            _ => None,
+        }
+    }
+
+    fn score(&self, log: &RunLog) -> Score {
+        score::score(self, log)
+    }
+
+    fn errors(&self, log: &RunLog) -> Vec<ErrorSeries> {
+        score::errors(self, log)
+    }
+
+    fn study(&self) -> Result<Option<Box<dyn Batch>>, ParameterError> {
+        let study = FleetStudy::new(&self.parameters, self.seed)?;
+        Ok(Some(into_batch(study)))
+    }
+}

@@ -1,0 +1,158 @@
+//! The fleet's coordinator: from the robots' states to missions and authorities, once per control
+//! period. A pure state machine; what carries the messages, and how badly, it does not know.
+
+#[cfg(test)]
+mod closed_loop;
+pub mod counters;
+mod legacy;
+pub mod parameters;
+pub mod policy;
+pub mod roster;
+pub mod safe;
+pub mod sections;
+mod view;
+
+use core::fmt::Debug;
+
+use crate::coordinator::counters::CoordinatorCounters;
+use crate::coordinator::legacy::LegacyRules;
+use crate::coordinator::parameters::{CoordinatorMode, CoordinatorParameters};
+use crate::coordinator::policy::OrderingPolicy;
+use crate::coordinator::roster::{MissionSupply, Roster, SectionKind};
+use crate::coordinator::safe::SafeRules;
+use crate::coordinator::safe::reservation::Traffic;
+use crate::messages::{State, ToRobot};
+use crate::scenario::Scene;
+use hil_core::time::Instant;
+
+/// What rules decide on, and with, in one control cycle.
+pub(crate) struct Cycle<'a> {
+    pub(crate) now: Instant,
+    pub(crate) roster: &'a mut Roster,
+    pub(crate) policy: &'a dyn OrderingPolicy,
+    pub(crate) counters: &'a mut CoordinatorCounters,
+    pub(crate) send: &'a mut dyn FnMut(ToRobot),
+}
+
+/// Rules that give robots their way: what differs between the coordinator's modes.
+pub(crate) trait Rules: Debug {
+    /// Decides and sends authorities. The roster is settled: missions that ended, and sections
+    /// that were passed, are gone from it; missions that begin are in it.
+    fn decide(&mut self, cycle: &mut Cycle<'_>);
+
+    /// Sees every state as it arrives, also those the roster does not take.
+    fn on_state(&mut self, _now: Instant, _state: &State) {}
+
+    /// The way each robot has to itself, if the rules keep account of it.
+    fn reservations(&self) -> Option<&Traffic> {
+        None
+    }
+
+    /// Whether a robot that makes no way may be put at its goal.
+    fn resets_stuck_robots(&self) -> bool {
+        true
+    }
+}
+
+/// One fleet's coordinator.
+#[derive(Debug)]
+pub struct Coordinator {
+    roster: Roster,
+    rules: Box<dyn Rules>,
+    policy: Box<dyn OrderingPolicy>,
+    missions: Box<dyn MissionSupply>,
+    counters: CoordinatorCounters,
+    clock_is_shared: bool,
+}
+
+impl Coordinator {
+    /// The coordinator of fleet `fleet_id`, its robots parked where the scene starts them.
+    pub fn new(
+        scene: &Scene,
+        parameters: &CoordinatorParameters,
+        fleet_id: u32,
+        missions: impl MissionSupply + 'static,
+    ) -> Self {
+        let (kind, rules): (_, Box<dyn Rules>) = match parameters.mode {
+            CoordinatorMode::Legacy => {
+                let rules = LegacyRules::new(scene, parameters);
+                (SectionKind::Exact, Box::new(rules))
+            }
+            CoordinatorMode::Safe => {
+                // The roster's sections are only counted here, as in the other mode.
+                let rules = SafeRules::new(&scene.world, &scene.starts, parameters, fleet_id);
+                (SectionKind::Exact, Box::new(rules))
+            }
+        };
+        Self {
+            roster: Roster::new(scene, parameters, fleet_id, kind),
+            rules,
+            policy: parameters.policy.policy(),
+            missions: Box::new(missions),
+            counters: CoordinatorCounters::default(),
+            clock_is_shared: parameters.clock_is_shared,
+        }
+    }
+
+    /// The same coordinator with a user's own ordering policy.
+    #[must_use]
+    pub fn with_policy(mut self, policy: Box<dyn OrderingPolicy>) -> Self {
+        self.policy = policy;
+        self
+    }
+
+    /// Takes a robot's state in.
+    pub fn on_state(&mut self, now: Instant, state: &State) {
+        self.roster.on_state(now, state, &mut self.counters.counts);
+        self.rules.on_state(now, state);
+    }
+
+    /// Takes in a robot's true state, past all channels: what the original does in simulation.
+    /// Then only commands suffer from the network.
+    pub fn observe(&mut self, now: Instant, state: &State) {
+        self.roster.observe(now, state, &mut self.counters.counts);
+        self.rules.on_state(now, state);
+    }
+
+    /// One control cycle; gives each message to `send`.
+    pub fn on_cycle(&mut self, now: Instant, send: &mut dyn FnMut(ToRobot)) {
+        let counts = &mut self.counters.counts;
+        counts.cycle_count += 1;
+        self.roster.settle(counts);
+        self.roster
+            .dispatch(now, self.missions.as_mut(), counts, send);
+        if self.clock_is_shared {
+            let driving = self.roster.robots().iter();
+            for state in driving.filter_map(|view| view.state) {
+                let age_ns = now.as_ns().saturating_sub(state.sampled_ns);
+                self.counters.state_age.record(age_ns);
+            }
+        }
+        self.rules.decide(&mut Cycle {
+            now,
+            roster: &mut self.roster,
+            policy: self.policy.as_ref(),
+            counters: &mut self.counters,
+            send,
+        });
+        if self.rules.resets_stuck_robots() {
+            self.roster
+                .reset_stuck(now, &mut self.counters.counts, send);
+        }
+    }
+
+    /// The way each robot has to itself; `None` in the legacy mode.
+    pub fn reservations(&self) -> Option<&Traffic> {
+        self.rules.reservations()
+    }
+
+    /// What it counted so far.
+    pub fn counters(&self) -> &CoordinatorCounters {
+        &self.counters
+    }
+
+    /// What it knows of its robots.
+    pub fn roster(&self) -> &Roster {
+        &self.roster
+    }
+}

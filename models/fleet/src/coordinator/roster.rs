@@ -1,0 +1,386 @@
+//! What the coordinator knows of its robots: the newest states, their missions, the bays and the
+//! sections ahead of them. It sends missions; who may go how far is decided elsewhere.
+
+use core::fmt::Debug;
+use core::time::Duration;
+use std::collections::VecDeque;
+use std::sync::Arc;
+
+use crate::coordinator::counters::CoordinatorCounts;
+use crate::coordinator::parameters::CoordinatorParameters;
+use crate::coordinator::sections::SectionBook;
+pub use crate::coordinator::view::{ActiveMission, RobotView};
+use crate::messages::MessageOrder;
+use crate::messages::{Header, State, ToRobot};
+use crate::mission::MissionSource;
+use crate::path::Path;
+use crate::scenario::Scene;
+use crate::world::{BayIndex, Route, SectionLibrary, World};
+use hil_core::time::Instant;
+
+/// Where missions come from.
+pub trait MissionSupply: Debug {
+    /// The next way of `robot`, which is parked in bay `at`; `None` if there is none now. The
+    /// goal must be a bay for which `is_free` holds.
+    fn next(
+        &mut self,
+        robot: usize,
+        at: BayIndex,
+        is_free: &dyn Fn(BayIndex) -> bool,
+    ) -> Option<Route>;
+
+    /// How long a robot stays parked before its next mission.
+    fn parking(&self) -> Duration;
+}
+
+impl MissionSupply for MissionSource {
+    fn next(
+        &mut self,
+        robot: usize,
+        at: BayIndex,
+        is_free: &dyn Fn(BayIndex) -> bool,
+    ) -> Option<Route> {
+        self.next(robot, at, is_free)
+    }
+
+    fn parking(&self) -> Duration {
+        self.parking()
+    }
+}
+
+/// Which of the world's section libraries a coordinator goes by.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum SectionKind {
+    /// Overlap of the exact footprints at the poses.
+    Exact,
+    /// Grown so that no overlap hides between two poses.
+    Guarded,
+}
+
+/// The robots of a fleet as their coordinator sees them.
+#[derive(Debug)]
+pub struct Roster {
+    world: Arc<World>,
+    fleet_id: u32,
+    kind: SectionKind,
+    message_order: MessageOrder,
+    missions_per_cycle: u32,
+    stuck_after: Duration,
+    robots: Vec<RobotView>,
+    sections: SectionBook,
+    /// Robots that stand in, leave or head for each bay.
+    bay_users: Vec<u32>,
+    /// Parked robots, the one that parked first in front.
+    parked: VecDeque<usize>,
+    next_reset: Instant,
+}
+
+/// After a reset, how long no other robot is reset: those it held up need time to show way.
+const RESET_PAUSE: Duration = Duration::from_secs(10);
+
+impl Roster {
+    /// The robots of fleet `fleet_id`, each parked where the scene starts it.
+    ///
+    /// # Panics
+    /// When a start is no bay of the world.
+    pub fn new(
+        scene: &Scene,
+        parameters: &CoordinatorParameters,
+        fleet_id: u32,
+        kind: SectionKind,
+    ) -> Self {
+        let mut bay_users = vec![0; scene.world.bays.len()];
+        let mut robots = Vec::with_capacity(scene.starts.len());
+        for &bay in &scene.starts {
+            assert!(bay < bay_users.len(), "bay {bay} of {}", bay_users.len());
+            bay_users[bay] += 1;
+            robots.push(RobotView {
+                bay,
+                ..RobotView::default()
+            });
+        }
+        Self {
+            fleet_id,
+            kind,
+            message_order: parameters.message_order,
+            missions_per_cycle: parameters.missions_per_cycle,
+            stuck_after: parameters.stuck_after(),
+            sections: SectionBook::new(robots.len()),
+            parked: (0..robots.len()).collect(),
+            robots,
+            bay_users,
+            world: Arc::clone(&scene.world),
+            next_reset: Instant::ZERO,
+        }
+    }
+
+    /// The world.
+    pub fn world(&self) -> &Arc<World> {
+        &self.world
+    }
+
+    /// The fleet's number.
+    pub fn fleet_id(&self) -> u32 {
+        self.fleet_id
+    }
+
+    /// Every robot, by number.
+    pub fn robots(&self) -> &[RobotView] {
+        &self.robots
+    }
+
+    /// The sections that driving robots have ahead of them.
+    pub fn sections(&self) -> &SectionBook {
+        &self.sections
+    }
+
+    /// The same, to keep their order.
+    pub fn sections_mut(&mut self) -> &mut SectionBook {
+        &mut self.sections
+    }
+
+    /// Takes over a robot's state, if it is one of the robot's present mission.
+    pub fn on_state(&mut self, now: Instant, state: &State, counts: &mut CoordinatorCounts) {
+        let header = &state.header;
+        let Some(view) = view_of(&mut self.robots, self.fleet_id, header) else {
+            counts.states_unknown += 1;
+            return;
+        };
+        if !state.is_sound() {
+            counts.states_unsound += 1;
+            return;
+        }
+        let order = view
+            .newest_header_id
+            .map_or(1, |newest| ahead_of(header.header_id, newest));
+        match order {
+            0 => counts.states_duplicate += 1,
+            ..0 => counts.states_reordered += 1,
+            1.. => view.newest_header_id = Some(header.header_id),
+        }
+        if order <= 0 && self.message_order == MessageOrder::Strict {
+            counts.states_dropped += 1;
+            return;
+        }
+        self.observe(now, state, counts);
+    }
+
+    /// The same for a state that came by no channel, so that it has no place in the order of
+    /// messages: what a coordinator that looks at the simulated robots themselves sees.
+    pub fn observe(&mut self, now: Instant, state: &State, counts: &mut CoordinatorCounts) {
+        let header = &state.header;
+        let Some(view) = view_of(&mut self.robots, self.fleet_id, header)
+            .filter(|view| ahead_of(header.mission_id, view.newest_mission_id) <= 0)
+        else {
+            counts.states_unknown += 1;
+            return;
+        };
+        let mission = view.mission.as_ref();
+        let Some(mission) = mission.filter(|mission| mission.id == header.mission_id) else {
+            counts.states_outdated += 1;
+            return;
+        };
+        let last_index = mission.path.last_index();
+        let is_on_path = usize::try_from(state.path_index).is_ok_and(|index| index <= last_index);
+        if is_on_path && state.is_sound() {
+            counts.states_accepted += 1;
+            view.take(now, state);
+        } else {
+            counts.states_unsound += 1;
+        }
+    }
+
+    /// Draws the consequences of the states since the last cycle: missions that ended, sections
+    /// that were passed, bays that were left.
+    pub fn settle(&mut self, counts: &mut CoordinatorCounts) {
+        for robot in 0..self.robots.len() {
+            let view = &mut self.robots[robot];
+            let index = view.index();
+            let has_moved = core::mem::take(&mut view.has_moved);
+            let Some(mission) = &mut view.mission else {
+                continue;
+            };
+            if index >= mission.clear_index && !mission.has_left_bay {
+                mission.has_left_bay = true;
+                self.bay_users[mission.route.from] -= 1;
+            }
+            if mission.done_at.is_some() {
+                self.finish(robot, counts);
+            } else if has_moved {
+                counts.sections_obsolete += self.sections.remove_passed(robot, index);
+            }
+        }
+    }
+
+    fn finish(&mut self, robot: usize, counts: &mut CoordinatorCounts) {
+        let view = &mut self.robots[robot];
+        let Some(mission) = view.mission.take() else {
+            return;
+        };
+        let removed_count = self.sections.remove_all(robot);
+        if mission.is_reset {
+            counts.sections_abandoned += removed_count;
+        } else {
+            counts.sections_obsolete += removed_count;
+        }
+        if !mission.has_left_bay {
+            self.bay_users[mission.route.from] -= 1;
+        }
+        counts.missions_done += 1;
+        view.bay = mission.route.to;
+        view.parked_since = mission.done_at;
+        view.state = None;
+        view.waiting_since = None;
+        self.parked.push_back(robot);
+    }
+
+    /// Begins missions of robots that parked long enough and repeats those no state showed yet.
+    pub fn dispatch(
+        &mut self,
+        now: Instant,
+        missions: &mut dyn MissionSupply,
+        counts: &mut CoordinatorCounts,
+        send: &mut dyn FnMut(ToRobot),
+    ) {
+        let parking = missions.parking();
+        let mut begun_count = 0;
+        let mut position = 0;
+        while begun_count < self.missions_per_cycle
+            && let Some(&robot) = self.parked.get(position)
+        {
+            let view = &self.robots[robot];
+            let is_rested = view.parked_since.is_none_or(|since| now >= since + parking);
+            if !is_rested {
+                // Those behind it parked later still.
+                break;
+            }
+            let bay_users = &self.bay_users;
+            let is_free = |bay: BayIndex| bay_users.get(bay) == Some(&0);
+            let route = missions.next(robot, view.bay, &is_free);
+            let Some(route) = route.filter(|route| route.from == view.bay && is_free(route.to))
+            else {
+                position += 1;
+                continue;
+            };
+            self.parked.remove(position);
+            self.begin(now, robot, route);
+            counts.missions_started += 1;
+            begun_count += 1;
+        }
+        for (robot_id, view) in (0..).zip(&mut self.robots) {
+            let needs_repeat = |mission: &ActiveMission| !mission.is_shown || mission.is_reset;
+            if view.mission.as_ref().is_some_and(needs_repeat) {
+                counts.mission_messages += 1;
+                send(view.mission_message(now, self.fleet_id, robot_id));
+            }
+        }
+    }
+
+    fn begin(&mut self, now: Instant, robot: usize, route: Route) {
+        let world = Arc::clone(&self.world);
+        let path = world.path(route.path);
+        let view = &mut self.robots[robot];
+        view.newest_mission_id += 1;
+        view.state = None;
+        view.waiting_since = None;
+        view.has_moved = false;
+        view.mission = Some(ActiveMission {
+            id: view.newest_mission_id,
+            route,
+            path: Arc::clone(path),
+            started: now,
+            is_shown: false,
+            is_reset: false,
+            clear_index: clear_index(&world, route.from, path),
+            has_left_bay: false,
+            done_at: None,
+            best_index: 0,
+            last_progress: now,
+        });
+        self.bay_users[route.to] += 1;
+        let library = self.library(&world);
+        for other in (0..self.robots.len()).filter(|&other| other != robot) {
+            let view = &self.robots[other];
+            let Some(mission) = &view.mission else {
+                continue;
+            };
+            let (theirs, index) = (mission.route.path, view.index());
+            let (robots, paths, indices) = if robot < other {
+                ([robot, other], [route.path, theirs], [0, index])
+            } else {
+                ([other, robot], [theirs, route.path], [index, 0])
+            };
+            let sections = library.between(paths[0], paths[1]);
+            self.sections.add(robots, sections, indices);
+        }
+    }
+
+    fn library<'a>(&self, world: &'a World) -> &'a SectionLibrary {
+        match self.kind {
+            SectionKind::Exact => &world.sections,
+            SectionKind::Guarded => &world.guarded_sections,
+        }
+    }
+
+    /// Puts the robot that made no way for the longest time at its goal, if that time is too
+    /// long; at most one per pause. The mission goes out again, marked, until a state shows it.
+    pub fn reset_stuck(
+        &mut self,
+        now: Instant,
+        counts: &mut CoordinatorCounts,
+        send: &mut dyn FnMut(ToRobot),
+    ) {
+        if now < self.next_reset {
+            return;
+        }
+        let stalled = (0..).zip(&mut self.robots).filter_map(|(robot_id, view)| {
+            let mission = view.mission.as_ref()?;
+            let stalled_ns = now.ns_since(mission.last_progress);
+            (!mission.is_reset).then_some((stalled_ns, robot_id, view))
+        });
+        let longest = stalled.max_by_key(|(stalled_ns, ..)| *stalled_ns);
+        let Some((stalled_ns, robot_id, view)) = longest else {
+            return;
+        };
+        if i128::from(stalled_ns) <= self.stuck_after.as_nanos().cast_signed() {
+            return;
+        }
+        if let Some(mission) = &mut view.mission {
+            mission.is_reset = true;
+        }
+        counts.resets += 1;
+        counts.mission_messages += 1;
+        self.next_reset = now + RESET_PAUSE;
+        send(view.mission_message(now, self.fleet_id, robot_id));
+    }
+}
+
+/// The robot a message names, if it is one of fleet `fleet_id`.
+fn view_of<'a>(
+    robots: &'a mut [RobotView],
+    fleet_id: u32,
+    header: &Header,
+) -> Option<&'a mut RobotView> {
+    robots
+        .get_mut(header.robot_id as usize)
+        .filter(|_| header.fleet_id == fleet_id)
+}
+
+/// How far header `id` is ahead of `newest`, across the wrap of the counter.
+fn ahead_of(id: u32, newest: u32) -> i32 {
+    id.wrapping_sub(newest).cast_signed()
+}
+
+/// First pose of `path` at which a vehicle no longer meets one parked in `bay`.
+fn clear_index(world: &World, bay: BayIndex, path: &Path) -> usize {
+    let footprint = &world.vehicle.footprint;
+    let parked = footprint.at(&world.bays[bay].pose);
+    path.poses()
+        .iter()
+        .position(|pose| !footprint.at(pose).overlaps(&parked))
+        .unwrap_or(path.last_index())
+}
+
+#[cfg(test)]
+#[path = "roster_tests.rs"]
+mod tests;

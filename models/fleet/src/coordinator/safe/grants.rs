@@ -1,0 +1,287 @@
+//! One control cycle of the safe rules: who gets how much more way, in which order, and from whom
+//! some is asked back. What is safe and live is not decided here but asked of the reservations
+//! and the plan.
+
+use core::cmp::Ordering;
+use core::time::Duration;
+
+use crate::coordinator::Cycle;
+use crate::coordinator::policy::Contest;
+use crate::coordinator::roster::Roster;
+use crate::coordinator::safe::SafeRules;
+use crate::coordinator::safe::horizon::{lookahead_s, reach_m};
+use crate::coordinator::safe::liveness::{Verdict, section_start};
+use crate::coordinator::safe::reservation::Contact;
+use crate::section::Side;
+use hil_core::time::Instant;
+
+/// A robot that could use more way in this cycle.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Candidate {
+    robot: usize,
+    /// Authority index it could use.
+    want: usize,
+    /// Rivals for the same sections that the policy puts first.
+    rivals_before: u32,
+}
+
+/// Ends that are tried for one extension, each nearer than the one before.
+const ENDS_MAX: usize = 4;
+/// Robots that are looked at along one queue.
+const QUEUE_MAX: usize = 16;
+/// A robot from which authority was taken back keeps what it then gets for this long.
+const SPARED: Duration = Duration::from_secs(30);
+
+impl SafeRules {
+    /// Extends authorities in the policy's order.
+    pub(crate) fn grant_all(&mut self, cycle: &mut Cycle<'_>) {
+        if self.lease.is_frozen(cycle.now) {
+            self.counts.cycles_frozen += 1;
+            return;
+        }
+        let may_reorder = !self.is_anyone_starving(cycle.now);
+        self.counts.cycles_in_order += u64::from(!may_reorder);
+        self.admit_all(cycle.now, may_reorder);
+        let mut order = core::mem::take(&mut self.order);
+        order.clear();
+        order.extend((0..self.robots.len()).filter_map(|robot| self.candidate(robot)));
+        self.rank(&mut order, cycle);
+        for view in &mut self.robots {
+            view.stopped_by = None;
+        }
+        for candidate in &order {
+            let is_given = self.extend(candidate, may_reorder);
+            let view = &mut self.robots[candidate.robot];
+            if is_given {
+                view.waited_since = view.waiting_since.take().or(view.waited_since);
+            } else {
+                view.waiting_since = view.waiting_since.or(Some(cycle.now));
+            }
+        }
+        if self.takes_back && may_reorder {
+            for candidate in &order {
+                self.take_back(cycle, candidate.robot);
+            }
+        }
+        self.order = order;
+        self.count_held_up(cycle.roster);
+    }
+
+    fn is_anyone_starving(&self, now: Instant) -> bool {
+        let mut waits = self.robots.iter().filter_map(|view| view.waiting_since);
+        waits.any(|since| now > since + self.patience)
+    }
+
+    fn admit_all(&mut self, now: Instant, may_reorder: bool) {
+        for robot in 0..self.robots.len() {
+            let view = &self.robots[robot];
+            if view.is_admitted || view.ledger.mission_id() == 0 || view.ledger.is_done() {
+                continue;
+            }
+            let is_admitted = self.plan.admit(&self.traffic, robot, may_reorder);
+            let view = &mut self.robots[robot];
+            view.is_admitted = is_admitted;
+            if !is_admitted {
+                view.waiting_since = view.waiting_since.or(Some(now));
+            }
+            self.counts.admissions_deferred += u64::from(!is_admitted);
+        }
+    }
+
+    fn candidate(&self, robot: usize) -> Option<Candidate> {
+        let view = &self.robots[robot];
+        let (ledger, last) = (&view.ledger, self.traffic.last(robot));
+        let is_open = view.is_admitted
+            && !ledger.is_done()
+            && !ledger.is_shrinking()
+            && ledger.bound() < last;
+        if !is_open {
+            return None;
+        }
+        let path = self.world.path(self.traffic.path(robot)?);
+        let time_s = lookahead_s(
+            self.cycles.expected_s(self.control_period),
+            view.round_trip.estimate_s(),
+            self.reserve_ms,
+        );
+        // The robot may be almost a pose beyond the one it passed last.
+        let way_m = path.way_to_m(ledger.lower() + 1)
+            + reach_m(&self.world.vehicle, view.speed_mps, time_s);
+        // One that came to stand short of the end of its authority still needs more to go on.
+        let needed = ledger.lower() + self.margin.below + 2;
+        let want = (path.index_at(way_m) + 1).max(needed).min(last);
+        (want > ledger.bound()).then_some(Candidate {
+            robot,
+            want,
+            rivals_before: 0,
+        })
+    }
+
+    /// Sorts by how many rivals go before, so that no inconsistency of a policy matters.
+    fn rank(&mut self, order: &mut [Candidate], cycle: &Cycle<'_>) {
+        self.places.fill(None);
+        for (place, candidate) in order.iter().enumerate() {
+            self.places[candidate.robot] = Some(place);
+        }
+        for place in 0..order.len() {
+            let first = order[place];
+            for contact in self.wanted(&first) {
+                // Each pair once, from the lower number.
+                let rival = self.places[contact.other].filter(|rival| *rival > place);
+                let Some(rival) = rival else {
+                    continue;
+                };
+                let second = order[rival];
+                if contact.others.lower > self.margin.upper(second.want, usize::MAX)
+                    || contact.others.upper <= self.traffic.span(second.robot).upper
+                {
+                    continue;
+                }
+                match self.compare(cycle, first.robot, contact) {
+                    Ordering::Less => order[rival].rivals_before += 1,
+                    Ordering::Greater => order[place].rivals_before += 1,
+                    Ordering::Equal => {}
+                }
+            }
+        }
+        order.sort_by_key(|candidate| (candidate.rivals_before, candidate.robot));
+    }
+
+    /// The sections of which the candidate wants poses it does not have.
+    fn wanted(&self, candidate: &Candidate) -> impl Iterator<Item = &Contact> {
+        let from = self.traffic.span(candidate.robot).upper;
+        let to = self.margin.upper(candidate.want, usize::MAX);
+        let contacts = self.traffic.contacts(candidate.robot).iter();
+        contacts.filter(move |contact| contact.own.upper > from && contact.own.lower <= to)
+    }
+
+    fn compare(&self, cycle: &Cycle<'_>, robot: usize, contact: &Contact) -> Ordering {
+        let contender = |robot: usize, start| {
+            let mut contender = cycle.roster.robots()[robot].contender(robot, start);
+            contender.held_up_count = self.robots[robot].held_up_count;
+            contender
+        };
+        let contest = Contest {
+            section: contact.section(),
+            first: contender(robot, contact.own.lower),
+            second: contender(contact.other, contact.others.lower),
+        };
+        let by_number = || robot.cmp(&contact.other);
+        cycle.policy.compare(&contest).then_with(by_number)
+    }
+
+    /// Gives the candidate as much as it may have; false when that is nothing.
+    fn extend(&mut self, candidate: &Candidate, may_reorder: bool) -> bool {
+        let robot = candidate.robot;
+        let (last, margin) = (self.traffic.last(robot), self.margin);
+        let bound = self.robots[robot].ledger.bound();
+        let from = self.traffic.span(robot).upper + 1;
+        let to = margin.upper(candidate.want, last);
+        let conflict = self
+            .traffic
+            .first_conflict(robot, from, to, self.traffic.spans());
+        let mut end = candidate.want;
+        if let Some((index, other)) = conflict {
+            self.robots[robot].stopped_by = Some(other);
+            end = (index - 1).saturating_sub(margin.above);
+        }
+        let free_end = end;
+        for _ in 0..ENDS_MAX {
+            if end <= bound {
+                break;
+            }
+            let upper = margin.upper(end, last);
+            match self.plan.extend(&self.traffic, robot, upper, may_reorder) {
+                Verdict::Withheld => self.counts.grants_withheld += 1,
+                verdict => {
+                    self.counts.plans_reordered += u64::from(verdict == Verdict::Reorders);
+                    return self.give(robot, end);
+                }
+            }
+            let start = section_start(self.traffic.contacts(robot), upper);
+            end = start.saturating_sub(margin.above + 1);
+        }
+        // What the plan itself foresees next is always possible.
+        let planned = self.plan.next_end(robot).map_or(0, |end| end.min(free_end));
+        if planned > bound {
+            let upper = margin.upper(planned, last);
+            if self.plan.extend(&self.traffic, robot, upper, false) != Verdict::Withheld {
+                return self.give(robot, planned);
+            }
+        }
+        false
+    }
+
+    fn give(&mut self, robot: usize, end: usize) -> bool {
+        let is_given = self.robots[robot].ledger.send(end).is_some();
+        if is_given {
+            self.counts.grants += 1;
+            self.update_span(robot);
+        }
+        is_given
+    }
+
+    /// Asks way back from the robot that stops `robot`, where the policy prefers the latter and
+    /// the former has not yet come so far that it must enter.
+    fn take_back(&mut self, cycle: &Cycle<'_>, robot: usize) {
+        let Some(holder) = self.robots[robot].stopped_by else {
+            return;
+        };
+        let from = self.traffic.span(robot).upper + 1;
+        let span = self.traffic.span(holder);
+        let view = &self.robots[holder];
+        if view.ledger.is_done() || view.ledger.is_shrinking() || cycle.now < view.spared_until {
+            return;
+        }
+        let Some(state) = cycle.roster.robots()[holder].state else {
+            return;
+        };
+        let may_stop = usize::try_from(state.stop_index).unwrap_or(usize::MAX);
+        let earliest = may_stop.max(view.ledger.lower()) + 1;
+        let contacts = self.traffic.contacts(robot).iter();
+        let end = contacts
+            .filter(|contact| contact.other == holder && contact.own.upper >= from)
+            .filter_map(|contact| {
+                let entry = contact.section().first_conflict(
+                    Side::Second,
+                    span.lower,
+                    (from, contact.own.upper),
+                )?;
+                let end = entry.checked_sub(self.margin.above + 1)?;
+                let is_useful = end >= earliest && entry <= span.upper;
+                let prefers = || self.compare(cycle, robot, contact) == Ordering::Less;
+                (is_useful && prefers()).then_some(end)
+            })
+            .min();
+        let Some(end) = end.filter(|end| *end < view.ledger.bound()) else {
+            return;
+        };
+        let view = &mut self.robots[holder];
+        if view.ledger.send(end).is_some() {
+            view.spared_until = cycle.now + SPARED;
+            view.waiting_since = view.waited_since.or(view.waiting_since);
+            view.retracted = cycle.now;
+            self.counts.shrinks += 1;
+        }
+    }
+
+    fn count_held_up(&mut self, roster: &Roster) {
+        for view in &mut self.robots {
+            view.held_up_count = 0;
+        }
+        for robot in 0..self.robots.len() {
+            if roster.robots()[robot].waiting_since.is_none() {
+                continue;
+            }
+            // Whoever waits for one that waits is held up by the one in front as well.
+            let mut next = self.robots[robot].stopped_by;
+            for _ in 0..QUEUE_MAX {
+                let Some(holder) = next.filter(|holder| *holder != robot) else {
+                    break;
+                };
+                self.robots[holder].held_up_count += 1;
+                next = self.robots[holder].stopped_by;
+            }
+        }
+    }
+}

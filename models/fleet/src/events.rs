@@ -1,0 +1,345 @@
+//! The events of a recorded run: incidents the referee saw and commands the robots got late, not
+//! at all or in vain, each with the messages behind it. What the network did to those messages is
+//! not known here; whoever has the account of the channels shows it beside them.
+
+use core::time::Duration;
+use std::collections::BTreeMap;
+
+use crate::case::{FLEET_AUTHORITY, FLEET_MISSION, FLEET_TRUTH};
+use crate::messages::{Authority, Mission, Truth, TruthKind};
+use crate::referee::{Incident, IncidentKind};
+use hil_core::case_study::{MessageRef, ScoreEvent, Severity};
+use hil_core::message::Message;
+use hil_core::run_log::RunLog;
+use hil_core::time::Instant;
+
+/// A command counts as held up when the copy that was taken left so long after the first. Repeats
+/// come after a control period, a second, and replicas at once.
+const HELD_UP_AFTER: Duration = Duration::from_millis(300);
+
+/// A robot dates what it does to the moment it began to read its channels; a command may come in
+/// while it reads, and so leave after its effect.
+const READING: Duration = Duration::from_millis(20);
+
+/// Copies of one command that an event names.
+const COPIES_NAMED_MAX: usize = 4;
+
+/// What a robot was told: fleet, robot, mission, and the number of the authority.
+type Key = (u32, u32, u32, u32);
+
+/// The events of a run, in order of time. The log must hold the truth in its own order.
+pub(crate) fn events(log: &RunLog, incidents: &[Incident]) -> Vec<ScoreEvent> {
+    let orders = Orders::of(log);
+    let mut watches: BTreeMap<(u32, u32), Watch> = BTreeMap::new();
+    let mut found = Found::default();
+    for (_, truth) in log.messages::<Truth>(FLEET_TRUTH) {
+        let watch = watches.entry((truth.fleet_id, truth.robot_id)).or_default();
+        watch.see(&truth, &orders, &mut found);
+    }
+    let Found { mut events, led_to } = found;
+    events.extend(incidents.iter().map(|one| incident(one, &orders, &led_to)));
+    events.sort_by_key(|event| event.at);
+    events
+}
+
+/// What came of the robots' records.
+#[derive(Debug, Default)]
+struct Found {
+    events: Vec<ScoreEvent>,
+    /// By authority taken: its copies, and those of the numbers that should have come before it.
+    led_to: BTreeMap<Key, Vec<Sent>>,
+}
+
+/// One sending of a command.
+#[derive(Debug, Clone, Copy)]
+struct Sent {
+    message: MessageRef,
+    at: Instant,
+}
+
+/// Everything the controller sent.
+#[derive(Debug, Default)]
+struct Orders {
+    authorities: BTreeMap<Key, Vec<Sent>>,
+    missions: BTreeMap<(u32, u32, u32), Vec<Sent>>,
+    /// Controller and robots read one clock, or theirs are aligned: their times compare.
+    has_one_clock: bool,
+    /// How much later than its effect a command may seem to have left.
+    reading: Duration,
+}
+
+impl Orders {
+    fn of(log: &RunLog) -> Self {
+        let mut orders = Self {
+            has_one_clock: log.has_one_clock(),
+            reading: READING + Duration::from_nanos(log.clock_bound_ns()),
+            ..Self::default()
+        };
+        for (sent, authority) in sent::<Authority>(log, FLEET_AUTHORITY) {
+            let to = &authority.header;
+            let key = (to.fleet_id, to.robot_id, to.mission_id, authority.sequence);
+            orders.authorities.entry(key).or_default().push(sent);
+        }
+        for (sent, mission) in sent::<Mission>(log, FLEET_MISSION) {
+            let to = &mission.header;
+            let key = (to.fleet_id, to.robot_id, to.mission_id);
+            orders.missions.entry(key).or_default().push(sent);
+        }
+        orders
+    }
+
+    fn authority(&self, key: Key) -> &[Sent] {
+        self.authorities.get(&key).map_or(&[], Vec::as_slice)
+    }
+
+    /// What was sent of a mission's authorities after number `after` and below `below`.
+    fn between(
+        &self,
+        (fleet, robot, mission): (u32, u32, u32),
+        after: u32,
+        below: u32,
+    ) -> Vec<Sent> {
+        let from = (fleet, robot, mission, after.saturating_add(1));
+        let to = (fleet, robot, mission, below);
+        if from >= to {
+            return Vec::new();
+        }
+        let range = self.authorities.range(from..to);
+        range.flat_map(|(_, copies)| copies).copied().collect()
+    }
+
+    /// How long after its first copy a command was taken at `at`, and how many copies left well
+    /// before the one that was; `None` when it was not held up, or no one can say.
+    fn held_up(&self, copies: &[Sent], at: Instant) -> Option<(f64, usize)> {
+        let first = copies.first().filter(|_| self.has_one_clock)?;
+        let taken = copies.iter().rfind(|copy| copy.at <= at + self.reading)?;
+        let missed = copies
+            .iter()
+            .filter(|copy| copy.at + HELD_UP_AFTER <= taken.at);
+        let missed_count = missed.count();
+        (missed_count > 0).then(|| (at.seconds_since(first.at), missed_count))
+    }
+}
+
+impl Orders {
+    /// The first of `copies` that went out before `event`: what was sent later did not lead to it.
+    fn named(&self, event: ScoreEvent, mut copies: Vec<Sent>) -> ScoreEvent {
+        copies.retain(|sent| !self.has_one_clock || sent.at <= event.at + self.reading);
+        copies.sort_by_key(|sent| sent.at);
+        let copies = copies.iter().take(COPIES_NAMED_MAX);
+        copies.fold(event, |event, sent| event.naming(sent.message))
+    }
+}
+
+fn sent<M: Message>(log: &RunLog, channel: &'static str) -> impl Iterator<Item = (Sent, M)> {
+    log.raw(channel).iter().filter_map(move |logged| {
+        let message = bytemuck::try_pod_read_unaligned(&logged.payload).ok()?;
+        let sent = Sent {
+            message: MessageRef::of(channel, &logged.envelope),
+            at: Instant::from_ns(logged.envelope.published_ns),
+        };
+        Some((sent, message))
+    })
+}
+
+/// What one robot has heard of its mission.
+#[derive(Debug, Default)]
+struct Watch {
+    mission_id: u32,
+    /// When the robot began it, if its record says so.
+    begun: Option<Instant>,
+    heard: u32,
+}
+
+impl Watch {
+    fn see(&mut self, truth: &Truth, orders: &Orders, found: &mut Found) {
+        let Some(kind) = TruthKind::of(truth.kind) else {
+            return;
+        };
+        if truth.mission_id != self.mission_id {
+            self.mission_id = truth.mission_id;
+            self.begun = (kind == TruthKind::MissionStarted).then(|| at(truth));
+            self.heard = 0;
+        }
+        match kind {
+            TruthKind::MissionStarted => found.events.extend(mission_held_up(truth, orders)),
+            TruthKind::AuthorityApplied
+            | TruthKind::AuthorityLate
+            | TruthKind::AuthorityIgnored
+            | TruthKind::AuthorityRefused => {
+                let (event, sent) = self.hear(truth, kind, orders);
+                found.events.extend(event);
+                found.led_to.entry(key(truth)).or_insert(sent);
+            }
+            // A repeat of what it knows; a number that was sent for this mission counts as heard.
+            TruthKind::MessageStale if !orders.authority(key(truth)).is_empty() => {
+                self.heard = self.heard.max(truth.caused_by_sequence);
+            }
+            TruthKind::LeaseEnded => found.events.push(lease_ended(truth, orders)),
+            TruthKind::Replaced => {
+                let what = format!("{} was put at its goal to clear a stuck fleet", name(truth));
+                found.events.push(event(Severity::Hazard, truth, what));
+            }
+            TruthKind::Motion | TruthKind::MissionDone | TruthKind::MessageStale => {}
+        }
+    }
+
+    /// One event at most per authority taken, the gravest that applies; and what led to it.
+    fn hear(
+        &mut self,
+        truth: &Truth,
+        kind: TruthKind,
+        orders: &Orders,
+    ) -> (Option<ScoreEvent>, Vec<Sent>) {
+        let number = truth.caused_by_sequence;
+        let before = self.heard;
+        self.heard = before.max(number);
+        let robot = (truth.fleet_id, truth.robot_id, truth.mission_id);
+        let missed = orders.between(robot, before, number);
+        let copies = orders.authority(key(truth));
+        // What was sent before the robot had the mission had to wait for it, not for the network.
+        let begun = self.begun.filter(|_| orders.has_one_clock);
+        let since = copies.partition_point(|copy| begun.is_some_and(|begun| copy.at < begun));
+        let copies = &copies[since..];
+        let sent = [missed.as_slice(), copies].concat();
+        let severity = match kind {
+            TruthKind::AuthorityLate | TruthKind::AuthorityIgnored => Severity::Hazard,
+            _ => Severity::Notice,
+        };
+        let said = if severity == Severity::Notice && number <= before {
+            None
+        } else {
+            let held_up = orders.held_up(copies, at(truth));
+            words(truth, kind, held_up, (before, !missed.is_empty()))
+        };
+        let event = said.map(|what| orders.named(event(severity, truth, what), sent.clone()));
+        (event, sent)
+    }
+}
+
+/// What to say of an authority taken: how long it was held up, and the number heard before with
+/// whether any between the two was sent. `None` when all is well.
+fn words(
+    truth: &Truth,
+    kind: TruthKind,
+    held_up: Option<(f64, usize)>,
+    (before, has_missed): (u32, bool),
+) -> Option<String> {
+    let (who, number, mission) = (name(truth), truth.caused_by_sequence, truth.mission_id);
+    let order = format!("authority {number} of mission {mission}");
+    match (kind, held_up) {
+        (TruthKind::AuthorityLate, _) => Some(format!(
+            "{who} could not stop at {order} any more and went past"
+        )),
+        (TruthKind::AuthorityIgnored, _) => Some(format!(
+            "{who} was past {order} already and drives on as before"
+        )),
+        (TruthKind::AuthorityRefused, _) => Some(format!(
+            "{who} refused {order}: it cannot stop there any more"
+        )),
+        (_, Some((late_s, copy_count))) => {
+            let copies = counted(copy_count, "copy", "copies");
+            Some(format!(
+                "{who} took {order} {late_s:.2} s after it was first sent, {copies} before"
+            ))
+        }
+        _ if has_missed => {
+            let first = before + 1;
+            let numbers = if first + 1 == number {
+                format!("authority {first}")
+            } else {
+                format!("authorities {first} to {}", number - 1)
+            };
+            Some(format!(
+                "{who} took no {numbers} of mission {mission} before {number}"
+            ))
+        }
+        _ => None,
+    }
+}
+
+fn mission_held_up(truth: &Truth, orders: &Orders) -> Option<ScoreEvent> {
+    let key = (truth.fleet_id, truth.robot_id, truth.mission_id);
+    let copies = orders.missions.get(&key)?;
+    let (late_s, copy_count) = orders.held_up(copies, at(truth))?;
+    let what = format!(
+        "{} began mission {} {late_s:.2} s after it was first sent, {} before",
+        name(truth),
+        truth.mission_id,
+        counted(copy_count, "copy", "copies"),
+    );
+    Some(orders.named(notice(truth, what), copies.clone()))
+}
+
+fn lease_ended(truth: &Truth, orders: &Orders) -> ScoreEvent {
+    let robot = (truth.fleet_id, truth.robot_id, truth.mission_id);
+    let unheard = orders.between(robot, truth.caused_by_sequence, u32::MAX);
+    let what = format!(
+        "{} braked: the lease of authority {} of mission {} ended",
+        name(truth),
+        truth.caused_by_sequence,
+        truth.mission_id
+    );
+    orders.named(notice(truth, what), unheard)
+}
+
+/// An incident with, for each of the two robots, what led to the authority it last took and what
+/// was sent to it after that.
+fn incident(incident: &Incident, orders: &Orders, led_to: &BTreeMap<Key, Vec<Sent>>) -> ScoreEvent {
+    let manner = match incident.kind {
+        IncidentKind::Section => "collided by the section checker",
+        IncidentKind::Overlap => "overlapped in a critical section",
+        IncidentKind::Outside => "overlapped outside every critical section",
+    };
+    let [one, other] = incident.robots;
+    let [x_m, y_m] = incident.position_m;
+    let what = format!(
+        "robots {one} and {other} of fleet {} {manner}, at x {x_m:.1} m, y {y_m:.1} m",
+        incident.fleet_id
+    );
+    let event = ScoreEvent::new(Severity::Incident, incident.at, FLEET_TRUTH, what);
+    let sides = incident
+        .robots
+        .iter()
+        .zip(incident.mission_ids)
+        .zip(incident.causes);
+    sides.fold(event, |event, ((robot, mission), cause)| {
+        let robot = (incident.fleet_id, *robot, mission);
+        let taken = cause.caused_by_sequence;
+        let last = led_to.get(&(robot.0, robot.1, robot.2, taken));
+        let event = orders.named(event, last.cloned().unwrap_or_default());
+        orders.named(event, orders.between(robot, taken, u32::MAX))
+    })
+}
+
+fn event(severity: Severity, truth: &Truth, what: String) -> ScoreEvent {
+    ScoreEvent::new(severity, at(truth), FLEET_TRUTH, what)
+}
+
+fn notice(truth: &Truth, what: String) -> ScoreEvent {
+    event(Severity::Notice, truth, what)
+}
+
+fn key(truth: &Truth) -> Key {
+    (
+        truth.fleet_id,
+        truth.robot_id,
+        truth.mission_id,
+        truth.caused_by_sequence,
+    )
+}
+
+fn at(truth: &Truth) -> Instant {
+    Instant::from_ns(truth.at_ns)
+}
+
+fn name(truth: &Truth) -> String {
+    format!("robot {} of fleet {}", truth.robot_id, truth.fleet_id)
+}
+
+fn counted(count: usize, one: &str, many: &str) -> String {
+    format!("{count} {}", if count == 1 { one } else { many })
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,425 @@
+//! The cells of the tables: which experiments there are, and what each is held against. It runs
+//! none of them.
+
+use crate::coordinator::parameters::CoordinatorMode;
+use crate::experiment::published::{Condition, HARBOR, PublishedNetwork, PublishedRow, WAREHOUSE};
+use crate::experiment::setup::{Links, Setup, StatusPath};
+use crate::messages::MessageOrder;
+use crate::robot::TrackerKind;
+use crate::scenario::Scenario;
+use hil_link::impaired::{DelayLaw, Impairments};
+use hil_link::wifi::WifiPreset;
+
+/// Scenarios of the paper's tables.
+pub(crate) const SCENARIOS: [Scenario; 2] = [Scenario::Harbor, Scenario::Warehouse];
+
+/// What a scenario is called in tables.
+pub(crate) const fn scenario_name(scenario: Scenario) -> &'static str {
+    match scenario {
+        Scenario::Harbor => "harbor",
+        Scenario::Warehouse => "warehouse",
+        _ => "other",
+    }
+}
+
+/// The published rows of a scenario.
+pub(crate) const fn published_rows(scenario: Scenario) -> &'static [PublishedRow] {
+    match scenario {
+        Scenario::Harbor => &HARBOR,
+        _ => &WAREHOUSE,
+    }
+}
+
+/// One experiment of the tables.
+#[derive(Debug, Clone)]
+pub(crate) struct Cell {
+    /// Which world.
+    pub(crate) scenario: Scenario,
+    /// Where its figures go.
+    pub(crate) place: Place,
+    /// Everything else.
+    pub(crate) setup: Setup,
+    /// What its figures are held against.
+    pub(crate) demand: Demand,
+}
+
+/// A cell's place in the tables.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Place {
+    /// Beside a published row, with so many copies of every message.
+    Published { row: PublishedRow, copies: u32 },
+    /// Below the published rows: what one change to a row does.
+    Variant { text: &'static str },
+    /// In the table of mechanisms.
+    Mechanism {
+        mechanism: Mechanism,
+        mode: CoordinatorMode,
+    },
+}
+
+/// What a probability of collision is held against, per 1000 critical sections.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) enum Demand {
+    /// Nothing.
+    None,
+    /// The interval's upper end lies below.
+    Below(f64),
+    /// More than none, and within.
+    Within(f64, f64),
+    /// None by the original's checker, which the probability is of.
+    NoneSeen,
+    /// None at all, by each checker.
+    NoneAtAll,
+}
+
+impl Cell {
+    /// What the cell is called, whatever its position among the others.
+    pub(crate) fn name(&self) -> String {
+        match self.place {
+            Place::Published { copies: 1, .. } => self.seed_name().replace("1 copies", "1 copy"),
+            _ => self.seed_name(),
+        }
+    }
+
+    /// What the seeds of its runs are drawn from: equal as long as equal tables are wanted.
+    pub(crate) fn seed_name(&self) -> String {
+        let scenario = scenario_name(self.scenario);
+        match &self.place {
+            Place::Published { row, copies } => match row.condition {
+                Condition::Static {
+                    loss_ratio,
+                    delay_ms,
+                } => format!("{scenario}, loss {loss_ratio}, {delay_ms} ms, {copies} copies"),
+                Condition::HardwareInTheLoop(network) => format!("{scenario}, {network}"),
+            },
+            Place::Variant { text } => format!("{scenario}, {text}"),
+            Place::Mechanism { mechanism, mode } => {
+                format!("{scenario}, {}, {}", mechanism.label(), mode_name(*mode))
+            }
+        }
+    }
+}
+
+/// What a mode is called in tables.
+pub(crate) const fn mode_name(mode: CoordinatorMode) -> &'static str {
+    match mode {
+        CoordinatorMode::Legacy => "legacy",
+        CoordinatorMode::Safe => "safe",
+    }
+}
+
+/// The static rows of Tables II and III as the original simulates them, with one and with three
+/// copies where packets are lost, and the variants that show where the collisions come from.
+pub(crate) fn published_cells(base: &Setup, law: DelayLaw) -> Vec<Cell> {
+    let mut cells = Vec::new();
+    for scenario in SCENARIOS {
+        for row in published_rows(scenario) {
+            let (loss_ratio, delay_ms) = match row.condition {
+                Condition::Static {
+                    loss_ratio,
+                    delay_ms,
+                } => (loss_ratio, delay_ms),
+                Condition::HardwareInTheLoop(network) => {
+                    cells.extend(wifi_cell(base, scenario, (*row, network)));
+                    continue;
+                }
+            };
+            let copies: &[u32] = if loss_ratio > 0.0 { &[1, 3] } else { &[1] };
+            cells.extend(copies.iter().map(|&copies| Cell {
+                scenario,
+                place: Place::Published { row: *row, copies },
+                setup: original(base, (delay_ms, law), (loss_ratio, copies)),
+                demand: demand_of(scenario, (loss_ratio, delay_ms), copies),
+            }));
+        }
+        if scenario == Scenario::Harbor {
+            cells.extend(variants(base, law));
+        }
+    }
+    cells
+}
+
+/// The original's mechanisms: believed delivery, stepped tracker whose steps the delay stretches,
+/// status read past the network, the delay known to the coordinator.
+fn original(
+    base: &Setup,
+    (delay_ms, law): (f64, DelayLaw),
+    (loss_ratio, copies): (f64, u32),
+) -> Setup {
+    let mut setup = base.clone();
+    setup.robot.tracker = TrackerKind::LegacyRk4;
+    setup.robot.step_inflation = true;
+    setup.robot.inflation_delay_ms = delay_ms;
+    setup.coordinator.mode = CoordinatorMode::Legacy;
+    setup.coordinator.known_delay_ms = delay_ms;
+    let channel = Impairments {
+        delay_ms,
+        delay_law: law,
+        loss_ratio,
+        copies,
+        ..Impairments::default()
+    };
+    setup.links = Links {
+        status_path: StatusPath::Bypass,
+        commands: channel,
+        status: channel,
+        wifi: None,
+        status_keeps_order: true,
+    };
+    setup
+}
+
+/// A row over a radio beside the model of that radio: the original's rules, status over the network,
+/// steps of nominal length, and a coordinator that knows of no delay. `None` for a wire.
+fn wifi_cell(
+    base: &Setup,
+    scenario: Scenario,
+    (row, network): (PublishedRow, PublishedNetwork),
+) -> Option<Cell> {
+    let preset = match network {
+        PublishedNetwork::ShortRange => WifiPreset::ShortRange,
+        PublishedNetwork::LongRange => WifiPreset::LongRange,
+        PublishedNetwork::Ethernet => return None,
+    };
+    let mut setup = original(base, (0.0, DelayLaw::Constant), (0.0, 1));
+    setup.robot.step_inflation = false;
+    setup.links.status_path = StatusPath::Network;
+    setup.links.wifi = Some(preset.spec());
+    Some(Cell {
+        scenario,
+        place: Place::Published { row, copies: 1 },
+        setup,
+        demand: Demand::None,
+    })
+}
+
+/// What our figures must come to, from the published ones and a prototype of the algorithm.
+fn demand_of(scenario: Scenario, (loss_ratio, delay_ms): (f64, f64), copies: u32) -> Demand {
+    let is_lossy = loss_ratio > 0.0;
+    let is_long = delay_ms > 99.0;
+    match (scenario, is_lossy) {
+        (Scenario::Harbor, false) if is_long => Demand::Within(0.2, 4.0),
+        (Scenario::Harbor, false) if delay_ms > 49.0 => Demand::Below(0.37),
+        // The reference gives no band for three copies.
+        (Scenario::Harbor, true) if is_long && copies > 1 => Demand::None,
+        (Scenario::Harbor, true) if is_long => Demand::Within(0.5, 5.0),
+        (Scenario::Harbor, true) => Demand::Below(0.37),
+        (_, false) => Demand::Below(0.2),
+        (_, true) if copies > 1 => Demand::Below(0.37),
+        (_, true) => Demand::None,
+    }
+}
+
+/// Harbor, 100 ms, no loss, with one thing changed; the last changes all that the network could
+/// be blamed for, and keeps the nominal steps.
+fn variants(base: &Setup, law: DelayLaw) -> Vec<Cell> {
+    let row = || original(base, (100.0, law), (0.0, 1));
+    let variant = |text, demand, change: fn(&mut Setup)| {
+        let mut setup = row();
+        change(&mut setup);
+        Cell {
+            scenario: Scenario::Harbor,
+            place: Place::Variant { text },
+            setup,
+            demand,
+        }
+    };
+    vec![
+        variant(
+            "100 ms, steps of nominal length",
+            Demand::NoneSeen,
+            |setup| setup.robot.step_inflation = false,
+        ),
+        variant("100 ms, exact tracker", Demand::NoneSeen, |setup| {
+            setup.robot.tracker = TrackerKind::Exact;
+        }),
+        variant("100 ms, margin of 6 poses", Demand::NoneSeen, |setup| {
+            setup.coordinator.trailing_points = 6;
+        }),
+        variant(
+            "100 ms, nominal steps, delayed status, delay unknown",
+            Demand::None,
+            |setup| {
+                setup.robot.step_inflation = false;
+                setup.links.status_path = StatusPath::Network;
+                setup.coordinator.known_delay_ms = 0.0;
+            },
+        ),
+    ]
+}
+
+/// What the network, or the controller's host, does in a row of the table of mechanisms.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Mechanism {
+    /// Nothing.
+    Clean,
+    /// Every message takes 300 ms.
+    Delay300Ms,
+    /// Every message takes 1 s.
+    Delay1S,
+    /// Messages take 0 to 1 s.
+    DelayTo1S,
+    /// A tenth of the commands is lost.
+    CommandLoss10,
+    /// A tenth of the status is lost.
+    StatusLoss10,
+    /// A tenth of both is lost.
+    Loss10,
+    /// Three tenths of both are lost.
+    Loss30,
+    /// The network stalls for 1 s in 30 s.
+    Stall1S,
+    /// The network stalls for 3 s in 30 s.
+    Stall3S,
+    /// The controller's host overruns.
+    Overrun,
+    /// A tenth of the messages comes twice.
+    Repeated,
+    /// A tenth of the messages is held back.
+    HeldBack,
+}
+
+impl Mechanism {
+    /// All of them, in the order of the table.
+    pub(crate) const ALL: [Self; 13] = [
+        Self::Clean,
+        Self::Delay300Ms,
+        Self::Delay1S,
+        Self::DelayTo1S,
+        Self::CommandLoss10,
+        Self::StatusLoss10,
+        Self::Loss10,
+        Self::Loss30,
+        Self::Stall1S,
+        Self::Stall3S,
+        Self::Overrun,
+        Self::Repeated,
+        Self::HeldBack,
+    ];
+
+    /// What a table calls it; the seeds of its cells are drawn from it too.
+    pub(crate) const fn label(self) -> &'static str {
+        match self {
+            Self::Clean => "clean",
+            Self::Delay300Ms => "delay 300 ms",
+            Self::Delay1S => "delay 1 s",
+            Self::DelayTo1S => "delay 0 to 1 s",
+            Self::CommandLoss10 => "loss 10 %, commands",
+            Self::StatusLoss10 => "loss 10 %, status",
+            Self::Loss10 => "loss 10 %, both",
+            Self::Loss30 => "loss 30 %, both",
+            Self::Stall1S => "stalls, mean 1 s in 30 s",
+            Self::Stall3S => "stalls, mean 3 s in 30 s",
+            Self::Overrun => "overrun to 4 s",
+            Self::Repeated => "10 % repeated to 3 s late",
+            Self::HeldBack => "10 % held back to 3 s",
+        }
+    }
+
+    fn apply(self, setup: &mut Setup) {
+        match self {
+            Self::Clean => {}
+            Self::Delay300Ms => delay_both(setup, 300.0, DelayLaw::Constant),
+            Self::Delay1S => delay_both(setup, 1000.0, DelayLaw::Constant),
+            Self::DelayTo1S => delay_both(setup, 1000.0, DelayLaw::Uniform),
+            Self::CommandLoss10 => setup.links.commands.loss_ratio = 0.1,
+            Self::StatusLoss10 => setup.links.status.loss_ratio = 0.1,
+            Self::Loss10 => lose_both(setup, 0.1),
+            Self::Loss30 => lose_both(setup, 0.3),
+            Self::Stall1S => stall_both(setup, 1.0),
+            Self::Stall3S => stall_both(setup, 3.0),
+            Self::Overrun => setup.overrun_max_s = 4.0,
+            Self::Repeated => both(setup, |channel| {
+                channel.duplicate_ratio = 0.1;
+                channel.duplicate_lag_ms = 3000.0;
+            }),
+            Self::HeldBack => both(setup, |channel| {
+                channel.hold_ratio = 0.1;
+                channel.hold_ms = 3000.0;
+            }),
+        }
+    }
+}
+
+fn both(setup: &mut Setup, change: impl Fn(&mut Impairments)) {
+    change(&mut setup.links.commands);
+    change(&mut setup.links.status);
+}
+
+fn delay_both(setup: &mut Setup, delay_ms: f64, law: DelayLaw) {
+    both(setup, |channel| {
+        channel.delay_ms = delay_ms;
+        channel.delay_law = law;
+    });
+}
+
+fn lose_both(setup: &mut Setup, loss_ratio: f64) {
+    both(setup, |channel| channel.loss_ratio = loss_ratio);
+}
+
+fn stall_both(setup: &mut Setup, mean_s: f64) {
+    both(setup, |channel| channel.stall_mean_s = mean_s);
+}
+
+/// Each mechanism with each coordinator in each scenario: status over the network, robots that
+/// stop where they mean to, and a coordinator that knows of no delay.
+pub(crate) fn mechanism_cells(base: &Setup) -> Vec<Cell> {
+    let mut cells = Vec::new();
+    for mechanism in Mechanism::ALL {
+        for scenario in SCENARIOS {
+            for mode in [CoordinatorMode::Legacy, CoordinatorMode::Safe] {
+                let mut setup = base.clone();
+                setup.robot.tracker = TrackerKind::Exact;
+                setup.coordinator.mode = mode;
+                setup.coordinator.known_delay_ms = 0.0;
+                setup.coordinator.message_order = match mode {
+                    CoordinatorMode::Legacy => MessageOrder::Legacy,
+                    CoordinatorMode::Safe => MessageOrder::Strict,
+                };
+                setup.links = Links::default();
+                mechanism.apply(&mut setup);
+                cells.push(Cell {
+                    scenario,
+                    place: Place::Mechanism { mechanism, mode },
+                    setup,
+                    demand: match mode {
+                        CoordinatorMode::Legacy => Demand::None,
+                        CoordinatorMode::Safe => Demand::NoneAtAll,
+                    },
+                });
+            }
+        }
+    }
+    cells
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::collections::BTreeSet;
+
+    #[test]
+    fn every_static_row_of_both_tables_has_its_cells_and_every_name_is_its_own() {
+        let base = Setup::default();
+        let published = published_cells(&base, DelayLaw::Constant);
+        // Per scenario 4 rows without loss and 4 with, the latter twice, and 2 over a radio; then the
+        // variants.
+        assert_eq!(published.len(), 2 * (4 + 8 + 2) + 4);
+        let mechanisms = mechanism_cells(&base);
+        assert_eq!(mechanisms.len(), 13 * 4);
+        let cells = published.iter().chain(&mechanisms);
+        let names: BTreeSet<_> = cells.clone().map(Cell::name).collect();
+        assert_eq!(names.len(), published.len() + mechanisms.len());
+        for cell in cells {
+            assert_eq!(cell.setup.check(), Ok(()), "{}", cell.name());
+        }
+    }
+
+    #[test]
+    fn each_safe_cell_demands_no_collision_at_all() {
+        for cell in mechanism_cells(&Setup::default()) {
+            let is_safe = cell.setup.coordinator.mode == CoordinatorMode::Safe;
+            assert_eq!(cell.demand == Demand::NoneAtAll, is_safe);
+        }
+    }
+}

@@ -1,0 +1,425 @@
+//! The tables: Tables II and III beside our figures, what the robots did in each row, and the table
+//! of mechanisms. It computes intervals and ratios, nothing else.
+
+use crate::coordinator::parameters::CoordinatorMode;
+use crate::experiment::cells::{
+    Cell as Experiment, Demand, Mechanism, Place, SCENARIOS, published_rows, scenario_name,
+};
+use crate::experiment::judgement;
+use crate::experiment::judgement::verdict_of;
+use crate::experiment::published::{Condition, PublishedRow};
+use crate::experiment::study::{FleetStudy, worlds_text};
+use crate::experiment::tally::{FleetTally, collision_interval};
+use crate::scenario::Scenario;
+use hil_core::study::{Cell, Column, StudyReport, Table};
+use hil_link::impaired::DelayLaw;
+
+/// The cells of a study with what came of them, as far as they were run.
+#[derive(Debug)]
+pub(crate) struct Results<'a> {
+    cells: Vec<(&'a Experiment, Option<FleetTally>)>,
+}
+
+impl<'a> Results<'a> {
+    /// Results in the order of their cells.
+    pub(crate) fn of(cells: Vec<(&'a Experiment, Option<FleetTally>)>) -> Self {
+        Self { cells }
+    }
+
+    /// All cells, and what came of those that were run.
+    pub(crate) fn all(&self) -> impl Iterator<Item = (&'a Experiment, Option<&FleetTally>)> {
+        self.cells
+            .iter()
+            .map(|(cell, tally)| (*cell, tally.as_ref()))
+    }
+
+    /// What came of the cell of a mechanism.
+    pub(crate) fn mechanism(
+        &self,
+        scenario: Scenario,
+        mechanism: Mechanism,
+        mode: CoordinatorMode,
+    ) -> Option<&FleetTally> {
+        let is_it = |cell: &Experiment| {
+            cell.scenario == scenario && cell.place == Place::Mechanism { mechanism, mode }
+        };
+        let (_, tally) = self.cells.iter().find(|(cell, _)| is_it(cell))?;
+        tally.as_ref()
+    }
+}
+
+/// The whole report.
+pub(crate) fn report(study: &FleetStudy, results: &Results<'_>) -> StudyReport {
+    let has = |is_wanted: fn(&Place) -> bool| {
+        let mut cells = study.cells().iter();
+        cells.any(|cell| is_wanted(&cell.place))
+    };
+    let mut tables = Vec::new();
+    if has(|place| !matches!(place, Place::Mechanism { .. })) {
+        for scenario in SCENARIOS {
+            tables.push(published_table(scenario, results));
+        }
+        tables.push(motion_table(results));
+    }
+    if has(|place| matches!(place, Place::Mechanism { .. })) {
+        for scenario in SCENARIOS {
+            tables.push(mechanism_table(scenario, results));
+        }
+        tables.push(command_table(results));
+    }
+    StudyReport {
+        title: "Case study 1: collisions per critical section (CS), in virtual time".to_owned(),
+        notes: notes(study),
+        tables,
+        criteria: judgement::criteria(study, results),
+    }
+}
+
+fn notes(study: &FleetStudy) -> Vec<String> {
+    let parameters = study.parameters();
+    let law = match parameters.delay_law {
+        DelayLaw::Constant => "constant",
+        DelayLaw::Uniform => "uniform from 0",
+    };
+    vec![
+        format!(
+            "seed {}, {} CS per cell in runs of {}; equal seeds give equal tables",
+            study.seed(),
+            parameters.sections,
+            parameters.sections_per_task.min(parameters.sections)
+        ),
+        format!("delay of the static rows: {law}"),
+        worlds_text(study),
+        "intervals: Clopper and Pearson, 95 %; without a collision the upper end is the exact \
+         bound behind the rule of three"
+            .to_owned(),
+        "collisions: by the original's checker / true overlaps / of these outside every section; \
+         the probability is of the first"
+            .to_owned(),
+    ]
+}
+
+const fn column(name: &'static str, label: &'static str) -> Column {
+    Column { name, label }
+}
+
+const PUBLISHED_COLUMNS: [Column; 13] = [
+    column("method", "Method"),
+    column("loss_ratio", "PLR"),
+    column("delay_ms", "Delay ms"),
+    column("copies", "Copies"),
+    column("sections", "CS"),
+    column("collisions", "Collisions"),
+    column("per_1000", "P x 1000"),
+    column("per_1000", "95 %"),
+    column("published_sections", "Paper: CS"),
+    column("published_collisions", "Coll."),
+    column("published_per_1000", "P x 1000"),
+    column("published_per_1000", "95 %"),
+    column("verdict", "Accepted if"),
+];
+
+/// Table II or III.
+fn published_table(scenario: Scenario, results: &Results<'_>) -> Table {
+    let (name, title) = match scenario {
+        Scenario::Harbor => ("table-2-harbor", "Table II, harbor"),
+        _ => ("table-3-warehouse", "Table III, warehouse"),
+    };
+    let mut rows = Vec::new();
+    for published in published_rows(scenario) {
+        let ours = results.all().filter(|(cell, _)| {
+            let is_row =
+                |place: &Place| matches!(place, Place::Published { row, .. } if row == published);
+            cell.scenario == scenario && is_row(&cell.place)
+        });
+        let before = rows.len();
+        rows.extend(ours.map(|(cell, tally)| published_row(published, Some((cell, tally)))));
+        if rows.len() == before {
+            rows.push(published_row(published, None));
+        }
+    }
+    let variants = results.all().filter(|(cell, _)| {
+        cell.scenario == scenario && matches!(cell.place, Place::Variant { .. })
+    });
+    rows.extend(variants.map(|(cell, tally)| variant_row(cell, tally)));
+    Table {
+        name: name.to_owned(),
+        title: title.to_owned(),
+        columns: PUBLISHED_COLUMNS.to_vec(),
+        rows,
+        notes: vec![
+            "rows measured with hardware in the loop depend on hosts and radio; ours beside them \
+             are over the Wi-Fi 6 model's presets, which are fitted to case study 2 alone"
+                .to_owned(),
+            "an overlap outside every section is a graze between two path poses, which a list of \
+             sections at the poses cannot hold; the safe coordinator's guarded sections do"
+                .to_owned(),
+        ],
+    }
+}
+
+fn published_row(
+    published: &PublishedRow,
+    ours: Option<(&Experiment, Option<&FleetTally>)>,
+) -> Vec<Cell> {
+    let mut row = match published.condition {
+        Condition::Static {
+            loss_ratio,
+            delay_ms,
+        } => vec![
+            Cell::text("static"),
+            Cell::number(Some(loss_ratio), 1),
+            Cell::number(Some(delay_ms), 0),
+        ],
+        Condition::HardwareInTheLoop(network) => vec![
+            Cell::text(format!("HiL, {network}")),
+            Cell::Absent,
+            Cell::Absent,
+        ],
+    };
+    row.push(match ours.map(|(cell, _)| &cell.place) {
+        Some(Place::Published { copies, .. }) => Cell::Count(u64::from(*copies)),
+        _ => Cell::Absent,
+    });
+    row.extend(figures(ours.and_then(|(_, tally)| tally)));
+    let (sections, collisions) = (published.sections, published.collisions);
+    row.extend([
+        Cell::Count(sections),
+        Cell::Count(collisions),
+        Cell::number(Some(1e3 * collisions as f64 / sections as f64), 2),
+        per_1000(collision_interval(collisions, sections)),
+    ]);
+    row.push(ours.map_or(Cell::Absent, |(cell, tally)| judged(cell, tally)));
+    row
+}
+
+fn variant_row(cell: &Experiment, tally: Option<&FleetTally>) -> Vec<Cell> {
+    let Place::Variant { text } = cell.place else {
+        return Vec::new();
+    };
+    let mut row = vec![
+        Cell::text(text),
+        Cell::number(Some(0.0), 1),
+        Cell::number(Some(100.0), 0),
+        Cell::Count(1),
+    ];
+    row.extend(figures(tally));
+    row.extend([Cell::Absent, Cell::Absent, Cell::Absent, Cell::Absent]);
+    row.push(judged(cell, tally));
+    row
+}
+
+/// Sections, collisions, probability and its interval.
+fn figures(tally: Option<&FleetTally>) -> [Cell; 4] {
+    let Some(tally) = tally else {
+        return [Cell::Absent, Cell::Absent, Cell::Absent, Cell::Absent];
+    };
+    [
+        Cell::Count(tally.section_count()),
+        collisions_cell(tally),
+        Cell::number(tally.collision_ratio().map(|ratio| 1e3 * ratio), 2),
+        per_1000(tally.collision_interval()),
+    ]
+}
+
+fn collisions_cell(tally: &FleetTally) -> Cell {
+    let seen = &tally.referee;
+    Cell::text(format!(
+        "{} / {} / {}",
+        seen.section_collisions_count, seen.overlaps_count, seen.outside_count
+    ))
+}
+
+fn per_1000(ends: Option<(f64, f64)>) -> Cell {
+    Cell::interval(ends.map(|(low, high)| (1e3 * low, 1e3 * high)), 2)
+}
+
+/// What a cell is held against, and whether it holds.
+fn judged(cell: &Experiment, tally: Option<&FleetTally>) -> Cell {
+    let text = judgement::demand_text(cell.demand);
+    if cell.demand == Demand::None {
+        return Cell::text(text);
+    }
+    let verdict = match tally.and_then(|tally| verdict_of(cell.demand, tally)) {
+        Some(true) => "met",
+        Some(false) => "MISSED",
+        None => "too few",
+    };
+    Cell::text(format!("{text}: {verdict}"))
+}
+
+const MOTION_COLUMNS: [Column; 13] = [
+    column("cell", "Row"),
+    column("separation_min_m", "Closest m"),
+    column("stop_error_max_m", "Past point m"),
+    column("stop_error_bound_m", "Bound m"),
+    column("late_overshoot_max_m", "Late, past m"),
+    column("late", "Late"),
+    column("ignored", "Ignored"),
+    column("order_reversals", "Reversals"),
+    column("deadlocks_broken", "Deadlocks"),
+    column("resets", "Resets"),
+    column("missions_per_hour", "Missions/h"),
+    column("robot_km", "Robot-km"),
+    column("collisions_per_1000_km", "Coll./1000 km"),
+];
+
+/// What the robots did in each row of Tables II and III.
+fn motion_table(results: &Results<'_>) -> Table {
+    let rows = results
+        .all()
+        .filter(|(cell, _)| !matches!(cell.place, Place::Mechanism { .. }))
+        .map(|(cell, tally)| {
+            let mut row = vec![Cell::text(cell.name())];
+            row.extend(motion_cells(tally));
+            row
+        });
+    Table {
+        name: "motion".to_owned(),
+        title: "Tables II and III: what the robots did".to_owned(),
+        columns: MOTION_COLUMNS.to_vec(),
+        rows: rows.collect(),
+        notes: vec![
+            "past point: farthest stop beyond an order that came in time; bound: 3 v (TT + D) + v \
+             TT / 2 for the stepped tracker, 0 for the exact one; late: orders too late to stop at"
+                .to_owned(),
+        ],
+    }
+}
+
+fn motion_cells(tally: Option<&FleetTally>) -> Vec<Cell> {
+    let Some(tally) = tally else {
+        return vec![Cell::Absent; MOTION_COLUMNS.len() - 1];
+    };
+    let (seen, decided) = (&tally.referee, &tally.coordinator);
+    let robot_km = 1e-3 * seen.travelled_m;
+    let per_1000_km = (robot_km > 0.0).then(|| 1e3 * tally.collision_count() as f64 / robot_km);
+    vec![
+        Cell::number(seen.separation_min_m, 2),
+        Cell::number(Some(seen.stop_error_max_m), 2),
+        Cell::number(Some(tally.stop_error_bound_m), 2),
+        Cell::number(Some(seen.late_overshoot_max_m), 2),
+        Cell::Count(seen.authorities_late_count),
+        Cell::Count(seen.authorities_ignored_count),
+        Cell::Count(decided.order_reversals),
+        Cell::Count(decided.deadlocks_broken),
+        Cell::Count(decided.resets),
+        Cell::number(tally.missions_per_hour(), 0),
+        Cell::number(Some(robot_km), 0),
+        Cell::number(per_1000_km, 2),
+    ]
+}
+
+const MECHANISM_COLUMNS: [Column; 12] = [
+    column("mechanism", "What the network does"),
+    column("legacy_sections", "Legacy: CS"),
+    column("legacy_collisions", "Collisions"),
+    column("legacy_per_1000", "P x 1000"),
+    column("legacy_per_1000", "95 %"),
+    column("legacy_resets", "Resets"),
+    column("legacy_missions_per_hour", "Missions/h"),
+    column("safe_sections", "Safe: CS"),
+    column("safe_collisions", "Collisions"),
+    column("safe_per_1000_high", "P x 1000 below"),
+    column("safe_stuck", "Stuck"),
+    column("safe_missions_per_hour", "Missions/h"),
+];
+
+/// What each impairment does to each coordinator.
+fn mechanism_table(scenario: Scenario, results: &Results<'_>) -> Table {
+    let absent = || vec![Cell::Absent; 6];
+    let rows = Mechanism::ALL.into_iter().map(|mechanism| {
+        let of = |mode| results.mechanism(scenario, mechanism, mode);
+        let mut cells = vec![Cell::text(mechanism.label())];
+        cells.extend(of(CoordinatorMode::Legacy).map_or_else(absent, |tally| {
+            let mut cells = figures(Some(tally)).to_vec();
+            cells.push(Cell::Count(tally.coordinator.resets));
+            cells.push(Cell::number(tally.missions_per_hour(), 0));
+            cells
+        }));
+        let safe = of(CoordinatorMode::Safe).map_or_else(absent, |tally| {
+            let high = tally.collision_interval().map(|(_, high)| 1e3 * high);
+            let [sections, collisions, ..] = figures(Some(tally));
+            vec![
+                sections,
+                collisions,
+                Cell::number(high, 3),
+                Cell::Count(tally.safe.stuck),
+                Cell::number(tally.missions_per_hour(), 0),
+            ]
+        });
+        cells.extend(safe.into_iter().take(5));
+        cells
+    });
+    Table {
+        name: format!("mechanisms-{}", scenario_name(scenario)),
+        title: format!(
+            "What causes collisions, {}: status over the network, exact tracker, delay unknown to \
+             the coordinator",
+            scenario_name(scenario)
+        ),
+        columns: MECHANISM_COLUMNS.to_vec(),
+        rows: rows.collect(),
+        notes: Vec::new(),
+    }
+}
+
+const COMMAND_COLUMNS: [Column; 13] = [
+    column("cell", "Cell"),
+    column("commands", "Commands"),
+    column("commands_lost", "Lost"),
+    column("states", "States"),
+    column("states_lost", "Lost"),
+    column("repeats", "Repeats"),
+    column("late", "Late"),
+    column("ignored", "Ignored"),
+    column("refused", "Refused"),
+    column("stale", "Stale"),
+    column("order_reversals", "Reversals"),
+    column("stop_error_max_m", "Past point m"),
+    column("separation_min_m", "Closest m"),
+];
+
+/// What became of the commands in each cell of the table of mechanisms.
+fn command_table(results: &Results<'_>) -> Table {
+    let rows = results
+        .all()
+        .filter(|(cell, _)| matches!(cell.place, Place::Mechanism { .. }))
+        .map(|(cell, tally)| {
+            let mut row = vec![Cell::text(cell.name())];
+            row.extend(tally.map_or_else(
+                || vec![Cell::Absent; COMMAND_COLUMNS.len() - 1],
+                |tally| command_cells(tally).to_vec(),
+            ));
+            row
+        });
+    Table {
+        name: "commands".to_owned(),
+        title: "What causes collisions: what became of the messages".to_owned(),
+        columns: COMMAND_COLUMNS.to_vec(),
+        rows: rows.collect(),
+        notes: vec![
+            "late: too late to stop at; ignored: behind the robot, which drove on; refused: not \
+             applied because it could not stop (safe); stale: older than one applied"
+                .to_owned(),
+        ],
+    }
+}
+
+fn command_cells(tally: &FleetTally) -> [Cell; 12] {
+    let (seen, decided) = (&tally.referee, &tally.coordinator);
+    [
+        Cell::Count(tally.commands.offered_count),
+        Cell::Count(tally.commands.lost_count),
+        Cell::Count(tally.status.offered_count),
+        Cell::Count(tally.status.lost_count),
+        Cell::Count(decided.authority_repeats),
+        Cell::Count(seen.authorities_late_count),
+        Cell::Count(seen.authorities_ignored_count),
+        Cell::Count(seen.authorities_refused_count),
+        Cell::Count(seen.stale_count),
+        Cell::Count(decided.order_reversals),
+        Cell::number(Some(seen.stop_error_max_m), 2),
+        Cell::number(seen.separation_min_m, 2),
+    ]
+}

@@ -1,0 +1,280 @@
+//! The study `hil-runtime tables` runs for the fleet case: every cell cut into tasks with seeds of
+//! their own. What the tables look like is in `report`.
+
+use serde::{Deserialize, Serialize};
+
+use crate::experiment::cells::{Cell, SCENARIOS, mechanism_cells, published_cells, scenario_name};
+use crate::experiment::driver::Experiment;
+use crate::experiment::report;
+use crate::experiment::report::Results;
+use crate::experiment::setup::Setup;
+use crate::experiment::tally::FleetTally;
+use crate::parameters::FleetParameters;
+use crate::scenario::{Scenario, Scene, WorldParameters};
+use hil_core::case_study::ParameterError;
+use hil_core::random::RandomStream;
+use hil_core::study::{Study, StudyReport, Watch};
+use hil_core::time::Instant;
+use hil_link::impaired::DelayLaw;
+
+/// Which tables.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum TablePart {
+    /// Tables II and III of the seed paper.
+    Published,
+    /// What each impairment does to each coordinator.
+    Mechanisms,
+}
+
+/// `[case.parameters.tables]`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TableParameters {
+    /// Critical sections per cell, 1..=1000000000.
+    pub sections: u64,
+    /// Critical sections per task, 100..=1000000: a cell is cut into independent runs of so many.
+    pub sections_per_task: u64,
+    /// Which tables.
+    pub parts: Vec<TablePart>,
+    /// How the static rows' delay is drawn.
+    pub delay_law: DelayLaw,
+    /// Only cells whose name contains one of these; empty for all.
+    pub cells: Vec<String>,
+}
+
+impl Default for TableParameters {
+    fn default() -> Self {
+        Self {
+            sections: 10_000,
+            sections_per_task: 5_000,
+            parts: vec![TablePart::Published, TablePart::Mechanisms],
+            delay_law: DelayLaw::Constant,
+            cells: Vec::new(),
+        }
+    }
+}
+
+impl TableParameters {
+    /// Checks every number against its range.
+    ///
+    /// # Errors
+    /// The first key outside its range.
+    pub fn check(&self) -> Result<(), ParameterError> {
+        if self.parts.is_empty() {
+            let problem = "[] leaves nothing to compute; name published, mechanisms or both";
+            return Err(ParameterError::new("tables.parts", problem));
+        }
+        ParameterError::check(
+            "tables.sections",
+            self.sections as f64,
+            1.0..=1e9,
+            "1 to 1000000000",
+        )?;
+        ParameterError::check(
+            "tables.sections_per_task",
+            self.sections_per_task as f64,
+            100.0..=1e6,
+            "100 to 1000000",
+        )
+    }
+}
+
+/// The study.
+#[derive(Debug)]
+pub(crate) struct FleetStudy {
+    parameters: TableParameters,
+    seed: u64,
+    scenes: Vec<(Scenario, Scene)>,
+    cells: Vec<Cell>,
+}
+
+/// One task: a run of one cell.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Task {
+    cell: usize,
+    replica: u64,
+    sections: u64,
+}
+
+/// Between two looks at how far a run has come.
+const LOOK_NS: i64 = 60_000_000_000;
+/// A fleet that passes no section for so long has come to a stand.
+const STAND_NS: i64 = 7_200_000_000_000;
+
+impl FleetStudy {
+    /// The study with these parameters: those of `tables` say what to compute; those of the other
+    /// tables hold wherever a cell does not say otherwise.
+    ///
+    /// # Errors
+    /// Names the parameter that keeps a world from being built, or a filter no cell meets.
+    pub(crate) fn new(parameters: &FleetParameters, seed: u64) -> Result<Self, ParameterError> {
+        let tables = parameters.tables.clone();
+        let base = Setup {
+            robot: parameters.robot.clone(),
+            coordinator: parameters.coordinator.clone(),
+            missions: parameters.missions,
+            ..Setup::default()
+        };
+        let mut cells = Vec::new();
+        for part in &tables.parts {
+            cells.extend(match part {
+                TablePart::Published => published_cells(&base, tables.delay_law),
+                TablePart::Mechanisms => mechanism_cells(&base),
+            });
+        }
+        if !tables.cells.is_empty() {
+            let is_wanted = |name: &str| tables.cells.iter().any(|part| name.contains(part));
+            cells.retain(|cell| is_wanted(&cell.name()));
+        }
+        if cells.is_empty() {
+            let problem = format!("{:?} is part of no cell's name", tables.cells);
+            return Err(ParameterError::new("tables.cells", problem));
+        }
+        for cell in &cells {
+            cell.setup.check()?;
+        }
+        let mut scenes = Vec::new();
+        for scenario in SCENARIOS {
+            if cells.iter().any(|cell| cell.scenario == scenario) {
+                let world = WorldParameters {
+                    scenario,
+                    ..parameters.world.clone()
+                };
+                scenes.push((scenario, world.build()?));
+            }
+        }
+        Ok(Self {
+            parameters: tables,
+            seed,
+            scenes,
+            cells,
+        })
+    }
+
+    /// The cells in order.
+    pub(crate) fn cells(&self) -> &[Cell] {
+        &self.cells
+    }
+
+    /// What the tables were asked for.
+    pub(crate) fn parameters(&self) -> &TableParameters {
+        &self.parameters
+    }
+
+    /// The seed all tasks' seeds come from.
+    pub(crate) fn seed(&self) -> u64 {
+        self.seed
+    }
+
+    /// The world of a scenario.
+    pub(crate) fn scene(&self, scenario: Scenario) -> &Scene {
+        let scene = self.scenes.iter().find(|(known, _)| *known == scenario);
+        &scene.expect("every cell's scenario has its scene").1
+    }
+
+    fn replica_count(&self) -> u64 {
+        let TableParameters {
+            sections,
+            sections_per_task,
+            ..
+        } = self.parameters;
+        sections.div_ceil(sections_per_task)
+    }
+
+    fn task(&self, task: usize) -> Task {
+        let (task, replicas) = (task as u64, self.replica_count());
+        let (cell, replica) = (task / replicas, task % replicas);
+        let done = replica * self.parameters.sections_per_task;
+        Task {
+            cell: usize::try_from(cell).expect("a task number was a usize"),
+            replica,
+            sections: self
+                .parameters
+                .sections_per_task
+                .min(self.parameters.sections - done),
+        }
+    }
+
+    /// The seed of a task depends on what it is about, not on its place among the others.
+    fn seed_of(&self, task: Task) -> u64 {
+        let cell = self.cells[task.cell].seed_name();
+        let name = format!("{cell}, run {}", task.replica);
+        RandomStream::new(self.seed, &name).next_u64()
+    }
+}
+
+impl Study for FleetStudy {
+    type Outcome = FleetTally;
+
+    fn task_count(&self) -> usize {
+        let replicas = usize::try_from(self.replica_count()).unwrap_or(usize::MAX);
+        self.cells.len().saturating_mul(replicas)
+    }
+
+    fn label(&self, task: usize) -> String {
+        self.cells[self.task(task).cell].name()
+    }
+
+    fn run(&self, task: usize, watch: Watch<'_>) -> Option<FleetTally> {
+        let task = self.task(task);
+        let cell = &self.cells[task.cell];
+        let scene = self.scene(cell.scenario);
+        let seed = self.seed_of(task);
+        let mut experiment = Experiment::new(scene, &cell.setup, seed)
+            .expect("the setup was checked when the study was made");
+        experiment.start(&mut |_| {});
+        let (mut newest_count, mut newest_at) = (0, Instant::ZERO);
+        loop {
+            let until = Instant::from_ns(experiment.now().as_ns() + LOOK_NS);
+            experiment.run_until(until, &mut |_| {});
+            let count = experiment.section_count();
+            if count > newest_count {
+                (newest_count, newest_at) = (count, until);
+            }
+            let is_standing = until.ns_since(newest_at) > STAND_NS;
+            if count >= task.sections || is_standing {
+                let mut tally = experiment.tally();
+                tally.conclude((seed, task.replica), cell, scene);
+                tally.stand_count = u64::from(is_standing);
+                return Some(tally);
+            }
+            if !watch(count as f64 / task.sections as f64) {
+                return None;
+            }
+        }
+    }
+
+    fn report(&self, outcomes: &[Option<&FleetTally>]) -> StudyReport {
+        let replicas = usize::try_from(self.replica_count()).unwrap_or(usize::MAX);
+        let tallies = outcomes.chunks(replicas).map(|runs| {
+            // A cell counts with the runs that ended; without any it is empty.
+            let mut ended = runs.iter().flatten();
+            let mut sum = (*ended.next()?).clone();
+            for run in ended {
+                sum.merge(run);
+            }
+            Some(sum)
+        });
+        let results: Vec<_> = self.cells.iter().zip(tallies).collect();
+        report::report(self, &Results::of(results))
+    }
+}
+
+/// The worlds a study drives in, for a note.
+pub(crate) fn worlds_text(study: &FleetStudy) -> String {
+    let text = |(scenario, scene): &(Scenario, Scene)| {
+        let (world, planning) = (&scene.world, &scene.planning);
+        format!(
+            "{}: {} robots, {} bays, {} paths ({} planned, {} states expanded)",
+            scenario_name(*scenario),
+            scene.starts.len(),
+            world.bays.len(),
+            world.paths.len() / 2,
+            planning.planned_count,
+            planning.expanded_count,
+        )
+    };
+    let texts: Vec<_> = study.scenes.iter().map(text).collect();
+    texts.join("; ")
+}

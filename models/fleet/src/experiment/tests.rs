@@ -1,0 +1,218 @@
+//! The fast driver against the generic one, and what links do to it.
+
+use core::time::Duration;
+use std::collections::BTreeMap;
+
+use super::*;
+use crate::messages::Truth;
+use crate::mission::{MissionMode, MissionParameters};
+use crate::path::PathId;
+use crate::robot::{RobotParameters, TrackerKind};
+use crate::scenario::{Scenario, Scene, WorldParameters};
+use crate::section::Side;
+use crate::{FLEET_TRUTH, Fleet, FleetParameters};
+use hil_core::case_study::CaseStudy;
+use hil_core::simulation::{Carrier, Simulation};
+use hil_core::time::Instant;
+
+fn parameters(scenario: Scenario, tracker: TrackerKind) -> FleetParameters {
+    FleetParameters {
+        world: WorldParameters {
+            scenario,
+            ..WorldParameters::default()
+        },
+        robot: RobotParameters {
+            tracker,
+            ..RobotParameters::default()
+        },
+        missions: MissionParameters {
+            mode: MissionMode::Shuttle,
+            ..MissionParameters::default()
+        },
+        ..FleetParameters::default()
+    }
+}
+
+fn setup_of(parameters: &FleetParameters, links: &Links) -> Setup {
+    Setup {
+        robot: parameters.robot.clone(),
+        coordinator: parameters.coordinator.clone(),
+        missions: parameters.missions,
+        links: *links,
+        overrun_max_s: 0.0,
+    }
+}
+
+fn scene_of(parameters: &FleetParameters) -> Scene {
+    parameters.world.build().unwrap()
+}
+
+/// Truth of the fast driver.
+fn fast(
+    parameters: &FleetParameters,
+    links: &Links,
+    seed: u64,
+    run_s: i64,
+) -> (Vec<Truth>, FleetTally) {
+    let setup = setup_of(parameters, links);
+    let mut experiment = Experiment::new(&scene_of(parameters), &setup, seed).unwrap();
+    let mut truth = Vec::new();
+    experiment.start(&mut |record| truth.push(*record));
+    let end = Instant::from_ns(run_s * 1_000_000_000);
+    experiment.run_until(end, &mut |record| truth.push(*record));
+    (truth, experiment.tally())
+}
+
+/// Truth of the same components joined by the generic driver, by robot.
+fn generic(parameters: &FleetParameters, seed: u64, run_s: u64) -> Vec<Truth> {
+    let case = Fleet::new(parameters.clone(), seed).unwrap();
+    let carriers: BTreeMap<String, Box<dyn Carrier>> = BTreeMap::new();
+    let simulation = Simulation::new(&case, carriers).unwrap();
+    let log = simulation.run(Duration::from_secs(run_s)).unwrap().log;
+    log.messages::<Truth>(FLEET_TRUTH)
+        .map(|(_, truth)| truth)
+        .collect()
+}
+
+/// Robot by robot: between robots, the order at one instant is the driver's own business.
+fn by_robot(mut truth: Vec<Truth>) -> Vec<Truth> {
+    truth.sort_by_key(|record| record.robot_id);
+    truth
+}
+
+#[test]
+fn on_a_perfect_link_both_drivers_move_the_robots_alike_to_the_bit() {
+    for scenario in [
+        Scenario::Crossing,
+        Scenario::Following,
+        Scenario::ThreeCycle,
+    ] {
+        for tracker in [TrackerKind::Exact, TrackerKind::LegacyRk4] {
+            let parameters = parameters(scenario, tracker);
+            for seed in [1, 2] {
+                let (truth, tally) = fast(&parameters, &Links::default(), seed, 600);
+                let mut expected = generic(&parameters, seed, 600);
+                expected.retain(|record| record.at_ns < 600_000_000_000);
+                assert!(tally.referee.missions_done_count > 10, "{scenario:?}");
+                let (truth, expected) = (by_robot(truth), by_robot(expected));
+                let differ = truth
+                    .iter()
+                    .zip(&expected)
+                    .position(|(one, other)| one != other);
+                assert_eq!(differ, None, "{scenario:?} {tracker:?} seed {seed}");
+                assert_eq!(truth.len(), expected.len());
+            }
+        }
+    }
+}
+
+#[test]
+fn equal_seeds_give_equal_runs_and_unequal_ones_do_not() {
+    let parameters = parameters(Scenario::ThreeCycle, TrackerKind::Exact);
+    let mut links = Links::default();
+    links.commands.loss_ratio = 0.2;
+    links.status.loss_ratio = 0.2;
+    let run = |seed| fast(&parameters, &links, seed, 300);
+    assert_eq!(run(4), run(4));
+    assert_ne!(run(4).0, run(5).0);
+}
+
+#[test]
+fn links_lose_delay_and_repeat_what_they_are_told_to() {
+    let parameters = parameters(Scenario::Crossing, TrackerKind::Exact);
+    let mut links = Links::default();
+    links.status.loss_ratio = 0.5;
+    links.status.duplicate_ratio = 0.1;
+    links.status.duplicate_lag_ms = 100.0;
+    links.commands.delay_ms = 40.0;
+    let (_, tally) = fast(&parameters, &links, 1, 300);
+    let lost = tally.status.lost_count as f64 / tally.status.offered_count as f64;
+    assert!((lost - 0.5).abs() < 0.05, "{lost}");
+    assert!(tally.status.duplicated_count > 0);
+    assert_eq!(tally.commands.lost_count, 0);
+    assert!(tally.coordinator.states_duplicate + tally.coordinator.states_reordered > 0);
+}
+
+#[test]
+fn states_that_keep_order_are_deleted_by_newer_ones() {
+    let parameters = parameters(Scenario::Crossing, TrackerKind::Exact);
+    let mut links = Links::default();
+    links.status.hold_ratio = 0.2;
+    links.status.hold_ms = 200.0;
+    let (_, free) = fast(&parameters, &links, 1, 300);
+    assert!(free.coordinator.states_reordered > 0);
+    assert_eq!(free.superseded_count, 0);
+    links.status_keeps_order = true;
+    let (_, kept) = fast(&parameters, &links, 1, 300);
+    assert_eq!(kept.coordinator.states_reordered, 0);
+    assert!(kept.superseded_count > 0);
+}
+
+#[test]
+fn a_bypassed_status_path_sends_no_state() {
+    let parameters = parameters(Scenario::Crossing, TrackerKind::LegacyRk4);
+    let links = Links {
+        status_path: StatusPath::Bypass,
+        ..Links::default()
+    };
+    let (_, tally) = fast(&parameters, &links, 1, 600);
+    assert_eq!(tally.status.offered_count, 0);
+    assert!(tally.referee.missions_done_count > 10);
+    assert!(tally.section_count() > 5);
+}
+
+/// Robot 1 gives way at the crossing: where it stops, from when to when it waits and when it
+/// enters the section follow from the vehicle, the section and the control period alone.
+#[test]
+fn the_robot_that_yields_stops_waits_and_enters_when_the_closed_form_says() {
+    let mut parameters = parameters(Scenario::Crossing, TrackerKind::Exact);
+    parameters.missions.mode = MissionMode::Once;
+    let links = Links {
+        status_path: StatusPath::Bypass,
+        ..Links::default()
+    };
+    let (truth, tally) = fast(&parameters, &links, 1, 60);
+    let scene = scene_of(&parameters);
+    let (speed, acceleration) = (2.0, 1.0);
+    let of = |robot| {
+        let records = truth.iter().filter(|record| record.mission_id > 0);
+        records.filter(move |record| record.robot_id == robot)
+    };
+    let seconds = |record: &Truth| record.at_ns as f64 * 1e-9;
+    let departs = |robot| {
+        seconds(
+            of(robot)
+                .find(|record| record.acceleration_mps2 > 0.0)
+                .unwrap(),
+        )
+    };
+    let paths = [0, 1]
+        .map(|robot| of(robot).next_back().unwrap().path_id)
+        .map(PathId);
+    let section = &scene.world.sections.between(paths[0], paths[1])[0];
+    let way = |robot: usize, index| scene.world.path(paths[robot]).way_to_m(index);
+
+    // From rest to rest over s: s / v + v / a. From rest to s at full speed: s / v + v / 2a.
+    let stop_m = way(1, section.start(Side::Second) - 3);
+    let arrives_s = departs(1) + stop_m / speed + speed / acceleration;
+    let cleared_m = way(0, section.end(Side::First) + 1);
+    let cleared_s = departs(0) + cleared_m / speed + 0.5 * speed / acceleration;
+    let stands = |record: &&Truth| record.travelled_m > 1.0 && record.speed_mps.abs() < 1e-9;
+    let stop = of(1).find(stands).unwrap();
+    assert!((stop.travelled_m - stop_m).abs() < 1e-6, "{stop:?}");
+    assert!(
+        (seconds(stop) - arrives_s).abs() < 1e-6,
+        "{stop:?} {arrives_s}"
+    );
+
+    // The next control cycle after the other has cleared the section lets it go.
+    let goes = of(1).find(|record| seconds(record) > arrives_s && record.acceleration_mps2 > 0.0);
+    let (goes_s, waited_s) = (seconds(goes.unwrap()), cleared_s.ceil() - arrives_s);
+    assert!(waited_s > 0.0);
+    assert!(
+        (goes_s - arrives_s - waited_s).abs() < 1e-6,
+        "{goes_s} {cleared_s}"
+    );
+    assert_eq!(tally.referee.sections_passed_count, 1);
+    assert_eq!(tally.any_collision_count(), 0);
+}

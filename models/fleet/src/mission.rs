@@ -1,0 +1,229 @@
+//! Which bay a robot is sent to next. When it goes, and whether it may, is the coordinator's
+//! business.
+
+use core::time::Duration;
+
+use serde::{Deserialize, Serialize};
+
+use crate::geometry::floor_index;
+use crate::scenario::Scene;
+use crate::world::{BayIndex, Route};
+use hil_core::case_study::ParameterError;
+use hil_core::random::RandomStream;
+
+/// How goals are chosen.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum MissionMode {
+    /// Any free bay a path leads to, each as likely.
+    #[default]
+    Random,
+    /// To the bay at the other end of the start's shuttle line, and back, for ever.
+    Shuttle,
+    /// Once to the other end of the shuttle line.
+    Once,
+}
+
+/// `[case.parameters.missions]`.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct MissionParameters {
+    /// How goals are chosen.
+    pub mode: MissionMode,
+    /// Missions after which a robot stays parked; 0 for no end. `once` gives one at most.
+    pub missions_per_robot: u32,
+    /// How long a robot stays in a bay before its next mission, seconds, 0..=3600.
+    pub parking_s: f64,
+}
+
+impl Default for MissionParameters {
+    fn default() -> Self {
+        Self {
+            mode: MissionMode::default(),
+            missions_per_robot: 0,
+            parking_s: 3.0,
+        }
+    }
+}
+
+impl MissionParameters {
+    /// Checks every number against its range.
+    ///
+    /// # Errors
+    /// Names the key, below `missions`, and its range.
+    pub fn check(&self) -> Result<(), ParameterError> {
+        ParameterError::check(
+            "missions.parking_s",
+            self.parking_s,
+            0.0..=3600.0,
+            "0 to 3600",
+        )
+    }
+}
+
+/// Gives out missions.
+#[derive(Debug, Clone)]
+pub struct MissionSource {
+    mode: MissionMode,
+    parking: Duration,
+    left_counts: Vec<u32>,
+    scene: Scene,
+    random: RandomStream,
+}
+
+impl MissionSource {
+    /// A source for the robots of `scene`; all its choices come from `random`.
+    pub fn new(parameters: &MissionParameters, scene: &Scene, random: RandomStream) -> Self {
+        let asked = match parameters.missions_per_robot {
+            0 => u32::MAX,
+            count => count,
+        };
+        let limit = match parameters.mode {
+            MissionMode::Once => asked.min(1),
+            MissionMode::Random | MissionMode::Shuttle => asked,
+        };
+        Self {
+            mode: parameters.mode,
+            parking: Duration::from_secs_f64(parameters.parking_s),
+            left_counts: vec![limit; scene.starts.len()],
+            scene: scene.clone(),
+            random,
+        }
+    }
+
+    /// The next way for `robot`, which stands in bay `at`; `None` when it has had all its missions
+    /// or when no bay it could go to is free now. A bay that the robot itself stands in is never
+    /// asked about.
+    ///
+    /// # Panics
+    /// When the scene has no such robot.
+    pub fn next(
+        &mut self,
+        robot: usize,
+        at: BayIndex,
+        is_free: &dyn Fn(BayIndex) -> bool,
+    ) -> Option<Route> {
+        if self.left_counts[robot] == 0 {
+            return None;
+        }
+        let routes = self.scene.world.routes_from(at);
+        let route = match self.mode {
+            MissionMode::Random => {
+                let free_count = routes.iter().filter(|route| is_free(route.to)).count();
+                if free_count == 0 {
+                    return None;
+                }
+                let pick = floor_index(self.random.uniform() * free_count as f64);
+                let mut free = routes.iter().filter(|route| is_free(route.to));
+                free.nth(pick.min(free_count - 1))
+            }
+            MissionMode::Shuttle | MissionMode::Once => {
+                let partner = self.scene.partners.get(at).copied().flatten()?;
+                let mut there = routes.iter().filter(|route| route.to == partner);
+                there.next().filter(|route| is_free(route.to))
+            }
+        }?;
+        // Without a limit the count never runs out within a run's mission numbers.
+        self.left_counts[robot] -= 1;
+        Some(*route)
+    }
+
+    /// How long a robot stays in a bay before its next mission.
+    pub fn parking(&self) -> Duration {
+        self.parking
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scenario::{Scenario, WorldParameters};
+
+    fn scene(scenario: Scenario) -> Scene {
+        let parameters = WorldParameters {
+            scenario,
+            ..WorldParameters::default()
+        };
+        parameters.build().unwrap()
+    }
+
+    fn source(
+        scene: &Scene,
+        mode: MissionMode,
+        missions_per_robot: u32,
+        seed: u64,
+    ) -> MissionSource {
+        let parameters = MissionParameters {
+            mode,
+            missions_per_robot,
+            ..MissionParameters::default()
+        };
+        MissionSource::new(&parameters, scene, RandomStream::new(seed, "missions"))
+    }
+
+    /// Sends seven robots about in turn; gives all routes.
+    fn tour(scene: &Scene, mut source: MissionSource, rounds: usize) -> Vec<Route> {
+        let mut places = scene.starts.clone();
+        let mut routes = Vec::new();
+        for _ in 0..rounds {
+            for robot in 0..places.len() {
+                let taken = places.clone();
+                let is_free = |bay: BayIndex| !taken.contains(&bay);
+                if let Some(route) = source.next(robot, places[robot], &is_free) {
+                    assert!(route.from == places[robot] && is_free(route.to));
+                    places[robot] = route.to;
+                    routes.push(route);
+                }
+            }
+        }
+        routes
+    }
+
+    #[test]
+    fn random_missions_reach_all_bays_alike_and_repeat_with_their_seed() {
+        let scene = scene(Scenario::Warehouse);
+        let once = tour(&scene, source(&scene, MissionMode::Random, 0, 1), 1000);
+        assert_eq!(once.len(), 7000);
+        for bay in 0..14 {
+            let count = once.iter().filter(|route| route.to == bay).count();
+            assert!((400..600).contains(&count), "{bay} {count}");
+        }
+        let again = tour(&scene, source(&scene, MissionMode::Random, 0, 1), 1000);
+        assert_eq!(once, again);
+        let other = tour(&scene, source(&scene, MissionMode::Random, 0, 2), 1000);
+        assert_ne!(once, other);
+    }
+
+    #[test]
+    fn shuttles_go_there_and_back_and_end_with_their_missions() {
+        let scene = scene(Scenario::Warehouse);
+        let routes = tour(&scene, source(&scene, MissionMode::Shuttle, 3, 1), 10);
+        assert_eq!(routes.len(), 21);
+        assert!(
+            routes
+                .iter()
+                .all(|route| route.from.abs_diff(route.to) == 7)
+        );
+        assert_eq!(routes[7].path, routes[0].path.reversed());
+    }
+
+    #[test]
+    fn once_is_once_and_only_to_a_free_bay() {
+        let scene = scene(Scenario::Crossing);
+        let mut once = source(&scene, MissionMode::Once, 0, 1);
+        assert_eq!(once.next(0, 0, &|_| false), None);
+        assert_eq!(once.next(0, 0, &|_| true).map(|route| route.to), Some(2));
+        assert_eq!(once.next(0, 2, &|_| true), None);
+        assert_eq!(once.next(1, 1, &|_| true).map(|route| route.to), Some(3));
+        assert!(once.left_counts.iter().all(|count| *count == 0));
+    }
+
+    #[test]
+    fn parking_for_no_number_of_seconds_is_refused() {
+        let parameters = MissionParameters {
+            parking_s: f64::NAN,
+            ..MissionParameters::default()
+        };
+        assert_eq!(parameters.check().unwrap_err().key, "missions.parking_s");
+    }
+}

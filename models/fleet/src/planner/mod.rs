@@ -1,0 +1,307 @@
+//! Plans paths on a map at run time: for a vehicle with a smallest turning radius, driving
+//! forwards, around obstacles, from any start to any goal pose. It reads no clock; what a plan
+//! cost is counted in expanded states.
+//!
+//! A search over poses finds a way, which is then shortened; [`trajectory`] adds time.
+
+pub(crate) mod dubins;
+mod grid;
+mod search;
+mod shorten;
+pub(crate) mod space;
+pub mod trajectory;
+
+use crate::geometry::{Pose, floor_index};
+use crate::map::Map;
+use crate::path::{Path, PathError};
+use crate::planner::grid::Distances;
+use crate::planner::search::Search;
+use crate::planner::shorten::shortened;
+use crate::planner::space::{Space, extent};
+use crate::planner::trajectory::Trajectory;
+use crate::world::Vehicle;
+
+pub use crate::planner::dubins::Segment;
+pub use crate::planner::space::Blocker;
+
+/// States a plan may expand before it gives up.
+pub const EXPANDED_MAX: u64 = 200_000;
+/// Cells of place a search may have: with their headings, 77 MB.
+const CELLS_MAX: f64 = 200_000.0;
+
+/// Goals a planner remembers the surroundings of.
+const GOALS_MAX: usize = 64;
+
+/// A way from start to goal: arcs and straight lines, none curved more than the turning radius
+/// allows.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Plan {
+    start: Pose,
+    goal: Pose,
+    segments: Vec<Segment>,
+    expanded_count: u64,
+}
+
+/// Why there is no plan.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum PlanError {
+    /// The turning radius is not a positive number.
+    #[error("turning radius {turning_radius_m} m is not above 0")]
+    TurningRadius {
+        /// What was asked.
+        turning_radius_m: f64,
+    },
+    /// The ground has more cells than a search has memory for.
+    #[error(
+        "a ground of {width_m} m x {height_m} m is too large to plan with a turning radius of \
+         {turning_radius_m} m"
+    )]
+    TooLarge {
+        /// Metres.
+        width_m: f64,
+        /// Metres.
+        height_m: f64,
+        /// Metres.
+        turning_radius_m: f64,
+    },
+    /// A coordinate of start or goal is NaN or infinite.
+    #[error("a path from {} to {} cannot be: not finite", At(.start), At(.goal))]
+    NotFinite {
+        /// Where the path was to begin.
+        start: Pose,
+        /// Where it was to end.
+        goal: Pose,
+    },
+    /// The vehicle cannot stand at the start.
+    #[error("start {} is blocked by {blocker}", At(.start))]
+    StartBlocked {
+        /// Where the path was to begin.
+        start: Pose,
+        /// What is there.
+        blocker: Blocker,
+    },
+    /// The vehicle cannot stand at the goal.
+    #[error("goal {} is blocked by {blocker}", At(.goal))]
+    GoalBlocked {
+        /// Where the path was to end.
+        goal: Pose,
+        /// What is there.
+        blocker: Blocker,
+    },
+    /// No way was found.
+    #[error(
+        "no path from {} to {} fits the free space ({expanded_count} states expanded, \
+         at most {EXPANDED_MAX})",
+        At(.start),
+        At(.goal)
+    )]
+    NoPath {
+        /// Where the path was to begin.
+        start: Pose,
+        /// Where it was to end.
+        goal: Pose,
+        /// States expanded before giving up.
+        expanded_count: u64,
+    },
+}
+
+/// How messages name a pose.
+pub(crate) struct At<'a>(pub(crate) &'a Pose);
+
+impl core::fmt::Display for At<'_> {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        let pose = self.0;
+        write!(
+            f,
+            "({:.3} m, {:.3} m, {:.3} rad)",
+            pose.x_m, pose.y_m, pose.heading_rad
+        )
+    }
+}
+
+impl Plan {
+    /// Its arcs and straight lines in order.
+    pub fn segments(&self) -> &[Segment] {
+        &self.segments
+    }
+
+    /// Whole way, metres.
+    pub fn length_m(&self) -> f64 {
+        self.segments.iter().map(|segment| segment.length_m).sum()
+    }
+
+    /// States expanded to find it.
+    pub fn expanded_count(&self) -> u64 {
+        self.expanded_count
+    }
+
+    /// Poses along the way, at most `spacing_m` apart, from the very start to the very goal.
+    pub fn poses(&self, spacing_m: f64) -> Vec<Pose> {
+        let mut poses = vec![self.start];
+        let mut from = self.start;
+        for segment in &self.segments {
+            let count = floor_index((segment.length_m / spacing_m).ceil().max(1.0));
+            poses.extend((1..=count).map(|step| {
+                segment.pose_after(&from, segment.length_m * step as f64 / count as f64)
+            }));
+            from = segment.pose_after(&from, segment.length_m);
+        }
+        // The sum of many arcs ends a rounding error beside the goal.
+        if let Some(last) = poses.last_mut() {
+            *last = self.goal;
+        }
+        poses
+    }
+
+    /// The path with its poses at most `spacing_m` apart.
+    ///
+    /// # Errors
+    /// When the spacing is not a positive number, or start and goal are the same.
+    pub fn path(&self, spacing_m: f64) -> Result<Path, PathError> {
+        if !(spacing_m > 0.0 && spacing_m.is_finite()) {
+            return Err(PathError::Spacing { spacing_m });
+        }
+        // Chords between poses so near are shorter than their arcs by less than a micrometre.
+        Path::new(&self.poses(0.1 * spacing_m), spacing_m)
+    }
+}
+
+impl Plan {
+    /// The fastest run along the plan for a vehicle that begins and ends at rest.
+    pub fn trajectory(&self, vehicle: &Vehicle) -> Trajectory {
+        let limits = (vehicle.speed_max_mps, vehicle.acceleration_mps2);
+        Trajectory::new(self.length_m(), limits.0, limits.1)
+    }
+}
+
+/// Plans the path from `start` to `goal` around the map's obstacles; bays count as empty.
+///
+/// # Errors
+/// When there is none; see [`PlanError`].
+pub fn plan(
+    map: &Map,
+    vehicle: &Vehicle,
+    turning_radius_m: f64,
+    start: &Pose,
+    goal: &Pose,
+) -> Result<Plan, PlanError> {
+    Planner::new(map, vehicle, turning_radius_m)?.plan(start, goal)
+}
+
+/// Plans path after path on one map, faster than each alone when goals repeat.
+#[derive(Debug, Clone)]
+pub struct Planner {
+    space: Space,
+    search: Search,
+    turning_radius_m: f64,
+    /// What is known of recent goals, the latest last.
+    distances: Vec<(Pose, Distances)>,
+}
+
+impl Planner {
+    /// A planner for the map's obstacles; bays count as empty.
+    ///
+    /// # Errors
+    /// When the turning radius is no positive number or small beyond reason for the ground.
+    pub fn new(map: &Map, vehicle: &Vehicle, turning_radius_m: f64) -> Result<Self, PlanError> {
+        Self::within(map.space(vehicle), turning_radius_m)
+    }
+
+    /// A planner that also keeps clear of vehicles parked in all bays of the map.
+    ///
+    /// # Errors
+    /// As [`new`](Self::new).
+    pub fn around_parked(
+        map: &Map,
+        vehicle: &Vehicle,
+        turning_radius_m: f64,
+    ) -> Result<Self, PlanError> {
+        Self::within(map.space_around_parked(vehicle), turning_radius_m)
+    }
+
+    fn within(space: Space, turning_radius_m: f64) -> Result<Self, PlanError> {
+        if !(turning_radius_m > 0.0 && turning_radius_m.is_finite()) {
+            return Err(PlanError::TurningRadius { turning_radius_m });
+        }
+        let (width_m, height_m) = extent(space.bounds());
+        let cell_m = (0.25 * turning_radius_m).max((width_m * height_m / CELLS_MAX).sqrt());
+        // A step longer than the radius would turn past headings on the way.
+        if cell_m > 0.5 * turning_radius_m {
+            return Err(PlanError::TooLarge {
+                width_m,
+                height_m,
+                turning_radius_m,
+            });
+        }
+        Ok(Self {
+            search: Search::new(&space, cell_m, turning_radius_m),
+            space,
+            turning_radius_m,
+            distances: Vec::new(),
+        })
+    }
+
+    /// The path from `start` to `goal`.
+    ///
+    /// # Errors
+    /// When there is none; see [`PlanError`].
+    pub fn plan(&mut self, start: &Pose, goal: &Pose) -> Result<Plan, PlanError> {
+        let (start, goal) = (*start, *goal);
+        let is_finite = |pose: &Pose| {
+            pose.x_m.is_finite() && pose.y_m.is_finite() && pose.heading_rad.is_finite()
+        };
+        if !(is_finite(&start) && is_finite(&goal)) {
+            return Err(PlanError::NotFinite { start, goal });
+        }
+        if let Some(blocker) = self.space.blocker(&start) {
+            return Err(PlanError::StartBlocked { start, blocker });
+        }
+        if let Some(blocker) = self.space.blocker(&goal) {
+            return Err(PlanError::GoalBlocked { goal, blocker });
+        }
+        let known = self.distances.iter().position(|(known, _)| *known == goal);
+        let latest = match known {
+            Some(index) => self.distances.remove(index),
+            None => (goal, Distances::new(&self.space, &goal)),
+        };
+        let ends = (&start, &goal);
+        let found = self.search.run(&self.space, &latest.1, ends, EXPANDED_MAX);
+        self.distances.push(latest);
+        if self.distances.len() > GOALS_MAX {
+            self.distances.remove(0);
+        }
+        let expanded_count = found.expanded_count;
+        let Some(segments) = found.segments else {
+            return Err(PlanError::NoPath {
+                start,
+                goal,
+                expanded_count,
+            });
+        };
+        let limits = (self.turning_radius_m, &goal);
+        let segments = shortened(&self.space, &start, &segments, limits);
+        Ok(Plan {
+            start,
+            goal,
+            segments: joined(segments),
+            expanded_count,
+        })
+    }
+}
+
+/// Neighbouring segments of equal curvature as one, empty ones left out.
+fn joined(segments: Vec<Segment>) -> Vec<Segment> {
+    let mut joined: Vec<Segment> = Vec::with_capacity(segments.len());
+    for segment in segments.into_iter().filter(|part| part.length_m > 1e-9) {
+        match joined.last_mut() {
+            Some(last) if (last.curvature_per_m - segment.curvature_per_m).abs() < 1e-12 => {
+                last.length_m += segment.length_m;
+            }
+            _ => joined.push(segment),
+        }
+    }
+    joined
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,355 @@
+//! `[case.parameters.world]`: which vehicle, which map, how many robots; checked and built into
+//! the [`World`] a fleet shares. It says nothing about who goes when.
+
+use std::sync::Arc;
+
+use serde::{Deserialize, Serialize};
+
+use crate::analytic;
+use crate::geometry::{Bounds, Footprint, Pose};
+use crate::layout;
+use crate::layout::BAYS_PER_SIDE;
+use crate::map::Map;
+use crate::section::MergePolicy;
+use crate::world::{BayIndex, Vehicle, World};
+use hil_core::case_study::ParameterError;
+
+/// Where the fleet drives.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Scenario {
+    /// Container yard, 400 m x 220 m, vehicles of 14.8 m x 3 m (Table I).
+    Harbor,
+    /// Hall with racks, 80 m x 44 m, vehicles of 2 m x 0.5 m (Table I).
+    #[default]
+    Warehouse,
+    /// Two straight paths at a right angle.
+    Crossing,
+    /// Two robots swap sides through a corridor for one.
+    HeadOn,
+    /// One robot behind another on the same line.
+    Following,
+    /// Three straight paths that cross in a triangle.
+    ThreeCycle,
+    /// Bounds, obstacles and bays as given.
+    Custom,
+}
+
+/// `[case.parameters.world]`. What is not given is the scenario's own.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct WorldParameters {
+    /// Where the fleet drives.
+    pub scenario: Scenario,
+    /// Number of robots, 1..=448. Harbor and warehouse grow by one yard or hall for every 7; the
+    /// other scenarios have as many robots as starts, at most this many.
+    pub robots: u32,
+    /// Way between neighbouring path poses at most, metres, 0.01..=5.
+    pub path_spacing_m: f64,
+    /// Which overlaps count as one critical section.
+    pub merge: MergePolicy,
+    /// Vehicle length, metres, 0.05..=100.
+    pub length_m: Option<f64>,
+    /// Vehicle width, metres, 0.05..=100.
+    pub width_m: Option<f64>,
+    /// Largest speed, m/s, 0.01..=100.
+    pub speed_max_mps: Option<f64>,
+    /// Largest acceleration and deceleration, m/s^2, 0.01..=100.
+    pub acceleration_mps2: Option<f64>,
+    /// Smallest turning radius of planned paths, metres, 0.05..=1000.
+    pub turning_radius_m: Option<f64>,
+    /// What planned paths keep between vehicle and everything else, metres, 0..=100.
+    pub clearance_m: Option<f64>,
+    /// `custom`: the ground, metres.
+    pub bounds: Option<Bounds>,
+    /// `custom`: what no vehicle may touch.
+    pub obstacles: Vec<Bounds>,
+    /// `custom`: where robots park.
+    pub bays: Vec<BayParameters>,
+    /// `custom`: paths given pose by pose. When there are any, none is planned.
+    pub paths: Vec<PathParameters>,
+}
+
+impl Default for WorldParameters {
+    fn default() -> Self {
+        Self {
+            scenario: Scenario::default(),
+            robots: 7,
+            path_spacing_m: 0.3,
+            merge: MergePolicy::default(),
+            length_m: None,
+            width_m: None,
+            speed_max_mps: None,
+            acceleration_mps2: None,
+            turning_radius_m: None,
+            clearance_m: None,
+            bounds: None,
+            obstacles: Vec::new(),
+            bays: Vec::new(),
+            paths: Vec::new(),
+        }
+    }
+}
+
+/// Which end of the paths a bay is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum BaySide {
+    /// Forward paths begin here, and robots start here.
+    Left,
+    /// Forward paths end here.
+    Right,
+}
+
+/// `[[case.parameters.world.bays]]`.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct BayParameters {
+    /// Metres.
+    pub x_m: f64,
+    /// Metres.
+    pub y_m: f64,
+    /// Radians; the heading of a vehicle that parks here, whichever way it came.
+    #[serde(default)]
+    pub heading_rad: f64,
+    /// Robots go from left bays to right ones and back.
+    pub side: BaySide,
+}
+
+/// `[[case.parameters.world.paths]]`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PathParameters {
+    /// Index of the left bay in `bays`.
+    pub from: u32,
+    /// Index of the right bay in `bays`.
+    pub to: u32,
+    /// Poses from bay to bay.
+    pub poses: Vec<Pose>,
+}
+
+/// A world with its robots in their starting bays.
+#[derive(Debug, Clone)]
+pub struct Scene {
+    /// What never changes.
+    pub world: Arc<World>,
+    /// Per robot, the bay it starts in.
+    pub starts: Vec<BayIndex>,
+    /// Per bay, the bay at the other end of its shuttle line.
+    pub partners: Vec<Option<BayIndex>>,
+    /// What planning the paths took.
+    pub planning: PlanningSummary,
+}
+
+/// What planning a world's paths took.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+pub struct PlanningSummary {
+    /// Paths the planner was asked for; paths which repeat another one elsewhere are not.
+    pub planned_count: u64,
+    /// States it expanded for them.
+    pub expanded_count: u64,
+}
+
+impl WorldParameters {
+    /// Checks the parameters and builds the world.
+    ///
+    /// # Errors
+    /// Names the key, below `world`, and what is wrong with it.
+    pub fn build(&self) -> Result<Scene, ParameterError> {
+        self.check()?;
+        let vehicle = self.vehicle();
+        match self.scenario {
+            Scenario::Crossing => self.lines(vehicle, &analytic::crossing(&vehicle)),
+            Scenario::HeadOn => self.lines(vehicle, &analytic::head_on(&vehicle)),
+            Scenario::Following => self.lines(vehicle, &analytic::following(&vehicle)),
+            Scenario::ThreeCycle => self.lines(vehicle, &analytic::three_cycle(&vehicle)),
+            Scenario::Harbor => self.hall(vehicle, &layout::harbor(self.clearance_m())),
+            Scenario::Warehouse => self.hall(vehicle, &layout::warehouse(self.clearance_m())),
+            Scenario::Custom => self.custom(vehicle),
+        }
+    }
+
+    /// The map of the scenario; `None` for the small scenarios, whose ground has neither edge nor
+    /// obstacles.
+    ///
+    /// # Errors
+    /// When `custom` lacks its bounds.
+    pub fn map(&self) -> Result<Option<Map>, ParameterError> {
+        Ok(match self.scenario {
+            Scenario::Harbor => Some(layout::harbor(self.clearance_m()).stacked(self.tiles())),
+            Scenario::Warehouse => {
+                Some(layout::warehouse(self.clearance_m()).stacked(self.tiles()))
+            }
+            Scenario::Custom => Some(self.custom_map()?),
+            _ => None,
+        })
+    }
+
+    /// The smallest turning radius of planned paths: as given, or 10 m in the harbor, else 4 m.
+    pub fn turning_radius_m(&self) -> f64 {
+        let own = match self.scenario {
+            Scenario::Harbor => 10.0,
+            _ => 4.0,
+        };
+        self.turning_radius_m.unwrap_or(own)
+    }
+
+    /// What planned paths keep between vehicle and obstacles, as given or half a width.
+    pub fn clearance_m(&self) -> f64 {
+        let own = 0.5 * self.vehicle().footprint.width_m;
+        self.clearance_m.unwrap_or(own)
+    }
+
+    pub(super) fn tiles(&self) -> usize {
+        (self.robots as usize).div_ceil(BAYS_PER_SIDE).max(1)
+    }
+
+    /// The vehicle: that of Table I for the scenario (the warehouse's unless harbor), with what
+    /// the parameters override.
+    pub fn vehicle(&self) -> Vehicle {
+        let table = match self.scenario {
+            Scenario::Harbor => [14.8, 3.0, 6.0, 2.0],
+            _ => [2.0, 0.5, 2.0, 1.0],
+        };
+        Vehicle {
+            footprint: Footprint {
+                length_m: self.length_m.unwrap_or(table[0]),
+                width_m: self.width_m.unwrap_or(table[1]),
+            },
+            speed_max_mps: self.speed_max_mps.unwrap_or(table[2]),
+            acceleration_mps2: self.acceleration_mps2.unwrap_or(table[3]),
+        }
+    }
+
+    fn check(&self) -> Result<(), ParameterError> {
+        let vehicle = self.vehicle();
+        let size = (0.05..=100.0, "0.05 to 100");
+        let rate = (0.01..=100.0, "0.01 to 100");
+        let spacing = (0.01..=5.0, "0.01 to 5");
+        let radius = (0.05..=1000.0, "0.05 to 1000");
+        let numbers = [
+            ("world.length_m", vehicle.footprint.length_m, &size),
+            ("world.width_m", vehicle.footprint.width_m, &size),
+            ("world.speed_max_mps", vehicle.speed_max_mps, &rate),
+            ("world.acceleration_mps2", vehicle.acceleration_mps2, &rate),
+            ("world.path_spacing_m", self.path_spacing_m, &spacing),
+            ("world.turning_radius_m", self.turning_radius_m(), &radius),
+            (
+                "world.clearance_m",
+                self.clearance_m(),
+                &(0.0..=100.0, "0 to 100"),
+            ),
+            (
+                "world.robots",
+                f64::from(self.robots),
+                &(1.0..=448.0, "1 to 448"),
+            ),
+        ];
+        for (key, value, (allowed, text)) in numbers {
+            ParameterError::check(key, value, allowed.clone(), text)?;
+        }
+        if self.scenario != Scenario::Custom {
+            let given = [
+                ("world.bounds", self.bounds.is_some()),
+                ("world.obstacles", !self.obstacles.is_empty()),
+                ("world.bays", !self.bays.is_empty()),
+                ("world.paths", !self.paths.is_empty()),
+            ];
+            if let Some((key, _)) = given.iter().find(|(_, is_given)| *is_given) {
+                let problem = "is for scenario = \"custom\"; this one has its own";
+                return Err(ParameterError::new(key, problem));
+            }
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::path::PathId;
+    use crate::section::Side;
+
+    fn scene(scenario: Scenario) -> Scene {
+        let parameters = WorldParameters {
+            scenario,
+            path_spacing_m: 0.1,
+            ..WorldParameters::default()
+        };
+        parameters.build().unwrap()
+    }
+
+    /// The only section of the forward paths of two lines.
+    fn only_section(scene: &Scene, first: u32, second: u32) -> crate::section::Section {
+        let (first, second) = (PathId(2 * first), PathId(2 * second));
+        let sections = scene.world.sections.between(first, second);
+        assert_eq!(sections.len(), 1, "{first} {second}");
+        sections[0].clone()
+    }
+
+    #[test]
+    fn crossing_has_the_section_of_its_closed_form() {
+        let scene = scene(Scenario::Crossing);
+        assert_eq!(scene.starts, [0, 1]);
+        assert!((scene.world.path(PathId(0)).length_m() - 40.0).abs() < 1e-9);
+        let section = only_section(&scene, 0, 1);
+        // Overlap while both are nearer to the middle, 20 m, than half of 2 m + 0.5 m.
+        for side in [Side::First, Side::Second] {
+            let expected = (188..=212, 188, 212);
+            assert!(expected.0.contains(&section.start(side)));
+            assert_eq!(
+                (section.start(side), section.end(side)),
+                (expected.1, expected.2)
+            );
+        }
+    }
+
+    #[test]
+    fn head_on_robots_meet_in_one_section_but_not_in_their_bays() {
+        let scene = scene(Scenario::HeadOn);
+        let section = only_section(&scene, 0, 1);
+        let path = scene.world.path(PathId(0));
+        // From the bay: 6 m straight, then 1.5 m aside at 45 degrees, then 20 m of corridor.
+        let length_m = 2.0 * 6.0 + 2.0 * 1.5 * 2.0_f64.sqrt() + 20.0;
+        assert!((path.length_m() - length_m).abs() < 1e-9);
+        for side in [Side::First, Side::Second] {
+            let start_m = path.way_to_m(section.start(side));
+            let end_m = path.way_to_m(section.end(side));
+            // Leaning out by y needs the other within 0.5 - y of the axis: the section begins
+            // when bearing away by less than 0.5 m and 2 m of length behind.
+            assert!(start_m > 4.0 && start_m < 8.2, "{start_m}");
+            assert!((start_m + end_m - length_m).abs() < 0.2);
+        }
+        let bays = &scene.world.bays;
+        let covered = |bay: usize| scene.world.vehicle.footprint.at(&bays[bay].pose);
+        assert!(!covered(0).overlaps(&covered(3)) && !covered(1).overlaps(&covered(2)));
+    }
+
+    #[test]
+    fn a_follower_keeps_its_headway_from_start_to_end() {
+        let scene = scene(Scenario::Following);
+        let (leader, follower) = (scene.world.bays[0].pose, scene.world.bays[1].pose);
+        assert!((leader.distance_m(&follower) - 6.0).abs() < 1e-12);
+        let section = only_section(&scene, 1, 0);
+        // The follower's front reaches the leader's rear after 4 m; those poses only touch.
+        assert_eq!(
+            (section.start(Side::First), section.start(Side::Second)),
+            (41, 0)
+        );
+    }
+
+    #[test]
+    fn in_the_three_cycle_each_waits_within_its_first_section() {
+        let scene = scene(Scenario::ThreeCycle);
+        for robot in 0..3_u32 {
+            let (next, last) = ((robot + 1) % 3, (robot + 2) % 3);
+            let second = only_section(&scene, robot, next);
+            let first = only_section(&scene, robot, last);
+            assert!(first.start(Side::First) < second.start(Side::First));
+            assert!(first.end(Side::First) > second.start(Side::First) + 3);
+            // A robot just before its second section does not yet overlap the next one in its.
+            let waiting = second.start(Side::First) - 4;
+            assert!(waiting > first.start(Side::First));
+        }
+    }
+}

@@ -1,0 +1,380 @@
+//! The score of a recorded run: the referee looks at the robots' truth, and what the controller
+//! and the robots said to each other tells the rest. It makes no tables; those are the
+//! experiment's.
+
+use std::collections::BTreeMap;
+
+use crate::case::{FLEET_AUTHORITY, FLEET_STATE, FLEET_TRUTH, Fleet};
+use crate::events::events;
+use crate::experiment::collision_interval;
+use crate::messages::{Authority, State, Truth};
+use crate::referee::{Referee, SCAN_PERIOD, Tally};
+use hil_core::case_study::{ErrorSeries, Metric, Score};
+use hil_core::run_log::RunLog;
+use hil_core::time::Instant;
+use hil_stats::histogram::{LatencyHistogram, LatencySummary};
+
+/// Scores a run.
+pub(crate) fn score(case: &Fleet, log: &RunLog) -> Score {
+    let truths = truths(log);
+    let Some((start, end)) = span(&truths) else {
+        return Score {
+            metrics: vec![unavailable(
+                COLLISIONS,
+                "1",
+                "the robots left no record of their motion",
+            )],
+            ..Score::default()
+        };
+    };
+    let mut referee = Referee::new(case.scene(), case.parameters().fleets);
+    referee.replay(&mut truths.into_iter(), start, end);
+    let run_s = end.seconds_since(start);
+    let tally = referee.tally();
+    let mut score = Score::default();
+    score.metrics.extend(collisions(tally));
+    score.metrics.extend(distances(case, tally));
+    score.metrics.extend(commands(tally));
+    score.metrics.extend(ages(log));
+    score.metrics.extend(work(tally, run_s));
+    for event in events(log, referee.incidents()) {
+        score.add_event(event);
+    }
+    score
+}
+
+type Label = (&'static str, &'static str);
+
+const COLLISIONS: Label = ("section_collisions_count", "collisions, section checker");
+
+fn metric((name, label): Label, value: f64, unit: &'static str, method: &str) -> Metric {
+    Metric {
+        name,
+        label,
+        value: Some(value),
+        interval: None,
+        unit,
+        method: method.to_owned(),
+    }
+}
+
+fn unavailable((name, label): Label, unit: &'static str, why: &str) -> Metric {
+    Metric {
+        value: None,
+        ..metric((name, label), 0.0, unit, why)
+    }
+}
+
+fn count(label: Label, value: u64, method: &str) -> Metric {
+    metric(label, value as f64, "1", method)
+}
+
+fn collisions(tally: &Tally) -> Vec<Metric> {
+    let passed = tally.sections_passed_count;
+    let collided = tally.section_collisions_count;
+    let label = ("collision_ratio", "collisions per critical section");
+    let mut ratio = if passed == 0 {
+        unavailable(label, "1", "no robot has passed a critical section")
+    } else {
+        let method = "section checker over sections passed; interval of Clopper and Pearson";
+        metric(label, collided as f64 / passed as f64, "1", method)
+    };
+    ratio.interval = collision_interval(collided, passed).filter(|_| ratio.value.is_some());
+    vec![
+        count(
+            COLLISIONS,
+            collided,
+            "both robots in a section and overlapping at the last path poses they passed, looked \
+             at every 30 ms",
+        ),
+        count(
+            ("overlaps_count", "collisions, exact"),
+            tally.overlaps_count,
+            "footprints overlapping where the robots truly were, looked at every 30 ms",
+        ),
+        count(
+            ("outside_count", "collisions outside any section"),
+            tally.outside_count,
+            "exact collisions that began where no critical section is",
+        ),
+        count(
+            ("critical_sections_count", "critical sections passed"),
+            passed,
+            "of two missions under way at once, driven through to the end",
+        ),
+        count(
+            ("encounters_count", "encounters"),
+            tally.encounters_count,
+            "critical sections that both robots were in at the same time",
+        ),
+        ratio,
+    ]
+}
+
+fn distances(case: &Fleet, tally: &Tally) -> Vec<Metric> {
+    let least = ("separation_m_min", "smallest distance of two robots");
+    let bound_m = case
+        .parameters()
+        .robot
+        .stop_error_bound_m(&case.scene().world.vehicle);
+    vec![
+        tally.separation_min_m.map_or_else(
+            || unavailable(least, "m", "no two robots came near each other"),
+            |value| metric(least, value, "m", "between footprints; 0 when they overlap"),
+        ),
+        metric(
+            ("stop_error_m_max", "farthest past an authority"),
+            tally.stop_error_max_m,
+            "m",
+            &format!("of authorities that came in time; the tracker's bound is {bound_m:.3} m"),
+        ),
+        metric(
+            ("late_overshoot_m_max", "farthest past a late authority"),
+            tally.late_overshoot_max_m,
+            "m",
+            "of authorities that came when the robot could not stop there any more",
+        ),
+    ]
+}
+
+fn commands(tally: &Tally) -> Vec<Metric> {
+    [
+        (
+            ("authorities_applied_count", "authorities applied"),
+            tally.authorities_applied_count,
+            "taken in time to stop at",
+        ),
+        (
+            ("authorities_late_count", "authorities too late"),
+            tally.authorities_late_count,
+            "the robot could not stop there any more and went past",
+        ),
+        (
+            ("authorities_ignored_count", "authorities ignored"),
+            tally.authorities_ignored_count,
+            "behind the robot when they came",
+        ),
+        (
+            ("authorities_refused_count", "authorities refused"),
+            tally.authorities_refused_count,
+            "the robot could not stop there and kept the old one",
+        ),
+        (
+            ("stale_count", "commands passed over"),
+            tally.stale_count,
+            "older than what the robot had, or a repeat of it",
+        ),
+        (
+            ("leases_ended_count", "leases ended"),
+            tally.leases_ended_count,
+            "the robot braked because no newer authority came",
+        ),
+    ]
+    .map(|(label, value, method)| count(label, value, method))
+    .into()
+}
+
+/// Robots that stand still on a mission, over time. Some always wait for others at a section; what a
+/// network holds up or loses makes more of them wait, and longer.
+pub(crate) fn errors(case: &Fleet, log: &RunLog) -> Vec<ErrorSeries> {
+    let truths = truths(log);
+    let Some(span) = span(&truths) else {
+        return Vec::new();
+    };
+    let mut samples = Vec::new();
+    let mut referee = Referee::new(case.scene(), case.parameters().fleets);
+    referee.replay_seeing(&mut truths.into_iter(), span, &mut |now, referee| {
+        samples.push((now, referee.standing_count() as f64));
+    });
+    vec![ErrorSeries {
+        label: "robots standing still on a mission",
+        unit: "1",
+        clock_of: FLEET_TRUTH,
+        samples,
+    }]
+}
+
+/// What the robots recorded, in order of time.
+fn truths(log: &RunLog) -> Vec<Truth> {
+    let mut truths: Vec<Truth> = log.messages(FLEET_TRUTH).map(|(_, truth)| truth).collect();
+    // A robot notes what happened between two of its events afterwards, with its true time.
+    truths.sort_by_key(|truth| truth.at_ns);
+    truths
+}
+
+/// From the first record to a look after the last: robots in motion go on until then.
+fn span(truths: &[Truth]) -> Option<(Instant, Instant)> {
+    let (first, last) = truths.first().zip(truths.last())?;
+    let end = Instant::from_ns(last.at_ns) + SCAN_PERIOD;
+    Some((Instant::from_ns(first.at_ns), end))
+}
+
+/// How old the newest state was on which each authority rests.
+fn ages(log: &RunLog) -> Vec<Metric> {
+    let labels = [
+        ("state_age_s_p50", "age of state at decision, median"),
+        ("state_age_s_p99", "age of state at decision, 99 %"),
+        ("state_age_s_max", "age of state at decision, largest"),
+    ];
+    let none = |why: &str| labels.map(|label| unavailable(label, "s", why)).into();
+    if !log.has_one_clock() {
+        return none("states and authorities were stamped by two clocks that are not aligned");
+    }
+    let states: BTreeMap<(u32, u32, u32), Instant> = log
+        .messages::<State>(FLEET_STATE)
+        .map(|(_, state)| {
+            let from = &state.header;
+            let key = (from.fleet_id, from.robot_id, from.header_id);
+            (key, Instant::from_ns(state.sampled_ns))
+        })
+        .collect();
+    let mut histogram = LatencyHistogram::default();
+    for (sent, authority) in log.messages::<Authority>(FLEET_AUTHORITY) {
+        let to = &authority.header;
+        let key = (to.fleet_id, to.robot_id, authority.echo_header_id);
+        if let Some(sampled) = states.get(&key) {
+            histogram.record(sent.ns_since(*sampled));
+        }
+    }
+    let Some(ages) = histogram.summary() else {
+        return none("no authority names the state it rests on");
+    };
+    let LatencySummary {
+        p50_ns,
+        p99_ns,
+        max_ns,
+        count,
+        ..
+    } = ages;
+    let figures = labels.into_iter().zip([p50_ns, p99_ns, max_ns]);
+    let figures = figures.map(|(label, ns)| {
+        let seconds = ns as f64 * 1e-9;
+        let clock = log.clock_words(Some(seconds));
+        let method =
+            format!("sampled by the robot to authority sent, of {count} authorities{clock}");
+        metric(label, seconds, "s", &method)
+    });
+    figures.collect()
+}
+
+fn work(tally: &Tally, run_s: f64) -> Vec<Metric> {
+    let per_hour = 3600.0 * tally.missions_done_count as f64 / run_s;
+    vec![
+        count(
+            ("missions_count", "missions done"),
+            tally.missions_done_count,
+            "driven to their goal, all fleets together",
+        ),
+        metric(
+            ("missions_per_hour", "missions per hour"),
+            per_hour,
+            "1",
+            &format!("all fleets together, over {run_s:.1} s; missions under way do not count"),
+        ),
+        metric(
+            ("travelled_km", "way driven"),
+            tally.travelled_m * 1e-3,
+            "km",
+            "by all robots of all fleets",
+        ),
+        count(
+            ("resets_count", "resets"),
+            tally.replaced_count,
+            "robots put at their goal to clear a stuck fleet",
+        ),
+        count(
+            ("unsound_records_count", "unsound records"),
+            tally.unsound_count,
+            "records of motion that name nothing known or no finite motion",
+        ),
+    ]
+}
+
+#[cfg(test)]
+mod tests {
+    use core::time::Duration;
+    use std::collections::BTreeMap;
+
+    use super::*;
+    use crate::FleetParameters;
+    use crate::scenario::Scenario;
+    use hil_core::case_study::CaseStudy;
+    use hil_core::link_model::{Fate, LinkModel};
+    use hil_core::simulation::{Carrier, Simulation};
+
+    fn crossing() -> Fleet {
+        let mut parameters = FleetParameters::default();
+        parameters.world.scenario = Scenario::Crossing;
+        parameters.fleets = 2;
+        Fleet::new(parameters, 3).unwrap()
+    }
+
+    #[test]
+    fn two_fleets_at_a_crossing_are_scored_from_what_they_left_in_the_log() {
+        let case = crossing();
+        let result = Simulation::new(&case, BTreeMap::new()).unwrap();
+        let result = result.run(Duration::from_mins(2)).unwrap();
+        let score = case.score(&result.log);
+        let value = |name: &str| score.get(name).and_then(|metric| metric.value);
+        assert_eq!(value("section_collisions_count"), Some(0.0));
+        assert_eq!(value("overlaps_count"), Some(0.0));
+        assert!(
+            value("critical_sections_count").unwrap() >= 2.0,
+            "{score:?}"
+        );
+        assert!(value("missions_count").unwrap() >= 4.0, "{score:?}");
+        assert!(value("state_age_s_max").unwrap() < 1.0, "{score:?}");
+        assert!(value("separation_m_min").unwrap() > 0.0, "{score:?}");
+        assert_eq!(
+            score.events,
+            [],
+            "a perfect channel does nothing to a robot"
+        );
+    }
+
+    /// Loses everything offered from 30 s to 60 s.
+    #[derive(Debug)]
+    struct Silence;
+
+    impl LinkModel for Silence {
+        fn offer(&mut self, now: Instant, _length_bytes: usize) -> Fate {
+            if (30.0..60.0).contains(&now.seconds_since(Instant::ZERO)) {
+                Fate::Lost
+            } else {
+                Fate::Delivered(now)
+            }
+        }
+    }
+
+    #[test]
+    fn more_robots_stand_still_while_no_command_gets_through() {
+        let case = crossing();
+        let standing_s = |carriers: BTreeMap<String, Box<dyn Carrier>>| -> f64 {
+            let result = Simulation::new(&case, carriers).unwrap();
+            let result = result.run(Duration::from_mins(2)).unwrap();
+            let errors = case.errors(&result.log);
+            assert_eq!(errors.len(), 1);
+            let samples = &errors[0].samples;
+            assert!(samples.is_sorted_by_key(|sample| sample.0));
+            assert!(samples.iter().all(|sample| sample.1 >= 0.0));
+            let within = samples
+                .iter()
+                .filter(|(at, _)| (40.0..60.0).contains(&at.seconds_since(Instant::ZERO)));
+            within
+                .map(|(_, count)| count * SCAN_PERIOD.as_secs_f64())
+                .sum()
+        };
+        let silence: Box<dyn Carrier> = Box::new(Silence);
+        let silent_s = standing_s(BTreeMap::from([(FLEET_AUTHORITY.to_owned(), silence)]));
+        let whole_s = standing_s(BTreeMap::new());
+        assert!(silent_s > whole_s + 10.0, "{silent_s} s, {whole_s} s");
+        assert!(case.errors(&RunLog::default()).is_empty());
+    }
+
+    #[test]
+    fn a_run_without_record_has_no_figure() {
+        let score = crossing().score(&RunLog::default());
+        assert_eq!(score.metrics[0].value, None);
+        assert!(score.metrics[0].method.contains("no record"));
+    }
+}

@@ -1,0 +1,273 @@
+//! Intervals for how two runs differ: by a difference or a ratio, from the intervals of each, or from
+//! the spread of repetitions. It judges nothing and knows no channel.
+
+use core::cmp::Ordering;
+
+use serde::{Deserialize, Serialize};
+
+use super::histogram::DurationBin;
+use super::special::student_quantile;
+use super::statistics::{Interval, IntervalNs, quantile_ranks, wilson};
+
+/// A figure of one run, with its interval where it has one.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Estimate {
+    /// The figure.
+    pub value: f64,
+    /// Its interval.
+    pub interval: Option<Interval>,
+}
+
+/// The interval of `new - base` for independent estimates, from the interval of each (MOVER, Zou and
+/// Donner 2008; with Wilson intervals it is method 10 of Newcombe 1998). `None` when either has none.
+pub fn difference(base: Estimate, new: Estimate) -> Option<Interval> {
+    let (b, n) = (base.interval?, new.interval?);
+    let d = new.value - base.value;
+    let below = (new.value - n.low).hypot(b.high - base.value);
+    let above = (n.high - new.value).hypot(base.value - b.low);
+    Some(Interval {
+        low: d - below,
+        high: d + above,
+    })
+}
+
+/// The interval of `new / base`, by [`difference`] of the logarithms. `None` when either has none, or
+/// reaches to zero or below.
+pub fn ratio(base: Estimate, new: Estimate) -> Option<Interval> {
+    let logarithm = |one: Estimate| {
+        let interval = one.interval?;
+        (interval.low > 0.0 && one.value > 0.0).then(|| Estimate {
+            value: one.value.ln(),
+            interval: Some(Interval {
+                low: interval.low.ln(),
+                high: interval.high.ln(),
+            }),
+        })
+    };
+    let found = difference(logarithm(base)?, logarithm(new)?)?;
+    Some(Interval {
+        low: found.low.exp(),
+        high: found.high.exp(),
+    })
+}
+
+/// So many of so many.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Share {
+    /// Those that count.
+    pub count: u64,
+    /// All.
+    pub of: u64,
+}
+
+impl Share {
+    /// The share with its Wilson interval; `None` of none.
+    ///
+    /// # Panics
+    /// When more count than there are, or `confidence` is not inside 0..1.
+    pub fn estimate(self, confidence: f64) -> Option<Estimate> {
+        let interval = wilson(self.count, self.of, confidence)?;
+        Some(Estimate {
+            value: self.count as f64 / self.of as f64,
+            interval: Some(interval),
+        })
+    }
+}
+
+/// The interval of the difference of two means, `new - base`, of repetitions (Welch 1947): what the runs
+/// differ by among themselves is in it. `None` below two on either side, or when none differs at all.
+///
+/// # Panics
+/// When `confidence` is not inside 0..1.
+pub fn welch(base: &[f64], new: &[f64], confidence: f64) -> Option<Interval> {
+    assert_inside(confidence);
+    let (base, new) = (Moments::of(base)?, Moments::of(new)?);
+    let (b, n) = (base.variance / base.count, new.variance / new.count);
+    let error = (b + n).sqrt();
+    if error.partial_cmp(&0.0) != Some(Ordering::Greater) {
+        return None;
+    }
+    let freedom =
+        (b + n).powi(2) / (b.powi(2) / (base.count - 1.0) + n.powi(2) / (new.count - 1.0));
+    let reach = student_quantile(0.5 + 0.5 * confidence, freedom) * error;
+    let d = new.mean - base.mean;
+    Some(Interval {
+        low: d - reach,
+        high: d + reach,
+    })
+}
+
+/// The interval of the mean of repetitions (Student 1908). `None` below two, when none differs at all,
+/// and when one is not finite.
+///
+/// # Panics
+/// When `confidence` is not inside 0..1.
+pub fn mean_interval(values: &[f64], confidence: f64) -> Option<Interval> {
+    assert_inside(confidence);
+    let Moments {
+        count,
+        mean,
+        variance,
+    } = Moments::of(values)?;
+    let error = (variance / count).sqrt();
+    if !error.is_finite() || error <= 0.0 {
+        return None;
+    }
+    let reach = student_quantile(0.5 + 0.5 * confidence, count - 1.0) * error;
+    Some(Interval {
+        low: mean - reach,
+        high: mean + reach,
+    })
+}
+
+fn assert_inside(confidence: f64) {
+    assert!(
+        confidence > 0.0 && confidence < 1.0,
+        "confidence {confidence} is outside 0..1"
+    );
+}
+
+struct Moments {
+    count: f64,
+    mean: f64,
+    variance: f64,
+}
+
+impl Moments {
+    fn of(values: &[f64]) -> Option<Self> {
+        let (&[first, ..], true) = (values, values.len() > 1) else {
+            return None;
+        };
+        let count = values.len() as f64;
+        // From the first, so that equal values have no variance by rounding.
+        let mean = first + values.iter().map(|value| value - first).sum::<f64>() / count;
+        let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
+        Some(Self {
+            count,
+            mean,
+            variance: squares / (count - 1.0),
+        })
+    }
+}
+
+/// The order-statistics interval of a quantile from a histogram, as wide as its bins make it. It takes
+/// values as independent, so it is too narrow where successive ones are correlated. `None` when there
+/// are too few.
+///
+/// # Panics
+/// When `quantile` or `confidence` is not inside 0..1.
+pub fn binned_quantile_interval(
+    bins: &[DurationBin],
+    quantile: f64,
+    confidence: f64,
+) -> Option<IntervalNs> {
+    let count = bins.iter().map(|bin| bin.count).sum();
+    let (low, high) = quantile_ranks(count, quantile, confidence)?;
+    let bin_of = |rank: u64| {
+        let mut below = 0;
+        bins.iter().find(|bin| {
+            below += bin.count;
+            below >= rank
+        })
+    };
+    Some(IntervalNs {
+        low_ns: bin_of(low)?.from_ns(),
+        high_ns: bin_of(high)?.until_ns,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::histogram::LatencyHistogram;
+    use hil_core::random::RandomStream;
+
+    fn close(found: f64, expected: f64, tolerance: f64) {
+        assert!(
+            (found - expected).abs() <= tolerance,
+            "{found} is not {expected}"
+        );
+    }
+
+    #[test]
+    fn differences_of_shares_are_those_newcombe_published() {
+        // Newcombe 1998 (Statistics in Medicine 17, 873), table II, method 10.
+        for ((k1, n1), (k2, n2), low, high) in [
+            ((56, 70), (48, 80), 0.0524, 0.3339),
+            ((9, 10), (3, 10), 0.1705, 0.8090),
+            ((10, 10), (0, 20), 0.6791, 1.0000),
+        ] {
+            let share = |count, of| Share { count, of }.estimate(0.95).unwrap();
+            let found = difference(share(k2, n2), share(k1, n1)).unwrap();
+            close(found.low, low, 6e-5);
+            close(found.high, high, 6e-5);
+        }
+        assert_eq!(Share { count: 0, of: 0 }.estimate(0.95), None);
+    }
+
+    #[test]
+    fn repetitions_are_compared_by_their_own_spread() {
+        // Means 12 and 10, variances 1 and 1, three each: error 0.8165, t of 4 is 2.776.
+        let found = welch(&[9.0, 10.0, 11.0], &[11.0, 12.0, 13.0], 0.95).unwrap();
+        close(found.low, 2.0 - 2.267, 2e-3);
+        close(found.high, 2.0 + 2.267, 2e-3);
+        assert_eq!(welch(&[1.0], &[1.0, 2.0], 0.95), None);
+        assert_eq!(welch(&[1.0, 1.0], &[1.0, 1.0], 0.95), None);
+    }
+
+    #[test]
+    fn a_mean_of_repetitions_has_students_interval() {
+        // Mean 10, variance 1, three: error 0.57735, t of 2 is 4.30265.
+        let found = mean_interval(&[9.0, 10.0, 11.0], 0.95).unwrap();
+        close(found.low, 10.0 - 2.4841, 1e-3);
+        close(found.high, 10.0 + 2.4841, 1e-3);
+        // Mean 3, two that are 2 apart: error 1, t of 1 is 12.7062.
+        let found = mean_interval(&[2.0, 4.0], 0.95).unwrap();
+        close(found.low, 3.0 - 12.7062, 1e-3);
+        close(found.high, 3.0 + 12.7062, 1e-3);
+        for values in [
+            vec![],
+            vec![1.0],
+            vec![0.1, 0.1, 0.1],
+            vec![1.0, f64::NEG_INFINITY],
+            vec![1.0, f64::NAN],
+        ] {
+            assert_eq!(mean_interval(&values, 0.95), None, "{values:?}");
+        }
+    }
+
+    #[test]
+    fn a_ratio_covers_one_as_often_as_it_claims() {
+        // Two samples of one law: the ratio of their medians is 1 within 95 % of the intervals, by
+        // independent order statistics, and a doubled law is found.
+        let mut stream = RandomStream::new(7, "ratios");
+        let mut sample = |scale: f64| {
+            let mut histogram = LatencyHistogram::default();
+            for _ in 0..400 {
+                #[expect(clippy::cast_possible_truncation, reason = "nanoseconds below 1e8")]
+                histogram.record((scale * (1.0 + stream.uniform()) * 1e6) as i64);
+            }
+            let interval = binned_quantile_interval(&histogram.bins(), 0.5, 0.95).unwrap();
+            Estimate {
+                value: histogram.quantile(0.5).unwrap() as f64,
+                interval: Some(Interval {
+                    low: interval.low_ns as f64,
+                    high: interval.high_ns as f64,
+                }),
+            }
+        };
+        let mut covered = 0;
+        for _ in 0..200 {
+            let found = ratio(sample(1.0), sample(1.0)).unwrap();
+            covered += i32::from(found.low <= 1.0 && found.high >= 1.0);
+        }
+        assert!(covered >= 180, "{covered} of 200");
+        let doubled = ratio(sample(1.0), sample(2.0)).unwrap();
+        assert!(doubled.low > 1.5 && doubled.high < 2.7, "{doubled:?}");
+        let without = Estimate {
+            value: 1.0,
+            interval: None,
+        };
+        assert_eq!(ratio(without, sample(1.0)), None);
+    }
+}

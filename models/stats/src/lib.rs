@@ -1,0 +1,15 @@
+//! Statistics: histograms, intervals, series and comparisons of samples. It knows neither messages
+//! nor links.
+#![forbid(unsafe_code)]
+
+pub mod bounds;
+pub mod comparison;
+pub mod correlation;
+pub mod goodness;
+pub mod histogram;
+pub mod in_order;
+pub mod resampling;
+pub mod samples;
+pub mod series;
+pub mod special;
+pub mod statistics;

@@ -1,0 +1,445 @@
+//! Motion files in the BVH text format (Biovision hierarchy): reader and writer on text. It opens
+//! no file, and it does not interpret the motion: see [`super::motion`].
+//!
+//! [`BvhReader`] reads line by line and frame by frame, so the text may come from anywhere and
+//! need never end; [`Bvh::parse`] reads a whole file with it. Numbers and keywords may be spread
+//! over lines at will; every error names the line it was found on. No input makes the reader
+//! panic, recurse or reserve more memory than the text's own size.
+
+use core::fmt::Write as _;
+use core::ops::Range;
+
+use crate::skeleton::{Channel, Skeleton};
+
+/// More joints than any capture suit has; a bound against nonsense.
+pub const JOINT_COUNT_MAX: usize = 1024;
+
+/// A skeleton and its frames.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Bvh {
+    /// The joints and what their channels mean.
+    pub skeleton: Skeleton,
+    /// Time from one frame to the next, seconds; above zero.
+    pub frame_time_s: f64,
+    /// Frames one after another, [`Skeleton::channel_count`] values each.
+    pub values: Vec<f64>,
+}
+
+/// Why a text is not a motion file.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error("line {line}: {problem}")]
+pub struct BvhError {
+    /// Line of the offending word, counted from 1; the last line when the text ended early.
+    pub line: usize,
+    /// What was wrong with it.
+    pub problem: BvhProblem,
+}
+
+/// What was wrong.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum BvhProblem {
+    /// Another word was due.
+    #[error("expected {expected}, found {found:?}")]
+    Unexpected {
+        /// What was due.
+        expected: &'static str,
+        /// What stood there, shortened to 40 characters.
+        found: String,
+    },
+    /// The text ended.
+    #[error("expected {expected}, found the end of the text")]
+    Ended {
+        /// What was due.
+        expected: &'static str,
+    },
+    /// A number outside its bound.
+    #[error("{what} {value} is outside {allowed}")]
+    OutOfRange {
+        /// Which number.
+        what: &'static str,
+        /// Its value as written.
+        value: String,
+        /// What it may be.
+        allowed: &'static str,
+    },
+    /// The frame count does not fit the numbers that follow.
+    #[error("{frame_count} frames of {channel_count} values announced, {value_count} values found")]
+    FrameCount {
+        /// Announced frames.
+        frame_count: usize,
+        /// Values per frame.
+        channel_count: usize,
+        /// Values in the text.
+        value_count: usize,
+    },
+}
+
+impl Bvh {
+    /// Number of frames.
+    pub fn frame_count(&self) -> usize {
+        self.values.len() / self.skeleton.channel_count().max(1)
+    }
+
+    /// The frames in order.
+    pub fn frames(&self) -> impl Iterator<Item = &[f64]> {
+        self.values
+            .chunks_exact(self.skeleton.channel_count().max(1))
+    }
+
+    /// Reads a motion file's text.
+    ///
+    /// # Errors
+    /// The first line that is not as the format says.
+    pub fn parse(text: &str) -> Result<Self, BvhError> {
+        let mut reader = BvhReader::new(text.lines())?;
+        let mut values = Vec::new();
+        while reader.words.advance() {
+            values.push(reader.words.present_number("a channel value")?);
+        }
+        let channel_count = reader.skeleton.channel_count();
+        let frame_count = reader.announced_frame_count;
+        if frame_count.checked_mul(channel_count) != Some(values.len()) || values.is_empty() {
+            return Err(BvhError {
+                line: reader.count_line,
+                problem: BvhProblem::FrameCount {
+                    frame_count,
+                    channel_count,
+                    value_count: values.len(),
+                },
+            });
+        }
+        Ok(Self {
+            skeleton: reader.skeleton,
+            frame_time_s: reader.frame_time_s,
+            values,
+        })
+    }
+
+    /// The motion file's text; [`Bvh::parse`] reads it back with six decimals.
+    pub fn to_text(&self) -> String {
+        let mut text = String::from("HIERARCHY\n");
+        write_joint(&mut text, &self.skeleton, 0, 0);
+        let frame_count = self.frame_count();
+        // Writing to a String cannot fail.
+        let _infallible = write!(
+            text,
+            "MOTION\nFrames: {frame_count}\nFrame Time: {:.9}\n",
+            self.frame_time_s
+        );
+        for frame in self.frames() {
+            for (index, value) in frame.iter().enumerate() {
+                let separator = if index == 0 { "" } else { " " };
+                let _infallible = write!(text, "{separator}{value:.6}");
+            }
+            text.push('\n');
+        }
+        text
+    }
+}
+
+/// Reads a motion file as its lines come in: the hierarchy at once, then a frame at a time.
+#[derive(Debug)]
+pub struct BvhReader<L> {
+    words: Words<L>,
+    skeleton: Skeleton,
+    frame_time_s: f64,
+    announced_frame_count: usize,
+    count_line: usize,
+}
+
+impl<L: Iterator<Item: AsRef<str>>> BvhReader<L> {
+    /// Reads up to the frame time; `lines` come without their line ends.
+    ///
+    /// # Errors
+    /// The first line that is not as the format says.
+    pub fn new(lines: L) -> Result<Self, BvhError> {
+        let mut words = Words::new(lines);
+        words.keyword("HIERARCHY", "the keyword HIERARCHY")?;
+        words.keyword("ROOT", "the keyword ROOT")?;
+        let skeleton = parse_hierarchy(&mut words)?;
+        words.keyword("MOTION", "the keyword MOTION")?;
+        words.keyword("Frames:", "the keyword Frames:")?;
+        let count_line = words.line();
+        let announced_frame_count = words.parsed("a frame count")?;
+        words.keyword("Frame", "the keywords Frame Time:")?;
+        words.keyword("Time:", "the keywords Frame Time:")?;
+        let frame_time_s = words.number("a frame time in seconds")?;
+        if !(1e-6..=10.0).contains(&frame_time_s) {
+            return Err(words.error(BvhProblem::OutOfRange {
+                what: "frame time",
+                value: frame_time_s.to_string(),
+                allowed: "0.000001 to 10 s",
+            }));
+        }
+        Ok(Self {
+            words,
+            skeleton,
+            frame_time_s,
+            announced_frame_count,
+            count_line,
+        })
+    }
+
+    /// The joints and what their channels mean.
+    pub fn skeleton(&self) -> &Skeleton {
+        &self.skeleton
+    }
+
+    /// Time from one frame to the next, seconds.
+    pub fn frame_time_s(&self) -> f64 {
+        self.frame_time_s
+    }
+
+    /// Frames the header speaks of; a live source may send any number.
+    pub fn announced_frame_count(&self) -> usize {
+        self.announced_frame_count
+    }
+
+    /// Line of the newest word, counted from 1.
+    pub fn line(&self) -> usize {
+        self.words.line()
+    }
+
+    /// Reads the next frame into `values`, which is cleared first; false at the end of the lines,
+    /// and for a skeleton without channels.
+    ///
+    /// # Errors
+    /// A word that is no number, or lines that end within a frame. The words before it are gone.
+    pub fn next_frame(&mut self, values: &mut Vec<f64>) -> Result<bool, BvhError> {
+        values.clear();
+        let channel_count = self.skeleton.channel_count();
+        if channel_count == 0 || !self.words.advance() {
+            return Ok(false);
+        }
+        values.push(self.words.present_number("a channel value")?);
+        while values.len() < channel_count {
+            values.push(self.words.number("a channel value")?);
+        }
+        Ok(true)
+    }
+}
+
+/// Reads from the root's name to the brace that closes the root.
+fn parse_hierarchy<L: Iterator<Item: AsRef<str>>>(
+    words: &mut Words<L>,
+) -> Result<Skeleton, BvhError> {
+    const EXPECTED: &str = "JOINT, End Site or a closing brace";
+    let mut skeleton = Skeleton::default();
+    let mut open: Vec<usize> = Vec::new();
+    open.push(parse_joint(words, &mut skeleton, None)?);
+    while let Some(&parent) = open.last() {
+        words.next(EXPECTED)?;
+        if words.is("}") {
+            open.pop();
+        } else if words.is("JOINT") {
+            open.push(parse_joint(words, &mut skeleton, Some(parent))?);
+        } else if words.is("End") {
+            words.keyword("Site", "the keyword Site")?;
+            words.keyword("{", "an opening brace")?;
+            words.keyword("OFFSET", "the keyword OFFSET")?;
+            for _ in 0..3 {
+                words.number("an offset")?;
+            }
+            words.keyword("}", "a closing brace")?;
+        } else {
+            return Err(words.unexpected(EXPECTED));
+        }
+    }
+    Ok(skeleton)
+}
+
+/// Reads a joint's name, offset and channels; its children and closing brace come after.
+fn parse_joint<L: Iterator<Item: AsRef<str>>>(
+    words: &mut Words<L>,
+    skeleton: &mut Skeleton,
+    parent: Option<usize>,
+) -> Result<usize, BvhError> {
+    words.next("a joint name")?;
+    let name = words.present().to_owned();
+    if skeleton.joints().len() >= JOINT_COUNT_MAX {
+        return Err(words.error(BvhProblem::OutOfRange {
+            what: "joint count",
+            value: (JOINT_COUNT_MAX + 1).to_string(),
+            allowed: "1 to 1024",
+        }));
+    }
+    words.keyword("{", "an opening brace")?;
+    words.keyword("OFFSET", "the keyword OFFSET")?;
+    let mut offset = [0.0; 3];
+    for part in &mut offset {
+        *part = words.number("an offset")?;
+    }
+    words.keyword("CHANNELS", "the keyword CHANNELS")?;
+    let count: usize = words.parsed("a channel count")?;
+    if count > 6 {
+        return Err(words.error(BvhProblem::OutOfRange {
+            what: "channel count",
+            value: count.to_string(),
+            allowed: "0 to 6",
+        }));
+    }
+    let mut channels = Vec::with_capacity(count);
+    for _ in 0..count {
+        const EXPECTED: &str = "a channel name such as Xrotation";
+        words.next("a channel name")?;
+        let channel =
+            Channel::from_name(words.present()).ok_or_else(|| words.unexpected(EXPECTED))?;
+        channels.push(channel);
+    }
+    Ok(skeleton.push(&name, parent, offset, &channels))
+}
+
+/// The lines' words, one at a time.
+#[derive(Debug)]
+struct Words<L> {
+    lines: L,
+    /// The line under way.
+    text: String,
+    line_count: usize,
+    /// Where in the line the newest word lies.
+    word: Range<usize>,
+}
+
+impl<L: Iterator<Item: AsRef<str>>> Words<L> {
+    fn new(lines: L) -> Self {
+        Self {
+            lines,
+            text: String::new(),
+            line_count: 0,
+            word: 0..0,
+        }
+    }
+
+    /// Line of the newest word, counted from 1.
+    fn line(&self) -> usize {
+        self.line_count.max(1)
+    }
+
+    /// Goes to the next word; false when there is none.
+    fn advance(&mut self) -> bool {
+        loop {
+            let rest = &self.text[self.word.end..];
+            let trimmed = rest.trim_start();
+            if let Some(word) = trimmed.split_whitespace().next() {
+                let start = self.text.len() - trimmed.len();
+                self.word = start..start + word.len();
+                return true;
+            }
+            let Some(next) = self.lines.next() else {
+                return false;
+            };
+            self.text.clear();
+            // A byte order mark may stand before everything else.
+            let is_first = self.line_count == 0;
+            self.text.push_str(match next.as_ref() {
+                text if is_first => text.trim_start_matches('\u{feff}'),
+                text => text,
+            });
+            self.word = 0..0;
+            self.line_count += 1;
+        }
+    }
+
+    /// The newest word.
+    fn present(&self) -> &str {
+        &self.text[self.word.clone()]
+    }
+
+    fn is(&self, keyword: &str) -> bool {
+        self.present().eq_ignore_ascii_case(keyword)
+    }
+
+    fn next(&mut self, expected: &'static str) -> Result<(), BvhError> {
+        if self.advance() {
+            Ok(())
+        } else {
+            Err(self.error(BvhProblem::Ended { expected }))
+        }
+    }
+
+    fn keyword(&mut self, keyword: &str, expected: &'static str) -> Result<(), BvhError> {
+        self.next(expected)?;
+        if self.is(keyword) {
+            Ok(())
+        } else {
+            Err(self.unexpected(expected))
+        }
+    }
+
+    fn parsed<T: core::str::FromStr>(&mut self, expected: &'static str) -> Result<T, BvhError> {
+        self.next(expected)?;
+        let parsed = self.present().parse().ok();
+        parsed.ok_or_else(|| self.unexpected(expected))
+    }
+
+    fn number(&mut self, expected: &'static str) -> Result<f64, BvhError> {
+        self.next(expected)?;
+        self.present_number(expected)
+    }
+
+    /// The newest word as a finite number.
+    fn present_number(&self, expected: &'static str) -> Result<f64, BvhError> {
+        let parsed = self.present().parse().ok();
+        parsed
+            .filter(|value: &f64| value.is_finite())
+            .ok_or_else(|| self.unexpected(expected))
+    }
+
+    fn unexpected(&self, expected: &'static str) -> BvhError {
+        self.error(BvhProblem::Unexpected {
+            expected,
+            found: self.present().chars().take(40).collect(),
+        })
+    }
+
+    fn error(&self, problem: BvhProblem) -> BvhError {
+        BvhError {
+            line: self.line(),
+            problem,
+        }
+    }
+}
+
+/// Writes joint `index` and everything below it. The depth is that of a skeleton in memory, at
+/// most [`JOINT_COUNT_MAX`] when it was read.
+fn write_joint(text: &mut String, skeleton: &Skeleton, index: usize, depth: usize) {
+    let Some(joint) = skeleton.joints().get(index) else {
+        return;
+    };
+    let indent = "\t".repeat(depth);
+    let keyword = if joint.parent.is_none() {
+        "ROOT"
+    } else {
+        "JOINT"
+    };
+    let [x, y, z] = joint.offset.into();
+    // Writing to a String cannot fail.
+    let _infallible = write!(
+        text,
+        "{indent}{keyword} {}\n{indent}{{\n{indent}\tOFFSET {x:.6} {y:.6} {z:.6}\n{indent}\tCHANNELS {}",
+        joint.name,
+        joint.channels.len()
+    );
+    for channel in &joint.channels {
+        let _infallible = write!(text, " {}", channel.name());
+    }
+    text.push('\n');
+    let mut is_leaf = true;
+    for (child, candidate) in skeleton.joints().iter().enumerate().skip(index + 1) {
+        if candidate.parent == Some(index) {
+            is_leaf = false;
+            write_joint(text, skeleton, child, depth + 1);
+        }
+    }
+    if is_leaf {
+        let _infallible = write!(
+            text,
+            "{indent}\tEnd Site\n{indent}\t{{\n{indent}\t\tOFFSET 0.000000 0.000000 0.000000\n{indent}\t}}\n"
+        );
+    }
+    let _infallible = writeln!(text, "{indent}}}");
+}
+
+#[cfg(test)]
+#[path = "bvh_tests.rs"]
+mod tests;

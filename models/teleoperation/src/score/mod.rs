@@ -1,0 +1,342 @@
+//! What the robot made of the motion: motion loops and why they were lost, sessions, joint error,
+//! lag, age. It reads the run log and nothing else, in time linear in the log's length.
+//!
+//! Where commands and feedback were stamped by two clocks, loops are still counted, on clocks
+//! that the fastest answered command brings together; what needs better than that is unavailable.
+
+mod age;
+mod figure;
+mod joint_error;
+pub(crate) mod loops;
+mod lost;
+mod path;
+mod plots;
+pub(crate) mod record;
+pub(crate) mod sessions;
+#[cfg(test)]
+mod tests;
+
+use crate::messages::HumanFrame;
+use crate::score::figure::{count, estimated, figure};
+use crate::score::joint_error::JointError;
+use crate::score::loops::{LoopCounter, Loops, LossCause};
+use crate::score::record::Record;
+use crate::score::sessions::Sessions;
+use crate::{HUMAN_FRAME, Teleoperation};
+use hil_arm::egm::messages::{EgmCommand, EgmFeedback};
+use hil_core::case_study::{ErrorSeries, Metric, Score};
+use hil_core::plot::PlotSeries;
+use hil_core::run_log::RunLog;
+use hil_stats::series::{Estimate, Sample, lag_s, peak_to_peak};
+use hil_stats::statistics::{CONFIDENCE, poisson};
+
+/// Everything a plot of the run shows.
+pub(crate) fn series(case: &Teleoperation, log: &RunLog) -> Vec<PlotSeries> {
+    let mut series = plots::series(log);
+    series.extend(plots::motion_loops(&Run::read(case, log)));
+    series
+}
+
+/// The joint error of the right arm over time.
+pub(crate) fn errors(log: &RunLog) -> Vec<ErrorSeries> {
+    plots::joint_error_over_time(log)
+}
+
+/// Scores a run.
+pub(crate) fn score(case: &Teleoperation, log: &RunLog) -> Score {
+    let run = Run::read(case, log);
+    let loops = run.counter.count(&run.sent.samples, &run.moved);
+    let mut metrics = run.motion_loops(loops.as_ref());
+    metrics.extend(JointError::read(case, log, run.period_s).metrics());
+    metrics.push(run.tracking_lag(log));
+    metrics.push(run.tool_travel());
+    let commanded = run.record.sent_y();
+    metrics.extend(path::metrics(
+        &run.record,
+        &commanded,
+        &run.moved,
+        run.period_s,
+    ));
+    metrics.extend(age::metrics(&run.record));
+    metrics.extend(run.sessions.metrics(&run.record));
+    metrics.extend(run.inverse_kinematics());
+    let mut score = Score {
+        metrics,
+        ..Score::default()
+    };
+    lost::add_events(&mut score, &run, loops.as_ref(), log);
+    score
+}
+
+/// A sender silent for longer than this share of a loop may have left one out.
+const SILENCE_PERIODS: f64 = 0.25;
+
+/// A log made ready.
+#[derive(Debug)]
+struct Run {
+    counter: LoopCounter,
+    period_s: f64,
+    /// How long the human rests first.
+    rest_s: f64,
+    has_one_clock: bool,
+    record: Record,
+    sent: Sent,
+    moved: Vec<Sample>,
+    sessions: Sessions,
+}
+
+/// The motion the loops are counted in.
+#[derive(Debug)]
+struct Sent {
+    samples: Vec<Sample>,
+    what: &'static str,
+}
+
+impl Sent {
+    /// The commanded tool y. A sender that parks the arm or falls silent now and then sends fewer
+    /// loops than the human makes: then the human's hand is what was asked for.
+    fn read(case: &Teleoperation, log: &RunLog, record: &Record) -> Self {
+        let is_parked = |flags: u32| flags & EgmCommand::PARKED != 0;
+        let mut commands = record.commands.iter();
+        // What comes before the first command that follows the hand is no loop left out.
+        let followed = commands.find(|command| !is_parked(command.flags));
+        let silence_ns = SILENCE_PERIODS * case.parameters.motion_period_s * 1e9;
+        let mut heard_ns = followed.map_or(0, |command| command.at_ns);
+        let has_left_out = commands.any(|command| {
+            let gap_ns = command.at_ns - core::mem::replace(&mut heard_ns, command.at_ns);
+            is_parked(command.flags) || gap_ns as f64 > silence_ns
+        });
+        let is_behind_the_network = log.raw(HUMAN_FRAME).is_empty();
+        if followed.is_none() || (!has_left_out && !is_behind_the_network) {
+            return Self {
+                samples: record.sent_y(),
+                what: "as commanded",
+            };
+        }
+        if is_behind_the_network {
+            return Self {
+                samples: record.sent_y(),
+                what: "as the commands arrived: what was lost on their way is not counted",
+            };
+        }
+        let scale = case.parameters.mapping_scale_ratio;
+        let begin_ns = followed.map_or(0, |command| command.at_ns);
+        let hand = log.messages::<HumanFrame>(HUMAN_FRAME);
+        let samples: Vec<_> = hand
+            .map(|(at, frame)| {
+                (
+                    at.as_ns() + record.shift_ns,
+                    scale * frame.right_hand.position_m[0],
+                )
+            })
+            .filter(|(at, y_m)| *at >= begin_ns && y_m.is_finite())
+            .collect();
+        if samples.is_empty() {
+            return Self {
+                samples: record.sent_y(),
+                what: "as commanded, without the loops in which the sender was silent",
+            };
+        }
+        Self {
+            samples,
+            what: "as the human's hand made them, because the sender was silent at times",
+        }
+    }
+}
+
+impl Run {
+    fn read(case: &Teleoperation, log: &RunLog) -> Self {
+        let record = Record::read(log);
+        Self {
+            counter: LoopCounter::new(
+                case.nominal_peak_to_peak_m(),
+                case.parameters.motion_period_s,
+            ),
+            period_s: case.parameters.motion_period_s,
+            rest_s: case.parameters.motion_start_s,
+            has_one_clock: log.has_one_clock(),
+            sent: Sent::read(case, log, &record),
+            moved: record.moved_y(),
+            sessions: Sessions::read(&record, log),
+            record,
+        }
+    }
+
+    /// Loops sent, loops executed, their loss ratio (Lv et al., equation 1), and causes.
+    fn motion_loops(&self, loops: Option<&Loops>) -> Vec<Metric> {
+        let missing = "no whole motion loop between the first and the last feedback";
+        let counter = self.counter.text();
+        let sent = loops.map(|loops| loops.sent_count() as f64);
+        let executed = loops.map(|loops| loops.executed_count as f64);
+        let ratio = figure(
+            ("motion_loss_ratio", "motion loss rate", "1"),
+            loops.map(Loops::loss_ratio),
+            format!("(sent - executed) / sent, {counter}; interval of a Poisson count"),
+            missing,
+        );
+        let interval = loops.and_then(|loops| {
+            let lost = poisson(loops.missing_count()?, CONFIDENCE);
+            let sent = loops.sent_count() as f64;
+            Some((lost.low / sent, (lost.high / sent).min(1.0)))
+        });
+        let mut metrics = vec![
+            figure(
+                ("motion_loops_sent_count", "motion loops sent", "1"),
+                sent,
+                format!("{}, {counter}", self.sent.what),
+                missing,
+            ),
+            figure(
+                ("motion_loops_executed_count", "motion loops executed", "1"),
+                executed,
+                format!("as measured, {counter}"),
+                missing,
+            ),
+            Metric { interval, ..ratio },
+        ];
+        metrics.extend(self.causes(loops, missing));
+        metrics
+    }
+
+    fn causes(&self, loops: Option<&Loops>, missing: &str) -> [Metric; 7] {
+        let mut kinds = [0_u64; LossCause::KIND_COUNT];
+        for lost in loops.map_or(&[][..], |loops| &loops.lost) {
+            let cause = self
+                .sessions
+                .evidence
+                .cause_of(lost.due_ns, self.counter.period_ns);
+            kinds[cause.kind()] += 1;
+        }
+        let by = |names: (&'static str, &'static str), kind: usize, what: &str| {
+            let value = loops.map(|_| kinds[kind] as f64);
+            figure((names.0, names.1, "1"), value, what, missing)
+        };
+        [
+            by(
+                ("loops_lost_by_trip_count", "loops lost without a session"),
+                0,
+                "sent peaks that no executed one answers, with no session in part of their loop",
+            ),
+            by(
+                ("loops_lost_by_hold_count", "loops lost in a hold"),
+                1,
+                "of the others, those with a hold in their loop",
+            ),
+            by(
+                (
+                    "loops_lost_by_clipping_count",
+                    "loops lost to inverse kinematics",
+                ),
+                2,
+                "of the others, those with limited or unreachable commands in their loop",
+            ),
+            by(
+                (
+                    "loops_lost_by_throttling_count",
+                    "loops lost to MaxSpeedDeviation",
+                ),
+                3,
+                "of the others, those with MaxSpeedDeviation binding in a fifth of their loop",
+            ),
+            by(
+                (
+                    "loops_lost_by_merging_count",
+                    "loops merged with a neighbour",
+                ),
+                4,
+                "the others: too little motion between two peaks",
+            ),
+            by(
+                ("loops_lost_unseen_count", "loops lost without feedback"),
+                5,
+                "of those with a session, as far as is known: no feedback in part of their loop",
+            ),
+            figure(
+                ("loops_extra_count", "executed loops that answer none", "1"),
+                loops.map(|loops| loops.extra_count as f64),
+                "a motion of the robot's own, or one loop cut in two; each hides one lost loop in \
+                 the motion loss rate",
+                missing,
+            ),
+        ]
+    }
+
+    fn tracking_lag(&self, log: &RunLog) -> Metric {
+        let names = ("tracking_lag_ms", "tracking lag", "ms");
+        if !self.has_one_clock {
+            let missing = "commands and feedback were stamped by two clocks that are not aligned";
+            return figure(names, None, "", missing);
+        }
+        let lag = lag_s(&self.record.sent_y(), &self.moved, 0.5 * self.period_s);
+        let in_ms = |lag: Estimate| Estimate {
+            value: lag.value * 1e3,
+            interval: lag.interval.map(|(low, high)| (low * 1e3, high * 1e3)),
+        };
+        let clock = log.clock_words(lag.map(|lag| lag.value));
+        estimated(
+            names,
+            lag.map(in_ms),
+            format!(
+                "highest cross-correlation of the right tool's y, commanded and measured, on a 4 ms \
+                 grid; interval from blocks of the run{clock}"
+            ),
+            "commands and feedback overlap for less than two motion periods, or nothing moved",
+        )
+    }
+
+    fn tool_travel(&self) -> Metric {
+        #[allow(
+            clippy::cast_possible_truncation,
+            reason = "a period of at most a minute in nanoseconds"
+        )]
+        let travel = peak_to_peak(self.followed(), (self.period_s * 1e9) as i64);
+        estimated(
+            (
+                "tool_y_m_peak_to_peak",
+                "side-to-side travel of the right tool",
+                "m",
+            ),
+            travel,
+            "mean over whole motion periods of following the human of highest minus lowest \
+             measured y",
+            "no whole motion period of feedback that follows the human",
+        )
+    }
+
+    /// The measured tool y from when the robot first had a command to use and the human no longer
+    /// rested; hosts start together within milliseconds.
+    fn followed(&self) -> &[Sample] {
+        let mut feedback = self.record.feedback.iter();
+        let first = feedback.find(|known| known.has(EgmFeedback::HAS_REFERENCE));
+        let (Some(first), Some(start)) = (first, self.moved.first()) else {
+            return &[];
+        };
+        let is_before = |sample: &Sample| {
+            sample.0 < first.at_ns || ((sample.0 - start.0) as f64) < self.rest_s * 1e9
+        };
+        &self.moved[self.moved.partition_point(is_before)..]
+    }
+
+    fn inverse_kinematics(&self) -> [Metric; 2] {
+        const LIMITED: u32 = EgmCommand::LIMITED | EgmCommand::JUMP_LIMITED;
+        let commands = &self.record.commands;
+        let flagged = |bits: u32| {
+            let is_flagged = |flags: u32| flags & bits != 0;
+            let found = commands.iter().filter(|command| is_flagged(command.flags));
+            (!commands.is_empty()).then(|| found.count() as u64)
+        };
+        let of = commands.len();
+        [
+            count(
+                ("ik_failure_count", "inverse kinematics failures"),
+                flagged(EgmCommand::UNREACHABLE),
+                format!("commands flagged unreachable, of {of}"),
+            ),
+            count(
+                ("ik_limited_count", "commands held back by a limit"),
+                flagged(LIMITED),
+                format!("commands flagged as limited in speed, position or jump, of {of}"),
+            ),
+        ]
+    }
+}

@@ -1,0 +1,217 @@
+//! `report`: a finished run's report again, on the terminal or as files.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use crate::arguments::ReportArgs;
+use hil_platform::console::Console;
+use hil_platform::progress::Progress;
+use hil_report::analysis;
+use hil_report::page;
+use hil_report::page::material::Material;
+use hil_report::page::{Format, read, write};
+use hil_report::summary::{RunSummary, SummaryError};
+use hil_report::terminal;
+use hil_report::terminal::Style;
+use hil_rundir::run_folder::RunFolder;
+use hil_topology::registry::Registry;
+
+use super::{columns, exit};
+
+/// What stops a report, with its exit code.
+struct Refusal(u8, String);
+
+fn usage(text: impl core::fmt::Display) -> Refusal {
+    Refusal(exit::USAGE, text.to_string())
+}
+
+fn failed(text: impl core::fmt::Display) -> Refusal {
+    Refusal(exit::FAILED, text.to_string())
+}
+
+/// `report`.
+pub(super) fn report(args: &ReportArgs, registry: &Registry, console: &mut Console) -> u8 {
+    let is_file = args.output.is_some()
+        || args.format.is_some()
+        || args.template.is_some()
+        || args.figure.is_some();
+    if !is_file {
+        if let [run] = args.runs.as_slice() {
+            return show(run, registry, console);
+        }
+        console.error("several runs need --output or --format, e.g. -o report.html");
+        return exit::USAGE;
+    }
+    match to_files(args, console) {
+        Ok(()) => exit::RAN,
+        Err(Refusal(code, text)) => {
+            console.error(&text);
+            code
+        }
+    }
+}
+
+fn to_files(args: &ReportArgs, console: &mut Console) -> Result<(), Refusal> {
+    let format = format(args)?;
+    let template = args.template.as_deref().map(template).transpose()?;
+    let is_folder = format == Format::Svg && args.figure.is_none() && template.is_none();
+    if let Some(output) = args.output.as_deref().filter(|_| !is_folder) {
+        write::check(output, args.force).map_err(usage)?;
+    }
+    let materials = Progress::begin().during(console, "reading runs", |stage| {
+        let runs = args.runs.iter().enumerate();
+        let materials = runs.map(|(index, run)| {
+            // Of the first, nothing says yet how long one takes.
+            let share = (index > 0).then(|| index as f64 / args.runs.len() as f64);
+            stage.tell(share, &format!("reading {}", run.display()));
+            read::read(run)
+        });
+        materials.collect::<Result<Vec<_>, _>>()
+    });
+    let materials = materials.map_err(usage)?;
+    if format == Format::Svg && template.is_none() {
+        return figures(args, &materials, console);
+    }
+    let own = template
+        .as_ref()
+        .map(|(name, text)| (name.as_str(), text.as_str()));
+    let text = Progress::begin().during(console, "drawing", |_| {
+        page::render(&materials, format, own)
+    });
+    let text = text.map_err(usage)?;
+    match &args.output {
+        None => {
+            console.result(&text);
+            Ok(())
+        }
+        Some(path) => {
+            write::write(path, &text).map_err(failed)?;
+            console.say(&format!("wrote {} ({} bytes)", path.display(), text.len()));
+            if own.is_none() && format == Format::Html && text.len() > page::PAGE_BYTES_MAX {
+                let most = page::PAGE_BYTES_MAX;
+                console.warn(&format!(
+                    "the page is larger than {most} bytes although its series are as short as they \
+                     may be; give each run a page of its own"
+                ));
+            }
+            Ok(())
+        }
+    }
+}
+
+fn format(args: &ReportArgs) -> Result<Format, Refusal> {
+    let by_name = args.output.as_deref().and_then(Format::of_path);
+    let figure = args.figure.as_ref().map(|_| Format::Svg);
+    let own = args.template.as_ref().map(|_| Format::Html);
+    if args.figure.is_some() && args.format.is_some_and(|format| format != Format::Svg) {
+        return Err(usage("--figure is for --format svg only"));
+    }
+    args.format.or(figure).or(by_name).or(own).ok_or_else(|| {
+        let path = args.output.as_deref().unwrap_or_else(|| Path::new(""));
+        usage(format!(
+            "{}: its ending says no format; give --format html, md, tex, csv, json or svg",
+            path.display()
+        ))
+    })
+}
+
+fn template(path: &Path) -> Result<(String, String), Refusal> {
+    let text = fs::read_to_string(path);
+    let text = text.map_err(|error| usage(format!("{}: {error}", path.display())))?;
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    Ok((name.into_owned(), text))
+}
+
+/// One figure to a file or standard output, or all of them to a folder.
+fn figures(
+    args: &ReportArgs,
+    materials: &[Material],
+    console: &mut Console,
+) -> Result<(), Refusal> {
+    let files = Progress::begin().during(console, "drawing", |_| {
+        page::figure_files(materials, args.figure.as_deref())
+    });
+    let files = files.map_err(usage)?;
+    let Some(output) = &args.output else {
+        if args.figure.is_none() {
+            return Err(usage(
+                "all figures need a folder: give --output DIR, or one with --figure NAME",
+            ));
+        }
+        for (_, text) in &files {
+            console.result(text);
+        }
+        return Ok(());
+    };
+    if args.figure.is_some() {
+        for (_, text) in files.iter().take(1) {
+            write::write(output, text).map_err(failed)?;
+        }
+        console.say(&format!("wrote {}", output.display()));
+        return Ok(());
+    }
+    let paths: Vec<PathBuf> = files
+        .iter()
+        .map(|(name, _)| output.join(format!("{name}.svg")))
+        .collect();
+    fs::create_dir_all(output).map_err(|error| failed(format!("{}: {error}", output.display())))?;
+    for path in &paths {
+        write::check(path, args.force).map_err(usage)?;
+    }
+    for (path, (_, text)) in paths.iter().zip(&files) {
+        write::write(path, text).map_err(failed)?;
+    }
+    console.say(&format!(
+        "wrote {} figures to {}",
+        paths.len(),
+        output.display()
+    ));
+    Ok(())
+}
+
+/// The report as the run printed it.
+fn show(run: &Path, registry: &Registry, console: &mut Console) -> u8 {
+    let folder = RunFolder::existing(run);
+    if !folder.summary().is_file() && folder.result().is_file() {
+        // The run ended, and what was to draw up its account did not come to that.
+        let root = run.canonicalize().unwrap_or_else(|_error| run.to_owned());
+        let analysed = Progress::begin().during(console, "drawing up the account", |_| {
+            analysis::analyse(&RunFolder::existing(&root), registry)
+        });
+        if let Some(error) = analysed.map_or_else(Some, |concluded| concluded.unwritten) {
+            console.error(&error.to_string());
+            return exit::FAILED;
+        }
+    }
+    let progress = Progress::begin();
+    let text = progress.during(console, "reading the summary", |_| {
+        fs::read_to_string(folder.summary())
+    });
+    let text = match text {
+        Ok(text) => text,
+        Err(error) => {
+            let path = folder.summary();
+            let text = if folder.manifest().is_file() {
+                "this run never began or was killed outright, so it left no summary".to_owned()
+            } else {
+                format!("not a run's folder: {error}")
+            };
+            console.error(&format!("{}: {text}", path.display()));
+            return exit::USAGE;
+        }
+    };
+    let page = progress.during(console, "laying out the report", |_| {
+        let summary = RunSummary::from_json(&text)?;
+        Ok::<_, SummaryError>(terminal::render(&summary, columns(), Style::Coloured))
+    });
+    match page {
+        Ok(page) => {
+            console.result(&page);
+            exit::RAN
+        }
+        Err(error) => {
+            console.error(&format!("{}: {error}", folder.summary().display()));
+            exit::USAGE
+        }
+    }
+}

@@ -1,0 +1,407 @@
+//! From measured lateness to what may be claimed on this host, each by a rule that is printed with it.
+//! It judges the host, not a run: a run has links and programs besides.
+
+use serde::{Deserialize, Serialize};
+
+use super::{Gaps, LatencyReport, Quantiles};
+use hil_platform::host_facts::Fact;
+
+/// Wake-ups beyond a quantile without which it is an anecdote.
+const BEYOND_MIN: u64 = 10;
+/// What the host adds may be this part of the period at most.
+const PERIOD_PARTS: i64 = 10;
+/// Deadlines that control loops have: 1 kHz, EGM's 250 Hz, 100 Hz.
+const DEADLINE_RATES_HZ: [i64; 3] = [1_000, 250, 100];
+/// Milliseconds per second that a busy poller may lose to what is not its work.
+const LOST_MS_PER_S_MAX: f64 = 1.0;
+
+/// Whether a claim can be made.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Standing {
+    /// It can, with the bound that is stated.
+    Supportable,
+    /// It cannot: the host itself is worse.
+    NotSupportable,
+    /// Too little was measured to say.
+    NotMeasured,
+}
+
+/// Something one would like to say of a run, and whether this host allows it.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Claim {
+    /// Stable identifier, for example `p99` or `deadline_1000_hz`.
+    pub id: String,
+    /// What one would like to say.
+    pub claim: String,
+    /// Whether.
+    pub standing: Standing,
+    /// With which bound, or why not.
+    pub why: String,
+    /// The rule, in words.
+    pub rule: String,
+}
+
+impl Claim {
+    fn new(id: &str, claim: &str, rule: &str, standing: Standing, why: String) -> Self {
+        Self {
+            id: id.to_owned(),
+            claim: claim.to_owned(),
+            standing,
+            why,
+            rule: rule.to_owned(),
+        }
+    }
+}
+
+/// The least that is known of all CPUs, and the worst that was seen on one.
+#[derive(Debug, Clone, Copy)]
+struct Worst {
+    /// From one wake-up to the next.
+    period_ns: i64,
+    count: u64,
+    lateness: Quantiles,
+}
+
+fn worst(report: &LatencyReport) -> Option<Worst> {
+    let figures = report
+        .wakeups
+        .iter()
+        .map(|one| one.lateness.map(|lateness| (one.count, lateness)));
+    // A CPU without figures leaves nothing to claim of all.
+    let figures: Vec<(u64, Quantiles)> = figures.collect::<Option<_>>()?;
+    let most = |of: fn(&Quantiles) -> i64| figures.iter().map(|(_, one)| of(one)).max();
+    Some(Worst {
+        period_ns: i64::try_from(report.period_ns).unwrap_or(i64::MAX),
+        count: figures.iter().map(|(count, _)| *count).min()?,
+        lateness: Quantiles {
+            p50_ns: most(|one| one.p50_ns)?,
+            p99_ns: most(|one| one.p99_ns)?,
+            p999_ns: most(|one| one.p999_ns)?,
+            max_ns: most(|one| one.max_ns)?,
+        },
+    })
+}
+
+/// All claims, from the easiest to the hardest.
+pub(super) fn derive(report: &LatencyReport) -> Vec<Claim> {
+    let Some(worst) = worst(report) else {
+        return vec![Claim::new(
+            "median",
+            "medians of delays",
+            QUANTILE_RULE,
+            Standing::NotMeasured,
+            "no wake-up fell into the time".to_owned(),
+        )];
+    };
+    let of = worst.lateness;
+    let mut claims = vec![
+        quantile("median", "medians of delays", 500, of.p50_ns, &worst),
+        quantile("p99", "99 % quantiles of delays", 990, of.p99_ns, &worst),
+        quantile(
+            "p999",
+            "99.9 % quantiles of delays",
+            999,
+            of.p999_ns,
+            &worst,
+        ),
+        variation(&worst),
+        largest(&worst),
+    ];
+    let deadlines = DEADLINE_RATES_HZ.iter().map(|rate| deadline(*rate, &worst));
+    claims.extend(deadlines);
+    claims.extend(
+        report
+            .gaps
+            .iter()
+            .map(|gaps| busy_polling(gaps, worst.period_ns)),
+    );
+    if let Fact::Available(answer) = &report.surroundings.virtual_machine
+        && answer != "no"
+    {
+        claims.push(below());
+    }
+    claims
+}
+
+const QUANTILE_RULE: &str = "supportable to what the host's own wake-up takes at that quantile, if at least 10 \
+                             wake-ups lie beyond it and it stays within a tenth of the period";
+
+/// The rule of `permille` of delays that end in a blocking receive.
+fn quantile(id: &str, claim: &str, permille: u64, late_ns: i64, worst: &Worst) -> Claim {
+    let Worst {
+        count, period_ns, ..
+    } = *worst;
+    let late = us(late_ns);
+    let needed = needed_count(permille);
+    let (standing, why) = if count < needed {
+        let why = format!("{count} wake-ups, and {needed} are needed: measure longer");
+        (Standing::NotMeasured, why)
+    } else if late_ns <= period_ns / PERIOD_PARTS {
+        (Standing::Supportable, format!("to ±{late} us"))
+    } else {
+        let tenth = us(period_ns / PERIOD_PARTS);
+        let why = format!("the host's own wake-up is {late} us there, more than {tenth} us");
+        (Standing::NotSupportable, why)
+    };
+    Claim::new(id, claim, QUANTILE_RULE, standing, why)
+}
+
+/// Wake-ups of which enough lie beyond the quantile.
+fn needed_count(permille: u64) -> u64 {
+    BEYOND_MIN * 1000 / (1000 - permille).max(1)
+}
+
+fn variation(worst: &Worst) -> Claim {
+    let spread = us(worst.lateness.p99_ns - worst.lateness.p50_ns);
+    let (standing, why) = if worst.count < needed_count(990) {
+        let why = format!("{} wake-ups are too few for a p99", worst.count);
+        (Standing::NotMeasured, why)
+    } else {
+        let why = format!("from {spread} us up; less is the host's own");
+        (Standing::Supportable, why)
+    };
+    let rule =
+        "what differs by less than p99 minus p50 of the host's own wake-up may be the host's";
+    Claim::new("variation", "delay variation", rule, standing, why)
+}
+
+fn largest(worst: &Worst) -> Claim {
+    let (max, count) = (us(worst.lateness.max_ns), worst.count);
+    let why = format!("the host alone was {max} us late once in {count}, and may be later");
+    let rule = "the largest of any number of wake-ups bounds nothing but itself";
+    Claim::new(
+        "largest",
+        "largest delays",
+        rule,
+        Standing::NotSupportable,
+        why,
+    )
+}
+
+fn deadline(rate_hz: i64, worst: &Worst) -> Claim {
+    let period_ns = 1_000_000_000 / rate_hz;
+    let tenth_ns = period_ns / PERIOD_PARTS;
+    let Quantiles {
+        p999_ns, max_ns, ..
+    } = worst.lateness;
+    let (tail, max) = (us(p999_ns), us(max_ns));
+    // One miss is enough to know; that there is none takes many wake-ups.
+    let (standing, why) = if max_ns >= period_ns {
+        let why = format!("the host alone missed one: a wake-up was {max} us late");
+        (Standing::NotSupportable, why)
+    } else if worst.count < needed_count(999) {
+        let (count, needed) = (worst.count, needed_count(999));
+        let why = format!("{count} wake-ups, and {needed} are needed: measure longer");
+        (Standing::NotMeasured, why)
+    } else if p999_ns > tenth_ns {
+        let why = format!("99.9 % wake-up is {tail} us, more than {} us", us(tenth_ns));
+        (Standing::NotSupportable, why)
+    } else {
+        let why = format!("99.9 % wake-up is {tail} us, the latest {max} us");
+        (Standing::Supportable, why)
+    };
+    let rate = if rate_hz >= 1000 {
+        format!("{} kHz", rate_hz / 1000)
+    } else {
+        format!("{rate_hz} Hz")
+    };
+    Claim::new(
+        &format!("deadline_{rate_hz}_hz"),
+        &format!("deadline misses at {rate}"),
+        "supportable if the host's own wake-up stays within a tenth of the period at 99.9 % (at least 10 \
+         wake-ups beyond) and never misses one itself",
+        standing,
+        why,
+    )
+}
+
+fn busy_polling(gaps: &Gaps, period_ns: i64) -> Claim {
+    let lost = gaps.lost_ms_per_s();
+    let longest_ns = gaps.length.map_or(0, |length| length.max_ns);
+    let throttled = match gaps.throttle_like_count {
+        Some(count) if count > 0 => {
+            let gaps = if count == 1 { "gap" } else { "gaps" };
+            format!("; {count} {gaps} as long as what sched_rt_runtime_us keeps back")
+        }
+        _ => String::new(),
+    };
+    let why = format!(
+        "it loses {lost:.1} ms per s, {} us at most at a time{throttled}",
+        us(longest_ns)
+    );
+    let standing = if gaps.measured_ns == 0 {
+        Standing::NotMeasured
+    } else if lost < LOST_MS_PER_S_MAX && longest_ns <= period_ns / PERIOD_PARTS {
+        Standing::Supportable
+    } else {
+        Standing::NotSupportable
+    };
+    let (id, claim) = match gaps.cpu {
+        Some(cpu) => (
+            format!("busy_polling_cpu{cpu}"),
+            format!("busy polling on CPU {cpu}"),
+        ),
+        None => ("busy_polling".to_owned(), "busy polling".to_owned()),
+    };
+    let rule = "supportable if gaps over 10 us take less than 1 ms per second and none a tenth of the period";
+    Claim::new(&id, &claim, rule, standing, why)
+}
+
+fn below() -> Claim {
+    Claim::new(
+        "tail_cause",
+        "tails as this system's own",
+        "below a hypervisor the tail is not this system's alone, whatever steal time says",
+        Standing::NotSupportable,
+        "a virtual machine: long wake-ups may come from below, also when nothing runs here"
+            .to_owned(),
+    )
+}
+
+/// Microseconds, rounded up: a bound is not rounded in its own favour.
+pub(super) fn us(ns: i64) -> i64 {
+    ns.max(0).unsigned_abs().div_ceil(1000).cast_signed()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{Surroundings, Wakeups};
+    use super::*;
+
+    fn report(count: u64, lateness_us: [i64; 4]) -> LatencyReport {
+        let [p50, p99, p999, max] = lateness_us.map(|us| us * 1000);
+        let unknown = || Fact::Unavailable("not in this test".to_owned());
+        LatencyReport {
+            duration_ns: 30_000_000_000,
+            period_ns: 1_000_000,
+            priority: 80,
+            is_thorough: true,
+            is_interrupted: false,
+            wakeups: vec![Wakeups {
+                cpu: Some(1),
+                scheduling: Vec::new(),
+                is_as_asked: true,
+                measured_ns: 30_000_000_000,
+                count,
+                skipped_count: 0,
+                preempted_count: None,
+                lateness: Some(Quantiles {
+                    p50_ns: p50,
+                    p99_ns: p99,
+                    p999_ns: p999,
+                    max_ns: max,
+                }),
+            }],
+            gaps: Vec::new(),
+            surroundings: Surroundings {
+                load_before: unknown(),
+                load_after: unknown(),
+                ticks: Fact::Unavailable("not in this test".to_owned()),
+                virtual_machine: unknown(),
+            },
+            claims: Vec::new(),
+        }
+    }
+
+    fn found(report: &LatencyReport, id: &str) -> Claim {
+        let claims = derive(report);
+        claims.into_iter().find(|claim| claim.id == id).unwrap()
+    }
+
+    #[test]
+    fn a_virtual_machine_supports_medians_and_no_deadlines() {
+        // The figures of a real one: p99.9 far off, single wake-ups of several milliseconds.
+        let report = report(30_000, [26, 66, 1279, 7201]);
+        for (id, standing, words) in [
+            ("median", Standing::Supportable, "to ±26 us"),
+            ("p99", Standing::Supportable, "to ±66 us"),
+            (
+                "p999",
+                Standing::NotSupportable,
+                "1279 us there, more than 100 us",
+            ),
+            ("variation", Standing::Supportable, "from 40 us up"),
+            (
+                "largest",
+                Standing::NotSupportable,
+                "7201 us late once in 30000",
+            ),
+            (
+                "deadline_1000_hz",
+                Standing::NotSupportable,
+                "missed one: a wake-up was 7201 us",
+            ),
+            (
+                "deadline_100_hz",
+                Standing::NotSupportable,
+                "1279 us, more than 1000 us",
+            ),
+        ] {
+            let claim = found(&report, id);
+            assert_eq!(claim.standing, standing, "{claim:?}");
+            assert!(claim.why.contains(words), "{claim:?}");
+            assert!(!claim.rule.is_empty());
+        }
+    }
+
+    #[test]
+    fn a_tuned_host_supports_deadlines_too() {
+        let report = report(30_000, [3, 8, 12, 40]);
+        for id in ["p999", "deadline_1000_hz", "deadline_250_hz"] {
+            assert_eq!(found(&report, id).standing, Standing::Supportable, "{id}");
+        }
+    }
+
+    #[test]
+    fn too_few_wake_ups_say_nothing_of_tails() {
+        let short = report(900, [3, 8, 12, 40]);
+        assert_eq!(found(&short, "median").standing, Standing::Supportable);
+        for id in ["p99", "p999", "variation", "deadline_1000_hz"] {
+            assert_eq!(found(&short, id).standing, Standing::NotMeasured, "{id}");
+        }
+        assert_eq!(needed_count(990), 1000);
+        assert_eq!(needed_count(999), 10_000);
+        let mut silent = report(0, [0; 4]);
+        silent.wakeups[0].lateness = None;
+        assert_eq!(found(&silent, "median").standing, Standing::NotMeasured);
+    }
+
+    #[test]
+    fn a_poller_is_judged_by_what_it_loses() {
+        let mut report = report(30_000, [3, 8, 12, 40]);
+        report.gaps = vec![Gaps {
+            cpu: Some(1),
+            scheduling: Vec::new(),
+            measured_ns: 10_000_000_000,
+            look_count: 100_000_000,
+            count: 3_500,
+            lost_ns: 570_000_000,
+            throttle_like_count: Some(10),
+            length: Some(Quantiles {
+                p50_ns: 23_000,
+                p99_ns: 80_000,
+                p999_ns: 50_000_000,
+                max_ns: 50_100_000,
+            }),
+        }];
+        let claim = found(&report, "busy_polling_cpu1");
+        assert_eq!(claim.standing, Standing::NotSupportable);
+        let words = "it loses 57.0 ms per s, 50100 us at most at a time; 10 gaps as long as what \
+                     sched_rt_runtime_us keeps back";
+        assert_eq!(claim.why, words);
+        report.gaps[0].lost_ns = 1_000_000;
+        report.gaps[0].length = None;
+        let claim = found(&report, "busy_polling_cpu1");
+        assert_eq!(claim.standing, Standing::Supportable);
+    }
+
+    #[test]
+    fn a_hypervisor_shares_the_blame() {
+        let mut report = report(30_000, [3, 8, 12, 40]);
+        assert!(derive(&report).iter().all(|claim| claim.id != "tail_cause"));
+        report.surroundings.virtual_machine = Fact::Available("yes".to_owned());
+        let claim = found(&report, "tail_cause");
+        assert_eq!(claim.standing, Standing::NotSupportable);
+    }
+}

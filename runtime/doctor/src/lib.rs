@@ -1,0 +1,242 @@
+//! `hil-runtime doctor`: what this host can measure, what stands in the way, and the cure for
+//! each. It examines and reports; it changes nothing that outlives it, prints nothing and knows
+//! no exit codes: the caller turns [`DoctorReport::worst_severity`] into one.
+//!
+//! One file per subject, each a function from the kernel's files (below a root that tests can move)
+//! and a [`Plan`] to findings; [`latency`] measures. Every finding is in the catalogue, from which
+//! `docs/doctor.md` is checked.
+#![forbid(unsafe_code)]
+
+mod card;
+mod catalogue;
+pub mod cli;
+mod clock_path;
+mod clocks;
+mod driver;
+mod finding;
+mod firewall;
+mod interrupts;
+mod kernel;
+pub mod latency;
+mod network;
+mod paths;
+mod plan;
+mod ports;
+mod privileges;
+mod processors;
+mod radio;
+mod render;
+mod shared_memory;
+mod storage;
+mod wakeup;
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use hil_net::interface::interface_with_address;
+use hil_net::timestamping::TimestampCapabilities;
+use serde::{Deserialize, Serialize};
+
+pub use self::finding::{Finding, Severity};
+use self::latency::LatencyReport;
+use self::network::StampQuery;
+pub use self::plan::{LinkLoad, Peer, Pin, Plan, Protocol, WantedPort};
+use self::privileges::Rights;
+use hil_nic::card_clock::probing::probe_card;
+use hil_platform::clock_discipline::HostDiscipline;
+use hil_platform::domain_address::domain_base_candidates;
+use hil_platform::host_facts::{HostFacts, HostFiles};
+use hil_shm::ForeignNodes;
+
+/// What to examine.
+#[derive(Debug, Clone)]
+pub struct DoctorRequest {
+    /// What a topology has this host do; `None` when none was given.
+    pub plan: Option<Plan>,
+    /// Another host's report, with its name, to compare clocks with.
+    pub other: Option<(String, Box<DoctorReport>)>,
+    /// Folders for sockets and service files, in the order the runtime tries them.
+    pub runtime_folders: Vec<PathBuf>,
+    /// The kernel's text files.
+    pub files: HostFiles,
+}
+
+impl Default for DoctorRequest {
+    fn default() -> Self {
+        Self {
+            plan: None,
+            other: None,
+            runtime_folders: domain_base_candidates(),
+            files: HostFiles::of_this_host(),
+        }
+    }
+}
+
+/// The facts of a host and what they mean for a measurement. `docs/doctor.md` describes its JSON.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct DoctorReport {
+    /// [`DoctorReport::SCHEMA`].
+    pub schema: String,
+    /// The host described.
+    pub host: HostFacts,
+    /// How many findings there are of each severity, by its word.
+    pub counts: BTreeMap<String, usize>,
+    /// What was found, grouped by subject.
+    pub findings: Vec<Finding>,
+    /// How the time of day is kept; `None` when the kernel does not say.
+    pub clock: Option<HostDiscipline>,
+    /// The lateness of wake-ups; `None` before it is measured.
+    pub latency: Option<LatencyReport>,
+}
+
+impl DoctorReport {
+    /// The form of the JSON. It changes when a field goes or changes its meaning.
+    pub const SCHEMA: &'static str = "hil-doctor/1";
+
+    /// A report of these findings alone.
+    fn of(findings: Vec<Finding>) -> Self {
+        let mut report = Self {
+            schema: Self::SCHEMA.to_owned(),
+            host: HostFacts::default(),
+            counts: BTreeMap::new(),
+            findings,
+            clock: None,
+            latency: None,
+        };
+        report.recount();
+        report
+    }
+
+    fn recount(&mut self) {
+        let counts =
+            Severity::ALL.map(|severity| (severity.word().to_owned(), self.count(severity)));
+        self.counts = counts.into();
+    }
+
+    fn count(&self, severity: Severity) -> usize {
+        let own = self.findings.iter().filter(|one| one.severity == severity);
+        own.count()
+    }
+
+    /// Takes a measurement in, with its finding.
+    pub fn add_latency(&mut self, measured: LatencyReport) {
+        self.findings.push(wakeup::judge(&measured));
+        self.latency = Some(measured);
+        self.recount();
+    }
+
+    /// The worst severity among the findings. A strict caller takes [`Severity::Warning`] and worse
+    /// for a host that is not fit.
+    pub fn worst_severity(&self) -> Severity {
+        let severities = self.findings.iter().map(|finding| finding.severity);
+        severities.max().unwrap_or(Severity::Ok)
+    }
+
+    /// The finding with this identifier.
+    pub fn find(&self, id: &str) -> Option<&Finding> {
+        self.findings.iter().find(|finding| finding.id == id)
+    }
+
+    /// The report as indented JSON.
+    ///
+    /// # Panics
+    /// Never: the report holds strings, numbers and lists only.
+    pub fn to_json(&self) -> String {
+        serde_json::to_string_pretty(self).expect("strings, numbers and lists always serialise")
+    }
+
+    /// Reads another host's report.
+    ///
+    /// # Errors
+    /// When the text is no report of this form.
+    pub fn from_json(text: &str) -> Result<Self, String> {
+        let read: Self = serde_json::from_str(text).map_err(|error| error.to_string())?;
+        if read.schema == Self::SCHEMA {
+            Ok(read)
+        } else {
+            let (found, known) = (read.schema, Self::SCHEMA);
+            Err(format!(
+                "its schema is `{found}`, this program reads `{known}`"
+            ))
+        }
+    }
+}
+
+/// Examines this host; takes a fraction of a second. It measures no latency, see [`latency::measure`].
+///
+/// A network card with a clock of its own is asked for stamps, sent a few datagrams through and put
+/// back as it was; that takes another half second for each.
+pub fn examine(request: &DoctorRequest) -> DoctorReport {
+    let stamps: StampQuery<'_> =
+        &|interface| TimestampCapabilities::query(interface).map_err(|error| error.to_string());
+    let files = &request.files;
+    let plan = request.plan.clone().unwrap_or_default();
+    let rights = Rights::tried();
+    let mut findings = Vec::new();
+    findings.extend(kernel::examine(files, &plan, rights.is_fifo_granted()));
+    findings.extend(processors::examine(files, &plan));
+    findings.extend(privileges::examine(files, &rights));
+    examine_network(request, &plan, stamps, &mut findings);
+    let discipline = HostDiscipline::gather();
+    let other = request.other.as_ref();
+    let other = other.map(|(name, report)| (name.as_str(), report.clock.as_ref()));
+    findings.extend(clocks::examine(&discipline, other));
+    let folders = &request.runtime_folders;
+    findings.extend(shared_memory::examine(files, folders, ForeignNodes::list()));
+    let runtime_folder = shared_memory::usable(folders).unwrap_or(Path::new("/run/hil"));
+    let record_folder = if plan.record_folder.as_os_str().is_empty() {
+        Path::new("runs")
+    } else {
+        &plan.record_folder
+    };
+    findings.extend(storage::examine(files, record_folder, runtime_folder));
+    DoctorReport {
+        host: HostFacts::gather_from(files),
+        clock: discipline.ok(),
+        ..DoctorReport::of(findings)
+    }
+}
+
+fn examine_network(
+    request: &DoctorRequest,
+    plan: &Plan,
+    stamps: StampQuery<'_>,
+    findings: &mut Vec<Finding>,
+) {
+    let files = &request.files;
+    let present = match network::interfaces() {
+        Ok(present) => present,
+        Err(reason) => {
+            findings.push(Finding::cannot_tell("interface", reason).of("any"));
+            network::Interfaces::new()
+        }
+    };
+    let names = network::wanted(&present, plan);
+    findings.extend(network::examine(files, &present, &names, stamps));
+    findings.extend(card::examine(&present, &names, stamps, &probe_card));
+    findings.extend(radio::examine(&names));
+    findings.extend(interrupts::examine(files, &names, plan));
+    let mut ask_driver = driver::asker();
+    for name in names.iter().filter(|name| network::has_device(files, name)) {
+        findings.extend(driver::examine(name, &ask_driver(name)));
+    }
+    findings.extend(paths::examine(
+        files,
+        &present,
+        plan,
+        &paths::source_towards,
+    ));
+    findings.extend(ports::examine(files, &plan.ports));
+    findings.push(firewall::examine(files, firewall::chains(), &plan.ports));
+    if request.plan.is_some() {
+        let interface_of = |address| {
+            interface_with_address(address).map_err(|error| format!("getifaddrs: {error}"))
+        };
+        let end = plan.clock_end.as_ref();
+        findings.push(clock_path::examine(end, &interface_of, stamps));
+    }
+}
+
+#[cfg(test)]
+#[path = "mod_tests.rs"]
+mod tests;

@@ -1,0 +1,395 @@
+//! What a topology wants of this host, as far as the doctor looks at it: pinned CPUs, addresses,
+//! ports, message sizes, the folder of the run. It examines nothing.
+
+use std::net::{IpAddr, SocketAddr};
+use std::path::PathBuf;
+
+use hil_arm::egm::messages::Side;
+use hil_protocol::wire;
+
+use hil_topology::{ClockEnd, Crossing, Execution, FaceKind, Host, Program, Topology, Via, Wait};
+
+/// Bytes of the IP and UDP headers before a datagram.
+const IPV4_HEADERS: usize = 28;
+const IPV6_HEADERS: usize = 48;
+
+/// A CPU that something is pinned to.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Pin {
+    /// The CPU.
+    pub cpu: usize,
+    /// The process or gateway, for people.
+    pub of: String,
+    /// It polls without pause (`wait = "spin"`).
+    pub spins: bool,
+}
+
+/// TCP or UDP.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Protocol {
+    /// Datagrams.
+    Udp,
+    /// Connections.
+    Tcp,
+}
+
+impl Protocol {
+    pub(super) const fn word(self) -> &'static str {
+        match self {
+            Self::Udp => "udp",
+            Self::Tcp => "tcp",
+        }
+    }
+}
+
+/// A port that a run binds on this host.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub struct WantedPort {
+    /// Its protocol.
+    pub protocol: Protocol,
+    /// Where.
+    pub address: SocketAddr,
+    /// What for.
+    pub of: String,
+}
+
+/// A host that this one talks to.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Peer {
+    /// Its name in the topology.
+    pub name: String,
+    /// Its address.
+    pub address: IpAddr,
+    /// This host's address, from which it expects to be talked to.
+    pub own: IpAddr,
+    /// The interface the topology binds to.
+    pub interface: Option<String>,
+}
+
+/// The longest message that leaves this host over a link.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct LinkLoad {
+    /// The link.
+    pub link: String,
+    /// The channel with the longest message.
+    pub channel: String,
+    /// Bytes of that message.
+    pub message_bytes: usize,
+    /// `path_mtu_bytes` of the link.
+    pub path_mtu_bytes: usize,
+    /// Where it leaves.
+    pub own: IpAddr,
+    /// True over TCP, where segments are the kernel's business.
+    pub is_stream: bool,
+}
+
+impl LinkLoad {
+    /// Bytes of the IP packet that the message would be in one piece.
+    pub(super) fn packet_bytes(&self) -> usize {
+        self.headers() + wire::HEADER_BYTES + self.message_bytes
+    }
+
+    /// Datagrams of one message where a packet has at most `mtu` bytes; `None` when not even the
+    /// headers fit.
+    pub(super) fn datagram_count(&self, mtu: usize) -> Option<usize> {
+        let budget = mtu.checked_sub(self.headers() + wire::HEADER_BYTES)?;
+        (budget > 0).then(|| self.message_bytes.div_ceil(budget).max(1))
+    }
+
+    fn headers(&self) -> usize {
+        if self.own.is_ipv4() {
+            IPV4_HEADERS
+        } else {
+            IPV6_HEADERS
+        }
+    }
+}
+
+/// What a topology has this host do.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Plan {
+    /// Pinned CPUs.
+    pub pins: Vec<Pin>,
+    /// Interfaces it names; those of its addresses are found by the addresses.
+    pub interfaces: Vec<String>,
+    /// Its own addresses.
+    pub addresses: Vec<IpAddr>,
+    /// Ports.
+    pub ports: Vec<WantedPort>,
+    /// Hosts to talk to.
+    pub peers: Vec<Peer>,
+    /// The longest message per link.
+    pub loads: Vec<LinkLoad>,
+    /// Where this host exchanges clocks.
+    pub clock_end: Option<ClockEnd>,
+    /// Folder that receives the runs.
+    pub record_folder: PathBuf,
+}
+
+impl Plan {
+    /// The plan of the hosts called `here`, which run on this machine.
+    pub fn of(topology: &Topology, here: &[String]) -> Self {
+        let is_here = |host: &Host| here.contains(&host.name);
+        let own: Vec<&Host> = topology.hosts().iter().filter(|h| is_here(h)).collect();
+        let ends = own.iter().filter_map(|host| host.clock.clone());
+        let mut plan = Self {
+            record_folder: PathBuf::from(&topology.run().record_folder),
+            clock_end: ends.clone().next(),
+            addresses: own.iter().filter_map(|host| host.address).collect(),
+            ..Self::default()
+        };
+        let clock_interfaces = ends.clone().filter_map(|end| end.interface);
+        let interfaces = own.iter().filter_map(|host| host.interface.clone());
+        plan.interfaces = interfaces.chain(clock_interfaces).collect();
+        plan.addresses.extend(ends.map(|end| end.address));
+        for host in &own {
+            for process in topology.processes_on(&host.name) {
+                plan.pin(&process.name, &process.execution);
+                plan.listen_for_face(&process.name, &process.program);
+            }
+        }
+        for crossing in topology.crossings() {
+            plan.cross(&crossing, &is_here);
+        }
+        plan.meet(topology, &is_here);
+        plan.tidy();
+        plan
+    }
+
+    /// The CPUs of the pins, each once.
+    pub fn cpus(&self) -> Vec<usize> {
+        let mut cpus: Vec<usize> = self.pins.iter().map(|pin| pin.cpu).collect();
+        cpus.sort_unstable();
+        cpus.dedup();
+        cpus
+    }
+
+    /// Something pinned polls without pause.
+    pub(super) fn spins(&self) -> bool {
+        self.pins.iter().any(|pin| pin.spins)
+    }
+
+    fn pin(&mut self, of: &str, execution: &Execution) {
+        self.pins.extend(execution.cpus.iter().map(|cpu| Pin {
+            cpu: usize::from(*cpu),
+            of: of.to_owned(),
+            spins: execution.wait == Wait::Spin,
+        }));
+    }
+
+    /// A sensor face listens; a robot face sends from a port of the kernel's choice.
+    fn listen_for_face(&mut self, process: &str, program: &Program) {
+        let Program::Egm { face, .. } = program else {
+            return;
+        };
+        if face.kind == FaceKind::Sensor {
+            let sides = [Side::Right, Side::Left].into_iter();
+            self.ports
+                .extend(
+                    sides
+                        .filter_map(|side| face.address(side))
+                        .map(|address| WantedPort {
+                            protocol: Protocol::Udp,
+                            address,
+                            of: process.to_owned(),
+                        }),
+                );
+        }
+    }
+
+    fn cross(&mut self, crossing: &Crossing<'_>, is_here: &dyn Fn(&Host) -> bool) {
+        let (from, to, channel) = (crossing.from_host, crossing.to_host, crossing.channel);
+        let is_stream = matches!(crossing.link.via, Via::Tcp(_));
+        let name = format!("gateway of {}", crossing.link.name);
+        if is_here(from) || is_here(to) {
+            self.pin(&name, &crossing.hop.gateway.execution);
+        }
+        if is_here(from) {
+            if !is_stream {
+                self.bind(from, Protocol::Udp, crossing.ports.sender, &channel.name);
+            }
+            self.loads.push(LinkLoad {
+                link: crossing.link.name.clone(),
+                channel: channel.name.clone(),
+                message_bytes: channel.message.size_bytes,
+                path_mtu_bytes: crossing.hop.path_mtu_bytes,
+                own: from.gateway_address(),
+                is_stream,
+            });
+            self.face(from, to);
+        }
+        if is_here(to) {
+            let protocol = if is_stream {
+                Protocol::Tcp
+            } else {
+                Protocol::Udp
+            };
+            self.bind(to, protocol, crossing.ports.receiver, &channel.name);
+            self.face(to, from);
+        }
+    }
+
+    fn bind(&mut self, host: &Host, protocol: Protocol, port: u16, of: &str) {
+        self.ports.push(WantedPort {
+            protocol,
+            address: SocketAddr::new(host.gateway_address(), port),
+            of: of.to_owned(),
+        });
+    }
+
+    /// `own` talks to `other`, as far as both have an address.
+    fn face(&mut self, own: &Host, other: &Host) {
+        if let (Some(here), Some(there)) = (own.address, other.address) {
+            self.peers.push(Peer {
+                name: other.name.clone(),
+                address: there,
+                own: here,
+                interface: own.interface.clone(),
+            });
+        }
+    }
+
+    /// The supervisors meet at the first host; clock paths have ports of their own.
+    fn meet(&mut self, topology: &Topology, is_here: &dyn Fn(&Host) -> bool) {
+        let first = topology.hosts().first().filter(|host| is_here(host));
+        self.ports.extend(
+            first
+                .and_then(Host::control_address)
+                .map(|address| WantedPort {
+                    protocol: Protocol::Tcp,
+                    address,
+                    of: "control_port".to_owned(),
+                }),
+        );
+        for path in topology.clock_paths() {
+            let ends = [(path.from, path.asking), (path.to, path.answering)];
+            let own = ends.into_iter().filter(|(host, _)| is_here(host));
+            self.ports.extend(own.map(|(_, address)| WantedPort {
+                protocol: Protocol::Udp,
+                address,
+                of: path.name(),
+            }));
+        }
+    }
+
+    fn tidy(&mut self) {
+        self.pins
+            .sort_by(|a, b| (a.cpu, &a.of).cmp(&(b.cpu, &b.of)));
+        self.pins.dedup();
+        self.ports.sort();
+        self.ports.dedup();
+        self.interfaces.sort();
+        self.interfaces.dedup();
+        self.addresses.sort();
+        self.addresses.dedup();
+        self.peers
+            .sort_by(|a, b| (&a.name, a.own).cmp(&(&b.name, b.own)));
+        self.peers.dedup();
+        // The longest of each link stays.
+        self.loads
+            .sort_by(|a, b| (&a.link, b.message_bytes).cmp(&(&b.link, a.message_bytes)));
+        self.loads.dedup_by(|later, first| later.link == first.link);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use hil_shuttle::Shuttle;
+
+    use super::*;
+    use hil_topology::{KnownCases, parse};
+
+    const SPLIT: &str = r#"
+version = 1
+name = "t"
+case.name = "shuttle"
+[run]
+record = "/var/tmp/t"
+[hosts.a]
+address = "10.0.0.1"
+interface = "eth9"
+clock_address = "10.1.0.1"
+[hosts.b]
+address = "10.0.0.2"
+clock_address = "10.1.0.2"
+[processes.controller]
+role = "controller"
+host = "a"
+cpu = 2
+[processes.robot]
+role = "robot"
+host = "b"
+cpu = 5
+[channels]
+"shuttle/command".link = "hop"
+"shuttle/status".link = "hop"
+[links.hop]
+via = "udp"
+port = 7400
+path_mtu_bytes = 1400
+[links.hop.gateway]
+cpu = 3
+wait = "spin"
+"#;
+
+    fn plan(host: &str) -> Plan {
+        let known = KnownCases::new().with::<Shuttle>();
+        let topology = parse("t.toml", SPLIT, &[], &known).unwrap();
+        Plan::of(&topology, &[host.to_owned()])
+    }
+
+    #[test]
+    fn a_host_gets_its_own_share_and_nothing_of_its_peer() {
+        let plan = plan("a");
+        assert_eq!(plan.cpus(), [2, 3]);
+        assert!(plan.spins());
+        assert_eq!(plan.pins[0].of, "controller");
+        assert_eq!(plan.interfaces, ["eth9"]);
+        assert_eq!(plan.record_folder, PathBuf::from("/var/tmp/t"));
+        let ports: Vec<String> = plan
+            .ports
+            .iter()
+            .map(|port| format!("{} {} {}", port.protocol.word(), port.address, port.of))
+            .collect();
+        assert_eq!(
+            ports,
+            [
+                "udp 10.0.0.1:7400 shuttle/command",
+                "udp 10.0.0.1:7403 shuttle/status",
+                "udp 10.1.0.1:7390 clock/a-b",
+                "tcp 10.0.0.1:7399 control_port",
+            ]
+        );
+        let peers: Vec<(&str, IpAddr)> = plan
+            .peers
+            .iter()
+            .map(|peer| (peer.name.as_str(), peer.address))
+            .collect();
+        assert_eq!(peers, [("b", "10.0.0.2".parse().unwrap())]);
+        assert_eq!(plan.loads.len(), 1);
+    }
+
+    #[test]
+    fn the_second_host_listens_for_no_supervisor() {
+        let plan = plan("b");
+        assert_eq!(plan.cpus(), [3, 5]);
+        assert!(plan.ports.iter().all(|port| port.of != "control_port"));
+    }
+
+    #[test]
+    fn datagrams_of_a_message_follow_from_headers_and_mtu() {
+        let load = LinkLoad {
+            link: "hop".to_owned(),
+            channel: "c".to_owned(),
+            message_bytes: 1400,
+            path_mtu_bytes: 1500,
+            own: IpAddr::from([10, 0, 0, 1]),
+            is_stream: false,
+        };
+        // 1500 - 28 - 72 leave exactly 1400.
+        assert_eq!(load.packet_bytes(), 1500);
+        assert_eq!(load.datagram_count(1500), Some(1));
+        assert_eq!(load.datagram_count(1499), Some(2));
+        assert_eq!(load.datagram_count(100), None);
+    }
+}

@@ -1,0 +1,380 @@
+//! The processors: who else may run on those that the topology pins to, how fast they clock, how
+//! deep they sleep, with whom they share a core. It reads settings only; what they cost is measured
+//! by the wake-ups.
+
+use super::Finding;
+use super::finding::Severity;
+use super::plan::Plan;
+use hil_platform::host_facts::{
+    CPU_FOLDER, Fact, HostFiles, IsolatedCpus, KernelOptions, format_cpu_list, governors,
+    online_cpus,
+};
+
+/// An idle state that takes longer to leave shows up in every blocking receive.
+const IDLE_EXIT_US_OK: i64 = 10;
+/// And one that takes longer than this dwarfs what a wake-up costs otherwise.
+const IDLE_EXIT_US_NOTE: i64 = 100;
+
+pub(super) fn examine(files: &HostFiles, plan: &Plan) -> Vec<Finding> {
+    let isolation = IsolatedCpus::read(files);
+    let without_tick = isolation.nohz_full.clone();
+    let without_tick = match (without_tick, KernelOptions::read(files)) {
+        // A kernel without the option has no such file, and ticks everywhere.
+        (Fact::Unavailable(_), Fact::Available(options)) if !options.has("NO_HZ_FULL") => {
+            Fact::Available(Vec::new())
+        }
+        (found, _) => found,
+    };
+    vec![
+        covered("isolated_cpus", &isolation.isolated, plan),
+        covered("nohz_full", &without_tick, plan),
+        covered("rcu_nocbs", &isolation.without_callbacks, plan),
+        governor(files, plan),
+        idle_states(files, plan),
+        siblings(files, plan),
+    ]
+}
+
+/// Whether the pinned CPUs are among those that were set apart.
+fn covered(id: &str, apart: &Fact<Vec<usize>>, plan: &Plan) -> Finding {
+    let apart = match apart {
+        Fact::Available(cpus) => cpus,
+        Fact::Unavailable(reason) => return Finding::cannot_tell(id, reason),
+    };
+    let value = format_cpu_list(apart);
+    if plan.pins.is_empty() {
+        return if apart.is_empty() {
+            Finding::note(id, value)
+        } else {
+            let value = format!("{value}; the topology pins nothing, or none was given");
+            Finding::ok(id, value)
+        };
+    }
+    let outside: Vec<_> = plan
+        .pins
+        .iter()
+        .filter(|pin| !apart.contains(&pin.cpu))
+        .collect();
+    if outside.is_empty() {
+        return Finding::ok(id, value);
+    }
+    let spins = outside.iter().any(|pin| pin.spins);
+    let severity = if spins {
+        Severity::Warning
+    } else {
+        Severity::Note
+    };
+    let words: Vec<String> = outside
+        .iter()
+        .map(|pin| {
+            let what = if pin.spins { ", which busy-polls" } else { "" };
+            format!("{} ({}{what})", pin.cpu, pin.of)
+        })
+        .collect();
+    let value = format!("{value}; pinned to outside: {}", words.join(", "));
+    let mut cpus: Vec<usize> = outside.iter().map(|pin| pin.cpu).collect();
+    cpus.dedup();
+    let cpus = format_cpu_list(&cpus);
+    let parameter = if id == "isolated_cpus" {
+        "isolcpus"
+    } else {
+        id
+    };
+    Finding::new(id, severity, value).fixed_by(format!("boot with {parameter}={cpus}"))
+}
+
+fn governor(files: &HostFiles, plan: &Plan) -> Finding {
+    let id = "governor";
+    let found = match governors(files, &plan.cpus()) {
+        Fact::Available(found) => found,
+        Fact::Unavailable(reason) => {
+            let why = format!("{reason}: no cpufreq driver, as in most virtual machines");
+            return Finding::cannot_tell(id, why);
+        }
+    };
+    let slow: Vec<usize> = found
+        .iter()
+        .filter(|(_, governor)| governor != "performance")
+        .map(|(cpu, _)| *cpu)
+        .collect();
+    if slow.is_empty() {
+        return Finding::ok(id, "performance");
+    }
+    let mut names: Vec<&str> = found
+        .iter()
+        .filter(|(cpu, _)| slow.contains(cpu))
+        .map(|(_, governor)| governor.as_str())
+        .collect();
+    names.sort_unstable();
+    names.dedup();
+    let cpus = format_cpu_list(&slow);
+    Finding::warning(id, format!("{} on CPU {cpus}", names.join(", ")))
+        .fixed_by(format!("cpupower -c {cpus} frequency-set -g performance"))
+}
+
+/// The enabled idle state of a CPU with the longest way out.
+fn deepest_idle(files: &HostFiles, cpu: usize) -> Fact<(i64, String)> {
+    let folder = format!("{CPU_FOLDER}/cpu{cpu}/cpuidle");
+    files.list(&folder).and_then(|states| {
+        let mut deepest: Option<(i64, String)> = None;
+        for state in states.iter().filter(|name| name.starts_with("state")) {
+            let file = |name: &str| format!("{folder}/{state}/{name}");
+            if files.read_number(&file("disable")) == Fact::Available(1) {
+                continue;
+            }
+            let exit_us = match files.read_number(&file("latency")) {
+                Fact::Available(us) => us,
+                Fact::Unavailable(reason) => return Fact::Unavailable(reason),
+            };
+            if deepest.as_ref().is_none_or(|(us, _)| exit_us > *us) {
+                deepest = Some((exit_us, files.read(&file("name")).to_text()));
+            }
+        }
+        deepest.map_or_else(
+            || Fact::Unavailable(format!("{folder} has no enabled state")),
+            Fact::Available,
+        )
+    })
+}
+
+fn idle_states(files: &HostFiles, plan: &Plan) -> Finding {
+    let id = "idle_states";
+    let cpus = if plan.pins.is_empty() {
+        match online_cpus(files) {
+            Fact::Available(cpus) => cpus,
+            Fact::Unavailable(reason) => return Finding::cannot_tell(id, reason),
+        }
+    } else {
+        plan.cpus()
+    };
+    let mut worst: Option<(i64, String)> = None;
+    for cpu in cpus {
+        match deepest_idle(files, cpu) {
+            Fact::Available((us, name)) => {
+                if worst.as_ref().is_none_or(|(most, _)| us > *most) {
+                    worst = Some((us, format!("{name} on CPU {cpu}, {us} us to leave")));
+                }
+            }
+            Fact::Unavailable(reason) => {
+                let why = format!("{reason}: no cpuidle driver, as in most virtual machines");
+                return Finding::cannot_tell(id, why);
+            }
+        }
+    }
+    let Some((exit_us, words)) = worst else {
+        return Finding::cannot_tell(id, "no CPU is online");
+    };
+    // What a program that holds the file open asked for; the kernel then avoids deeper states.
+    let held = files.read_word("/dev/cpu_dma_latency");
+    let (bound, also) = match &held {
+        Fact::Available(us) if i64::from(*us) < exit_us => (
+            i64::from(*us),
+            format!("; /dev/cpu_dma_latency holds it at {us} us"),
+        ),
+        Fact::Available(_) => (exit_us, "; nobody holds /dev/cpu_dma_latency".to_owned()),
+        Fact::Unavailable(reason) => (exit_us, format!("; a bound on it is unknown ({reason})")),
+    };
+    let severity = if bound > IDLE_EXIT_US_NOTE {
+        Severity::Warning
+    } else if bound > IDLE_EXIT_US_OK {
+        Severity::Note
+    } else {
+        Severity::Ok
+    };
+    Finding::new(id, severity, format!("{words}{also}"))
+}
+
+fn siblings(files: &HostFiles, plan: &Plan) -> Finding {
+    let id = "smt";
+    let active = match files.read(&format!("{CPU_FOLDER}/smt/active")) {
+        Fact::Available(active) => active,
+        Fact::Unavailable(reason) => return Finding::cannot_tell(id, reason),
+    };
+    if active != "1" {
+        return Finding::ok(id, "none");
+    }
+    let pinned = plan.cpus();
+    if pinned.is_empty() {
+        return Finding::note(id, "in use; the topology pins nothing, or none was given");
+    }
+    let isolated = IsolatedCpus::read(files).isolated;
+    let isolated = isolated.available().cloned().unwrap_or_default();
+    let mut shared = Vec::new();
+    for cpu in &pinned {
+        let path = format!("{CPU_FOLDER}/cpu{cpu}/topology/thread_siblings_list");
+        let group = match files.read_cpu_list(&path) {
+            Fact::Available(group) => group,
+            Fact::Unavailable(reason) => return Finding::cannot_tell(id, reason),
+        };
+        for other in group.into_iter().filter(|other| other != cpu) {
+            if pinned.contains(&other) {
+                shared.push(format!("CPU {cpu} shares with CPU {other}, pinned too"));
+            } else if !isolated.contains(&other) {
+                shared.push(format!(
+                    "CPU {cpu} shares with CPU {other}, open to all tasks"
+                ));
+            }
+        }
+    }
+    if shared.is_empty() {
+        return Finding::ok(id, "in use; those of the pinned CPUs are isolated and idle");
+    }
+    Finding::warning(id, shared.join("; "))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::plan::Pin;
+    use hil_platform::host_facts::FakeHost;
+
+    fn pinned(cpus: &[usize], spins: bool) -> Plan {
+        let pins = cpus.iter().map(|cpu| Pin {
+            cpu: *cpu,
+            of: "gateway of hop".to_owned(),
+            spins,
+        });
+        Plan {
+            pins: pins.collect(),
+            ..Plan::default()
+        }
+    }
+
+    fn at(path: &str) -> String {
+        format!("{CPU_FOLDER}/{path}")
+    }
+
+    fn found<'a>(findings: &'a [Finding], id: &str) -> &'a Finding {
+        findings.iter().find(|finding| finding.id == id).unwrap()
+    }
+
+    fn with(files: &[(String, &str)], plan: &Plan) -> Vec<Finding> {
+        let files: Vec<(&str, &str)> = files.iter().map(|(p, t)| (p.as_str(), *t)).collect();
+        examine(&FakeHost::with(&files).files(), plan)
+    }
+
+    #[test]
+    fn a_tuned_host_gets_no_complaint() {
+        let files = [
+            (at("online"), "0-3"),
+            (at("isolated"), "2-3"),
+            (at("nohz_full"), "2-3"),
+            ("/proc/cmdline".to_owned(), "rcu_nocbs=2-3"),
+            (at("cpu2/cpufreq/scaling_governor"), "performance"),
+            (at("cpu2/cpuidle/state0/latency"), "0"),
+            (at("cpu2/cpuidle/state0/name"), "POLL"),
+            (at("cpu2/topology/thread_siblings_list"), "2-3"),
+            (at("smt/active"), "1"),
+        ];
+        for finding in with(&files, &pinned(&[2], true)) {
+            assert_eq!(finding.severity, Severity::Ok, "{finding:?}");
+        }
+    }
+
+    #[test]
+    fn a_desktop_gets_each_complaint_with_its_numbers() {
+        let files = [
+            (at("online"), "0-1"),
+            (at("isolated"), ""),
+            (at("nohz_full"), "(null)"),
+            ("/proc/cmdline".to_owned(), "quiet"),
+            (at("cpu0/cpufreq/scaling_governor"), "performance"),
+            (at("cpu1/cpufreq/scaling_governor"), "powersave"),
+            (at("cpu1/cpuidle/state1/latency"), "890"),
+            (at("cpu1/cpuidle/state1/name"), "C10"),
+            (at("cpu1/topology/thread_siblings_list"), "0-1"),
+            (at("smt/active"), "1"),
+        ];
+        let findings = with(&files, &pinned(&[1], true));
+        for (id, value) in [
+            (
+                "isolated_cpus",
+                "none; pinned to outside: 1 (gateway of hop, which busy-polls)",
+            ),
+            (
+                "rcu_nocbs",
+                "none; pinned to outside: 1 (gateway of hop, which busy-polls)",
+            ),
+            ("governor", "powersave on CPU 1"),
+            ("smt", "CPU 1 shares with CPU 0, open to all tasks"),
+        ] {
+            let finding = found(&findings, id);
+            assert_eq!(finding.severity, Severity::Warning, "{finding:?}");
+            assert_eq!(finding.value, value);
+        }
+        let idle = found(&findings, "idle_states");
+        assert!(idle.value.starts_with("C10 on CPU 1, 890 us"), "{idle:?}");
+        assert_eq!(idle.severity, Severity::Warning);
+        assert_eq!(
+            found(&findings, "isolated_cpus").fix,
+            "boot with isolcpus=1"
+        );
+        // What only blocks feels it less.
+        let findings = with(&files, &pinned(&[1], false));
+        assert_eq!(found(&findings, "nohz_full").severity, Severity::Note);
+    }
+
+    #[test]
+    fn a_silent_host_passes_nothing() {
+        for plan in [Plan::default(), pinned(&[0], true)] {
+            for finding in with(&[], &plan) {
+                assert_eq!(finding.severity, Severity::CannotTell, "{finding:?}");
+                assert!(finding.value.contains('/'), "names its file: {finding:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn disabled_idle_states_do_not_count_and_a_held_latency_bounds_the_rest() {
+        let mut files = vec![
+            (at("cpu1/cpuidle/state0/latency"), "2"),
+            (at("cpu1/cpuidle/state0/name"), "C1"),
+            (at("cpu1/cpuidle/state1/latency"), "890"),
+            (at("cpu1/cpuidle/state1/name"), "C10"),
+        ];
+        files.push((at("cpu1/cpuidle/state1/disable"), "1"));
+        let findings = with(&files, &pinned(&[1], false));
+        let idle = found(&findings, "idle_states");
+        assert!(idle.value.starts_with("C1 on CPU 1, 2 us"), "{idle:?}");
+        assert_eq!(idle.severity, Severity::Ok);
+        files.pop();
+        files.push(("/dev/cpu_dma_latency".to_owned(), "\0\0\0\0"));
+        let findings = with(&files, &pinned(&[1], false));
+        let idle = found(&findings, "idle_states");
+        assert_eq!(idle.severity, Severity::Ok);
+        assert!(idle.value.contains("holds it at 0 us"), "{idle:?}");
+    }
+
+    #[test]
+    fn siblings_that_are_both_pinned_are_named() {
+        let files = [
+            (at("smt/active"), "1"),
+            (at("isolated"), "2-3"),
+            (at("cpu2/topology/thread_siblings_list"), "2-3"),
+            (at("cpu3/topology/thread_siblings_list"), "2-3"),
+        ];
+        let findings = with(&files, &pinned(&[2, 3], false));
+        let smt = found(&findings, "smt");
+        assert_eq!(smt.severity, Severity::Warning);
+        assert!(smt.value.contains("CPU 3, pinned too"), "{smt:?}");
+    }
+
+    #[test]
+    fn a_kernel_that_cannot_leave_the_tick_out_is_known_to_tick() {
+        let files = [
+            ("/proc/sys/kernel/osrelease".to_owned(), "6.1"),
+            ("/boot/config-6.1".to_owned(), "CONFIG_NO_HZ_IDLE=y"),
+        ];
+        let findings = with(&files, &pinned(&[1], true));
+        let tick = found(&findings, "nohz_full");
+        assert_eq!(tick.severity, Severity::Warning, "{tick:?}");
+        // One that can, and does not tell where, is not known to do anything.
+        let able = [
+            files[0].clone(),
+            (files[1].0.clone(), "CONFIG_NO_HZ_FULL=y"),
+        ];
+        let findings = with(&able, &pinned(&[1], true));
+        let tick = found(&findings, "nohz_full");
+        assert_eq!(tick.severity, Severity::CannotTell, "{tick:?}");
+    }
+}

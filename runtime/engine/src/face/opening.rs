@@ -1,0 +1,247 @@
+//! Opens what one arm of a face needs: socket and record files in a thread of normal priority, the
+//! shared-memory ports in the thread that uses them. It moves nothing.
+
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64};
+
+use hil_arm::egm::messages::{EgmCommand, EgmFeedback};
+use hil_core::message::{Envelope, MessageType};
+use hil_core::record::{PublishedRecord, TakenRecord};
+use hil_net::timestamping::TimestampMode;
+use hil_transport::udp::{GrantedOptions, UdpSender, UdpSettings};
+use hil_transport::udp_server::UdpServer;
+
+use super::FaceError;
+use super::arm::{Arm, Attention, DATAGRAM_BYTES_MAX, Work};
+use super::line::{Line, Socket};
+use super::robot::RobotWork;
+use super::sensor::SensorWork;
+use crate::gateway::socket::timestamp_mode;
+use crate::process::pulse::Pulse;
+use crate::process::recording::{Destination, RecordedInput, RecordedOutput};
+use hil_platform::clock::MonotonicClock;
+use hil_platform::wait::{WaitMode, WaitStrategy};
+use hil_rundir::face_launch::{ArmLaunch, FaceLaunch};
+use hil_rundir::face_record::{FaceReceivedRecord, FaceSentRecord};
+use hil_rundir::pipe::{CountByName, CounterGroup, FaceReport};
+use hil_rundir::record::{RecordKind, RecordSink, Recorder};
+use hil_shm::{Domain, OutputSettings, ShmInput, ShmOutput, Waiter};
+use hil_topology::FaceKind;
+
+/// Records a ring holds.
+const RING_RECORDS: usize = 16_384;
+
+/// An arm whose socket and files are open and whose ports are not.
+#[derive(Debug)]
+pub struct OpenedArm {
+    line: Line,
+    taken: RecordSink,
+    published: RecordSink,
+    messages: RecordSink,
+    /// Messages taken from and published to shared memory so far.
+    pub(super) counts: [Arc<AtomicU64>; 2],
+    /// The turns of the thread that will carry the messages.
+    pub(super) pulse: Pulse,
+    /// What was granted, in words.
+    pub(super) facts: Vec<(String, String)>,
+}
+
+impl OpenedArm {
+    /// Opens the socket and the record files of `arm`; call it from a thread of normal priority,
+    /// as kernel stamps are switched on by a worker.
+    ///
+    /// # Errors
+    /// When the kernel refuses a socket option or a file cannot be made.
+    pub fn open(
+        launch: &FaceLaunch,
+        arm: &ArmLaunch,
+        recorder: &mut Recorder,
+    ) -> Result<Self, FaceError> {
+        let settings = socket_settings(launch, arm);
+        let (socket, granted, what) = match launch.face.kind {
+            FaceKind::Robot => {
+                let socket = UdpSender::open(&settings)?;
+                let from = socket.local_address().map_err(FaceError::Address)?;
+                let what = format!("from port {} to {}", from.port(), settings.peer);
+                let granted = socket.granted();
+                (Socket::Client(Box::new(socket)), granted, what)
+            }
+            FaceKind::Sensor => {
+                let socket = UdpServer::open(&settings)?;
+                let granted = socket.granted();
+                let what = format!("listens at {}", settings.local);
+                (Socket::Server(Box::new(socket)), granted, what)
+            }
+        };
+        let mut sink = |kind, channel: &str, size| recorder.sink(kind, channel, size, RING_RECORDS);
+        let (input, output) = (arm.input.name.as_str(), arm.output.name.as_str());
+        let sent = sink(RecordKind::FaceSent, input, size_of::<FaceSentRecord>())?;
+        let size = size_of::<FaceReceivedRecord>();
+        let received = sink(RecordKind::FaceReceived, output, size)?;
+        let message_size = size_of::<Envelope>() + arm.output.message_size_bytes;
+        let has_stamps = settings.timestamps != TimestampMode::Off;
+        Ok(Self {
+            line: Line::new(socket, (sent, received), has_stamps)?,
+            taken: sink(RecordKind::Taken, input, size_of::<TakenRecord>())?,
+            published: sink(RecordKind::Published, output, size_of::<PublishedRecord>())?,
+            messages: sink(RecordKind::Message, output, message_size)?,
+            counts: [Arc::default(), Arc::default()],
+            pulse: Pulse::default(),
+            facts: facts(&settings, granted, what),
+        })
+    }
+
+    /// Joins the channels; call it in the thread that will carry the messages.
+    ///
+    /// # Errors
+    /// When a channel does not appear or is of another type.
+    pub fn connect(
+        self,
+        launch: &FaceLaunch,
+        arm: &ArmLaunch,
+        domain: &Domain,
+    ) -> Result<JoinedArm, FaceError> {
+        let report = FaceReport {
+            arm: arm.arm,
+            outgoing: arm.input.name.clone(),
+            incoming: arm.output.name.clone(),
+            peer_state: String::new(),
+            counters: Vec::new(),
+            refusals: Vec::new(),
+            facts: self.facts.clone(),
+        };
+        Ok(JoinedArm {
+            arm: self.join(launch, arm, domain)?,
+            work: match launch.face.kind {
+                FaceKind::Robot => Box::new(RobotWork::new(&launch.face, arm.arm)),
+                FaceKind::Sensor => Box::new(SensorWork::new(&launch.face, arm.arm)),
+            },
+            report,
+        })
+    }
+
+    fn join(self, launch: &FaceLaunch, arm: &ArmLaunch, domain: &Domain) -> Result<Arm, FaceError> {
+        let command = MessageType::of::<EgmCommand>();
+        let feedback = MessageType::of::<EgmFeedback>();
+        let (outgoing, incoming) = match launch.face.kind {
+            FaceKind::Robot => (feedback, command),
+            FaceKind::Sensor => (command, feedback),
+        };
+        // Writers of one channel never start twice within a microsecond on one host.
+        let epoch = u32::try_from(MonotonicClock::now().as_ns() / 1000 % i64::from(u32::MAX))
+            .expect("the remainder is below u32::MAX");
+        let settings = OutputSettings {
+            epoch,
+            ..OutputSettings::default()
+        };
+        let [taken, given] = self.counts;
+        let waiter = (launch.wait != WaitMode::Spin)
+            .then(|| Waiter::open(domain, &[arm.input.name.as_str()]))
+            .transpose()?;
+        Ok(Arm {
+            input: RecordedInput {
+                port: ShmInput::open(domain, &arm.input.name, &outgoing, arm.input.depth)?,
+                sink: self.taken,
+                taken,
+                wait: WaitStrategy::new(launch.wait),
+            },
+            output: RecordedOutput {
+                destination: Destination::Channel {
+                    port: Box::new(ShmOutput::open(
+                        domain,
+                        &arm.output.name,
+                        &incoming,
+                        settings,
+                    )?),
+                    sink: self.published,
+                },
+                messages: self.messages,
+                given,
+            },
+            waiter,
+            line: self.line,
+            wait: WaitStrategy::new(launch.wait),
+            buffer: Box::new([0; DATAGRAM_BYTES_MAX]),
+            attention: Attention::default(),
+            early_count: 0,
+            pulse: self.pulse,
+        })
+    }
+}
+
+/// An arm at work.
+#[derive(Debug)]
+pub struct JoinedArm {
+    arm: Arm,
+    work: Box<dyn Work>,
+    report: FaceReport,
+}
+
+impl JoinedArm {
+    /// Carries messages until `stop` is set, then what still waits.
+    ///
+    /// # Errors
+    /// When a channel or the socket itself breaks.
+    pub fn run(&mut self, stop: &AtomicBool) -> Result<(), FaceError> {
+        self.arm.run(self.work.as_mut(), stop)
+    }
+
+    /// Moves what waits, without waiting for more; false when nothing waited.
+    ///
+    /// # Errors
+    /// As [`JoinedArm::run`].
+    pub fn turn(&mut self) -> Result<bool, FaceError> {
+        self.arm.turn(self.work.as_mut())
+    }
+
+    /// Everything it counted so far.
+    pub fn report(&self) -> FaceReport {
+        let mut counters = self.work.counters();
+        let socket = self.arm.line.counters();
+        counters.extend(CountByName::all(CounterGroup::Socket, socket.iter()));
+        let own = [
+            ("datagrams before the run, dropped", self.arm.early_count),
+            ("clock_step_count", self.arm.line.clock_step_count()),
+        ];
+        counters.extend(CountByName::all(CounterGroup::Own, own));
+        FaceReport {
+            peer_state: self.work.peer_state(),
+            counters,
+            refusals: self.work.refusals(),
+            ..self.report.clone()
+        }
+    }
+}
+
+fn socket_settings(launch: &FaceLaunch, arm: &ArmLaunch) -> UdpSettings {
+    let any: IpAddr = if arm.address.is_ipv4() {
+        Ipv4Addr::UNSPECIFIED.into()
+    } else {
+        Ipv6Addr::UNSPECIFIED.into()
+    };
+    let local = match launch.face.kind {
+        FaceKind::Robot => SocketAddr::new(any, 0),
+        FaceKind::Sensor => arm.address,
+    };
+    UdpSettings {
+        interface: launch.face.interface.clone(),
+        // 0 is the kernel's default; setting it would only reset the priority.
+        dscp: (launch.face.dscp > 0).then_some(launch.face.dscp),
+        timestamps: timestamp_mode(launch.face.timestamps),
+        ..UdpSettings::new(local, arm.address)
+    }
+}
+
+fn facts(settings: &UdpSettings, granted: GrantedOptions, what: String) -> Vec<(String, String)> {
+    let mut facts = vec![
+        ("socket".to_owned(), what),
+        (
+            "receive buffer granted".to_owned(),
+            format!("{} bytes", granted.receive_buffer_bytes),
+        ),
+    ];
+    let shortfalls = granted.shortfalls(settings).into_iter();
+    facts.extend(shortfalls.map(|text| ("socket option".to_owned(), text)));
+    facts
+}

@@ -1,0 +1,359 @@
+//! One channel direction of a gateway from its launch description to its final counters: opens
+//! the socket in the normal thread, the shared-memory port in the pinned one.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64};
+use std::time::Duration;
+
+use hil_core::link_model::ReplayTally;
+use hil_core::record::{EgressRecord, FollowUpRecord, IngressRecord, RoundTripRecord};
+use hil_protocol::{EgressBridge, EgressSettings, IngressBridge, IngressSettings, SettingsError};
+use hil_transport::tcp::ConnectionTally;
+use hil_transport::{DatagramReceiver, DatagramSender};
+
+use super::egress::{Attention, Egress};
+use super::gathering::Gathering;
+use super::ingress::{Ingress, Notes};
+use super::kernel_clock::KernelClock;
+use super::line::Line;
+use super::link_switch::SwitchHandle;
+use super::socket::{Ends, OpenSocket, stamps_of};
+use super::stamp_plan::StampPlan;
+use super::{GatewayError, Surroundings};
+use super::{counters, stream};
+use crate::process::pulse::Pulse;
+use hil_platform::clock::MonotonicClock;
+use hil_platform::wait::{WaitMode, WaitStrategy};
+use hil_rundir::launch::{DirectionLaunch, Side};
+use hil_rundir::pipe::{DirectionReport, RunStart};
+use hil_rundir::record::{RecordKind, RecordSink, Recorder};
+use hil_shm::{RawInput, RawOutput, Waiter};
+
+/// Records a ring holds.
+const RING_RECORDS: usize = 16_384;
+/// Time between clock exchanges: frequent enough for a round-trip distribution, rare enough to
+/// be a fraction of any control channel's traffic.
+const SYNC_PERIOD: Duration = Duration::from_millis(100);
+/// The same on a clock path, which has nothing else to do: clocks stray by 2 us at most in between,
+/// which is less than the fastest exchange leaves open.
+const CLOCK_PATH_PERIOD: Duration = Duration::from_millis(10);
+type Sinks = (RecordSink, RecordSink);
+
+/// A direction whose socket and files are open and whose port is not.
+#[derive(Debug)]
+pub struct Opened {
+    socket: OpenSocket,
+    sinks: Sinks,
+    count: Arc<AtomicU64>,
+    is_established: Arc<AtomicBool>,
+    pulse: Pulse,
+    plan: StampPlan,
+}
+
+/// A direction at work.
+#[derive(Debug)]
+pub struct Direction {
+    way: Way,
+    pulse: Pulse,
+    facts: Vec<(String, String)>,
+    replay: Option<ReplayTally>,
+}
+
+#[derive(Debug)]
+enum Way {
+    Egress(Box<Egress>),
+    Ingress(Box<Ingress>),
+}
+
+/// Opens the socket and the record files of `launch`; call it from a thread of normal priority.
+/// `start` is told when the run starts, from which an emulated link counts its outages.
+///
+/// # Errors
+/// When the kernel refuses a socket option or a file cannot be made.
+pub fn open<'a>(
+    launch: &'a DirectionLaunch,
+    recorder: &mut Recorder,
+    start: &RunStart,
+) -> Result<(&'a DirectionLaunch, Opened), GatewayError> {
+    let plan = StampPlan::asked(stamps_of(&launch.socket));
+    let socket = OpenSocket::open(launch, start, (plan, None))?;
+    Ok((launch, Opened::new(launch, recorder, (socket, plan))?))
+}
+
+fn open_sinks(launch: &DirectionLaunch, recorder: &mut Recorder) -> Result<Sinks, GatewayError> {
+    let channel = &launch.channel;
+    let mut sink = |kind, size| {
+        // Files of messages would say that a channel carried none.
+        if launch.is_clock_path && kind != RecordKind::RoundTrip {
+            return Ok(recorder.closed_sink());
+        }
+        recorder.sink(kind, channel, size, RING_RECORDS)
+    };
+    Ok(match launch.side {
+        Side::Egress => (
+            sink(RecordKind::Egress, size_of::<EgressRecord>())?,
+            sink(RecordKind::RoundTrip, size_of::<RoundTripRecord>())?,
+        ),
+        Side::Ingress => (
+            sink(RecordKind::Ingress, size_of::<IngressRecord>())?,
+            sink(RecordKind::FollowUp, size_of::<FollowUpRecord>())?,
+        ),
+    })
+}
+
+impl Opened {
+    /// The direction of an open socket, with its record files.
+    ///
+    /// # Errors
+    /// When a file cannot be made.
+    pub(super) fn new(
+        launch: &DirectionLaunch,
+        recorder: &mut Recorder,
+        (socket, plan): (OpenSocket, StampPlan),
+    ) -> Result<Self, GatewayError> {
+        Ok(Self {
+            socket,
+            sinks: open_sinks(launch, recorder)?,
+            plan,
+            count: Arc::default(),
+            pulse: Pulse::default(),
+            // A receiver has nobody to wait for: it takes what comes.
+            is_established: Arc::new(AtomicBool::new(launch.side == Side::Ingress)),
+        })
+    }
+
+    /// Messages carried so far.
+    pub fn count(&self) -> Arc<AtomicU64> {
+        Arc::clone(&self.count)
+    }
+
+    /// Where the emulated link of this direction is changed, if it has one; once.
+    pub(super) fn take_switch(&mut self) -> Option<SwitchHandle> {
+        self.socket.switch.take()
+    }
+
+    /// How often its connections come and go, if it is one that connects.
+    pub fn tally(&self) -> Option<Arc<ConnectionTally>> {
+        self.socket.tally.clone()
+    }
+
+    /// The turns of the thread that will carry the messages.
+    pub(crate) fn pulse(&self) -> Pulse {
+        self.pulse.clone()
+    }
+
+    /// True while the peer takes this direction's messages.
+    pub fn is_established(&self) -> Arc<AtomicBool> {
+        Arc::clone(&self.is_established)
+    }
+
+    /// Joins the local channel; call it in the thread that will carry the messages.
+    ///
+    /// # Errors
+    /// When the channel does not appear or is of another type.
+    pub fn connect(
+        self,
+        launch: &DirectionLaunch,
+        surroundings: &Surroundings,
+    ) -> Result<Direction, GatewayError> {
+        let OpenSocket {
+            ends,
+            facts,
+            replay,
+            ..
+        } = self.socket;
+        let way = match ends {
+            Ends::Sender(sender, datagram_bytes_max) => Way::Egress(Box::new(egress(
+                (sender, datagram_bytes_max),
+                self.sinks,
+                (self.count, self.is_established),
+                (launch, surroundings, self.plan),
+            )?)),
+            Ends::Receiver(receiver) => Way::Ingress(Box::new(ingress(
+                receiver,
+                self.sinks,
+                self.count,
+                (launch, surroundings),
+            )?)),
+        };
+        Ok(Direction {
+            way,
+            pulse: self.pulse,
+            facts,
+            replay,
+        })
+    }
+}
+
+/// A bridge over a path that takes datagrams of so many bytes.
+pub(super) fn egress_bridge(
+    datagram_max_bytes: usize,
+    (launch, around): (&DirectionLaunch, &Surroundings),
+) -> Result<EgressBridge, SettingsError> {
+    EgressBridge::new(EgressSettings {
+        channel: Surroundings::identity(launch),
+        session: around.session,
+        domain: around.fingerprint,
+        clock_id: around.clock_id,
+        datagram_max_bytes,
+        sync_period: if launch.is_clock_path {
+            CLOCK_PATH_PERIOD
+        } else {
+            SYNC_PERIOD
+        },
+    })
+}
+
+fn egress(
+    (sender, datagram_max_bytes): (Box<dyn DatagramSender>, usize),
+    sinks: Sinks,
+    (count, is_established): (Arc<AtomicU64>, Arc<AtomicBool>),
+    (launch, around, plan): (&DirectionLaunch, &Surroundings, StampPlan),
+) -> Result<Egress, GatewayError> {
+    let bridge = egress_bridge(datagram_max_bytes, (launch, around))?;
+    let input = (!launch.is_clock_path)
+        .then(|| RawInput::open(&around.domain, &launch.channel, launch.depth))
+        .transpose()?;
+    let waiter = (launch.wait != WaitMode::Spin && input.is_some())
+        .then(|| Waiter::open(&around.domain, &[launch.channel.as_str()]))
+        .transpose()?;
+    Ok(Egress {
+        input,
+        waiter,
+        bridge,
+        line: Line::new(sender, sinks, around.session, plan)?,
+        wait: WaitStrategy::new(launch.wait),
+        sent: count,
+        stop: Arc::clone(&around.stop),
+        attention: Attention::default(),
+        gathering: Gathering::of_replies(),
+        is_established,
+    })
+}
+
+fn ingress(
+    receiver: Box<dyn DatagramReceiver>,
+    sinks: Sinks,
+    count: Arc<AtomicU64>,
+    (launch, around): (&DirectionLaunch, &Surroundings),
+) -> Result<Ingress, GatewayError> {
+    let identity = Surroundings::identity(launch);
+    let settings = IngressSettings::new(
+        identity,
+        around.session,
+        around.fingerprint,
+        around.clock_id,
+    );
+    let (messages, follow_ups) = sinks;
+    let output = (!launch.is_clock_path)
+        .then(|| RawOutput::open(&around.domain, &launch.channel, true))
+        .transpose()?;
+    Ok(Ingress {
+        receiver,
+        is_emulated: launch.emulation.is_some(),
+        bridge: IngressBridge::new(settings)?,
+        output,
+        wait: WaitStrategy::new(launch.wait),
+        peer: launch.peer,
+        notes: Notes {
+            messages,
+            follow_ups,
+        },
+        received: count,
+        stop: Arc::clone(&around.stop),
+        foreign_count: 0,
+        stray_count: 0,
+        gathering: Gathering::of_messages(),
+        clock: KernelClock::read()?,
+        response: None,
+        buffer: vec![0; usize::from(u16::MAX)].into_boxed_slice(),
+    })
+}
+
+impl Direction {
+    /// Carries messages until told to stop.
+    ///
+    /// # Errors
+    /// When the channel or the socket itself breaks, or the peer refuses the channel for good.
+    pub fn run(&mut self) -> Result<(), GatewayError> {
+        match &mut self.way {
+            Way::Egress(egress) => egress.run(&self.pulse),
+            Way::Ingress(ingress) => ingress.run(&self.pulse),
+        }
+    }
+
+    /// Does what there is to do now, without waiting; false when there was nothing.
+    ///
+    /// # Errors
+    /// As [`Direction::run`].
+    pub fn step(&mut self) -> Result<bool, GatewayError> {
+        match &mut self.way {
+            Way::Egress(egress) => egress.step(),
+            Way::Ingress(ingress) => ingress.step(),
+        }
+    }
+
+    /// Waits for the next thing to do, as its waiting strategy says.
+    ///
+    /// # Errors
+    /// When waiting itself fails.
+    pub fn rest(&mut self) -> Result<(), GatewayError> {
+        match &mut self.way {
+            Way::Egress(egress) => egress.rest(),
+            Way::Ingress(ingress) => ingress.rest(),
+        }
+    }
+
+    /// Every counter of the direction.
+    pub fn report(&self, launch: &DirectionLaunch) -> DirectionReport {
+        let now = MonotonicClock::now();
+        let (direction, peer_state, mut counters, (stream, seal)) = match &self.way {
+            Way::Egress(egress) => (
+                Side::Egress,
+                counters::egress_state(egress),
+                counters::of_egress(egress),
+                (
+                    egress.line.sender().stream_figures(now),
+                    egress.line.sender().seal_counts(),
+                ),
+            ),
+            Way::Ingress(ingress) => (
+                Side::Ingress,
+                counters::ingress_state(ingress),
+                counters::of_ingress(ingress),
+                (
+                    ingress.receiver.stream_figures(now),
+                    ingress.receiver.seal_counts(),
+                ),
+            ),
+        };
+        let mut facts = self.facts.clone();
+        if let Way::Ingress(ingress) = &self.way
+            && launch.socket.dscp > 0
+        {
+            let counters = ingress.receiver.counters();
+            facts.extend(counters::mark_fact(launch.socket.dscp, &counters));
+        }
+        counters.extend(seal.iter().flat_map(counters::of_seal));
+        if let Some(figures) = &stream {
+            counters.extend(stream::counters(figures));
+            facts.extend(stream::facts(figures, launch.side));
+        }
+        let stalls = stream.filter(|_| direction == Side::Egress);
+        DirectionReport {
+            channel: launch.channel.clone(),
+            direction,
+            peer_state,
+            counters,
+            facts,
+            stalls: stalls.as_ref().map(stream::stalls),
+            replay: self.replay.as_ref().map(ReplayTally::counts),
+        }
+    }
+}
+
+/// Where a transmit probe of this direction may go: the peer's discard port.
+pub(crate) fn probe_target(launch: &DirectionLaunch) -> SocketAddr {
+    SocketAddr::new(launch.peer.ip(), hil_transport::probe::DISCARD_PORT)
+}

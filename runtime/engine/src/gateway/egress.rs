@@ -1,0 +1,254 @@
+//! The sending thread of a gateway: from one local channel to the network. It owns the clock, the
+//! port and the socket; what to send and what replies mean is the bridge's business.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+
+use hil_core::message::Envelope;
+use hil_core::record::{EgressRecord, RoundTripRecord, UNAVAILABLE};
+use hil_core::time::Instant;
+use hil_protocol::egress::RoundTrip;
+use hil_protocol::{EgressBridge, EgressEvent, LocalRefusal, PeerState};
+
+use super::gathering::Gathering;
+use super::line::{Line, STAMP_PATIENCE_NS};
+use super::{GatewayError, poll_descriptors};
+use crate::process::pulse::Pulse;
+use hil_platform::clock::MonotonicClock;
+use hil_platform::wait::{Pause, WaitStrategy};
+use hil_shm::{RawInput, Waiter};
+
+/// Longer than any reply; what is longer is no reply and is cut.
+const REPLY_BYTES_MAX: usize = 1024;
+
+/// Everything the thread works with.
+#[derive(Debug)]
+pub(crate) struct Egress {
+    /// Where messages come from; `None` on a clock path, which carries none.
+    pub(crate) input: Option<RawInput>,
+    pub(crate) waiter: Option<Waiter>,
+    pub(crate) bridge: EgressBridge,
+    pub(crate) line: Line,
+    pub(crate) wait: WaitStrategy,
+    pub(crate) sent: Arc<AtomicU64>,
+    pub(crate) stop: Arc<AtomicBool>,
+    pub(crate) attention: Attention,
+    pub(super) gathering: Gathering,
+    /// Set while the peer takes messages.
+    pub(crate) is_established: Arc<AtomicBool>,
+}
+
+/// What waiting found: to look after the socket costs system calls that a waiting message would
+/// have to wait for, and so does taking back announcements.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Attention {
+    has_news: bool,
+    is_announced: bool,
+    is_overdue: bool,
+    looked: Instant,
+}
+
+/// A thread that finds a message in every turn looks after its socket this often.
+const LOOK_PERIOD_BUSY_NS: i64 = 5_000_000;
+/// A spinning thread looks after its socket this often.
+const LOOK_PERIOD_NS: i64 = 500_000;
+
+impl Egress {
+    /// Carries the channel until told to stop, then says goodbye to the peer.
+    ///
+    /// # Errors
+    /// When the channel or the socket itself breaks, or the peer refuses the channel for good.
+    pub(crate) fn run(&mut self, pulse: &Pulse) -> Result<(), GatewayError> {
+        while !self.stop.load(Ordering::Acquire) {
+            if !self.step()? {
+                self.rest()?;
+            }
+            pulse.beat();
+        }
+        self.bridge.bye();
+        self.line.transmit(&mut self.bridge);
+        self.line.settle(&mut self.bridge)?;
+        self.line.hand_over()
+    }
+
+    /// Sends one waiting message, or else looks after stamps, replies and appointments; false when
+    /// no message waited and none was announced.
+    pub(crate) fn step(&mut self) -> Result<bool, GatewayError> {
+        let moved = self.forward()?;
+        if moved && !self.attention.is_overdue {
+            // A producer faster than the socket must not keep replies and orders waiting for ever.
+            let now = self.line.newest_handed;
+            self.attention.is_overdue = now.ns_since(self.attention.looked) > LOOK_PERIOD_BUSY_NS;
+            return Ok(true);
+        }
+        let now = MonotonicClock::now();
+        let since_look = now.ns_since(self.attention.looked);
+        if self.attention.has_news || self.attention.is_overdue || since_look > LOOK_PERIOD_NS {
+            self.attention.is_overdue = false;
+            self.attention.has_news = false;
+            self.attention.looked = now;
+            self.line.sender.attend(now);
+            self.line.take_stamps(&mut self.bridge);
+            self.line.notice_reports(&mut self.bridge, now);
+            self.hear()?;
+            self.line.expire(now);
+            self.line.clock.refresh(now);
+            self.is_established
+                .store(self.is_ready(), Ordering::Release);
+        }
+        if self.bridge.next_wakeup().is_some_and(|due| due <= now) {
+            self.line.transmit(&mut self.bridge);
+        }
+        // Announcements are taken back only now, for the message waited for its datagram, not
+        // for this. A message published before they were is seen by the look that follows.
+        let was_announced = core::mem::take(&mut self.attention.is_announced);
+        if was_announced && let Some(waiter) = &mut self.waiter {
+            waiter.drain()?;
+        }
+        Ok(moved || was_announced)
+    }
+
+    /// True while the peer takes messages. On a clock path the run may begin after an exchange
+    /// whose four stamps are known: that of the response's departure rides on the next.
+    fn is_ready(&self) -> bool {
+        let is_established = self.bridge.peer_state() == PeerState::Established;
+        is_established && (self.input.is_some() || self.bridge.counts().round_trip_count > 1)
+    }
+
+    /// Sends the oldest waiting message; false when none waited.
+    fn forward(&mut self) -> Result<bool, GatewayError> {
+        let Self {
+            input,
+            bridge,
+            line,
+            wait,
+            sent,
+            ..
+        } = self;
+        let Some(input) = input else {
+            return Ok(false);
+        };
+        let mut take = |envelope: &Envelope, payload: &[u8]| {
+            let taken = MonotonicClock::now();
+            wait.on_arrival(taken);
+            let record = EgressRecord {
+                sequence: envelope.sequence,
+                published_ns: envelope.published_ns,
+                taken_ns: taken.as_ns(),
+                handed_ns: UNAVAILABLE,
+                tx_software_ns: UNAVAILABLE,
+                tx_hardware_ns: UNAVAILABLE,
+                realtime_offset_ns: line.clock.offset_ns(),
+                epoch: envelope.epoch,
+                session: line.session,
+                flags: 0,
+                fragment_count: 0,
+            };
+            match bridge.on_local(taken, envelope, payload) {
+                Ok(()) => {
+                    line.message = Some(record);
+                    line.transmit(bridge);
+                    sent.store(bridge.counts().sent_count, Ordering::Relaxed);
+                }
+                // Another gateway's message: not this gateway's to account for.
+                Err(LocalRefusal::Forwarded) => {}
+                Err(_counted) => line.finish(EgressRecord {
+                    flags: EgressRecord::REFUSED_BY_KERNEL,
+                    ..record
+                }),
+            }
+        };
+        Ok(input.receive(&mut take)?)
+    }
+
+    /// Takes the peer's replies.
+    fn hear(&mut self) -> Result<(), GatewayError> {
+        let mut buffer = [0; REPLY_BYTES_MAX];
+        while let Some(received) = self
+            .line
+            .sender
+            .receive(&mut buffer)
+            .map_err(GatewayError::Socket)?
+        {
+            let now = MonotonicClock::now();
+            let arrival = self.line.clock.arrival(&received, now);
+            let bytes = &buffer[..received.length_bytes];
+            match self.bridge.on_datagram(now, arrival, bytes) {
+                Ok(EgressEvent::RoundTrip {
+                    round_trip,
+                    earlier,
+                    ..
+                }) => {
+                    if let Some(earlier) = earlier {
+                        self.note_round_trip(&earlier);
+                    }
+                    self.note_round_trip(&round_trip);
+                }
+                Ok(EgressEvent::Refused(status)) => {
+                    if self.bridge.peer_state() == PeerState::Refused(status) {
+                        return Err(GatewayError::Refused(status));
+                    }
+                }
+                Ok(EgressEvent::Accepted { .. } | EgressEvent::GreetAgain) | Err(_) => {}
+            }
+        }
+        Ok(())
+    }
+
+    fn note_round_trip(&mut self, round_trip: &RoundTrip) {
+        let sources = [
+            round_trip.t1_source,
+            round_trip.t2_source,
+            round_trip.t3_source,
+            round_trip.t4_source,
+        ];
+        self.line.round_trips.push(&RoundTripRecord {
+            sequence: round_trip.sequence,
+            t1_ns: round_trip.t1_ns,
+            t2_ns: round_trip.t2_ns,
+            t3_ns: round_trip.t3_ns,
+            t4_ns: round_trip.t4_ns,
+            session: self.line.session,
+            sources: sources.map(|source| source as u8),
+        });
+    }
+
+    /// Waits for a message, a stamp, a reply or an appointment.
+    pub(crate) fn rest(&mut self) -> Result<(), GatewayError> {
+        let now = MonotonicClock::now();
+        let dues = [self.bridge.next_wakeup(), self.line.sender.next_due()];
+        let mut due = dues.into_iter().flatten().min();
+        if self.line.pending_count > 0 {
+            // A stamp makes the socket readable, but an overdue one must be given up in time.
+            let patience = Instant::from_ns(now.as_ns() + STAMP_PATIENCE_NS);
+            due = Some(due.map_or(patience, |due| due.min(patience)));
+        }
+        match self.wait.pause(now, due) {
+            Pause::Spin => core::hint::spin_loop(),
+            Pause::Sleep(until) => {
+                // Messages are never kept waiting for refused replies.
+                let away = self.gathering.until(now, self.refused_count());
+                let until = away.unwrap_or(until).min(until);
+                let listeners = self.waiter.iter().flat_map(Waiter::descriptors);
+                let socket = self.line.sender.poll_fd().filter(|_| away.is_none());
+                let [is_announced, has_socket_news] =
+                    poll_descriptors(listeners.chain(socket), until)?;
+                // Without a waiter the socket comes first.
+                let (is_announced, has_socket_news) = match self.waiter {
+                    Some(_) => (is_announced, has_socket_news || away.is_some()),
+                    None => (false, is_announced || away.is_some()),
+                };
+                self.attention.has_news |= has_socket_news;
+                // After a quiet wait it is looked at as well: see `Waiter::drain`.
+                self.attention.is_announced |= is_announced || !has_socket_news;
+            }
+        }
+        Ok(())
+    }
+
+    /// Replies refused so far, by the seal or the bridge.
+    fn refused_count(&self) -> u64 {
+        let sealed = self.line.sender().seal_counts();
+        sealed.map_or(0, |counts| counts.refused_total()) + self.bridge.refusals().total()
+    }
+}

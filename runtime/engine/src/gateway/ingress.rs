@@ -1,0 +1,310 @@
+//! The receiving thread of a gateway: from the network to one local channel. It owns the clock,
+//! the socket and the port; what a datagram means is the bridge's business.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+
+use hil_core::message::Envelope;
+use hil_core::record::{FollowUpRecord, IngressRecord, UNAVAILABLE};
+use hil_core::time::Instant;
+use hil_protocol::ingress::{FollowUp, MessageInfo};
+use hil_protocol::sequence::Order;
+use hil_protocol::wire::Kind;
+use hil_protocol::{Delivery, Disposition, IngressBridge};
+use hil_transport::{DatagramReceiver, Received};
+
+use super::gathering::Gathering;
+use super::kernel_clock::KernelClock;
+use super::{GatewayError, poll_descriptors};
+use crate::process::pulse::Pulse;
+use hil_platform::clock::MonotonicClock;
+use hil_platform::wait::{Pause, WaitStrategy, release};
+use hil_rundir::record::RecordSink;
+use hil_shm::{ChannelError, RawOutput};
+
+/// Everything the thread works with.
+#[derive(Debug)]
+pub(crate) struct Ingress {
+    pub(crate) receiver: Box<dyn DatagramReceiver>,
+    /// The receiver holds datagrams back, so it must be told the time.
+    pub(crate) is_emulated: bool,
+    pub(crate) bridge: IngressBridge,
+    /// Where messages go; `None` on a clock path, which carries none.
+    pub(crate) output: Option<RawOutput>,
+    pub(crate) wait: WaitStrategy,
+    pub(crate) peer: SocketAddr,
+    pub(crate) notes: Notes,
+    pub(crate) received: Arc<AtomicU64>,
+    pub(crate) stop: Arc<AtomicBool>,
+    /// Datagrams from an address that is not the peer's, dropped unread.
+    pub(crate) foreign_count: u64,
+    /// Messages that came over a clock path, dropped.
+    pub(crate) stray_count: u64,
+    pub(super) gathering: Gathering,
+    pub(crate) clock: KernelClock,
+    /// The clock response whose departure the kernel is to stamp.
+    pub(crate) response: Option<Response>,
+    pub(crate) buffer: Box<[u8]>,
+}
+
+/// A clock response that left.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Response {
+    sequence: u64,
+    handed: Instant,
+}
+
+/// Where the thread's records go.
+#[derive(Debug)]
+pub(crate) struct Notes {
+    pub(crate) messages: RecordSink,
+    pub(crate) follow_ups: RecordSink,
+}
+
+/// What is known of a datagram before the bridge reads it.
+#[derive(Clone, Copy)]
+struct Arrival {
+    received: Received,
+    at: Instant,
+    offset_ns: i64,
+}
+
+impl Arrival {
+    fn record(&self, message: &MessageInfo, forwarded_ns: i64, flags: u32) -> IngressRecord {
+        let emulated = self.received.emulated;
+        IngressRecord {
+            sequence: message.sequence,
+            published_ns: message.published.as_ns(),
+            handed_ns: message.handed.as_ns(),
+            rx_hardware_ns: self.received.stamps.hardware_ns.unwrap_or(UNAVAILABLE),
+            rx_software_ns: self.received.stamps.software_ns.unwrap_or(UNAVAILABLE),
+            received_ns: self.at.as_ns(),
+            forwarded_ns,
+            realtime_offset_ns: self.offset_ns,
+            emulated_ns: emulated.map_or(UNAVAILABLE, |delay| delay.arrived.as_ns()),
+            due_ns: emulated.map_or(UNAVAILABLE, |delay| delay.due.as_ns()),
+            epoch: message.epoch,
+            session: message.session,
+            flags,
+            fragment_count: u32::from(message.fragment_count),
+        }
+    }
+}
+
+impl Ingress {
+    /// Carries the channel until told to stop.
+    ///
+    /// # Errors
+    /// When the channel or the socket itself breaks.
+    pub(crate) fn run(&mut self, pulse: &Pulse) -> Result<(), GatewayError> {
+        while !self.stop.load(Ordering::Acquire) {
+            if !self.step()? {
+                self.rest()?;
+            }
+            pulse.beat();
+        }
+        self.bridge.finish();
+        Ok(())
+    }
+
+    /// Delivers one waiting datagram, or else does what is due; false when none waited. Asking
+    /// for a second one at once would cost a system call that a message just delivered, or the
+    /// thread's other work, would have to wait for.
+    pub(crate) fn step(&mut self) -> Result<bool, GatewayError> {
+        if let Some(at) = self.take()? {
+            if self.bridge.has_reply() {
+                self.answer();
+            }
+            // Under load too, but after the message: a reading of the clocks must not age.
+            self.clock.refresh(at);
+            return Ok(true);
+        }
+        let now = MonotonicClock::now();
+        self.bridge.on_wakeup(now);
+        self.take_response_stamp(now);
+        self.receiver.attend(now);
+        self.clock.refresh(now);
+        Ok(false)
+    }
+
+    /// Takes one datagram and gives when; `None` when none waits.
+    fn take(&mut self) -> Result<Option<Instant>, GatewayError> {
+        // Only a link model asks what time it is.
+        let now = if self.is_emulated {
+            MonotonicClock::now()
+        } else {
+            Instant::ZERO
+        };
+        let Some(received) = self
+            .receiver
+            .receive(now, &mut self.buffer)
+            .map_err(GatewayError::Socket)?
+        else {
+            return Ok(None);
+        };
+        let at = MonotonicClock::now();
+        self.wait.on_arrival(at);
+        if received.source != self.peer {
+            self.foreign_count += 1;
+            return Ok(Some(at));
+        }
+        let arrival = Arrival {
+            received,
+            at,
+            offset_ns: self.clock.offset_ns(),
+        };
+        let stamps = self.clock.arrival(&received, at);
+        let Self {
+            bridge,
+            output,
+            notes,
+            received: count,
+            stray_count,
+            buffer,
+            ..
+        } = self;
+        let bytes = &buffer[..received.length_bytes];
+        let mut failed = None;
+        let mut deliver = |delivery: Delivery<'_>| {
+            let Some(output) = output else {
+                *stray_count += 1;
+                return;
+            };
+            count.fetch_add(1, Ordering::Relaxed);
+            if let Err(error) = publish(output, notes, &arrival, &delivery) {
+                failed = Some(error);
+            }
+        };
+        // A refused datagram is a counter of the bridge.
+        if let Ok(disposition) = bridge.on_datagram(at, stamps, bytes, &mut deliver) {
+            note_undelivered(notes, &arrival, disposition);
+        }
+        failed.map_or(Ok(Some(at)), |error| Err(error.into()))
+    }
+
+    /// Sends the replies that are due; a reply that cannot leave is counted by the transport.
+    fn answer(&mut self) {
+        loop {
+            let now = MonotonicClock::now();
+            let Some(reply) = self.bridge.poll_transmit(now) else {
+                return;
+            };
+            let to = reply.destination.unwrap_or(self.peer);
+            if reply.kind != Kind::SyncResponse {
+                let _counted = self.receiver.reply(reply.datagram, to).is_err();
+                continue;
+            }
+            let sent = self.receiver.reply_stamped(now, reply.datagram, to);
+            self.response = sent.is_ok().then_some(Response {
+                sequence: reply.sequence,
+                handed: now,
+            });
+            self.take_response_stamp(now);
+        }
+    }
+
+    /// Takes the kernel's stamp of the newest clock response, if it has come; it rides on the next.
+    fn take_response_stamp(&mut self, now: Instant) {
+        let Some(realtime_ns) = self.receiver.take_reply_stamp(now) else {
+            return;
+        };
+        if let Some(response) = self.response.take() {
+            let left_ns = realtime_ns - self.clock.offset_ns();
+            self.bridge.on_transmit_stamp(
+                Kind::SyncResponse,
+                response.sequence,
+                left_ns.saturating_sub(response.handed.as_ns()),
+            );
+        }
+    }
+
+    /// Waits for a datagram or an appointment.
+    pub(crate) fn rest(&mut self) -> Result<(), GatewayError> {
+        let now = MonotonicClock::now();
+        let due = self.receiver.next_due();
+        let pause = if self.is_emulated {
+            // A link model's delay is a promise; the bridge's appointments are not.
+            let pause = self.wait.pause(now, self.bridge.next_wakeup());
+            due.map_or(pause, |due| pause.sooner(release(now, due)))
+        } else {
+            let dues = [self.bridge.next_wakeup(), due];
+            self.wait.pause(now, dues.into_iter().flatten().min())
+        };
+        match pause {
+            Pause::Spin => core::hint::spin_loop(),
+            Pause::Sleep(until) => {
+                let away = self.gathering.until(now, self.refused_count());
+                let socket = self.receiver.poll_fd().filter(|_| away.is_none());
+                poll_descriptors(socket.into_iter(), away.unwrap_or(until).min(until))?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Datagrams refused so far, whoever refused them.
+    fn refused_count(&self) -> u64 {
+        let sealed = self.receiver.seal_counts();
+        let by_seal = sealed.map_or(0, |counts| counts.refused_total());
+        by_seal + self.foreign_count + self.bridge.refusals().total()
+    }
+}
+
+fn publish(
+    output: &mut RawOutput,
+    notes: &mut Notes,
+    arrival: &Arrival,
+    delivery: &Delivery<'_>,
+) -> Result<(), ChannelError> {
+    let message = &delivery.message;
+    let mut forwarded_ns = UNAVAILABLE;
+    output.publish_with(delivery.payload, || {
+        forwarded_ns = MonotonicClock::now().as_ns();
+        Envelope {
+            sequence: message.sequence,
+            published_ns: message.published.as_ns(),
+            forwarded_ns,
+            epoch: message.epoch,
+            flags: Envelope::FORWARDED,
+            reserved: [0; 4],
+        }
+    })?;
+    let flags = if delivery.order == Order::Reordered {
+        IngressRecord::REORDERED
+    } else {
+        0
+    };
+    notes
+        .messages
+        .push(&arrival.record(message, forwarded_ns, flags));
+    if let Some(FollowUp {
+        sequence,
+        handed_to_tx_ns,
+    }) = delivery.follow_up
+    {
+        let session = message.session;
+        notes.follow_ups.push(&FollowUpRecord {
+            sequence,
+            handed_to_tx_ns,
+            session,
+            reserved: 0,
+        });
+    }
+    Ok(())
+}
+
+fn note_undelivered(notes: &mut Notes, arrival: &Arrival, disposition: Disposition) {
+    let (message, flags) = match disposition {
+        Disposition::Duplicate(message) => (message, IngressRecord::DUPLICATE),
+        Disposition::Late(message) => (message, IngressRecord::LATE),
+        Disposition::Superseded(message) => (message, IngressRecord::REORDERED),
+        Disposition::Delivered(_)
+        | Disposition::FragmentStored
+        | Disposition::Greeted { .. }
+        | Disposition::SyncRequested
+        | Disposition::Farewell => return,
+    };
+    notes
+        .messages
+        .push(&arrival.record(&message, UNAVAILABLE, flags));
+}

@@ -1,0 +1,494 @@
+//! The socket of a sending gateway thread, and the records that wait for what the kernel and the
+//! radio have yet to say of datagrams that left. It decides nothing about what to send.
+
+use std::time::Duration;
+
+use hil_core::record::{EgressRecord, UNAVAILABLE};
+use hil_core::time::Instant;
+use hil_net::radio::RadioReport;
+use hil_net::{TransmitStage, TransmitStamp, TxToken};
+use hil_protocol::egress::TransmitFailure;
+use hil_protocol::wire::Kind;
+use hil_protocol::{EgressBridge, PeerState};
+use hil_transport::{DatagramSender, SendRefusal};
+
+use super::kernel_clock::KernelClock;
+use super::stamp_plan::StampPlan;
+use super::{GatewayError, poll_descriptors};
+use hil_platform::clock::MonotonicClock;
+use hil_rundir::record::RecordSink;
+
+/// Datagrams whose stamps and reports may be outstanding; a power of two.
+const PENDING: usize = 256;
+/// A stamp that has not come by then does not come: drivers deliver within a millisecond or so,
+/// and a record must not wait for ever.
+pub(super) const STAMP_PATIENCE_NS: i64 = 20_000_000;
+/// A radio reports after its last retry, with other stations and its queue before that; the driver
+/// of a card that stamps fetches the stamp from a worker of normal priority.
+const LATE_PATIENCE_NS: i64 = 200_000_000;
+/// How long the end of a run may wait for the kernel to take what is left.
+const HAND_OVER_MAX: Duration = Duration::from_millis(200);
+
+/// The socket, the stamps still to come from it, and the records they complete.
+#[derive(Debug)]
+pub(crate) struct Line {
+    pub(super) sender: Box<dyn DatagramSender>,
+    pending: Box<[Option<Pending>]>,
+    pub(super) pending_count: usize,
+    /// At or before the slot of the oldest that is pending: tokens go round the slots in order.
+    oldest: usize,
+    records: RecordSink,
+    pub(super) round_trips: RecordSink,
+    pub(super) session: u32,
+    pub(super) clock: KernelClock,
+    awaited: StampPlan,
+    pub(super) message: Option<EgressRecord>,
+    pub(super) newest_handed: Instant,
+    report_count: u64,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Pending {
+    token: TxToken,
+    kind: Kind,
+    sequence: u64,
+    handed: Instant,
+    /// Of a message's last piece.
+    record: Option<EgressRecord>,
+    is_stamped: bool,
+    is_card_stamped: bool,
+    is_reported: bool,
+}
+
+impl Line {
+    pub(crate) fn new(
+        sender: Box<dyn DatagramSender>,
+        (records, round_trips): (RecordSink, RecordSink),
+        session: u32,
+        awaited: StampPlan,
+    ) -> Result<Self, GatewayError> {
+        Ok(Self {
+            sender,
+            pending: vec![None; PENDING].into_boxed_slice(),
+            pending_count: 0,
+            oldest: 0,
+            records,
+            round_trips,
+            session,
+            clock: KernelClock::read()?,
+            awaited,
+            message: None,
+            newest_handed: Instant::ZERO,
+            report_count: 0,
+        })
+    }
+
+    pub(crate) fn sender(&self) -> &dyn DatagramSender {
+        self.sender.as_ref()
+    }
+
+    /// Sends everything the bridge has, then takes the stamps that came of it.
+    pub(super) fn transmit(&mut self, bridge: &mut EgressBridge) {
+        loop {
+            let handed = MonotonicClock::now();
+            let Some(transmit) = bridge.poll_transmit(handed) else {
+                break;
+            };
+            self.newest_handed = handed;
+            let (kind, sequence) = (transmit.kind, transmit.sequence);
+            let is_last = transmit.is_last_fragment;
+            if kind == Kind::Data
+                && let Some(record) = &mut self.message
+            {
+                record.fragment_count += 1;
+                if record.handed_ns == UNAVAILABLE {
+                    record.handed_ns = handed.as_ns();
+                }
+            }
+            let sent = self.sender.send(transmit.datagram);
+            let is_message_end = kind == Kind::Data && (is_last || sent.is_err());
+            let record = if is_message_end {
+                self.message.take()
+            } else {
+                None
+            };
+            match sent {
+                Ok(token) => self.expect_stamp(token, (kind, sequence), handed, record),
+                Err(refusal) => {
+                    let is_established = bridge.peer_state() == PeerState::Established;
+                    bridge.on_transmit_failed(handed, failure(refusal, is_established));
+                    if let Some(record) = record {
+                        self.finish(EgressRecord {
+                            flags: EgressRecord::REFUSED_BY_KERNEL,
+                            ..record
+                        });
+                    }
+                }
+            }
+            // Asked before the clock is read again: after most messages nothing is due.
+            if bridge.next_wakeup().is_none_or(|due| due > handed) {
+                break;
+            }
+        }
+        self.take_due_stamps(bridge);
+    }
+
+    fn expect_stamp(
+        &mut self,
+        token: TxToken,
+        (kind, sequence): (Kind, u64),
+        handed: Instant,
+        record: Option<EgressRecord>,
+    ) {
+        if !self.awaited.is_anything_awaited() {
+            if let Some(record) = record {
+                self.finish(record);
+            }
+            return;
+        }
+        let slot = slot_of(token);
+        if let Some(old) = self.pending[slot].take() {
+            self.retire(old);
+        }
+        if self.pending_count == 0 {
+            self.oldest = slot;
+        } else if self.oldest == slot {
+            // Gone round once: the newest takes this slot, and the oldest is in a later one.
+            self.oldest = (slot + 1) % PENDING;
+        }
+        self.pending[slot] = Some(Pending {
+            token,
+            kind,
+            sequence,
+            handed,
+            record,
+            is_stamped: false,
+            is_card_stamped: false,
+            is_reported: false,
+        });
+        self.pending_count += 1;
+    }
+
+    /// Takes the stamps that are still to come, as far as they have come; asks no further, as
+    /// each look is a system call.
+    fn take_due_stamps(&mut self, bridge: &mut EgressBridge) {
+        while self.pending_count > 0 && self.take_stamp(bridge) {}
+    }
+
+    /// Takes every stamp there is, and with them the reports of the network.
+    pub(super) fn take_stamps(&mut self, bridge: &mut EgressBridge) {
+        while self.take_stamp(bridge) {}
+    }
+
+    /// Takes one stamp without blocking, and the radio's reports found on the way; false when
+    /// there is no stamp. A record is complete when all it waits for has come.
+    fn take_stamp(&mut self, bridge: &mut EgressBridge) -> bool {
+        let stamp = self.sender.next_stamp();
+        while let Some(report) = self.sender.next_radio_report() {
+            self.note_report(report);
+        }
+        let Some(stamp) = stamp else {
+            return false;
+        };
+        self.note_stamp(bridge, stamp);
+        true
+    }
+
+    fn note_stamp(&mut self, bridge: &mut EgressBridge, stamp: TransmitStamp) {
+        let slot = slot_of(stamp.token);
+        let offset = self.clock.offset_ns();
+        let is_departure = stamp.stage == TransmitStage::Sent;
+        let counts = is_departure || self.awaited.is_before_queue_final();
+        let pending = self.pending[slot].as_mut();
+        let Some(pending) = pending.filter(|one| one.token == stamp.token) else {
+            return;
+        };
+        // Of a message in pieces only the last piece's stamp is the message's.
+        let is_whole = pending.kind != Kind::Data || pending.record.is_some();
+        if let Some(software_ns) = stamp.stamps.software_ns {
+            if is_whole && counts {
+                let first_handed = pending
+                    .record
+                    .map_or(pending.handed.as_ns(), |record| record.handed_ns);
+                bridge.on_transmit_stamp(
+                    pending.kind,
+                    pending.sequence,
+                    software_ns - offset - first_handed,
+                );
+            }
+            pending.is_stamped |= counts;
+            if let Some(record) = &mut pending.record {
+                note_software(record, software_ns, is_departure);
+            }
+        }
+        if let Some(hardware_ns) = stamp.stamps.hardware_ns {
+            pending.is_card_stamped = true;
+            if let Some(record) = &mut pending.record {
+                record.tx_hardware_ns = hardware_ns;
+            }
+        }
+        self.retire_if_complete(slot);
+    }
+
+    fn note_report(&mut self, report: RadioReport) {
+        let slot = slot_of(report.token);
+        let pending = self.pending[slot].as_mut();
+        let Some(pending) = pending.filter(|one| one.token == report.token) else {
+            return;
+        };
+        pending.is_reported = true;
+        if let Some(record) = &mut pending.record {
+            record.flags |= if report.is_acknowledged {
+                EgressRecord::RADIO_ACKNOWLEDGED
+            } else {
+                EgressRecord::RADIO_UNACKNOWLEDGED
+            };
+        }
+        self.retire_if_complete(slot);
+    }
+
+    fn retire_if_complete(&mut self, slot: usize) {
+        let awaited = self.awaited;
+        let is_complete = self.pending[slot].is_some_and(|one| {
+            (one.is_stamped || !awaited.awaits_software())
+                && (one.is_card_stamped || !awaited.awaits_hardware())
+                && (one.is_reported || !awaited.asks_radio)
+        });
+        if is_complete && let Some(pending) = self.pending[slot].take() {
+            self.retire(pending);
+        }
+    }
+
+    /// A host without a listener answers with a report instead of a reply; reading stamps swallows
+    /// it before any send call could fail with it.
+    pub(super) fn notice_reports(&mut self, bridge: &mut EgressBridge, now: Instant) {
+        let counters = self.sender.counters();
+        if counters.network_report_count == self.report_count {
+            return;
+        }
+        self.report_count = counters.network_report_count;
+        let newest = counters.newest_report.map(|report| failure(report, true));
+        if newest == Some(TransmitFailure::PeerUnreachable) {
+            bridge.on_peer_unreachable(now);
+        }
+    }
+
+    fn retire(&mut self, pending: Pending) {
+        self.pending_count -= 1;
+        if let Some(record) = pending.record {
+            self.finish(record);
+        }
+    }
+
+    pub(super) fn finish(&mut self, record: EgressRecord) {
+        self.records.push(&record);
+    }
+
+    /// How long a datagram may wait for what is still to come of it.
+    const fn patience_ns(&self) -> i64 {
+        if self.awaited.asks_radio || self.awaited.awaits_hardware() {
+            LATE_PATIENCE_NS
+        } else {
+            STAMP_PATIENCE_NS
+        }
+    }
+
+    /// Gives up on stamps and reports that are overdue at `now`.
+    pub(super) fn expire(&mut self, now: Instant) {
+        let patience_ns = self.patience_ns();
+        // Something is pending, so the walk ends within one round.
+        while self.pending_count > 0 {
+            match self.pending[self.oldest] {
+                Some(one) if now.ns_since(one.handed) <= patience_ns => return,
+                Some(one) => {
+                    self.pending[self.oldest] = None;
+                    self.retire(one);
+                }
+                None => {}
+            }
+            self.oldest = (self.oldest + 1) % PENDING;
+        }
+    }
+
+    /// Waits a bounded time for what is still to come of the last datagrams.
+    pub(super) fn settle(&mut self, bridge: &mut EgressBridge) -> Result<(), GatewayError> {
+        let end = MonotonicClock::now() + Duration::from_nanos(self.patience_ns().unsigned_abs());
+        loop {
+            self.take_stamps(bridge);
+            if self.pending_count == 0 || MonotonicClock::now() >= end {
+                self.expire(Instant::from_ns(i64::MAX));
+                return Ok(());
+            }
+            poll_descriptors(self.sender.poll_fd().into_iter(), end)?;
+            // What has come without being awaited, such as a last reply, stays readable.
+            std::thread::yield_now();
+        }
+    }
+
+    /// Gives the kernel what the transport still holds, for a bounded time.
+    pub(super) fn hand_over(&mut self) -> Result<(), GatewayError> {
+        let end = MonotonicClock::now() + HAND_OVER_MAX;
+        loop {
+            let now = MonotonicClock::now();
+            self.sender.attend(now);
+            if !self.sender.has_unsent() || now >= end {
+                return Ok(());
+            }
+            poll_descriptors(self.sender.poll_fd().into_iter(), end)?;
+        }
+    }
+
+    /// How often the real-time clock was stepped.
+    pub(crate) fn clock_step_count(&self) -> u64 {
+        self.clock.step_count()
+    }
+}
+
+/// A departure takes the place of a stamp before the queue, in whatever order they come.
+fn note_software(record: &mut EgressRecord, software_ns: i64, is_departure: bool) {
+    if is_departure {
+        record.tx_software_ns = software_ns;
+        record.flags &= !EgressRecord::STAMPED_BEFORE_QUEUE;
+    } else if record.tx_software_ns == UNAVAILABLE {
+        record.tx_software_ns = software_ns;
+        record.flags |= EgressRecord::STAMPED_BEFORE_QUEUE;
+    }
+}
+
+fn slot_of(token: TxToken) -> usize {
+    token.0 as usize % PENDING
+}
+
+/// What a refusal means for the conversation. That there is no connection yet says nothing of a
+/// peer that has not been heard of; that there is none any more says that it is gone.
+fn failure(refusal: SendRefusal, is_established: bool) -> TransmitFailure {
+    match refusal {
+        SendRefusal::PeerRefused | SendRefusal::Unreachable { .. } => {
+            TransmitFailure::PeerUnreachable
+        }
+        SendRefusal::NotConnected if is_established => TransmitFailure::PeerUnreachable,
+        SendRefusal::NotConnected
+        | SendRefusal::QueueFull { .. }
+        | SendRefusal::TooLong { .. }
+        | SendRefusal::Other { .. } => TransmitFailure::Local,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io;
+    use std::os::fd::BorrowedFd;
+
+    use hil_net::timestamping::TimestampMode;
+    use hil_transport::{Received, SenderCounters};
+
+    use super::*;
+    use hil_rundir::record::{RecordKind, Recorder};
+
+    /// Sends nothing and hears nothing.
+    #[derive(Debug)]
+    struct Silent;
+
+    impl DatagramSender for Silent {
+        fn send(&mut self, _datagram: &[u8]) -> Result<TxToken, SendRefusal> {
+            Ok(TxToken(0))
+        }
+
+        fn next_stamp(&mut self) -> Option<TransmitStamp> {
+            None
+        }
+
+        fn receive(&mut self, _buffer: &mut [u8]) -> io::Result<Option<Received>> {
+            Ok(None)
+        }
+
+        fn poll_fd(&self) -> Option<BorrowedFd<'_>> {
+            None
+        }
+
+        fn counters(&self) -> SenderCounters {
+            SenderCounters::default()
+        }
+    }
+
+    fn silent_line(folder: &std::path::Path) -> Line {
+        std::fs::create_dir_all(folder).unwrap();
+        let mut recorder = Recorder::new(folder, "gateway", 0);
+        let mut sink = |kind| recorder.sink(kind, "x", 8, 16).unwrap();
+        let sinks = (sink(RecordKind::Egress), sink(RecordKind::RoundTrip));
+        let plan = StampPlan::asked(TimestampMode::Software);
+        Line::new(Box::new(Silent), sinks, 1, plan).unwrap()
+    }
+
+    #[test]
+    fn what_is_overdue_goes_and_the_rest_stays_however_often_tokens_go_round() {
+        let folder = std::env::temp_dir().join(format!("hil-line-{}", std::process::id()));
+        let mut line = silent_line(&folder);
+        let spacing_ns = 1_000_000;
+        let kept = usize::try_from(STAMP_PATIENCE_NS / spacing_ns).unwrap() + 1;
+        // Past the wrap of the tokens, and of the slots many times.
+        let first = u32::MAX - 700;
+        for step in 0..2_000_u32 {
+            let now = Instant::from_ns(i64::from(step) * spacing_ns);
+            let token = TxToken(first.wrapping_add(step));
+            line.expect_stamp(token, (Kind::Data, u64::from(step)), now, None);
+            // Every third is stamped at once, and for a while all are.
+            if step % 3 == 0 || (800..1_200).contains(&step) {
+                let slot = slot_of(token);
+                let pending = line.pending[slot].as_mut().unwrap();
+                pending.is_stamped = true;
+                line.retire_if_complete(slot);
+            }
+            line.expire(now);
+            let left = line.pending.iter().flatten();
+            let is_timely = |one: &Pending| now.ns_since(one.handed) <= STAMP_PATIENCE_NS;
+            assert!(left.clone().all(is_timely), "step {step}");
+            assert_eq!(left.count(), line.pending_count, "step {step}");
+            assert!(line.pending_count <= kept);
+        }
+        assert!(line.pending_count > kept / 2, "{}", line.pending_count);
+        // Without a look in between the slots go round over what waits; the end takes it all.
+        for step in 2_000..2_600_u32 {
+            let token = TxToken(first.wrapping_add(step));
+            let now = Instant::from_ns(i64::from(step) * spacing_ns);
+            line.expect_stamp(token, (Kind::Data, u64::from(step)), now, None);
+        }
+        assert_eq!(line.pending_count, PENDING);
+        line.expire(Instant::from_ns(
+            (2_599 - 9) * spacing_ns + STAMP_PATIENCE_NS,
+        ));
+        assert_eq!(line.pending_count, 10, "the oldest went first");
+        line.expire(Instant::from_ns(i64::MAX));
+        assert_eq!(line.pending_count, 0);
+        std::fs::remove_dir_all(&folder).unwrap();
+    }
+
+    #[test]
+    fn a_departure_replaces_a_stamp_before_the_queue_in_either_order() {
+        let empty = EgressRecord {
+            sequence: 0,
+            published_ns: 0,
+            taken_ns: 0,
+            handed_ns: 0,
+            tx_software_ns: UNAVAILABLE,
+            tx_hardware_ns: UNAVAILABLE,
+            realtime_offset_ns: 0,
+            epoch: 0,
+            session: 0,
+            flags: EgressRecord::RADIO_ACKNOWLEDGED,
+            fragment_count: 1,
+        };
+        let radio = EgressRecord::RADIO_ACKNOWLEDGED;
+        for order in [[false, true], [true, false]] {
+            let mut record = empty;
+            for is_departure in order {
+                note_software(&mut record, if is_departure { 9 } else { 4 }, is_departure);
+            }
+            assert_eq!((record.tx_software_ns, record.flags), (9, radio));
+        }
+        let mut record = empty;
+        note_software(&mut record, 4, false);
+        let flags = radio | EgressRecord::STAMPED_BEFORE_QUEUE;
+        assert_eq!((record.tx_software_ns, record.flags), (4, flags));
+    }
+}

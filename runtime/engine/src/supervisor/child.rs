@@ -1,0 +1,287 @@
+//! One process the supervisor started: its pipes, its log, its death. When to start, restart or
+//! stop it is decided in `crew.rs`.
+
+use std::fs::File;
+use std::io::{self, BufRead, BufReader, Read as _, Seek as _, SeekFrom, Write};
+use std::os::unix::process::{CommandExt, ExitStatusExt};
+use std::path::Path;
+use std::process::{ChildStdin, Command, ExitStatus, Stdio};
+use std::sync::mpsc::SyncSender;
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+use nix::sys::signal::{Signal, killpg};
+use nix::sys::wait::{Id, WaitPidFlag, WaitStatus, waitid};
+use nix::unistd::Pid;
+use zeroize::Zeroizing;
+
+use hil_platform::systemd;
+use hil_rundir::pipe::{FromProcess, ToProcess};
+
+/// A word from a process: which one (index and instance), and what.
+pub(crate) type Word = (usize, u32, FromProcess);
+
+/// A running (or finished) child process.
+#[derive(Debug)]
+pub(crate) struct Child {
+    process: std::process::Child,
+    words: Option<JoinHandle<()>>,
+    stdin: Option<ChildStdin>,
+    status: Option<ExitStatus>,
+    is_foreign: bool,
+}
+
+impl Child {
+    /// Its process id.
+    pub(crate) fn id(&self) -> u32 {
+        self.process.id()
+    }
+
+    /// Starts a process that speaks the pipe protocol; its words arrive at `words` marked with
+    /// `index` and `instance`. Standard error goes to `log`.
+    ///
+    /// # Errors
+    /// When the program cannot be started or the log cannot be written.
+    pub(crate) fn spawn_speaking(
+        command: Command,
+        log: &Path,
+        (index, instance): (usize, u32),
+        words: SyncSender<Word>,
+    ) -> io::Result<Self> {
+        let mut command = prepared(command, log)?;
+        let mut process = command
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()?;
+        let output = process
+            .stdout
+            .take()
+            .expect("standard output was piped just above");
+        let words = thread::Builder::new()
+            .name(format!("words {index}"))
+            .spawn(move || {
+                for line in BufReader::new(output).lines() {
+                    let Ok(line) = line else { return };
+                    let word = serde_json::from_str(&line)
+                        .unwrap_or_else(|_not_ours| FromProcess::Warning(format!("said: {line}")));
+                    if words.send((index, instance, word)).is_err() {
+                        return;
+                    }
+                }
+            })?;
+        let stdin = process.stdin.take();
+        Ok(Self {
+            process,
+            words: Some(words),
+            stdin,
+            status: None,
+            is_foreign: false,
+        })
+    }
+
+    /// Starts a user's own command; both its outputs go to `log`.
+    ///
+    /// # Errors
+    /// When the program cannot be started or the log cannot be written.
+    pub(crate) fn spawn_foreign(command: Command, log: &Path) -> io::Result<Self> {
+        let mut command = prepared(command, log)?;
+        command.stdout(File::options().append(true).open(log)?);
+        let process = command.stdin(Stdio::null()).spawn()?;
+        Ok(Self {
+            process,
+            words: None,
+            stdin: None,
+            status: None,
+            is_foreign: true,
+        })
+    }
+
+    /// How it ended, once it has; does not wait.
+    pub(crate) fn poll_exit(&mut self) -> Option<ExitStatus> {
+        if self.status.is_none() && self.is_dead() {
+            // Children of its own must not outlive it. Its number still belongs to it, because
+            // it has not been reaped yet, so no stranger can be hit.
+            self.signal(Signal::SIGKILL);
+            self.status = self.process.try_wait().ok().flatten();
+        }
+        self.status
+    }
+
+    fn is_dead(&self) -> bool {
+        let look = WaitPidFlag::WEXITED | WaitPidFlag::WNOHANG | WaitPidFlag::WNOWAIT;
+        match i32::try_from(self.process.id()) {
+            Ok(id) => !matches!(
+                waitid(Id::Pid(Pid::from_raw(id)), look),
+                Ok(WaitStatus::StillAlive)
+            ),
+            Err(_out_of_range) => true,
+        }
+    }
+
+    /// True once everything the process said has been handed on. Comes soon after its end, as
+    /// nobody holds the other end of its output then.
+    pub(crate) fn has_said_all(&self) -> bool {
+        self.words.as_ref().is_none_or(JoinHandle::is_finished)
+    }
+
+    /// Gives an order. A foreign command gets SIGTERM for [`ToProcess::Stop`] and nothing for
+    /// [`ToProcess::Start`].
+    pub(crate) fn order(&mut self, order: &ToProcess) {
+        if self.is_foreign {
+            if *order == ToProcess::Stop {
+                self.signal(Signal::SIGTERM);
+            }
+            return;
+        }
+        let mut line = serde_json::to_string(order).expect("an order always serialises");
+        line.push('\n');
+        // It may be the run's secret.
+        let line = Zeroizing::new(line);
+        if let Some(stdin) = &mut self.stdin {
+            // A process that is gone is noticed by poll_exit.
+            let _gone = stdin
+                .write_all(line.as_bytes())
+                .and_then(|()| stdin.flush())
+                .is_err();
+        }
+    }
+
+    /// Waits until it ends or `deadline`; then kills it. True when it ended by itself.
+    pub(crate) fn end(&mut self, deadline: Instant) -> bool {
+        while self.poll_exit().is_none() {
+            if Instant::now() >= deadline {
+                self.signal(Signal::SIGKILL);
+                self.status = self.process.wait().ok();
+                return false;
+            }
+            thread::sleep(Duration::from_millis(2));
+        }
+        true
+    }
+
+    fn signal(&self, signal: Signal) {
+        if let Ok(id) = i32::try_from(self.process.id()) {
+            // The group may have ended already.
+            let _gone = killpg(Pid::from_raw(id), signal).is_err();
+        }
+    }
+}
+
+impl Drop for Child {
+    fn drop(&mut self) {
+        if self.status.is_none() {
+            self.end(Instant::now());
+        }
+    }
+}
+
+/// A group of its own keeps the terminal's Ctrl-C away from the child, so that the supervisor
+/// ends it in order. To systemd the supervisor speaks alone.
+fn prepared(mut command: Command, log: &Path) -> io::Result<Command> {
+    let log = File::options().create(true).append(true).open(log)?;
+    command.stderr(log).process_group(0);
+    for variable in systemd::VARIABLES {
+        command.env_remove(variable);
+    }
+    Ok(command)
+}
+
+/// How a process ended, in words.
+pub(crate) fn describe_exit(status: ExitStatus) -> String {
+    match (status.code(), status.signal()) {
+        (Some(0), _) => "ended".to_owned(),
+        (Some(code), _) => format!("ended with exit code {code}"),
+        (None, Some(number)) => {
+            let name = Signal::try_from(number).map_or("an unknown signal", Signal::as_str);
+            format!("was killed by {name}")
+        }
+        (None, None) => "ended for an unknown reason".to_owned(),
+    }
+}
+
+/// The last line that a process said on its standard error, if it said any: as much of it as fits a
+/// line of a report.
+pub(crate) fn last_line(log: &Path) -> Option<String> {
+    const TAIL_BYTES: u64 = 4096;
+    const LINE_CHARS: usize = 200;
+    let mut file = File::open(log).ok()?;
+    let size_bytes = file.metadata().ok()?.len();
+    file.seek(SeekFrom::Start(size_bytes.saturating_sub(TAIL_BYTES)))
+        .ok()?;
+    let mut bytes = Vec::new();
+    file.take(TAIL_BYTES).read_to_end(&mut bytes).ok()?;
+    let text = String::from_utf8_lossy(&bytes);
+    let lines = text.lines().map(str::trim);
+    let last = lines.rev().find(|line| !line.is_empty())?;
+    let plain = last.chars().filter(|one| !one.is_control());
+    Some(plain.take(LINE_CHARS).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::env;
+    use std::fs;
+    use std::sync::mpsc::sync_channel;
+
+    fn shell(script: &str) -> Command {
+        let mut command = Command::new("sh");
+        command.args(["-c", script]);
+        command
+    }
+
+    #[test]
+    fn words_arrive_marked_and_other_output_is_kept_as_a_warning() {
+        let log = env::temp_dir().join(format!("hil-child-{}.log", std::process::id()));
+        let (sender, words) = sync_channel(8);
+        let mut child =
+            Child::spawn_speaking(shell("echo '\"ready\"'; echo hello"), &log, (3, 1), sender)
+                .unwrap();
+        assert!(child.end(Instant::now() + Duration::from_secs(10)));
+        assert_eq!(words.recv().unwrap(), (3, 1, FromProcess::Ready));
+        let (_, _, word) = words.recv().unwrap();
+        assert_eq!(word, FromProcess::Warning("said: hello".to_owned()));
+        fs::remove_file(log).unwrap();
+    }
+
+    #[test]
+    fn the_last_line_that_was_said_is_found_whatever_it_is() {
+        let log = env::temp_dir().join(format!("hil-last-{}.log", std::process::id()));
+        assert_eq!(last_line(&log), None);
+        for (said, expected) in [
+            ("", None),
+            ("\n \n", None),
+            (
+                "one\ntwo: no license file\n\n",
+                Some("two: no license file"),
+            ),
+            ("\u{1b}[31mred\n", Some("[31mred")),
+        ] {
+            fs::write(&log, said).unwrap();
+            assert_eq!(last_line(&log).as_deref(), expected, "{said:?}");
+        }
+        fs::write(&log, [vec![0xff; 10_000], b"end".to_vec()].concat()).unwrap();
+        assert_eq!(last_line(&log).map(|line| line.chars().count()), Some(200));
+        fs::remove_file(log).unwrap();
+    }
+
+    #[test]
+    fn a_child_that_does_not_stop_is_killed_and_its_end_is_told() {
+        let log = env::temp_dir().join(format!("hil-kill-{}.log", std::process::id()));
+        let script = "trap '' TERM; echo deaf; sleep 60";
+        let mut child = Child::spawn_foreign(shell(script), &log).unwrap();
+        let deadline = Instant::now() + Duration::from_secs(10);
+        // Asked before it has set its trap it would stop.
+        while !fs::read_to_string(&log).unwrap().contains("deaf") {
+            assert!(Instant::now() < deadline, "the script did not begin");
+            thread::sleep(Duration::from_millis(2));
+        }
+        child.order(&ToProcess::Stop);
+        assert!(!child.end(Instant::now() + Duration::from_millis(50)));
+        assert_eq!(
+            describe_exit(child.poll_exit().unwrap()),
+            "was killed by SIGKILL"
+        );
+        fs::remove_file(log).unwrap();
+    }
+}

@@ -1,0 +1,273 @@
+//! After a run, every host gets the records of all hosts, so that each report is complete: the
+//! others send theirs to the first host of the topology, and it sends everybody the rest. It
+//! computes nothing from them.
+
+use std::collections::BTreeSet;
+use std::fs::{self, File};
+use std::io::{self, Read, Write};
+use std::path::{Path, PathBuf};
+use std::sync::mpsc::{Receiver, RecvTimeoutError};
+use std::thread::{self, ScopedJoinHandle};
+use std::time::{Duration, Instant};
+
+use super::frame::{
+    CHUNK_BYTES, Frame, PeerMessage, is_plain_record_name, write_chunk, write_message,
+};
+use super::peer::{Peer, PeerEvent};
+use hil_rundir::event::HostStory;
+
+/// A peer that says nothing for this long while records are due has failed to deliver them.
+const PATIENCE: Duration = Duration::from_secs(20);
+/// How often the first host says that it is still there while it receives.
+const ALIVE_PERIOD: Duration = Duration::from_secs(1);
+
+/// What came from one peer, or from all of them.
+#[derive(Debug, Default)]
+pub(crate) struct Received {
+    pub(crate) stories: Vec<HostStory>,
+    /// Why records of a host are missing or incomplete.
+    pub(crate) problems: Vec<String>,
+    names: BTreeSet<String>,
+}
+
+/// Sends this host's records and story, and receives those of the others into `records`.
+pub(crate) fn exchange(
+    peers: &mut [Peer],
+    is_first_host: bool,
+    (records, story): (&Path, &HostStory),
+) -> Received {
+    let mut all = Received::default();
+    let own = record_files(records).unwrap_or_else(|error| {
+        all.problems
+            .push(format!("cannot list own records: {error}"));
+        Vec::new()
+    });
+    for peer in peers.iter_mut() {
+        if let Err(error) = peer.allow_writes_to_take(PATIENCE) {
+            all.problems.push(format!("{}: {error}", peer.hello.host));
+        }
+    }
+    let given = (own.as_slice(), core::slice::from_ref(story));
+    if is_first_host {
+        let received = collect(peers, records);
+        distribute(peers, given, (&received, records), &mut all);
+        for one in received {
+            all.stories.extend(one.stories);
+            all.problems.extend(one.problems);
+        }
+    } else {
+        for peer in peers.iter_mut() {
+            give_and_take(peer, given, records, &mut all);
+        }
+    }
+    all
+}
+
+/// Receives from all peers at once, and says meanwhile that this host is still there.
+fn collect(peers: &mut [Peer], records: &Path) -> Vec<Received> {
+    thread::scope(|scope| {
+        let mut writers = Vec::new();
+        let mut receiving = Vec::new();
+        for peer in peers {
+            let host = peer.hello.host.clone();
+            let (writer, inbox) = peer.halves();
+            writers.push(writer);
+            let take = move || take_from(&host, inbox, records);
+            receiving.push(scope.spawn(take));
+        }
+        let mut said = Instant::now();
+        while !receiving.iter().all(ScopedJoinHandle::is_finished) {
+            if said.elapsed() >= ALIVE_PERIOD {
+                said = Instant::now();
+                for writer in &mut writers {
+                    // A peer that left is noticed by the thread that receives from it.
+                    let _left = write_message(*writer, &PeerMessage::Alive).is_err();
+                }
+            }
+            thread::sleep(Duration::from_millis(2));
+        }
+        receiving.into_iter().map(join_receiving).collect()
+    })
+}
+
+/// Sends every peer what it does not have yet, all at once.
+fn distribute(
+    peers: &mut [Peer],
+    (own, own_story): (&[PathBuf], &[HostStory]),
+    (received, records): (&[Received], &Path),
+    all: &mut Received,
+) {
+    let sent = thread::scope(|scope| {
+        let mut sending = Vec::new();
+        for (index, peer) in peers.iter_mut().enumerate() {
+            let others = received
+                .iter()
+                .enumerate()
+                .filter(|(other, _)| *other != index);
+            let mut files = own.to_vec();
+            let mut stories = own_story.to_vec();
+            for (_, other) in others {
+                files.extend(other.names.iter().map(|name| records.join(name)));
+                stories.extend(other.stories.iter().cloned());
+            }
+            let host = peer.hello.host.clone();
+            let (writer, _) = peer.halves();
+            let give = move || give_all(writer, &files, &stories);
+            sending.push((host, scope.spawn(give)));
+        }
+        sending
+            .into_iter()
+            .map(|(host, one)| (host, join_sending(one)))
+            .collect::<Vec<_>>()
+    });
+    for (host, outcome) in sent {
+        note_unsent(&host, outcome, all);
+    }
+}
+
+/// Sends in a thread of its own: two ends that only send would wait for each other for ever.
+fn give_and_take(
+    peer: &mut Peer,
+    (own, own_story): (&[PathBuf], &[HostStory]),
+    records: &Path,
+    all: &mut Received,
+) {
+    let host = peer.hello.host.clone();
+    let (writer, inbox) = peer.halves();
+    let (received, sent) = thread::scope(|scope| {
+        let sending = scope.spawn(|| give_all(writer, own, own_story));
+        let received = take_from(&host, inbox, records);
+        (received, join_sending(sending))
+    });
+    all.stories.extend(received.stories);
+    all.problems.extend(received.problems);
+    note_unsent(&host, sent, all);
+}
+
+fn join_receiving(thread: ScopedJoinHandle<'_, Received>) -> Received {
+    thread.join().unwrap_or_else(|_panic| Received {
+        problems: vec!["a receiving thread panicked".to_owned()],
+        ..Received::default()
+    })
+}
+
+fn join_sending(thread: ScopedJoinHandle<'_, io::Result<()>>) -> io::Result<()> {
+    let panicked = |_panic| Err(io::Error::other("the sending thread panicked"));
+    thread.join().unwrap_or_else(panicked)
+}
+
+fn note_unsent(host: &str, sent: io::Result<()>, all: &mut Received) {
+    if let Err(error) = sent {
+        all.problems
+            .push(format!("records could not be sent to {host}: {error}"));
+    }
+}
+
+fn record_files(records: &Path) -> io::Result<Vec<PathBuf>> {
+    let mut files: Vec<PathBuf> = fs::read_dir(records)?
+        .map(|entry| Ok(entry?.path()))
+        .collect::<io::Result<_>>()?;
+    files.sort();
+    Ok(files)
+}
+
+fn give_all(out: &mut impl Write, files: &[PathBuf], stories: &[HostStory]) -> io::Result<()> {
+    for story in stories {
+        write_message(out, &PeerMessage::Report(story.clone()))?;
+    }
+    for path in files {
+        let Some(name) = path.file_name().and_then(|name| name.to_str()) else {
+            continue;
+        };
+        let mut file = File::open(path)?;
+        let size_bytes = file.metadata()?.len();
+        write_message(
+            out,
+            &PeerMessage::File {
+                name: name.to_owned(),
+                size_bytes,
+            },
+        )?;
+        let mut left = size_bytes;
+        let mut chunk = vec![0; CHUNK_BYTES];
+        while left > 0 {
+            let length = chunk.len().min(usize::try_from(left).unwrap_or(usize::MAX));
+            file.read_exact(&mut chunk[..length])?;
+            write_chunk(out, &chunk[..length])?;
+            left -= length as u64;
+        }
+    }
+    write_message(out, &PeerMessage::Done)
+}
+
+/// A file on its way in.
+struct Incoming {
+    file: Option<File>,
+    left: u64,
+}
+
+fn take_from(host: &str, inbox: &mut Receiver<PeerEvent>, records: &Path) -> Received {
+    let mut received = Received::default();
+    let mut incoming = Incoming {
+        file: None,
+        left: 0,
+    };
+    let problem = loop {
+        let frame = match inbox.recv_timeout(PATIENCE) {
+            Ok(PeerEvent::Frame(frame)) => frame,
+            Ok(PeerEvent::Closed(reason)) => break reason,
+            Err(RecvTimeoutError::Disconnected) => break "connection closed".to_owned(),
+            Err(RecvTimeoutError::Timeout) => {
+                break format!("silent for {} s", PATIENCE.as_secs());
+            }
+        };
+        match take_frame(frame, records, &mut incoming, &mut received) {
+            Ok(true) => return received,
+            Ok(false) => {}
+            Err(error) => break error.to_string(),
+        }
+    };
+    let text = format!("records of {host} are incomplete: {problem}");
+    received.problems.push(text);
+    received
+}
+
+/// Deals with one frame; true when it was the last.
+fn take_frame(
+    frame: Frame,
+    records: &Path,
+    incoming: &mut Incoming,
+    received: &mut Received,
+) -> io::Result<bool> {
+    let invalid = |text: String| io::Error::new(io::ErrorKind::InvalidData, text);
+    match frame {
+        Frame::Message(PeerMessage::Done) => return Ok(true),
+        Frame::Message(PeerMessage::Report(story)) => received.stories.push(story),
+        Frame::Message(PeerMessage::File { name, size_bytes }) => {
+            if !is_plain_record_name(&name) {
+                return Err(invalid(format!(
+                    "file name {name:?} is not a record file's"
+                )));
+            }
+            incoming.file = Some(File::create_new(records.join(&name))?);
+            incoming.left = size_bytes;
+            received.names.insert(name);
+        }
+        Frame::Chunk(bytes) => {
+            let length = bytes.len() as u64;
+            if length > incoming.left {
+                return Err(invalid(format!(
+                    "{length} bytes came, {} were due",
+                    incoming.left
+                )));
+            }
+            incoming.left -= length;
+            if let Some(file) = &mut incoming.file {
+                file.write_all(&bytes)?;
+            }
+        }
+        // Left over from the run itself.
+        Frame::Message(_) => {}
+    }
+    Ok(false)
+}

@@ -1,0 +1,392 @@
+//! Bringing the hosts of a run together: the first host of the topology listens, the others connect
+//! to it, and both ends check that they fit. What they say to each other afterwards is not here.
+
+use std::io;
+use std::net::{IpAddr, SocketAddr, TcpStream};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use socket2::{Domain, Socket, Type};
+
+use super::door::{Admission, Arrived, Door, KEY_NEEDED, knock, read_hello, say};
+use super::frame::{PeerHello, PeerMessage};
+use super::peer::{ControlEnds, Peer};
+use crate::security::PreSharedKey;
+use crate::security::greeting::GreetingError;
+
+/// How often a host that cannot connect yet tries again.
+const RETRY_PERIOD: Duration = Duration::from_millis(200);
+/// How often the caller is told whom the host waits for, and may end the waiting.
+const TELL_PERIOD: Duration = Duration::from_millis(200);
+
+/// Why the hosts of a run did not come together.
+#[derive(Debug, thiserror::Error)]
+pub enum PeerError {
+    /// A peer did not appear in time.
+    #[error(
+        "{missing} did not appear within {waited_s} s; is the same topology started there, and is TCP {address} reachable?"
+    )]
+    Absent {
+        /// Host names.
+        missing: String,
+        /// How long was waited.
+        waited_s: u64,
+        /// Where the hosts meet.
+        address: SocketAddr,
+    },
+    /// The meeting address cannot be used.
+    #[error(
+        "cannot listen on {address}: {source}; is it this host's address, and is no other run using control_port?"
+    )]
+    Listen {
+        /// Where the hosts meet.
+        address: SocketAddr,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// This host's address cannot be used.
+    #[error("cannot connect from {own}: {source}; is it this host's address?")]
+    Own {
+        /// The address that the topology gives this host.
+        own: IpAddr,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// One end holds another key, or none.
+    #[error("no connection with {host}: {reason}")]
+    Key {
+        /// The other host.
+        host: String,
+        /// What does not fit, and what to do.
+        reason: String,
+    },
+    /// The ends do not fit.
+    #[error("{host} does not fit this run: {reason}")]
+    Mismatch {
+        /// The other host.
+        host: String,
+        /// Which property differs.
+        reason: String,
+    },
+    /// The user ended the run while waiting.
+    #[error("interrupted while waiting for {missing}")]
+    Interrupted {
+        /// Host names.
+        missing: String,
+    },
+    /// The connection broke.
+    #[error("connection to {host}: {source}")]
+    Connection {
+        /// The other host.
+        host: String,
+        /// What the system said.
+        source: io::Error,
+    },
+}
+
+/// Where the hosts of a run meet.
+#[derive(Debug, Clone)]
+pub(crate) struct Meeting {
+    /// Address of the first host of the topology.
+    pub(crate) address: SocketAddr,
+    /// True on that first host.
+    pub(crate) is_here: bool,
+    /// This host's own address, by which the first host knows it.
+    pub(crate) own: IpAddr,
+    /// Names and addresses of the other hosts this one connects with.
+    pub(crate) expected: Vec<(String, IpAddr)>,
+    /// How long to wait for all of them.
+    pub(crate) timeout: Duration,
+    /// The key they all hold; `None` when the topology says that hops are plain.
+    pub(crate) key: Option<PreSharedKey>,
+}
+
+impl Meeting {
+    /// Who is at `ip` by the topology.
+    fn name_of(&self, ip: IpAddr) -> String {
+        let mut expected = self.expected.iter();
+        let known = expected.find(|(_, address)| *address == ip);
+        known.map_or_else(|| ip.to_string(), |(name, _)| format!("{name} ({ip})"))
+    }
+
+    /// Who is not among `peers`.
+    fn missing(&self, peers: &[Peer]) -> String {
+        let names = self.expected.iter().map(|(name, _)| name.as_str());
+        let missing = names.filter(|name| peers.iter().all(|peer| peer.hello.host != *name));
+        missing.collect::<Vec<_>>().join(", ")
+    }
+}
+
+/// The hosts of a run that met.
+#[derive(Debug)]
+pub(crate) struct Met {
+    /// All that were awaited.
+    pub(crate) peers: Vec<Peer>,
+    /// What else came to the door and got no further, in words.
+    pub(crate) strangers: Option<String>,
+}
+
+/// Brings the hosts of a run together. `waiting` is told whom it waits for, a few times a second;
+/// it returns false to give up.
+///
+/// # Errors
+/// See [`PeerError`].
+pub(crate) fn meet(
+    meeting: &Meeting,
+    hello: &PeerHello,
+    waiting: &mut dyn FnMut(&str, Duration) -> bool,
+) -> Result<Met, PeerError> {
+    let mut patience = Patience {
+        meeting,
+        waiting,
+        began: Instant::now(),
+        told: None,
+        turned_away: None,
+    };
+    if meeting.is_here {
+        host(meeting, hello, &mut patience)
+    } else {
+        let peers = join(meeting, hello, &mut patience)?;
+        Ok(Met {
+            peers,
+            strangers: None,
+        })
+    }
+}
+
+struct Patience<'a> {
+    meeting: &'a Meeting,
+    waiting: &'a mut dyn FnMut(&str, Duration) -> bool,
+    began: Instant,
+    told: Option<Instant>,
+    /// Whoever came last without this run's key, and what it did.
+    turned_away: Option<(String, &'static str)>,
+}
+
+impl Patience<'_> {
+    /// Remembers one that was turned away. It ends no waiting: whoever takes a host's address could
+    /// end a run with it, and the right one may still come.
+    fn note(&mut self, meeting: &Meeting, ip: IpAddr, why: &'static str) {
+        self.turned_away = Some((meeting.name_of(ip), why));
+    }
+
+    /// Waits a moment for `missing`, or says why not. True a few times a second.
+    fn wait(&mut self, missing: &str) -> Result<bool, PeerError> {
+        let waited = self.began.elapsed();
+        if waited > self.meeting.timeout {
+            if let Some((host, reason)) = self.turned_away.take() {
+                let reason = format!("it {reason}");
+                return Err(PeerError::Key { host, reason });
+            }
+            return Err(PeerError::Absent {
+                missing: missing.to_owned(),
+                waited_s: waited.as_secs(),
+                address: self.meeting.address,
+            });
+        }
+        let is_time = self.told.is_none_or(|told| told.elapsed() >= TELL_PERIOD);
+        if is_time {
+            self.told = Some(Instant::now());
+            let who = match &self.turned_away {
+                Some((host, why)) => format!("{missing}; {host} {why}"),
+                None => missing.to_owned(),
+            };
+            if !(self.waiting)(&who, waited) {
+                return Err(PeerError::Interrupted {
+                    missing: missing.to_owned(),
+                });
+            }
+        }
+        thread::sleep(Duration::from_millis(20));
+        Ok(is_time)
+    }
+}
+
+fn host(
+    meeting: &Meeting,
+    hello: &PeerHello,
+    patience: &mut Patience<'_>,
+) -> Result<Met, PeerError> {
+    let address = meeting.address;
+    let listen = |source| PeerError::Listen { address, source };
+    let admission = Admission {
+        own: hello.host.clone(),
+        expected: meeting.expected.clone(),
+        key: meeting.key.clone(),
+    };
+    let mut door = Door::open(address, admission).map_err(listen)?;
+    let mut peers: Vec<Peer> = Vec::new();
+    loop {
+        door.admit_waiting().map_err(listen)?;
+        while let Some(arrived) = door.look() {
+            match arrived {
+                Arrived::Peer(ip, arrived) => {
+                    let (ends, theirs) = *arrived;
+                    if let Some(peer) = welcome(ends, (ip, theirs), meeting, hello)? {
+                        // One that gave up and came again: its first connection is a dead one.
+                        peers.retain(|known| known.hello.host != peer.hello.host);
+                        peers.push(peer);
+                    }
+                }
+                Arrived::TurnedAway(ip, why) => patience.note(meeting, ip, why),
+                Arrived::Keyed(ip) => {
+                    return Err(PeerError::Key {
+                        host: meeting.name_of(ip),
+                        reason: "it came with a key and this topology says [security] hops = \
+                                 \"plain\"; use the same file on both"
+                            .to_owned(),
+                    });
+                }
+                Arrived::Nobody => {}
+            }
+        }
+        if peers.len() == meeting.expected.len() {
+            let strangers = door.counts().words();
+            return Ok(Met { peers, strangers });
+        }
+        // Whatever came: strangers must not keep this host from its deadline and its signals.
+        let missing = meeting.missing(&peers);
+        if patience.wait(&missing)? {
+            // Those that are here must not take the waiting for an absence.
+            for peer in &mut peers {
+                peer.say(&PeerMessage::Alive);
+            }
+        }
+    }
+}
+
+/// Greets one that said who it is; `None` when it is nobody of this run, or not at its own address.
+fn welcome(
+    mut ends: ControlEnds,
+    (ip, theirs): (IpAddr, PeerHello),
+    meeting: &Meeting,
+    hello: &PeerHello,
+) -> Result<Option<Peer>, PeerError> {
+    let mut expected = meeting.expected.iter();
+    if !expected.any(|(name, from)| *name == theirs.host && *from == ip) {
+        let text = format!("host {} is not awaited here at {ip}", theirs.host);
+        let _left = say(&mut ends, &PeerMessage::Refused(text)).is_err();
+        return Ok(None);
+    }
+    let reason = misfit(hello, &theirs);
+    let connection = |source| PeerError::Connection {
+        host: theirs.host.clone(),
+        source,
+    };
+    if let Some(reason) = reason {
+        say(&mut ends, &PeerMessage::Refused(reason.clone())).map_err(connection)?;
+        return Err(PeerError::Mismatch {
+            host: theirs.host,
+            reason,
+        });
+    }
+    // One that is gone again by now comes back.
+    if say(&mut ends, &PeerMessage::Hello(hello.clone())).is_err() {
+        return Ok(None);
+    }
+    Peer::new(ends, theirs.clone())
+        .map(Some)
+        .map_err(connection)
+}
+
+fn join(
+    meeting: &Meeting,
+    hello: &PeerHello,
+    patience: &mut Patience<'_>,
+) -> Result<Vec<Peer>, PeerError> {
+    let first = meeting.expected.first();
+    let name = first.map_or("the first host", |(name, _)| name).to_owned();
+    loop {
+        let Ok(stream) = connect(meeting)? else {
+            patience.wait(&name)?;
+            continue;
+        };
+        match greet(stream, (hello, &name), meeting.key.as_ref()) {
+            Ok((ends, PeerMessage::Hello(theirs))) => {
+                if let Some(reason) = misfit(hello, &theirs) {
+                    return Err(PeerError::Mismatch {
+                        host: theirs.host,
+                        reason,
+                    });
+                }
+                let connection = |source| PeerError::Connection { host: name, source };
+                return Ok(vec![Peer::new(ends, theirs).map_err(connection)?]);
+            }
+            Ok((_, PeerMessage::Refused(reason))) if reason == KEY_NEEDED => {
+                return Err(PeerError::Key {
+                    host: name,
+                    reason: "it speaks with holders of its key only, and this topology says \
+                             [security] hops = \"plain\"; use the same file on both"
+                        .to_owned(),
+                });
+            }
+            Ok((_, PeerMessage::Refused(reason))) => {
+                return Err(PeerError::Mismatch { host: name, reason });
+            }
+            Err(GreetingError::Refused(why)) => {
+                let reason = why.words().to_owned();
+                return Err(PeerError::Key { host: name, reason });
+            }
+            // Somebody else's service, or a peer that is just going away.
+            Ok(_) | Err(GreetingError::Connection(_)) => {
+                patience.wait(&name)?;
+            }
+        }
+    }
+}
+
+/// What the first host answers to this one's name.
+fn greet(
+    stream: TcpStream,
+    (hello, other): (&PeerHello, &str),
+    key: Option<&PreSharedKey>,
+) -> Result<(ControlEnds, PeerMessage), GreetingError> {
+    let mut ends = knock(stream, (&hello.host, other), key)?;
+    say(&mut ends, &PeerMessage::Hello(hello.clone()))?;
+    let answer = read_hello(&mut ends)?;
+    Ok((ends, answer))
+}
+
+/// One attempt to reach the first host, from this host's own address: the kernel would choose the
+/// sender's address by the route, and the first host turns strangers away.
+fn connect(meeting: &Meeting) -> Result<io::Result<TcpStream>, PeerError> {
+    let own = meeting.own;
+    let prepare = || {
+        let domain = Domain::for_address(meeting.address);
+        let socket = Socket::new(domain, Type::STREAM, None)?;
+        socket.bind(&SocketAddr::new(own, 0).into())?;
+        Ok(socket)
+    };
+    let socket = prepare().map_err(|source| PeerError::Own { own, source })?;
+    let connected = socket.connect_timeout(&meeting.address.into(), RETRY_PERIOD);
+    Ok(connected.map(|()| socket.into()))
+}
+
+/// Why two hosts cannot share a run.
+fn misfit(ours: &PeerHello, theirs: &PeerHello) -> Option<String> {
+    let (our_name, their_name) = (&ours.host, &theirs.host);
+    if ours.version != theirs.version {
+        return Some(format!(
+            "version {} on {our_name}, {} on {their_name}; install the same on both",
+            ours.version, theirs.version
+        ));
+    }
+    if ours.topology_hash != theirs.topology_hash {
+        return Some(format!(
+            "topology {:016x} on {our_name}, {:016x} on {their_name}; use the same file and the \
+             same --set on both (--check prints what a file comes to)",
+            ours.topology_hash, theirs.topology_hash
+        ));
+    }
+    (ours.domain == theirs.domain).then(|| {
+        format!(
+            "{} and {} share one shared-memory domain, so messages would bypass the network; \
+             give each host its own /dev/shm and run folder",
+            ours.host, theirs.host
+        )
+    })
+}
+
+#[cfg(test)]
+#[path = "meet_tests.rs"]
+mod tests;

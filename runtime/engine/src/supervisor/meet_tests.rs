@@ -1,0 +1,189 @@
+//! Two ends of a meeting on loopback: who meets, and who is told why not.
+
+use super::*;
+use crate::supervisor::frame::Frame;
+use crate::supervisor::peer::PeerEvent;
+use std::net::{Ipv4Addr, TcpListener};
+
+fn hello(host: &str, hash: u64, domain: u8) -> PeerHello {
+    PeerHello {
+        version: "1".to_owned(),
+        topology_hash: hash,
+        host: host.to_owned(),
+        clock_id: 1,
+        domain: [domain; 16],
+        has_fast_aes: true,
+    }
+}
+
+fn pair(left: &PeerHello, right: &PeerHello) -> [Result<Vec<Peer>, PeerError>; 2] {
+    pair_with((left, None), (right, None))
+}
+
+type End<'a> = (&'a PeerHello, Option<PreSharedKey>);
+
+fn pair_with(
+    (left, left_key): End<'_>,
+    (right, right_key): End<'_>,
+) -> [Result<Vec<Peer>, PeerError>; 2] {
+    let probe = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
+    let address = probe.local_addr().unwrap();
+    drop(probe);
+    let meeting = |is_here, other: &PeerHello, key| Meeting {
+        address,
+        is_here,
+        own: address.ip(),
+        expected: vec![(other.host.clone(), address.ip())],
+        timeout: Duration::from_secs(2),
+        key,
+    };
+    let there = meeting(false, left, right_key);
+    let here = meeting(true, right, left_key);
+    let right = right.clone();
+    let joining = thread::spawn(move || meet(&there, &right, &mut |_, _| true));
+    let hosting = meet(&here, left, &mut |_, _| true);
+    [hosting, joining.join().unwrap()].map(|end| end.map(|met| met.peers))
+}
+
+#[test]
+fn two_hosts_meet_and_talk() {
+    let [left, right] = pair(&hello("a", 1, 1), &hello("b", 1, 2));
+    let (mut left, mut right) = (left.unwrap(), right.unwrap());
+    assert_eq!(left[0].hello.host, "b");
+    left[0].say(&PeerMessage::Ready);
+    let event = right[0].receive(Duration::from_secs(5));
+    assert!(matches!(
+        event,
+        Some(PeerEvent::Frame(Frame::Message(PeerMessage::Ready)))
+    ));
+    drop(left);
+    let event = right[0].receive(Duration::from_secs(5));
+    assert!(matches!(event, Some(PeerEvent::Closed(_))));
+}
+
+fn key(name: &str) -> PreSharedKey {
+    let file = format!("hil-meet-{name}-{}.key", std::process::id());
+    let path = std::env::temp_dir().join(file);
+    let key = PreSharedKey::create(&path).unwrap();
+    std::fs::remove_file(path).unwrap();
+    key
+}
+
+#[test]
+fn with_one_key_two_hosts_meet_and_with_two_or_one_alone_both_say_why() {
+    let (a, b) = (hello("a", 1, 1), hello("b", 1, 2));
+    let (one, other) = (key("one"), key("other"));
+    let [left, right] = pair_with((&a, Some(one.clone())), (&b, Some(one.clone())));
+    let (mut left, mut right) = (left.unwrap(), right.unwrap());
+    left[0].say(&PeerMessage::Ready);
+    let event = right[0].receive(Duration::from_secs(5));
+    assert!(matches!(
+        event,
+        Some(PeerEvent::Frame(Frame::Message(PeerMessage::Ready)))
+    ));
+    for (ours, theirs, word) in [
+        (Some(one.clone()), Some(other), "another key"),
+        (Some(one.clone()), None, "key"),
+        (None, Some(one), "plain"),
+    ] {
+        for outcome in pair_with((&a, ours.clone()), (&b, theirs.clone())) {
+            let error = outcome.map(|_| ()).unwrap_err();
+            assert!(matches!(error, PeerError::Key { .. }), "{error}");
+            assert!(error.to_string().contains(word), "{error}");
+        }
+    }
+}
+
+#[test]
+fn another_topology_is_refused_on_both_hosts() {
+    let [left, right] = pair(&hello("a", 1, 1), &hello("b", 2, 2));
+    for outcome in [left, right] {
+        let error = outcome.map(|_| ()).unwrap_err().to_string();
+        assert!(error.contains("topology"), "{error}");
+    }
+}
+
+#[test]
+fn another_version_is_refused_on_both_hosts_with_both_versions() {
+    let mut newer = hello("b", 1, 2);
+    newer.version = "2".to_owned();
+    for outcome in pair(&hello("a", 1, 1), &newer) {
+        let error = outcome.map(|_| ()).unwrap_err().to_string();
+        assert!(
+            error.contains("1 on a") && error.contains("2 on b"),
+            "{error}"
+        );
+    }
+}
+
+#[test]
+fn one_domain_at_both_ends_is_refused() {
+    let [left, _] = pair(&hello("a", 1, 7), &hello("b", 1, 7));
+    assert!(
+        left.map(|_| ())
+            .unwrap_err()
+            .to_string()
+            .contains("bypass the network")
+    );
+}
+
+#[test]
+fn nobody_there_is_said_with_the_name_and_the_address() {
+    let meeting = Meeting {
+        address: SocketAddr::from((Ipv4Addr::LOCALHOST, 1)),
+        is_here: false,
+        own: Ipv4Addr::LOCALHOST.into(),
+        expected: vec![("robot-pc".to_owned(), Ipv4Addr::LOCALHOST.into())],
+        timeout: Duration::from_millis(1),
+        key: None,
+    };
+    let error = meet(&meeting, &hello("a", 1, 1), &mut |_, _| true)
+        .map(|_| ())
+        .unwrap_err();
+    assert!(
+        error.to_string().starts_with("robot-pc did not appear"),
+        "{error}"
+    );
+}
+
+#[test]
+fn connections_that_say_nothing_keep_a_host_neither_from_its_deadline_nor_from_its_signals() {
+    let probe = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
+    let address = probe.local_addr().unwrap();
+    drop(probe);
+    let meeting = Meeting {
+        address,
+        is_here: true,
+        own: address.ip(),
+        expected: vec![("b".to_owned(), address.ip())],
+        timeout: Duration::from_secs(1),
+        key: Some(key("knocked")),
+    };
+    let is_over = std::sync::atomic::AtomicBool::new(false);
+    let (mut told_count, mut tried_count) = (0, 0);
+    let outcome = thread::scope(|scope| {
+        let knocking = scope.spawn(|| {
+            let mut open = std::collections::VecDeque::new();
+            while !is_over.load(std::sync::atomic::Ordering::Acquire) {
+                open.extend(TcpStream::connect_timeout(&address, RETRY_PERIOD));
+                tried_count += 1;
+                if open.len() > 100 {
+                    open.pop_front();
+                }
+            }
+        });
+        let outcome = meet(&meeting, &hello("a", 1, 1), &mut |_, _| {
+            told_count += 1;
+            true
+        });
+        is_over.store(true, std::sync::atomic::Ordering::Release);
+        knocking.join().unwrap();
+        outcome
+    });
+    let error = outcome.map(|_| ()).unwrap_err();
+    assert!(matches!(error, PeerError::Absent { .. }), "{error}");
+    assert!(
+        told_count > 1 && tried_count > 1,
+        "{told_count} {tried_count}"
+    );
+}

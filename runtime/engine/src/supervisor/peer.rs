@@ -1,0 +1,176 @@
+//! One connected peer: another host's supervisor at the other end of a TCP connection. How hosts
+//! find each other is in `meet.rs`.
+
+use std::io::{self, BufReader, BufWriter, Read, Write};
+use std::net::{Shutdown, TcpStream};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use super::frame::{Frame, PeerHello, PeerMessage, read_frame, write_message};
+use crate::security::{SecureReader, SecureWriter, TimedStream};
+
+/// Frames that may wait between the reader thread and the supervisor.
+const INBOX_FRAMES: usize = 256;
+
+/// Something a peer said, or that it left.
+#[derive(Debug)]
+pub(crate) enum PeerEvent {
+    /// A frame.
+    Frame(Frame),
+    /// The connection ended, and why.
+    Closed(String),
+}
+
+/// The receiving half of a connection.
+#[derive(Debug)]
+pub(super) enum ControlReader {
+    Plain(BufReader<TimedStream>),
+    Secured(Box<SecureReader>),
+}
+
+impl ControlReader {
+    /// From now on a read waits for as long as it takes.
+    fn wait_for_ever(&mut self) -> io::Result<()> {
+        match self {
+            Self::Plain(reader) => reader.get_mut().wait_for_ever(),
+            Self::Secured(reader) => reader.wait_for_ever(),
+        }
+    }
+}
+
+impl Read for ControlReader {
+    fn read(&mut self, out: &mut [u8]) -> io::Result<usize> {
+        match self {
+            Self::Plain(reader) => reader.read(out),
+            Self::Secured(reader) => reader.read(out),
+        }
+    }
+}
+
+/// The sending half of a connection.
+#[derive(Debug)]
+pub(super) enum ControlWriter {
+    Plain(BufWriter<TcpStream>),
+    Secured(SecureWriter),
+}
+
+impl ControlWriter {
+    fn stream(&self) -> &TcpStream {
+        match self {
+            Self::Plain(writer) => writer.get_ref(),
+            Self::Secured(writer) => writer.stream(),
+        }
+    }
+}
+
+impl Write for ControlWriter {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        match self {
+            Self::Plain(writer) => writer.write(bytes),
+            Self::Secured(writer) => writer.write(bytes),
+        }
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        match self {
+            Self::Plain(writer) => writer.flush(),
+            Self::Secured(writer) => writer.flush(),
+        }
+    }
+}
+
+/// Both halves.
+pub(super) type ControlEnds = (ControlReader, ControlWriter);
+
+/// One connected peer.
+#[derive(Debug)]
+pub(crate) struct Peer {
+    /// What it said of itself.
+    pub(crate) hello: PeerHello,
+    writer: ControlWriter,
+    inbox: Receiver<PeerEvent>,
+    heard: Instant,
+    is_open: bool,
+    /// It said that its components have stopped; what it says next belongs to the exchange of
+    /// records and must not be read before.
+    pub(crate) is_quiet: bool,
+}
+
+impl Peer {
+    /// Listens to the connection in a thread of its own.
+    pub(super) fn new((mut input, writer): ControlEnds, hello: PeerHello) -> io::Result<Self> {
+        input.wait_for_ever()?;
+        let (sender, inbox) = sync_channel(INBOX_FRAMES);
+        thread::Builder::new()
+            .name(format!("peer {}", hello.host))
+            .spawn(move || forward(input, &sender))?;
+        Ok(Self {
+            hello,
+            writer,
+            inbox,
+            heard: Instant::now(),
+            is_open: true,
+            is_quiet: false,
+        })
+    }
+
+    /// Says `message`; a peer that is gone is noticed by [`Peer::receive`].
+    pub(crate) fn say(&mut self, message: &PeerMessage) {
+        self.is_open = self.is_open && write_message(&mut self.writer, message).is_ok();
+    }
+
+    /// The next thing the peer said, waiting up to `timeout`.
+    pub(crate) fn receive(&mut self, timeout: Duration) -> Option<PeerEvent> {
+        match self.inbox.recv_timeout(timeout) {
+            Ok(event) => {
+                self.heard = Instant::now();
+                Some(event)
+            }
+            Err(RecvTimeoutError::Timeout) => None,
+            Err(RecvTimeoutError::Disconnected) => {
+                Some(PeerEvent::Closed("connection closed".to_owned()))
+            }
+        }
+    }
+
+    /// How long nothing has been heard.
+    pub(crate) fn silence(&self) -> Duration {
+        self.heard.elapsed()
+    }
+
+    /// Records are larger than greetings: a write may take up to `limit`.
+    pub(crate) fn allow_writes_to_take(&mut self, limit: Duration) -> io::Result<()> {
+        self.writer.stream().set_write_timeout(Some(limit))
+    }
+
+    /// The sending half by itself, so that a thread can send while another receives.
+    pub(crate) fn halves(
+        &mut self,
+    ) -> (&mut (impl Write + Send + use<>), &mut Receiver<PeerEvent>) {
+        (&mut self.writer, &mut self.inbox)
+    }
+}
+
+impl Drop for Peer {
+    /// Ends the connection both ways, so that the reader thread and the other end notice.
+    fn drop(&mut self) {
+        let _already_closed = self.writer.stream().shutdown(Shutdown::Both).is_err();
+    }
+}
+
+fn forward(mut input: ControlReader, out: &SyncSender<PeerEvent>) {
+    loop {
+        let event = match read_frame(&mut input) {
+            Ok(frame) => PeerEvent::Frame(frame),
+            Err(error) if error.kind() == io::ErrorKind::UnexpectedEof => {
+                PeerEvent::Closed("it closed the connection".to_owned())
+            }
+            Err(error) => PeerEvent::Closed(error.to_string()),
+        };
+        let is_last = matches!(event, PeerEvent::Closed(_));
+        if out.send(event).is_err() || is_last {
+            return;
+        }
+    }
+}

@@ -1,0 +1,423 @@
+//! From a checked topology to what this supervisor starts: domains, channels, processes. It
+//! starts nothing itself.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use hil_arm::egm::messages::Side as ArmSide;
+use hil_arm::egm::parameters::{ControllerSettings, EgmParameters};
+use hil_core::message::{FNV_OFFSET, fnv1a};
+use hil_link::condition::order_channel;
+use nix::unistd::{AccessFlags, access};
+
+use super::clock_path;
+use hil_platform::domain_address::domain_base_candidates;
+use hil_platform::realtime::{RealtimeRequest, SchedulingPolicy};
+use hil_platform::wait::WaitMode;
+use hil_rundir::announcement;
+use hil_rundir::event::ProcessKind;
+use hil_rundir::face_launch::{ArmLaunch, FaceSettings};
+use hil_rundir::launch::{DirectionLaunch, Side, SocketLaunch, Transport};
+use hil_rundir::live_run::Source;
+use hil_topology::emulation::EmulationLaunch;
+use hil_topology::gateway_name;
+use hil_topology::{
+    CardChannel, Channel, Crossing, EgmFace, Execution, FaceKind, Host, OnExit, Process,
+    ProcessCard, Program, Scheduling, Topology, Via, Wait, command_channel, feedback_channel,
+};
+
+/// Everything one supervisor is responsible for.
+#[derive(Debug)]
+pub(crate) struct Plan {
+    /// One per host that runs here.
+    pub(crate) hosts: Vec<HostPlan>,
+    /// Clock paths first, whose exchanges are to lie on both sides of every message; then gateways
+    /// and faces, which must be ready before components publish.
+    pub(crate) processes: Vec<ProcessPlan>,
+}
+
+/// A host that runs here.
+#[derive(Debug)]
+pub(crate) struct HostPlan {
+    pub(crate) name: String,
+    /// Channels in shared memory with an end on this host.
+    pub(crate) channels: Vec<Channel>,
+    /// Channels for orders to the directions of emulated links that are emulated here.
+    pub(crate) orders: BTreeSet<String>,
+    /// Names of those whose messages no process here records: who wants to see them looks into
+    /// the shared memory of this host.
+    pub(crate) observed: BTreeSet<String>,
+}
+
+/// A process to start here.
+#[derive(Debug)]
+pub(crate) struct ProcessPlan {
+    pub(crate) name: String,
+    pub(crate) host: String,
+    pub(crate) task: ProcessTask,
+    pub(crate) realtime: RealtimeRequest,
+    pub(crate) wait: WaitMode,
+    pub(crate) on_exit: OnExit,
+}
+
+/// What it executes.
+#[derive(Debug)]
+pub(crate) enum ProcessTask {
+    /// A role of the case, in this binary.
+    Component(ProcessCard),
+    /// The gateway of one link, in this binary.
+    Gateway(Vec<DirectionLaunch>),
+    /// One end of a clock path: a gateway that carries no messages.
+    ClockPath {
+        /// One.
+        directions: Vec<DirectionLaunch>,
+        /// How long the run may wait for the other end.
+        ready_within: Duration,
+    },
+    /// What speaks with a foreign program, in this binary.
+    Face(FaceSettings),
+    /// The user's own program.
+    Foreign {
+        card: ProcessCard,
+        command: Vec<String>,
+        environment: BTreeMap<String, String>,
+    },
+}
+
+impl ProcessPlan {
+    /// True for what makes messages, or hears them.
+    pub(crate) fn is_component(&self) -> bool {
+        !self.is_carrier() && !self.is_clock_path()
+    }
+
+    /// True for what exchanges clocks and nothing else.
+    pub(crate) fn is_clock_path(&self) -> bool {
+        matches!(self.task, ProcessTask::ClockPath { .. })
+    }
+
+    /// True for what has datagrams of ours on the network.
+    pub(crate) fn is_gateway(&self) -> bool {
+        matches!(self.task, ProcessTask::Gateway(_)) || self.is_clock_path()
+    }
+
+    /// True for what carries messages instead of making them: a gateway, or a face.
+    pub(crate) fn is_carrier(&self) -> bool {
+        matches!(self.task, ProcessTask::Gateway(_) | ProcessTask::Face(_))
+    }
+
+    /// What it is.
+    pub(crate) fn kind(&self) -> ProcessKind {
+        match &self.task {
+            ProcessTask::Component(_) => ProcessKind::Component,
+            ProcessTask::Gateway(_) => ProcessKind::Gateway,
+            ProcessTask::ClockPath { .. } => ProcessKind::ClockPath,
+            ProcessTask::Face(_) => ProcessKind::Adapter,
+            ProcessTask::Foreign { .. } => ProcessKind::OwnProgram,
+        }
+    }
+
+    /// The role of the case that it plays, or that a foreign program plays through it.
+    pub(crate) fn role(&self) -> Option<String> {
+        match &self.task {
+            ProcessTask::Component(card) | ProcessTask::Foreign { card, .. } => card.role.clone(),
+            ProcessTask::Face(face) => Some(face.role.clone()),
+            ProcessTask::Gateway(_) | ProcessTask::ClockPath { .. } => None,
+        }
+    }
+}
+
+/// What to run on `hosts`, all of them on this PC.
+pub(crate) fn plan(topology: &Topology, hosts: &[&Host]) -> Plan {
+    let is_here = |name: &str| hosts.iter().any(|host| host.name == name);
+    let host_plans = hosts.iter().map(|host| {
+        let channels = topology.channels().iter().filter(|channel| {
+            // What is only recorded needs no memory to share.
+            let ends = channel.to.iter().chain([&channel.from]);
+            !channel.is_recorded_only()
+                && ends
+                    .filter_map(|name| topology.process(name))
+                    .any(|process| process.host == host.name)
+        });
+        let observed = topology.channels().iter().filter(|channel| {
+            let source = announcement::source(topology, channel, &is_here);
+            matches!(source, Some(Source::SharedMemory { host: at, .. }) if at == host.name)
+        });
+        HostPlan {
+            name: host.name.clone(),
+            observed: observed.map(|channel| channel.name.clone()).collect(),
+            channels: channels.cloned().collect(),
+            orders: order_channels(topology, host),
+        }
+    });
+    let clock_paths = hosts.iter().flat_map(|host| clock_path::on(topology, host));
+    let gateways = hosts.iter().flat_map(|host| gateways_on(topology, host));
+    let processes = topology
+        .processes()
+        .iter()
+        .filter(|process| is_here(&process.host))
+        .map(|process| component(topology, process));
+    let carriers = clock_paths.chain(gateways);
+    let mut processes: Vec<ProcessPlan> = carriers.chain(processes).collect();
+    processes.sort_by_key(|process| (!process.is_clock_path(), process.is_component()));
+    Plan {
+        hosts: host_plans.collect(),
+        processes,
+    }
+}
+
+/// The channels for orders to what is emulated on `host`: it receives.
+fn order_channels(topology: &Topology, host: &Host) -> BTreeSet<String> {
+    let seed = topology.run().seed;
+    topology
+        .crossings()
+        .filter(|crossing| crossing.to_host.name == host.name)
+        .filter_map(|crossing| EmulationLaunch::of(&crossing, seed))
+        .map(|emulation| order_channel(&emulation.link, emulation.way))
+        .collect()
+}
+
+fn component(topology: &Topology, process: &Process) -> ProcessPlan {
+    let card = topology
+        .process_card(&process.name)
+        .expect("the process is of this topology");
+    let task = match &process.program {
+        Program::BuiltIn { .. } => ProcessTask::Component(card),
+        Program::Command {
+            command,
+            environment,
+            ..
+        } => ProcessTask::Foreign {
+            card,
+            command: command.clone(),
+            environment: environment.clone(),
+        },
+        Program::Egm { role, face } => {
+            let host = topology.host(&process.host);
+            let interface = host.and_then(|host| host.interface.clone());
+            ProcessTask::Face(face_settings(role, face, (&card, process), interface))
+        }
+    };
+    ProcessPlan {
+        name: process.name.clone(),
+        host: process.host.clone(),
+        task,
+        realtime: realtime(&process.execution, 0),
+        wait: wait_mode(process.execution.wait),
+        on_exit: process.on_exit,
+    }
+}
+
+fn face_settings(
+    role: &str,
+    face: &EgmFace,
+    (card, process): (&ProcessCard, &Process),
+    interface: Option<String>,
+) -> FaceSettings {
+    let mut arms = Vec::new();
+    for side in ArmSide::BOTH {
+        let Some(address) = face.address(side) else {
+            continue;
+        };
+        let (input, output) = match face.kind {
+            FaceKind::Robot => (feedback_channel(side), command_channel(side)),
+            FaceKind::Sensor => (command_channel(side), feedback_channel(side)),
+        };
+        let named = |channels: &[CardChannel], name: &str| {
+            channels
+                .iter()
+                .find(|channel| channel.name == name)
+                .cloned()
+        };
+        // A channel whose other role nobody plays is not there; the topology saw to the rest.
+        let (Some(input), Some(output)) =
+            (named(&card.inputs, input), named(&card.outputs, output))
+        else {
+            continue;
+        };
+        arms.push(ArmLaunch {
+            arm: side,
+            address,
+            input,
+            output,
+            realtime: realtime(&process.execution, arms.len()),
+        });
+    }
+    let (cycle, delay_cycles) = robot_cycle(card);
+    let is_used = |channel: &&CardChannel| arms.iter().any(|arm| arm.input == **channel);
+    FaceSettings {
+        role: role.to_owned(),
+        kind: face.kind,
+        axes: face.axes,
+        robotware: face.robotware,
+        cycle_ns: nanoseconds(cycle),
+        planned_lead_ns: nanoseconds(cycle) * delay_cycles,
+        send: face.send,
+        timestamps: face.timestamps,
+        dscp: face.dscp,
+        interface,
+        spare: card
+            .inputs
+            .iter()
+            .filter(|one| !is_used(one))
+            .cloned()
+            .collect(),
+        arms,
+    }
+}
+
+/// The robot's cycle, and by how many of them its measured joints lag the planned ones: what the
+/// case's `egm` table says, or its default.
+fn robot_cycle(card: &ProcessCard) -> (Duration, u64) {
+    let table = card.parameters.get("egm").cloned();
+    let parameters: EgmParameters = table
+        .and_then(|egm| egm.try_into().ok())
+        .unwrap_or_default();
+    let settings = parameters.settings();
+    let settings = settings.unwrap_or_else(|_checked| ControllerSettings::of(parameters.preset));
+    (settings.cycle, settings.control_delay_cycles as u64)
+}
+
+fn nanoseconds(duration: Duration) -> u64 {
+    u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX)
+}
+
+fn gateways_on(topology: &Topology, host: &Host) -> Vec<ProcessPlan> {
+    let mut plans = Vec::new();
+    for link in topology.links() {
+        let Some(hop) = link.hop() else { continue };
+        let mut directions = Vec::new();
+        for crossing in topology
+            .crossings()
+            .filter(|crossing| crossing.link.name == link.name)
+        {
+            for side in [Side::Egress, Side::Ingress] {
+                let here = match side {
+                    Side::Egress => crossing.from_host,
+                    Side::Ingress => crossing.to_host,
+                };
+                if here.name == host.name {
+                    let index = directions.len();
+                    directions.push(direction(&crossing, side, index, topology.run().seed));
+                }
+            }
+        }
+        if !directions.is_empty() {
+            plans.push(ProcessPlan {
+                name: gateway_name(&link.name, &host.name),
+                host: host.name.clone(),
+                task: ProcessTask::Gateway(directions),
+                realtime: RealtimeRequest::default(),
+                wait: wait_mode(hop.gateway.execution.wait),
+                on_exit: hop.gateway.on_exit,
+            });
+        }
+    }
+    plans
+}
+
+fn direction(crossing: &Crossing<'_>, side: Side, index: usize, seed: u64) -> DirectionLaunch {
+    let Crossing {
+        channel,
+        hop,
+        ports,
+        ..
+    } = crossing;
+    let sender = SocketAddr::new(crossing.from_host.gateway_address(), ports.sender);
+    let receiver = SocketAddr::new(crossing.to_host.gateway_address(), ports.receiver);
+    let (local, peer, here) = match side {
+        Side::Egress => (sender, receiver, crossing.from_host),
+        Side::Ingress => (receiver, sender, crossing.to_host),
+    };
+    DirectionLaunch {
+        channel: channel.name.clone(),
+        channel_id: channel.channel_id,
+        message: channel.message.name.clone(),
+        size_bytes: channel.message.size_bytes,
+        alignment_bytes: channel.message.alignment_bytes,
+        depth: channel.depth,
+        side,
+        local,
+        peer,
+        socket: SocketLaunch {
+            interface: here.interface.clone(),
+            dscp: hop.dscp,
+            priority: hop.socket_priority,
+            send_buffer_bytes: hop.send_buffer_bytes,
+            receive_buffer_bytes: hop.receive_buffer_bytes,
+            transport: match crossing.link.via {
+                Via::Tcp(_) => Transport::Tcp,
+                Via::SharedMemory | Via::Udp(_) | Via::Emulated(..) => Transport::Udp,
+            },
+            path_mtu_bytes: hop.path_mtu_bytes,
+            timestamps: hop.timestamps,
+        },
+        wait: wait_mode(hop.gateway.execution.wait),
+        realtime: realtime(&hop.gateway.execution, index),
+        emulation: EmulationLaunch::of(crossing, seed).filter(|_| side == Side::Ingress),
+        is_clock_path: false,
+    }
+}
+
+/// The request for thread number `index` of something that runs as `execution` says: its CPUs
+/// are dealt out in turn.
+fn realtime(execution: &Execution, index: usize) -> RealtimeRequest {
+    let cpu = (!execution.cpus.is_empty())
+        .then(|| usize::from(execution.cpus[index % execution.cpus.len()]));
+    RealtimeRequest {
+        cpu,
+        policy: match execution.scheduling {
+            Scheduling::Other => SchedulingPolicy::Other,
+            Scheduling::Fifo { priority } => SchedulingPolicy::Fifo { priority },
+        },
+        lock_memory: execution.locks_memory,
+        timer_slack: Some(execution.timer_slack),
+    }
+}
+
+fn wait_mode(wait: Wait) -> WaitMode {
+    match wait {
+        Wait::Block => WaitMode::Block,
+        Wait::Hybrid => WaitMode::Hybrid,
+        Wait::Spin => WaitMode::Spin,
+    }
+}
+
+/// Where the shared-memory domain of `host` lies: short, because a socket path below it must
+/// stay under 108 bytes. `run` is the whole path of the run folder: runs that record into
+/// different folders may bear one name.
+pub(crate) fn domain_root(base: Option<&PathBuf>, run: &str, host: &str) -> PathBuf {
+    let run = fnv1a(FNV_OFFSET, run.as_bytes());
+    let hash = fnv1a(fnv1a(run, &[0]), host.as_bytes());
+    domain_base(base).join(format!("{:012x}", hash & 0xffff_ffff_ffff))
+}
+
+/// Folder of all domains: `base`, or the default.
+pub(crate) fn domain_base(base: Option<&PathBuf>) -> PathBuf {
+    base.cloned().unwrap_or_else(default_domain_base)
+}
+
+/// The first candidate that this user may use; the last one is the user's own.
+fn default_domain_base() -> PathBuf {
+    let is_usable = |folder: &PathBuf| {
+        std::fs::create_dir_all(folder).is_ok() && access(folder, AccessFlags::W_OK).is_ok()
+    };
+    let mut candidates = domain_base_candidates();
+    let last = candidates.pop().unwrap_or_default();
+    candidates.into_iter().find(is_usable).unwrap_or(last)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn runs_of_one_name_in_different_folders_have_different_domains() {
+        let base = PathBuf::from("/run/hil");
+        let root = |run, host| domain_root(Some(&base), run, host);
+        assert_ne!(root("/a/run-1", "x"), root("/b/run-1", "x"));
+        assert_ne!(root("/a/run-1", "x"), root("/a/run-1", "y"));
+        assert_eq!(root("/a/run-1", "x"), root("/a/run-1", "x"));
+    }
+}

@@ -1,0 +1,501 @@
+//! One run from beginning to end. Each step is short; what a step does is in its own file.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::thread;
+use std::time::{Duration, Instant as WallInstant, SystemTime};
+
+use hil_core::time::Instant;
+use hil_net::clock_pair::ClockPair;
+
+use super::crew::{self, Crew, Verdict};
+use super::domains::Domains;
+use super::elsewhere::{Elsewhere, greeting, own_ticks};
+use super::exchange::exchange;
+use super::frame::{Frame, PeerMessage};
+use super::gathering::{gather, read_key};
+use super::outcome::meaning;
+use super::outcome::{Heard, RunError, RunOptions};
+use super::peer::{Peer, PeerEvent};
+use super::plan::{ProcessPlan, plan};
+use super::teller::Teller;
+use hil_nic::card_clock::CardWatch;
+use hil_platform::clock::MonotonicClock;
+use hil_platform::clock_discipline::HostDiscipline;
+use hil_platform::console::Console;
+use hil_platform::host_facts::HostFacts;
+use hil_platform::signals::Signals;
+use hil_rundir::announcement::Announcement;
+use hil_rundir::event::{Event, HostStory, ProcessStory, disciplines};
+use hil_rundir::manifest;
+use hil_rundir::manifest::ManifestContent;
+use hil_rundir::protection::RunSecurity;
+use hil_rundir::run_folder::{RunFolder, utc_text};
+use hil_rundir::run_result::{Outcome, RunResult};
+use hil_rundir::status::Phase;
+use hil_shm::clock_id;
+use hil_topology::emulation::EmulationLaunch;
+use hil_topology::emulation_room::check_emulation;
+use hil_topology::{Host, Topology};
+
+/// Reads of the two clocks of which the narrowest counts.
+const CLOCK_READS: u32 = 5;
+/// How often the supervisor looks after everything.
+const WATCH_PERIOD: Duration = Duration::from_millis(5);
+/// How often the memory of dead processes is freed: short against the second in which a
+/// restarted process is to be back.
+const CLEANUP_PERIOD: Duration = Duration::from_millis(100);
+const ALIVE_PERIOD: Duration = Duration::from_millis(500);
+/// How long components and gateways may take to end in order.
+const STOP_PATIENCE: Duration = Duration::from_secs(3);
+/// How long the other hosts wait for the first host's word that the time is up.
+const END_GRACE: Duration = Duration::from_secs(3);
+/// Time for what is still under way when the components have stopped.
+const DRAIN: Duration = Duration::from_millis(200);
+
+/// Runs `topology` here.
+///
+/// # Errors
+/// When the run did not come about. Once it has begun, every end is an [`Outcome`].
+pub fn run(
+    topology: &Topology,
+    options: &RunOptions,
+    signals: &Signals,
+    console: &mut Console,
+) -> Result<RunResult, RunError> {
+    let hosts: Vec<&Host> = topology
+        .hosts()
+        .iter()
+        .filter(|host| options.hosts.contains(&host.name))
+        .collect();
+    let key = read_key(topology, &hosts)?;
+    let plan = plan(topology, &hosts);
+    crew::find_programs(&plan.processes)?;
+    check_emulation(topology).map_err(RunError::Emulation)?;
+    let folder = make_folder(topology, &hosts)?;
+    let facts = HostFacts::gather();
+    let discipline = HostDiscipline::gather().ok();
+    let unwritable = |source| RunError::Folder {
+        folder: folder.root().to_owned(),
+        source,
+    };
+    let content = ManifestContent {
+        topology,
+        topology_file: &options.topology_file,
+        hosts: &options.hosts,
+        command_line: &options.command_line,
+        layouts: &options.layouts,
+        facts: &facts,
+        realtime_minus_monotonic_ns: ClockPair::read(CLOCK_READS).ok().map(|pair| pair.offset_ns),
+    };
+    manifest::write(&content, &folder).map_err(unwritable)?;
+    let run = folder.root().to_string_lossy();
+    let domains = Domains::create(&plan.hosts, options.domain_root.as_ref(), &run)?;
+    console.say(&format!("run folder {}", folder.root().display()));
+    let meant = (topology, key.as_ref());
+    let gathered = gather(meant, &hosts, &domains, (signals, console))?;
+    let peers = gathered.peers;
+    let here = clock_id()?;
+    let crew = Crew::new(plan.processes, domains.addresses(), &folder, gathered.seal)?;
+    let announcement = Announcement::make(
+        topology,
+        &folder,
+        domains.addresses(),
+        crew.names(),
+        clocks_known(topology, &hosts, &peers, here),
+    );
+    let announcement = announcement.map_err(unwritable)?;
+    // Before the gateways: they find out by sending what the cards deliver.
+    let cards = CardWatch::start(topology, &hosts, &folder.records());
+    let teller = Teller::new(folder.root());
+    let mut session = Session {
+        topology,
+        announcement,
+        cards,
+        is_first_host: is_here(&topology.hosts()[0], &hosts),
+        has_one_clock: peers.iter().all(|peer| peer.hello.clock_id == here),
+        crew,
+        domains,
+        peers,
+        signals,
+        console,
+        discipline,
+        security: gathered.security,
+        cleaned: WallInstant::now(),
+        greeted: WallInstant::now(),
+        teller,
+        elsewhere: Elsewhere::new(topology, &hosts),
+    };
+    let begun = session.begin(topology.run().start_timeout);
+    let start = MonotonicClock::now();
+    let started = utc_text(SystemTime::now());
+    let outcome = match begun {
+        Err(outcome) => outcome,
+        Ok(()) => session.watch(start, topology.run().duration),
+    };
+    let span = (start, MonotonicClock::now());
+    session.stop(&outcome);
+    Ok(session.conclude(folder, outcome, span, (started, facts)))
+}
+
+/// The longest delay of each trace that a link of `topology` replays, by channel: known since before
+/// the run began.
+fn trace_delays(topology: &Topology) -> BTreeMap<String, Duration> {
+    let seed = topology.run().seed;
+    let delays = topology.crossings().filter_map(|crossing| {
+        let trace = EmulationLaunch::of(&crossing, seed)?.trace?;
+        Some((crossing.channel.name.clone(), trace.delay_max().ok()?))
+    });
+    delays.collect()
+}
+
+pub(super) fn is_here(host: &Host, hosts: &[&Host]) -> bool {
+    hosts.iter().any(|here| here.name == host.name)
+}
+
+/// Whether all hosts read one clock, where this host has met them all.
+fn clocks_known(topology: &Topology, hosts: &[&Host], peers: &[Peer], here: u64) -> Option<bool> {
+    let has_met_all = peers.len() + hosts.len() == topology.hosts().len();
+    has_met_all.then(|| peers.iter().all(|peer| peer.hello.clock_id == here))
+}
+
+fn make_folder(topology: &Topology, hosts: &[&Host]) -> Result<RunFolder, RunError> {
+    let parent = PathBuf::from(&topology.run().record_folder);
+    let suffix = (hosts.len() < topology.hosts().len()).then(|| hosts[0].name.as_str());
+    RunFolder::create(&parent, topology.name(), suffix).map_err(|source| RunError::Folder {
+        folder: parent,
+        source,
+    })
+}
+
+struct Session<'a> {
+    topology: &'a Topology,
+    // Before the domains: its files lie beside theirs.
+    announcement: Announcement,
+    cards: CardWatch,
+    is_first_host: bool,
+    /// All hosts of the run read one clock.
+    has_one_clock: bool,
+    // Before the domains: no process may be left when its shared memory goes.
+    crew: Crew,
+    domains: Domains,
+    peers: Vec<Peer>,
+    signals: &'a Signals,
+    console: &'a mut Console,
+    /// Who steered the system clock before the run.
+    discipline: Option<HostDiscipline>,
+    /// How the hops are protected, in words.
+    security: Option<RunSecurity>,
+    cleaned: WallInstant,
+    greeted: WallInstant,
+    teller: Teller,
+    elsewhere: Elsewhere,
+}
+
+impl Session<'_> {
+    /// Starts the processes and waits until those of all hosts are ready, then begins
+    /// everywhere.
+    ///
+    /// # Errors
+    /// Why the run ended before it began.
+    fn begin(&mut self, timeout: Duration) -> Result<(), Outcome> {
+        self.crew
+            .start()
+            .map_err(|error| Outcome::Failed(error.to_string()))?;
+        let deadline = WallInstant::now() + timeout;
+        let mut ready_peers = 0;
+        let mut has_told = false;
+        loop {
+            match self.look_after() {
+                None => {}
+                // Whoever ends before the run has begun has failed, however politely.
+                Some(Outcome::EndedEarly(text)) => return Err(Outcome::Failed(text)),
+                Some(outcome) => return Err(outcome),
+            }
+            self.tell(Phase::Starting);
+            let is_ready = self.crew.is_ready();
+            if is_ready && !has_told && !self.is_first_host {
+                self.say_to_all(&PeerMessage::Ready);
+                has_told = true;
+            }
+            let mut may_begin = self.peers.is_empty();
+            for event in self.hear() {
+                match event {
+                    Heard::Said(PeerMessage::Ready) => ready_peers += 1,
+                    Heard::Said(PeerMessage::Start { has_one_clock }) => {
+                        self.has_one_clock = has_one_clock;
+                        may_begin = true;
+                    }
+                    other => {
+                        if let Some(outcome) = other.outcome() {
+                            return Err(outcome);
+                        }
+                    }
+                }
+            }
+            if self.is_first_host && ready_peers == self.peers.len() {
+                may_begin = true;
+            }
+            if is_ready && may_begin {
+                let has_one_clock = self.has_one_clock;
+                self.say_to_all(&PeerMessage::Start { has_one_clock });
+                // Only observers read it; they do without.
+                let _is_said = self.announcement.say_clock(has_one_clock).is_ok();
+                self.crew.begin();
+                return Ok(());
+            }
+            if WallInstant::now() > deadline {
+                let missing = self.crew.missing();
+                let text = if missing.is_empty() {
+                    "the other host".to_owned()
+                } else {
+                    missing
+                };
+                let limit_s = timeout.as_secs();
+                let text = format!("{text} was not ready within {limit_s} s");
+                return Err(Outcome::Failed(text));
+            }
+            thread::sleep(WATCH_PERIOD);
+        }
+    }
+
+    /// Watches until the time is up or something ends the run.
+    fn watch(&mut self, start: Instant, duration: Duration) -> Outcome {
+        loop {
+            if let Some(outcome) = self.look_after() {
+                return outcome;
+            }
+            if let Some(outcome) = self.hear().into_iter().find_map(Heard::outcome) {
+                return outcome;
+            }
+            let elapsed = MonotonicClock::now().saturating_duration_since(start);
+            // The others end when the first host says so; on their own only if it does not.
+            let grace = if self.is_first_host {
+                Duration::ZERO
+            } else {
+                END_GRACE
+            };
+            if elapsed >= duration + grace {
+                return Outcome::Completed;
+            }
+            self.tell(Phase::Running);
+            thread::sleep(WATCH_PERIOD);
+        }
+    }
+
+    /// What must be done all the time, and the first reason to end.
+    fn look_after(&mut self) -> Option<Outcome> {
+        if self.cleaned.elapsed() >= CLEANUP_PERIOD {
+            self.domains.free_what_the_dead_held();
+            self.cleaned = WallInstant::now();
+        }
+        if self.greeted.elapsed() >= ALIVE_PERIOD {
+            self.greet();
+            self.greeted = WallInstant::now();
+        }
+        if let Some(signal) = self.signals.received() {
+            self.console.say(&format!(
+                "{signal}: ending the run and writing its report; a second one drops the report"
+            ));
+            return Some(Outcome::Interrupted(signal.to_owned()));
+        }
+        let known = self.crew.events().len();
+        let verdict = self.crew.watch();
+        for event in &self.crew.events()[known..] {
+            self.console
+                .warn(&format!("{}: {}", event.process, event.kind));
+        }
+        match verdict {
+            Verdict::GoesOn => None,
+            Verdict::Finished(text) => Some(Outcome::EndedEarly(text)),
+            Verdict::Failed(text) => Some(Outcome::Failed(text)),
+        }
+    }
+
+    /// Tells each peer that this host lives, and what is known of ticks.
+    fn greet(&mut self) {
+        let ticks = own_ticks(&self.own_hosts(), self.crew.members());
+        let told = self.elsewhere.told(ticks, MonotonicClock::now());
+        for peer in &mut self.peers {
+            let is_heard = peer.silence() <= 2 * ALIVE_PERIOD;
+            let greeting = greeting(&told, &peer.hello.host, is_heard);
+            peer.say(&greeting);
+        }
+    }
+
+    /// Names of the hosts that run here.
+    fn own_hosts(&self) -> Vec<String> {
+        self.domains.addresses().into_keys().collect()
+    }
+
+    fn say_to_all(&mut self, message: &PeerMessage) {
+        for peer in &mut self.peers {
+            peer.say(message);
+        }
+    }
+
+    fn hear(&mut self) -> Vec<Heard> {
+        let mut heard = Vec::new();
+        for peer in &mut self.peers {
+            let host = peer.hello.host.clone();
+            while !peer.is_quiet
+                && let Some(event) = peer.receive(Duration::ZERO)
+            {
+                match event {
+                    PeerEvent::Frame(Frame::Message(PeerMessage::Quiet)) => peer.is_quiet = true,
+                    PeerEvent::Frame(Frame::Message(PeerMessage::Ticks(said))) => {
+                        self.elsewhere.hear(&host, said, MonotonicClock::now());
+                    }
+                    PeerEvent::Frame(Frame::Message(message)) => {
+                        heard.push(Heard::Said(message).named(&host));
+                    }
+                    PeerEvent::Frame(Frame::Chunk(_)) => {}
+                    PeerEvent::Closed(reason) => {
+                        heard.push(Heard::Lost(format!("{host}: {reason}")));
+                        break;
+                    }
+                }
+            }
+            let silence_max = self.topology.run().peer_timeout;
+            if !peer.is_quiet && peer.silence() > silence_max {
+                let silence_s = silence_max.as_secs();
+                heard.push(Heard::Lost(format!(
+                    "{host} has been silent for {silence_s} s"
+                )));
+            }
+        }
+        heard
+    }
+
+    fn tell(&mut self, phase: Phase) {
+        let run = (self.topology, &mut self.crew, &self.elsewhere);
+        self.teller.tell(phase, run, self.console);
+    }
+
+    /// Ends components everywhere first, then gateways, so that what is under way arrives, and last
+    /// the clock paths, so that an exchange follows the last message.
+    fn stop(&mut self, outcome: &Outcome) {
+        self.tell(Phase::Ending);
+        let reason = outcome.text();
+        let meaning = meaning(outcome);
+        self.say_to_all(&PeerMessage::Stop { reason, meaning });
+        self.crew.stop(STOP_PATIENCE, ProcessPlan::is_component);
+        self.say_to_all(&PeerMessage::Quiet);
+        if !matches!(outcome, Outcome::PeerLost(_)) {
+            self.wait_for_quiet();
+        }
+        thread::sleep(DRAIN);
+        self.crew.stop(STOP_PATIENCE, ProcessPlan::is_carrier);
+        self.crew.stop(STOP_PATIENCE, ProcessPlan::is_clock_path);
+    }
+
+    fn wait_for_quiet(&mut self) {
+        let deadline = WallInstant::now() + STOP_PATIENCE + DRAIN;
+        while self.peers.iter().any(|peer| !peer.is_quiet) && WallInstant::now() < deadline {
+            if self
+                .hear()
+                .iter()
+                .any(|heard| matches!(heard, Heard::Lost(_)))
+            {
+                return;
+            }
+            thread::sleep(WATCH_PERIOD);
+        }
+    }
+
+    /// Exchanges records with the other hosts and takes everything down.
+    fn conclude(
+        mut self,
+        folder: RunFolder,
+        outcome: Outcome,
+        span: (Instant, Instant),
+        (started, facts): (String, HostFacts),
+    ) -> RunResult {
+        let own_hosts = self.own_hosts();
+        let watch = core::mem::take(&mut self.cards);
+        let (cards, mut problems) = watch.finish();
+        let own = HostStory {
+            hosts: own_hosts.clone(),
+            span,
+            events: self.crew.events().to_vec(),
+            discipline: self.discipline(),
+            processes: self.stories(),
+            cards,
+        };
+        let mut stories = vec![own.clone()];
+        if let Outcome::PeerLost(who) = &outcome {
+            problems.push(format!("no records of the host that vanished ({who})"));
+        } else if !self.peers.is_empty() {
+            self.console
+                .progress("exchanging records with the other host");
+            let records = folder.records();
+            let first = self.is_first_host;
+            let received = exchange(&mut self.peers, first, (&records, &own));
+            problems.extend(received.problems);
+            stories.extend(received.stories);
+        }
+        let has_one_clock = self.has_one_clock;
+        drop(self.crew);
+        drop(self.teller);
+        self.announcement.withdraw();
+        self.domains.let_observers_leave();
+        let left = self.domains.remove();
+        problems.extend(
+            left.into_iter()
+                .map(|what| format!("left in shared memory: {what}")),
+        );
+        let spans = stories.iter().flat_map(|story| {
+            let span = story.span;
+            story.hosts.iter().map(move |host| (host.clone(), span))
+        });
+        let spans: BTreeMap<String, (Instant, Instant)> = spans.collect();
+        let disciplines = disciplines(&stories);
+        let mut events: Vec<Event> = stories.iter().flat_map(|one| one.events.clone()).collect();
+        // Each host counts from its own start of the run.
+        let since_start =
+            |event: &Event| spans.get(&event.host).map(|span| event.at.ns_since(span.0));
+        events.sort_by_key(since_start);
+        let cards = stories.iter().flat_map(|one| one.cards.clone()).collect();
+        let processes = stories.into_iter().flat_map(|one| one.processes).collect();
+        RunResult {
+            folder,
+            outcome,
+            spans,
+            started,
+            events,
+            processes,
+            cards,
+            has_one_clock,
+            security: self.security,
+            disciplines,
+            own_hosts,
+            problems,
+            facts,
+            trace_delays: trace_delays(self.topology),
+        }
+    }
+
+    /// Who steered this host's system clock, before and after.
+    fn discipline(&self) -> Option<HostDiscipline> {
+        let before = self.discipline.clone()?;
+        Some(before.worse(HostDiscipline::gather().ok()?))
+    }
+
+    fn stories(&self) -> Vec<ProcessStory> {
+        let members = self.crew.members().iter();
+        members
+            .map(|member| ProcessStory {
+                name: member.plan.name.clone(),
+                host: member.plan.host.clone(),
+                kind: member.plan.kind(),
+                role: member.plan.role(),
+                end: member
+                    .end
+                    .clone()
+                    .unwrap_or_else(|| "never started".to_owned()),
+                restart_count: member.restart_count,
+                report: member.report.clone(),
+            })
+            .collect()
+    }
+}

@@ -1,0 +1,134 @@
+//! Asks the daemons that steer the clock, by their own tools and for a bounded time. What the
+//! answers mean is read elsewhere.
+
+use std::io::Read;
+use std::process::{Command, Stdio};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use super::{ChronyTracking, NtpVariables, PtpStatus};
+use crate::host_facts::HostFiles;
+
+/// How long a tool may take; a daemon on this host answers within milliseconds, but `ntpq` of ntpsec
+/// alone takes a third of a second to start on a busy machine.
+const PATIENCE: Duration = Duration::from_secs(1);
+const LOOK_PERIOD: Duration = Duration::from_millis(5);
+/// Longer than any answer.
+const ANSWER_BYTES_MAX: u64 = 1 << 16;
+
+/// Which of the field's daemons run on this host.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[allow(
+    clippy::struct_excessive_bools,
+    reason = "a set of daemons, any of which may run beside any other"
+)]
+pub(super) struct Daemons {
+    pub(super) chronyd: bool,
+    pub(super) ptp4l: bool,
+    pub(super) phc2sys: bool,
+    pub(super) ntpd: bool,
+    pub(super) timesyncd: bool,
+}
+
+impl Daemons {
+    /// By the names of processes, as the kernel cuts them: at fifteen bytes.
+    fn named(names: impl Iterator<Item = String>) -> Self {
+        let mut found = Self::default();
+        for name in names {
+            match name.trim() {
+                "chronyd" => found.chronyd = true,
+                "ptp4l" => found.ptp4l = true,
+                "phc2sys" => found.phc2sys = true,
+                "ntpd" => found.ntpd = true,
+                "systemd-timesyn" => found.timesyncd = true,
+                _ => {}
+            }
+        }
+        found
+    }
+}
+
+/// Among the processes this one can see.
+pub(super) fn running_daemons() -> Daemons {
+    let names = HostFiles::of_this_host().process_names();
+    Daemons::named(names.available().into_iter().flatten().cloned())
+}
+
+pub(super) fn chrony() -> Result<ChronyTracking, String> {
+    ChronyTracking::parse(&answer("chronyc", &["-n", "-c", "tracking"])?)
+}
+
+pub(super) fn ptp() -> Result<PtpStatus, String> {
+    let questions = ["GET TIME_STATUS_NP", "GET CURRENT_DATA_SET"];
+    let [status, current] = questions;
+    PtpStatus::parse(&answer("pmc", &["-u", "-b", "0", status, current])?)
+}
+
+pub(super) fn ntp() -> Result<NtpVariables, String> {
+    NtpVariables::parse(&answer("ntpq", &["-n", "-c", "rv", "127.0.0.1"])?)
+}
+
+/// What `program` prints, if it ends in time and without a fault.
+fn answer(program: &str, arguments: &[&str]) -> Result<String, String> {
+    let mut child = Command::new(program)
+        .args(arguments)
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::null())
+        .spawn()
+        .map_err(|error| format!("{program}: {error}"))?;
+    let deadline = Instant::now() + PATIENCE;
+    let ended = loop {
+        match child.try_wait() {
+            Ok(Some(status)) => break Ok(status),
+            Ok(None) if Instant::now() < deadline => thread::sleep(LOOK_PERIOD),
+            Ok(None) => {
+                let limit_ms = PATIENCE.as_millis();
+                break Err(format!("{program} did not answer within {limit_ms} ms"));
+            }
+            Err(error) => break Err(format!("{program}: {error}")),
+        }
+    };
+    if ended.is_err() {
+        // It may end by itself in between; waiting afterwards is what matters.
+        let _already_ended = child.kill().is_err();
+        let _already_waited_for = child.wait().is_err();
+    }
+    let status = ended?;
+    if !status.success() {
+        return Err(format!("{program} ended with {status}"));
+    }
+    let mut text = String::new();
+    let output = child.stdout.take();
+    let output = output.ok_or_else(|| format!("{program} printed nothing"))?;
+    output
+        .take(ANSWER_BYTES_MAX)
+        .read_to_string(&mut text)
+        .map_err(|error| format!("{program}: {error}"))?;
+    Ok(text)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn daemons_are_known_by_the_names_that_the_kernel_cuts() {
+        let names = ["systemd-timesyn\n", "bash\n", "phc2sys\n", "ntpdate\n"];
+        let found = Daemons::named(names.into_iter().map(str::to_owned));
+        let expected = Daemons {
+            phc2sys: true,
+            timesyncd: true,
+            ..Daemons::default()
+        };
+        assert_eq!(found, expected);
+    }
+
+    #[test]
+    fn a_tool_that_is_not_there_fails_or_hangs_is_an_error_and_one_that_answers_is_read() {
+        assert!(answer("no-such-tool-here", &[]).is_err());
+        assert!(answer("false", &[]).unwrap_err().contains("ended with"));
+        assert!(answer("sleep", &["60"]).unwrap_err().contains("within"));
+        assert_eq!(answer("echo", &["C0A80A01,1"]).unwrap(), "C0A80A01,1\n");
+    }
+}

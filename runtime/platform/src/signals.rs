@@ -1,0 +1,88 @@
+//! Ctrl-C and SIGTERM as a flag the supervisor looks at. A second one ends the program at once.
+
+use std::io;
+use std::process;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::thread;
+use std::time::Duration;
+
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+use signal_hook::flag;
+
+use crate::console::Console;
+
+/// Exit code of an interrupted run.
+pub const EXIT_INTERRUPTED: i32 = 130;
+/// Exit code when a second signal ended the program before its report.
+const EXIT_DROPPED: i32 = 131;
+
+/// How often a watch looks for a signal.
+const LOOK_PERIOD: Duration = Duration::from_millis(20);
+
+/// While it lives a signal ends the program; see [`Signals::end_program_unless_over`].
+#[derive(Debug)]
+pub struct EndWatch {
+    is_over: Arc<AtomicBool>,
+}
+
+impl Drop for EndWatch {
+    fn drop(&mut self) {
+        self.is_over.store(true, Ordering::Release);
+    }
+}
+
+/// The user's wish to end.
+#[derive(Debug, Clone)]
+pub struct Signals {
+    which: Arc<AtomicUsize>,
+}
+
+impl Signals {
+    /// Takes over SIGINT, SIGTERM and SIGHUP.
+    ///
+    /// # Errors
+    /// When the system refuses a handler.
+    ///
+    /// # Panics
+    /// Never: signal numbers are positive.
+    pub fn install() -> io::Result<Self> {
+        let which = Arc::new(AtomicUsize::new(0));
+        for signal in [SIGINT, SIGTERM, SIGHUP] {
+            let armed = Arc::new(AtomicBool::new(false));
+            // Order matters: the first signal finds the flag unset and then sets it.
+            flag::register_conditional_shutdown(signal, EXIT_DROPPED, Arc::clone(&armed))?;
+            flag::register(signal, armed)?;
+            let number = usize::try_from(signal).expect("signal numbers are positive");
+            flag::register_usize(signal, Arc::clone(&which), number)?;
+        }
+        Ok(Self { which })
+    }
+
+    /// From now until the watch is dropped a signal ends the program with
+    /// [`EXIT_INTERRUPTED`] and a line with the reason: for work that does not look at signals.
+    pub fn end_program_unless_over(&self, why: &'static str) -> EndWatch {
+        let is_over = Arc::new(AtomicBool::new(false));
+        let (signals, over) = (self.clone(), Arc::clone(&is_over));
+        thread::spawn(move || {
+            while !over.load(Ordering::Acquire) {
+                if let Some(signal) = signals.received() {
+                    Console::new(true).error(&format!("ended by {signal}: {why}"));
+                    process::exit(EXIT_INTERRUPTED);
+                }
+                thread::sleep(LOOK_PERIOD);
+            }
+        });
+        EndWatch { is_over }
+    }
+
+    /// The signal that came, in words.
+    pub fn received(&self) -> Option<&'static str> {
+        match i32::try_from(self.which.load(Ordering::Acquire)) {
+            Ok(SIGINT) => Some("Ctrl-C (SIGINT)"),
+            Ok(SIGTERM) => Some("SIGTERM"),
+            Ok(SIGHUP) => Some("SIGHUP"),
+            _ => None,
+        }
+    }
+}

@@ -1,0 +1,490 @@
+//! A finished run's own account of its wire beside what a probe saw of it: counts, and the time
+//! between the kernel's stamps, message by message. Neither side knows of the other: the run's come
+//! from record files and summary, the probe's from captures.
+
+use core::fmt::Write as _;
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use hil_capture::flow::OwnHeader;
+use hil_capture::join::Joined;
+use hil_capture::observe::{Observation, Stream};
+use hil_core::record::{EgressRecord, IngressRecord, UNAVAILABLE};
+use hil_net::Direction;
+use hil_protocol::wire::Kind;
+use hil_stats::histogram::{Distribution, LatencyHistogram};
+use serde::Serialize;
+
+use super::analyse::{Reading, quantiles};
+use super::point_clocks::WireClocks;
+use hil_platform::progress::Stage;
+use hil_report::summary::{CounterGroup, RunSummary, SummaryError};
+use hil_rundir::launch::Side;
+use hil_rundir::record::{RecordFile, RecordFileError, RecordKind};
+use hil_rundir::run_folder::RunFolder;
+
+/// Why nothing could be compared.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum CompareError {
+    #[error("run folder {path}: {source}")]
+    Folder { path: PathBuf, source: io::Error },
+    #[error(transparent)]
+    Record(#[from] RecordFileError),
+    #[error("{path}: {source}")]
+    Summary { path: PathBuf, source: SummaryError },
+    #[error("{0}: no record of a gateway, so there is no wire to compare")]
+    NoGateway(PathBuf),
+    #[error("{capture}: holds no message of the run {run}: another time, place or flow?")]
+    NothingOfRun { capture: PathBuf, run: String },
+}
+
+/// A count of both sides.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+struct BothCounts {
+    gateway: Option<u64>,
+    probe: u64,
+}
+
+impl BothCounts {
+    fn is_equal(&self) -> bool {
+        self.gateway == Some(self.probe)
+    }
+}
+
+/// One channel in one direction.
+#[derive(Debug, Serialize)]
+struct ChannelComparison {
+    channel: String,
+    /// Every datagram of the sending gateway's socket, and the same leaving its interface.
+    sent: BothCounts,
+    /// Datagrams that the receiving gateway took: its messages, and greetings and requests that it
+    /// answered. What came before it listened or after it left, and farewells, which nobody
+    /// answers, are in neither count.
+    received: BothCounts,
+    /// Datagrams with messages, by the gateways' records.
+    data_sent: BothCounts,
+    data_received: BothCounts,
+    /// Kernel stamp to kernel stamp, by the gateways.
+    gateway_wire: Distribution,
+    /// Tap to tap, by the probe, of the same messages.
+    probe_wire: Distribution,
+    /// Probe's less gateway's, message by message.
+    difference: Distribution,
+    /// Probe's stamp at departure less the gateway's: the tap is ahead of the driver.
+    departure_difference: Distribution,
+    /// Probe's stamp at arrival less the gateway's.
+    arrival_difference: Distribution,
+}
+
+impl ChannelComparison {
+    fn medians_apart_us(&self) -> Option<f64> {
+        let gateway = self.gateway_wire.measured()?.p50_ns;
+        let probe = self.probe_wire.measured()?.p50_ns;
+        Some((probe - gateway).abs() as f64 * 1e-3)
+    }
+
+    fn agrees_within(&self, limit_us: f64) -> bool {
+        let counts = [self.sent, self.received, self.data_sent, self.data_received];
+        counts.iter().all(BothCounts::is_equal)
+            && self
+                .medians_apart_us()
+                .is_some_and(|apart| apart <= limit_us)
+    }
+}
+
+/// The whole comparison.
+#[derive(Debug, Serialize)]
+pub(super) struct Comparison {
+    schema_version: u32,
+    run: String,
+    clocks: WireClocks,
+    channels: Vec<ChannelComparison>,
+}
+
+impl Comparison {
+    pub(super) fn agrees_within(&self, limit_us: f64) -> bool {
+        let channels = &self.channels;
+        !channels.is_empty() && channels.iter().all(|one| one.agrees_within(limit_us))
+    }
+
+    pub(super) fn to_text(&self, limit_us: f64) -> String {
+        let clocks = self.clocks.words();
+        let mut text = format!("{}: gateways and probe; {clocks}\n", self.run);
+        for one in &self.channels {
+            let _infallible = write!(text, "\n{}\n", one.channel);
+            for (what, counts) in [
+                ("sent", one.sent),
+                ("received", one.received),
+                ("messages sent", one.data_sent),
+                ("messages received", one.data_received),
+            ] {
+                let gateway = counts
+                    .gateway
+                    .map_or("unknown".to_owned(), |n| n.to_string());
+                let word = if counts.is_equal() {
+                    "equal"
+                } else {
+                    "DIFFERENT"
+                };
+                let _infallible = writeln!(
+                    text,
+                    "  {what:<18}{gateway:>10} {:>10}  {word}",
+                    counts.probe
+                );
+            }
+            for (what, distribution) in [
+                ("wire, gateways", &one.gateway_wire),
+                ("wire, probe", &one.probe_wire),
+                ("probe - gateways", &one.difference),
+                ("  at departure", &one.departure_difference),
+                ("  at arrival", &one.arrival_difference),
+            ] {
+                let _infallible = writeln!(text, "  {what:<18}{}", quantiles(distribution));
+            }
+            let verdict = match one.medians_apart_us() {
+                Some(apart) if apart <= limit_us => {
+                    format!("  medians {apart:.2} us apart, at most {limit_us} us\n")
+                }
+                Some(apart) => format!("  medians {apart:.2} us apart, MORE than {limit_us} us\n"),
+                None => "  medians unavailable\n".to_owned(),
+            };
+            text.push_str(&verdict);
+        }
+        text
+    }
+}
+
+/// What the gateways recorded of one channel.
+#[derive(Debug, Default)]
+struct GatewaySide {
+    egress: Vec<EgressRecord>,
+    ingress: Vec<IngressRecord>,
+}
+
+/// A message: producer's start and its number there.
+type Message = (u32, u64);
+
+/// Draws up the comparison.
+pub(super) fn compare(
+    run: &Path,
+    captures: &Reading,
+    window_ns: i64,
+    stage: &Stage,
+) -> Result<Comparison, CompareError> {
+    let folder = RunFolder::existing(run);
+    let sides = gateway_sides(&folder, stage)?;
+    stage.tell(None, "joining with the run");
+    if sides.is_empty() {
+        return Err(CompareError::NoGateway(run.to_owned()));
+    }
+    if let Some(capture) = file_without(&sides, captures) {
+        let run = folder.name();
+        return Err(CompareError::NothingOfRun { capture, run });
+    }
+    let summary = summary(&folder)?;
+    let joined = captures.joined(window_ns);
+    let numbers = channel_numbers(&sides, captures);
+    let channels = sides.iter().map(|(name, side)| {
+        let sockets = summary.as_ref().map(|summary| socket_counts(summary, name));
+        let number = numbers.get(name).copied();
+        channel(
+            name,
+            side,
+            sockets.unwrap_or_default(),
+            &Probe {
+                captures,
+                joined: &joined,
+                number,
+            },
+        )
+    });
+    Ok(Comparison {
+        schema_version: 1,
+        run: folder.name(),
+        clocks: WireClocks::of(summary.as_ref()),
+        channels: channels.collect(),
+    })
+}
+
+/// A capture in which no message of the run was seen.
+fn file_without(sides: &BTreeMap<String, GatewaySide>, captures: &Reading) -> Option<PathBuf> {
+    let mut of_run: BTreeSet<Message> = BTreeSet::new();
+    for side in sides.values() {
+        of_run.extend(side.egress.iter().map(|one| (one.epoch, one.sequence)));
+        of_run.extend(side.ingress.iter().map(|one| (one.epoch, one.sequence)));
+    }
+    let is_of_run = |own: OwnHeader| is_data(&own) && of_run.contains(&(own.epoch, own.sequence));
+    let has_some = |index: usize| {
+        let points = captures.observer.seen().iter();
+        let points = points.filter(|(point, _)| point.file_index == index);
+        let mut observations = points.flat_map(|(_, seen)| seen.streams.values().flatten());
+        observations.any(|one| own(one).is_some_and(is_of_run))
+    };
+    let mut files = captures.files.iter().enumerate();
+    let (_, file) = files.find(|(index, _)| !has_some(*index))?;
+    Some(file.path.clone())
+}
+
+fn gateway_sides(
+    folder: &RunFolder,
+    stage: &Stage,
+) -> Result<BTreeMap<String, GatewaySide>, CompareError> {
+    let files = folder
+        .record_files()
+        .map_err(|source| CompareError::Folder {
+            path: folder.records(),
+            source,
+        })?;
+    let all_bytes: u64 = files.iter().map(|(_, bytes)| bytes).sum();
+    let mut read_bytes = 0;
+    let mut sides: BTreeMap<String, GatewaySide> = BTreeMap::new();
+    for (path, bytes) in files {
+        stage.reach(read_bytes as f64 / all_bytes.max(1) as f64);
+        read_bytes += bytes;
+        let file = RecordFile::read(&path)?;
+        let channel = file.header.channel.clone();
+        match file.header.kind {
+            RecordKind::Egress => sides
+                .entry(channel)
+                .or_default()
+                .egress
+                .extend(file.records::<EgressRecord>()),
+            RecordKind::Ingress => sides
+                .entry(channel)
+                .or_default()
+                .ingress
+                .extend(file.records::<IngressRecord>()),
+            _ => {}
+        }
+    }
+    Ok(sides)
+}
+
+fn summary(folder: &RunFolder) -> Result<Option<RunSummary>, CompareError> {
+    let path = folder.summary();
+    if !path.is_file() {
+        return Ok(None);
+    }
+    let failed = |source| CompareError::Folder {
+        path: path.clone(),
+        source,
+    };
+    let text = fs::read_to_string(&path).map_err(failed)?;
+    let summary = RunSummary::from_json(&text);
+    summary
+        .map(Some)
+        .map_err(|source| CompareError::Summary { path, source })
+}
+
+/// Datagrams sent and received by the sockets of a channel, by the run's summary. Farewells received
+/// are left out: whether one is depends on which gateway ends first.
+fn socket_counts(summary: &RunSummary, channel: &str) -> (Option<u64>, Option<u64>) {
+    let of = |side: Side, group: CounterGroup, name: &str| {
+        let channel = summary.channels.iter().find(|one| one.name == channel)?;
+        let ways = channel.directions.iter();
+        let counts = ways
+            .filter(|one| one.direction == side)
+            .filter_map(|one| one.count(group, name));
+        counts.reduce(|a, b| a + b)
+    };
+    let received = of(Side::Ingress, CounterGroup::Socket, "received_count").zip(of(
+        Side::Ingress,
+        CounterGroup::Own,
+        "bye_count",
+    ));
+    (
+        of(Side::Egress, CounterGroup::Socket, "sent_count"),
+        received.and_then(|(all, farewells)| all.checked_sub(farewells)),
+    )
+}
+
+/// The number by which each channel goes on the wire, found by the first message both sides know:
+/// its session, number, and the time it was handed to the kernel.
+fn channel_numbers(
+    sides: &BTreeMap<String, GatewaySide>,
+    captures: &Reading,
+) -> BTreeMap<String, u16> {
+    let mut known: BTreeMap<(u32, u32, u64, i64), &str> = BTreeMap::new();
+    for (name, side) in sides {
+        let records = side.egress.iter();
+        known.extend(records.map(|one| {
+            (
+                (one.session, one.epoch, one.sequence, one.handed_ns),
+                name.as_str(),
+            )
+        }));
+    }
+    let mut numbers = BTreeMap::new();
+    let seen = captures.observer.seen().values();
+    for observation in seen.flat_map(|seen| seen.streams.values().flatten()) {
+        let Some(own) = observation
+            .identity
+            .own
+            .filter(|own| own.kind == Kind::Data)
+        else {
+            continue;
+        };
+        let key = (own.session, own.epoch, own.sequence, own.handed_ns);
+        if let Some(name) = known.get(&key) {
+            numbers.entry((*name).to_owned()).or_insert(own.channel);
+        }
+    }
+    numbers
+}
+
+struct Probe<'a> {
+    captures: &'a Reading,
+    joined: &'a [(Stream, Joined)],
+    /// `None` when no message of the channel was seen.
+    number: Option<u16>,
+}
+
+impl Probe<'_> {
+    /// Headers of the channel's datagrams that went `direction`.
+    fn headers(&self, direction: Direction) -> impl Iterator<Item = OwnHeader> + '_ {
+        let points = self.captures.observer.seen().iter();
+        let points = points.filter(move |(point, _)| point.direction == direction);
+        let streams = points.flat_map(|(_, seen)| &seen.streams);
+        let ours = streams.filter(|(stream, _)| {
+            self.number.is_some() && stream.own.map(|(channel, _)| channel) == self.number
+        });
+        ours.flat_map(|(_, list)| list).filter_map(own)
+    }
+
+    fn count(&self, direction: Direction, wanted: fn(&OwnHeader) -> bool) -> u64 {
+        self.headers(direction).filter(wanted).count() as u64
+    }
+
+    /// Greetings and requests of the channel that were answered where they came in.
+    fn answered_count(&self) -> u64 {
+        let answers: BTreeSet<(u8, u32, u64)> = self
+            .headers(Direction::Outbound)
+            .filter(|own| !is_forward(own))
+            .map(|own| (own.kind as u8, own.session, own.sequence))
+            .collect();
+        let requests = self.headers(Direction::Inbound).filter(|own| {
+            let answer = match own.kind {
+                Kind::Hello => Kind::HelloAck,
+                Kind::SyncRequest => Kind::SyncResponse,
+                _ => return false,
+            };
+            answers.contains(&(answer as u8, own.session, own.sequence))
+        });
+        requests.count() as u64
+    }
+
+    /// Departure of the last piece and arrival of the latest, of each message of the channel.
+    fn wire(&self) -> BTreeMap<Message, (i64, i64)> {
+        let mut wire: BTreeMap<Message, (i64, i64)> = BTreeMap::new();
+        for (stream, joined) in self.joined {
+            if self.number.is_none() || stream.own.map(|(channel, _)| channel) != self.number {
+                continue;
+            }
+            for pair in &joined.pairs {
+                let Some(own) = own(&pair.first).filter(|own| own.kind == Kind::Data) else {
+                    continue;
+                };
+                let both = (pair.first.stamp_ns, pair.second.stamp_ns);
+                let latest = wire.entry((own.epoch, own.sequence)).or_insert(both);
+                *latest = (latest.0.max(both.0), latest.1.max(both.1));
+            }
+        }
+        wire
+    }
+}
+
+fn own(observation: &Observation) -> Option<OwnHeader> {
+    observation.identity.own
+}
+
+/// What the sender of a channel sends; the rest are replies of the receiver.
+fn is_forward(own: &OwnHeader) -> bool {
+    !matches!(own.kind, Kind::SyncResponse | Kind::HelloAck)
+}
+
+fn is_data(own: &OwnHeader) -> bool {
+    own.kind == Kind::Data
+}
+
+/// Departure and arrival of each message by the gateways' kernel stamps.
+fn gateway_wire(side: &GatewaySide) -> BTreeMap<Message, (i64, i64)> {
+    let mut gateway = BTreeMap::new();
+    let departures: BTreeMap<Message, i64> = side
+        .egress
+        .iter()
+        .filter(|one| one.tx_software_ns != UNAVAILABLE)
+        .map(|one| ((one.epoch, one.sequence), one.tx_software_ns))
+        .collect();
+    for one in side
+        .ingress
+        .iter()
+        .filter(|one| one.rx_software_ns != UNAVAILABLE)
+    {
+        let key = (one.epoch, one.sequence);
+        if let Some(departure) = departures.get(&key) {
+            // A duplicate arrives later under the same number; the first one counts.
+            gateway
+                .entry(key)
+                .or_insert((*departure, one.rx_software_ns));
+        }
+    }
+    gateway
+}
+
+fn channel(
+    name: &str,
+    side: &GatewaySide,
+    sockets: (Option<u64>, Option<u64>),
+    probe: &Probe<'_>,
+) -> ChannelComparison {
+    let has_left = |one: &&EgressRecord| one.flags & EgressRecord::REFUSED_BY_KERNEL == 0;
+    let left = side.egress.iter().filter(has_left);
+    let data_sent: u64 = left.map(|one| u64::from(one.fragment_count)).sum();
+    let data_received: u64 = side
+        .ingress
+        .iter()
+        .map(|one| u64::from(one.fragment_count))
+        .sum();
+    let gateway = gateway_wire(side);
+    let mut columns: [LatencyHistogram; 5] = Default::default();
+    for (key, (departure, arrival)) in probe.wire() {
+        if let Some((left_ns, came_ns)) = gateway.get(&key) {
+            let (ours, theirs) = (came_ns - left_ns, arrival - departure);
+            let (ahead, behind) = (departure - left_ns, arrival - came_ns);
+            for (column, value) in
+                columns
+                    .iter_mut()
+                    .zip([ours, theirs, theirs - ours, ahead, behind])
+            {
+                column.record(value);
+            }
+        }
+    }
+    let reason = "no message was stamped by both";
+    ChannelComparison {
+        channel: name.to_owned(),
+        sent: BothCounts {
+            gateway: sockets.0,
+            probe: probe.count(Direction::Outbound, is_forward),
+        },
+        received: BothCounts {
+            gateway: sockets.1,
+            probe: probe.count(Direction::Inbound, is_data) + probe.answered_count(),
+        },
+        data_sent: BothCounts {
+            gateway: Some(data_sent),
+            probe: probe.count(Direction::Outbound, is_data),
+        },
+        data_received: BothCounts {
+            gateway: Some(data_received),
+            probe: probe.count(Direction::Inbound, is_data),
+        },
+        gateway_wire: columns[0].distribution(reason),
+        probe_wire: columns[1].distribution(reason),
+        difference: columns[2].distribution(reason),
+        departure_difference: columns[3].distribution(reason),
+        arrival_difference: columns[4].distribution(reason),
+    }
+}

@@ -1,0 +1,303 @@
+//! The passive probe: looks at the wire in a process of its own and holds its figures against the
+//! gateways'. It takes no part in any run. Packets are understood in [`hil_capture`].
+#![forbid(unsafe_code)]
+
+mod analyse;
+pub mod arguments;
+mod card_tap;
+mod compare;
+mod files;
+mod live;
+mod output;
+mod point_clocks;
+
+use core::fmt::Write as _;
+use std::fs;
+use std::path::Path;
+use std::time::Duration;
+
+use hil_capture::flow::FlowFilter;
+use hil_net::filter::FILTER_COUNT_MAX;
+use hil_net::packet_ring::{RingError, RingStamps};
+
+use self::analyse::{Reading, Report};
+use self::arguments::{LiveArgs, ProbeArgs, ProbeWork, ReadingArgs, Stamps};
+use self::live::{InterfaceResult, LiveError, LiveResult, Request};
+use hil_platform::console::Console;
+use hil_platform::progress::Progress;
+use hil_platform::signals::{EXIT_INTERRUPTED, Signals};
+
+/// Exit codes; the command's help lists them.
+mod exit {
+    pub(crate) const DONE: u8 = 0;
+    pub(crate) const GAPS: u8 = 1;
+    pub(crate) const USAGE: u8 = 2;
+    pub(crate) const NO_INTERFACE: u8 = 69;
+    pub(crate) const INTERNAL: u8 = 70;
+    pub(crate) const HOST_UNFIT: u8 = 78;
+}
+
+/// Does what the command line says and gives the exit code.
+pub fn run(args: &ProbeArgs, console: &mut Console) -> u8 {
+    match &args.work {
+        None => capture(&args.live),
+        Some(ProbeWork::Analyse {
+            file,
+            second,
+            one_clock,
+            reading,
+        }) => {
+            let paths = paths(file, second.as_deref());
+            analyse(&paths, reading, *one_clock, console)
+        }
+        Some(ProbeWork::Compare {
+            run,
+            file,
+            second,
+            limit,
+            reading,
+        }) => {
+            let paths = paths(file, second.as_deref());
+            let Some(captures) = read(&paths, reading, console) else {
+                return exit::USAGE;
+            };
+            for complaint in captures.complaints() {
+                console.warn(&complaint);
+            }
+            let words = "reading records of the run";
+            let compared = Progress::begin().during(console, words, |stage| {
+                compare::compare(run, &captures, window_ns(reading), stage)
+            });
+            match compared {
+                Ok(comparison) => {
+                    console.result(&if reading.json {
+                        json(&comparison)
+                    } else {
+                        comparison.to_text(*limit)
+                    });
+                    if comparison.agrees_within(*limit) && !captures.has_gaps() {
+                        exit::DONE
+                    } else {
+                        exit::GAPS
+                    }
+                }
+                Err(error) => {
+                    console.error(&error.to_string());
+                    exit::USAGE
+                }
+            }
+        }
+    }
+}
+
+fn paths<'a>(file: &'a Path, second: Option<&'a Path>) -> Vec<&'a Path> {
+    core::iter::once(file).chain(second).collect()
+}
+
+fn window_ns(reading: &ReadingArgs) -> i64 {
+    i64::try_from(reading.window.as_nanos()).unwrap_or(i64::MAX)
+}
+
+fn json(value: &impl serde::Serialize) -> String {
+    let text = serde_json::to_string_pretty(value);
+    format!("{}\n", text.expect("figures are numbers and words"))
+}
+
+/// The flows asked for, or our own.
+fn flows(asked: &[FlowFilter]) -> Vec<FlowFilter> {
+    if asked.is_empty() {
+        vec![FlowFilter::hil()]
+    } else {
+        asked.to_vec()
+    }
+}
+
+fn read(paths: &[&Path], reading: &ReadingArgs, console: &mut Console) -> Option<Reading> {
+    let flows = flows(&reading.flow);
+    let sizes = paths.iter().filter_map(|path| fs::metadata(path).ok());
+    let all_bytes: u64 = sizes.map(|one| one.len()).sum();
+    let captures = Progress::begin().during(console, "reading packets", |stage| {
+        let mut read_bytes = 0;
+        Reading::of(paths, &flows, &mut |bytes| {
+            read_bytes += bytes;
+            // A pipe does not tell how much will come.
+            if all_bytes > 0 {
+                stage.reach(read_bytes as f64 / all_bytes as f64);
+            }
+        })
+    });
+    match captures {
+        Ok(captures) => Some(captures),
+        Err(error) => {
+            console.error(&error.to_string());
+            None
+        }
+    }
+}
+
+fn analyse(
+    paths: &[&Path],
+    reading: &ReadingArgs,
+    is_one_clock: bool,
+    console: &mut Console,
+) -> u8 {
+    let Some(captures) = read(paths, reading, console) else {
+        return exit::USAGE;
+    };
+    let report = Progress::begin().during(console, "drawing up the figures", |_| {
+        Report::of(&captures, window_ns(reading), is_one_clock)
+    });
+    let complaints = captures.complaints();
+    for complaint in &complaints {
+        console.warn(complaint);
+    }
+    if report.is_empty() && !complaints.is_empty() {
+        return exit::USAGE;
+    }
+    console.result(&if reading.json {
+        json(&report)
+    } else {
+        report.to_text()
+    });
+    if captures.has_gaps() {
+        exit::GAPS
+    } else {
+        exit::DONE
+    }
+}
+
+fn capture(args: &LiveArgs) -> u8 {
+    let mut console = Console::new(args.quiet);
+    let Some(output) = &args.output else {
+        console.error("no --output FILE given for the capture; try --help");
+        return exit::USAGE;
+    };
+    if args.interface.is_empty() {
+        console.error("no --interface given; `ip link` lists those of this host");
+        return exit::USAGE;
+    }
+    let again = (1..args.interface.len())
+        .map(|index| &args.interface[index])
+        .zip(1..)
+        .find(|(name, index)| args.interface[..*index].contains(name));
+    if let Some((name, _)) = again {
+        console.error(&format!(
+            "--interface {name} is given twice; one tap sees all there is"
+        ));
+        return exit::USAGE;
+    }
+    if args.flow.len() > FILTER_COUNT_MAX {
+        console.error(&format!(
+            "{} flows are more than the {FILTER_COUNT_MAX} one probe follows",
+            args.flow.len()
+        ));
+        return exit::USAGE;
+    }
+    let flows = flows(&args.flow);
+    let needed = flows.iter().map(FlowFilter::snap_bytes).max().unwrap_or(0);
+    let request = Request {
+        interfaces: args.interface.clone(),
+        output: output.clone(),
+        replaces: args.force,
+        duration: args.duration,
+        snap_bytes: args
+            .snap_length
+            .unwrap_or(u32::try_from(needed).unwrap_or(2048)),
+        ring_bytes: usize::from(args.ring) << 20,
+        stamps: match args.stamps {
+            Stamps::Kernel => RingStamps::Kernel,
+            Stamps::Card => RingStamps::Card,
+        },
+        flows,
+    };
+    let signals = match Signals::install() {
+        Ok(signals) => signals,
+        Err(error) => {
+            console.error(&format!("cannot handle signals: {error}"));
+            return exit::INTERNAL;
+        }
+    };
+    match live::capture(&request, &signals, &mut console) {
+        Ok(result) => conclude(&request, &result, &mut console),
+        Err(error) => {
+            console.error(&error.to_string());
+            match error {
+                LiveError::Ring(RingError::Interface { .. }) => exit::NO_INTERFACE,
+                LiveError::Ring(RingError::Size { .. } | RingError::LinkLayer { .. })
+                | LiveError::File { .. }
+                | LiveError::Exists { .. } => exit::USAGE,
+                LiveError::Ring(RingError::Rights { .. }) | LiveError::Card { .. } => {
+                    exit::HOST_UNFIT
+                }
+                LiveError::Ring(RingError::Refused { .. }) | LiveError::Counters { .. } => {
+                    exit::INTERNAL
+                }
+            }
+        }
+    }
+}
+
+/// What came of one interface.
+fn tell(text: &mut String, one: &InterfaceResult) {
+    let _infallible = write!(
+        text,
+        "{}: {} in, {} out, {} dropped by the kernel",
+        one.name, one.inbound_count, one.outbound_count, one.counters.dropped_count
+    );
+    if one.late_stamp_count > 0 {
+        let late = one.late_stamp_count;
+        let _infallible = write!(text, ", {late} stamped by the tap instead of in the stack");
+    }
+    if one.has_failed {
+        text.push_str(", interrupted");
+    }
+    text.push('\n');
+    if let Some(card) = &one.card {
+        let _infallible = writeln!(
+            text,
+            "{}: {} of {} arrivals have the card's stamp, the others the kernel's alone; {} \
+             dropped by the kernel; {}; the card {}",
+            one.name,
+            card.stamped_count,
+            card.stamped_count + card.unstamped_count,
+            card.counters.dropped_count,
+            card.granted,
+            card.restoring
+        );
+    }
+}
+
+fn conclude(request: &Request, result: &LiveResult, console: &mut Console) -> u8 {
+    let mut text = String::new();
+    let mut dropped_count = 0;
+    for one in &result.interfaces {
+        tell(&mut text, one);
+        let of_card = one.card.as_ref();
+        dropped_count += one.counters.dropped_count;
+        dropped_count += of_card.map_or(0, |card| card.counters.dropped_count);
+    }
+    let _infallible = writeln!(
+        text,
+        "{}: {} bytes in {:.1} s{}",
+        request.output.display(),
+        result.file_bytes,
+        result.length.as_secs_f64(),
+        result
+            .ended_by
+            .map(|by| format!(", ended by {by}"))
+            .unwrap_or_default()
+    );
+    console.result(&text);
+    let is_early = |planned: Duration| result.length < planned;
+    if result.interfaces.iter().any(|one| one.has_failed) {
+        console.warn("an interface failed while it was watched: the file has a gap from there on");
+        exit::GAPS
+    } else if dropped_count > 0 {
+        console.warn("packets were dropped: the file has gaps; a larger --ring may help");
+        exit::GAPS
+    } else if result.ended_by.is_some() && request.duration.is_some_and(is_early) {
+        u8::try_from(EXIT_INTERRUPTED).unwrap_or(exit::INTERNAL)
+    } else {
+        exit::DONE
+    }
+}

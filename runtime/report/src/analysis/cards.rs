@@ -1,0 +1,67 @@
+//! Which cards the channels of a run passed, and where their stamps lie on the hosts' clocks.
+
+use std::collections::BTreeMap;
+
+use hil_account::card_clock::CardTimeline;
+
+use super::records::RunRecords;
+use crate::card_figures::{CardSummary, HardwareStamps, Places, channel_stamps};
+use hil_rundir::card_story::CardStory;
+use hil_rundir::run_result::RunResult;
+use hil_topology::{Crossing, Timestamps, Topology, Via};
+
+/// What the cards of the run say; `None` when hardware stamps were not asked for.
+pub(super) fn hardware_stamps(
+    topology: &Topology,
+    result: &RunResult,
+    records: &RunRecords,
+) -> Option<HardwareStamps> {
+    let timelines: BTreeMap<&str, CardTimeline> = result
+        .cards
+        .iter()
+        .filter_map(|card| {
+            let timeline = records.card_timeline(&card.name())?;
+            Some((card.host.as_str(), timeline))
+        })
+        .collect();
+    let cards = result.cards.iter().map(|card| CardSummary {
+        story: card.clone(),
+        clock: timelines
+            .get(card.host.as_str())
+            .and_then(CardTimeline::figures),
+    });
+    let passing = topology.crossings().filter(passes_card);
+    let channels = passing.map(|crossing| {
+        let (egress, ingress) = records.of_gateways(&crossing.channel.name);
+        records.consult((topology, result), crossing.channel, |_, context| {
+            let places = Places {
+                sender: timelines.get(crossing.from_host.name.as_str()),
+                receiver: timelines.get(crossing.to_host.name.as_str()),
+                path: context.path,
+                receiving_card: card_of(result, &crossing.to_host.name),
+            };
+            channel_stamps(&crossing.channel.name, &egress, &ingress, &places)
+        })
+    });
+    let stamps = HardwareStamps {
+        cards: cards.collect(),
+        channels: channels.collect(),
+    };
+    (!stamps.cards.is_empty() || !stamps.channels.is_empty()).then_some(stamps)
+}
+
+fn passes_card(crossing: &Crossing<'_>) -> bool {
+    crossing.hop.timestamps == Timestamps::Hardware && !matches!(crossing.link.via, Via::Tcp(_))
+}
+
+fn card_of<'a>(result: &'a RunResult, host: &str) -> Option<&'a CardStory> {
+    result.cards.iter().find(|card| card.host == host)
+}
+
+/// True when both ends of a channel take their stamps from one clock: the clocks of the hosts are
+/// one, and so is the number of the cards' clock, which a kernel gives once.
+pub(super) fn share_a_clock(result: &RunResult, crossing: &Crossing<'_>) -> bool {
+    let index_of = |host: &str| card_of(result, host).and_then(|card| card.phc_index);
+    let from = index_of(&crossing.from_host.name);
+    result.has_one_clock && from.is_some() && from == index_of(&crossing.to_host.name)
+}

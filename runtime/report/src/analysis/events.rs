@@ -1,0 +1,254 @@
+//! Joins what the robot did with what the network did: looks up the fate of every message that an
+//! event of the score names. Which messages led to an event is the case's to say.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use hil_account::{Happening, MessageFate, MessageStory, Side};
+use hil_core::case_study::{ChannelSpec, MessageRef, Score, ScoreEvent};
+use hil_core::time::{Instant, RemoteInstant};
+
+use super::axis::RunAxis;
+use super::clocks::HostClocks;
+use super::outages::OutageStory;
+use super::records::RunRecords;
+use crate::network::within;
+use crate::score_event::{EventOutage, ExplainedEvent, ExplainedMessage, ScoreEvents};
+use crate::summary::{ChannelSummary, CounterGroup, LinkKind};
+use crate::terminal::duration_s;
+use hil_rundir::run_result::RunResult;
+use hil_topology::{Channel, Topology};
+
+/// The events of `score` with the fates of their messages and the outages before them.
+pub(super) fn explained(
+    score: &Score,
+    run: (&Topology, &RunResult),
+    (records, axis): (&RunRecords, &RunAxis<'_>),
+    channels: &[ChannelSummary],
+    (specs, outages): (&[ChannelSpec], &[OutageStory]),
+) -> ScoreEvents {
+    let mut wanted: BTreeMap<&str, BTreeSet<(u32, u64)>> = BTreeMap::new();
+    for message in score.events.iter().flat_map(|event| &event.messages) {
+        let of_channel = wanted.entry(message.channel).or_default();
+        of_channel.insert((message.epoch, message.sequence));
+    }
+    let (topology, _) = run;
+    let ways = wanted.iter().filter_map(|(name, wanted)| {
+        let channel = topology.channel(name)?;
+        let way = Way {
+            axis,
+            host: topology.process(&channel.from).map(|one| one.host.as_str()),
+            stories: if channel.is_recorded_only() {
+                BTreeMap::new()
+            } else {
+                records.stories(run, channel, wanted)
+            },
+            channel,
+            summary: channels.iter().find(|one| one.name == *name)?,
+        };
+        Some((*name, way))
+    });
+    let ways: BTreeMap<&str, Way<'_>> = ways.collect();
+    let events = score.events.iter();
+    ScoreEvents {
+        events: events
+            .map(|event| ExplainedEvent {
+                outages: outages_before(event, (run, records.clocks()), (specs, outages), &ways),
+                ..explain(event, topology, (axis, &ways))
+            })
+            .collect(),
+        dropped_count: score.events_dropped_count,
+        clocks_differ: axis.is_split(),
+    }
+}
+
+/// Start of the run on the clock of `host`. Hosts begin milliseconds apart; where their clocks are
+/// aligned, one beginning holds for all, lest an effect come before its cause, and a start that does not
+/// convert is unknown. Where they are not, each host counts from its own, and the report says so.
+pub(super) fn start_on(result: &RunResult, host: &str, clocks: &HostClocks) -> Option<Instant> {
+    let own = result.spans.get(host).map(|span| span.0)?;
+    let starts = result.spans.iter().map(|(host, span)| (host, span.0));
+    if clocks.are_aligned(result.spans.keys()) {
+        clocks.earliest_on(host, starts)
+    } else {
+        Some(own)
+    }
+}
+
+fn explain(
+    event: &ScoreEvent,
+    topology: &Topology,
+    (axis, ways): (&RunAxis<'_>, &BTreeMap<&str, Way<'_>>),
+) -> ExplainedEvent {
+    let clock_of = topology.channel(event.clock_of);
+    let process = clock_of.and_then(|channel| topology.process(&channel.from));
+    let messages = event.messages.iter().map(|message| {
+        ways.get(message.channel).map_or_else(
+            || unavailable(message, "the run has no such channel"),
+            |way| way.explain(message),
+        )
+    });
+    ExplainedEvent {
+        at_s: process.and_then(|process| axis.place_s(&process.host, event.at)),
+        clock: process.map_or_else(|| "unknown".to_owned(), |process| process.host.clone()),
+        severity: event.severity,
+        what: event.what.clone(),
+        outages: Vec::new(),
+        network: None,
+        messages: messages.collect(),
+        messages_dropped_count: event.messages_dropped_count,
+    }
+}
+
+/// What the channels that `event` concerns went through when it happened.
+fn outages_before(
+    event: &ScoreEvent,
+    ((topology, _), clocks): ((&Topology, &RunResult), &HostClocks),
+    (specs, stories): (&[ChannelSpec], &[OutageStory]),
+    ways: &BTreeMap<&str, Way<'_>>,
+) -> Vec<EventOutage> {
+    let host_of = |process: &str| topology.process(process).map(|one| &one.host);
+    let teller = topology.channel(event.clock_of);
+    let Some(here) = teller.and_then(|one| host_of(&one.from)) else {
+        return Vec::new();
+    };
+    let before = |spec: &ChannelSpec| {
+        let story = stories.iter().find(|one| one.channel == spec.name)?;
+        let channel = topology.channel(spec.name)?;
+        let is_here = |process: &str| host_of(process) == Some(here);
+        let is_consumers = channel.to.as_deref().is_some_and(is_here);
+        let on_producers_clock = host_of(&channel.from).and_then(|producers| {
+            let remote = RemoteInstant::from_ns(event.at.as_ns());
+            let (at, bound_ns) = clocks.path(here, producers).localise(remote)?;
+            Some((at, Side::Producer, bound_ns))
+        });
+        let lost_published_ns = ways
+            .get(spec.name)
+            .map_or_else(Vec::new, |way| way.lost_published_ns(event));
+        // A time compares only with times of its own clock.
+        let sides = [
+            is_consumers.then_some((event.at, Side::Consumer, 0)),
+            on_producers_clock,
+        ];
+        let mut sides = sides.into_iter().flatten().map(Some).chain([None]);
+        sides.find_map(|side| {
+            let mut found = story.before(&Happening {
+                at: side.map(|(at, side, _)| (at, side)),
+                lost_published_ns: &lost_published_ns,
+            })?;
+            found.put_clock_bound(side.map_or(0, |(.., bound_ns)| bound_ns));
+            Some(found)
+        })
+    };
+    let concerned = event.concerned_channels(specs);
+    let mut outages: Vec<_> = concerned.into_iter().filter_map(before).collect();
+    EventOutage::put_own_channels_first(&mut outages, &event.what);
+    outages
+}
+
+fn unavailable(message: &MessageRef, why: &str) -> ExplainedMessage {
+    ExplainedMessage {
+        channel: message.channel.to_owned(),
+        epoch: message.epoch,
+        sequence: message.sequence,
+        published_at_s: None,
+        fate: None,
+        delay_s: None,
+        delay_bound_s: None,
+        words: format!("unavailable: {why}"),
+    }
+}
+
+/// All that is known of one channel's messages.
+struct Way<'a> {
+    channel: &'a Channel,
+    summary: &'a ChannelSummary,
+    stories: BTreeMap<(u32, u64), MessageStory>,
+    axis: &'a RunAxis<'a>,
+    /// Of its producer.
+    host: Option<&'a str>,
+}
+
+impl Way<'_> {
+    fn explain(&self, message: &MessageRef) -> ExplainedMessage {
+        if self.channel.is_recorded_only() {
+            return unavailable(message, "its channel is only recorded and crosses no link");
+        }
+        let Some(story) = self.stories.get(&(message.epoch, message.sequence)) else {
+            return unavailable(message, "no process left a record of it");
+        };
+        let published = story.published_ns.map(Instant::from_ns);
+        ExplainedMessage {
+            published_at_s: published
+                .zip(self.host)
+                .and_then(|(published, host)| self.axis.place_s(host, published)),
+            fate: Some(story.fate),
+            delay_s: story.delay_ns.map(|ns| ns as f64 * 1e-9),
+            delay_bound_s: story.delay_bound_ns.map(|ns| ns as f64 * 1e-9),
+            words: self.words(story),
+            ..unavailable(message, "")
+        }
+    }
+
+    /// Publications of the messages that `event` names and that were lost on this channel.
+    fn lost_published_ns(&self, event: &ScoreEvent) -> Vec<i64> {
+        let messages = event.messages.iter();
+        let named = messages.filter(|message| message.channel == self.channel.name);
+        let stories =
+            named.filter_map(|message| self.stories.get(&(message.epoch, message.sequence)));
+        let lost = stories.filter(|story| story.fate.is_loss());
+        lost.filter_map(|story| story.published_ns).collect()
+    }
+
+    fn words(&self, story: &MessageStory) -> String {
+        let link = self.channel.link.as_deref().unwrap_or_default();
+        match story.fate {
+            MessageFate::Taken => {
+                let how = match story.delay_ns {
+                    Some(ns) => {
+                        let bound_ns = story.delay_bound_ns.unwrap_or(0);
+                        let bound = within(bound_ns, ns);
+                        format!("delivered after {}{bound}", duration_s(ns as f64 * 1e-9))
+                    }
+                    None => "delivered; delay unavailable: clocks not aligned".to_owned(),
+                };
+                let overtaken = if story.is_overtaken {
+                    ", overtaken by a later message"
+                } else {
+                    ""
+                };
+                format!("{how}{overtaken}")
+            }
+            MessageFate::LostOnWire if self.is_all_loss_emulated() => {
+                format!("lost on link {link}: emulated loss")
+            }
+            MessageFate::LostOnWire => format!("lost on link {link}"),
+            MessageFate::LostInInterruption => self.words_of_interruption(story),
+            MessageFate::InFlight => "still in flight at the end of the run".to_owned(),
+            MessageFate::UnknownPeerRecordsUnavailable => {
+                "unavailable: no records of the other host".to_owned()
+            }
+            fate => fate.label().to_owned(),
+        }
+    }
+
+    fn words_of_interruption(&self, story: &MessageStory) -> String {
+        let account = self.summary.account.as_ref();
+        let interruption = account
+            .zip(story.interruption_index)
+            .and_then(|(account, index)| account.interruptions.get(index));
+        interruption.map_or_else(
+            || story.fate.label().to_owned(),
+            |one| format!("lost while {} was down ({})", one.process, one.cause),
+        )
+    }
+
+    /// True when the link's model counted at least as many losses as the account has: then none
+    /// is left that anything else could have caused.
+    fn is_all_loss_emulated(&self) -> bool {
+        let emulated_count = self.summary.count(CounterGroup::Socket, "link_lost_count");
+        let account = self.summary.account.as_ref();
+        let lost_count = account.map(|account| account.fates.of(MessageFate::LostOnWire));
+        self.summary.link == LinkKind::Emulated
+            && lost_count.is_some_and(|lost_count| lost_count <= emulated_count)
+    }
+}

@@ -1,0 +1,287 @@
+//! From the records of a finished run to its summary: reads the record files, draws up the
+//! account of each channel, and lets the case score what the robot did.
+
+mod axis;
+mod cards;
+mod channel_files;
+mod clock_path;
+mod clocks;
+mod events;
+mod faces;
+pub(crate) mod figures;
+mod interruptions;
+pub(crate) mod link_changes;
+#[cfg(test)]
+mod memory_tests;
+pub(crate) mod message_records;
+pub(crate) mod network;
+pub(crate) mod outages;
+mod radio;
+pub(crate) mod records;
+mod robot_series;
+mod score_clock;
+mod stalls;
+
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use hil_account::MessageFate;
+use hil_core::case_study::Score;
+use hil_core::plot::PlotSeries;
+
+use axis::RunAxis;
+use clocks::HostClocks;
+use figures::{channel_summary, process_summary, realtime_facts, run_event, run_facts};
+use outages::OutageStory;
+use records::RunRecords;
+
+use crate::event_log;
+use crate::summary::{Fact, RunSummary, ScoreMetric, SummaryError};
+use crate::terminal;
+use crate::terminal::Style;
+use crate::trace::capture;
+use hil_rundir::manifest::{Manifest, ManifestTopologyError};
+use hil_rundir::run_folder::RunFolder;
+use hil_rundir::run_result::{RunResult, RunResultError};
+use hil_rundir::series;
+use hil_topology::Topology;
+use hil_topology::registry::{Case, CaseError, Registry};
+
+/// Why no summary could be made.
+#[derive(Debug, thiserror::Error)]
+pub enum AnalysisError {
+    /// The records cannot be read.
+    #[error("records folder {folder}: {source}")]
+    Folder {
+        /// Where they are.
+        folder: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// The case cannot be made.
+    #[error(transparent)]
+    Case(#[from] CaseError),
+    /// The summary cannot be written.
+    #[error(transparent)]
+    Summary(#[from] SummaryError),
+    /// The manifest cannot be read.
+    #[error("{path}: {source}")]
+    Manifest {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        source: io::Error,
+    },
+    /// The manifest does not give back the topology.
+    #[error("{path}: {source}")]
+    Topology {
+        /// The manifest.
+        path: PathBuf,
+        /// Why not.
+        source: ManifestTopologyError,
+    },
+    /// The result of the run cannot be read or written.
+    #[error(transparent)]
+    Result(#[from] RunResultError),
+    /// A file of the report cannot be written.
+    #[error("cannot write {path}: {source}")]
+    Write {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+}
+
+/// The account of a finished run.
+#[derive(Debug)]
+pub struct Concluded {
+    /// Every figure of the report.
+    pub summary: RunSummary,
+    /// Why the run folder lacks it, e.g. because its disk is full; it can be shown all the same.
+    pub unwritten: Option<AnalysisError>,
+}
+
+/// Draws up the summary of the finished run in `folder` from nothing but the files there, and writes
+/// it with its report beside them.
+///
+/// # Errors
+/// When the manifest, the result or the records cannot be read.
+pub fn analyse(folder: &RunFolder, registry: &Registry) -> Result<Concluded, AnalysisError> {
+    let path = folder.manifest();
+    let manifest = match Manifest::read(folder) {
+        Ok(manifest) => manifest,
+        Err(source) => return Err(AnalysisError::Manifest { path, source }),
+    };
+    let topology = match manifest.read_topology(registry.known()) {
+        Ok(topology) => topology,
+        Err(source) => return Err(AnalysisError::Topology { path, source }),
+    };
+    let result = RunResult::read(folder)?;
+    let origin = (
+        Path::new(&manifest.topology_file),
+        manifest.command_line.as_slice(),
+    );
+    conclude(&topology, &result, registry, origin)
+}
+
+/// Draws up the summary of a finished run and writes it with its report into the run's folder.
+///
+/// # Errors
+/// When the records cannot be read at all.
+pub fn conclude(
+    topology: &Topology,
+    result: &RunResult,
+    registry: &Registry,
+    (topology_file, command_line): (&Path, &[String]),
+) -> Result<Concluded, AnalysisError> {
+    let mut records = RunRecords::read(&result.folder.records())?;
+    let clocks = HostClocks::of(topology, result, &records);
+    records.set_clocks(clocks);
+    let case = registry.make_case(topology)?;
+    let unscored = score_clock::apply(&mut records, (topology, result), case.as_ref());
+    let score_host = score_clock::host(topology, case.as_ref());
+    let axis = RunAxis::of(records.clocks(), &result.spans, score_host);
+    let mut summary = RunSummary::new(run_facts(topology, result, topology_file, command_line));
+    summary.host_facts = result.facts.clone();
+    for process in &result.processes {
+        summary.processes.push(process_summary(process));
+    }
+    summary.clocks = Some(records.clocks().section().clone());
+    summary.realtime = realtime_facts(&result.processes);
+    summary.events = result
+        .events
+        .iter()
+        .map(|event| run_event(&axis, event))
+        .collect();
+    summary.link_changes = link_changes::of_run(topology, &records, &axis);
+    summary.channels = topology
+        .channels()
+        .iter()
+        .map(|channel| channel_summary(topology, result, channel, &records))
+        .collect();
+    capture::write(&mut summary, (topology, result), &records);
+    summary.faces = faces::face_summaries(topology, result, &records);
+    summary.hardware_stamps = cards::hardware_stamps(topology, result, &records);
+    let outages = add_outages(&mut summary, (topology, result), (&records, &axis));
+    let (specs, score) = match &case {
+        Some((entry, case)) => (entry.channels, case.score(records.log())),
+        None => (&[][..], Score::default()),
+    };
+    summary.score = ScoreMetric::all_of(&score);
+    summary.score_events = events::explained(
+        &score,
+        (topology, result),
+        (&records, &axis),
+        &summary.channels,
+        (specs, &outages),
+    );
+    let errors = case.as_ref().map(|(_, case)| case.errors(records.log()));
+    let network = network::of_run(
+        (topology, result),
+        (&records, &axis),
+        errors.unwrap_or_default(),
+        (&mut summary.score_events, &mut summary.warnings),
+    );
+    let (network, network_series) = network.unzip();
+    summary.network = network;
+    radio::add(&mut summary, (topology, result), (&records, &axis));
+    add_warnings(&mut summary, result, &records);
+    summary.warnings.extend(unscored);
+    let case = case.as_ref().map(|(_, case)| case.as_ref());
+    let network_series = network_series.unwrap_or_default();
+    write_series(&mut summary, result, (case, network_series), records);
+    let unwritten = write_texts(&summary, result).err();
+    Ok(Concluded { summary, unwritten })
+}
+
+/// Writes the summary, the events and the report into the run's folder.
+fn write_texts(summary: &RunSummary, result: &RunResult) -> Result<(), AnalysisError> {
+    let path = result.folder.events();
+    let text = event_log::text(
+        &summary.run.name,
+        &summary.score_events,
+        &summary.link_changes,
+    );
+    fs::write(&path, text).map_err(|source| AnalysisError::Write { path, source })?;
+    summary.write(&result.folder.summary())?;
+    let plain = terminal::render(summary, REPORT_FILE_WIDTH, Style::Plain);
+    let path = result.folder.report();
+    fs::write(&path, plain).map_err(|source| AnalysisError::Write { path, source })
+}
+
+/// The outages of every channel, their figures put into the summary.
+fn add_outages(
+    summary: &mut RunSummary,
+    run: (&Topology, &RunResult),
+    (records, axis): (&RunRecords, &RunAxis<'_>),
+) -> Vec<OutageStory> {
+    let mut stories = Vec::new();
+    for (summary, channel) in summary.channels.iter_mut().zip(run.0.channels()) {
+        let unknown = MessageFate::UnknownPeerRecordsUnavailable;
+        let fates = summary.account.as_ref().map(|account| &account.fates);
+        let is_partial = fates.is_some_and(|fates| fates.of(unknown) > 0);
+        if let Some(story) = OutageStory::of(run, channel, (records, axis), is_partial) {
+            summary.outages = story.figures();
+            stories.push(story);
+        }
+    }
+    stories
+}
+
+/// Writes what the case and the network have to plot. A run whose plots cannot be written has its report still.
+fn write_series(
+    summary: &mut RunSummary,
+    result: &RunResult,
+    (case, network): (Option<&dyn Case>, Vec<PlotSeries>),
+    records: RunRecords,
+) {
+    let mut made = case.map_or_else(Vec::new, |case| case.series(records.log()));
+    made.extend(network);
+    // They are as large as the messages; only one of the two need be in memory.
+    drop(records);
+    match series::write(&result.folder.series(), made) {
+        Ok(names) if names.is_empty() => {}
+        Ok(names) => {
+            let what = format!("{}; columns in series/series.json", names.join(", "));
+            summary.run.files.push(Fact::new("series/", what));
+        }
+        Err(error) => summary
+            .warnings
+            .push(format!("series are missing or not whole: {error}")),
+    }
+}
+
+/// What spoils the run or the reading of its figures.
+fn add_warnings(summary: &mut RunSummary, result: &RunResult, records: &RunRecords) {
+    summary
+        .warnings
+        .extend(result.problems.iter().cloned().chain(records.problems()));
+    for process in &result.processes {
+        let failures = process
+            .report
+            .iter()
+            .flat_map(|report| &report.recorder_failures);
+        let named = failures.map(|failure| format!("{} could not write {failure}", process.name));
+        summary.warnings.extend(named);
+        let unconnected = process
+            .report
+            .as_ref()
+            .map_or(0, |report| report.connection_failures);
+        if unconnected > 0 {
+            let name = &process.name;
+            summary.warnings.push(format!(
+                "{name} failed {unconnected} times to connect to the other end of a channel; do \
+                 all processes run as one user?"
+            ));
+        }
+    }
+    summary.warnings.extend(records.clocks().warnings());
+    let pairs = &records.clocks().section().pairs;
+    let paths = pairs.iter().filter_map(clock_path::warning);
+    summary.warnings.extend(paths);
+}
+
+/// Width of `report.txt`.
+const REPORT_FILE_WIDTH: usize = 100;

@@ -1,0 +1,409 @@
+//! The record files of a finished run, joined by channel, and the account drawn up from them. What
+//! the account means for a reader is decided elsewhere.
+
+use std::cell::RefCell;
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use hil_account::card_clock::{CardClockRecord, CardTimeline};
+use hil_account::radio::{RadioFigures, TransmitStampFigures, radio_figures, transmit_stamps};
+use hil_account::{
+    AccountContext, ChannelAccount, ChannelPath, ChannelRecords, FLIGHT_TIME_MAX, Interruption,
+    MessageStory, ORDER_TOLERANCE_NS, Outage, RunSpan, account, outages, stories,
+};
+use hil_core::record::{EgressRecord, IngressRecord, RoundTripRecord};
+use hil_core::run_log::RunLog;
+use hil_link::condition::LinkConditionRecord;
+
+use super::AnalysisError;
+use super::channel_files::{ChannelFiles, Signs, all, widen};
+use super::clocks::HostClocks;
+use super::message_records::missing_count;
+use super::{interruptions, link_changes, stalls};
+use crate::summary::RecordedFigures;
+use hil_rundir::face_record::{FaceReceivedRecord, FaceSentRecord};
+use hil_rundir::radio_record::RadioRecord;
+use hil_rundir::record::stored::{
+    ReadFaults, StoredFile, StoredRecords, file_bytes, sort_by_start,
+};
+use hil_rundir::record::{RecordFileError, RecordKind};
+use hil_rundir::run_result::RunResult;
+use hil_topology::emulation::EmulationLaunch;
+use hil_topology::{Channel, Topology};
+
+/// Share of the messages of an emulated link that are not under way for longer than is allowed for:
+/// at the end of a run, what is younger may still arrive.
+const FLIGHT_QUANTILE: f64 = 0.9999;
+
+/// Every record file of a run.
+#[derive(Debug, Default)]
+pub(crate) struct RunRecords {
+    pub(super) channels: BTreeMap<String, ChannelFiles>,
+    cards: BTreeMap<String, Vec<CardClockRecord>>,
+    log: RunLog,
+    clocks: HostClocks,
+    /// Records of radios, by `<process>/<interface>`.
+    pub(super) radios: BTreeMap<String, Vec<RadioRecord>>,
+    /// Orders to emulated links, by the channel on which they were given.
+    link_orders: BTreeMap<String, Vec<LinkConditionRecord>>,
+    /// Files that could not be opened, with the reason.
+    problems: Vec<String>,
+    /// What went wrong later.
+    faults: ReadFaults,
+    /// Processes on the way of each channel that were not there or held up, once asked for.
+    interruptions: RefCell<BTreeMap<String, Vec<Interruption>>>,
+}
+
+impl RunRecords {
+    /// Opens the files of the records folder. What a channel has of every message stays in them.
+    pub(crate) fn read(folder: &Path) -> Result<Self, AnalysisError> {
+        let mut records = Self::default();
+        let mut add = |path: &Path| {
+            records.add(StoredFile::open(path)?);
+            Ok(())
+        };
+        let problems = each_file(folder, &|_| true, &|_| {}, &mut add)?;
+        records.problems = problems;
+        for (name, files) in &mut records.channels {
+            files.signs = Signs::of(files);
+            if let Some(messages) = files.message.take() {
+                records.log.set_stored(name, Arc::new(messages));
+            }
+        }
+        Ok(records)
+    }
+
+    fn add(&mut self, file: StoredFile) {
+        let name = file.header.channel.clone();
+        let kind = file.header.kind;
+        let alone = |file| {
+            let mut records = StoredRecords::new(&self.faults);
+            records.push(file);
+            records
+        };
+        match kind {
+            RecordKind::CardClock => {
+                let card = self.cards.entry(name).or_default();
+                card.extend(alone(file).records::<CardClockRecord>());
+                return;
+            }
+            RecordKind::Radio => {
+                let radio = self.radios.entry(name).or_default();
+                radio.extend(alone(file).records::<RadioRecord>());
+                return;
+            }
+            RecordKind::LinkCondition => {
+                let orders = self.link_orders.entry(name).or_default();
+                orders.extend(alone(file).records::<LinkConditionRecord>());
+                return;
+            }
+            _ => {}
+        }
+        let channel = self.channels.entry(name).or_default();
+        let files = match kind {
+            RecordKind::Published => &mut channel.published,
+            RecordKind::Taken => &mut channel.taken,
+            RecordKind::Egress => &mut channel.egress,
+            RecordKind::Ingress => &mut channel.ingress,
+            RecordKind::FollowUp => &mut channel.follow_up,
+            RecordKind::FaceSent => &mut channel.face_sent,
+            RecordKind::FaceReceived => &mut channel.face_received,
+            RecordKind::Message => &mut channel.message,
+            RecordKind::RoundTrip => {
+                let records = alone(file);
+                // An exchange whose stamps were bettered later is there twice.
+                let of = |one: RoundTripRecord| ((one.session, one.sequence), one);
+                channel.round_trips.extend(records.records().map(of));
+                return;
+            }
+            // They belong to no channel, see above.
+            RecordKind::CardClock | RecordKind::Radio | RecordKind::LinkCondition => return,
+        };
+        files
+            .get_or_insert_with(|| StoredRecords::new(&self.faults))
+            .push(file);
+    }
+
+    /// Record files that could not be read, or not to their ends, with the reason.
+    pub(crate) fn problems(&self) -> Vec<String> {
+        let later = self.faults.texts();
+        self.problems.iter().cloned().chain(later).collect()
+    }
+
+    /// Orders to emulated links that were given on `channel`, in the order of the gateway's count.
+    pub(super) fn link_orders(&self, channel: &str) -> &[LinkConditionRecord] {
+        self.link_orders.get(channel).map_or(&[], Vec::as_slice)
+    }
+
+    /// The clock of a card, by the name that a
+    /// [`CardStory`](hil_rundir::card_story::CardStory) gives it; `None` when it was not read.
+    pub(super) fn card_timeline(&self, card: &str) -> Option<CardTimeline> {
+        self.cards.get(card).map(|pairs| CardTimeline::new(pairs))
+    }
+
+    /// What the gateways recorded of `channel`: what they sent and what they received.
+    pub(super) fn of_gateways(&self, channel: &str) -> (Vec<EgressRecord>, Vec<IngressRecord>) {
+        let files = self.channels.get(channel);
+        let egress = all(files.and_then(|files| files.egress.as_ref()));
+        let ingress = all(files.and_then(|files| files.ingress.as_ref()));
+        (egress.collect(), ingress.collect())
+    }
+
+    /// Every message of the run, to bring them to one clock.
+    pub(super) const fn log_mut(&mut self) -> &mut RunLog {
+        &mut self.log
+    }
+
+    /// Relates the hosts' clocks; until then none are aligned.
+    pub(super) fn set_clocks(&mut self, clocks: HostClocks) {
+        self.clocks = clocks;
+    }
+
+    /// How the hosts' clocks relate.
+    pub(super) const fn clocks(&self) -> &HostClocks {
+        &self.clocks
+    }
+
+    /// The clock exchanges of the gateways of `channel`.
+    pub(super) fn round_trips(&self, channel: &str) -> impl Iterator<Item = &RoundTripRecord> {
+        let files = self.channels.get(channel);
+        files
+            .into_iter()
+            .flat_map(|files| files.round_trips.values())
+    }
+
+    /// Real-time minus monotonic clock of `host` as its gateways noted it; `None` when none did, or
+    /// the clock was stepped.
+    pub(super) fn realtime_offset_ns(&self, topology: &Topology, host: &str) -> Option<i64> {
+        let is_here = |process: &str| {
+            topology
+                .process(process)
+                .is_some_and(|one| one.host == host)
+        };
+        let mut ends: Option<(i64, i64)> = None;
+        for channel in topology.channels() {
+            let Some(files) = self.channels.get(&channel.name) else {
+                continue;
+            };
+            let is_receiver = channel.to.as_deref().is_some_and(is_here);
+            let of_sender = files.signs.sender_realtime_ns;
+            let of_receiver = files.signs.receiver_realtime_ns;
+            let own = [
+                of_sender.filter(|_| is_here(&channel.from)),
+                of_receiver.filter(|_| is_receiver),
+            ];
+            for (lowest, highest) in own.into_iter().flatten() {
+                widen(&mut ends, lowest);
+                widen(&mut ends, highest);
+            }
+        }
+        let (lowest, highest) = ends?;
+        let width_ns = highest.saturating_sub(lowest);
+        (width_ns <= ORDER_TOLERANCE_NS).then_some(lowest + width_ns / 2)
+    }
+
+    /// True when anything was recorded of `channel`.
+    pub(super) fn has(&self, channel: &str) -> bool {
+        self.channels.contains_key(channel)
+    }
+
+    /// What the receiving gateway of `channel` noted of each datagram; empty when it left nothing.
+    pub(super) fn arrivals(&self, channel: &str) -> impl Iterator<Item = IngressRecord> + '_ {
+        let files = self.channels.get(channel);
+        all(files.and_then(|files| files.ingress.as_ref()))
+    }
+
+    /// Every message of the run.
+    pub(crate) fn log(&self) -> &RunLog {
+        &self.log
+    }
+
+    /// What there is of a channel that is only recorded; `None` when nothing is.
+    pub(super) fn recorded(&self, channel: &str) -> Option<RecordedFigures> {
+        let messages = self.log.raw(channel);
+        self.has(channel).then(|| RecordedFigures {
+            message_count: messages.len() as u64,
+            missing_count: missing_count(messages),
+        })
+    }
+
+    /// What a face recorded that sends the messages of `out` and publishes on `back`.
+    pub(super) fn of_face(
+        &self,
+        out: &str,
+        back: &str,
+    ) -> (Vec<FaceSentRecord>, Vec<FaceReceivedRecord>) {
+        let sent = self.channels.get(out);
+        let sent = all(sent.and_then(|files| files.face_sent.as_ref()));
+        let received = self.channels.get(back);
+        let received = all(received.and_then(|files| files.face_received.as_ref()));
+        (sent.collect(), received.collect())
+    }
+
+    /// The account of `channel`.
+    pub(crate) fn account(
+        &self,
+        topology: &Topology,
+        result: &RunResult,
+        channel: &Channel,
+    ) -> ChannelAccount {
+        self.consult((topology, result), channel, account)
+    }
+
+    /// Where the messages of `channel` were stamped, and what the radio said of them.
+    pub(super) fn radio_figures(
+        &self,
+        run: (&Topology, &RunResult),
+        channel: &Channel,
+    ) -> (Option<TransmitStampFigures>, Option<RadioFigures>) {
+        self.consult(run, channel, |records, context| {
+            let stamps = records.egress.map(transmit_stamps);
+            (stamps, radio_figures(records, context))
+        })
+    }
+
+    /// What became of the `wanted` messages of `channel`, by start of the producer and number.
+    pub(super) fn stories(
+        &self,
+        run: (&Topology, &RunResult),
+        channel: &Channel,
+        wanted: &BTreeSet<(u32, u64)>,
+    ) -> BTreeMap<(u32, u64), MessageStory> {
+        self.consult(run, channel, |records, context| {
+            stories(records, context, wanted)
+        })
+    }
+
+    /// The outages of `channel`, in the order of its messages.
+    pub(super) fn outages(&self, run: (&Topology, &RunResult), channel: &Channel) -> Vec<Outage> {
+        self.consult(run, channel, outages)
+    }
+
+    /// The processes on the way of `channel` that were down, one for each interruption.
+    pub(super) fn interrupted(
+        &self,
+        run: (&Topology, &RunResult),
+        channel: &Channel,
+    ) -> Vec<String> {
+        self.consult(run, channel, |_, context| {
+            let interruptions = context.interruptions.iter();
+            interruptions.map(|one| one.process.clone()).collect()
+        })
+    }
+
+    /// Asks something of the records of `channel` and of what the run knows about its way.
+    pub(crate) fn consult<T>(
+        &self,
+        (topology, result): (&Topology, &RunResult),
+        channel: &Channel,
+        ask: impl FnOnce(&ChannelRecords<'_>, &AccountContext<'_>) -> T,
+    ) -> T {
+        let nothing = ChannelFiles::default();
+        let files = self.channels.get(&channel.name).unwrap_or(&nothing);
+        let interruptions = self.interruptions((topology, result), channel);
+        let span_of = |process: &str| {
+            let (start, end) = *result.spans.get(&topology.process(process)?.host)?;
+            Some(RunSpan { start, end })
+        };
+        let crossing = topology.crossing(channel);
+        let cards_share_clock = crossing
+            .as_ref()
+            .is_some_and(|crossing| super::cards::share_a_clock(result, crossing));
+        let path = if crossing.is_some() {
+            let host_of = |process: Option<&str>| Some(&topology.process(process?)?.host);
+            let hosts = host_of(Some(&channel.from)).zip(host_of(channel.to.as_deref()));
+            hosts.map_or(ChannelPath::Gateway { alignment: None }, |(from, to)| {
+                self.clocks.path(from, to)
+            })
+        } else {
+            ChannelPath::SharedMemory
+        };
+        // A link that delays on purpose keeps messages under way for that much longer.
+        let changed = crossing
+            .as_ref()
+            .map(|crossing| link_changes::longest_delay(topology, self, crossing));
+        let delay = crossing
+            .and_then(|crossing| EmulationLaunch::of(&crossing, topology.run().seed))
+            .map(|emulation| match emulation.trace {
+                // A run begins when its traces were read, and what was read is in its result.
+                Some(_) => {
+                    let noted = result.trace_delays.get(&channel.name);
+                    noted.copied().unwrap_or_default()
+                }
+                None => emulation.spec.flight_time(FLIGHT_QUANTILE),
+            });
+        let round_trips = files.round_trips.values();
+        let round_trips_ns: Vec<i64> = round_trips.map(RoundTripRecord::rtt_ns).collect();
+        let context = AccountContext {
+            interruptions: &interruptions,
+            producer_run: span_of(&channel.from),
+            consumer_run: channel.to.as_deref().and_then(span_of),
+            flight_time_max: FLIGHT_TIME_MAX + delay.max(changed).unwrap_or(Duration::ZERO),
+            cards_share_clock,
+            round_trips_ns: &round_trips_ns,
+            seed: topology.run().seed,
+            ..AccountContext::new(path)
+        };
+        let records = ChannelRecords {
+            published: files.published.as_ref().map(|files| files as _),
+            egress: files.egress.as_ref().map(|files| files as _),
+            ingress: files.ingress.as_ref().map(|files| files as _),
+            follow_up: files.follow_up.as_ref().map(|files| files as _),
+            taken: files.taken.as_ref().map(|files| files as _),
+        };
+        ask(&records, &context)
+    }
+
+    /// Both kinds read what the channel's processes left.
+    fn interruptions(&self, run: (&Topology, &RunResult), channel: &Channel) -> Vec<Interruption> {
+        if let Some(known) = self.interruptions.borrow().get(&channel.name) {
+            return known.clone();
+        }
+        let mut found = interruptions::noted(self, run, channel);
+        found.extend(stalls::at_end(self, run, channel));
+        let mut interruptions = self.interruptions.borrow_mut();
+        interruptions.insert(channel.name.clone(), found.clone());
+        found
+    }
+}
+
+/// Hands every record file of `folder` with a `wanted` name to `take`, and before each the share of
+/// their bytes that lies before it to `reach`; gives what could not be read.
+pub(super) fn each_file(
+    folder: &Path,
+    wanted: &dyn Fn(&str) -> bool,
+    reach: &dyn Fn(f64),
+    take: &mut dyn FnMut(&Path) -> Result<(), RecordFileError>,
+) -> Result<Vec<String>, AnalysisError> {
+    let failed = |source| AnalysisError::Folder {
+        folder: folder.to_owned(),
+        source,
+    };
+    let mut paths: Vec<PathBuf> = fs::read_dir(folder)
+        .and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect())
+        .map_err(failed)?;
+    sort_by_start(&mut paths);
+    paths.retain(|path| {
+        let name = path.file_name().unwrap_or_default();
+        wanted(&name.to_string_lossy())
+    });
+    let all_bytes: u64 = paths.iter().map(|path| file_bytes(path)).sum();
+    let mut read_bytes = 0;
+    let mut problems = Vec::new();
+    for path in paths {
+        reach(read_bytes as f64 / all_bytes.max(1) as f64);
+        read_bytes += file_bytes(&path);
+        match take(&path) {
+            Ok(()) => {}
+            // A process killed while it opened its files leaves one without a header.
+            Err(error @ RecordFileError::Malformed { offset: 0, .. }) => {
+                problems.push(format!("{error}; left out"));
+            }
+            Err(error) => problems.push(error.to_string()),
+        }
+    }
+    Ok(problems)
+}

@@ -1,0 +1,315 @@
+//! What follows from a summary's figures: whether the run may be called a network result at all,
+//! and what a reader must be warned of. It draws conclusions, it does not measure.
+
+use hil_account::{ChannelAccount, ClosingFigures, Coverage, MessageFate};
+use serde::{Deserialize, Serialize};
+
+use super::face::FaceSummary;
+use super::face_warnings;
+use super::summary::{
+    ChannelSummary, Fact, LinkKind, NO_ROOM, Outcome, ProcessSummary, RunSummary,
+};
+use super::terminal::{JOINT, percent};
+use hil_platform::text::grouped;
+use hil_platform::words::counted;
+
+/// Share of skipped ticks above which the host, not the network, shaped the run.
+pub const SKIPPED_TICK_RATIO_MAX: f64 = 0.001;
+
+/// Share of messages whose account must close.
+const CLOSED_RATIO_MIN: f64 = 0.999;
+
+/// Share of messages that must carry a software stamp.
+const STAMPED_RATIO_MIN: f64 = 0.99;
+
+/// Whether delays and losses of a run may be put down to the network.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "state", rename_all = "snake_case")]
+pub enum NetworkVerdict {
+    /// The run did not take place as planned.
+    RunFailed,
+    /// It took no time and crossed no network: link models took its messages.
+    VirtualTime,
+    /// No channel went over a network.
+    NoNetwork,
+    /// No link of ours was a network, but a foreign program took part through a face.
+    ForeignProgram,
+    /// No link of ours was a network, and nothing came to any face from a foreign program.
+    NoForeignProgram,
+    /// A channel went over an emulated link, whatever carried the others.
+    EmulatedLink,
+    /// The host could not keep an emulated link: the run says nothing about its model either.
+    EmulationNotKept {
+        /// The channels concerned.
+        channels: Vec<String>,
+    },
+    /// The host kept its ticks: what remains is the network's.
+    NetworkResult,
+    /// A process skipped too many ticks: the run says nothing about the network.
+    HostOverran {
+        /// The processes that did.
+        processes: Vec<Overrun>,
+    },
+    /// Receiving gateways were late, and their kernel dropped what found no room meanwhile: the run says
+    /// nothing about the network.
+    ReceiverLate {
+        /// The channels concerned.
+        channels: Vec<String>,
+    },
+    /// A component left no report, so nobody can tell whether it kept its ticks.
+    TicksUnknown,
+}
+
+/// A process that skipped more than [`SKIPPED_TICK_RATIO_MAX`] of its ticks.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Overrun {
+    /// Its name.
+    pub process: String,
+    /// Its host.
+    pub host: String,
+    /// Ticks it passed over.
+    pub skipped_tick_count: u64,
+    /// Ticks it should have run.
+    pub due_tick_count: u64,
+}
+
+/// What follows from a summary's figures.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Assessment {
+    /// Whether this is a network result.
+    pub network: NetworkVerdict,
+    /// What a reader must be warned of, most important first.
+    pub warnings: Vec<String>,
+}
+
+impl Assessment {
+    /// Draws the conclusions.
+    pub fn of(summary: &RunSummary) -> Self {
+        let overruns: Vec<Overrun> = summary.processes.iter().filter_map(overrun).collect();
+        let mut warnings: Vec<String> = overruns.iter().map(overrun_warning).collect();
+        warnings.extend(summary.channels.iter().filter_map(emulation_warning));
+        warnings.extend(summary.channels.iter().filter_map(no_room_warning));
+        warnings.extend(summary.warnings.iter().cloned());
+        warnings.extend(summary.faces.iter().flat_map(face_warnings::face_warnings));
+        warnings.extend(summary.processes.iter().flat_map(process_warnings));
+        warnings.extend(summary.channels.iter().flat_map(channel_warnings));
+        warnings.extend(summary.realtime.refused.iter().map(refused_warning));
+        let network = verdict(summary, overruns);
+        // The joint is for pages; in JSON it would only surprise.
+        for warning in &mut warnings {
+            *warning = warning.replace(JOINT, " ");
+        }
+        Self { network, warnings }
+    }
+}
+
+fn verdict(summary: &RunSummary, overruns: Vec<Overrun>) -> NetworkVerdict {
+    let has = |link: LinkKind| summary.channels.iter().any(|channel| channel.link == link);
+    let has_face = !summary.faces.is_empty();
+    // A component that was killed took its count with it; other kinds have none to take.
+    let is_silent =
+        |process: &ProcessSummary| process.kind.counts_ticks() && process.cpu_time_s.is_none();
+    let has_ticks = |process: &ProcessSummary| process.tick_count.is_some();
+    if summary.run.outcome == Outcome::Failed {
+        NetworkVerdict::RunFailed
+    } else if summary.run.is_virtual {
+        NetworkVerdict::VirtualTime
+    } else if ![LinkKind::Udp, LinkKind::Tcp, LinkKind::Emulated]
+        .into_iter()
+        .any(has)
+        && !has_face
+    {
+        NetworkVerdict::NoNetwork
+    } else if !overruns.is_empty() {
+        NetworkVerdict::HostOverran {
+            processes: overruns,
+        }
+    } else if !unkept(summary).is_empty() {
+        NetworkVerdict::EmulationNotKept {
+            channels: unkept(summary),
+        }
+    } else if !received_late(summary).is_empty() {
+        NetworkVerdict::ReceiverLate {
+            channels: received_late(summary),
+        }
+    } else if summary.processes.iter().any(is_silent) || !summary.processes.iter().any(has_ticks) {
+        NetworkVerdict::TicksUnknown
+    } else if has(LinkKind::Emulated) {
+        NetworkVerdict::EmulatedLink
+    } else if has(LinkKind::Udp) || has(LinkKind::Tcp) {
+        NetworkVerdict::NetworkResult
+    } else if summary.faces.iter().all(FaceSummary::is_unanswered) {
+        NetworkVerdict::NoForeignProgram
+    } else {
+        NetworkVerdict::ForeignProgram
+    }
+}
+
+/// The channels whose emulated link the host could not keep.
+fn unkept(summary: &RunSummary) -> Vec<String> {
+    let is_unkept = |channel: &&ChannelSummary| {
+        let figures = channel.emulation.as_ref();
+        figures.is_some_and(|figures| !figures.is_kept())
+    };
+    let channels = summary.channels.iter().filter(is_unkept);
+    channels.map(|channel| channel.name.clone()).collect()
+}
+
+/// The channels of which more than [`SKIPPED_TICK_RATIO_MAX`] of the messages may have been lost to the
+/// receiver's host: a gateway keeps no ticks that would tell that it was late.
+fn received_late(summary: &RunSummary) -> Vec<String> {
+    let is_late = |channel: &&ChannelSummary| {
+        let account = channel.account.as_ref();
+        let published_count = account.map_or(0, |account| account.published_count);
+        channel.no_room_count as f64 > SKIPPED_TICK_RATIO_MAX * published_count as f64
+    };
+    let channels = summary.channels.iter().filter(is_late);
+    channels.map(|channel| channel.name.clone()).collect()
+}
+
+fn no_room_warning(channel: &ChannelSummary) -> Option<String> {
+    let count = Some(channel.no_room_count).filter(|count| *count > 0)?;
+    let account = channel.account.as_ref();
+    let lost = account.map_or(0, |account| account.fates.of(MessageFate::LostOnWire));
+    let lost = match lost.min(count) {
+        0 => String::new(),
+        most => format!(
+            ", which may be what became of up to {} lost on the wire",
+            counted(most, "message")
+        ),
+    };
+    Some(format!(
+        "{}: {} had {NO_ROOM}, because the receiving gateway was late or more came than it could take{lost}",
+        channel.name,
+        counted(count, "datagram"),
+    ))
+}
+
+fn emulation_warning(channel: &ChannelSummary) -> Option<String> {
+    let figures = channel
+        .emulation
+        .as_ref()
+        .filter(|figures| !figures.is_kept())?;
+    let ms = |ns: i64| ns as f64 * 1e-6;
+    let dropped = figures.overflow_count.filter(|count| *count > 0);
+    let dropped = dropped.map_or_else(String::new, |count| {
+        format!(", and {} found no room", grouped(count))
+    });
+    Some(format!(
+        "the host could not keep the emulated link: {} had its datagrams {:.3} ms late at p99, where \
+         {:.3} ms are allowed{dropped}; neither network nor model is to blame for that",
+        channel.name,
+        ms(figures.scheduling_error.p99_ns),
+        ms(figures.error_max_ns),
+    ))
+}
+
+fn refused_warning(refused: &Fact) -> String {
+    format!("{}: {}", refused.value, refused.label)
+}
+
+fn overrun(process: &ProcessSummary) -> Option<Overrun> {
+    let skipped_tick_count = process.skipped_tick_count?;
+    let due_tick_count = process.tick_count?.saturating_add(skipped_tick_count);
+    let limit = SKIPPED_TICK_RATIO_MAX * due_tick_count as f64;
+    (skipped_tick_count as f64 > limit).then(|| Overrun {
+        process: process.name.clone(),
+        host: process.host.clone(),
+        skipped_tick_count,
+        due_tick_count,
+    })
+}
+
+fn overrun_warning(overrun: &Overrun) -> String {
+    format!(
+        "host overran: {} skipped {} of {} ticks ({}) on {}; the network is not to blame for \
+         what these ticks missed",
+        overrun.process,
+        grouped(overrun.skipped_tick_count),
+        grouped(overrun.due_tick_count),
+        percent(overrun.skipped_tick_count as f64 / overrun.due_tick_count as f64),
+        overrun.host,
+    )
+}
+
+fn process_warnings(process: &ProcessSummary) -> Vec<String> {
+    let name = &process.name;
+    let some = |count: Option<u64>| count.filter(|count| *count > 0);
+    let mut warnings = Vec::new();
+    if let Some(count) = some(process.recorder_drop_count) {
+        warnings.push(format!(
+            "{name} could not write {}; their messages show as missing stages",
+            counted(count, "record")
+        ));
+    }
+    if let Some(count) = some(process.outbox_drop_count) {
+        let count = counted(count, "message");
+        warnings.push(format!("{name} dropped {count} into a full outbox"));
+    }
+    if let Some(count) = some(process.malformed_count) {
+        warnings.push(format!(
+            "{name} refused {}",
+            counted(count, "malformed message")
+        ));
+    }
+    warnings
+}
+
+fn channel_warnings(channel: &ChannelSummary) -> Vec<String> {
+    let name = &channel.name;
+    if channel.link == LinkKind::RecordOnly {
+        return recorded_warnings(channel);
+    }
+    let Some(account) = &channel.account else {
+        return vec![format!("{name} left no records: it has no account")];
+    };
+    let mut warnings = Vec::new();
+    let unexplained = account.fates.of(MessageFate::Unexplained);
+    if unexplained > 0 {
+        let count = counted(unexplained, "message");
+        warnings.push(format!("{name}: {count} vanished without explanation"));
+    }
+    if let Some((ratio, _)) = account
+        .closing
+        .checked()
+        .and_then(ClosingFigures::closed_ratio)
+        && ratio < CLOSED_RATIO_MIN
+    {
+        let (ratio, least) = (percent(ratio), percent(CLOSED_RATIO_MIN));
+        warnings.push(format!(
+            "{name}: the account closes for {ratio} of messages, less than {least}"
+        ));
+    }
+    // A stream has no stamps, by design: nobody can do anything about it.
+    if channel.link != LinkKind::Tcp {
+        warnings.extend(stamp_warnings(name, account));
+    }
+    warnings
+}
+
+/// The record is all there is of such a channel, and a score rests on it.
+fn recorded_warnings(channel: &ChannelSummary) -> Vec<String> {
+    let name = &channel.name;
+    match &channel.recorded {
+        None => vec![format!("{name} left no record")],
+        Some(figures) if figures.missing_count > 0 => {
+            let count = counted(figures.missing_count, "message");
+            vec![format!("{name}: {count} missing in its record")]
+        }
+        Some(_) => Vec::new(),
+    }
+}
+
+fn stamp_warnings(name: &str, account: &ChannelAccount) -> Vec<String> {
+    let coverage = &account.coverage;
+    [("TX", coverage.tx_software), ("RX", coverage.rx_software)]
+        .into_iter()
+        .filter_map(|(kind, coverage)| {
+            let ratio = coverage.as_ref().and_then(Coverage::ratio)?;
+            (ratio < STAMPED_RATIO_MIN).then(|| {
+                let ratio = percent(ratio);
+                format!("{name}: only {ratio} of messages carry a kernel {kind} stamp")
+            })
+        })
+        .collect()
+}

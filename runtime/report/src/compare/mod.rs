@@ -1,0 +1,205 @@
+//! Two runs, or two sets of repetitions, side by side: every delay, loss and score with the ratio or
+//! difference of the two and its interval, and whether the runs may be compared at all. It reads
+//! `summary.json` only.
+
+pub mod cli;
+mod conditions;
+mod figures;
+mod origin;
+mod render;
+pub mod work;
+
+use std::fmt;
+use std::path::{Path, PathBuf};
+
+use hil_account::Stage;
+use hil_stats::comparison::Estimate;
+use hil_stats::statistics::Interval;
+use serde::Serialize;
+
+use crate::summary::{RunSummary, SummaryError};
+use hil_rundir::run_folder::RunFolder;
+
+/// Why runs cannot be compared.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum CompareError {
+    /// The summary cannot be read.
+    #[error("{path}: {source}; only runs that ended and have a summary can be compared")]
+    Read {
+        path: PathBuf,
+        source: std::io::Error,
+    },
+    /// The summary is not one.
+    #[error("{path}: {source}")]
+    Summary { path: PathBuf, source: SummaryError },
+}
+
+/// One run.
+#[derive(Debug, Clone)]
+pub(crate) struct ComparedRun {
+    /// As it was named.
+    pub(crate) folder: PathBuf,
+    pub(crate) summary: RunSummary,
+}
+
+impl ComparedRun {
+    /// Reads the summary of the run in `folder`.
+    ///
+    /// # Errors
+    /// When it is not there or not a summary.
+    pub(crate) fn read(folder: &Path) -> Result<Self, CompareError> {
+        let path = RunFolder::existing(folder).summary();
+        let text = std::fs::read_to_string(&path).map_err(|source| CompareError::Read {
+            path: path.clone(),
+            source,
+        })?;
+        let summary = RunSummary::from_json(&text)
+            .map_err(|source| CompareError::Summary { path, source })?;
+        Ok(Self {
+            folder: folder.to_owned(),
+            summary,
+        })
+    }
+}
+
+/// How a figure of the new runs stands to that of the base.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum Verdict {
+    /// The interval has both directions in it.
+    NoDifferenceShown,
+    /// Shorter delays, by the whole interval.
+    Faster,
+    /// Longer delays, by the whole interval.
+    Slower,
+    /// Fewer losses, by the whole interval.
+    LosesLess,
+    /// More losses, by the whole interval.
+    LosesMore,
+    /// A smaller score, by the whole interval; which is better, the case knows.
+    Lower,
+    /// A larger score, by the whole interval.
+    Higher,
+    /// No interval can be had.
+    NotTested,
+}
+
+impl Verdict {
+    pub(crate) const fn words(self) -> &'static str {
+        match self {
+            Self::NoDifferenceShown => "no difference shown",
+            Self::Faster => "faster",
+            Self::Slower => "slower",
+            Self::LosesLess => "loses less",
+            Self::LosesMore => "loses more",
+            Self::Lower => "lower",
+            Self::Higher => "higher",
+            Self::NotTested => "not tested",
+        }
+    }
+}
+
+/// What kind of figure it is: it says how it is compared and printed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum FigureKind {
+    /// Nanoseconds, compared by their ratio.
+    Delay,
+    /// A share, compared by its difference.
+    Loss,
+    /// A score, compared by its difference.
+    Score,
+}
+
+/// A part of a channel's way.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(tag = "kind", rename_all = "snake_case")]
+pub(crate) enum Part {
+    /// The whole of it.
+    EndToEnd,
+    /// From one stage to another.
+    Segment {
+        /// Where it begins.
+        from: Stage,
+        /// Where it ends.
+        to: Stage,
+    },
+}
+
+impl fmt::Display for Part {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::EndToEnd => formatter.write_str("end to end"),
+            Self::Segment { from, to } => write!(formatter, "{from} → {to}"),
+        }
+    }
+}
+
+/// One figure of both sides.
+#[derive(Debug, Clone, Serialize)]
+pub(crate) struct ComparedFigure {
+    /// The channel; `None` for a score.
+    pub(crate) channel: Option<String>,
+    /// Which part of the channel's way a delay is of; `None` for losses and scores.
+    pub(crate) part: Option<Part>,
+    /// `p50`, `p99`, `p99.9`, `max`, `loss`, or the score's name.
+    pub(crate) metric: String,
+    pub(crate) kind: FigureKind,
+    /// The unit of both: `ns`, `1`, or the score's.
+    pub(crate) unit: String,
+    /// Of the base: one run's figure, or the mean of repetitions (of delays, the geometric one), with
+    /// its own interval if all of its runs have the figure.
+    pub(crate) base: Option<Estimate>,
+    /// Of the new runs.
+    pub(crate) new: Option<Estimate>,
+    /// Runs of the base that have the figure.
+    pub(crate) base_count: usize,
+    /// New runs that have it.
+    pub(crate) new_count: usize,
+    /// New by base; `None` where the base is zero, and for shares.
+    pub(crate) ratio: Option<f64>,
+    /// Interval of the ratio.
+    pub(crate) ratio_interval: Option<Interval>,
+    /// New less base, in the figure's unit.
+    pub(crate) difference: Option<f64>,
+    /// Interval of the difference.
+    pub(crate) difference_interval: Option<Interval>,
+    pub(crate) verdict: Verdict,
+    /// How the interval came about, or why there is none.
+    pub(crate) method: String,
+}
+
+/// All of it.
+#[derive(Debug, Clone, Serialize)]
+pub(crate) struct Comparison {
+    /// Folders of the base.
+    pub(crate) base: Vec<PathBuf>,
+    /// Folders of the new runs.
+    pub(crate) new: Vec<PathBuf>,
+    /// What both sides have in common that matters.
+    pub(crate) same: Vec<String>,
+    /// In what the runs differ beside the figures; empty when in nothing that is known.
+    pub(crate) differences: Vec<String>,
+    /// Why figures must be read with care.
+    pub(crate) cautions: Vec<String>,
+    pub(crate) figures: Vec<ComparedFigure>,
+}
+
+impl Comparison {
+    /// Compares `new` with `base`; neither may be empty.
+    pub(crate) fn of(base: &[ComparedRun], new: &[ComparedRun]) -> Self {
+        let folders = |runs: &[ComparedRun]| runs.iter().map(|run| run.folder.clone()).collect();
+        let (same, differences) = origin::of(base, new);
+        let figures = figures::of(base, new);
+        let mut cautions = origin::cautions(base, new);
+        cautions.extend(figures::cautions(&figures, [base.len(), new.len()]));
+        Self {
+            base: folders(base),
+            new: folders(new),
+            same,
+            differences,
+            cautions,
+            figures,
+        }
+    }
+}

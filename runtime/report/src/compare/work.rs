@@ -1,0 +1,102 @@
+//! What `hil-runtime compare` does: reads, compares, judges, prints.
+
+use std::path::PathBuf;
+
+use serde::Serialize;
+
+use super::cli::{CompareArgs, CompareFormat};
+use super::conditions::{Condition, Judged, Unjudged, Verdicts};
+use super::{ComparedRun, Comparison, render};
+use hil_platform::console::Console;
+use hil_platform::progress::{Progress, Stage};
+
+/// How it ended; the caller knows the exit codes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum End {
+    /// No condition holds.
+    Passed,
+    /// One does.
+    Failed,
+    /// Nothing could be compared or judged.
+    Refused,
+}
+
+/// Does what the command line says.
+pub fn work(args: &CompareArgs, console: &mut Console) -> End {
+    let compared = Progress::begin().during(console, "reading runs", |stage| compared(args, stage));
+    match compared {
+        Ok((text, has_failed)) => {
+            console.result(&format!("{text}\n"));
+            if has_failed {
+                console.error("a condition of --fail-if holds");
+                return End::Failed;
+            }
+            End::Passed
+        }
+        Err(text) => {
+            console.error(&text);
+            End::Refused
+        }
+    }
+}
+
+fn compared(args: &CompareArgs, stage: &Stage) -> Result<(String, bool), String> {
+    let (base, new) = sides(args);
+    // Wrong words are told before folders are read.
+    let conditions = args.fail_if.iter().map(|text| Condition::parse(text));
+    let conditions = conditions
+        .collect::<Result<Vec<_>, _>>()
+        .map_err(|error| error.to_string())?;
+    let (run_count, mut read_count) = (base.len() + new.len(), 0_usize);
+    let mut read = |folders: &[PathBuf]| {
+        let runs = folders.iter().map(|folder| {
+            let run = ComparedRun::read(folder);
+            read_count += 1;
+            stage.reach(read_count as f64 / run_count as f64);
+            run
+        });
+        runs.collect::<Result<Vec<_>, _>>()
+            .map_err(|error| error.to_string())
+    };
+    let (base, new) = (read(&base)?, read(&new)?);
+    stage.tell(None, "comparing");
+    let comparison = Comparison::of(&base, &new);
+    let mut verdicts = Verdicts::default();
+    for condition in &conditions {
+        condition
+            .judge(&comparison, args.strict, &mut verdicts)
+            .map_err(|error| error.to_string())?;
+    }
+    let has_failed = verdicts.judged.iter().any(|one| one.holds);
+    let text = match args.format {
+        CompareFormat::Text => render::text(&comparison, &verdicts),
+        CompareFormat::Md => render::markdown(&comparison, &verdicts),
+        CompareFormat::Json => json(&comparison, &verdicts)?,
+    };
+    Ok((text, has_failed))
+}
+
+fn sides(args: &CompareArgs) -> (Vec<PathBuf>, Vec<PathBuf>) {
+    match args.runs.as_slice() {
+        [base, new] => (vec![base.clone()], vec![new.clone()]),
+        _ => (args.base.clone(), args.new.clone()),
+    }
+}
+
+fn json(comparison: &Comparison, verdicts: &Verdicts) -> Result<String, String> {
+    #[derive(Serialize)]
+    struct Document<'a> {
+        schema_version: u32,
+        #[serde(flatten)]
+        comparison: &'a Comparison,
+        conditions: &'a [Judged],
+        unjudged: &'a [Unjudged],
+    }
+    let document = Document {
+        schema_version: 1,
+        comparison,
+        conditions: &verdicts.judged,
+        unjudged: &verdicts.unjudged,
+    };
+    serde_json::to_string_pretty(&document).map_err(|error| error.to_string())
+}

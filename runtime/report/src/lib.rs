@@ -1,0 +1,36 @@
+//! What a run leaves behind for people: the summary that goes into `summary.json` and its
+//! rendering for a terminal. It measures nothing and prints nothing; the caller writes the text.
+#![forbid(unsafe_code)]
+
+pub(crate) mod alike;
+pub mod analysis;
+pub mod assessment;
+pub mod card_figures;
+pub mod clock_summary;
+pub mod compare;
+pub mod emulation;
+pub(crate) mod event_log;
+pub mod face;
+pub mod face_figures;
+mod face_warnings;
+pub mod link_change;
+pub mod network;
+pub mod page;
+pub mod radio;
+pub mod replay;
+pub mod score_event;
+pub mod simulate;
+pub mod study;
+pub mod summary;
+pub mod terminal;
+pub mod trace;
+pub mod trace_counts;
+
+#[cfg(test)]
+pub(crate) mod sample;
+#[cfg(test)]
+mod sample_events;
+#[cfg(test)]
+mod sample_network;
+#[cfg(test)]
+mod sample_records;

@@ -1,0 +1,254 @@
+//! Data into text by templates (minijinja): the page, Markdown and `LaTeX` of this program, or a user's
+//! own. HTML is escaped wherever a template puts a value; figures alone are put as they are.
+
+use minijinja::{AutoEscape, Environment, ErrorKind, UndefinedBehavior, Value, context};
+use serde_json::json;
+
+use super::data::Page;
+use super::svg::{STYLE, escaped};
+use crate::alike::joined_labels;
+use crate::terminal::JOINT;
+
+/// Why a template gave no text.
+#[derive(Debug, thiserror::Error)]
+#[error("template {name}{place}: {text}")]
+pub struct TemplateError {
+    name: String,
+    /// `, line 3`, where it is known.
+    place: String,
+    text: String,
+}
+
+impl TemplateError {
+    fn of(name: &str, error: &minijinja::Error) -> Self {
+        let detail = error
+            .detail()
+            .map(|detail| format!(": {detail}"))
+            .unwrap_or_default();
+        Self {
+            name: error.name().unwrap_or(name).to_owned(),
+            place: error
+                .line()
+                .map(|line| format!(", line {line}"))
+                .unwrap_or_default(),
+            text: format!("{}{detail}", error.kind()),
+        }
+    }
+}
+
+const PAGE: &str = include_str!("templates/page.html");
+const MARKDOWN: &str = include_str!("templates/report.md");
+const TEX: &str = include_str!("templates/table.tex");
+const PAGE_STYLE: &str = include_str!("templates/page.css");
+const PAGE_SCRIPT: &str = include_str!("templates/page.js");
+
+/// What marks a file as one of ours, which may be overwritten.
+pub(super) const MARK: &str = "hil-runtime report";
+
+pub(super) fn html(page: &Page) -> Result<String, TemplateError> {
+    let plots = page.runs.iter().flat_map(|run| &run.drawings);
+    let plots = plots.filter_map(|one| {
+        Some((
+            one.name.clone(),
+            serde_json::to_value(one.plot.as_ref()?).ok()?,
+        ))
+    });
+    let plots: serde_json::Map<String, serde_json::Value> = plots.collect();
+    // Within a script element nothing is escaped, and "</script>" ends it.
+    let data = json!(plots)
+        .to_string()
+        .replace('<', "\\u003c")
+        .replace('>', "\\u003e")
+        .replace('&', "\\u0026");
+    let extra = context! {
+        style => Value::from_safe_string(format!("{STYLE}{PAGE_STYLE}")),
+        script => Value::from_safe_string(PAGE_SCRIPT.to_owned()),
+        plots => Value::from_safe_string(data),
+        mark => MARK,
+    };
+    rendered(("page.html", PAGE), page, extra)
+}
+
+pub(super) fn markdown(page: &Page) -> Result<String, TemplateError> {
+    let extra = context! { mark => MARK };
+    Ok(rendered(("report.md", MARKDOWN), page, extra)?.replace(JOINT, " "))
+}
+
+pub(super) fn tex(page: &Page) -> Result<String, TemplateError> {
+    let extra = context! { mark => MARK };
+    Ok(rendered(("table.tex", TEX), page, extra)?.replace(JOINT, "~"))
+}
+
+/// A user's own template: its name, whose ending decides about escaping, and its text.
+pub(super) fn own((name, text): (&str, &str), page: &Page) -> Result<String, TemplateError> {
+    rendered((name, text), page, context! {})
+}
+
+fn rendered(
+    (name, text): (&str, &str),
+    page: &Page,
+    extra: Value,
+) -> Result<String, TemplateError> {
+    let failed = |error: minijinja::Error| TemplateError::of(name, &error);
+    let mut environment = Environment::new();
+    environment.set_undefined_behavior(UndefinedBehavior::Strict);
+    environment.set_trim_blocks(true);
+    environment.set_lstrip_blocks(true);
+    let is_html = [".html", ".htm", ".xml", ".svg"]
+        .iter()
+        .any(|ending| name.ends_with(ending));
+    environment.set_auto_escape_callback(move |_| {
+        if is_html {
+            AutoEscape::Html
+        } else {
+            AutoEscape::None
+        }
+    });
+    // The engine's own escaping also replaces every slash; ours leaves paths readable.
+    environment.set_formatter(|out, state, value| {
+        let is_text = value.as_str().is_some_and(|_| !value.is_safe());
+        if is_text && state.auto_escape() == AutoEscape::Html {
+            let text = escaped(value.as_str().unwrap_or_default());
+            return out.write_str(&text).map_err(minijinja::Error::from);
+        }
+        minijinja::escape_formatter(out, state, value)
+    });
+    environment.add_filter("md", |text: String| markdown_escaped(&text));
+    environment.add_filter("tex", |text: String| tex_escaped(&text));
+    environment.add_filter("alike", alike);
+    environment.add_filter("xml", |text: String| {
+        Value::from_safe_string(escaped(&text))
+    });
+    environment.add_template(name, text).map_err(failed)?;
+    let template = environment.get_template(name).map_err(failed)?;
+    let page = Value::from_serialize(page);
+    template
+        .render(context! { ..extra, ..page })
+        .map_err(failed)
+}
+
+/// Figures for a table: those that there are none of for one reason make one row, where the first of
+/// them stands.
+fn alike(figures: Vec<Value>) -> Result<Vec<Value>, minijinja::Error> {
+    let mut rows: Vec<(String, Vec<Value>)> = Vec::new();
+    for figure in figures {
+        let reason = if field(&figure, "value")?.is_none() {
+            field(&figure, "method")?.to_string()
+        } else {
+            String::new()
+        };
+        let known = rows.iter_mut().find(|(known, _)| *known == reason);
+        match known.filter(|_| !reason.is_empty()) {
+            Some((_, row)) => row.push(figure),
+            None => rows.push((reason, vec![figure])),
+        }
+    }
+    let row = |(_, row): (String, Vec<Value>)| {
+        let label = |one: &Value| Ok(field(one, "label")?.to_string());
+        let labels = row.iter().map(label);
+        let labels = labels.collect::<Result<Vec<String>, minijinja::Error>>()?;
+        let labels: Vec<&str> = labels.iter().map(String::as_str).collect();
+        let label = joined_labels(&labels);
+        Ok(context! { label, ..row[0].clone() })
+    };
+    rows.into_iter().map(row).collect()
+}
+
+/// A field that every figure has; the engine's own look gives an empty text for one that is not there.
+fn field(figure: &Value, name: &str) -> Result<Value, minijinja::Error> {
+    let found = figure.get_attr(name)?;
+    if found.is_undefined() {
+        let text = format!("alike: {figure} is no figure, it has no field {name}");
+        return Err(minijinja::Error::new(ErrorKind::UndefinedError, text));
+    }
+    Ok(found)
+}
+
+/// For a cell of a GitHub table or a line of prose.
+fn markdown_escaped(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    for c in text.chars() {
+        match c {
+            '\\' | '`' | '*' | '_' | '[' | ']' | '|' | '#' | '~' => out.extend(['\\', c]),
+            '<' => out.push_str("&lt;"),
+            '>' => out.push_str("&gt;"),
+            '&' => out.push_str("&amp;"),
+            '\n' | '\r' => out.push(' '),
+            _ => out.push(c),
+        }
+    }
+    out
+}
+
+/// For text in `LaTeX`.
+fn tex_escaped(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    for c in text.chars() {
+        match c {
+            '&' | '%' | '$' | '#' | '_' | '{' | '}' => out.extend(['\\', c]),
+            '\\' => out.push_str(r"\textbackslash{}"),
+            '~' => out.push_str(r"\textasciitilde{}"),
+            '^' => out.push_str(r"\textasciicircum{}"),
+            '<' => out.push_str(r"\textless{}"),
+            '>' => out.push_str(r"\textgreater{}"),
+            'µ' => out.push_str(r"\textmu{}"),
+            '‰' => out.push_str(r"\textperthousand{}"),
+            '→' => out.push_str(r"$\rightarrow$"),
+            '≤' => out.push_str(r"$\le$"),
+            '±' => out.push_str(r"$\pm$"),
+            '−' => out.push_str("$-$"),
+            '–' => out.push_str("--"),
+            '\n' | '\r' => out.push(' '),
+            _ => out.push(c),
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_language_keeps_a_text_a_text() {
+        assert_eq!(markdown_escaped("a|b_<c>\n"), "a\\|b\\_&lt;c&gt; ");
+        assert_eq!(tex_escaped("5 % of a_b\\"), r"5 \% of a\_b\textbackslash{}");
+    }
+
+    #[test]
+    fn a_faulty_template_is_named_with_its_line() {
+        let page = super::super::page_of(&[], 10);
+        let error = own(("mine.txt", "a\n{{ title }\n"), &page)
+            .unwrap_err()
+            .to_string();
+        assert!(error.starts_with("template mine.txt, line 2: "), "{error}");
+        let error = own(("mine.txt", "{{ titel }}"), &page)
+            .unwrap_err()
+            .to_string();
+        assert!(error.contains("undefined"), "{error}");
+        assert_eq!(own(("mine.txt", "{{ title }}"), &page).unwrap(), "0 runs");
+    }
+
+    #[test]
+    fn what_is_no_figure_is_an_error_and_not_an_empty_row() {
+        let page = super::super::page_of(&[], 10);
+        let used = |figures: &str| {
+            let text = format!("\n{{{{ [{figures}]|alike|length }}}}");
+            own(("mine.txt", &text), &page)
+        };
+        assert_eq!(
+            used("{'label': 'a', 'value': 1, 'method': ''}").unwrap(),
+            "\n1"
+        );
+        for (figures, missing) in [
+            ("{'name': 'a', 'value': 1, 'method': ''}", "label"),
+            ("{'label': 'a', 'method': ''}", "value"),
+            ("{'label': 'a', 'value': none}", "method"),
+            ("'a'", "value"),
+        ] {
+            let error = used(figures).unwrap_err().to_string();
+            assert!(error.starts_with("template mine.txt, line 2: "), "{error}");
+            assert!(error.contains(&format!("no field {missing}")), "{error}");
+        }
+    }
+}

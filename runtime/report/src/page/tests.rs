@@ -1,0 +1,383 @@
+//! Pages of runs that went right, and of runs that went wrong in every way they can.
+
+use std::collections::BTreeMap;
+
+use super::material::{Found, Manifest, Material};
+use super::series::{Series, parse};
+use super::{Format, PAGE_BYTES_MAX, figure_files, page_of, render};
+use crate::network::TimelineSubject;
+use crate::sample::{awkward, empty, full};
+use crate::summary::RunSummary;
+use crate::terminal::{JOINT, Style};
+
+const HOSTILE: &str = "</script><script>alert(1)</script>\"'><img src=x onerror=alert(1)>&amp;]]>";
+
+fn material(summary: RunSummary) -> Material {
+    Material {
+        folder: "swing".to_owned(),
+        found: Found::Ended(Box::new(summary)),
+        series: Vec::new(),
+        printed: Some("as printed <b>\u{1b}[2J".to_owned()),
+        problems: Vec::new(),
+    }
+}
+
+fn html(material: &Material) -> String {
+    render(std::slice::from_ref(material), Format::Html, None).unwrap()
+}
+
+/// Every element that begins ends, in order; attributes are quoted, and no text has a bare `<`.
+fn assert_well_formed(page: &str) {
+    const VOID: [&str; 3] = ["meta", "link", "!doctype"];
+    let mut open: Vec<String> = Vec::new();
+    let mut rest = page;
+    while let Some(at) = rest.find('<') {
+        rest = &rest[at + 1..];
+        if let Some(comment) = rest.strip_prefix("!--") {
+            rest = &comment[comment.find("-->").expect("an open comment") + 3..];
+            continue;
+        }
+        let end = rest.find('>').expect("an open tag");
+        let tag = &rest[..end];
+        rest = &rest[end + 1..];
+        let name: String = tag
+            .chars()
+            .take_while(|c| !c.is_whitespace() && *c != '>')
+            .collect();
+        let name = name.trim_end_matches('/').to_ascii_lowercase();
+        if let Some(name) = name.strip_prefix('/') {
+            assert_eq!(open.pop().as_deref(), Some(name), "near {rest:.80}");
+            continue;
+        }
+        assert!(
+            name.starts_with(|c: char| c.is_ascii_alphabetic() || c == '!'),
+            "<{tag}>"
+        );
+        assert_eq!(tag.matches('"').count() % 2, 0, "<{tag}>");
+        let is_void = VOID.contains(&name.as_str()) || tag.ends_with('/');
+        if name == "script" || name == "style" {
+            let close = rest.find(&format!("</{name}")).expect("an open script");
+            rest = &rest[close..];
+        }
+        if !is_void {
+            open.push(name);
+        }
+    }
+    assert!(open.is_empty(), "left open: {open:?}");
+}
+
+#[test]
+fn a_full_page_is_well_formed_and_has_the_figures_of_the_summary() {
+    let page = html(&material(full()));
+    assert_well_formed(&page);
+    let text = page.replace(JOINT, " ");
+    for words in [
+        "completed",
+        "swing-split",
+        "arm/command",
+        "Where each microsecond went",
+        "Network and robot over time",
+        "How long it took",
+        "Losses in a row",
+        "spin: core 1 is not isolated",
+        "hil-runtime --topology deploy/topologies/split.toml --seed 42",
+        "clocks not aligned",
+        "block bootstrap",
+        "Wilson",
+    ] {
+        assert!(text.contains(words), "{words}");
+    }
+    let summary = full();
+    let account = summary.channels[0].account.as_ref().unwrap();
+    let p99 = account.end_to_end.distribution.measured().unwrap().p99_ns;
+    let p99 = crate::terminal::duration(p99);
+    assert!(page.contains(&p99), "{p99}");
+    assert!(!page.contains("NaN"));
+}
+
+#[test]
+fn nothing_is_fetched_and_everything_is_seen_without_a_script() {
+    let page = html(&material(full()));
+    let addresses: Vec<&str> = page
+        .match_indices("//")
+        .filter_map(|(at, _)| page.get(at.saturating_sub(6)..at + 20))
+        .collect();
+    let fetched = [
+        "src=",
+        "@import",
+        "url(http",
+        "fetch(",
+        "XMLHttpRequest",
+        "https://",
+    ];
+    for word in fetched {
+        assert!(!page.contains(word), "{word}: {addresses:?}");
+    }
+    // The name of the SVG vocabulary is no address that is fetched.
+    let names = page.matches("http://").count();
+    assert_eq!(
+        names,
+        page.matches("xmlns=\"http://www.w3.org/2000/svg\"").count()
+    );
+    let (before, _) = page.split_once("<script").unwrap();
+    assert!(before.matches("<svg").count() >= 6);
+    assert!(before.contains("Repeat this run"));
+}
+
+#[test]
+fn hostile_texts_stay_texts() {
+    let mut summary = full();
+    summary.run.name = HOSTILE.to_owned();
+    summary.run.repeat_command = HOSTILE.to_owned();
+    summary.channels[0].name = HOSTILE.to_owned();
+    summary.warnings.push(HOSTILE.to_owned());
+    if let Some(network) = &mut summary.network {
+        network.channels[0].channel = HOSTILE.to_owned();
+        for row in &mut network.timeline.rows {
+            match &mut row.subject {
+                TimelineSubject::Channel { channel: name, .. }
+                | TimelineSubject::Robot { label: name } => *name = HOSTILE.to_owned(),
+            }
+        }
+    }
+    for event in &mut summary.score_events.events {
+        event.what = HOSTILE.to_owned();
+    }
+    let material = material(summary);
+    let page = html(&material);
+    assert_well_formed(&page);
+    assert!(!page.contains("<img"), "escaped nowhere");
+    assert_eq!(page.matches("<script").count(), 2);
+    let markdown = render(std::slice::from_ref(&material), Format::Md, None).unwrap();
+    // An indented line is code, and shown as it is.
+    let prose = markdown.lines().filter(|line| !line.starts_with("    "));
+    let markdown = prose.collect::<Vec<_>>().join("\n");
+    assert!(
+        !markdown.contains("<img") && !markdown.contains("<script"),
+        "{markdown}"
+    );
+    for (name, svg) in figure_files(&[material], None).unwrap() {
+        assert_well_formed(svg.trim_start_matches("<?xml version=\"1.0\" encoding=\"UTF-8\"?>"));
+        assert!(
+            name.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'-'),
+            "{name}"
+        );
+    }
+}
+
+#[test]
+fn runs_that_went_wrong_get_pages_that_say_so() {
+    let mut silent = full();
+    silent.channels[0].account = None;
+    silent.network = None;
+    let manifest = Manifest {
+        name: "<killed>".to_owned(),
+        command_line: vec!["hil-runtime".to_owned()],
+        records: (3, 400),
+        ..Manifest::default()
+    };
+    let unfinished = Material {
+        found: Found::Unfinished(manifest),
+        printed: None,
+        ..material(full())
+    };
+    let mut torn = material(full());
+    torn.problems
+        .push("series/a.csv cannot be read: line 2: \"x\" is not a number".to_owned());
+    let cases = [
+        (material(awkward()), "failed"),
+        (material(empty()), "stopped early"),
+        (material(silent), "no records of this channel"),
+        (unfinished, "left no summary"),
+        (torn, "series/a.csv cannot be read"),
+    ];
+    for (material, expected) in cases {
+        let page = html(&material);
+        assert_well_formed(&page);
+        assert!(page.contains(expected), "{expected}");
+        assert!(page.contains("unavailable"), "{expected}");
+        for format in [Format::Md, Format::Tex, Format::Csv, Format::Json] {
+            let text = render(std::slice::from_ref(&material), format, None).unwrap();
+            assert!(!text.contains("NaN"), "{format:?}");
+        }
+    }
+}
+
+#[test]
+fn no_message_is_no_zero_delay() {
+    let page = page_of(&[material(empty())], 100);
+    let figures: BTreeMap<_, _> = super::csv::rows(&page.runs[0])
+        .filter(|(channel, _)| *channel == "arm/command")
+        .map(|(_, figure)| (figure.name.clone(), figure.clone()))
+        .collect();
+    for name in [
+        "p50",
+        "p99",
+        "max",
+        "loss_ratio",
+        "network_p50",
+        "reordered",
+    ] {
+        let figure = &figures[name];
+        assert_eq!(
+            (figure.value, figure.text.as_str()),
+            (None, "unavailable"),
+            "{name}"
+        );
+        assert!(!figure.method.is_empty(), "{name}");
+    }
+}
+
+/// As many rows as an hour of a robot at 250 Hz leaves, in 15 columns.
+fn long_series(name: &str) -> Series {
+    let mut text = "time_s,a,b,c,d,e,f,g,h,i,j,k,l,m,n\n".to_owned();
+    for index in 0..66_667_u32 {
+        let value = f64::from(index % 977) * 0.001_234_567_891;
+        let row = [
+            format!("{}", f64::from(index) * 0.015),
+            vec![format!("{value}"); 14].join(","),
+        ];
+        text.push_str(&row.join(","));
+        text.push('\n');
+    }
+    parse(name, &text).unwrap()
+}
+
+#[test]
+fn a_million_values_make_a_small_page_that_says_it_is_thinned() {
+    let mut material = material(full());
+    material.series = vec![long_series("robot"), long_series("network-arm-command")];
+    let page = html(&material);
+    assert!(page.len() < PAGE_BYTES_MAX, "{}", page.len());
+    assert!(page.contains("smallest and largest value within"));
+    let many = vec![material; 12];
+    let page = render(&many, Format::Html, None).unwrap();
+    assert!(page.contains("12 runs"));
+    assert_well_formed(&page);
+}
+
+#[test]
+fn several_runs_get_a_row_each_and_figures_of_their_own() {
+    let both = [material(full()), material(empty())];
+    let page = page_of(&both, 100);
+    assert_eq!(page.overview.as_ref().unwrap().rows.len(), 2);
+    let text = render(&both, Format::Html, None).unwrap();
+    assert_well_formed(&text);
+    let ids: Vec<&str> = text
+        .split(" id=\"")
+        .skip(1)
+        .filter_map(|rest| rest.split('"').next())
+        .collect();
+    let mut once = ids.clone();
+    once.sort_unstable();
+    once.dedup();
+    assert_eq!(once.len(), ids.len(), "{ids:?}");
+}
+
+#[test]
+fn markdown_says_the_name_of_its_only_run_once() {
+    let one = material(full());
+    let headings = |materials: &[Material]| {
+        let text = render(materials, Format::Md, None).unwrap();
+        let lines = text
+            .lines()
+            .filter(|line| line.starts_with("# ") || line.starts_with("## "));
+        lines.map(str::to_owned).collect::<Vec<_>>()
+    };
+    assert_eq!(headings(std::slice::from_ref(&one)).len(), 1);
+    assert_eq!(headings(&[one, material(full())]).len(), 3);
+}
+
+#[test]
+fn the_other_formats_have_the_same_figures() {
+    let one = [material(full())];
+    let csv = render(&one, Format::Csv, None).unwrap();
+    assert!(csv.starts_with("run,channel,figure,value,unit,low,high,method\r\n"));
+    assert!(csv.contains("swing-split,arm/command,p99,"), "{csv}");
+    let tex = render(&one, Format::Tex, None).unwrap();
+    assert_eq!(
+        tex.matches("\\begin{tabular}").count(),
+        tex.matches("\\bottomrule").count()
+    );
+    assert!(tex.contains("\\toprule"), "{tex}");
+    let json: serde_json::Value =
+        serde_json::from_str(&render(&one, Format::Json, None).unwrap()).unwrap();
+    assert_eq!(json["schema_version"], 1);
+    assert_eq!(json["runs"][0]["channels"][0]["name"], "arm/command");
+    let own = render(
+        &one,
+        Format::Html,
+        Some(("x.html", "<b>{{ runs[0].name }}</b>")),
+    )
+    .unwrap();
+    assert_eq!(own, "<b>swing-split</b>");
+    let error = figure_files(&one, Some("none")).unwrap_err();
+    assert!(
+        error.starts_with("no figure \"none\"; figures of this report: "),
+        "{error}"
+    );
+    assert!(error.contains("timeline"), "{error}");
+    assert_eq!(figure_files(&one, Some("timeline")).unwrap().len(), 1);
+}
+
+/// Ten figures that there are none of, for one reason, around one that there is.
+fn for_one_reason() -> RunSummary {
+    let mut summary = full();
+    let mut given = summary.score[0].clone();
+    given.value = None;
+    given.interval = None;
+    given.method = "no whole motion loop".to_owned();
+    let kept = summary.score[0].clone();
+    summary.score = (0..10)
+        .map(|number| {
+            let mut one = given.clone();
+            one.name = format!("figure_{number}");
+            one.label = format!("motion loops, number {number}");
+            one
+        })
+        .collect();
+    summary.score.insert(5, kept);
+    summary
+}
+
+#[test]
+fn a_reason_is_said_once_with_all_that_it_is_for() {
+    let summary = for_one_reason();
+    let page = html(&material(summary.clone()));
+    assert_well_formed(&page);
+    // The tile of the first figure says it by itself.
+    let reason = "<td class=\"how\">no whole motion loop";
+    assert_eq!(page.matches(reason).count(), 1);
+    assert!(page.contains("motion loops, number 0, number 1, number 2"));
+    assert!(page.contains(&summary.score[5].label));
+    let terminal = crate::terminal::render(&summary, 120, Style::Plain);
+    assert_eq!(
+        terminal.matches("no whole motion loop").count(),
+        1,
+        "{terminal}"
+    );
+    assert!(terminal.contains("unavailable, 10: no whole motion loop"));
+    let markdown = render(&[material(summary.clone())], Format::Md, None).unwrap();
+    assert_eq!(markdown.matches("no whole motion loop").count(), 1);
+    // For programs each figure stands by itself.
+    let csv = render(&[material(summary)], Format::Csv, None).unwrap();
+    assert_eq!(csv.matches("no whole motion loop").count(), 10);
+}
+
+#[test]
+fn long_lists_show_their_beginning_and_how_much_is_folded() {
+    let mut summary = full();
+    let event = summary.score_events.events[0].clone();
+    summary.score_events.events = vec![event; 40];
+    summary.warnings = (0..30)
+        .map(|number| format!("odd thing {number}"))
+        .collect();
+    let page = html(&material(summary));
+    assert_well_formed(&page);
+    assert!(page.contains("32 later ones of 40"));
+    let warnings = page.split("<h3>Warnings</h3>").nth(1).unwrap();
+    let (shown, rest) = warnings.split_once("<details>").unwrap();
+    assert!(shown.matches("<li>").count() == 8, "{shown}");
+    let folded = rest.split("</details>").next().unwrap();
+    assert!(folded.contains("odd thing 29") && folded.contains("more of"));
+}

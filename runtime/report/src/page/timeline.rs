@@ -1,0 +1,346 @@
+//! Figures over time: the network and the robot on the axis of the run, and the case's own series on
+//! theirs.
+
+use hil_core::case_study::Severity;
+
+use super::data::Drawing;
+use super::drawings::name_of;
+use super::figures::time::{Mark, MarkClass, over_time};
+use super::series::{Plot, PlotPanel, Series, Thinned, thinned};
+use crate::link_change::LinkChange;
+use crate::network::{NetworkQuantity, NetworkReport, TimelineRow, TimelineSubject};
+use crate::score_event::{ExplainedEvent, ScoreEvents};
+use crate::terminal::duration_s;
+
+/// Lines of one panel; a series with more columns gets more panels.
+const LINES_MAX: usize = 7;
+/// Panels of the case's own series.
+const CASE_PANELS_MAX: usize = 8;
+/// Outages shaded in the panels of the network.
+const BANDS_MAX: usize = 300;
+
+/// Network and robot on one axis.
+pub(super) fn over_run(
+    key: &str,
+    report: &NetworkReport,
+    (events, changes): (&ScoreEvents, &[LinkChange]),
+    (series, point_count): (&[Series], usize),
+) -> Drawing {
+    let rows = &report.timeline.rows;
+    let step_s = report.timeline.step_s;
+    let ends = rows.iter().map(|row| row.values.len() as f64 * step_s);
+    let until_s = ends.fold(0.0, f64::max);
+    let span = (0.0, if until_s > 0.0 { until_s } else { 1.0 });
+    let (mut panels, width_s) = network_panels(report, series, (span, point_count));
+    for row in rows {
+        let TimelineSubject::Robot { label } = &row.subject else {
+            continue;
+        };
+        // A number of events has no unit; an error has.
+        let (title, unit) = match row.unit.as_str() {
+            "1" => (format!("Robot: {label}"), "count"),
+            unit => (format!("Robot: {label} ({unit})"), unit),
+        };
+        panels.push(PlotPanel {
+            title,
+            unit: unit.to_owned(),
+            series: vec![of_row(label, row)],
+        });
+    }
+    let bands = bands(report);
+    let by_hand = changes.iter().filter_map(changed_at);
+    let moments = events.events.iter().filter_map(moment);
+    let moments: Vec<Mark> = moments.chain(by_hand).collect();
+    let caption = run_caption(report, (step_s, width_s), bands.len() == BANDS_MAX);
+    let plot = Plot {
+        axis: format!("{key}-run"),
+        from_s: span.0,
+        until_s: span.1,
+        panels,
+    };
+    let name = name_of(&[key, "timeline"]);
+    let title = "Network and robot over time";
+    Drawing {
+        svg: over_time((&name, title), &plot, &bands, &moments),
+        name,
+        title: title.to_owned(),
+        caption,
+        is_wide: true,
+        plot: Some(plot),
+    }
+}
+
+/// What is shaded: outages and processes that were down; of too many the longest.
+fn bands(report: &NetworkReport) -> Vec<Mark> {
+    let outages = report.events.iter().filter(|event| event.is_outage());
+    let mut outages: Vec<_> = outages.collect();
+    if outages.len() > BANDS_MAX {
+        outages.sort_by(|a, b| b.length_s().total_cmp(&a.length_s()));
+        outages.truncate(BANDS_MAX);
+    }
+    outages
+        .into_iter()
+        .map(|event| Mark {
+            from_s: event.from_s,
+            until_s: event.until_s,
+            class: MarkClass::Band,
+            channel: event.channel.clone(),
+            words: event.words(),
+        })
+        .collect()
+}
+
+fn run_caption(report: &NetworkReport, (robot_s, width_s): (f64, f64), is_cut: bool) -> String {
+    let mut caption = format!(
+        "Above the network, below the robot. Each point stands for up to {} and has the smallest and \
+         largest value within; the robot's for {}. Figures are from all messages. Shaded: outages{}.",
+        duration_s(width_s),
+        duration_s(robot_s),
+        if is_cut { ", the longest 300" } else { "" }
+    );
+    if report.clocks_differ {
+        caption.push_str(
+            " The hosts' clocks are not aligned: each host's times count from its own start of the run.",
+        );
+    } else if let Some(bound_s) = report.clock_bound_s.filter(|bound_s| *bound_s > 0.0) {
+        let bound = duration_s(bound_s);
+        caption.push_str(
+            &[
+                " Times of two hosts are known to ",
+                &bound,
+                " of each other.",
+            ]
+            .concat(),
+        );
+    }
+    caption
+}
+
+fn moment(event: &ExplainedEvent) -> Option<Mark> {
+    Some(Mark {
+        from_s: event.at_s?,
+        until_s: None,
+        class: match event.severity {
+            Severity::Notice => MarkClass::Notice,
+            Severity::Hazard => MarkClass::Hazard,
+            Severity::Incident => MarkClass::Incident,
+        },
+        channel: String::new(),
+        words: event.what.clone(),
+    })
+}
+
+/// Refused changes changed nothing.
+fn changed_at(change: &LinkChange) -> Option<Mark> {
+    Some(Mark {
+        from_s: change.at_s.filter(|_| change.is_in_force())?,
+        until_s: None,
+        class: MarkClass::Change,
+        channel: String::new(),
+        words: change.what(),
+    })
+}
+
+fn of_row(name: &str, row: &TimelineRow) -> Thinned {
+    Thinned {
+        name: name.to_owned(),
+        channel: match &row.subject {
+            TimelineSubject::Channel { channel, .. } => channel.clone(),
+            TimelineSubject::Robot { .. } => String::new(),
+        },
+        high: row.values.clone(),
+        low: Vec::new(),
+    }
+}
+
+/// What of the network is drawn: title, unit, what the timeline has of it.
+const PANELS: [(&str, &str, Option<NetworkQuantity>); 4] = [
+    ("Delay, median", "s", None),
+    ("Delay, largest", "s", Some(NetworkQuantity::Delay)),
+    ("Share lost", "share", Some(NetworkQuantity::Loss)),
+    ("Longest silence", "s", Some(NetworkQuantity::Silence)),
+];
+
+/// From the series where they are, else from the summary's timeline; with the width of a step.
+fn network_panels(
+    report: &NetworkReport,
+    series: &[Series],
+    (span, steps): ((f64, f64), usize),
+) -> (Vec<PlotPanel>, f64) {
+    let mut panels: Vec<PlotPanel> = PANELS
+        .iter()
+        .map(|(title, unit, _)| PlotPanel {
+            title: (*title).to_owned(),
+            unit: (*unit).to_owned(),
+            series: Vec::new(),
+        })
+        .collect();
+    let mut width_s = 0.0_f64;
+    for one in &report.channels {
+        let channel = one.channel.as_str();
+        let file = format!("network-{}", channel.replace('/', "-"));
+        let found = series.iter().find(|one| one.name == file);
+        if let Some(found) = found.filter(|found| !found.rows.is_empty()) {
+            let steps = steps.min(found.rows.len()).max(1);
+            width_s = width_s.max((span.1 - span.0) / steps as f64);
+            // A channel that speaks seldom has no silence to tell of; see the summary's timeline.
+            let told = |quantity: Option<NetworkQuantity>| {
+                let mut rows = report.timeline.rows.iter();
+                quantity.is_none_or(|quantity| rows.any(|row| row.subject.is_of(channel, quantity)))
+            };
+            let points = network_points(found).into_iter().zip(PANELS);
+            for (panel, (points, (_, _, quantity))) in panels.iter_mut().zip(points) {
+                if !told(quantity) {
+                    continue;
+                }
+                let thin = thinned((channel, channel), points.into_iter(), span, steps);
+                panel.series.push(thin);
+            }
+            continue;
+        }
+        width_s = width_s.max(report.timeline.step_s);
+        for (panel, (_, _, quantity)) in panels.iter_mut().zip(PANELS) {
+            let row = quantity.and_then(|quantity| {
+                let mut rows = report.timeline.rows.iter();
+                rows.find(|row| row.subject.is_of(channel, quantity))
+            });
+            panel.series.extend(row.map(|row| of_row(channel, row)));
+        }
+    }
+    let has_values = |one: &Thinned| one.high.iter().any(Option::is_some);
+    for panel in &mut panels {
+        panel.series.retain(has_values);
+    }
+    panels.retain(|panel| !panel.series.is_empty());
+    (panels, width_s)
+}
+
+/// Median delay, largest delay, share lost, silence; each at the middle of its bin.
+fn network_points(series: &Series) -> [Vec<(f64, f64)>; 4] {
+    let starts = || {
+        series
+            .rows
+            .iter()
+            .filter_map(|row| row.first().copied().flatten())
+    };
+    let width_s = starts()
+        .nth(1)
+        .zip(starts().next())
+        .map_or(0.0, |(second, first)| second - first);
+    let column = |name: &str| -> Vec<(f64, f64)> {
+        let index = series.column(name);
+        let points = index.map(|index| series.points(index).collect::<Vec<_>>());
+        let points = points.unwrap_or_default().into_iter();
+        points
+            .map(|(at, value)| (at + width_s / 2.0, value))
+            .collect()
+    };
+    let lost = series.column("sent_count").zip(series.column("lost_count"));
+    let share = |row: &Vec<Option<f64>>| {
+        let (sent, lost) = lost?;
+        let (sent, lost) = ((*row.get(sent)?)?, (*row.get(lost)?)?);
+        (sent > 0.0).then_some(((*row.first()?)? + width_s / 2.0, lost / sent))
+    };
+    let shares = series.rows.iter().filter_map(share).collect();
+    [
+        column("delay_s_p50"),
+        column("delay_s_max"),
+        shares,
+        column("silence_s_max"),
+    ]
+}
+
+/// The case's own series over time, on the axis that they name.
+pub(super) fn of_case(
+    key: &str,
+    series: &[Series],
+    steps: usize,
+) -> (Option<Drawing>, Vec<String>) {
+    let is_own = |one: &&Series| !one.name.starts_with("network-") && one.columns.len() > 1;
+    let is_timed = |one: &&Series| {
+        one.columns
+            .first()
+            .is_some_and(|column| column.name == "time_s")
+    };
+    let timed: Vec<&Series> = series.iter().filter(is_own).filter(is_timed).collect();
+    let moments = timed
+        .iter()
+        .flat_map(|one| one.rows.iter().filter_map(|row| row.first().copied()?));
+    let (from_s, until_s) = moments.fold((f64::MAX, f64::MIN), |(low, high), at| {
+        (low.min(at), high.max(at))
+    });
+    if until_s <= from_s {
+        return (None, Vec::new());
+    }
+    let (panels, left_out) = case_panels(&timed, (from_s, until_s), steps);
+    let axis_words = timed
+        .iter()
+        .map(|one| one.columns[0].label.as_str())
+        .find(|words| !words.is_empty());
+    let plot = Plot {
+        axis: format!("{key}-case"),
+        from_s,
+        until_s,
+        panels,
+    };
+    let name = name_of(&[key, "robot"]);
+    let title = "The robot, as its case plots it";
+    let caption = format!(
+        "Axis: {}. Each point stands for {} and has the smallest and largest value within; all values \
+         are in series/.",
+        axis_words.unwrap_or("time_s of the series"),
+        duration_s((until_s - from_s) / steps.max(1) as f64)
+    );
+    let drawing = Drawing {
+        svg: over_time((&name, title), &plot, &[], &[]),
+        name,
+        title: title.to_owned(),
+        caption,
+        is_wide: true,
+        plot: Some(plot),
+    };
+    (Some(drawing), left_out)
+}
+
+/// Panels of the case's series, and the files that found no room.
+fn case_panels(timed: &[&Series], span: (f64, f64), steps: usize) -> (Vec<PlotPanel>, Vec<String>) {
+    let mut panels = Vec::new();
+    let mut left_out = Vec::new();
+    for one in timed {
+        let columns: Vec<usize> = (1..one.columns.len()).collect();
+        for chunk in columns.chunks(LINES_MAX) {
+            if panels.len() == CASE_PANELS_MAX {
+                left_out.push(format!("series/{}.csv", one.name));
+                break;
+            }
+            let of = |column: &usize| {
+                let label = &one.columns[*column];
+                let words = if label.label.is_empty() {
+                    &label.name
+                } else {
+                    &label.label
+                };
+                thinned((words, ""), one.points(*column), span, steps)
+            };
+            let first = &one.columns[chunk[0]];
+            let title = if one.title.is_empty() {
+                &one.name
+            } else {
+                &one.title
+            };
+            panels.push(PlotPanel {
+                title: format!(
+                    "{title} ({})",
+                    if first.unit.is_empty() {
+                        "unit not said"
+                    } else {
+                        &first.unit
+                    }
+                ),
+                unit: first.unit.clone(),
+                series: chunk.iter().map(of).collect(),
+            });
+        }
+    }
+    (panels, left_out)
+}

@@ -1,0 +1,248 @@
+//! `hil-runtime replay`: hands the recorded messages of a finished run back to its case, which runs
+//! the robot's side again in virtual time. What is compared, and how, is the case's to say.
+
+use core::fmt::Write;
+use std::fs;
+use std::path::PathBuf;
+
+use hil_core::replay::Replay;
+use serde::Deserialize;
+use serde_json::{Value, json};
+
+use crate::analysis::AnalysisError;
+use crate::analysis::message_records::{MessageRecords, missing_count};
+use crate::summary::RunSummary;
+use crate::terminal::wrapped;
+use hil_platform::text::grouped;
+use hil_platform::words::counted;
+use hil_rundir::run_folder::RunFolder;
+use hil_topology::registry::{CaseEntry, CaseError, Registry};
+
+/// Columns of the outcome, and those before its texts.
+const PAGE_WIDTH: usize = 100;
+const LABEL_END: usize = 20;
+
+/// Why a run cannot be replayed at all.
+#[derive(Debug, thiserror::Error)]
+pub enum ReplayError {
+    /// No manifest, or one that cannot be read.
+    #[error("{}: not a run's folder: {problem}", path.display())]
+    Manifest {
+        /// The manifest.
+        path: PathBuf,
+        /// What is wrong with it.
+        problem: String,
+    },
+    /// The run was of the user's own programs.
+    #[error("the run is of no case; only a case can be replayed")]
+    NoCase,
+    /// This binary does not have the case.
+    #[error("the run is of case {name}, which this program does not know")]
+    UnknownCase {
+        /// Its name.
+        name: String,
+    },
+    /// The case refused the parameters it was run with.
+    #[error("case {name} cannot be made again: {source}")]
+    Case {
+        /// Its name.
+        name: String,
+        /// What it said.
+        source: CaseError,
+    },
+    /// The case has no replay.
+    #[error("case {name} has no replay; `hil-runtime cases` lists what each case offers")]
+    NoReplay {
+        /// Its name.
+        name: String,
+    },
+    /// The records cannot be read.
+    #[error(transparent)]
+    Records(#[from] AnalysisError),
+    /// There are no records.
+    #[error("{}: no messages are recorded here, so there is nothing to replay", folder.display())]
+    NoRecords {
+        /// The records folder.
+        folder: PathBuf,
+    },
+}
+
+/// A run that was replayed.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Replayed {
+    run: String,
+    case: String,
+    replay: Replay,
+}
+
+/// What of a manifest a replay needs.
+#[derive(Debug, Deserialize)]
+struct Manifest {
+    topology: ManifestTopology,
+}
+
+#[derive(Debug, Deserialize)]
+struct ManifestTopology {
+    case: Option<ManifestCase>,
+    run: ManifestRun,
+}
+
+#[derive(Debug, Deserialize)]
+struct ManifestCase {
+    name: String,
+    parameters: Value,
+}
+
+#[derive(Debug, Deserialize)]
+struct ManifestRun {
+    seed: u64,
+}
+
+/// Replays the run in `folder`; `tell` hears what is done, and the share of it where that is known.
+///
+/// # Errors
+/// When there is nothing to replay, or nobody who can.
+pub fn replay(
+    folder: &RunFolder,
+    registry: &Registry,
+    tell: &dyn Fn(Option<f64>, &str),
+) -> Result<Replayed, ReplayError> {
+    let path = folder.manifest();
+    let manifest = fs::read_to_string(&path)
+        .map_err(|error| error.to_string())
+        .and_then(|text| {
+            serde_json::from_str::<Manifest>(&text).map_err(|error| error.to_string())
+        });
+    let topology = manifest
+        .map_err(|problem| ReplayError::Manifest { path, problem })?
+        .topology;
+    let ManifestCase { name, parameters } = topology.case.ok_or(ReplayError::NoCase)?;
+    let Some(entry) = registry.find(&name) else {
+        return Err(ReplayError::UnknownCase { name });
+    };
+    let case = match entry.make(parameters, topology.run.seed) {
+        Ok(case) => case,
+        Err(source) => return Err(ReplayError::Case { name, source }),
+    };
+    let reach = |share| tell(Some(share), "reading messages");
+    let mut records = MessageRecords::read(&folder.records(), &reach)?;
+    tell(None, "running the robot again");
+    if records.log.counts().next().is_none() {
+        let folder = folder.records();
+        return Err(ReplayError::NoRecords { folder });
+    }
+    if !has_one_clock(folder) {
+        records.log.set_clocks_differ();
+    }
+    let Some(mut replay) = case.replay(&records.log) else {
+        return Err(ReplayError::NoReplay { name });
+    };
+    let also = gaps(entry, &records, &replay.gaps);
+    replay.gaps.extend(also);
+    Ok(Replayed {
+        run: folder.name(),
+        case: name,
+        replay,
+    })
+}
+
+/// True when the run's summary says so; a run without one is taken at its worst.
+fn has_one_clock(folder: &RunFolder) -> bool {
+    let summary = fs::read_to_string(folder.summary())
+        .ok()
+        .and_then(|text| RunSummary::from_json(&text).ok());
+    // Records are replayed as they were taken: aligned clocks are two clocks still.
+    summary.is_some_and(|summary| {
+        let clocks = summary.clocks.as_ref();
+        clocks.map_or(!summary.score_events.clocks_differ, |one| one.has_one_clock)
+    })
+}
+
+/// What is missing of the records and not told by the case already. A role that tells the record
+/// more than the other roles is the one that runs again: what it said must be there, and what only
+/// the record heard must be whole.
+fn gaps(entry: &CaseEntry, records: &MessageRecords, told: &[String]) -> Vec<String> {
+    let mut gaps = records.problems.clone();
+    let channels = entry.channels.iter();
+    let tells_more = |role: &str| {
+        let mut recorded = channels.clone().filter(|one| one.is_recorded_only());
+        recorded.any(|one| one.from == role)
+    };
+    for channel in channels.clone().filter(|one| tells_more(one.from)) {
+        let name = channel.name;
+        if told.iter().any(|gap| gap.contains(name)) {
+            continue;
+        }
+        if !records.files.contains(name) {
+            gaps.push(format!("{name}: no record is at hand"));
+        }
+        let missing = missing_count(records.log.raw(name));
+        if channel.is_recorded_only() && missing > 0 {
+            let count = grouped(missing);
+            gaps.push(format!("{name}: {count} missing in its record"));
+        }
+    }
+    gaps
+}
+
+impl Replayed {
+    /// True when nothing differs and nothing is missing.
+    pub fn is_identical(&self) -> bool {
+        self.replay.is_identical()
+    }
+
+    fn verdict(&self) -> &'static str {
+        let replay = &self.replay;
+        if replay.is_identical() {
+            "identical"
+        } else if replay.different_count > 0 {
+            "DIFFERENT"
+        } else if replay.compared_count == 0 {
+            "nothing was compared"
+        } else {
+            "records are missing"
+        }
+    }
+
+    /// The outcome for people.
+    pub fn text(&self) -> String {
+        let replay = &self.replay;
+        let mut text = format!("{} · {}: {}\n", self.case, self.run, self.verdict());
+        let mut field = |label: &str, words: &str| {
+            for (index, row) in wrapped(words, PAGE_WIDTH - LABEL_END).iter().enumerate() {
+                let label = if index == 0 { label } else { "" };
+                let _infallible = writeln!(text, "  {label:<18}{row}");
+            }
+        };
+        field("method", &replay.method);
+        field("went in", &counted(replay.input_count, "message"));
+        let compared = counted(replay.compared_count, "message");
+        let different = match replay.different_count {
+            0 => "none differs".to_owned(),
+            1 => "1 differs".to_owned(),
+            count => format!("{} differ", grouped(count)),
+        };
+        field("compared", &format!("{compared}, {different}"));
+        if let Some(first) = &replay.first_difference {
+            field("first difference", first);
+        }
+        for (index, gap) in replay.gaps.iter().enumerate() {
+            field(if index == 0 { "gaps" } else { "" }, gap);
+        }
+        text
+    }
+
+    /// The outcome for programs.
+    pub fn json(&self) -> String {
+        let document = json!({
+            "run": self.run,
+            "case": self.case,
+            "is_identical": self.is_identical(),
+            "replay": self.replay,
+        });
+        format!("{document:#}\n")
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,392 @@
+//! `hil-runtime simulate`: a topology's case in virtual time, with the link models of its emulated
+//! links. It starts no process and opens no socket.
+
+mod events;
+mod network;
+mod watched;
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use hil_account::{
+    ChannelAccount, Closing, EndToEnd, FateCounts, Gaps, MessageFate, StampCoverage,
+};
+use hil_core::link_model::LinkModel;
+use hil_core::link_model::ReplayTally;
+use hil_core::plot::PlotSeries;
+use hil_core::run_log::RunLog;
+use hil_core::simulation::{Carrier, ChannelCounts, Simulation, SimulationError, SimulationResult};
+use hil_core::time::Instant;
+use hil_stats::histogram::Distribution;
+
+use crate::analysis::figures::shell_words;
+use crate::analysis::outages::OutageStory;
+use crate::event_log;
+use crate::summary::{
+    ChannelSummary, CountByName, DirectionSummary, Fact, LinkKind, Outcome, RecordedFigures,
+    RunFacts, RunSummary, ScoreMetric,
+};
+use crate::terminal;
+use crate::terminal::{Style, percent};
+use hil_rundir::launch::Side;
+use hil_rundir::pipe::CounterGroup;
+use hil_rundir::run_folder::RunFolder;
+use hil_rundir::series;
+use hil_topology::emulation::EmulationLaunch;
+use hil_topology::registry::{Case, Registry};
+use hil_topology::{Channel, Crossing, Program, Topology};
+
+use self::watched::Watch;
+
+/// Why there is no outcome, or not all of its files.
+#[derive(Debug, thiserror::Error)]
+pub enum SimulateError {
+    /// The topology cannot be simulated.
+    #[error("{0}")]
+    Topology(String),
+    /// A file could not be written.
+    #[error("{0}")]
+    Output(String),
+    /// What is in the folder would be overwritten, or left beside what it does not belong to.
+    #[error("{}: the folder is not empty; name another one, or empty it", .0.display())]
+    Occupied(PathBuf),
+}
+
+/// A run in virtual time that is over.
+#[derive(Debug)]
+pub struct Simulated {
+    /// As of any run.
+    pub summary: RunSummary,
+    case: Box<dyn Case>,
+    log: RunLog,
+    network_series: Vec<PlotSeries>,
+}
+
+/// Runs the case of the topology in `file` in virtual time; tells `watch` now and then which share of
+/// it is over.
+///
+/// # Errors
+/// When the topology has no case, or a link that only a real run shows.
+pub fn simulate(
+    topology: &Topology,
+    file: &Path,
+    registry: &Registry,
+    watch: &mut dyn FnMut(f64),
+) -> Result<Simulated, SimulateError> {
+    let refused = |text: String| SimulateError::Topology(text);
+    let made = registry
+        .make_case(topology)
+        .map_err(|error| refused(error.to_string()))?;
+    let no_case = "the topology names no case; only a case can be simulated";
+    let (entry, case) = made.ok_or_else(|| refused(no_case.to_owned()))?;
+    refuse_faces(topology).map_err(refused)?;
+    let mut links = BTreeMap::new();
+    let mut carriers: BTreeMap<String, Box<dyn Carrier>> = BTreeMap::new();
+    for (name, emulation) in emulations(topology).map_err(refused)? {
+        // Virtual time begins with the run.
+        let link = emulation
+            .model(&name)
+            .map_err(|error| refused(error.to_string()))?;
+        let replay = link.replay_tally();
+        let (carrier, watch) = Watch::over(link);
+        carriers.insert(name.clone(), carrier);
+        let link = WatchedLink {
+            emulation,
+            replay,
+            watch,
+        };
+        links.insert(name, link);
+    }
+    let roles = entry
+        .roles
+        .iter()
+        .map(|role| case.role(role).map(|made| (*role, made)))
+        .collect::<Option<Vec<_>>>()
+        .ok_or_else(|| refused("the case lists a role it cannot make".to_owned()))?;
+    let result = Simulation::of_roles(entry.name, entry.channels, roles, carriers)
+        .and_then(|simulation| run_watched(simulation, topology.run().duration, watch))
+        .map_err(|error| refused(error.to_string()))?;
+    let score = case.score(&result.log);
+    let duration = topology.run().duration;
+    let mut summary = RunSummary::new(run_facts(topology, file));
+    let outages: Vec<_> = links
+        .iter()
+        .map(|(name, link)| events::story(name.clone(), link.watch.outages(), duration))
+        .collect();
+    let channels = topology.channels().iter();
+    summary.channels = channels
+        .map(|channel| {
+            let story = outages.iter().find(|story| story.channel == channel.name);
+            ChannelSummary {
+                outages: story.and_then(OutageStory::figures),
+                ..channel_summary(topology, channel, &result, links.get(&channel.name))
+            }
+        })
+        .collect();
+    summary.score = ScoreMetric::all_of(&score);
+    summary.score_events = events::explained(&score, entry.channels, &outages, &result.log);
+    let watches = links.into_iter().map(|(name, link)| (name, link.watch));
+    let (network, network_series) = network::of_simulation(
+        topology,
+        watches.collect(),
+        &result.log,
+        case.errors(&result.log),
+        &mut summary.score_events,
+    )
+    .unzip();
+    summary.network = network;
+    Ok(Simulated {
+        summary,
+        case,
+        log: result.log,
+        network_series: network_series.unwrap_or_default(),
+    })
+}
+
+fn run_facts(topology: &Topology, file: &Path) -> RunFacts {
+    let case = topology.case().map(|case| case.name.clone());
+    let command_line: Vec<String> = std::env::args().collect();
+    RunFacts {
+        name: topology.name().to_owned(),
+        case: case.unwrap_or_default(),
+        topology_file: file.display().to_string(),
+        topology_hash: format!("{:016x}", topology.hash()),
+        seed: topology.run().seed,
+        security: None,
+        is_virtual: true,
+        host: "none".to_owned(),
+        started: "virtual time".to_owned(),
+        starts_ns: BTreeMap::new(),
+        duration_s: topology.run().duration.as_secs_f64(),
+        outcome: Outcome::Completed,
+        exit_reason: "ran its full length in virtual time".to_owned(),
+        folder: "none; --output DIR writes one".to_owned(),
+        files: Vec::new(),
+        repeat_command: shell_words(&command_line),
+    }
+}
+
+/// Runs for `duration`; tells `watch` which share of it is over.
+fn run_watched(
+    simulation: Simulation,
+    duration: Duration,
+    watch: &mut dyn FnMut(f64),
+) -> Result<SimulationResult, SimulationError> {
+    simulation.run_watched(duration, &mut |now| {
+        let passed = now.saturating_duration_since(Instant::ZERO);
+        watch(passed.as_secs_f64() / duration.as_secs_f64());
+    })
+}
+
+fn refuse_faces(topology: &Topology) -> Result<(), String> {
+    let mut processes = topology.processes().iter();
+    let face = processes.find(|one| matches!(one.program, Program::Egm { .. }));
+    face.map_or(Ok(()), |face| {
+        let name = &face.name;
+        Err(format!(
+            "process `{name}` speaks with a foreign program, which knows no virtual time"
+        ))
+    })
+}
+
+/// What the links do to the channels that cross one, by the channel's name.
+fn emulations(topology: &Topology) -> Result<Vec<(String, EmulationLaunch)>, String> {
+    let seed = topology.run().seed;
+    let emulation = |crossing: Crossing<'_>| {
+        let name = &crossing.channel.name;
+        let emulation = EmulationLaunch::of(&crossing, seed).ok_or_else(|| {
+            format!(
+                "channel {name} crosses link {} via {}, whose delay only a real run shows; use \
+                 via = \"emulated\" to simulate it",
+                crossing.link.name,
+                crossing.link.via.word()
+            )
+        })?;
+        Ok((name.clone(), emulation))
+    };
+    topology.crossings().map(emulation).collect()
+}
+
+/// Makes sure that nothing is in the way of the files in `folder`, before anything is computed.
+///
+/// # Errors
+/// When the folder has anything in it, or cannot be read.
+pub fn check_output(folder: &Path) -> Result<(), SimulateError> {
+    let is_occupied = match fs::read_dir(folder) {
+        Ok(mut entries) => entries.next().is_some(),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => false,
+        Err(error) => {
+            let text = format!("{}: {error}", folder.display());
+            return Err(SimulateError::Output(text));
+        }
+    };
+    if is_occupied {
+        return Err(SimulateError::Occupied(folder.to_owned()));
+    }
+    Ok(())
+}
+
+impl Simulated {
+    /// Writes the run's folder: series, summary, events and report.
+    ///
+    /// # Errors
+    /// Names the file that cannot be written.
+    pub fn write(&mut self, folder: &Path) -> Result<(), SimulateError> {
+        let failed = |path: PathBuf, error: io::Error| {
+            SimulateError::Output(format!("{}: {error}", path.display()))
+        };
+        fs::create_dir_all(folder).map_err(|error| failed(folder.to_owned(), error))?;
+        let files = RunFolder::existing(folder);
+        let mut made = self.case.series(&self.log);
+        made.append(&mut self.network_series);
+        let names = series::write(&files.series(), made)
+            .map_err(|error| SimulateError::Output(error.to_string()))?;
+        let run = &mut self.summary.run;
+        run.folder = folder.display().to_string();
+        run.files = vec![
+            Fact::new("summary.json", "every figure of this report"),
+            Fact::new("events.log", "what happened to the robot, one line each"),
+        ];
+        if !names.is_empty() {
+            let what = format!("{}; columns in series/series.json", names.join(", "));
+            run.files.push(Fact::new("series/", what));
+        }
+        let summary = &self.summary;
+        let written = summary.write(&files.summary());
+        written.map_err(|error| SimulateError::Output(error.to_string()))?;
+        let page = terminal::render(summary, REPORT_FILE_WIDTH, Style::Plain);
+        let events = event_log::text(&summary.run.name, &summary.score_events, &[]);
+        for (path, text) in [(files.report(), page), (files.events(), events)] {
+            fs::write(&path, text).map_err(|error| failed(path, error))?;
+        }
+        Ok(())
+    }
+}
+
+/// The account of one channel, with what virtual time lacks "unavailable".
+fn channel_summary(
+    topology: &Topology,
+    channel: &Channel,
+    result: &SimulationResult,
+    link: Option<&WatchedLink>,
+) -> ChannelSummary {
+    let recorded = result.recorded_counts.get(channel.name.as_str());
+    let counts = result.channels.get(channel.name.as_str());
+    let lost_count = link.map_or(0, |link| link.watch.lost_count());
+    ChannelSummary {
+        name: channel.name.clone(),
+        from: channel.from.clone(),
+        to: channel.to.clone(),
+        link: LinkKind::of(topology, channel),
+        account: counts.map(|counts| account(counts, lost_count)),
+        outages: None,
+        emulation: None,
+        trace_replay: link.and_then(|link| Some(link.replay.as_ref()?.counts())),
+        recorded: recorded.map(|count| RecordedFigures {
+            message_count: *count,
+            missing_count: 0,
+        }),
+        refusals: Vec::new(),
+        no_room_count: 0,
+        directions: link.map(WatchedLink::direction).into_iter().collect(),
+    }
+}
+
+fn account(counts: &ChannelCounts, lost_count: u64) -> ChannelAccount {
+    const REASON: &str = "virtual time notes what a link did, and no stage of a message";
+    let unavailable = || Distribution::unavailable(REASON);
+    let published_count = counts.published_count;
+    let in_flight_count = counts.in_flight_count.min(published_count - lost_count);
+    let mut fates = FateCounts::default();
+    for (fate, count) in [
+        (
+            MessageFate::Taken,
+            published_count - lost_count - in_flight_count,
+        ),
+        (MessageFate::LostOnWire, lost_count),
+        (MessageFate::InFlight, in_flight_count),
+    ] {
+        if count > 0 {
+            fates.add(fate, count);
+        }
+    }
+    ChannelAccount {
+        published_count,
+        published_unrecorded_count: Some(0),
+        producer_restart_count: 0,
+        fates,
+        reordered_count: None,
+        duplicated_count: None,
+        late_count: None,
+        segments: Vec::new(),
+        hardware_wire: None,
+        end_to_end: EndToEnd {
+            distribution: unavailable(),
+            bins: Vec::new(),
+            p50_interval: None,
+            p99_interval: None,
+            alignment_bound_ns: None,
+            bound: None,
+        },
+        closing: Closing::Unavailable {
+            reason: REASON.to_owned(),
+        },
+        coverage: StampCoverage::default(),
+        round_trip: unavailable(),
+        loss_bursts: Vec::new(),
+        gaps: Gaps {
+            between_taken: unavailable(),
+            longest: None,
+            longest_unattributed: None,
+            last_taken_to_run_end_ns: None,
+        },
+        interruptions: Vec::new(),
+    }
+}
+
+/// A link model under watch.
+struct WatchedLink {
+    emulation: EmulationLaunch,
+    replay: Option<ReplayTally>,
+    watch: Watch,
+}
+
+impl WatchedLink {
+    /// The model and its own counts, where a real run has its gateways.
+    fn direction(&self) -> DirectionSummary {
+        let mut facts = vec![Fact::new("model", self.emulation.describe())];
+        let ratio = self.emulation.loss_ratio();
+        facts.extend(ratio.map(|ratio| Fact::new("loss asked for", percent(ratio))));
+        let causes = self.watch.loss_causes();
+        let causes = causes.into_iter().flat_map(|causes| {
+            [
+                ("link_outage_lost_count", causes.outage_count),
+                ("link_chance_lost_count", causes.chance_count),
+                ("link_queue_lost_count", causes.queue_count),
+            ]
+        });
+        let all = [("link_lost_count", self.watch.lost_count())];
+        let counters = all.into_iter().chain(causes);
+        DirectionSummary {
+            process: "simulate".to_owned(),
+            // Where a real run has its link model: behind the receiving socket.
+            direction: Side::Ingress,
+            peer_state: "none, in virtual time".to_owned(),
+            counters: counters
+                .map(|(name, count)| CountByName {
+                    group: CounterGroup::Own,
+                    name: name.to_owned(),
+                    count,
+                })
+                .collect(),
+            facts,
+            stalls: None,
+        }
+    }
+}
+
+/// Width of `report.txt`.
+const REPORT_FILE_WIDTH: usize = 100;

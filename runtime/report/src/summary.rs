@@ -1,0 +1,607 @@
+//! The serialisable summary of a run, schema version 1. It holds figures, not judgements: those
+//! are drawn from them in [`super::assessment`] whenever a summary is written.
+//!
+//! `summary.json` is one object with the fields of [`RunSummary`] under their own names plus
+//! `assessment`. Within a schema version fields are only added; a reader ignores what it does
+//! not know. Units are part of the names.
+
+use std::collections::BTreeMap;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use hil_account::{ChannelAccount, MessageFate, OutageFigures};
+use hil_core::case_study::{Metric, Score};
+use hil_core::link_model::ReplayCounts;
+use serde::{Deserialize, Serialize};
+
+use super::assessment::Assessment;
+use super::clock_summary::ClockSection;
+use super::emulation::EmulationFigures;
+use super::face::FaceSummary;
+use super::link_change::LinkChange;
+use super::network::NetworkReport;
+use super::radio::RadioReport;
+use super::score_event::ScoreEvents;
+use crate::card_figures::HardwareStamps;
+use hil_platform::host_facts::HostFacts;
+use hil_platform::text::grouped;
+use hil_rundir::event::{EventKind, ProcessKind};
+use hil_rundir::launch::Side;
+use hil_rundir::pipe::StallFigures;
+pub use hil_rundir::pipe::{CountByName, CounterGroup};
+use hil_rundir::protection::RunSecurity;
+use hil_topology::{Channel, Topology, Via};
+
+/// Version of the `summary.json` layout.
+pub const SCHEMA_VERSION: u32 = 1;
+
+/// Everything a finished run has to say.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RunSummary {
+    /// [`SCHEMA_VERSION`] of the writer.
+    pub schema_version: u32,
+    /// What was run, when, and how it ended.
+    pub run: RunFacts,
+    /// What the host is.
+    pub host_facts: HostFacts,
+    /// What real-time settings the kernel granted and refused.
+    pub realtime: RealtimeFacts,
+    /// How the hosts' clocks relate, and what that rests on.
+    #[serde(default)]
+    pub clocks: Option<ClockSection>,
+    /// The processes of the run.
+    pub processes: Vec<ProcessSummary>,
+    /// What happened, in order of time.
+    pub events: Vec<RunEvent>,
+    /// Changes of emulated links while the run went on, by hand or by a program, in order of time.
+    #[serde(default)]
+    pub link_changes: Vec<LinkChange>,
+    /// The channels, in the order of the case study.
+    pub channels: Vec<ChannelSummary>,
+    /// Arms that went through a face to a foreign program.
+    #[serde(default)]
+    pub faces: Vec<FaceSummary>,
+    /// What the network cards stamped; `None` unless hardware stamps were asked for.
+    #[serde(default)]
+    pub hardware_stamps: Option<HardwareStamps>,
+    /// What the radios of wireless hops said, and where messages were stamped.
+    #[serde(default)]
+    pub radio: RadioReport,
+    /// What the robot did.
+    pub score: Vec<ScoreMetric>,
+    /// What happened to the robot, and what the network had done to the messages concerned.
+    #[serde(default)]
+    pub score_events: ScoreEvents,
+    /// The network in the field's terms, and on one axis with the robot; `None` when no channel
+    /// crossed one.
+    #[serde(default)]
+    pub network: Option<NetworkReport>,
+    /// Anything else a reader must know; [`Assessment::warnings`] come on top.
+    pub warnings: Vec<String>,
+}
+
+impl RunSummary {
+    /// A summary with nothing but its run facts.
+    pub fn new(run: RunFacts) -> Self {
+        Self {
+            schema_version: SCHEMA_VERSION,
+            run,
+            host_facts: HostFacts::default(),
+            realtime: RealtimeFacts::default(),
+            clocks: None,
+            processes: Vec::new(),
+            events: Vec::new(),
+            link_changes: Vec::new(),
+            channels: Vec::new(),
+            faces: Vec::new(),
+            hardware_stamps: None,
+            radio: RadioReport::default(),
+            score: Vec::new(),
+            score_events: ScoreEvents::default(),
+            network: None,
+            warnings: Vec::new(),
+        }
+    }
+
+    /// The text of `summary.json`, with the assessment drawn from the figures.
+    ///
+    /// # Errors
+    /// When a figure cannot be represented.
+    pub fn to_json(&self) -> Result<String, SummaryError> {
+        #[derive(Serialize)]
+        struct Document<'a> {
+            #[serde(flatten)]
+            summary: &'a RunSummary,
+            assessment: Assessment,
+        }
+        let document = Document {
+            summary: self,
+            assessment: Assessment::of(self),
+        };
+        serde_json::to_string_pretty(&document).map_err(SummaryError::Encode)
+    }
+
+    /// Reads the text of `summary.json`.
+    ///
+    /// # Errors
+    /// When it is not JSON of this layout, or of a newer schema version.
+    pub fn from_json(text: &str) -> Result<Self, SummaryError> {
+        /// Read first, so that a newer layout is named as such instead of as a missing field.
+        #[derive(Deserialize)]
+        struct Version {
+            schema_version: u32,
+        }
+        let version: Version = serde_json::from_str(text).map_err(SummaryError::Decode)?;
+        if version.schema_version > SCHEMA_VERSION {
+            return Err(SummaryError::NewerSchema {
+                found: version.schema_version,
+            });
+        }
+        serde_json::from_str(text).map_err(SummaryError::Decode)
+    }
+
+    /// Writes `summary.json` at `path`, whole or not at all: a reader never sees half a file.
+    ///
+    /// # Errors
+    /// When the file cannot be written; names the path.
+    pub fn write(&self, path: &Path) -> Result<(), SummaryError> {
+        let text = self.to_json()?;
+        let partial = path.with_extension("json.partial");
+        std::fs::write(&partial, text)
+            .and_then(|()| std::fs::rename(&partial, path))
+            .map_err(|source| SummaryError::Write {
+                path: path.to_owned(),
+                source,
+            })
+    }
+}
+
+/// Why a summary could not be written or read.
+#[derive(Debug, thiserror::Error)]
+pub enum SummaryError {
+    /// A figure cannot be represented.
+    #[error("the summary cannot be encoded")]
+    Encode(#[source] serde_json::Error),
+    /// Not JSON, or not this layout.
+    #[error("not a run summary of schema version {SCHEMA_VERSION} or below")]
+    Decode(#[source] serde_json::Error),
+    /// Written by a newer version.
+    #[error("schema version {found} is newer than {SCHEMA_VERSION}")]
+    NewerSchema {
+        /// Version of the file.
+        found: u32,
+    },
+    /// The file cannot be written.
+    #[error("cannot write {}", path.display())]
+    Write {
+        /// Which file.
+        path: PathBuf,
+        /// Why.
+        source: io::Error,
+    },
+}
+
+/// What was run, when, and how it ended.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RunFacts {
+    /// Name of the run.
+    pub name: String,
+    /// Name of the case study.
+    pub case: String,
+    /// The topology file, as given.
+    pub topology_file: String,
+    /// Hash of the topology's text.
+    pub topology_hash: String,
+    /// Seed of every random stream.
+    pub seed: u64,
+    /// How the hops between hosts were protected; `None` when there were none.
+    #[serde(default)]
+    pub security: Option<RunSecurity>,
+    /// True for a run in virtual time, which has no host, no process and no record.
+    #[serde(default)]
+    pub is_virtual: bool,
+    /// The host that wrote this summary.
+    pub host: String,
+    /// Wall-clock time of the start, with its zone.
+    pub started: String,
+    /// The start on each host's own monotonic clock, nanoseconds; nothing of a host that told
+    /// nothing.
+    #[serde(default)]
+    pub starts_ns: BTreeMap<String, i64>,
+    /// Length of the run, seconds.
+    pub duration_s: f64,
+    /// How it ended.
+    pub outcome: Outcome,
+    /// Why it ended, in words.
+    pub exit_reason: String,
+    /// Folder with the records.
+    pub folder: String,
+    /// Files in the folder and what they hold.
+    pub files: Vec<Fact>,
+    /// The command that repeats the run.
+    pub repeat_command: String,
+}
+
+/// How a run ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Outcome {
+    /// Ran its full length.
+    Completed,
+    /// Ran, but a result failed its criterion.
+    CriterionFailed,
+    /// Stopped before its end by a person, a signal or the peer.
+    Stopped,
+    /// Could not go on.
+    Failed,
+}
+
+/// A label and its value.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Fact {
+    /// What.
+    pub label: String,
+    /// Its value.
+    pub value: String,
+}
+
+impl Fact {
+    /// `label` is `value`.
+    pub fn new(label: impl Into<String>, value: impl Into<String>) -> Self {
+        Self {
+            label: label.into(),
+            value: value.into(),
+        }
+    }
+}
+
+/// The facts of a host, for a reader.
+pub(crate) fn host_words(host: &HostFacts) -> Vec<Fact> {
+    let facts = host.facts.iter();
+    let words = facts.map(|one| Fact::new(one.label.replace('_', " "), one.value.to_text()));
+    words.collect()
+}
+
+/// What real-time settings the kernel granted and refused.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RealtimeFacts {
+    /// Granted: who, and what.
+    pub granted: Vec<Fact>,
+    /// Refused: who, and what with the reason.
+    pub refused: Vec<Fact>,
+}
+
+/// One process. `None` where it left no figure, e.g. because it was killed.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ProcessSummary {
+    /// Its name in the topology.
+    pub name: String,
+    /// The host it ran on.
+    pub host: String,
+    /// What it was.
+    pub kind: ProcessKind,
+    /// The role of the case study that it played, or that a foreign program played through it.
+    pub role: Option<String>,
+    /// How it ended, in words.
+    pub exit: String,
+    /// Starts after the first.
+    pub restart_count: u64,
+    /// How long its role took to prepare, seconds; `None` for a process without a role.
+    #[serde(default)]
+    pub preparation_s: Option<f64>,
+    /// Periodic ticks it ran; `None` for a process without a period.
+    pub tick_count: Option<u64>,
+    /// Ticks it could not run in time and passed over.
+    pub skipped_tick_count: Option<u64>,
+    /// Processor time, seconds.
+    pub cpu_time_s: Option<f64>,
+    /// Context switches it asked for.
+    pub voluntary_switch_count: Option<u64>,
+    /// Context switches forced on it.
+    pub involuntary_switch_count: Option<u64>,
+    /// Messages of a wrong size or port it refused.
+    pub malformed_count: Option<u64>,
+    /// Messages its component could not put into a full outbox.
+    pub outbox_drop_count: Option<u64>,
+    /// Records it could not write because the recorder was full.
+    pub recorder_drop_count: Option<u64>,
+}
+
+impl ProcessSummary {
+    /// What a report calls it.
+    pub(crate) fn label(&self) -> String {
+        self.kind.label(self.role.as_deref())
+    }
+}
+
+/// Something that happened during the run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RunEvent {
+    /// When, seconds after the start; `None` when the run's start on its host is unknown.
+    pub at_s: Option<f64>,
+    /// The process concerned.
+    pub process: String,
+    /// What happened.
+    #[serde(flatten)]
+    pub kind: RunEventKind,
+    /// Set when the process carried no messages for a while.
+    pub absence: Option<Absence>,
+}
+
+/// How long a process carried no messages.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Absence {
+    /// Seconds; `None` when it never came back.
+    pub length_s: Option<f64>,
+}
+
+/// What happened during a run.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(tag = "source", rename_all = "snake_case")]
+pub enum RunEventKind {
+    /// Its supervisor saw it in a process.
+    Process(EventKind),
+    /// A gateway's radio reported it.
+    Radio {
+        /// The network interface.
+        interface: String,
+        /// What the radio did.
+        change: RadioChange,
+        /// The station concerned, as its address; `None` where the kernel named none.
+        station: Option<String>,
+        /// Status or reason code of IEEE 802.11; `None` where the kernel gave none.
+        code: Option<u16>,
+    },
+}
+
+/// What a radio did.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RadioChange {
+    /// It associated.
+    Associated,
+    /// It went to another access point.
+    Roamed,
+    /// It lost its association.
+    Disconnected,
+    /// A station left it.
+    StationLeft,
+    /// The quality of its connection changed.
+    QualityChanged,
+}
+
+impl RadioChange {
+    const fn label(self) -> &'static str {
+        match self {
+            Self::Associated => "associated",
+            Self::Roamed => "roamed",
+            Self::Disconnected => "disconnected",
+            Self::StationLeft => "station left",
+            Self::QualityChanged => "connection quality changed",
+        }
+    }
+}
+
+impl RunEvent {
+    /// What happened, for a reader.
+    pub fn what(&self) -> String {
+        let process = &self.process;
+        match &self.kind {
+            RunEventKind::Process(kind) => format!("{process}: {kind}"),
+            RunEventKind::Radio {
+                interface,
+                change,
+                station,
+                ..
+            } => {
+                let what = format!("{process}: {interface} {}", change.label());
+                match station {
+                    Some(station) => format!("{what} ({station})"),
+                    None => what,
+                }
+            }
+        }
+    }
+
+    /// Why, or for how long, for a reader; `None` when nothing is known.
+    pub fn cause(&self) -> Option<String> {
+        if let Some(absence) = self.absence {
+            return Some(absence.length_s.map_or_else(
+                || "never came back".to_owned(),
+                |length_s| format!("away for {:.0} ms", length_s * 1e3),
+            ));
+        }
+        match self.kind {
+            RunEventKind::Radio { code, .. } => Some(format!("802.11 code {}", code?)),
+            RunEventKind::Process(_) => None,
+        }
+    }
+}
+
+/// How a channel is carried.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum LinkKind {
+    /// Shared memory of one host.
+    SharedMemory,
+    /// A gateway pair over UDP.
+    Udp,
+    /// A gateway pair over TCP.
+    Tcp,
+    /// A gateway pair over an emulated link.
+    Emulated,
+    /// Nothing: its messages go to the run's record only.
+    RecordOnly,
+}
+
+impl LinkKind {
+    /// How `topology` carries `channel`.
+    pub(crate) fn of(topology: &Topology, channel: &Channel) -> Self {
+        match topology
+            .crossing(channel)
+            .map(|crossing| &crossing.link.via)
+        {
+            None if channel.is_recorded_only() => Self::RecordOnly,
+            None | Some(Via::SharedMemory) => Self::SharedMemory,
+            Some(Via::Udp(_)) => Self::Udp,
+            Some(Via::Tcp(_)) => Self::Tcp,
+            Some(Via::Emulated(..)) => Self::Emulated,
+        }
+    }
+
+    /// The words a report prints.
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::SharedMemory => "shared memory",
+            Self::Udp => "UDP",
+            Self::Tcp => "TCP",
+            Self::Emulated => "emulated link",
+            Self::RecordOnly => "recorded only",
+        }
+    }
+}
+
+impl LinkKind {
+    /// The words for a fate of a message on it: what an emulated link lost, no wire did.
+    pub const fn fate_label(self, fate: MessageFate) -> &'static str {
+        match (self, fate) {
+            (Self::Emulated, MessageFate::LostOnWire) => "lost by the emulated link",
+            (_, fate) => fate.label(),
+        }
+    }
+}
+
+/// One channel.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ChannelSummary {
+    /// Its name.
+    pub name: String,
+    /// The role that publishes.
+    pub from: String,
+    /// The role that subscribes; `None` for a channel that is only recorded.
+    pub to: Option<String>,
+    /// How it is carried.
+    pub link: LinkKind,
+    /// Its latency account; `None` when no records were found or it is only recorded.
+    pub account: Option<ChannelAccount>,
+    /// Its outages: messages lost in a row, by length; `None` when they are unknown or it is only
+    /// recorded.
+    #[serde(default)]
+    pub outages: Option<OutageFigures>,
+    /// How well the hosts kept its emulated link; `None` on every other link, or when no message
+    /// came through it.
+    #[serde(default)]
+    pub emulation: Option<EmulationFigures>,
+    /// What its emulated link met of the trace that it replays; `None` where it replays none, or
+    /// its gateway left no word.
+    #[serde(default)]
+    pub trace_replay: Option<ReplayCounts>,
+    /// What was recorded of a channel that is only recorded; `None` when nothing was.
+    #[serde(default)]
+    pub recorded: Option<RecordedFigures>,
+    /// Datagrams the gateways refused, by cause; only causes that occurred.
+    pub refusals: Vec<CountByName>,
+    /// Datagrams that came while a socket's receive buffer was full: their receiver was late. They may have
+    /// been anything, also messages.
+    #[serde(default)]
+    pub no_room_count: u64,
+    /// The gateway threads that carried it; empty on a direct channel.
+    pub directions: Vec<DirectionSummary>,
+}
+
+/// What the record holds of a channel that goes nowhere else.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RecordedFigures {
+    /// Messages in the record.
+    pub message_count: u64,
+    /// Sequence numbers below the highest of each start that are not: the recorder was full, or
+    /// its process was killed.
+    pub missing_count: u64,
+}
+
+impl ChannelSummary {
+    /// What its gateways counted by this name, together.
+    pub fn count(&self, group: CounterGroup, name: &str) -> u64 {
+        let counts = self.directions.iter();
+        counts.filter_map(|one| one.count(group, name)).sum()
+    }
+
+    /// What became of datagrams that are no messages of it, in words, each cause with its count.
+    pub(crate) fn refusal_words(&self) -> Vec<String> {
+        let refused = self.refusals.iter();
+        let refused = refused.map(|one| format!("{} {}", one.name, grouped(one.count)));
+        let no_room = Some(self.no_room_count).filter(|count| *count > 0);
+        let no_room = no_room.map(|count| format!("{NO_ROOM} {}", grouped(count)));
+        refused.chain(no_room).collect()
+    }
+}
+
+/// What reports say of [`ChannelSummary::no_room_count`].
+pub(super) const NO_ROOM: &str = "no room in the receive buffer";
+
+/// One gateway thread of a channel.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct DirectionSummary {
+    /// The gateway process.
+    pub process: String,
+    /// Which way it carried it.
+    pub direction: Side,
+    /// The peer's state at the end, in words.
+    pub peer_state: String,
+    /// Everything it counted.
+    pub counters: Vec<CountByName>,
+    /// What was granted and found: buffers, stamp probe, path MTU.
+    pub facts: Vec<Fact>,
+    /// How often its stream stood still; `None` where it is none, or receives.
+    #[serde(default)]
+    pub stalls: Option<StallFigures>,
+}
+
+impl DirectionSummary {
+    /// What it counted by this name; `None` where it counts no such thing.
+    pub fn count(&self, group: CounterGroup, name: &str) -> Option<u64> {
+        let mut counters = self.counters.iter();
+        let found = counters.find(|one| one.group == group && one.name == name);
+        found.map(|one| one.count)
+    }
+}
+
+/// One figure of the score.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ScoreMetric {
+    /// Snake-case name with unit suffix.
+    pub name: String,
+    /// The words a report prints.
+    pub label: String,
+    /// The figure; `None` when the run did not allow it.
+    pub value: Option<f64>,
+    /// 95 % interval, when the figure is a statistic.
+    pub interval: Option<(f64, f64)>,
+    /// SI unit, or `1` for a pure number.
+    pub unit: String,
+    /// How it was obtained, or why it was not.
+    pub method: String,
+}
+
+impl ScoreMetric {
+    /// The figures of a score, in its order.
+    pub fn all_of(score: &Score) -> Vec<Self> {
+        score.metrics.iter().map(Self::from).collect()
+    }
+}
+
+impl From<&Metric> for ScoreMetric {
+    fn from(metric: &Metric) -> Self {
+        Self {
+            name: metric.name.to_owned(),
+            label: metric.label.to_owned(),
+            // JSON has no word for infinity and NaN: both mean that there is no figure.
+            value: metric.value.filter(|value| value.is_finite()),
+            interval: metric
+                .interval
+                .filter(|(low, high)| low.is_finite() && high.is_finite()),
+            unit: metric.unit.to_owned(),
+            method: metric.method.clone(),
+        }
+    }
+}

@@ -1,0 +1,276 @@
+//! A page of text of fixed width: padding, wrapping, bars and colours. It knows no figures.
+
+use anstyle::{AnsiColor, Style as Ansi};
+
+use super::units::JOINT;
+
+use hil_platform::text::{clean, columns, shortened};
+
+/// Whether the text carries colour sequences.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Style {
+    /// Text only.
+    Plain,
+    /// With ANSI sequences. A caller that prints through `anstream` gets `NO_COLOR` and pipes
+    /// right by itself.
+    Coloured,
+}
+
+/// What a piece of text means; the style decides how that looks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Tone {
+    Plain,
+    Strong,
+    Good,
+    Caution,
+    Bad,
+    Faint,
+    Bar,
+}
+
+impl Tone {
+    /// Its name where tones are few.
+    pub(crate) const fn word(self) -> &'static str {
+        match self {
+            Self::Good => "good",
+            Self::Caution => "caution",
+            Self::Bad => "bad",
+            Self::Plain | Self::Strong | Self::Faint | Self::Bar => "plain",
+        }
+    }
+}
+
+/// Narrowest and widest page.
+const WIDTH_MIN: usize = 80;
+const WIDTH_MAX: usize = 120;
+
+/// Left margin of everything below a heading.
+pub(super) const INDENT: usize = 2;
+
+/// Eighths of a block, thinnest first.
+const EIGHTHS: [char; 8] = ['▏', '▎', '▍', '▌', '▋', '▊', '▉', '█'];
+
+/// A growing page.
+#[derive(Debug)]
+pub(super) struct Canvas {
+    text: String,
+    width: usize,
+    style: Style,
+}
+
+impl Canvas {
+    pub(super) fn new(width: usize, style: Style) -> Self {
+        Self {
+            text: String::new(),
+            width: width.clamp(WIDTH_MIN, WIDTH_MAX),
+            style,
+        }
+    }
+
+    pub(super) const fn width(&self) -> usize {
+        self.width
+    }
+
+    pub(super) fn finish(self) -> String {
+        self.text
+    }
+
+    /// `text` in `tone`; call it after padding, since sequences have no width. Padding stays
+    /// unpainted, so that a line's trailing blanks can be dropped in both styles.
+    pub(super) fn paint(&self, tone: Tone, text: &str) -> String {
+        let (shown, padding) = text.split_at(text.trim_end().len());
+        let ansi = match tone {
+            _ if self.style == Style::Plain || shown.is_empty() => return text.to_owned(),
+            Tone::Plain => return text.to_owned(),
+            Tone::Strong => Ansi::new().bold(),
+            Tone::Good => Ansi::new().bold().fg_color(Some(AnsiColor::Green.into())),
+            Tone::Caution => Ansi::new().fg_color(Some(AnsiColor::Yellow.into())),
+            Tone::Bad => Ansi::new().bold().fg_color(Some(AnsiColor::Red.into())),
+            Tone::Faint => Ansi::new().dimmed(),
+            Tone::Bar => Ansi::new().fg_color(Some(AnsiColor::Cyan.into())),
+        };
+        format!("{}{shown}{}{padding}", ansi.render(), ansi.render_reset())
+    }
+
+    /// Ends a line; trailing blanks are dropped.
+    pub(super) fn line(&mut self, line: &str) {
+        let line = line.replace(JOINT, " ");
+        self.text.push_str(line.trim_end());
+        self.text.push('\n');
+    }
+
+    pub(super) fn blank(&mut self) {
+        self.text.push('\n');
+    }
+
+    /// A rule across the page.
+    pub(super) fn rule(&mut self, tone: Tone) {
+        let rule = self.paint(tone, &"─".repeat(self.width));
+        self.line(&rule);
+    }
+
+    /// A heading, with something faint beside it.
+    pub(super) fn heading(&mut self, title: &str, aside: &str) {
+        self.blank();
+        let title = shortened(title, self.width);
+        let room = self.width.saturating_sub(columns(&title) + 2);
+        let aside = shortened(aside, room);
+        let line = format!(
+            "{}  {}",
+            self.paint(Tone::Strong, &title),
+            self.paint(Tone::Faint, &aside)
+        );
+        self.line(&line);
+    }
+
+    /// A label and a text that wraps beside it.
+    pub(super) fn field(&mut self, label: &str, tone: Tone, text: &str) {
+        self.field_of(14, label, tone, text);
+    }
+
+    /// As [`Canvas::field`], with a label column of `label_width`.
+    pub(super) fn field_of(&mut self, label_width: usize, label: &str, tone: Tone, text: &str) {
+        self.field_at(INDENT, (label_width, label), tone, text);
+    }
+
+    /// As [`Canvas::field_of`], behind `margin` columns.
+    pub(super) fn field_at(
+        &mut self,
+        margin: usize,
+        (label_width, label): (usize, &str),
+        tone: Tone,
+        text: &str,
+    ) {
+        let rows = wrapped(text, self.width - margin - label_width);
+        for (index, row) in rows.iter().enumerate() {
+            let label = if index == 0 { label } else { "" };
+            let line = format!(
+                "{:margin$}{}{}",
+                "",
+                self.paint(Tone::Faint, &left(label, label_width)),
+                self.paint(tone, row)
+            );
+            self.line(&line);
+        }
+    }
+
+    /// A paragraph behind a blank margin.
+    pub(super) fn paragraph(&mut self, margin: usize, tone: Tone, text: &str) {
+        for row in wrapped(text, self.width.saturating_sub(margin).max(20)) {
+            let line = format!("{:margin$}{}", "", self.paint(tone, &row));
+            self.line(&line);
+        }
+    }
+}
+
+/// Exactly `width` columns, text at the left.
+pub(super) fn left(text: &str, width: usize) -> String {
+    let text = shortened(text, width);
+    let padding = width - columns(&text);
+    format!("{text}{:padding$}", "")
+}
+
+/// Exactly `width` columns, text at the right.
+pub(super) fn right(text: &str, width: usize) -> String {
+    let text = shortened(text, width);
+    let padding = width - columns(&text);
+    format!("{:padding$}{text}", "")
+}
+
+/// Rows of at most `width` columns, broken at blanks, or anywhere in a longer word.
+pub(crate) fn wrapped(text: &str, width: usize) -> Vec<String> {
+    let (mut rows, mut row) = (Vec::new(), String::new());
+    for word in clean(text).split(' ').filter(|word| !word.is_empty()) {
+        let mut word: Vec<char> = word.chars().collect();
+        if !row.is_empty() && columns(&row) + 1 + word.len() > width {
+            rows.push(core::mem::take(&mut row));
+        }
+        while word.len() > width {
+            let rest = word.split_off(width);
+            rows.push(word.into_iter().collect());
+            word = rest;
+        }
+        if !row.is_empty() {
+            row.push(' ');
+        }
+        row.extend(word);
+    }
+    if !row.is_empty() || rows.is_empty() {
+        rows.push(row);
+    }
+    rows
+}
+
+/// A bar from `start` to `end` on a scale of 0..=1 over `width` columns. It begins at a whole
+/// column and ends at an eighth; anything above nothing is visible.
+pub(super) fn bar(start: f64, end: f64, width: usize) -> String {
+    let unit = 8 * width as u64;
+    let at = |share: f64| eighths(share.clamp(0.0, 1.0) * unit as f64, unit);
+    let (first, last) = (at(start) / 8, at(end));
+    if start.is_nan() || end.is_nan() || end <= start || width == 0 {
+        return String::new();
+    }
+    let first = first.min(width as u64 - 1);
+    let length = last.saturating_sub(first * 8).max(1);
+    let mut text = " ".repeat(usize::try_from(first).unwrap_or(width));
+    text.extend((0..length / 8).map(|_| EIGHTHS[7]));
+    if length % 8 > 0 {
+        text.push(EIGHTHS[usize::try_from(length % 8 - 1).unwrap_or(0)]);
+    }
+    text
+}
+
+#[allow(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "the value lies in 0..=limit, and NaN becomes 0"
+)]
+fn eighths(value: f64, limit: u64) -> u64 {
+    (value.round() as u64).min(limit)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bars_start_and_end_where_they_should() {
+        assert_eq!(bar(0.0, 1.0, 4), "████");
+        assert_eq!(bar(0.5, 1.0, 4), "  ██");
+        assert_eq!(bar(0.0, 0.5 / 4.0, 4), "▌");
+        assert_eq!(bar(0.0, 1e-9, 4), "▏");
+        assert_eq!(bar(1.0 - 1e-9, 1.0, 4), "   █");
+        assert_eq!(bar(0.3, 0.3, 4), "");
+        assert_eq!(bar(f64::NAN, f64::NAN, 4), "");
+        assert_eq!(bar(0.0, 1.0, 0), "");
+    }
+
+    #[test]
+    fn rows_never_exceed_their_width() {
+        let text = "a word and averyveryverylongwordwithoutanyblank and \u{1b}[31m more";
+        for width in 1..60 {
+            for row in wrapped(text, width) {
+                assert!(columns(&row) <= width, "{row:?} in {width}");
+                assert!(!row.contains('\u{1b}'));
+            }
+        }
+        assert_eq!(wrapped("", 10), [""]);
+    }
+
+    #[test]
+    fn padding_shortens_what_does_not_fit() {
+        assert_eq!(left("robot", 8), "robot   ");
+        assert_eq!(right("robot", 8), "   robot");
+        assert_eq!(left("controller", 6), "contr…");
+        assert_eq!(right("µ→", 0), "");
+    }
+
+    #[test]
+    fn colours_appear_only_when_asked_for() {
+        let plain = Canvas::new(80, Style::Plain);
+        assert_eq!(plain.paint(Tone::Bad, "x"), "x");
+        let coloured = Canvas::new(80, Style::Coloured);
+        assert!(coloured.paint(Tone::Bad, "x").starts_with('\u{1b}'));
+        assert_eq!(coloured.paint(Tone::Plain, "x"), "x");
+    }
+}

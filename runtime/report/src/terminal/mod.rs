@@ -1,0 +1,247 @@
+//! Renders a summary for a terminal of 80 to 120 columns. It returns text; the caller prints it.
+
+mod canvas;
+mod cards;
+mod changes;
+mod channel;
+mod clocks;
+mod emulation;
+mod events;
+mod face;
+mod network;
+mod outages;
+mod radio;
+mod tables;
+mod timeline;
+mod trace;
+mod units;
+
+pub use canvas::Style;
+pub(crate) use canvas::{Tone, wrapped};
+pub(crate) use channel::{closing_text, stall_words};
+use hil_platform::text::{grouped, shortened};
+pub(crate) use trace::{render_fit, render_trace, render_trace_plots};
+pub use units::{JOINT, duration, percent};
+pub(crate) use units::{duration_s, figure, seconds};
+
+use canvas::{Canvas, INDENT};
+
+use super::assessment::{Assessment, NetworkVerdict, SKIPPED_TICK_RATIO_MAX};
+use super::link_change::LinkChange;
+use super::network::NetworkReport;
+use super::score_event::ScoreEvents;
+use super::summary::{Outcome, RunSummary};
+use hil_rundir::protection::HopProtection;
+
+/// The report of a run as text of at most `width_columns` columns (clamped to 80..=120).
+pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> String {
+    let assessment = Assessment::of(summary);
+    let mut canvas = Canvas::new(width_columns, style);
+    title(&mut canvas, summary);
+    verdict(&mut canvas, summary, &assessment);
+    changes::changes(&mut canvas, &summary.link_changes);
+    tables::score(&mut canvas, &summary.score);
+    events::score_events(&mut canvas, &summary.score_events);
+    if let Some(report) = &summary.network {
+        let changes = &summary.link_changes;
+        network_sections(&mut canvas, report, (&summary.score_events, changes));
+    }
+    for channel in &summary.channels {
+        channel::channel(&mut canvas, channel);
+        radio::channel(&mut canvas, summary.radio.channel(&channel.name));
+    }
+    for face in &summary.faces {
+        face::face(&mut canvas, face);
+    }
+    if let Some(stamps) = &summary.hardware_stamps {
+        cards::hardware_stamps(&mut canvas, stamps);
+    }
+    if let Some(section) = &summary.clocks {
+        clocks::clocks(&mut canvas, section);
+    }
+    radio::hops(&mut canvas, &summary.radio);
+    tables::processes(&mut canvas, &summary.processes);
+    tables::events(&mut canvas, &summary.events);
+    tables::realtime(&mut canvas, &summary.realtime);
+    tables::host(&mut canvas, &summary.host_facts);
+    method(&mut canvas, summary);
+    files(&mut canvas, summary);
+    canvas.rule(Tone::Faint);
+    canvas.finish()
+}
+
+/// The network of a run and how the robot stood to it.
+fn network_sections(
+    canvas: &mut Canvas,
+    report: &NetworkReport,
+    (events, changes): (&ScoreEvents, &[LinkChange]),
+) {
+    timeline::timeline(canvas, &report.timeline, changes);
+    network::what_preceded_what(canvas, report, events);
+    network::network(canvas, report);
+}
+
+fn title(canvas: &mut Canvas, summary: &RunSummary) {
+    let run = &summary.run;
+    canvas.rule(Tone::Faint);
+    let title = shortened(&format!("{} · {}", run.case, run.name), canvas.width());
+    let line = canvas.paint(Tone::Strong, &title);
+    canvas.line(&line);
+    let facts = format!(
+        "{} · {} long · seed {} · host {} · topology {} ({})",
+        run.started,
+        seconds(run.duration_s),
+        run.seed,
+        run.host,
+        run.topology_file,
+        run.topology_hash,
+    );
+    canvas.paragraph(0, Tone::Faint, &facts);
+    canvas.rule(Tone::Faint);
+}
+
+fn verdict(canvas: &mut Canvas, summary: &RunSummary, assessment: &Assessment) {
+    let (tone, word) = outcome_words(summary.run.outcome);
+    canvas.field(
+        "Outcome",
+        tone,
+        &format!("{word}: {}", summary.run.exit_reason),
+    );
+    let (tone, text) = network_words(&assessment.network);
+    canvas.field("Network", tone, &text);
+    if let Some(security) = &summary.run.security {
+        let tone = match security.hops {
+            HopProtection::Plain => Tone::Caution,
+            HopProtection::Sealed { .. } => Tone::Good,
+        };
+        canvas.field("Security", tone, &security.to_string());
+    }
+    for (index, warning) in assessment.warnings.iter().enumerate() {
+        let label = if index == 0 { "Warnings" } else { "" };
+        canvas.field(label, Tone::Caution, warning);
+    }
+}
+
+/// How a run ended, in a word.
+pub(crate) const fn outcome_words(outcome: Outcome) -> (Tone, &'static str) {
+    match outcome {
+        Outcome::Completed => (Tone::Good, "completed"),
+        Outcome::CriterionFailed => (Tone::Bad, "criterion failed"),
+        Outcome::Stopped => (Tone::Caution, "stopped early"),
+        Outcome::Failed => (Tone::Bad, "failed"),
+    }
+}
+
+fn no_result(why: &str) -> (Tone, String) {
+    let cure = "repeat on an idle host or at a lower rate";
+    (Tone::Bad, format!("NOT a network result{why}; {cure}"))
+}
+
+/// What a run says about a network, in a few words.
+pub(crate) const fn network_word(verdict: &NetworkVerdict) -> &'static str {
+    match verdict {
+        NetworkVerdict::RunFailed | NetworkVerdict::TicksUnknown => "no verdict",
+        NetworkVerdict::VirtualTime => "virtual time",
+        NetworkVerdict::EmulatedLink => "an emulated link",
+        NetworkVerdict::NoNetwork => "no channel went over a network",
+        NetworkVerdict::ForeignProgram => "a foreign program took part over its own protocol",
+        NetworkVerdict::NoForeignProgram => "no foreign program answered",
+        NetworkVerdict::NetworkResult => "a network result",
+        NetworkVerdict::EmulationNotKept { .. }
+        | NetworkVerdict::HostOverran { .. }
+        | NetworkVerdict::ReceiverLate { .. } => "NOT a network result",
+    }
+}
+
+/// What a run says about a network, in words.
+pub(crate) fn network_words(verdict: &NetworkVerdict) -> (Tone, String) {
+    let limit = percent(SKIPPED_TICK_RATIO_MAX);
+    match verdict {
+        NetworkVerdict::RunFailed => {
+            let text = "no verdict: the run failed";
+            (Tone::Caution, text.to_owned())
+        }
+        NetworkVerdict::VirtualTime => {
+            let text = "virtual time: a result about the link models, not about a network";
+            (Tone::Plain, text.to_owned())
+        }
+        NetworkVerdict::EmulatedLink => {
+            let text = format!(
+                "an emulated link: a result about the model, not about a network; no process \
+                 skipped more than {limit} of its ticks"
+            );
+            (Tone::Good, text)
+        }
+        NetworkVerdict::EmulationNotKept { channels } => {
+            let why =
+                ", nor one about the link model: the host could not keep the emulated link of";
+            no_result(&format!("{why} {}", channels.join(", ")))
+        }
+        NetworkVerdict::NoNetwork => {
+            let text = "no channel went over a network; nothing here says anything about one";
+            (Tone::Plain, text.to_owned())
+        }
+        NetworkVerdict::ForeignProgram => {
+            let text = format!(
+                "a foreign program took part over its own protocol: its answers are its and its \
+                 network's; no process of ours skipped more than {limit} of its ticks"
+            );
+            (Tone::Plain, text)
+        }
+        NetworkVerdict::NoForeignProgram => {
+            let text = "no foreign program answered, and no link of ours was a network; nothing \
+                        here says anything about one";
+            (Tone::Caution, text.to_owned())
+        }
+        NetworkVerdict::NetworkResult => {
+            let text =
+                format!("a network result: no process skipped more than {limit} of its ticks");
+            (Tone::Good, text)
+        }
+        NetworkVerdict::HostOverran { processes } => {
+            let skipped = processes
+                .iter()
+                .map(|overrun| overrun.skipped_tick_count)
+                .sum();
+            let skipped = grouped(skipped);
+            no_result(&format!(
+                ": the host overran ({skipped} skipped ticks, more than {limit})"
+            ))
+        }
+        NetworkVerdict::ReceiverLate { channels } => {
+            let why = ": datagrams had no room in the receive buffer, their gateway was late with";
+            no_result(&format!("{why} {}", channels.join(", ")))
+        }
+        NetworkVerdict::TicksUnknown => {
+            let text = "no verdict: a component left no count of its ticks";
+            (Tone::Caution, text.to_owned())
+        }
+    }
+}
+
+fn method(canvas: &mut Canvas, summary: &RunSummary) {
+    if summary.channels.is_empty() {
+        return;
+    }
+    canvas.heading("How to read this", "");
+    for text in [
+        "Each message is joined across records by the producer's start and its sequence number. \
+         It closes when every stage is recorded, in order, and the segments add up to published → \
+         taken within 1 µs; on one clock the wire is the difference of raw kernel stamps.",
+        "Quantiles are from histograms with three digits, of taken messages. Bars show medians \
+         end to end. Intervals are 95 %: Wilson for shares, block bootstrap for quantiles, because \
+         successive delays are correlated.",
+    ] {
+        canvas.paragraph(INDENT, Tone::Faint, text);
+    }
+}
+
+fn files(canvas: &mut Canvas, summary: &RunSummary) {
+    let run = &summary.run;
+    canvas.heading("Files", "");
+    canvas.field("folder", Tone::Plain, &run.folder);
+    for file in &run.files {
+        canvas.field(&file.label, Tone::Plain, &file.value);
+    }
+    canvas.field("repeat with", Tone::Strong, &run.repeat_command);
+}

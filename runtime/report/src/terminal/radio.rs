@@ -1,0 +1,241 @@
+//! What a report says of radios. It returns nothing on a wired run whose drivers stamp departures.
+
+use hil_account::radio::{RadioFigures, Share, TransmitStampFigures};
+
+use super::canvas::{Canvas, Tone};
+use super::units::percent;
+use crate::radio::{ChannelRadio, RadioHopSummary, RadioReport, Spread, StationSummary};
+use hil_platform::text::grouped;
+
+/// Beside a channel's account: where it was stamped, and what the radio reported.
+pub(super) fn channel(canvas: &mut Canvas, radio: Option<&ChannelRadio>) {
+    let Some(radio) = radio else { return };
+    if let Some(text) = radio.transmit_stamps.as_ref().and_then(stamp_words) {
+        canvas.field("TX stamp", Tone::Caution, &text);
+    }
+    if let Some(figures) = &radio.acknowledgements {
+        acknowledgements(canvas, figures);
+    }
+}
+
+/// Where stamps were taken, unless all are departures.
+fn stamp_words(figures: &TransmitStampFigures) -> Option<String> {
+    let of = |count: u64| format!("{} of {}", grouped(count), grouped(figures.handed_count));
+    let mut words = Vec::new();
+    if figures.before_queue_count > 0 {
+        words.push(format!(
+            "before the queue for {} messages: this driver stamps no departures, so \"TX stamp → \
+             RX stamp\" holds what they waited in the queue and the driver",
+            of(figures.before_queue_count)
+        ));
+    }
+    if figures.application_count > 0 && figures.departure_count < figures.handed_count {
+        words.push(format!(
+            "none for {}: the gateway's own, before the send call, stands in",
+            of(figures.application_count)
+        ));
+    }
+    (!words.is_empty()).then(|| words.join("; "))
+}
+
+fn acknowledgements(canvas: &mut Canvas, figures: &RadioFigures) {
+    let text = acknowledgement_words(figures);
+    canvas.field("radio", Tone::Plain, &text);
+    let mut words = Vec::new();
+    if let Some(share) = &figures.unacknowledged_ratio {
+        words.push(format!("not acknowledged {}", share_words(share)));
+    }
+    if let Some(share) = &figures.known_loss_ratio {
+        words.push(format!(
+            "of the losses the radio knows {}",
+            share_words(share)
+        ));
+    }
+    if !words.is_empty() {
+        canvas.field("", Tone::Faint, &words.join("; "));
+    }
+}
+
+/// What the radio said, and what became of the messages of which it said so.
+fn acknowledgement_words(figures: &RadioFigures) -> String {
+    let n = grouped;
+    let rows = [
+        figures.acknowledged,
+        figures.unacknowledged,
+        figures.unreported,
+    ];
+    let [Some(heard), Some(unheard), Some(silent)] = rows.map(|row| row.fates) else {
+        return format!(
+            "{} acknowledged, {} not, {} without a report; what arrived is unavailable: no records \
+             of the receiving gateway",
+            n(figures.acknowledged.count),
+            n(figures.unacknowledged.count),
+            n(figures.unreported.count)
+        );
+    };
+    let text = format!(
+        "{} acknowledged and arrived, {} acknowledged and lost above the radio, {} not acknowledged \
+         and arrived (acknowledgement lost), {} not acknowledged and lost, {} without a report ({} \
+         of them lost)",
+        n(heard.arrived_count),
+        n(heard.lost_count),
+        n(unheard.arrived_count),
+        n(unheard.lost_count),
+        n(figures.unreported.count),
+        n(silent.lost_count)
+    );
+    let all = [heard, unheard, silent];
+    let aside = [
+        (
+            all.iter().map(|one| one.interrupted_count).sum::<u64>(),
+            "lost while a process was down",
+        ),
+        (
+            all.iter().map(|one| one.in_flight_count).sum::<u64>(),
+            "under way at the end",
+        ),
+    ];
+    let aside = aside.into_iter().filter(|(count, _)| *count > 0);
+    let aside: Vec<String> = aside
+        .map(|(count, what)| format!("; {} {what}", n(count)))
+        .collect();
+    text + &aside.concat()
+}
+
+fn share_words(share: &Share) -> String {
+    format!(
+        "{} (95 % {} to {}, {} of {})",
+        percent(share.ratio),
+        percent(share.low),
+        percent(share.high),
+        grouped(share.success_count),
+        grouped(share.trial_count)
+    )
+}
+
+/// The associations of the run.
+pub(super) fn hops(canvas: &mut Canvas, report: &RadioReport) {
+    if report.hops.is_empty() {
+        return;
+    }
+    canvas.heading("Radio", "the association, sampled beside the data");
+    for hop in &report.hops {
+        hop_lines(canvas, hop);
+    }
+}
+
+fn hop_lines(canvas: &mut Canvas, hop: &RadioHopSummary) {
+    let events = match hop.event_count {
+        0 => "the association did not change".to_owned(),
+        count => format!(
+            "the association changed {} times, see events",
+            grouped(count)
+        ),
+    };
+    let text = format!(
+        "{} on {} ({}): {events}",
+        hop.interface, hop.host, hop.process
+    );
+    canvas.field("radio", Tone::Plain, &text);
+    for station in &hop.stations {
+        canvas.field("", Tone::Faint, &station_words(station));
+    }
+}
+
+fn station_words(station: &StationSummary) -> String {
+    let spread = |name: &str, spread: &Option<Spread>, unit: &str| {
+        let words = spread.map_or_else(
+            || "unavailable".to_owned(),
+            |s| format!("{} {unit} ({} to {})", s.median, s.min, s.max),
+        );
+        format!("{name} {words}")
+    };
+    let count = |name: &str, count: Option<u64>| {
+        let words = count.map_or_else(|| "unavailable".to_owned(), grouped);
+        format!("{name} {words}")
+    };
+    let how = |modulation: &Option<String>| {
+        let words = modulation.as_ref().map(|text| format!(", {text}"));
+        words.unwrap_or_default()
+    };
+    [
+        format!(
+            "{} in {} samples",
+            station.mac,
+            grouped(station.sample_count)
+        ),
+        spread("signal", &station.signal_dbm, "dBm"),
+        spread("sends at", &station.transmit_mbps, "Mbit/s") + &how(&station.transmit_modulation),
+        spread("hears at", &station.receive_mbps, "Mbit/s") + &how(&station.receive_modulation),
+        count("packets sent", station.tx_packet_count),
+        count("retries", station.tx_retry_count),
+        count("given up", station.tx_failed_count),
+        count("beacon losses", station.beacon_loss_count),
+        count("longest silence, ms", station.inactive_ms_max),
+    ]
+    .join(" · ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use hil_account::radio::{RadioFates, RadioRow};
+
+    #[test]
+    fn a_wired_channel_stamped_at_departure_needs_no_line() {
+        let figures = TransmitStampFigures {
+            handed_count: 9,
+            departure_count: 9,
+            ..TransmitStampFigures::default()
+        };
+        assert_eq!(stamp_words(&figures), None);
+        let fallback = TransmitStampFigures {
+            handed_count: 9,
+            before_queue_count: 8,
+            application_count: 1,
+            ..TransmitStampFigures::default()
+        };
+        let words = stamp_words(&fallback).unwrap();
+        assert!(words.contains("before the queue for 8 of 9"), "{words}");
+        assert!(words.contains("none for 1 of 9"), "{words}");
+    }
+
+    #[test]
+    fn messages_that_no_radio_lost_are_told_apart_and_unknown_ones_are_not_zero() {
+        let row = |count, interrupted_count, in_flight_count| RadioRow {
+            count,
+            fates: Some(RadioFates {
+                arrived_count: count - interrupted_count - in_flight_count,
+                lost_count: 0,
+                interrupted_count,
+                in_flight_count,
+            }),
+        };
+        let mut figures = RadioFigures {
+            handed_count: 17,
+            acknowledged: row(10, 0, 0),
+            unacknowledged: row(7, 4, 2),
+            unreported: row(0, 0, 0),
+            unacknowledged_ratio: None,
+            known_loss_ratio: None,
+            lost_ratio: None,
+        };
+        let words = acknowledgement_words(&figures);
+        assert!(words.contains("0 not acknowledged and lost"), "{words}");
+        let aside = "; 4 lost while a process was down; 2 under way at the end";
+        assert!(words.ends_with(aside), "{words}");
+        for row in [
+            &mut figures.acknowledged,
+            &mut figures.unacknowledged,
+            &mut figures.unreported,
+        ] {
+            row.fates = None;
+        }
+        let words = acknowledgement_words(&figures);
+        assert!(
+            words.starts_with("10 acknowledged, 7 not, 0 without"),
+            "{words}"
+        );
+        assert!(words.contains("unavailable"), "{words}");
+    }
+}

@@ -1,0 +1,460 @@
+//! A link trace on a page: its figures, the laws fitted to it, and its plots. The figures are
+//! computed elsewhere.
+
+use core::fmt::Write as _;
+
+use hil_trace::figures::{Memory, RunCount, TraceFigures};
+use hil_trace::fit::{Fit, Ranking, TraceFit};
+use hil_trace::{Trace, TraceHeader};
+
+use super::Style;
+use super::canvas::{Canvas, INDENT, Tone, bar, left, right};
+use super::units::{duration, percent, seconds};
+use hil_platform::text::grouped;
+
+/// Columns of a label.
+const LABEL: usize = 20;
+/// Rows of a distribution.
+const PLOT_ROWS: usize = 20;
+
+/// The figures of a trace.
+pub(crate) fn render_trace(
+    trace: &Trace,
+    figures: &TraceFigures,
+    width_columns: usize,
+    style: Style,
+) -> String {
+    let mut canvas = Canvas::new(width_columns, style);
+    heading(&mut canvas, &trace.header);
+    let mut field = |label: &str, text: &str| canvas.field_of(LABEL, label, Tone::Plain, text);
+    let counts = &figures.counts;
+    let span_s = trace.records.last().map_or(0, |record| record.published_ns) as f64 * 1e-9;
+    field(
+        "messages",
+        &format!(
+            "{} published within {}, {}",
+            grouped(counts.message_count),
+            seconds(span_s),
+            rate_words(figures)
+        ),
+    );
+    field("lost", &loss_words(figures));
+    field("bursts", &runs_words(&figures.loss_bursts, "losses"));
+    field(
+        "between bursts",
+        &runs_words(&figures.delivery_runs, "deliveries"),
+    );
+    field(
+        "memory of loss",
+        &memory_words(figures.loss_memory.as_ref()),
+    );
+    field("longest outage", &outage_words(figures));
+    field("delay", &delay_words(figures));
+    for quantile in &figures.quantiles {
+        let interval = quantile.interval.map_or_else(String::new, |interval| {
+            format!(
+                "  [{}, {}]",
+                duration(interval.low_ns),
+                duration(interval.high_ns)
+            )
+        });
+        let name = format!("  p{}", quantile.quantile * 100.0);
+        field(&name, &format!("{}{interval}", duration(quantile.value_ns)));
+    }
+    if figures.late_delay.measured().is_some() {
+        field("came too late", &late_words(figures));
+    }
+    field(
+        "memory of delay",
+        &memory_words(figures.delay_memory.as_ref()),
+    );
+    field(
+        "order",
+        &format!(
+            "{} came after a later one, {} came twice",
+            grouped(counts.reordered_count),
+            grouped(counts.duplicated_count)
+        ),
+    );
+    canvas.paragraph(
+        INDENT,
+        Tone::Faint,
+        &format!(
+            "Loss ratio with Wilson's 95 % interval over messages of known fate; quantiles with 95 % \
+             intervals by resampling blocks, seed {}; memory is the autocorrelation over messages.",
+            figures.seed
+        ),
+    );
+    canvas.finish()
+}
+
+fn heading(canvas: &mut Canvas, header: &TraceHeader) {
+    let of = |name: &str, otherwise: &str| {
+        if name.is_empty() {
+            otherwise.to_owned()
+        } else {
+            name.to_owned()
+        }
+    };
+    let changed = match header.link_change_count {
+        0 => String::new(),
+        1 => " (changed by hand once)".to_owned(),
+        count => format!(" (changed by hand {count} times)"),
+    };
+    let aside = format!(
+        "link {}{changed}, {}, run {}; {}",
+        of(&header.link, "unknown"),
+        header.direction.word(),
+        of(&header.run, "unknown"),
+        of(&header.clock, "clocks unknown")
+    );
+    canvas.heading(&of(&header.channel, "a trace"), &aside);
+}
+
+fn outage_words(figures: &TraceFigures) -> String {
+    let Some(outage) = figures.longest_outage else {
+        return "none".to_owned();
+    };
+    let end = if outage.is_open { ", to the end" } else { "" };
+    format!(
+        "{} from {} on, {} messages{end}",
+        duration(outage.length_ns),
+        seconds(outage.from_ns as f64 * 1e-9),
+        grouped(outage.lost_count)
+    )
+}
+
+fn rate_words(figures: &TraceFigures) -> String {
+    match (figures.rate_hz, figures.rate_bytes_per_s) {
+        (Some(rate), Some(bytes)) => format!("{rate:.2} per second, {bytes:.0} bytes per second"),
+        _ => "rate unavailable: fewer than two instants".to_owned(),
+    }
+}
+
+fn loss_words(figures: &TraceFigures) -> String {
+    let counts = &figures.counts;
+    let Some((ratio, interval)) = figures.loss_ratio.zip(figures.loss_ratio_interval) else {
+        return "unavailable: no message has a known fate".to_owned();
+    };
+    let mut text = format!(
+        "{} of {}, {} [{}, {}]: {} in the network, {} before the link, {} after it",
+        grouped(counts.lost_count()),
+        grouped(counts.message_count - counts.unknown_count),
+        percent(ratio),
+        percent(interval.low),
+        percent(interval.high),
+        grouped(counts.lost_in_network_count),
+        grouped(counts.lost_before_link_count),
+        grouped(counts.lost_after_link_count)
+    );
+    if counts.unknown_count > 0 {
+        let unknown = grouped(counts.unknown_count);
+        let _infallible = write!(text, "; the fate of {unknown} is unknown");
+    }
+    text
+}
+
+fn runs_words(runs: &[RunCount], of: &str) -> String {
+    let count: u64 = runs.iter().map(|run| run.count).sum();
+    let messages: u64 = runs.iter().map(|run| run.count * run.length_messages).sum();
+    let Some(longest) = runs.last() else {
+        return "none".to_owned();
+    };
+    format!(
+        "{} rows of {of}, {:.2} messages on average, {} in the longest",
+        grouped(count),
+        messages as f64 / count as f64,
+        grouped(longest.length_messages)
+    )
+}
+
+fn memory_words(memory: Option<&Memory>) -> String {
+    let Some(memory) = memory else {
+        return "unavailable: nothing varies, or too few messages".to_owned();
+    };
+    let shown = [1, 2, 5, 10, 20, 50, 100];
+    let at = |lag: &usize| {
+        let value = memory.coefficients.get(lag - 1)?;
+        Some(format!("{value:.2} at {lag}"))
+    };
+    let shown: Vec<String> = shown.iter().filter_map(at).collect();
+    format!(
+        "{}; within {:.2} if independent",
+        shown.join(", "),
+        memory.independent_within
+    )
+}
+
+fn delay_words(figures: &TraceFigures) -> String {
+    use hil_stats::histogram::Distribution;
+    match &figures.delay {
+        Distribution::Unavailable { reason } => format!("unavailable: {reason}"),
+        Distribution::Measured(delay) => {
+            let bound = match figures.bound_max_ns {
+                None => "bound unknown".to_owned(),
+                Some(0) => "on one clock".to_owned(),
+                Some(bound) => {
+                    let bound = i64::try_from(bound).unwrap_or(i64::MAX);
+                    let wide = if bound > delay.p50_ns {
+                        ", wider than the median itself"
+                    } else {
+                        ""
+                    };
+                    format!("each within {}{wide}", duration(bound))
+                }
+            };
+            format!(
+                "{} to {} over {} messages, {bound}",
+                duration(delay.min_ns),
+                duration(delay.max_ns),
+                grouped(delay.count)
+            )
+        }
+    }
+}
+
+/// Of messages that arrived and were not published.
+fn late_words(figures: &TraceFigures) -> String {
+    use hil_stats::histogram::Distribution;
+    match &figures.late_delay {
+        Distribution::Unavailable { reason } => format!("unavailable: {reason}"),
+        Distribution::Measured(late) => format!(
+            "{} arrived and were not published: {} to {}, median {}; in no figure of delays above",
+            grouped(late.count),
+            duration(late.min_ns),
+            duration(late.max_ns),
+            duration(late.p50_ns)
+        ),
+    }
+}
+
+/// The laws fitted to a trace.
+pub(crate) fn render_fit(
+    header: &TraceHeader,
+    fit: &TraceFit,
+    width_columns: usize,
+    style: Style,
+) -> String {
+    let mut canvas = Canvas::new(width_columns, style);
+    heading(&mut canvas, header);
+    let messages = grouped(fit.loss_message_count as u64);
+    ranking(
+        &mut canvas,
+        &format!("Loss, {messages} messages"),
+        &fit.loss,
+    );
+    let tested = grouped(fit.tested_delay_count as u64);
+    ranking(
+        &mut canvas,
+        &format!("Delay, distance tested on {tested} messages"),
+        &fit.delay,
+    );
+    for remark in &fit.remarks {
+        canvas.paragraph(INDENT, Tone::Caution, remark);
+    }
+    canvas.paragraph(
+        INDENT,
+        Tone::Faint,
+        &format!(
+            "AIC = 2 k - 2 ln L, smaller is better. Bursts: chi-square of their lengths. KS: largest \
+             difference of the distribution functions, its probability by a parametric bootstrap of \
+             199 samples, seed {}. A probability below 0.05 speaks against the law.",
+            fit.seed
+        ),
+    );
+    canvas.blank();
+    canvas.finish()
+}
+
+fn ranking(canvas: &mut Canvas, title: &str, ranking: &Ranking) {
+    canvas.blank();
+    let title = format!("{:INDENT$}{title}", "");
+    let title = canvas.paint(Tone::Strong, &title);
+    canvas.line(&title);
+    if !ranking.fits.is_empty() {
+        let names = format!(
+            "{:INDENT$}  {}{}{}{}{}",
+            "",
+            left("law", 18),
+            right("k", 4),
+            right("AIC", 14),
+            right("bursts p", 12),
+            right("KS (p)", 18)
+        );
+        let names = canvas.paint(Tone::Faint, &names);
+        canvas.line(&names);
+    }
+    for (index, fit) in ranking.fits.iter().enumerate() {
+        let is_best = ranking.best == Some(index);
+        let tone = if is_best { Tone::Good } else { Tone::Plain };
+        let mark = if is_best { "→ " } else { "  " };
+        let line = format!("{:INDENT$}{mark}{}", "", fit_line(fit));
+        let line = canvas.paint(tone, &line);
+        canvas.line(&line);
+        canvas.paragraph(
+            INDENT + 4,
+            Tone::Faint,
+            &format!("{}; {}", fit.parameters, fit.method),
+        );
+    }
+    canvas.paragraph(INDENT, Tone::Plain, &format!("Taken: {}.", ranking.why));
+}
+
+fn fit_line(fit: &Fit) -> String {
+    let aic = fit.aic.map_or("–".to_owned(), |aic| format!("{aic:.1}"));
+    let bursts = fit
+        .bursts
+        .as_ref()
+        .map_or("–".to_owned(), |test| format!("{:.3}", test.probability));
+    let distance = match (fit.ks_distance, fit.ks_probability) {
+        (Some(distance), Some(p)) => format!("{distance:.4} ({p:.3})"),
+        _ => "–".to_owned(),
+    };
+    format!(
+        "{}{}{}{}{}",
+        left(&fit.law, 18),
+        right(&fit.parameter_count.to_string(), 4),
+        right(&aic, 14),
+        right(&bursts, 12),
+        right(&distance, 18)
+    )
+}
+
+/// Delay distribution, burst lengths and memory as bars.
+pub(crate) fn render_trace_plots(
+    trace: &Trace,
+    figures: &TraceFigures,
+    width_columns: usize,
+    style: Style,
+) -> String {
+    let mut canvas = Canvas::new(width_columns, style);
+    heading(&mut canvas, &trace.header);
+    let mut delays = trace.delays_ns();
+    delays.sort_unstable();
+    section(&mut canvas, "Share of the messages delivered within");
+    canvas.paragraph(INDENT, Tone::Faint, &delay_words(figures));
+    for row in 0..PLOT_ROWS.min(delays.len()) {
+        // From the smallest delay to the 99.9th percentile, in equal steps.
+        let last = delays[(delays.len() - 1) * 999 / 1000];
+        let step = i64::try_from(row + 1).unwrap_or(1);
+        let rows = i64::try_from(PLOT_ROWS).unwrap_or(1);
+        let upto = delays[0] + (last - delays[0]) / rows * step + i64::from(step == rows) * rows;
+        let share = delays.partition_point(|delay| *delay <= upto) as f64 / delays.len() as f64;
+        bar_line(&mut canvas, &duration(upto), &percent(share), share);
+    }
+    section(&mut canvas, "Losses in a row");
+    if figures.loss_bursts.is_empty() {
+        canvas.paragraph(INDENT, Tone::Faint, "nothing was lost");
+    }
+    for (name, count, share) in classes(&figures.loss_bursts) {
+        bar_line(&mut canvas, &name, &grouped(count), share);
+    }
+    for (title, memory) in [
+        (
+            "Autocorrelation of loss, by lag in messages",
+            &figures.loss_memory,
+        ),
+        (
+            "Autocorrelation of delay, by lag in messages",
+            &figures.delay_memory,
+        ),
+    ] {
+        section(&mut canvas, title);
+        let Some(memory) = memory else {
+            canvas.paragraph(INDENT, Tone::Faint, &memory_words(None));
+            continue;
+        };
+        for (index, value) in memory.coefficients.iter().enumerate().take(PLOT_ROWS) {
+            let lag = (index + 1).to_string();
+            bar_line(&mut canvas, &lag, &format!("{value:.3}"), *value);
+        }
+    }
+    canvas.finish()
+}
+
+fn section(canvas: &mut Canvas, title: &str) {
+    canvas.blank();
+    let title = format!("{:INDENT$}{title}", "");
+    let title = canvas.paint(Tone::Strong, &title);
+    canvas.line(&title);
+}
+
+fn bar_line(canvas: &mut Canvas, name: &str, value: &str, share: f64) {
+    let width = canvas.width().saturating_sub(INDENT + 30);
+    let painted = canvas.paint(Tone::Bar, &bar(0.0, share, width));
+    let line = format!(
+        "{:INDENT$}{}{}  {painted}",
+        "",
+        right(name, 12),
+        right(value, 12)
+    );
+    canvas.line(&line);
+}
+
+/// Burst lengths in classes of powers of two, with their share.
+fn classes(runs: &[RunCount]) -> Vec<(String, u64, f64)> {
+    let total: u64 = runs.iter().map(|run| run.count).sum();
+    let mut found: Vec<(String, u64, f64)> = Vec::new();
+    let longest = runs.last().map_or(0, |run| run.length_messages);
+    let mut from = 1_u64;
+    while from <= longest {
+        let upto = from.saturating_mul(2) - 1;
+        let inside = runs
+            .iter()
+            .filter(|run| (from..=upto).contains(&run.length_messages));
+        let count: u64 = inside.map(|run| run.count).sum();
+        let name = if from == upto {
+            from.to_string()
+        } else {
+            format!("{from}–{upto}")
+        };
+        found.push((name, count, count as f64 / total.max(1) as f64));
+        from = upto.saturating_add(1);
+    }
+    found
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use hil_trace::{TraceFate, TraceRecord};
+
+    fn sample() -> Trace {
+        let record = |index: u64| {
+            let published_ns = i64::try_from(index).unwrap() * 10_000_000;
+            let mut record = TraceRecord::published(published_ns, index, 16);
+            if index % 10 < 2 {
+                record.fate = TraceFate::LostInNetwork;
+            } else {
+                let delay_ns = 2_000_000 + i64::try_from(index % 7).unwrap() * 100_000;
+                record = record.delivered(delay_ns, 40);
+            }
+            record
+        };
+        Trace {
+            header: TraceHeader::new("shuttle/command"),
+            records: (0..400).map(record).collect(),
+        }
+    }
+
+    #[test]
+    fn a_page_says_what_was_measured_and_never_grows_too_wide() {
+        let trace = sample();
+        let figures = TraceFigures::of(&trace, 1);
+        let fit = TraceFit::of(&trace, 1);
+        let pages = [
+            render_trace(&trace, &figures, 90, Style::Plain),
+            render_fit(&trace.header, &fit, 90, Style::Plain),
+            render_trace_plots(&trace, &figures, 90, Style::Plain),
+        ];
+        for page in &pages {
+            for line in page.lines() {
+                assert!(line.chars().count() <= 90, "{line}");
+            }
+        }
+        assert!(pages[0].contains("80 of 400, 20.00 %"), "{}", pages[0]);
+        assert!(pages[0].contains("each within 40 ns"), "{}", pages[0]);
+        assert!(pages[1].contains("gilbert-elliott"), "{}", pages[1]);
+        assert!(pages[2].contains("2–3"), "{}", pages[2]);
+    }
+}

@@ -1,0 +1,445 @@
+//! The record file: a 128-byte header, then records of one fixed size. Not a database: a file
+//! cut short by a crash is read up to its last whole record.
+//!
+//! | offset | size | field (little-endian) |
+//! |---|---|---|
+//! | 0 | 8 | magic `HILREC01` |
+//! | 8 | 4 | kind, see [`RecordKind`] |
+//! | 12 | 4 | size of one record in bytes |
+//! | 16 | 4 | instance: 0 for a process's first start, counting its restarts |
+//! | 20 | 12 | zero |
+//! | 32 | 96 | channel name, UTF-8, padded with zeros |
+
+use std::fs::{self, File};
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+use bytemuck::Pod;
+use hil_account::card_clock::CardClockRecord;
+use hil_core::message::Envelope;
+use hil_core::record::{
+    EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
+};
+use hil_core::run_log::RunLog;
+use hil_link::condition::LinkConditionRecord;
+
+use crate::face_record::{FaceReceivedRecord, FaceSentRecord};
+use crate::radio_record::RadioRecord;
+use hil_topology::CHANNEL_NAME_BYTES_MAX;
+
+const MAGIC: &[u8; 8] = b"HILREC01";
+/// Size of the file header.
+pub const HEADER_BYTES: usize = 128;
+
+/// What a record file holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum RecordKind {
+    /// [`PublishedRecord`]s of a producer.
+    Published,
+    /// [`TakenRecord`]s of a consumer.
+    Taken,
+    /// [`EgressRecord`]s of a sending gateway.
+    Egress,
+    /// [`IngressRecord`]s of a receiving gateway.
+    Ingress,
+    /// [`FollowUpRecord`]s of a receiving gateway.
+    FollowUp,
+    /// Messages: an [`Envelope`] and the payload.
+    Message,
+    /// [`RoundTripRecord`]s of a sending gateway.
+    RoundTrip,
+    /// [`FaceSentRecord`]s of a face: datagrams to a foreign program.
+    FaceSent,
+    /// [`FaceReceivedRecord`]s of a face: datagrams of a foreign program.
+    FaceReceived,
+    /// [`CardClockRecord`]s of a supervisor; the channel is `<host>/<interface>` of the card.
+    CardClock,
+    /// [`RadioRecord`]s of a gateway on a wireless hop; the channel is `<process>/<interface>`.
+    Radio,
+    /// [`LinkConditionRecord`]s of a gateway that emulates a link; the channel is that of the orders,
+    /// `hil/link/<link>/<direction>`.
+    LinkCondition,
+}
+
+impl RecordKind {
+    /// Every kind, with the number that stands for it in the header and its name in file names.
+    const ALL: [(Self, u32, &'static str); 12] = [
+        (Self::Published, 1, "published"),
+        (Self::Taken, 2, "taken"),
+        (Self::Egress, 3, "egress"),
+        (Self::Ingress, 4, "ingress"),
+        (Self::FollowUp, 5, "follow-up"),
+        (Self::Message, 6, "message"),
+        (Self::RoundTrip, 7, "round-trip"),
+        (Self::FaceSent, 8, "face-sent"),
+        (Self::FaceReceived, 9, "face-received"),
+        (Self::CardClock, 10, "card-clock"),
+        (Self::Radio, 15, "radio"),
+        (Self::LinkCondition, 16, "link-condition"),
+    ];
+
+    fn row(self) -> (Self, u32, &'static str) {
+        *Self::ALL
+            .iter()
+            .find(|row| row.0 == self)
+            .expect("ALL lists every kind")
+    }
+
+    fn from_number(number: u32) -> Option<Self> {
+        Self::ALL
+            .iter()
+            .find(|row| row.1 == number)
+            .map(|row| row.0)
+    }
+
+    /// Size of one record; `None` where it depends on the channel.
+    fn record_bytes(self) -> Option<usize> {
+        match self {
+            Self::Published => Some(size_of::<PublishedRecord>()),
+            Self::Taken => Some(size_of::<TakenRecord>()),
+            Self::Egress => Some(size_of::<EgressRecord>()),
+            Self::Ingress => Some(size_of::<IngressRecord>()),
+            Self::FollowUp => Some(size_of::<FollowUpRecord>()),
+            Self::RoundTrip => Some(size_of::<RoundTripRecord>()),
+            Self::FaceSent => Some(size_of::<FaceSentRecord>()),
+            Self::FaceReceived => Some(size_of::<FaceReceivedRecord>()),
+            Self::CardClock => Some(size_of::<CardClockRecord>()),
+            Self::Radio => Some(size_of::<RadioRecord>()),
+            Self::LinkCondition => Some(size_of::<LinkConditionRecord>()),
+            Self::Message => None,
+        }
+    }
+}
+
+/// Why a record file cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum RecordFileError {
+    /// Reading or writing failed.
+    #[error("record file {path}: {source}")]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// The bytes are not what a record file holds.
+    #[error("record file {path}, byte {offset}: {problem}")]
+    Malformed {
+        /// The file.
+        path: PathBuf,
+        /// Where.
+        offset: usize,
+        /// What is wrong.
+        problem: &'static str,
+    },
+    /// The records are laid out in another way than this program's.
+    #[error(
+        "record file {path}, byte 12: {kind} records of {found_bytes} bytes, where this program \
+         has {expected}; written by another version of hil-runtime?"
+    )]
+    OtherLayout {
+        /// The file.
+        path: PathBuf,
+        /// Of what, as in file names.
+        kind: &'static str,
+        /// Size of one record as the header says it.
+        found_bytes: u32,
+        /// Size or sizes this program knows.
+        expected: String,
+    },
+}
+
+/// Identity of a record file: what its header says.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct RecordHeader {
+    /// What it holds.
+    pub kind: RecordKind,
+    /// The channel.
+    pub channel: String,
+    /// Size of one record.
+    pub record_bytes: u32,
+    /// Which start of the process wrote it.
+    pub instance: u32,
+}
+
+impl RecordHeader {
+    /// File name below the run's `records` folder: unique per channel, kind, writer, instance.
+    pub fn file_name(&self, writer: &str) -> String {
+        let channel = self.channel.replace('/', ".");
+        format!(
+            "{channel}.{}.{writer}.{}.rec",
+            self.kind.row().2,
+            self.instance
+        )
+    }
+
+    /// The header's bytes.
+    ///
+    /// # Errors
+    /// When the channel name is longer than [`CHANNEL_NAME_BYTES_MAX`].
+    pub fn encode(&self, path: &Path) -> Result<[u8; HEADER_BYTES], RecordFileError> {
+        let name = self.channel.as_bytes();
+        if name.len() > CHANNEL_NAME_BYTES_MAX {
+            let problem = "the channel name is longer than 96 bytes";
+            return Err(malformed(path, 32, problem));
+        }
+        let mut bytes = [0; HEADER_BYTES];
+        bytes[..8].copy_from_slice(MAGIC);
+        bytes[8..12].copy_from_slice(&self.kind.row().1.to_le_bytes());
+        bytes[12..16].copy_from_slice(&self.record_bytes.to_le_bytes());
+        bytes[16..20].copy_from_slice(&self.instance.to_le_bytes());
+        bytes[32..32 + name.len()].copy_from_slice(name);
+        Ok(bytes)
+    }
+
+    /// Makes the file of `writer` in `folder`, with the header in it; its path as well.
+    ///
+    /// # Errors
+    /// When it exists or cannot be written, or the channel name is too long.
+    pub fn create(&self, folder: &Path, writer: &str) -> Result<(PathBuf, File), RecordFileError> {
+        let path = folder.join(self.file_name(writer));
+        let bytes = self.encode(&path)?;
+        let made =
+            File::create_new(&path).and_then(|mut file| file.write_all(&bytes).map(|()| file));
+        match made {
+            Ok(file) => Ok((path, file)),
+            Err(source) => Err(RecordFileError::Io { path, source }),
+        }
+    }
+
+    /// The name of the process that wrote the file called `name`, which has this header; `None`
+    /// when the name is not made as [`RecordHeader::file_name`] makes it.
+    pub fn writer<'a>(&self, name: &'a str) -> Option<&'a str> {
+        let start = format!("{}.{}.", self.channel.replace('/', "."), self.kind.row().2);
+        let end = format!(".{}.rec", self.instance);
+        name.strip_prefix(&start)?.strip_suffix(&end)
+    }
+
+    /// Reads a header off the beginning of a file.
+    ///
+    /// # Errors
+    /// When they are none.
+    ///
+    /// # Panics
+    /// Never: the fields lie within the header.
+    pub fn decode(path: &Path, bytes: &[u8]) -> Result<Self, RecordFileError> {
+        let Some(header) = bytes.first_chunk::<HEADER_BYTES>() else {
+            return Err(malformed(
+                path,
+                bytes.len(),
+                "the file is shorter than its header",
+            ));
+        };
+        if header[..8] != MAGIC[..] {
+            return Err(malformed(path, 0, "not a record file"));
+        }
+        let word = |at: usize| {
+            u32::from_le_bytes(
+                header[at..at + 4]
+                    .try_into()
+                    .expect("the slice is four bytes"),
+            )
+        };
+        let kind = RecordKind::from_number(word(8))
+            .ok_or_else(|| malformed(path, 8, "unknown record kind"))?;
+        let record_bytes = word(12);
+        let least = size_of::<Envelope>();
+        let (fits, expected) = kind.record_bytes().map_or_else(
+            || {
+                (
+                    record_bytes as usize >= least,
+                    format!("at least {least} bytes"),
+                )
+            },
+            |size| (record_bytes as usize == size, format!("{size} bytes")),
+        );
+        if !fits {
+            return Err(RecordFileError::OtherLayout {
+                path: path.to_owned(),
+                kind: kind.row().2,
+                found_bytes: record_bytes,
+                expected,
+            });
+        }
+        let name = header[32..].split(|byte| *byte == 0).next().unwrap_or(&[]);
+        let channel = str::from_utf8(name)
+            .map_err(|_utf8| malformed(path, 32, "the channel name is not UTF-8"))?
+            .to_owned();
+        Ok(Self {
+            kind,
+            channel,
+            record_bytes,
+            instance: word(16),
+        })
+    }
+}
+
+fn malformed(path: &Path, offset: usize, problem: &'static str) -> RecordFileError {
+    RecordFileError::Malformed {
+        path: path.to_owned(),
+        offset,
+        problem,
+    }
+}
+
+/// A record file in memory.
+#[derive(Debug)]
+pub struct RecordFile {
+    /// What the header says.
+    pub header: RecordHeader,
+    bytes: Vec<u8>,
+    /// Bytes of an unfinished last record, left out.
+    pub truncated_bytes: usize,
+}
+
+impl RecordFile {
+    /// Reads a whole file.
+    ///
+    /// # Errors
+    /// When it cannot be read or its header is not that of a record file.
+    pub fn read(path: &Path) -> Result<Self, RecordFileError> {
+        let bytes = fs::read(path).map_err(|source| RecordFileError::Io {
+            path: path.to_owned(),
+            source,
+        })?;
+        Self::from_bytes(path, bytes)
+    }
+
+    /// Reads a whole file that is in memory; `path` stands in what is said of it.
+    ///
+    /// # Errors
+    /// When its header is not that of a record file.
+    pub fn from_bytes(path: &Path, bytes: Vec<u8>) -> Result<Self, RecordFileError> {
+        let header = RecordHeader::decode(path, &bytes)?;
+        let truncated_bytes = (bytes.len() - HEADER_BYTES) % header.record_bytes as usize;
+        Ok(Self {
+            header,
+            bytes,
+            truncated_bytes,
+        })
+    }
+
+    /// The records as `T`; empty when `T` has another size.
+    pub fn records<T: Pod>(&self) -> impl Iterator<Item = T> + '_ {
+        self.raw()
+            .filter_map(|bytes| bytemuck::try_pod_read_unaligned(bytes).ok())
+    }
+
+    /// The record with `index` in the order of the file as `T`; `None` beyond the last, and when
+    /// `T` has another size.
+    pub fn record<T: Pod>(&self, index: usize) -> Option<T> {
+        let bytes = self.raw().nth(index)?;
+        bytemuck::try_pod_read_unaligned(bytes).ok()
+    }
+
+    /// How many whole records there are.
+    pub fn record_count(&self) -> usize {
+        self.raw().len()
+    }
+
+    /// The message with `index` in the order of the file; `None` beyond the last, and when the
+    /// file holds records of another kind.
+    pub fn message(&self, index: usize) -> Option<(Envelope, &[u8])> {
+        if self.header.kind != RecordKind::Message {
+            return None;
+        }
+        let bytes = self.raw().nth(index)?;
+        let (envelope, payload) = bytes.split_at(size_of::<Envelope>());
+        Some((bytemuck::pod_read_unaligned(envelope), payload))
+    }
+
+    /// The messages, appended to a run log under the channel's name; nothing when the file holds
+    /// records of another kind.
+    pub fn append_messages(&self, log: &mut RunLog) {
+        if self.header.kind != RecordKind::Message {
+            return;
+        }
+        for bytes in self.raw() {
+            let (envelope, payload) = bytes.split_at(size_of::<Envelope>());
+            log.push(
+                &self.header.channel,
+                bytemuck::pod_read_unaligned(envelope),
+                payload,
+            );
+        }
+    }
+
+    fn raw(&self) -> impl ExactSizeIterator<Item = &[u8]> {
+        self.bytes[HEADER_BYTES..].chunks_exact(self.header.record_bytes as usize)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn sample() -> Vec<u8> {
+        let header = RecordHeader {
+            kind: RecordKind::Published,
+            channel: "arm/command".to_owned(),
+            record_bytes: u32::try_from(size_of::<PublishedRecord>()).unwrap(),
+            instance: 2,
+        };
+        let mut bytes = header.encode(Path::new("x")).unwrap().to_vec();
+        for sequence in 0..3 {
+            let record = PublishedRecord {
+                sequence,
+                published_ns: 9,
+                epoch: 4,
+                reserved: 0,
+            };
+            bytes.extend_from_slice(bytemuck::bytes_of(&record));
+        }
+        bytes
+    }
+
+    #[test]
+    fn a_file_gives_back_its_header_and_records() {
+        let file = RecordFile::from_bytes(Path::new("x"), sample()).unwrap();
+        assert_eq!(file.header.channel, "arm/command");
+        let sequence = |index| Some(file.record::<PublishedRecord>(index)?.sequence);
+        assert_eq!([0, 2, 3].map(sequence), [Some(0), Some(2), None]);
+        assert!(file.record::<u64>(0).is_none(), "another size");
+        assert_eq!(
+            file.header.file_name("robot"),
+            "arm.command.published.robot.2.rec"
+        );
+        let sequences: Vec<u64> = file
+            .records::<PublishedRecord>()
+            .map(|record| record.sequence)
+            .collect();
+        assert_eq!(sequences, [0, 1, 2]);
+    }
+
+    #[test]
+    fn a_file_cut_short_keeps_its_whole_records() {
+        let mut bytes = sample();
+        bytes.truncate(bytes.len() - 5);
+        let file = RecordFile::from_bytes(Path::new("x"), bytes).unwrap();
+        assert_eq!(file.records::<PublishedRecord>().count(), 2);
+        assert_eq!(file.truncated_bytes, size_of::<PublishedRecord>() - 5);
+    }
+
+    #[test]
+    fn a_file_of_another_layout_names_both_sizes_and_where_it_comes_from() {
+        let mut bytes = sample();
+        bytes[12] += 8;
+        let error = RecordFile::from_bytes(Path::new("x"), bytes).unwrap_err();
+        let size = size_of::<PublishedRecord>();
+        let expected = format!(
+            "record file x, byte 12: published records of {} bytes, where this program has {size} \
+             bytes; written by another version of hil-runtime?",
+            size + 8
+        );
+        assert_eq!(error.to_string(), expected);
+        let mut bytes = sample();
+        bytes[8] = 6;
+        bytes[12..16].copy_from_slice(&1_u32.to_le_bytes());
+        let error = RecordFile::from_bytes(Path::new("x"), bytes).unwrap_err();
+        let text = error.to_string();
+        assert!(
+            text.contains("message records of 1 bytes, where this program has at least"),
+            "{text}"
+        );
+    }
+}

@@ -1,0 +1,308 @@
+//! Bounded rings between the measured threads and one writer thread. Pushing never blocks,
+//! allocates or calls the system; a full ring drops the record and counts it.
+
+use std::fs::File;
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::thread::{self, JoinHandle};
+use std::time::Duration;
+
+use bytemuck::Pod;
+use hil_core::message::Envelope;
+
+use super::file::{RecordFileError, RecordHeader, RecordKind};
+
+/// How often the writer empties the rings: what a kill of the process can lose at most.
+const FLUSH_PERIOD: Duration = Duration::from_millis(20);
+
+/// No ring takes more memory than this, unless its records are enormous.
+const RING_BYTES_MAX: usize = 8 << 20;
+/// Fewer would not bridge the writer's period at a kilohertz.
+const RING_RECORDS_MIN: usize = 64;
+
+/// The producing end of one ring: lives in a measured thread.
+#[derive(Debug)]
+pub struct RecordSink {
+    ring: rtrb::Producer<u8>,
+    dropped: Arc<AtomicU64>,
+}
+
+impl RecordSink {
+    /// Stores one record.
+    pub fn push<T: Pod>(&mut self, record: &T) {
+        let stored = self.ring.push_entire_slice(bytemuck::bytes_of(record));
+        self.count_unless(stored.is_ok());
+    }
+
+    /// Stores one message: envelope and payload.
+    pub fn push_message(&mut self, envelope: &Envelope, payload: &[u8]) {
+        let envelope = bytemuck::bytes_of(envelope);
+        // Only this end fills the ring, so free slots can only become more between the calls.
+        let fits = self.ring.slots() >= envelope.len() + payload.len();
+        let stored = fits
+            && self.ring.push_entire_slice(envelope).is_ok()
+            && self.ring.push_entire_slice(payload).is_ok();
+        self.count_unless(stored);
+    }
+
+    fn count_unless(&mut self, is_stored: bool) {
+        if !is_stored {
+            self.dropped.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+}
+
+#[derive(Debug)]
+struct Drain {
+    ring: rtrb::Consumer<u8>,
+    file: File,
+    path: PathBuf,
+}
+
+/// What became of a recorder's files.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct RecorderOutcome {
+    /// Records dropped because a ring was full.
+    pub dropped_count: u64,
+    /// Files that could not be written, with the reason.
+    pub failures: Vec<String>,
+}
+
+/// Owns the files of one process and the thread that writes them.
+#[derive(Debug)]
+pub struct Recorder {
+    folder: PathBuf,
+    writer: String,
+    instance: u32,
+    dropped: Arc<AtomicU64>,
+    drains: Vec<Drain>,
+    stop: Arc<AtomicBool>,
+    thread: Option<JoinHandle<Vec<String>>>,
+}
+
+impl RecorderOutcome {
+    /// Why a process that could not record cannot go on: the first failure stands for those that
+    /// followed from it.
+    pub fn problem(&self) -> Option<String> {
+        let first = self.failures.first()?;
+        Some(format!(
+            "cannot record: {first}; messages after that would be in no account"
+        ))
+    }
+}
+
+impl Recorder {
+    /// A recorder for process `writer` below `folder`; opens nothing yet.
+    pub fn new(folder: &Path, writer: &str, instance: u32) -> Self {
+        Self {
+            folder: folder.to_owned(),
+            writer: writer.to_owned(),
+            instance,
+            dropped: Arc::new(AtomicU64::new(0)),
+            drains: Vec::new(),
+            stop: Arc::new(AtomicBool::new(false)),
+            thread: None,
+        }
+    }
+
+    /// A sink without a file, for records that a thread of its kind may make and this one does not:
+    /// every one would count as dropped.
+    pub fn closed_sink(&self) -> RecordSink {
+        let (ring, _nobody) = rtrb::RingBuffer::new(0);
+        RecordSink {
+            ring,
+            dropped: Arc::clone(&self.dropped),
+        }
+    }
+
+    /// Opens the file for `kind` records of `channel` and a ring of `capacity_records`, or of
+    /// as many as 8 MiB hold. Call
+    /// before [`Recorder::start`].
+    ///
+    /// # Errors
+    /// When the file cannot be created.
+    ///
+    /// # Panics
+    /// When a record is 4 GiB long.
+    pub fn sink(
+        &mut self,
+        kind: RecordKind,
+        channel: &str,
+        record_bytes: usize,
+        capacity_records: usize,
+    ) -> Result<RecordSink, RecordFileError> {
+        let record_bytes_header = u32::try_from(record_bytes).expect("records are small");
+        let header = RecordHeader {
+            kind,
+            channel: channel.to_owned(),
+            record_bytes: record_bytes_header,
+            instance: self.instance,
+        };
+        let (path, file) = header.create(&self.folder, &self.writer)?;
+        let capacity_records = capacity_records
+            .min(RING_BYTES_MAX / record_bytes)
+            .max(RING_RECORDS_MIN);
+        let (producer, ring) = rtrb::RingBuffer::new(record_bytes * capacity_records);
+        self.drains.push(Drain { ring, file, path });
+        Ok(RecordSink {
+            ring: producer,
+            dropped: Arc::clone(&self.dropped),
+        })
+    }
+
+    /// Starts the writer thread. Call from a thread of normal priority: the writer inherits it.
+    ///
+    /// # Errors
+    /// When the system gives no thread.
+    pub fn start(&mut self) -> io::Result<()> {
+        self.start_and_tell(|| ())
+    }
+
+    /// As [`Recorder::start`]; `on_failure` is called from the writer thread when a file can no
+    /// longer be written, so that a run does not go on for hours without its account.
+    ///
+    /// # Errors
+    /// As [`Recorder::start`].
+    pub fn start_and_tell(&mut self, on_failure: impl Fn() + Send + 'static) -> io::Result<()> {
+        let mut drains = core::mem::take(&mut self.drains);
+        let stop = Arc::clone(&self.stop);
+        let builder = thread::Builder::new().name("recorder".to_owned());
+        self.thread = Some(builder.spawn(move || {
+            let mut failures = Vec::new();
+            loop {
+                let is_last = stop.load(Ordering::Acquire);
+                drains.retain_mut(|drain| match flush(drain) {
+                    Ok(()) => true,
+                    Err(error) => {
+                        failures.push(format!("{}: {error}", drain.path.display()));
+                        on_failure();
+                        false
+                    }
+                });
+                if is_last {
+                    return failures;
+                }
+                thread::sleep(FLUSH_PERIOD);
+            }
+        })?);
+        Ok(())
+    }
+
+    /// Records dropped so far.
+    pub fn dropped_count(&self) -> u64 {
+        self.dropped.load(Ordering::Relaxed)
+    }
+
+    /// Writes what is left and ends the writer thread.
+    pub fn finish(mut self) -> RecorderOutcome {
+        self.stop.store(true, Ordering::Release);
+        let failures = match self.thread.take().map(JoinHandle::join) {
+            Some(Ok(failures)) => failures,
+            Some(Err(_)) => vec!["the recorder thread panicked".to_owned()],
+            None => Vec::new(),
+        };
+        RecorderOutcome {
+            dropped_count: self.dropped_count(),
+            failures,
+        }
+    }
+}
+
+fn flush(drain: &mut Drain) -> io::Result<()> {
+    let waiting = drain.ring.slots();
+    if let Ok(chunk) = drain.ring.read_chunk(waiting) {
+        let (first, second) = chunk.as_slices();
+        drain.file.write_all(first)?;
+        drain.file.write_all(second)?;
+        chunk.commit_all();
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::record::RecordFile;
+    use hil_core::record::PublishedRecord;
+    use std::env;
+    use std::fs;
+    use std::process;
+
+    fn record(sequence: u64) -> PublishedRecord {
+        PublishedRecord {
+            sequence,
+            published_ns: 1,
+            epoch: 0,
+            reserved: 0,
+        }
+    }
+
+    #[test]
+    fn a_closed_sink_leaves_no_file_and_counts_what_it_is_given() {
+        let folder = env::temp_dir().join(format!("hil-closed-{}", process::id()));
+        fs::create_dir_all(&folder).unwrap();
+        let mut recorder = Recorder::new(&folder, "clock", 0);
+        let mut sink = recorder.closed_sink();
+        recorder.start().unwrap();
+        sink.push(&record(0));
+        sink.push(&record(1));
+        assert_eq!(recorder.finish().dropped_count, 2);
+        assert_eq!(fs::read_dir(&folder).unwrap().count(), 0);
+        fs::remove_dir_all(&folder).unwrap();
+    }
+
+    #[test]
+    fn a_file_that_cannot_be_written_is_told_at_once_and_named() {
+        // The one device of every Linux that takes nothing.
+        let (mut ring, drained) = rtrb::RingBuffer::new(64);
+        ring.push(1).unwrap();
+        let path = PathBuf::from("/dev/full");
+        let file = File::options().write(true).open(&path).unwrap();
+        let mut recorder = Recorder::new(&env::temp_dir(), "robot", 0);
+        recorder.drains.push(Drain {
+            ring: drained,
+            file,
+            path,
+        });
+        let told = Arc::new(AtomicU64::new(0));
+        let counted = Arc::clone(&told);
+        let count = move || {
+            counted.fetch_add(1, Ordering::Relaxed);
+        };
+        recorder.start_and_tell(count).unwrap();
+        let outcome = recorder.finish();
+        assert_eq!(told.load(Ordering::Relaxed), 1);
+        let problem = outcome.problem().unwrap();
+        assert!(problem.starts_with("cannot record: /dev/full: No space left on device"));
+        assert_eq!(RecorderOutcome::default().problem(), None);
+    }
+
+    #[test]
+    fn what_was_pushed_is_in_the_file_and_what_did_not_fit_is_counted() {
+        let folder = env::temp_dir().join(format!("hil-ring-{}", process::id()));
+        fs::create_dir_all(&folder).unwrap();
+        let mut recorder = Recorder::new(&folder, "robot", 0);
+        let size = size_of::<PublishedRecord>();
+        let mut sink = recorder
+            .sink(RecordKind::Published, "a/b", size, 100)
+            .unwrap();
+        for sequence in 0..130 {
+            sink.push(&record(sequence));
+        }
+        recorder.start().unwrap();
+        let outcome = recorder.finish();
+        assert_eq!(
+            outcome,
+            RecorderOutcome {
+                dropped_count: 30,
+                failures: Vec::new()
+            }
+        );
+        let file = RecordFile::read(&folder.join("a.b.published.robot.0.rec")).unwrap();
+        let read: Vec<PublishedRecord> = file.records().collect();
+        assert_eq!(read, (0..100).map(record).collect::<Vec<_>>());
+        fs::remove_dir_all(&folder).unwrap();
+    }
+}

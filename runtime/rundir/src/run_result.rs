@@ -1,0 +1,213 @@
+//! How a run ended, and everything it knows before any figure is computed: `result.json` in the run's
+//! folder. With the manifest and the records beside it, every figure can be computed again.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::io;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use hil_core::time::Instant;
+use serde::{Deserialize, Serialize};
+
+use super::card_story::CardStory;
+use super::event::{Event, ProcessStory};
+use super::run_folder::RunFolder;
+use crate::protection::RunSecurity;
+use hil_platform::clock_discipline::HostDiscipline;
+use hil_platform::host_facts::HostFacts;
+
+/// What `result.json` says it is.
+pub const RUN_RESULT_FORMAT: &str = "hil-run-result";
+/// Version of the layout of `result.json`. Within one, fields are only added.
+pub const RUN_RESULT_VERSION: u32 = 1;
+
+/// How a run ended.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Outcome {
+    /// The planned time passed.
+    Completed,
+    /// A process ended by itself without a fault.
+    EndedEarly(String),
+    /// The user ended it.
+    Interrupted(String),
+    /// A process failed and its policy ended the run.
+    Failed(String),
+    /// Another host ended it.
+    EndedByPeer(String),
+    /// Another host vanished.
+    PeerLost(String),
+}
+
+impl Outcome {
+    /// In words.
+    pub fn text(&self) -> String {
+        match self {
+            Self::Completed => "completed as planned".to_owned(),
+            Self::EndedEarly(text) => format!("ended early: {text}"),
+            Self::Interrupted(by) => format!("interrupted by {by}"),
+            Self::Failed(text) => format!("failed: {text}"),
+            Self::EndedByPeer(text) => format!("ended by another host: {text}"),
+            Self::PeerLost(text) => format!("another host vanished: {text}"),
+        }
+    }
+
+    /// Why it ended so, to be said after a word for how.
+    pub fn reason(&self) -> String {
+        match self {
+            Self::Completed => "as planned".to_owned(),
+            Self::Failed(text) => text.clone(),
+            other => other.text(),
+        }
+    }
+}
+
+/// Everything a finished run knows, before any figure is computed.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RunResult {
+    /// Where its files are: not in the file, which lies there.
+    #[serde(skip)]
+    pub folder: RunFolder,
+    /// How it ended.
+    pub outcome: Outcome,
+    /// Start and end of the run on each host, on that host's own monotonic clock.
+    pub spans: BTreeMap<String, (Instant, Instant)>,
+    /// When it started, as people write it.
+    pub started: String,
+    /// What happened, on all hosts.
+    pub events: Vec<Event>,
+    /// How the processes of all hosts fared.
+    pub processes: Vec<ProcessStory>,
+    /// What became of the network cards of all hosts; empty unless hardware stamps were asked
+    /// for.
+    pub cards: Vec<CardStory>,
+    /// True when all hosts read one clock.
+    pub has_one_clock: bool,
+    /// How the hops between hosts are protected; `None` when there are none.
+    pub security: Option<RunSecurity>,
+    /// Who steers each host's system clock, of the hosts that told.
+    pub disciplines: BTreeMap<String, HostDiscipline>,
+    /// Hosts that ran here.
+    pub own_hosts: Vec<String>,
+    /// What spoils the completeness of the report.
+    pub problems: Vec<String>,
+    /// Facts of this host.
+    pub facts: HostFacts,
+    /// The longest delay of each trace that a link replayed, by channel.
+    pub trace_delays: BTreeMap<String, Duration>,
+}
+
+/// `result.json` cannot be read or written.
+#[derive(Debug, thiserror::Error)]
+pub enum RunResultError {
+    /// The file cannot be read or written.
+    #[error("{path}: {source}")]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// It does not say what it should.
+    #[error("{path}: {source}")]
+    Content {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        source: serde_json::Error,
+    },
+    /// It is another file, or of another version.
+    #[error(
+        "{path}: format {format:?} version {version}; this program reads {RUN_RESULT_FORMAT:?} \
+         version {RUN_RESULT_VERSION}"
+    )]
+    Version {
+        /// The file.
+        path: PathBuf,
+        /// What it says it is.
+        format: String,
+        /// Its version.
+        version: u32,
+    },
+}
+
+/// The file: its kind and version, and beside them the fields of the result.
+#[derive(Serialize)]
+struct Written<'a> {
+    format: &'static str,
+    version: u32,
+    #[serde(flatten)]
+    result: &'a RunResult,
+}
+
+/// The part of the file that says whether the rest can be read.
+#[derive(Deserialize)]
+struct Head {
+    format: String,
+    version: u32,
+}
+
+impl RunResult {
+    /// Writes it into the run's folder, so that a reader finds it whole or not at all.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn write(&self) -> Result<(), RunResultError> {
+        let path = self.folder.result();
+        let written = Written {
+            format: RUN_RESULT_FORMAT,
+            version: RUN_RESULT_VERSION,
+            result: self,
+        };
+        let text = match serde_json::to_string_pretty(&written) {
+            Ok(text) => text,
+            Err(source) => return Err(RunResultError::Content { path, source }),
+        };
+        let new = path.with_extension("json.new");
+        let done = fs::write(&new, text).and_then(|()| fs::rename(&new, &path));
+        done.map_err(|source| RunResultError::Io { path, source })
+    }
+
+    /// Reads that of the run in `folder`.
+    ///
+    /// # Errors
+    /// When it is not there, not of this version, or damaged.
+    pub fn read(folder: &RunFolder) -> Result<Self, RunResultError> {
+        let path = folder.result();
+        let text = match fs::read_to_string(&path) {
+            Ok(text) => text,
+            Err(source) => return Err(RunResultError::Io { path, source }),
+        };
+        let head = match serde_json::from_str::<Head>(&text) {
+            Ok(head) => head,
+            Err(source) => return Err(RunResultError::Content { path, source }),
+        };
+        if head.format != RUN_RESULT_FORMAT || head.version != RUN_RESULT_VERSION {
+            let Head { format, version } = head;
+            return Err(RunResultError::Version {
+                path,
+                format,
+                version,
+            });
+        }
+        match serde_json::from_str::<Self>(&text) {
+            Ok(result) => Ok(Self {
+                folder: folder.clone(),
+                ..result
+            }),
+            Err(source) => Err(RunResultError::Content { path, source }),
+        }
+    }
+
+    /// True when records are missing, or something could not be taken down: the report is not
+    /// what the run should have left.
+    pub fn has_gaps(&self) -> bool {
+        let reports = self
+            .processes
+            .iter()
+            .filter_map(|process| process.report.as_ref());
+        let mut failures = reports.flat_map(|report| &report.recorder_failures);
+        !self.problems.is_empty() || failures.next().is_some()
+    }
+}

@@ -1,0 +1,148 @@
+//! The secret of one run and the cipher of its hops, as supervisors hand them to each other and to their
+//! gateways. It goes through pipes and encrypted connections only, never into a file.
+
+use core::fmt;
+use std::io;
+
+use hil_protocol::seal::{Association, Initiator, Responder, Rotation, RunSecret, Suite};
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use zeroize::Zeroizing;
+
+use crate::launch::DirectionLaunch;
+use hil_platform::random::random_bytes;
+
+/// Secret and cipher of one run.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RunSeal {
+    secret: Secret,
+    cipher: Cipher,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+enum Cipher {
+    Aes256Gcm,
+    Chacha20Poly1305,
+}
+
+#[derive(Clone, PartialEq, Eq)]
+struct Secret(RunSecret);
+
+impl fmt::Debug for Secret {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("..")
+    }
+}
+
+impl Serialize for Secret {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        self.0.expose().serialize(serializer)
+    }
+}
+
+impl<'de> Deserialize<'de> for Secret {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let mut bytes = <[u8; 32]>::deserialize(deserializer)?;
+        Ok(Self(RunSecret::new(&mut bytes)))
+    }
+}
+
+impl RunSeal {
+    /// A fresh secret.
+    ///
+    /// # Errors
+    /// When the system gives no random numbers.
+    pub fn fresh(suite: Suite) -> io::Result<Self> {
+        Ok(Self {
+            secret: Secret(RunSecret::new(&mut random_bytes()?)),
+            cipher: match suite {
+                Suite::Aes256Gcm => Cipher::Aes256Gcm,
+                Suite::ChaCha20Poly1305 => Cipher::Chacha20Poly1305,
+            },
+        })
+    }
+
+    /// The cipher of every hop.
+    pub fn suite(&self) -> Suite {
+        match self.cipher {
+            Cipher::Aes256Gcm => Suite::Aes256Gcm,
+            Cipher::Chacha20Poly1305 => Suite::ChaCha20Poly1305,
+        }
+    }
+
+    fn association(&self, launch: &DirectionLaunch) -> Association {
+        Association {
+            secret: self.secret.0.clone(),
+            suite: self.suite(),
+            channel: launch.channel_id,
+            channel_name: launch.channel.clone(),
+        }
+    }
+
+    /// The sending end of the channel of `launch`, with a salt of its own.
+    ///
+    /// # Errors
+    /// As [`RunSeal::fresh`].
+    pub fn initiator(&self, launch: &DirectionLaunch) -> io::Result<Initiator> {
+        let salt = random_bytes()?;
+        Ok(Initiator::new(
+            &self.association(launch),
+            salt,
+            Rotation::default(),
+        ))
+    }
+
+    /// The receiving end of the channel of `launch`, with salts of its own.
+    ///
+    /// # Errors
+    /// As [`RunSeal::fresh`].
+    pub fn responder(&self, launch: &DirectionLaunch) -> io::Result<Responder> {
+        let seed = Zeroizing::new(random_bytes::<32>()?);
+        Ok(Responder::new(
+            &self.association(launch),
+            &seed,
+            Rotation::default(),
+        ))
+    }
+}
+
+/// Whether this processor has instructions for AES and for the multiplication of GCM.
+#[cfg(target_arch = "x86_64")]
+pub fn has_fast_aes() -> bool {
+    std::arch::is_x86_feature_detected!("aes") && std::arch::is_x86_feature_detected!("pclmulqdq")
+}
+
+/// Whether this processor has instructions for AES and for the multiplication of GCM.
+#[cfg(target_arch = "aarch64")]
+pub fn has_fast_aes() -> bool {
+    std::arch::is_aarch64_feature_detected!("aes")
+        && std::arch::is_aarch64_feature_detected!("pmull")
+}
+
+/// The cipher that is fast on every host; either is safe on any.
+pub fn suite_for(all_have_fast_aes: bool) -> Suite {
+    if all_have_fast_aes {
+        Suite::Aes256Gcm
+    } else {
+        Suite::ChaCha20Poly1305
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn it_survives_the_pipe_and_is_never_printed() {
+        let seal = RunSeal::fresh(suite_for(true)).unwrap();
+        let text = serde_json::to_string(&seal).unwrap();
+        let back: RunSeal = serde_json::from_str(&text).unwrap();
+        assert_eq!(back, seal);
+        assert_eq!(back.suite(), Suite::Aes256Gcm);
+        assert_ne!(RunSeal::fresh(suite_for(false)).unwrap(), seal);
+        let numbers = text.split('[').nth(1).unwrap();
+        let first: Vec<&str> = numbers.split(',').take(4).collect();
+        assert!(!format!("{seal:?}").contains(&first.join(", ")));
+    }
+}

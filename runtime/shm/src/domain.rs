@@ -1,0 +1,409 @@
+//! The shared memory of one run on one host: an iceoryx2 domain of its own, so that runs side by
+//! side cannot see each other and everything a dead run left behind can be thrown away.
+
+use std::fs::{self, DirBuilder, File};
+use std::io;
+use std::os::unix::fs::{DirBuilderExt, MetadataExt};
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use iceoryx2::config::Config;
+use iceoryx2::node::{Node, NodeBuilder};
+use iceoryx2::prelude::{
+    FileName, LogLevel, NodeName, Path as IceoryxPath, SemanticString, SignalHandlingMode, ipc,
+    set_log_level,
+};
+use nix::errno::Errno;
+use nix::fcntl::{Flock, FlockArg};
+
+use super::error::{DomainError, explain};
+use super::identity::{Fnv128, SHARED_MEMORY_DIRECTORY, fingerprint};
+use super::members;
+use super::sequence::OPEN_WITHIN;
+use hil_platform::clock::MonotonicClock;
+use hil_platform::domain_address::{
+    DomainAddress, DomainAddressError, checked_root_path, is_prefix,
+};
+
+/// File in the root path that says whose it is; its content is the prefix of the run.
+const MARKER: &str = "hil-domain";
+
+/// Ended writers of a channel whose unread samples a reader keeps; at least the samples a reader may
+/// borrow.
+const ENDED_WRITERS_MAX: usize = 4;
+
+/// Membership of this process in the domain of a run.
+///
+/// The launcher [creates](Domain::create) it and owns it: it alone holds the lock on the root
+/// path, and with it the domain goes. Workers [open](Domain::open) it. One per process is enough;
+/// it can be shared by threads, while the ports opened from it cannot.
+#[derive(Debug)]
+pub struct Domain {
+    address: DomainAddress,
+    config: Config,
+    node: Mutex<Option<Node<ipc::Service>>>,
+    /// The launcher's lock; `None` in a worker and after removal.
+    lock: Option<Flock<File>>,
+    open_within: Duration,
+}
+
+/// What [`Domain::remove`] found and left.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Removal {
+    /// Processes of the run that were still members; their channels are gone under their hands.
+    pub live_member_count: u64,
+    /// Files that could not be deleted.
+    pub remained: Vec<PathBuf>,
+}
+
+/// What [`Domain::cleanup_dead_nodes`] did.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Cleanup {
+    /// Dead processes whose slots, samples and files were freed.
+    pub freed_count: u64,
+    /// Dead processes another process is cleaning up, or whose files refuse.
+    pub failed_count: u64,
+    /// Nothing was done, because a file has no length yet: ask again soon. Such a file is either
+    /// being made, or of a process killed while making it.
+    pub is_postponed: bool,
+}
+
+impl Domain {
+    /// Creates the domain of a run below `root_path`, for the launcher.
+    ///
+    /// Directories are made as needed. What a dead run of the same name left is removed first.
+    ///
+    /// # Errors
+    /// When the path is unusable, too long, locked by a living run, or holds foreign files.
+    pub fn create(root_path: &Path) -> Result<Self, DomainError> {
+        let root_path = checked_root_path(root_path)?;
+        let lock = lock_directory(&root_path)?;
+        let marker = root_path.join(MARKER);
+        match fs::read_to_string(&marker) {
+            Ok(prefix) if is_prefix(&prefix) => {
+                delete_files(&DomainAddress::new(root_path.clone(), prefix));
+            }
+            Ok(_) => delete_below(&root_path),
+            Err(_) => {
+                let mut entries =
+                    fs::read_dir(&root_path).map_err(DomainError::io("read", &root_path))?;
+                if entries.next().is_some() {
+                    return Err(DomainError::ForeignDirectory { root_path });
+                }
+            }
+        }
+        let prefix = fresh_prefix(&root_path)?;
+        fs::write(&marker, &prefix).map_err(DomainError::io("write", &marker))?;
+        let mut domain = Self::join(DomainAddress::new(root_path, prefix), None)?;
+        domain.lock = Some(lock);
+        Ok(domain)
+    }
+
+    /// True when `root_path` is, or was, the root of a domain.
+    pub fn is_at(root_path: &Path) -> bool {
+        root_path.join(MARKER).is_file()
+    }
+
+    /// The prefix of the domain whose root is, or was, `root_path`; `None` where there is none.
+    pub fn prefix_at(root_path: &Path) -> Option<String> {
+        let prefix = fs::read_to_string(root_path.join(MARKER)).ok()?;
+        is_prefix(&prefix).then_some(prefix)
+    }
+
+    /// Joins the domain a launcher created.
+    ///
+    /// # Errors
+    /// When the root path does not exist here or iceoryx2 refuses, e.g. for another user's domain.
+    pub fn open(address: &DomainAddress) -> Result<Self, DomainError> {
+        let marker = address.root_path().join(MARKER);
+        fs::metadata(&marker).map_err(DomainError::io("find the run's", &marker))?;
+        Self::join(address.clone(), None)
+    }
+
+    /// As [`Domain::open`], for a program that only looks on: the run ends without regard to it.
+    ///
+    /// # Errors
+    /// As [`Domain::open`].
+    pub fn observe(address: &DomainAddress) -> Result<Self, DomainError> {
+        let marker = address.root_path().join(MARKER);
+        fs::metadata(&marker).map_err(DomainError::io("find the run's", &marker))?;
+        Self::join(address.clone(), Some(members::observer_name()))
+    }
+
+    fn join(address: DomainAddress, name: Option<NodeName>) -> Result<Self, DomainError> {
+        // Below this level iceoryx2 prints nothing we do not report ourselves; at it, some
+        // failures would be visible nowhere else.
+        set_log_level(LogLevel::Warn);
+        let config = configuration(&address)?;
+        let builder = name.map_or_else(NodeBuilder::new, |name| NodeBuilder::new().name(&name));
+        let node = builder
+            .config(&config)
+            .signal_handling_mode(SignalHandlingMode::Disabled)
+            .create::<ipc::Service>()
+            .map_err(|error| DomainError::Node {
+                root_path: address.root_path().to_owned(),
+                reason: explain(&format!("{error:?}")),
+            })?;
+        Ok(Self {
+            address,
+            config,
+            node: Mutex::new(Some(node)),
+            lock: None,
+            open_within: OPEN_WITHIN,
+        })
+    }
+
+    /// Sets how long opening a channel waits for the launcher to create it; 5 s unless set.
+    #[must_use]
+    pub fn with_open_within(mut self, open_within: Duration) -> Self {
+        self.open_within = open_within;
+        self
+    }
+
+    /// What another process needs to [open](Domain::open) this domain.
+    pub fn address(&self) -> &DomainAddress {
+        &self.address
+    }
+
+    /// Sixteen bytes that two processes have in common exactly when they share this domain's
+    /// memory. Network namespaces do not isolate shared memory: a gateway whose two ends agree
+    /// here is being bypassed.
+    ///
+    /// # Errors
+    /// When the root path, `/dev/shm` or `/proc` cannot be inspected.
+    pub fn fingerprint(&self) -> Result<[u8; 16], DomainError> {
+        fingerprint(self.address.root_path(), self.address.prefix())
+    }
+
+    /// Frees what dead processes of this domain held. Readers hear of a dead writer, and a
+    /// restarted process finds its slot, only after somebody called this or joined anew: the
+    /// launcher calls it about ten times a second.
+    pub fn cleanup_dead_nodes(&self) -> Cleanup {
+        // iceoryx2 0.10 waits without end for a file to get a length.
+        if !is_clear_of_lengthless_files(self.address.prefix()) {
+            return Cleanup {
+                is_postponed: true,
+                ..Cleanup::default()
+            };
+        }
+        let node = self.node();
+        let done = node_of(node.as_ref()).try_cleanup_dead_nodes();
+        Cleanup {
+            freed_count: done.cleanups,
+            failed_count: done.failed_cleanups,
+            is_postponed: false,
+        }
+    }
+
+    /// As [`Domain::cleanup_dead_nodes`], but waits, half a second at most, rather than postpone.
+    pub fn cleanup_dead_nodes_now(&self) -> Cleanup {
+        loop {
+            let cleanup = self.cleanup_dead_nodes();
+            if !cleanup.is_postponed {
+                return cleanup;
+            }
+            std::thread::sleep(LENGTHLESS_MAX / 20);
+        }
+    }
+
+    /// Observers that have not left yet.
+    pub fn observer_count(&self) -> u64 {
+        members::living(&self.config).observer_count
+    }
+
+    /// Leaves the domain and, in the launcher, deletes its files. Drop all ports and
+    /// [`ChannelHolder`](super::ChannelHolder)s and end all workers before.
+    pub fn remove(mut self) -> Removal {
+        self.leave()
+    }
+
+    fn leave(&mut self) -> Removal {
+        let node = self.node.get_mut().unwrap_or_else(PoisonError::into_inner);
+        drop(node.take());
+        let Some(lock) = self.lock.take() else {
+            return Removal::default();
+        };
+        let live_member_count = members::living(&self.config).process_count;
+        delete_files(&self.address);
+        let root_path = self.address.root_path();
+        // The directory goes while the lock is held, so that the next launcher starts clean.
+        // Failure shows in `remained`.
+        let _is_gone = fs::remove_dir(root_path).is_ok();
+        drop(lock);
+        let mut remained = shared_memory_files(self.address.prefix());
+        if root_path.exists() {
+            remained.push(root_path.to_owned());
+        }
+        Removal {
+            live_member_count,
+            remained,
+        }
+    }
+
+    pub(crate) fn config(&self) -> &Config {
+        &self.config
+    }
+
+    pub(crate) const fn open_within(&self) -> Duration {
+        self.open_within
+    }
+
+    /// Runs `act` with this process's node; ports keep their own share of it.
+    pub(crate) fn with_node<T>(&self, act: impl FnOnce(&Node<ipc::Service>) -> T) -> T {
+        act(node_of(self.node().as_ref()))
+    }
+
+    fn node(&self) -> MutexGuard<'_, Option<Node<ipc::Service>>> {
+        self.node.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Drop for Domain {
+    /// A launcher that fails half-way leaves nothing behind either.
+    fn drop(&mut self) {
+        self.leave();
+    }
+}
+
+fn node_of(node: Option<&Node<ipc::Service>>) -> &Node<ipc::Service> {
+    node.expect("the node is taken only by `leave`, which ends the domain")
+}
+
+fn configuration(address: &DomainAddress) -> Result<Config, DomainError> {
+    let unusable = || {
+        DomainError::Address(DomainAddressError::UnusableRootPath {
+            root_path: address.root_path().to_owned(),
+        })
+    };
+    let root_path = format!("{}/", address.root_path().display());
+    let mut config = Config::default();
+    config.global.prefix =
+        FileName::new(address.prefix().as_bytes()).map_err(|_refused_character| unusable())?;
+    let root_path =
+        IceoryxPath::new(root_path.as_bytes()).map_err(|_refused_character| unusable())?;
+    config.global.set_root_path(&root_path);
+    // A service is created by the launcher before any worker starts; whoever waits longer for a
+    // half-created one waits for a dead process, and our own retry covers the rest.
+    config.global.creation_timeout = Duration::from_millis(250);
+    // A reader that finds nothing has looked at the place of every connection it could have, and
+    // iceoryx2 reserves 128 for ended writers alone: a kilobyte per look. What an ended writer left
+    // unread is of its last start, or of the one before; anything older is discarded anyway.
+    let reading = &mut config.defaults.publish_subscribe;
+    reading.subscriber_expired_connection_buffer = ENDED_WRITERS_MAX;
+    Ok(config)
+}
+
+/// Makes the directory and takes the launcher's lock on it.
+fn lock_directory(root_path: &Path) -> Result<Flock<File>, DomainError> {
+    const ATTEMPTS: usize = 16;
+    for _ in 0..ATTEMPTS {
+        DirBuilder::new()
+            .recursive(true)
+            .mode(0o700)
+            .create(root_path)
+            .map_err(DomainError::io("create", root_path))?;
+        let directory = match File::open(root_path) {
+            Ok(directory) => directory,
+            Err(error) if error.kind() == io::ErrorKind::NotFound => continue,
+            Err(error) => return Err(DomainError::io("open", root_path)(error)),
+        };
+        let lock = match Flock::lock(directory, FlockArg::LockExclusiveNonblock) {
+            Ok(lock) => lock,
+            Err((_, Errno::EWOULDBLOCK)) => {
+                return Err(DomainError::Locked {
+                    root_path: root_path.to_owned(),
+                });
+            }
+            Err((_, errno)) => return Err(DomainError::io("lock", root_path)(errno.into())),
+        };
+        // The previous owner may have deleted the directory between our open and our lock.
+        let ours = lock
+            .metadata()
+            .map_err(DomainError::io("inspect", root_path))?;
+        if fs::metadata(root_path)
+            .is_ok_and(|there| (there.dev(), there.ino()) == (ours.dev(), ours.ino()))
+        {
+            return Ok(lock);
+        }
+    }
+    Err(DomainError::Locked {
+        root_path: root_path.to_owned(),
+    })
+}
+
+/// A prefix no file in `/dev/shm` has. Hosts emulated on one machine may share `/dev/shm` and use
+/// equal root paths in different mount namespaces, so the path alone does not tell runs apart.
+fn fresh_prefix(root_path: &Path) -> Result<String, DomainError> {
+    let metadata = fs::metadata(root_path).map_err(DomainError::io("inspect", root_path))?;
+    loop {
+        let mut hash = Fnv128::default();
+        for number in [
+            metadata.dev(),
+            metadata.ino(),
+            u64::from(std::process::id()),
+        ] {
+            hash.add(&number.to_le_bytes());
+        }
+        hash.add(&MonotonicClock::now().as_ns().to_le_bytes());
+        let [a, b, c, d, ..] = hash.0.to_le_bytes();
+        let prefix = format!("h{:08x}_", u32::from_le_bytes([a, b, c, d]));
+        if shared_memory_files(&prefix).is_empty() {
+            return Ok(prefix);
+        }
+    }
+}
+
+fn shared_memory_files(prefix: &str) -> Vec<PathBuf> {
+    let Ok(entries) = fs::read_dir(SHARED_MEMORY_DIRECTORY) else {
+        return Vec::new();
+    };
+    let names = entries.flatten().filter(|entry| {
+        let name = entry.file_name();
+        name.as_encoded_bytes().starts_with(prefix.as_bytes())
+    });
+    names.map(|entry| entry.path()).collect()
+}
+
+/// A living process gives a file its length within microseconds of making it.
+const LENGTHLESS_MAX: Duration = Duration::from_millis(500);
+
+/// Deletes files that a process was killed over before it could give them a length; false while
+/// one is young enough that its maker may live.
+fn is_clear_of_lengthless_files(prefix: &str) -> bool {
+    shared_memory_files(prefix).iter().all(|file| {
+        let Ok(metadata) = fs::metadata(file) else {
+            return true;
+        };
+        let age = metadata.modified().ok().and_then(|at| at.elapsed().ok());
+        metadata.len() > 0
+            || (age.is_some_and(|age| age > LENGTHLESS_MAX) && fs::remove_file(file).is_ok())
+    })
+}
+
+/// Deletes a run's shared memory, then all below its root path. What refuses is found by looking.
+fn delete_files(address: &DomainAddress) {
+    for file in shared_memory_files(address.prefix()) {
+        let _is_gone = fs::remove_file(file).is_ok();
+    }
+    delete_below(address.root_path());
+}
+
+/// Empties the root path; the marker goes last, so that an interrupted removal is resumed.
+fn delete_below(root_path: &Path) {
+    let Ok(entries) = fs::read_dir(root_path) else {
+        return;
+    };
+    for entry in entries
+        .flatten()
+        .filter(|entry| entry.file_name() != MARKER)
+    {
+        let path = entry.path();
+        let _is_gone = if entry.file_type().is_ok_and(|kind| kind.is_dir()) {
+            fs::remove_dir_all(path).is_ok()
+        } else {
+            fs::remove_file(path).is_ok()
+        };
+    }
+    let _is_gone = fs::remove_file(root_path.join(MARKER)).is_ok();
+}

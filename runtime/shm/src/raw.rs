@@ -1,0 +1,494 @@
+//! A channel without its Rust type, for gateways and recorders, and the byte ports under every
+//! other port. The only file that uses iceoryx2's hidden interface for foreign types
+//! (`CustomPayloadMarker`, `CustomHeaderMarker`, `__internal_*`, the same that its own network
+//! link and its C bindings use); the tests beside it say what an upgrade broke.
+
+use core::fmt;
+use core::mem::MaybeUninit;
+use core::slice;
+use std::os::fd::BorrowedFd;
+
+use hil_core::message::Envelope;
+use iceoryx2::identifiers::UniqueNodeId;
+use iceoryx2::port::LoanError;
+use iceoryx2::port::listener::Listener;
+use iceoryx2::port::notifier::Notifier;
+use iceoryx2::port::publisher::Publisher;
+use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::port::update_connections::UpdateConnections;
+use iceoryx2::prelude::{
+    FileDescriptorBased, MessagingPattern, PayloadHeader, Service, ServiceName, ZeroCopySend, ipc,
+};
+use iceoryx2::sample_mut_uninit::SampleMutUninit;
+use iceoryx2::service::builder::publish_subscribe::{Builder, PublishSubscribeOpenError};
+use iceoryx2::service::marker::{CustomHeaderMarker, CustomPayloadMarker};
+use iceoryx2::service::port_factory::publish_subscribe;
+use iceoryx2::service::static_config::message_type_details::{TypeDetail, TypeVariant};
+
+use super::ahead::Ahead;
+use super::degradation::ConnectionFailures;
+use super::domain::Domain;
+use super::error::{ChannelError, retry};
+use super::holder::ChannelSettings;
+use super::type_info::TypeInfo;
+use super::wake;
+
+/// What every channel's user header is called; changes when the envelope's layout does.
+pub const ENVELOPE_TYPE_NAME: &str = "hil.Envelope.v1";
+
+/// The envelope as iceoryx2 sees it.
+#[derive(Debug, Clone, Copy, Default)]
+#[repr(transparent)]
+pub(crate) struct SharedEnvelope(pub(crate) Envelope);
+
+// SAFETY: the envelope is plain old data without padding or pointers, and the name below is bound
+// to its layout.
+#[allow(unsafe_code, reason = "marks the envelope as fit for shared memory")]
+unsafe impl ZeroCopySend for SharedEnvelope {
+    // SAFETY: nothing is required of the caller; the trait marks the promise made above.
+    unsafe fn type_name() -> &'static str {
+        ENVELOPE_TYPE_NAME
+    }
+}
+
+fn info_of(detail: &TypeDetail) -> TypeInfo {
+    TypeInfo {
+        name: detail.type_name().to_string(),
+        size_bytes: detail.size(),
+        alignment_bytes: detail.alignment(),
+    }
+}
+
+fn detail_of(message: &TypeInfo, channel: &str) -> Result<TypeDetail, ChannelError> {
+    if message.size_bytes == 0 || !message.alignment_bytes.is_power_of_two() {
+        let reason = format_args!("{message}");
+        return Err(ChannelError::refused(
+            channel,
+            "describe its messages",
+            &reason,
+        ));
+    }
+    let (name, size) = (&message.name, message.size_bytes);
+    let variant = TypeVariant::FixedSize;
+    TypeDetail::__internal_new_from_parts(variant, name, size, message.alignment_bytes)
+        .map_err(|error| ChannelError::refused(channel, "name its messages", &error))
+}
+
+pub(crate) type ByteService =
+    publish_subscribe::PortFactory<ipc::Service, [CustomPayloadMarker], CustomHeaderMarker>;
+pub(super) type ReadService =
+    publish_subscribe::PortFactory<ipc::Service, [CustomPayloadMarker], SharedEnvelope>;
+
+pub(crate) fn service_name(channel: &str) -> Result<ServiceName, ChannelError> {
+    ServiceName::new(channel)
+        .map_err(|error| ChannelError::refused(channel, "use its name", &error))
+}
+
+fn envelope_detail() -> TypeDetail {
+    TypeDetail::new::<SharedEnvelope>(TypeVariant::FixedSize)
+}
+
+/// A builder for samples of `message` that is not told their Rust type.
+#[allow(
+    unsafe_code,
+    reason = "the hidden interface for foreign types is unsafe"
+)]
+fn byte_builder(
+    domain: &Domain,
+    channel: &str,
+    message: &TypeInfo,
+) -> Result<Builder<[CustomPayloadMarker], (), ipc::Service>, ChannelError> {
+    let detail = detail_of(message, channel)?;
+    let name = service_name(channel)?;
+    let builder = domain
+        .with_node(|node| node.service_builder(&name))
+        .publish_subscribe::<[CustomPayloadMarker]>();
+    // SAFETY: the detail describes a plain message of non-zero size; all ports below treat the
+    // payload as exactly that many bytes.
+    Ok(unsafe { builder.__internal_set_payload_type_details(&detail) })
+}
+
+/// The same with our envelope as the user header, in the form a byte-wise writer needs.
+#[allow(
+    unsafe_code,
+    reason = "the hidden interface for foreign types is unsafe"
+)]
+fn writing_builder(
+    domain: &Domain,
+    channel: &str,
+    message: &TypeInfo,
+) -> Result<Builder<[CustomPayloadMarker], CustomHeaderMarker, ipc::Service>, ChannelError> {
+    let builder = byte_builder(domain, channel, message)?.user_header::<CustomHeaderMarker>();
+    let detail = envelope_detail();
+    // SAFETY: the detail describes `Envelope`, which is what every port of ours writes and reads.
+    Ok(unsafe { builder.__internal_set_user_header_type_details(&detail) })
+}
+
+/// Creates the sample service; only the launcher does.
+pub(crate) fn create_samples(
+    domain: &Domain,
+    settings: &ChannelSettings,
+    nodes_max: usize,
+) -> Result<ByteService, ChannelError> {
+    writing_builder(domain, &settings.name, &settings.message)?
+        .enable_safe_overflow(true)
+        .history_size(0)
+        .subscriber_max_buffer_size(settings.depth_max)
+        .subscriber_max_borrowed_samples(2)
+        .max_publishers(settings.writers_max)
+        .max_subscribers(settings.readers_max)
+        .max_nodes(nodes_max)
+        .create()
+        .map_err(|error| ChannelError::refused(&settings.name, "create the channel", &error))
+}
+
+fn open_for_writing(
+    domain: &Domain,
+    channel: &str,
+    message: &TypeInfo,
+) -> Result<ByteService, ChannelError> {
+    writing_builder(domain, channel, message)?
+        .open()
+        .map_err(|error| open_error(domain, channel, message, error))
+}
+
+pub(super) fn open_for_reading(
+    domain: &Domain,
+    channel: &str,
+    message: &TypeInfo,
+) -> Result<ReadService, ChannelError> {
+    byte_builder(domain, channel, message)?
+        .user_header::<SharedEnvelope>()
+        .open()
+        .map_err(|error| open_error(domain, channel, message, error))
+}
+
+/// Says which types differ, where that is why the channel did not open.
+pub(crate) fn open_error(
+    domain: &Domain,
+    channel: &str,
+    wanted: &TypeInfo,
+    error: PublishSubscribeOpenError,
+) -> ChannelError {
+    if error == PublishSubscribeOpenError::IncompatibleTypes {
+        return match discover(domain, channel) {
+            Ok(found) => ChannelError::WrongType {
+                channel: channel.to_owned(),
+                found: found.to_string(),
+                wanted: wanted.to_string(),
+            },
+            Err(foreign) => foreign,
+        };
+    }
+    ChannelError::refused(channel, "open the channel", &error)
+}
+
+/// Reads the message type from the channel itself.
+pub(super) fn discover(domain: &Domain, channel: &str) -> Result<TypeInfo, ChannelError> {
+    const OPERATION: &str = "read its message type";
+    let name = service_name(channel)?;
+    let details = ipc::Service::details(&name, domain.config(), MessagingPattern::PublishSubscribe)
+        .map_err(|error| ChannelError::refused(channel, OPERATION, &error))?
+        .ok_or_else(|| {
+            let absent = PublishSubscribeOpenError::DoesNotExist;
+            ChannelError::refused(channel, OPERATION, &absent)
+        })?;
+    let types = details
+        .static_details
+        .publish_subscribe()
+        .message_type_details();
+    let wanted = envelope_detail();
+    if types.user_header != wanted {
+        return Err(ChannelError::ForeignHeader {
+            channel: channel.to_owned(),
+            found: info_of(&types.user_header).to_string(),
+            wanted: info_of(&wanted).to_string(),
+        });
+    }
+    if types.payload.variant() != TypeVariant::FixedSize {
+        let variant = types.payload.variant();
+        return Err(ChannelError::refused(channel, OPERATION, &variant));
+    }
+    Ok(info_of(&types.payload))
+}
+
+/// The descriptor that becomes readable when `listener` is notified.
+#[allow(unsafe_code, reason = "a descriptor is a bare number to iceoryx2")]
+pub(crate) fn descriptor(listener: &Listener<ipc::Service>) -> BorrowedFd<'_> {
+    // SAFETY: the number is used only for the borrow made below.
+    let raw = unsafe { listener.file_descriptor().native_handle() };
+    // SAFETY: the listener owns the descriptor and is borrowed for as long as the result lives.
+    unsafe { BorrowedFd::borrow_raw(raw) }
+}
+
+type BytePublisher = Publisher<ipc::Service, [CustomPayloadMarker], CustomHeaderMarker>;
+type ByteLoan =
+    SampleMutUninit<ipc::Service, [MaybeUninit<CustomPayloadMarker>], CustomHeaderMarker>;
+
+/// Memory for one message.
+#[allow(
+    unsafe_code,
+    reason = "the hidden interface for foreign types is unsafe"
+)]
+fn loan(publisher: &BytePublisher) -> Result<ByteLoan, LoanError> {
+    // SAFETY: one element is what a fixed-size message has.
+    unsafe { publisher.loan_custom_payload(1) }
+}
+
+/// Publishes bytes with a given envelope: the far end of a gateway.
+#[derive(Debug)]
+pub struct RawOutput {
+    // Before the publisher: it goes first.
+    next: Ahead<ByteLoan>,
+    channel: String,
+    message: TypeInfo,
+    publisher: BytePublisher,
+    notifier: Option<Notifier<ipc::Service>>,
+    failures: ConnectionFailures,
+}
+
+impl RawOutput {
+    /// Becomes the writer of `channel`, whatever it carries. With `notifies_readers` off, sleeping
+    /// readers sleep on.
+    ///
+    /// # Errors
+    /// When the channel does not appear in time, already has its writer, or has a user header
+    /// that is not our envelope.
+    pub fn open(
+        domain: &Domain,
+        channel: &str,
+        notifies_readers: bool,
+    ) -> Result<Self, ChannelError> {
+        let message = retry(domain.open_within(), || discover(domain, channel))?;
+        Self::open_as(domain, channel, message, notifies_readers)
+    }
+
+    pub(crate) fn open_as(
+        domain: &Domain,
+        channel: &str,
+        message: TypeInfo,
+        notifies_readers: bool,
+    ) -> Result<Self, ChannelError> {
+        let within = domain.open_within();
+        let service = retry(within, || open_for_writing(domain, channel, &message))?;
+        let failures = ConnectionFailures::default();
+        let publisher = retry(within, || {
+            service
+                .publisher_builder()
+                .max_loaned_samples(1)
+                .set_degradation_handler(failures.handler())
+                .create()
+                .map_err(|error| ChannelError::refused(channel, "become a writer", &error))
+        })?;
+        let notifier = notifies_readers
+            .then(|| retry(within, || wake::open_notifier(domain, channel)))
+            .transpose()?;
+        Ok(Self {
+            channel: channel.to_owned(),
+            message,
+            next: Ahead::keep(loan(&publisher)),
+            publisher,
+            notifier,
+            failures,
+        })
+    }
+
+    /// Attempts to connect to a reader that failed. While it grows, a reader hears nothing.
+    pub fn connection_failure_count(&self) -> u64 {
+        self.failures.count()
+    }
+
+    /// What the channel carries.
+    pub const fn message(&self) -> &TypeInfo {
+        &self.message
+    }
+
+    /// Publishes `payload` under `envelope` as it is, then wakes the readers.
+    ///
+    /// # Errors
+    /// When the payload is not one message long, or the channel is broken.
+    pub fn publish(&mut self, envelope: &Envelope, payload: &[u8]) -> Result<(), ChannelError> {
+        self.publish_with(payload, || *envelope)
+    }
+
+    /// As [`RawOutput::publish`], but asks for the envelope once the payload is in place, so that
+    /// a stamp in it is as late as it can be.
+    ///
+    /// # Errors
+    /// As [`RawOutput::publish`].
+    #[allow(
+        unsafe_code,
+        reason = "writes a message whose type is known only at run time"
+    )]
+    pub fn publish_with(
+        &mut self,
+        payload: &[u8],
+        envelope: impl FnOnce() -> Envelope,
+    ) -> Result<(), ChannelError> {
+        let refused = |operation, error: &dyn fmt::Debug| {
+            ChannelError::refused(&self.channel, operation, error)
+        };
+        self.check_size(payload.len())?;
+        let mut memory = self
+            .next
+            .take(|| loan(&self.publisher))
+            .map_err(|error| refused("get memory", &error))?;
+        let target = memory.payload_mut();
+        self.check_size(target.len())?;
+        let target = target.as_mut_ptr().cast::<u8>();
+        // SAFETY: source and target have one message's size, checked above, and do not overlap as
+        // the loan is exclusively ours.
+        unsafe { target.copy_from_nonoverlapping(payload.as_ptr(), payload.len()) };
+        let header: *mut CustomHeaderMarker = memory.user_header_mut();
+        let envelope = envelope();
+        // SAFETY: the service was opened with a user header of the envelope's size and alignment,
+        // and the marker reference is iceoryx2's pointer to that memory.
+        unsafe { header.cast::<Envelope>().write(envelope) };
+        // SAFETY: header and payload were written in full just above.
+        let sample = unsafe { memory.assume_init() };
+        sample.send().map_err(|error| refused("send", &error))?;
+        if let Some(notifier) = &self.notifier {
+            notifier
+                .notify()
+                .map_err(|error| refused("wake its readers", &error))?;
+        }
+        self.next = Ahead::keep(loan(&self.publisher));
+        Ok(())
+    }
+
+    fn check_size(&self, given: usize) -> Result<(), ChannelError> {
+        if given == self.message.size_bytes {
+            return Ok(());
+        }
+        Err(ChannelError::WrongSize {
+            channel: self.channel.clone(),
+            given,
+            expected: self.message.size_bytes,
+        })
+    }
+}
+
+/// Reads samples as envelope and bytes.
+#[derive(Debug)]
+pub(crate) struct ByteReader {
+    channel: String,
+    subscriber: Subscriber<ipc::Service, [CustomPayloadMarker], SharedEnvelope>,
+    failures: ConnectionFailures,
+}
+
+impl ByteReader {
+    pub(crate) fn open(
+        domain: &Domain,
+        channel: &str,
+        message: &TypeInfo,
+        depth: usize,
+    ) -> Result<Self, ChannelError> {
+        let within = domain.open_within();
+        let service = retry(within, || open_for_reading(domain, channel, message))?;
+        let failures = ConnectionFailures::default();
+        let subscriber = retry(within, || {
+            service
+                .subscriber_builder()
+                .buffer_size(depth)
+                .set_degradation_handler(failures.handler())
+                .create()
+                .map_err(|error| ChannelError::refused(channel, "become a reader", &error))
+        })?;
+        subscriber
+            .update_connections()
+            .map_err(|error| ChannelError::refused(channel, "connect to its writers", &error))?;
+        Ok(Self {
+            channel: channel.to_owned(),
+            subscriber,
+            failures,
+        })
+    }
+
+    pub(crate) fn connection_failure_count(&self) -> u64 {
+        self.failures.count()
+    }
+
+    /// Hands the oldest waiting sample to `take`; `None` when none waits.
+    #[allow(
+        unsafe_code,
+        reason = "reads a message whose type is known only at run time"
+    )]
+    pub(crate) fn receive<T>(
+        &mut self,
+        take: impl FnOnce(UniqueNodeId, &Envelope, &[u8]) -> T,
+    ) -> Result<Option<T>, ChannelError> {
+        let sample = self
+            .subscriber
+            .receive()
+            .map_err(|error| ChannelError::refused(&self.channel, "receive", &error))?;
+        Ok(sample.map(|sample| {
+            let payload = sample.payload();
+            // SAFETY: the marker is one byte of plain data, so the slice is that many bytes; the
+            // writer wrote them in full before it sent, and they stay while the sample is held.
+            let payload = unsafe { slice::from_raw_parts(payload.as_ptr().cast(), payload.len()) };
+            take(sample.header().node_id(), &sample.user_header().0, payload)
+        }))
+    }
+}
+
+/// Takes bytes and envelope off a channel it learns the type of: the near end of a gateway.
+#[derive(Debug)]
+pub struct RawInput {
+    message: TypeInfo,
+    reader: ByteReader,
+    own_node: UniqueNodeId,
+}
+
+impl RawInput {
+    /// Becomes a reader of `channel`, whatever it carries, with room for `depth` waiting samples.
+    ///
+    /// # Errors
+    /// When the channel does not appear in time, has all its readers, allows less depth, or has a
+    /// user header that is not our envelope.
+    pub fn open(domain: &Domain, channel: &str, depth: usize) -> Result<Self, ChannelError> {
+        let message = retry(domain.open_within(), || discover(domain, channel))?;
+        Ok(Self {
+            reader: ByteReader::open(domain, channel, &message, depth)?,
+            own_node: domain.with_node(|node| *node.id()),
+            message,
+        })
+    }
+
+    /// What the channel carries.
+    pub const fn message(&self) -> &TypeInfo {
+        &self.message
+    }
+
+    /// Attempts to connect to a writer that failed. While it grows, a writer is not heard.
+    pub fn connection_failure_count(&self) -> u64 {
+        self.reader.connection_failure_count()
+    }
+
+    /// Hands the oldest waiting sample to `take`; false when none waits. Never blocks.
+    ///
+    /// Samples published through the same [`Domain`] value are passed over, so that a gateway
+    /// does not send back what it delivered itself.
+    ///
+    /// # Errors
+    /// When the channel is broken.
+    pub fn receive(
+        &mut self,
+        take: &mut dyn FnMut(&Envelope, &[u8]),
+    ) -> Result<bool, ChannelError> {
+        let own_node = self.own_node;
+        loop {
+            let taken = self.reader.receive(|node, envelope, payload| {
+                let is_foreign = node != own_node;
+                if is_foreign {
+                    take(envelope, payload);
+                }
+                is_foreign
+            })?;
+            match taken {
+                Some(true) => return Ok(true),
+                Some(false) => {}
+                None => return Ok(false),
+            }
+        }
+    }
+}

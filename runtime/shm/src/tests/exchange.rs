@@ -1,0 +1,397 @@
+//! Samples through a channel: order, overflow, types, late joiners, wake-ups.
+
+use std::sync::atomic::{AtomicI64, Ordering};
+use std::thread;
+use std::time::Duration;
+
+use hil_core::endpoint::{InputPort, OutputPort};
+use hil_core::message::{Envelope, MessageType};
+use hil_core::time::Instant;
+use hil_shuttle::ShuttleStatus;
+
+use super::super::{
+    ChannelError, ChannelHolder, ChannelSettings, Domain, OutputSettings, RawInput, RawOutput,
+    ShmInput, ShmOutput, TypedInput, TypedOutput, Waiter, Wake,
+};
+use super::{POSE, Pose, assert_nothing_left, launch, pose};
+use hil_platform::clock::MonotonicClock;
+
+fn output(domain: &Domain, epoch: u32) -> ShmOutput {
+    let settings = OutputSettings {
+        epoch,
+        ..OutputSettings::default()
+    };
+    ShmOutput::open(domain, "arm/pose", &POSE, settings).unwrap()
+}
+
+fn send(
+    output: &mut impl OutputPort<Error = ChannelError>,
+    indices: impl IntoIterator<Item = u64>,
+) {
+    for index in indices {
+        output
+            .send(MonotonicClock::now(), bytemuck::bytes_of(&pose(index)))
+            .unwrap();
+    }
+}
+
+fn drain(input: &mut impl InputPort<Error = ChannelError>) -> Vec<(Envelope, Pose)> {
+    let mut seen = Vec::new();
+    let mut take = |envelope: &Envelope, payload: &[u8]| {
+        seen.push((*envelope, bytemuck::pod_read_unaligned(payload)));
+    };
+    while input.receive(MonotonicClock::now(), &mut take).unwrap() {}
+    seen
+}
+
+fn indices(seen: &[(Envelope, Pose)]) -> Vec<u64> {
+    seen.iter().map(|(_, pose)| pose.index).collect()
+}
+
+/// What every pair of ports owes: order, content, sequence numbers from 0, refusal of a wrong
+/// size, and nothing when nothing was sent. `capacity` messages may wait.
+fn conforms<O, I>(output: &mut O, input: &mut I, capacity: u64)
+where
+    O: OutputPort<Error = ChannelError>,
+    I: InputPort<Error = ChannelError>,
+{
+    assert!(drain(input).is_empty());
+    assert_eq!(input.next_arrival(), None);
+    for round in 0..10 {
+        let sent: Vec<_> = (round * capacity..(round + 1) * capacity).collect();
+        send(output, sent.clone());
+        let seen = drain(input);
+        assert_eq!(indices(&seen), sent);
+        for (envelope, seen) in seen {
+            assert_eq!(envelope.sequence, seen.index);
+            assert_eq!(seen, pose(seen.index));
+            assert!(!envelope.is_forwarded());
+        }
+    }
+    assert!(output.send(Instant::ZERO, &[0; 3]).is_err());
+    assert!(drain(input).is_empty());
+    send(output, [10 * capacity]);
+    assert_eq!(drain(input)[0].0.sequence, 10 * capacity);
+}
+
+#[test]
+fn ports_conform() {
+    let (domain, holder) = launch("conform", 8);
+    let mut input = ShmInput::open(&domain, "arm/pose", &POSE, 8).unwrap();
+    let mut output = output(&domain, 1);
+    conforms(&mut output, &mut input, 8);
+    assert_eq!(
+        (output.sent_count(), input.counters().missed_count),
+        (81, 0)
+    );
+    drop((input, output, holder));
+    assert_nothing_left(domain);
+}
+
+#[test]
+fn a_slow_reader_gets_the_newest_and_counts_the_rest() {
+    let (domain, holder) = launch("latest", 4);
+    let mut newest = ShmInput::open(&domain, "arm/pose", &POSE, 1).unwrap();
+    let mut deep = ShmInput::open(&domain, "arm/pose", &POSE, 4).unwrap();
+    let mut output = output(&domain, 1);
+    send(&mut output, 0..1);
+    drain(&mut newest);
+    drain(&mut deep);
+    send(&mut output, 1..11);
+    assert_eq!(indices(&drain(&mut newest)), [10]);
+    assert_eq!(indices(&drain(&mut deep)), [7, 8, 9, 10]);
+    assert_eq!(newest.counters().missed_count, 9);
+    assert_eq!(deep.counters().missed_count, 6);
+    drop((newest, deep, output, holder));
+    assert_nothing_left(domain);
+}
+
+#[test]
+fn a_late_joiner_sees_what_is_sent_from_then_on() {
+    let (domain, holder) = launch("late", 4);
+    let mut output = output(&domain, 1);
+    send(&mut output, 0..5);
+    let mut input = ShmInput::open(&domain, "arm/pose", &POSE, 4).unwrap();
+    assert!(drain(&mut input).is_empty());
+    send(&mut output, 5..7);
+    assert_eq!(indices(&drain(&mut input)), [5, 6]);
+    assert_eq!(input.counters().missed_count, 0);
+    drop((input, output, holder));
+    assert_nothing_left(domain);
+}
+
+#[test]
+fn a_restarted_writer_is_a_restart_and_not_a_loss() {
+    let (domain, holder) = launch("restart", 4);
+    let mut input = ShmInput::open(&domain, "arm/pose", &POSE, 4).unwrap();
+    let mut first = output(&domain, 1);
+    send(&mut first, 0..1);
+    assert_eq!(indices(&drain(&mut input)), [0]);
+    // What waits in the buffer of a reader that knew the writer survives the writer.
+    send(&mut first, 1..3);
+    drop(first);
+    let mut second = output(&domain, 2);
+    assert_eq!(indices(&drain(&mut input)), [1, 2]);
+    send(&mut second, 0..2);
+    assert_eq!(indices(&drain(&mut input)), [0, 1]);
+    let counters = input.counters();
+    assert_eq!((counters.restart_count, counters.missed_count), (1, 0));
+    drop((input, second, holder));
+    assert_nothing_left(domain);
+}
+
+#[test]
+fn a_typed_sample_crosses_two_untyped_ports_into_another_domain_and_back_to_its_type() {
+    let (near, near_holder) = launch("near", 4);
+    let (far, far_holder) = launch("far", 4);
+    let mut gateway_in =
+        RawInput::open(&Domain::open(near.address()).unwrap(), "arm/pose", 4).unwrap();
+    let mut gateway_out = RawOutput::open(&far, "arm/pose", true).unwrap();
+    let far_member = Domain::open(far.address()).unwrap();
+    let mut typed_in = TypedInput::<Pose>::open(&far_member, "arm/pose", 4).unwrap();
+    let mut role_in = ShmInput::open(&far_member, "arm/pose", &POSE, 4).unwrap();
+    let mut echo_in = RawInput::open(&far, "arm/pose", 4).unwrap();
+    let settings = OutputSettings {
+        epoch: 7,
+        stamp: None,
+        notifies_readers: true,
+    };
+    let mut typed_out = TypedOutput::<Pose>::open(&near, "arm/pose", settings).unwrap();
+    assert_eq!(gateway_in.message().name, "test.Pose.v1");
+    assert_eq!(gateway_in.message(), gateway_out.message());
+
+    for index in 0..3 {
+        typed_out
+            .send(Instant::from_ns(100 + index), pose(index.unsigned_abs()))
+            .unwrap();
+    }
+    let mut carry = |envelope: &Envelope, payload: &[u8]| {
+        let forwarded = Envelope {
+            forwarded_ns: 9,
+            flags: Envelope::FORWARDED,
+            ..*envelope
+        };
+        gateway_out.publish(&forwarded, payload).unwrap();
+    };
+    while gateway_in.receive(&mut carry).unwrap() {}
+
+    for index in 0..3 {
+        let (envelope, seen) = typed_in.receive().unwrap().unwrap();
+        assert_eq!(seen, pose(index));
+        assert_eq!((envelope.sequence, envelope.epoch), (index, 7));
+        assert_eq!(envelope.published_ns, 100 + i64::try_from(index).unwrap());
+        assert!(envelope.is_forwarded());
+    }
+    assert!(typed_in.receive().unwrap().is_none());
+    assert_eq!(indices(&drain(&mut role_in)), [0, 1, 2]);
+    let mut never = |_: &Envelope, _: &[u8]| panic!("a gateway must not hear itself");
+    assert!(!echo_in.receive(&mut never).unwrap());
+    drop((gateway_in, typed_out, near_holder));
+    drop((
+        gateway_out,
+        typed_in,
+        role_in,
+        echo_in,
+        far_member,
+        far_holder,
+    ));
+    assert_nothing_left(near);
+    assert_nothing_left(far);
+}
+
+#[test]
+fn another_type_is_refused_and_both_are_named() {
+    let (domain, holder) = launch("types", 1);
+    let status = MessageType::of::<ShuttleStatus>();
+    let messages = [
+        ShmInput::open(&domain, "arm/pose", &status, 1).unwrap_err(),
+        ShmOutput::open(&domain, "arm/pose", &status, OutputSettings::default()).unwrap_err(),
+        TypedInput::<ShuttleStatus>::open(&domain, "arm/pose", 1).unwrap_err(),
+    ];
+    for error in messages {
+        assert!(matches!(error, ChannelError::WrongType { .. }));
+        let message = error.to_string();
+        for part in [
+            "arm/pose",
+            "test.Pose.v1",
+            "32",
+            "hil.ShuttleStatus.v1",
+            "8 bytes",
+        ] {
+            assert!(message.contains(part), "{message} lacks {part}");
+        }
+    }
+    drop(holder);
+    assert_nothing_left(domain);
+}
+
+#[test]
+fn the_same_name_with_another_size_is_refused() {
+    let (domain, holder) = launch("size", 1);
+    let grown = MessageType {
+        size_bytes: POSE.size_bytes + 8,
+        ..POSE
+    };
+    let error = ShmInput::open(&domain, "arm/pose", &grown, 1).unwrap_err();
+    assert!(error.to_string().contains("40 bytes"), "{error}");
+    drop(holder);
+    assert_nothing_left(domain);
+}
+
+#[test]
+fn a_foreign_user_header_is_refused_by_name() {
+    let (domain, holder) = launch("header", 1);
+    let foreign = domain.with_node(|node| {
+        let name = "foreign".try_into().unwrap();
+        let builder = node.service_builder(&name).publish_subscribe::<u64>();
+        builder.user_header::<u32>().create().unwrap()
+    });
+    let error = RawInput::open(&domain, "foreign", 1).unwrap_err();
+    assert!(matches!(error, ChannelError::ForeignHeader { .. }));
+    let message = error.to_string();
+    assert!(
+        message.contains("u32") && message.contains("hil.Envelope.v1"),
+        "{message}"
+    );
+    assert!(RawOutput::open(&domain, "foreign", false).is_err());
+    drop((foreign, holder));
+    assert_nothing_left(domain);
+}
+
+#[test]
+fn the_stamp_is_read_at_publication() {
+    static CLOCK_NS: AtomicI64 = AtomicI64::new(5_000);
+    let (domain, holder) = launch("stamp", 1);
+    let mut input = ShmInput::open(&domain, "arm/pose", &POSE, 1).unwrap();
+    let settings = OutputSettings {
+        stamp: Some(|| Instant::from_ns(CLOCK_NS.fetch_add(1, Ordering::Relaxed))),
+        ..OutputSettings::default()
+    };
+    let mut output = ShmOutput::open(&domain, "arm/pose", &POSE, settings).unwrap();
+    output
+        .send(Instant::from_ns(1), bytemuck::bytes_of(&pose(0)))
+        .unwrap();
+    assert_eq!(drain(&mut input)[0].0.published_ns, 5_000);
+    drop((input, output, holder));
+    assert_nothing_left(domain);
+}
+
+#[test]
+fn a_second_writer_beyond_the_limit_is_refused_in_words() {
+    let domain = Domain::create(&super::root_path("writers")).unwrap();
+    let holder = ChannelHolder::create(&domain, &ChannelSettings::of("arm/pose", &POSE)).unwrap();
+    let first = output(&domain, 1);
+    let member = Domain::open(domain.address())
+        .unwrap()
+        .with_open_within(Duration::ZERO);
+    let second = ShmOutput::open(&member, "arm/pose", &POSE, OutputSettings::default());
+    let message = second.unwrap_err().to_string();
+    assert!(
+        message.contains("become a writer") && message.contains("second instance"),
+        "{message}"
+    );
+    drop((first, member, holder));
+    assert_nothing_left(domain);
+}
+
+#[test]
+fn a_waiter_wakes_on_either_channel_and_drains() {
+    let (domain, holder) = launch("wake", 1);
+    let other = ChannelHolder::create(&domain, &ChannelSettings::of("arm/other", &POSE)).unwrap();
+    let mut waiter = Waiter::open(&domain, &["arm/pose", "arm/other"]).unwrap();
+    assert_eq!(waiter.wait(Duration::ZERO).unwrap(), Wake::TimedOut);
+    for channel in ["arm/other", "arm/pose"] {
+        let mut output =
+            ShmOutput::open(&domain, channel, &POSE, OutputSettings::default()).unwrap();
+        send(&mut output, 0..1000);
+        assert_eq!(waiter.wait_until(None).unwrap(), Wake::Woken, "{channel}");
+        assert_eq!(
+            waiter.wait(Duration::ZERO).unwrap(),
+            Wake::TimedOut,
+            "{channel}"
+        );
+    }
+    let past = Instant::from_ns(MonotonicClock::now().as_ns() - 1);
+    assert_eq!(waiter.wait_until(Some(past)).unwrap(), Wake::TimedOut);
+    assert_eq!(waiter.descriptors().count(), 2);
+    assert!(!waiter.drain().unwrap());
+    drop((waiter, other, holder));
+    assert_nothing_left(domain);
+}
+
+#[test]
+fn a_sleeping_reader_is_woken_by_a_sample_that_is_already_there() {
+    let (domain, holder) = launch("sleep", 1);
+    let address = domain.address().clone();
+    let reader = thread::spawn(move || {
+        let member = Domain::open(&address).unwrap();
+        let mut input = ShmInput::open(&member, "arm/pose", &POSE, 1).unwrap();
+        let mut waiter = Waiter::open(&member, &["arm/pose"]).unwrap();
+        let mut seen = Vec::new();
+        while seen.last() != Some(&200) {
+            while waiter.wait_until(None).unwrap() != Wake::Woken {}
+            seen.extend(indices(&drain(&mut input)));
+        }
+        seen
+    });
+    let mut output = output(&domain, 1);
+    for index in 0.. {
+        send(&mut output, [index.min(200)]);
+        if reader.is_finished() {
+            break;
+        }
+        thread::yield_now();
+    }
+    let seen = reader.join().unwrap();
+    assert!(seen.is_sorted() && seen.ends_with(&[200]));
+    drop((output, holder));
+    assert_nothing_left(domain);
+}
+
+#[test]
+fn no_announcement_means_no_wake() {
+    let (domain, holder) = launch("quiet", 1);
+    let mut waiter = Waiter::open(&domain, &["arm/pose"]).unwrap();
+    let settings = OutputSettings {
+        notifies_readers: false,
+        ..OutputSettings::default()
+    };
+    let mut output = ShmOutput::open(&domain, "arm/pose", &POSE, settings).unwrap();
+    send(&mut output, 0..3);
+    assert_eq!(waiter.wait(Duration::ZERO).unwrap(), Wake::TimedOut);
+    drop((waiter, output, holder));
+    assert_nothing_left(domain);
+}
+
+#[test]
+fn a_waiter_takes_a_bounded_number_of_channels() {
+    let (domain, holder) = launch("bound", 1);
+    for channels in [&[][..], &["arm/pose"; 17][..]] {
+        let refused = Waiter::open(&domain, channels);
+        assert!(matches!(
+            refused,
+            Err(ChannelError::WaiterChannelCount { .. })
+        ));
+    }
+    drop(holder);
+    assert_nothing_left(domain);
+}
+
+#[test]
+fn a_writer_whose_memory_cannot_be_mapped_is_counted() {
+    let (domain, holder) = launch("unmapped", 1);
+    let mut output = output(&domain, 1);
+    let prefix = domain.address().prefix();
+    for file in std::fs::read_dir("/dev/shm").unwrap().flatten() {
+        let name = file.file_name().into_string().unwrap();
+        if name.starts_with(prefix) && name.trim_end_matches(".data") != name {
+            std::fs::remove_file(file.path()).unwrap();
+        }
+    }
+    let mut input = ShmInput::open(&domain, "arm/pose", &POSE, 1).unwrap();
+    send(&mut output, 0..1);
+    assert!(drain(&mut input).is_empty());
+    assert!(input.counters().connection_failure_count > 0);
+    drop((input, output, holder));
+    assert_nothing_left(domain);
+}

@@ -1,8 +1,0 @@
-//! A run as it goes: the supervisor, and what runs inside each process that it starts. It reads no
-//! report and draws nothing.
-
-pub mod face;
-pub mod gateway;
-pub mod process;
-pub mod security;
-pub mod supervisor;

@@ -1,5 +1,0 @@
-//! Network cards with their clocks, and radios: what this host's interfaces are asked and told beside
-//! the messages. It carries no message itself.
-
-pub mod card_clock;
-pub mod radio;

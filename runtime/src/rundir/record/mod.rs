@@ -1,9 +1,0 @@
-//! Recording: fixed-size records go through a bounded ring to a file, off the measured path.
-//! What the records mean is in `hil_models::record`; nothing here computes a figure.
-
-pub mod file;
-pub mod ring;
-pub mod stored;
-
-pub use file::{RecordFile, RecordFileError, RecordKind};
-pub use ring::{RecordSink, Recorder};

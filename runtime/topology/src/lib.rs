@@ -1,0 +1,185 @@
+//! The topology file: hosts, processes, channels and links in TOML, read, checked, and written
+//! back. It starts nothing and opens no socket.
+//!
+//! Reading goes in steps, each in its own file: [`load`] joins the `extends` chain and the
+//! overrides into one tree whose every key remembers its place (`layers`, `tree`); each table is
+//! read by itself (`reader`, `file`); then the tables are checked against each other (`check`)
+//! and become a [`Topology`]. Bounds of numbers are in `limits` alone. Whatever is wrong is
+//! collected with file, line and column into [`TopologyErrors`].
+//!
+//! A program registers its case studies in [`KnownCases`]; [`which_host`] says which host of the
+//! topology this machine is; [`ProcessCard`] is all that a process is told.
+#![forbid(unsafe_code)]
+
+mod card;
+mod check;
+mod check_channels;
+mod check_face;
+mod clock_path;
+pub mod documents;
+pub mod emulation;
+pub mod emulation_room;
+mod errors;
+mod face;
+mod file;
+mod file_impairments;
+mod file_links;
+mod file_trace;
+mod file_wifi;
+mod host;
+mod known;
+mod layers;
+mod limits;
+mod model;
+mod model_links;
+mod names;
+mod parameter_reader;
+mod reader;
+pub mod registry;
+mod resolved;
+mod resolved_impairments;
+mod schema;
+mod security;
+mod suggest;
+pub mod trace_source;
+mod tree;
+mod units;
+
+use std::path::Path;
+
+pub use card::{CardChannel, ProcessCard};
+pub use check_face::{command_channel, feedback_channel};
+pub use clock_path::describe_end;
+pub use clock_path::{ClockEnd, ClockPath};
+pub use errors::{Fault, Location, TopologyError, TopologyErrors};
+pub use face::{EgmFace, FaceKind, FaceSend};
+pub use host::{HOST_VARIABLE, HostChoice, HostError, MachineIdentity, which_host};
+pub use known::{
+    KnownCase, KnownCases, ParameterCheck, ParameterFault, check_parameters_with, parameters_of,
+};
+pub use model::{
+    Case, Channel, ChannelPorts, Crossing, Direction, Execution, Host, MessageLayout, OnExit,
+    Process, Program, Run, Scheduling, Topology, Wait,
+};
+pub use model_links::{Emulation, Gateway, Hop, Link, Timestamps, Via};
+pub use names::{CHANNEL_NAME_BYTES_MAX, clock_process_name, gateway_name};
+pub use schema::schema;
+pub use security::{Hops, Security};
+
+pub use units::duration_within;
+
+use check::Needs;
+use errors::Place;
+use layers::Layers;
+
+/// A duration as topology files write it, such as `40 s`; `None` when it is none.
+pub fn read_duration(text: &str) -> Option<std::time::Duration> {
+    units::parse_duration(text).ok()
+}
+
+/// Reads the topology file at `path` and all it extends, lays the `overrides` (each
+/// `key.path=value`) over it, and checks the result against the cases the program knows.
+///
+/// # Errors
+/// Everything that is wrong, each with file, line, column and key.
+pub fn load(
+    path: &Path,
+    overrides: &[String],
+    known: &KnownCases,
+) -> Result<Topology, TopologyErrors> {
+    read_and_check(path, None, overrides, (known, Needs::Processes))
+}
+
+/// Like [`load`], for whoever wants the case alone: the file need not say where its roles run.
+///
+/// # Errors
+/// As [`load`].
+pub fn load_case(
+    path: &Path,
+    overrides: &[String],
+    known: &KnownCases,
+) -> Result<Topology, TopologyErrors> {
+    read_and_check(path, None, overrides, (known, Needs::Case))
+}
+
+/// Like [`load_case`], without any file: the case called `name` as it is by default, with the
+/// `overrides` laid over it.
+///
+/// # Errors
+/// As [`load`].
+pub fn case_by_name(
+    name: &str,
+    overrides: &[String],
+    known: &KnownCases,
+) -> Result<Topology, TopologyErrors> {
+    let text = format!("version = 1\nname = \"{name}\"\ncase.name = \"{name}\"\n");
+    read_and_check(Path::new(name), Some(text), overrides, (known, Needs::Case))
+}
+
+/// Like [`load`], but from a text; `name` stands in error messages, and what the text extends is
+/// looked for beside it.
+///
+/// # Errors
+/// As [`load`].
+///
+/// ```
+/// use hil_shuttle::Shuttle;
+/// use crate::{KnownCases, parse};
+///
+/// let text = r#"
+/// version = 1
+/// name = "shuttle"
+/// case.name = "shuttle"
+/// processes.controller.role = "controller"
+/// processes.robot.role = "robot"
+/// "#;
+/// let known = KnownCases::new().with::<Shuttle>();
+/// let topology = parse("shuttle.toml", text, &[], &known).unwrap();
+/// assert_eq!(topology.channels().len(), 2);
+///
+/// let wrong = parse("shuttle.toml", text, &["run.duratoin=4 s".to_owned()], &known);
+/// assert!(wrong.unwrap_err().to_string().contains("did you mean `duration`?"));
+/// ```
+pub fn parse(
+    name: &str,
+    text: &str,
+    overrides: &[String],
+    known: &KnownCases,
+) -> Result<Topology, TopologyErrors> {
+    let text = Some(text.to_owned());
+    read_and_check(Path::new(name), text, overrides, (known, Needs::Processes))
+}
+
+fn read_and_check(
+    path: &Path,
+    text: Option<String>,
+    overrides: &[String],
+    (known, needs): (&KnownCases, Needs),
+) -> Result<Topology, TopologyErrors> {
+    let mut layers = Layers::default();
+    let Some(mut table) = layers.read(path, text) else {
+        return Err(layers.faults.into_errors(layers.sources));
+    };
+    for text in overrides {
+        layers.lay_override(&mut table, text);
+    }
+    // The first source is the file that was asked for; what is missing is missing there.
+    let top = Place {
+        source_index: 0,
+        start: 0,
+        end: 0,
+    };
+    let topology = {
+        let file = file::read(&table, top, &layers.faults);
+        check::check(file, known, needs, &layers.faults)
+    };
+    let topology = topology.with_traces_beside(path).with_key_beside(path);
+    if layers.faults.is_empty() {
+        Ok(topology)
+    } else {
+        Err(layers.faults.into_errors(layers.sources))
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,371 @@
+//! Where a link's traces lie, and how they become its model: `[links.<name>.trace]`. It reads the
+//! files; what a message meets then is `hil_link::trace`.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use hil_core::link_model::TraceMatch;
+use hil_link::trace::{ReplayError, TraceEnd, TraceLink, TraceReplay};
+use hil_trace::fault::TraceFault;
+use hil_trace::wire;
+use hil_trace::wire::Decoded;
+use hil_trace::{Trace, csv};
+use serde::{Deserialize, Serialize};
+
+use crate::Topology;
+
+/// The file of `channel` in a folder of traces.
+pub fn file_name(channel: &str) -> String {
+    format!("{}.trace", channel.replace('/', "."))
+}
+
+/// `[links.<name>.trace]`: paths are as written, relative to the topology file.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct TraceSource {
+    /// Folder with one file per channel, named as a run names them.
+    pub folder: Option<String>,
+    /// Files by channel; they go before the folder.
+    pub files: BTreeMap<String, String>,
+    /// How they are replayed.
+    pub replay: TraceReplay,
+    /// What the paths start from.
+    pub base: BaseFolder,
+    /// What was read of them, so that nobody reads a file twice for it.
+    pub noted: NotedDelays,
+}
+
+/// The folder of the topology file. Where a file lies is no part of what it says, so any two are
+/// equal: the same topology on two hosts is one.
+#[derive(Debug, Clone, Default)]
+pub struct BaseFolder(pub PathBuf);
+
+impl PartialEq for BaseFolder {
+    fn eq(&self, _other: &Self) -> bool {
+        true
+    }
+}
+
+impl Eq for BaseFolder {}
+
+/// The longest delay of each trace that was read. It is kept beside what names the files and is no
+/// part of it, so any two are equal.
+#[derive(Debug, Clone, Default)]
+pub struct NotedDelays(Arc<Mutex<BTreeMap<PathBuf, Duration>>>);
+
+impl NotedDelays {
+    fn get(&self, file: &Path) -> Option<Duration> {
+        let noted = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        noted.get(file).copied()
+    }
+
+    fn note(&self, file: &Path, delay_max: Duration) {
+        let mut noted = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        noted.insert(file.to_owned(), delay_max);
+    }
+}
+
+impl PartialEq for NotedDelays {
+    fn eq(&self, _other: &Self) -> bool {
+        true
+    }
+}
+
+impl Eq for NotedDelays {}
+
+/// One channel's trace and how to replay it: what a gateway is told.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TraceLaunch {
+    /// The key that names it in the topology.
+    pub key: String,
+    /// The file.
+    pub file: PathBuf,
+    /// How to replay it.
+    pub replay: TraceReplay,
+    /// Its longest delay, where whoever made this has read it.
+    pub delay_max: Option<Duration>,
+    /// Where that is noted once it was read.
+    #[serde(skip)]
+    pub noted: NotedDelays,
+}
+
+/// A trace that a topology names cannot be used.
+#[derive(Debug, thiserror::Error)]
+#[error("{key}: {source}")]
+pub struct TraceError {
+    /// The key that names it.
+    pub key: String,
+    /// What is wrong with it.
+    pub source: TraceFileError,
+}
+
+/// Why a trace file cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum TraceFileError {
+    /// It cannot be read.
+    #[error("trace {path}: {source}")]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// It is no trace.
+    #[error("trace {path}: {source}")]
+    Foreign {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        source: TraceFault,
+    },
+    /// It is damaged; whoever can live with that part reads it with `hil-runtime trace convert`.
+    #[error(
+        "trace {path}: {source}; the {kept} records before it are whole: `hil-runtime trace convert` \
+         keeps them"
+    )]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        source: TraceFault,
+        /// Records before it.
+        kept: usize,
+    },
+    /// It is a CSV file with a fault.
+    #[error("trace {path}: {source}")]
+    Csv {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        source: csv::CsvFault,
+    },
+    /// It cannot be replayed.
+    #[error("trace {path}: {source}")]
+    Replay {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: ReplayError,
+    },
+}
+
+impl TraceSource {
+    /// The trace of `channel` on `link`; `None` for one that is not named where no folder is.
+    pub fn launch(&self, link: &str, channel: &str) -> Option<TraceLaunch> {
+        let (key, named) = if let Some(file) = self.files.get(channel) {
+            (format!("files.\"{channel}\""), PathBuf::from(file))
+        } else {
+            let folder = Path::new(self.folder.as_ref()?);
+            ("folder".to_owned(), folder.join(file_name(channel)))
+        };
+        let file = self.base.0.join(named);
+        // A gateway may run in another folder.
+        let file = std::path::absolute(&file).unwrap_or(file);
+        Some(TraceLaunch {
+            key: format!("links.{link}.trace.{key}"),
+            delay_max: self.noted.get(&file),
+            file,
+            replay: self.replay,
+            noted: self.noted.clone(),
+        })
+    }
+}
+
+/// Reads every trace that the links of `topology` replay, so that a run without one does not begin.
+///
+/// # Errors
+/// The first that cannot be used.
+pub fn check(topology: &Topology) -> Result<(), TraceError> {
+    for crossing in topology.crossings() {
+        let source = crossing
+            .link
+            .emulation()
+            .and_then(|emulation| emulation.trace.as_ref());
+        let (link, channel) = (&crossing.link.name, &crossing.channel.name);
+        if let Some(launch) = source.and_then(|source| source.launch(link, channel)) {
+            launch.model()?;
+        }
+    }
+    Ok(())
+}
+
+impl TraceLaunch {
+    /// The longest delay that it adds; the file is read unless it was before.
+    ///
+    /// # Errors
+    /// As [`TraceLaunch::model`].
+    pub fn delay_max(&self) -> Result<Duration, TraceError> {
+        match self.delay_max.or_else(|| self.noted.get(&self.file)) {
+            Some(known) => Ok(known),
+            None => Ok(self.model()?.delay_max()),
+        }
+    }
+
+    /// What it does, in words.
+    pub fn describe(&self) -> String {
+        let matching = match self.replay.matching {
+            TraceMatch::Index => "message by message",
+            TraceMatch::Time => "by the time of the run",
+            TraceMatch::Tick => "tick by tick",
+        };
+        let end = match self.replay.end {
+            TraceEnd::Wrap => "begins anew",
+            TraceEnd::Perfect => "delivers at once",
+            TraceEnd::Lost => "delivers nothing",
+        };
+        format!(
+            "replay of {}, {matching}; after its end it {end}",
+            self.file.display()
+        )
+    }
+
+    /// The link.
+    ///
+    /// # Errors
+    /// When the file is no whole trace, or cannot be replayed; with the key that names it.
+    pub fn model(&self) -> Result<TraceLink, TraceError> {
+        let failed = |source| TraceError {
+            key: self.key.clone(),
+            source,
+        };
+        let trace = read_whole(&self.file).map_err(failed)?;
+        let link = TraceLink::new(trace.replayed(), self.replay);
+        let link = link.map_err(|source| {
+            failed(TraceFileError::Replay {
+                path: self.file.clone(),
+                source,
+            })
+        })?;
+        self.noted.note(&self.file, link.delay_max());
+        Ok(link)
+    }
+}
+
+/// A trace that must be whole, in its binary form or as CSV.
+///
+/// # Errors
+/// With the offset of the first fault.
+pub fn read_whole(path: &Path) -> Result<Trace, TraceFileError> {
+    let (path_owned, bytes) = (path.to_owned(), read(path)?);
+    if looks_like_text(&bytes) {
+        let text = String::from_utf8_lossy(&bytes);
+        let decoded = csv::decode(&text);
+        let whole = decoded.and_then(|read| read.fault.map_or(Ok(read.trace), Err));
+        return whole.map_err(|source| TraceFileError::Csv {
+            path: path_owned,
+            source,
+        });
+    }
+    let Decoded { trace, fault } = wire::decode(&bytes).map_err(|source| {
+        let path = path.to_owned();
+        TraceFileError::Foreign { path, source }
+    })?;
+    match fault {
+        None => Ok(trace),
+        Some(source) => Err(TraceFileError::Damaged {
+            path: path_owned,
+            source,
+            kept: trace.records.len(),
+        }),
+    }
+}
+
+/// The bytes of a file.
+///
+/// # Errors
+/// When it cannot be read.
+pub fn read(path: &Path) -> Result<Vec<u8>, TraceFileError> {
+    fs::read(path).map_err(|source| TraceFileError::Io {
+        path: path.to_owned(),
+        source,
+    })
+}
+
+/// True for what may be CSV: text by its first bytes, and no trace.
+pub fn looks_like_text(bytes: &[u8]) -> bool {
+    let start = &bytes[..bytes.len().min(512)];
+    // A letter may be cut in two at the end.
+    let is_utf8 =
+        core::str::from_utf8(start).map_or_else(|end| end.error_len().is_none(), |_| true);
+    !start.starts_with(&wire::MAGIC)
+        && !start.is_empty()
+        && is_utf8
+        && start
+            .iter()
+            .all(|byte| byte.is_ascii_graphic() || byte.is_ascii_whitespace() || *byte >= 0x80)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn source(folder: Option<&str>, channel: &str, file: &str) -> TraceSource {
+        TraceSource {
+            folder: folder.map(str::to_owned),
+            files: BTreeMap::from([(channel.to_owned(), file.to_owned())]),
+            replay: TraceReplay::default(),
+            base: BaseFolder(PathBuf::from("/lab")),
+            noted: NotedDelays::default(),
+        }
+    }
+
+    #[test]
+    fn a_file_of_its_own_goes_before_the_folder() {
+        let source = source(Some("runs/x/traces"), "a/b", "/tmp/one.trace");
+        let of = |channel| source.launch("hop", channel).unwrap();
+        assert_eq!(of("a/b").file, Path::new("/tmp/one.trace"));
+        assert_eq!(of("a/b").key, "links.hop.trace.files.\"a/b\"");
+        assert_eq!(of("b/a").file, Path::new("/lab/runs/x/traces/b.a.trace"));
+        assert_eq!(of("b/a").key, "links.hop.trace.folder");
+        let files_only = TraceSource {
+            folder: None,
+            ..source
+        };
+        assert_eq!(files_only.launch("hop", "b/a"), None);
+    }
+
+    #[test]
+    fn a_trace_is_read_once_and_one_that_vanished_before_is_named_with_its_key() {
+        let folder = std::env::temp_dir().join(format!("hil-trace-source-{}", std::process::id()));
+        fs::create_dir_all(&folder).unwrap();
+        let file = folder.join("a.csv");
+        fs::write(&file, "published_ns,delay_ns\n0,7000\n10,9000\n").unwrap();
+        let source = source(None, "a/b", &file.display().to_string());
+        let launch = || source.launch("hop", "a/b").unwrap();
+        assert_eq!(launch().delay_max, None);
+        assert_eq!(launch().delay_max().unwrap(), Duration::from_micros(9));
+        fs::remove_dir_all(&folder).unwrap();
+        // What was read is still known, to a gateway too.
+        assert_eq!(launch().delay_max().unwrap(), Duration::from_micros(9));
+        let told = serde_json::to_string(&launch()).unwrap();
+        let told: TraceLaunch = serde_json::from_str(&told).unwrap();
+        assert_eq!(told.delay_max().unwrap(), Duration::from_micros(9));
+        // But nothing is replayed that is not there.
+        let anew = TraceSource {
+            noted: NotedDelays::default(),
+            ..source.clone()
+        };
+        let launch = anew.launch("hop", "a/b").unwrap();
+        for error in [
+            launch.delay_max().unwrap_err(),
+            launch.model().unwrap_err(),
+            told.model().unwrap_err(),
+        ] {
+            let text = error.to_string();
+            let start = format!("links.hop.trace.files.\"a/b\": trace {}: ", file.display());
+            assert!(text.starts_with(&start), "{text}");
+        }
+    }
+
+    #[test]
+    fn text_and_traces_are_told_apart() {
+        assert!(looks_like_text(b"# run: x\npublished_ns,delay_ns\n"));
+        assert!(!looks_like_text(b"HILTRACE\x01\0\0\0"));
+        assert!(!looks_like_text(&[0xd4, 0xc3, 0xb2, 0xa1]));
+        assert!(!looks_like_text(b""));
+    }
+}

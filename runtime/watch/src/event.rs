@@ -1,0 +1,119 @@
+//! What an observer hears of a run, one thing at a time.
+
+use hil_account::card_clock::CardClockRecord;
+use hil_core::message::Envelope;
+use hil_core::record::{
+    EgressRecord, FollowUpRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
+};
+use hil_link::condition::LinkConditionRecord;
+
+use super::feed::WatchedChannel;
+use super::follow::Batch;
+use hil_rundir::face_record::{FaceReceivedRecord, FaceSentRecord};
+use hil_rundir::radio_record::RadioRecord;
+use hil_rundir::record::RecordKind;
+
+/// Something that happened in a run. Messages and records of one process and kind come in order;
+/// otherwise the order is roughly that of time, and what a process wrote comes up to 20 ms later.
+#[derive(Debug)]
+pub enum Event<'a> {
+    /// A message, each once.
+    Message {
+        /// Its channel.
+        channel: &'a WatchedChannel,
+        /// Where it was read.
+        origin: Origin,
+        /// Its number and times.
+        envelope: &'a Envelope,
+        /// The message as it lies in memory.
+        payload: &'a [u8],
+    },
+    /// What a process noted beside a message.
+    Record {
+        /// The channel, as record files name it.
+        channel: &'a str,
+        /// The process.
+        writer: &'a str,
+        /// True when the process runs on this host; else it came at the end, from another one.
+        is_of_this_host: bool,
+        /// What.
+        record: Record,
+    },
+    /// Something could not be read; it is said once.
+    Problem(&'a str),
+    /// No more messages: all processes have ended, all records have been given out, also those
+    /// that other hosts sent at the end.
+    Silent,
+    /// The supervisor is done; the last event.
+    Ended {
+        /// The run's account is in its folder. A killed supervisor leaves none.
+        has_summary: bool,
+    },
+}
+
+/// Where a message was read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Origin {
+    /// From the records of its producer, which runs here.
+    Records,
+    /// From shared memory.
+    SharedMemory,
+    /// From the records that another host sent at the end of the run: a message that never came
+    /// here, or came before anybody looked.
+    OtherHost,
+}
+
+/// A record of any kind but a message.
+#[derive(Debug, Clone, Copy)]
+pub enum Record {
+    /// A producer published.
+    Published(PublishedRecord),
+    /// A consumer took.
+    Taken(TakenRecord),
+    /// A gateway sent.
+    Egress(EgressRecord),
+    /// A gateway received.
+    Ingress(IngressRecord),
+    /// A transmit stamp that came later.
+    FollowUp(FollowUpRecord),
+    /// A clock exchange.
+    RoundTrip(RoundTripRecord),
+    /// A face sent.
+    FaceSent(FaceSentRecord),
+    /// A face received.
+    FaceReceived(FaceReceivedRecord),
+    /// A network card's clock was read.
+    CardClock(CardClockRecord),
+    /// A radio was asked, or said something.
+    Radio(RadioRecord),
+    /// An emulated link was given an order; the channel is `hil/link/<link>/<direction>`.
+    LinkCondition(LinkConditionRecord),
+}
+
+impl Record {
+    /// The records of a batch, in order; none of a batch of messages.
+    pub(super) fn each(batch: &Batch<'_>, take: &mut dyn FnMut(Self)) {
+        match batch.header.kind {
+            RecordKind::Published => batch.records().for_each(|one| take(Self::Published(one))),
+            RecordKind::Taken => batch.records().for_each(|one| take(Self::Taken(one))),
+            RecordKind::Egress => batch.records().for_each(|one| take(Self::Egress(one))),
+            RecordKind::Ingress => batch.records().for_each(|one| take(Self::Ingress(one))),
+            RecordKind::FollowUp => batch.records().for_each(|one| take(Self::FollowUp(one))),
+            RecordKind::RoundTrip => batch.records().for_each(|one| take(Self::RoundTrip(one))),
+            RecordKind::FaceSent => batch.records().for_each(|one| take(Self::FaceSent(one))),
+            RecordKind::FaceReceived => {
+                batch
+                    .records()
+                    .for_each(|one| take(Self::FaceReceived(one)));
+            }
+            RecordKind::CardClock => batch.records().for_each(|one| take(Self::CardClock(one))),
+            RecordKind::Radio => batch.records().for_each(|one| take(Self::Radio(one))),
+            RecordKind::LinkCondition => {
+                batch
+                    .records()
+                    .for_each(|one| take(Self::LinkCondition(one)));
+            }
+            RecordKind::Message => {}
+        }
+    }
+}

@@ -1,0 +1,291 @@
+//! The record files of a run while they grow: what came since the last look, in whole records. It
+//! knows no run; it follows a folder.
+
+use std::collections::BTreeSet;
+use std::ffi::OsString;
+use std::fs::{self, File};
+use std::io;
+use std::os::unix::fs::FileExt;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant as WallInstant};
+
+use bytemuck::Pod;
+use hil_core::message::Envelope;
+
+use hil_rundir::record::RecordKind;
+use hil_rundir::record::file::{HEADER_BYTES, RecordHeader};
+
+/// How often it looks for new files: processes that start again write new ones.
+const LOOK_PERIOD: Duration = Duration::from_millis(100);
+/// Largest piece read at once, unless one record is larger: a file that grew long does not keep
+/// the others waiting.
+const PIECE_BYTES: usize = 128 << 10;
+/// Most records read at once, so that each file gets the same number of them at its turn: with as many
+/// bytes, the files of short records would run ahead while one catches up, and messages would look
+/// as if they had been lost.
+pub(super) const PIECE_RECORDS: usize = 512;
+
+/// Whole records of one file, in the order in which they were written.
+#[derive(Debug, Clone, Copy)]
+pub struct Batch<'a> {
+    /// What the file holds, and of which channel.
+    pub header: &'a RecordHeader,
+    /// The process that wrote it; empty when the file's name does not tell.
+    pub writer: &'a str,
+    bytes: &'a [u8],
+}
+
+impl<'a> Batch<'a> {
+    /// The records as `T`; empty when `T` has another size.
+    pub fn records<T: Pod>(&self) -> impl Iterator<Item = T> + 'a {
+        self.raw()
+            .filter_map(|bytes| bytemuck::try_pod_read_unaligned(bytes).ok())
+    }
+
+    /// The messages; none when the file holds records of another kind.
+    pub fn messages(&self) -> impl Iterator<Item = (Envelope, &'a [u8])> + 'a {
+        let is_message = self.header.kind == RecordKind::Message;
+        self.raw().filter(move |_| is_message).map(|bytes| {
+            let (envelope, payload) = bytes.split_at(size_of::<Envelope>());
+            (bytemuck::pod_read_unaligned(envelope), payload)
+        })
+    }
+
+    fn raw(&self) -> impl Iterator<Item = &'a [u8]> + 'a {
+        self.bytes.chunks_exact(self.header.record_bytes as usize)
+    }
+}
+
+#[derive(Debug)]
+struct Followed {
+    file: File,
+    writer: String,
+    /// `None` until the file is as long as its header.
+    header: Option<RecordHeader>,
+    path: PathBuf,
+    /// Of the first byte that was not given out.
+    offset: u64,
+    /// Whole records before this many bytes are passed over.
+    passed_bytes: u64,
+    is_given_up: bool,
+}
+
+/// Follows the record files of one folder.
+#[derive(Debug)]
+pub struct RecordFollower {
+    folder: PathBuf,
+    files: Vec<Followed>,
+    known: BTreeSet<OsString>,
+    looked: Option<WallInstant>,
+    /// The file whose turn it is.
+    next: usize,
+    buffer: Vec<u8>,
+    problems: Vec<String>,
+    /// What is in files found now was written before.
+    passes_over: bool,
+}
+
+impl RecordFollower {
+    /// Follows the files in `folder` from their beginning.
+    pub fn new(folder: &Path) -> Self {
+        Self::of(folder, false)
+    }
+
+    /// Follows the files in `folder` from what is written next: for who looks at the present of a
+    /// run that may have gone for hours.
+    pub fn from_now(folder: &Path) -> Self {
+        let mut follower = Self::of(folder, true);
+        follower.look_for_files();
+        follower.passes_over = false;
+        follower
+    }
+
+    fn of(folder: &Path, passes_over: bool) -> Self {
+        Self {
+            passes_over,
+            folder: folder.to_owned(),
+            files: Vec::new(),
+            known: BTreeSet::new(),
+            looked: None,
+            next: 0,
+            buffer: vec![0; PIECE_BYTES],
+            problems: Vec::new(),
+        }
+    }
+
+    /// Gives out what came since the last look, `bytes_max` of it or little more; true when more
+    /// may be waiting. Files that cannot be read are left out from then on, see
+    /// [`Self::take_problems`].
+    pub fn poll(&mut self, bytes_max: usize, take: &mut dyn FnMut(&Batch<'_>)) -> bool {
+        self.look_for_files();
+        let mut left = bytes_max;
+        let mut quiet_count = 0;
+        while quiet_count < self.files.len() {
+            if left == 0 {
+                return true;
+            }
+            self.next %= self.files.len();
+            let file = &mut self.files[self.next];
+            match read_piece(file, &mut self.buffer, take) {
+                Ok(0) => quiet_count += 1,
+                Ok(count) => {
+                    quiet_count = 0;
+                    left = left.saturating_sub(count);
+                }
+                Err(text) => {
+                    self.problems.push(text);
+                    file.is_given_up = true;
+                    quiet_count += 1;
+                }
+            }
+            self.next += 1;
+        }
+        false
+    }
+
+    /// Passes over what is there by now.
+    pub fn skip_to_end(&mut self) {
+        self.look_again();
+        self.look_for_files();
+        for file in &mut self.files {
+            // A file without a header holds nothing yet; one that cannot be read says so at the poll.
+            if let (Ok(true), Ok(data)) = (has_header(file), file.file.metadata())
+                && let Some(header) = &file.header
+            {
+                let record_bytes = u64::from(header.record_bytes);
+                let written = data.len().saturating_sub(HEADER_BYTES as u64);
+                file.offset = HEADER_BYTES as u64 + written - written % record_bytes;
+            }
+        }
+    }
+
+    /// Looks for new files at the next poll, however short a time has passed.
+    pub fn look_again(&mut self) {
+        self.looked = None;
+    }
+
+    /// What went wrong since the last call, each file once.
+    pub fn take_problems(&mut self) -> Vec<String> {
+        core::mem::take(&mut self.problems)
+    }
+
+    /// What the files at hand hold, and of which channels, also where nothing came from them yet.
+    pub fn headers(&self) -> impl Iterator<Item = &RecordHeader> {
+        self.files.iter().filter_map(|one| one.header.as_ref())
+    }
+
+    /// Files found so far.
+    pub fn file_count(&self) -> usize {
+        self.files.len()
+    }
+
+    fn look_for_files(&mut self) {
+        if self.looked.is_some_and(|at| at.elapsed() < LOOK_PERIOD) {
+            return;
+        }
+        self.looked = Some(WallInstant::now());
+        let entries = match fs::read_dir(&self.folder) {
+            Ok(entries) => entries,
+            Err(error) => {
+                if self.known.insert(OsString::new()) {
+                    let folder = self.folder.display();
+                    self.problems.push(format!("{folder}: {error}"));
+                }
+                return;
+            }
+        };
+        let mut new: Vec<OsString> = entries
+            .flatten()
+            .map(|entry| entry.file_name())
+            .filter(|name| name.as_encoded_bytes().ends_with(b".rec"))
+            .filter(|name| !self.known.contains(name))
+            .collect();
+        new.sort();
+        for name in new {
+            let path = self.folder.join(&name);
+            self.known.insert(name);
+            match File::open(&path) {
+                Ok(file) => self.files.push(Followed {
+                    passed_bytes: match file.metadata() {
+                        Ok(metadata) if self.passes_over => metadata.len(),
+                        _ => 0,
+                    },
+                    file,
+                    writer: String::new(),
+                    header: None,
+                    path,
+                    offset: 0,
+                    is_given_up: false,
+                }),
+                Err(error) => self.problems.push(format!("{}: {error}", path.display())),
+            }
+        }
+    }
+}
+
+/// Gives out the next piece of one file; its length in bytes, 0 when nothing whole waits.
+fn read_piece(
+    one: &mut Followed,
+    buffer: &mut Vec<u8>,
+    take: &mut dyn FnMut(&Batch<'_>),
+) -> Result<usize, String> {
+    if one.is_given_up || !has_header(one)? {
+        return Ok(0);
+    }
+    let Some(header) = &one.header else {
+        return Ok(0);
+    };
+    let record_bytes = header.record_bytes as usize;
+    if buffer.len() < record_bytes {
+        buffer.resize(record_bytes, 0);
+    }
+    let whole = (buffer.len() / record_bytes).clamp(1, PIECE_RECORDS) * record_bytes;
+    let failed = |error: io::Error| format!("{}: {error}", one.path.display());
+    let count = read_up_to(&one.file, &mut buffer[..whole], one.offset).map_err(failed)?;
+    let count = count - count % record_bytes;
+    if count > 0 {
+        take(&Batch {
+            header,
+            writer: &one.writer,
+            bytes: &buffer[..count],
+        });
+        one.offset += count as u64;
+    }
+    Ok(count)
+}
+
+/// Reads the header as soon as it is there.
+fn has_header(one: &mut Followed) -> Result<bool, String> {
+    if one.header.is_some() {
+        return Ok(true);
+    }
+    let mut bytes = [0; HEADER_BYTES];
+    let failed = |error: io::Error| format!("{}: {error}", one.path.display());
+    if read_up_to(&one.file, &mut bytes, 0).map_err(failed)? < HEADER_BYTES {
+        return Ok(false);
+    }
+    let header = RecordHeader::decode(&one.path, &bytes).map_err(|error| error.to_string())?;
+    let name = one.path.file_name().and_then(|name| name.to_str());
+    one.writer = name
+        .and_then(|name| header.writer(name))
+        .unwrap_or_default()
+        .to_owned();
+    let record_bytes = u64::from(header.record_bytes).max(1);
+    let passed_bytes = one.passed_bytes.saturating_sub(HEADER_BYTES as u64);
+    one.offset = HEADER_BYTES as u64 + passed_bytes - passed_bytes % record_bytes;
+    one.header = Some(header);
+    Ok(true)
+}
+
+fn read_up_to(file: &File, buffer: &mut [u8], offset: u64) -> io::Result<usize> {
+    let mut count = 0;
+    while count < buffer.len() {
+        match file.read_at(&mut buffer[count..], offset + count as u64) {
+            Ok(0) => break,
+            Ok(more) => count += more,
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+            Err(error) => return Err(error),
+        }
+    }
+    Ok(count)
+}

@@ -1,0 +1,304 @@
+//! `hil-runtime channel`: which question is asked of which run, and the list of its channels.
+
+use core::fmt::Write as _;
+use std::time::Duration;
+
+use serde::Serialize;
+
+use super::cli::{ChannelArgs, ChannelCommand};
+use super::observer::{ObserveError, Observer};
+use super::pace::Pace;
+use super::top::via;
+use super::{delay, echo, hz};
+use hil_platform::console::Console;
+use hil_platform::signals::Signals;
+use hil_rundir::layout::PathFault;
+use hil_rundir::manifest::ChannelDescription;
+use hil_shm::Census;
+use hil_topology::registry::Registry;
+
+/// Why a question has no answer.
+#[derive(Debug, thiserror::Error)]
+pub enum ChannelError {
+    /// The run or the channel.
+    #[error(transparent)]
+    Observe(#[from] ObserveError),
+    /// The field.
+    #[error(transparent)]
+    Field(#[from] PathFault),
+    /// The fields of its messages.
+    #[error("the fields of {channel} cannot be shown: {why}; --raw shows its bytes")]
+    Layout {
+        /// The channel.
+        channel: String,
+        /// What is wrong.
+        why: String,
+    },
+    /// Nothing came where one answer was asked for.
+    #[error("{channel}: {why} within {window_s} s")]
+    Nothing {
+        /// The channel.
+        channel: String,
+        /// What did not happen.
+        why: &'static str,
+        /// The window.
+        window_s: f64,
+    },
+    /// The run ended before all that was asked for had come.
+    #[error("{channel}: the run ended after {shown_count} of {wanted_count} messages")]
+    Ended {
+        /// The channel.
+        channel: String,
+        /// Shown.
+        shown_count: u64,
+        /// Asked for.
+        wanted_count: u64,
+    },
+    /// The channel broke while the run went on.
+    #[error("cannot read on: {0}")]
+    Broken(#[source] hil_shm::ChannelError),
+    /// An answer that is no JSON.
+    #[error("cannot write JSON: {0}")]
+    Json(#[from] serde_json::Error),
+}
+
+impl ChannelError {
+    /// True when another command line would have had an answer.
+    pub const fn is_usage(&self) -> bool {
+        !matches!(
+            self,
+            Self::Nothing { .. } | Self::Ended { .. } | Self::Broken(_) | Self::Json(_)
+        )
+    }
+}
+
+/// How it ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum End {
+    /// As asked, or with the run.
+    Done,
+    /// By a signal; the totals so far were printed.
+    Interrupted,
+}
+
+/// How many of an observer's problems the user was told.
+#[derive(Debug, Default)]
+pub(super) struct Told(usize);
+
+impl Told {
+    /// Tells those that are new.
+    pub(super) fn tell(&mut self, observer: &Observer, console: &mut Console) {
+        let problems = observer.problems();
+        for problem in problems.iter().skip(self.0) {
+            console.warn(problem);
+        }
+        self.0 = problems.len();
+    }
+}
+
+/// Answers.
+///
+/// # Errors
+/// When the run or the channel cannot be found, or output cannot be written.
+pub fn run(
+    args: ChannelArgs,
+    registry: &Registry,
+    signals: &Signals,
+    console: &mut Console,
+) -> Result<End, ChannelError> {
+    let open = |run: Option<&str>| Observer::open(run, registry);
+    match args.command {
+        ChannelCommand::List { run, json, window } => {
+            let observer = open(run.as_deref())?;
+            Ok(list(observer, (window, json), signals, console))
+        }
+        ChannelCommand::Hz(args) => {
+            hz::run(open(args.which.run.as_deref())?, &args, signals, console)
+        }
+        ChannelCommand::Echo(args) => {
+            echo::run(open(args.which.run.as_deref())?, &args, signals, console)
+        }
+        ChannelCommand::Delay(args) => {
+            delay::run(open(args.which.run.as_deref())?, &args, signals, console)
+        }
+    }
+}
+
+/// One channel of the list.
+#[derive(Debug, Serialize)]
+struct Row {
+    name: String,
+    message: String,
+    size_bytes: usize,
+    is_typed: bool,
+    from_host: Option<String>,
+    to_host: Option<String>,
+    via: String,
+    rate_hz: Option<f64>,
+    ends: Vec<HostEnds>,
+}
+
+/// Who has the channel open in the shared memory of one host.
+#[derive(Debug, Serialize)]
+struct HostEnds {
+    host: String,
+    writer_count: usize,
+    reader_count: usize,
+}
+
+fn list(
+    mut observer: Observer,
+    (window, is_json): (Duration, bool),
+    signals: &Signals,
+    console: &mut Console,
+) -> End {
+    let channels = observer.manifest().channels.clone();
+    // Before this program becomes a reader of some.
+    let ends: Vec<Vec<HostEnds>> = channels
+        .iter()
+        .map(|one| ends(&mut observer, one))
+        .collect();
+    for one in &channels {
+        observer.count_unrecorded(&one.name);
+    }
+    let is_whole = observer.poll_for(window, signals);
+    let rows = channels.iter().zip(ends).map(|(one, ends)| {
+        let arrivals = observer.arrivals(&one.name).unwrap_or_default();
+        let mut pace = Pace::default();
+        for arrival in &arrivals {
+            pace.take(arrival);
+        }
+        let topology = observer.topology();
+        Row {
+            name: one.name.clone(),
+            message: one.message.clone(),
+            size_bytes: one.size_bytes,
+            is_typed: !one.fields.is_empty(),
+            from_host: one.from_host.clone(),
+            to_host: one.to_host.clone(),
+            via: via(topology, topology.and_then(|all| all.channel(&one.name))),
+            rate_hz: pace.turn().rate_hz,
+            ends,
+        }
+    });
+    let rows: Vec<Row> = rows.collect();
+    let run = &observer.run().name;
+    let text = if is_json {
+        let all = serde_json::json!({ "run": run, "channels": rows });
+        format!("{all}\n")
+    } else {
+        format!("{run}\n\n{}", table(&rows))
+    };
+    console.result(&text);
+    for problem in observer.problems() {
+        console.warn(problem);
+    }
+    if is_whole {
+        End::Done
+    } else {
+        End::Interrupted
+    }
+}
+
+fn ends(observer: &mut Observer, channel: &ChannelDescription) -> Vec<HostEnds> {
+    let hosts: Vec<String> = observer.run().hosts().map(str::to_owned).collect();
+    let is_end = |host: &String| {
+        channel.from_host.as_ref() == Some(host) || channel.to_host.as_ref() == Some(host)
+    };
+    // What is only recorded is in no shared memory.
+    let hosts = hosts
+        .into_iter()
+        .filter(|host| channel.to_host.is_some() && is_end(host));
+    hosts
+        .filter_map(|host| {
+            let domain = observer.domain(&host).ok()?;
+            let census = Census::of(domain, &channel.name).ok()?;
+            Some(HostEnds {
+                host,
+                writer_count: census.writer_count,
+                reader_count: census.reader_count,
+            })
+        })
+        .collect()
+}
+
+fn table(rows: &[Row]) -> String {
+    let columns = |of: &dyn Fn(&Row) -> usize, least: usize| {
+        rows.iter().map(of).max().unwrap_or(0).max(least)
+    };
+    let name = columns(&|row| row.name.chars().count(), "channel".len());
+    let message = columns(&|row| row.message.chars().count(), "message".len());
+    let way = columns(&|row| way(row).chars().count(), "way".len());
+    let via = columns(&|row| row.via.chars().count(), "via".len());
+    let mut text = format!(
+        "{:name$}  {:message$}  {:>8}  {:way$}  {:via$}  {:>9}  writers/readers\n",
+        "channel", "message", "size", "way", "via", "rate"
+    );
+    for row in rows {
+        let rate = row
+            .rate_hz
+            .map_or_else(|| "-".to_owned(), |rate| format!("{rate:.1} Hz"));
+        let counts = row.ends.iter();
+        let counts: Vec<String> = counts
+            .map(|end| format!("{}/{} on {}", end.writer_count, end.reader_count, end.host))
+            .collect();
+        let counts = if counts.is_empty() {
+            "-".to_owned()
+        } else {
+            counts.join(", ")
+        };
+        writeln!(
+            text,
+            "{:name$}  {:message$}  {:>6} B  {:way$}  {:via$}  {rate:>9}  {counts}",
+            row.name,
+            row.message,
+            row.size_bytes,
+            self::way(row),
+            row.via,
+        )
+        .expect("writing to a string cannot fail");
+    }
+    text
+}
+
+fn way(row: &Row) -> String {
+    let host = |host: &Option<String>| host.clone().unwrap_or_else(|| "?".to_owned());
+    match &row.to_host {
+        None => format!("{} → record", host(&row.from_host)),
+        to => format!("{} → {}", host(&row.from_host), host(to)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_list_is_a_table_with_a_dash_for_what_is_not_known() {
+        let row = |name: &str, to_host: Option<&str>| Row {
+            name: name.to_owned(),
+            message: "hil.X.v1".to_owned(),
+            size_bytes: 16,
+            is_typed: true,
+            from_host: Some("a".to_owned()),
+            to_host: to_host.map(str::to_owned),
+            via: "hop".to_owned(),
+            rate_hz: to_host.map(|_| 250.04),
+            ends: to_host
+                .map(|host| HostEnds {
+                    host: host.to_owned(),
+                    writer_count: 1,
+                    reader_count: 2,
+                })
+                .into_iter()
+                .collect(),
+        };
+        let rows = [row("x/command", Some("b")), row("truth", None)];
+        assert_eq!(
+            table(&rows),
+            "channel    message       size  way         via       rate  writers/readers\n\
+             x/command  hil.X.v1      16 B  a → b       hop   250.0 Hz  1/2 on b\n\
+             truth      hil.X.v1      16 B  a → record  hop          -  -\n"
+        );
+    }
+}

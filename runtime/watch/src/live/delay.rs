@@ -1,0 +1,345 @@
+//! `channel delay`: the latency account of a channel, window by window, as far as the records of
+//! this host go.
+
+use core::fmt::Write as _;
+use std::time::Duration;
+
+use hil_account::{ChannelAccount, Closing, MessageFate};
+use hil_clock::ClockMap;
+use hil_stats::histogram::{Distribution, LatencySummary};
+use serde::Serialize;
+use serde_json::{Value, json};
+
+use super::channel::{ChannelError, End, Told};
+use super::cli::WindowArgs;
+use super::observer::Observer;
+use hil_platform::console::Console;
+use hil_platform::signals::Signals;
+use hil_platform::text::grouped;
+use hil_platform::words::counted;
+use hil_report::terminal::{JOINT, duration};
+
+/// The totals reach back no further: they are of messages that are kept in memory.
+const TOTAL_MAX: Duration = Duration::from_mins(10);
+
+const NEVER_FAILS: &str = "writing to a string cannot fail";
+
+pub(super) fn run(
+    mut observer: Observer,
+    args: &WindowArgs,
+    signals: &Signals,
+    console: &mut Console,
+) -> Result<End, ChannelError> {
+    let name = observer.channel(&args.which.channel)?.name.clone();
+    let mut told = Told::default();
+    told.tell(&observer, console);
+    observer.settle(signals);
+    loop {
+        let is_whole = observer.poll_for(args.window, signals);
+        told.tell(&observer, console);
+        let is_last = !is_whole || observer.is_over();
+        if is_whole {
+            let account = observer.account(&name, args.window);
+            let clock = clock(&observer, &name);
+            let of = (name.as_str(), "window", args.window);
+            if !console.result(&answer(of, account.as_ref(), &clock, args.json)?) {
+                return Ok(End::Done);
+            }
+            if args.once {
+                let is_empty = account.is_none_or(|account| account.published_count == 0);
+                return if is_empty {
+                    Err(ChannelError::Nothing {
+                        channel: name,
+                        why: "no message was recorded here",
+                        window_s: args.window.as_secs_f64(),
+                    })
+                } else {
+                    Ok(End::Done)
+                };
+            }
+        }
+        if is_last {
+            let account = observer.account(&name, TOTAL_MAX);
+            let clock = clock(&observer, &name);
+            let of = (name.as_str(), "total", TOTAL_MAX);
+            console.result(&answer(of, account.as_ref(), &clock, args.json)?);
+            return Ok(if is_whole {
+                End::Done
+            } else {
+                End::Interrupted
+            });
+        }
+        observer.trim(TOTAL_MAX);
+    }
+}
+
+/// How the clocks of a channel's two hosts stand to each other.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+struct Clock {
+    /// `one clock`, `exchanges` or `not aligned`.
+    relation: &'static str,
+    /// Exchanges of the last half minute.
+    exchange_count: Option<u64>,
+    /// Estimated offset of the consumer's host against the producer's, nanoseconds.
+    offset_ns: Option<i64>,
+}
+
+fn clock(observer: &Observer, channel: &str) -> Clock {
+    let one = Clock {
+        relation: "one clock",
+        exchange_count: None,
+        offset_ns: Some(0),
+    };
+    let Some((from, to)) = observer.hosts_of(channel) else {
+        return one;
+    };
+    if observer.has_one_clock() {
+        return one;
+    }
+    let map = observer.clock_map(&from, &to);
+    let figures = map.as_ref().map(ClockMap::figures);
+    Clock {
+        relation: if figures.is_some() {
+            "exchanges"
+        } else {
+            "not aligned"
+        },
+        exchange_count: figures.map(|figures| figures.exchange_count),
+        offset_ns: figures.and_then(|figures| Some(figures.offset?.estimate_ns)),
+    }
+}
+
+fn answer(
+    (channel, of, window): (&str, &str, Duration),
+    account: Option<&ChannelAccount>,
+    clock: &Clock,
+    is_json: bool,
+) -> Result<String, ChannelError> {
+    if is_json {
+        let figures = account.map(|account| figures(account, clock));
+        let all = json!({
+            "channel": channel,
+            "of": of,
+            "window_s": window.as_secs_f64(),
+            "account": figures,
+        });
+        return Ok(format!("{}\n", serde_json::to_string(&all)?));
+    }
+    let of = match of {
+        "total" => "in all".to_owned(),
+        _ => format!("the last {}", duration_words(window)),
+    };
+    let Some(account) = account else {
+        return Ok(format!("{channel}, {of}: no message was recorded here\n"));
+    };
+    Ok(text(&format!("{channel}, {of}"), account, clock))
+}
+
+fn duration_words(time: Duration) -> String {
+    duration(i64::try_from(time.as_nanos()).unwrap_or(i64::MAX))
+}
+
+fn figures(account: &ChannelAccount, clock: &Clock) -> Value {
+    let each = account.segments.iter();
+    let segments: Vec<Value> = each
+        .map(|segment| {
+            let mut one = quantiles(&segment.distribution);
+            one["from"] = json!(segment.from);
+            one["to"] = json!(segment.to);
+            one["is_combined"] = json!(segment.is_combined);
+            one
+        })
+        .collect();
+    let fates = account.fates.iter();
+    let fates: serde_json::Map<String, Value> = fates
+        .filter_map(|(fate, count)| {
+            let name = serde_json::to_value(fate).ok()?;
+            Some((name.as_str()?.to_owned(), count.into()))
+        })
+        .collect();
+    let closing = match &account.closing {
+        Closing::Checked(figures) => json!({
+            "checked_count": figures.checked_count,
+            "closed_count": figures.closed_count,
+        }),
+        Closing::Unavailable { reason } => json!({ "unavailable": reason }),
+    };
+    json!({
+        "message_count": account.published_count,
+        "fates": fates,
+        "end_to_end": quantiles(&account.end_to_end.distribution),
+        "bound_ns": account.end_to_end.alignment_bound_ns,
+        "clock": clock,
+        "segments": segments,
+        "closing": closing,
+    })
+}
+
+fn quantiles(distribution: &Distribution) -> Value {
+    match distribution {
+        Distribution::Measured(summary) => json!({
+            "count": summary.count,
+            "min_ns": summary.min_ns,
+            "p50_ns": summary.p50_ns,
+            "p99_ns": summary.p99_ns,
+            "p999_ns": summary.p999_ns,
+            "max_ns": summary.max_ns,
+        }),
+        Distribution::Unavailable { reason } => json!({ "unavailable": reason }),
+    }
+}
+
+fn text(head: &str, account: &ChannelAccount, clock: &Clock) -> String {
+    let mut text = format!("{head}: {}", counted(account.published_count, "message"));
+    for (fate, count) in account.fates.iter() {
+        let words = match fate {
+            MessageFate::Taken => continue,
+            // The account speaks of runs that are over.
+            MessageFate::InFlight => "still under way",
+            fate => fate.label(),
+        };
+        write!(text, ", {} {words}", grouped(count)).expect(NEVER_FAILS);
+    }
+    let mut add = |row: String| {
+        write!(text, "\n  {row}").expect(NEVER_FAILS);
+    };
+    add(format!(
+        "{:42} {:>9} {:>9} {:>9} {:>9}",
+        "segment", "p50", "p99", "p99.9", "max"
+    ));
+    for segment in &account.segments {
+        add(row(&segment.name(), &segment.distribution));
+    }
+    let end_to_end = &account.end_to_end;
+    add(row(
+        "published → taken by consumer, whole",
+        &end_to_end.distribution,
+    ));
+    let relation = match (clock.relation, end_to_end.alignment_bound_ns) {
+        ("one clock", _) => "clock: both ends read one clock".to_owned(),
+        (_, Some(bound_ns)) => {
+            let bound_ns = i64::try_from(bound_ns).unwrap_or(i64::MAX);
+            let count = clock.exchange_count.unwrap_or(0);
+            format!(
+                "clock: within ±{}, by {count} exchanges",
+                duration(bound_ns)
+            )
+        }
+        _ => "clock: not aligned".to_owned(),
+    };
+    add(relation);
+    add(match &account.closing {
+        Closing::Checked(closing) => format!(
+            "closing: {} of {} messages add up",
+            grouped(closing.closed_count),
+            grouped(closing.checked_count)
+        ),
+        Closing::Unavailable { reason } => format!("closing: unavailable ({reason})"),
+    });
+    text.push('\n');
+    text.replace(JOINT, " ")
+}
+
+fn row(name: &str, distribution: &Distribution) -> String {
+    match distribution {
+        Distribution::Measured(LatencySummary {
+            p50_ns,
+            p99_ns,
+            p999_ns,
+            max_ns,
+            ..
+        }) => {
+            let [p50, p99, p999, max] = [p50_ns, p99_ns, p999_ns, max_ns].map(|ns| duration(*ns));
+            format!("{name:42} {p50:>9} {p99:>9} {p999:>9} {max:>9}")
+        }
+        Distribution::Unavailable { reason } => format!("{name:42} unavailable: {reason}"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use hil_account::{AccountContext, ChannelPath, ChannelRecords, account};
+    use hil_core::record::{PublishedRecord, TakenRecord, UNAVAILABLE};
+
+    const ONE_CLOCK: Clock = Clock {
+        relation: "one clock",
+        exchange_count: None,
+        offset_ns: Some(0),
+    };
+
+    fn sample() -> ChannelAccount {
+        let published: Vec<PublishedRecord> = (0..10)
+            .map(|sequence| PublishedRecord {
+                sequence,
+                published_ns: 1_000_000 * sequence.cast_signed(),
+                epoch: 1,
+                reserved: 0,
+            })
+            .collect();
+        let taken: Vec<TakenRecord> = published
+            .iter()
+            .filter(|one| one.sequence != 4)
+            .map(|one| TakenRecord {
+                sequence: one.sequence,
+                published_ns: one.published_ns,
+                forwarded_ns: UNAVAILABLE,
+                taken_ns: one.published_ns + 20_000,
+                epoch: 1,
+                reserved: 0,
+            })
+            .collect();
+        let records = ChannelRecords {
+            published: Some(&published),
+            taken: Some(&taken),
+            ..ChannelRecords::default()
+        };
+        account(&records, &AccountContext::new(ChannelPath::SharedMemory))
+    }
+
+    #[test]
+    fn a_page_has_a_row_per_segment_the_clock_and_the_closing() {
+        let text = answer(
+            ("x", "window", Duration::from_secs(1)),
+            Some(&sample()),
+            &ONE_CLOCK,
+            false,
+        );
+        assert_eq!(
+            text.unwrap(),
+            "x, the last 1.00 s: 10 messages, 1 superseded at the consumer\n  \
+             segment                                          p50       p99     p99.9       max\n  \
+             published → taken by consumer                20.0 µs   20.0 µs   20.0 µs   20.0 µs\n  \
+             published → taken by consumer, whole         20.0 µs   20.0 µs   20.0 µs   20.0 µs\n  \
+             clock: both ends read one clock\n  \
+             closing: 9 of 9 messages add up\n"
+        );
+    }
+
+    #[test]
+    fn what_this_host_has_not_is_unavailable_with_the_reason() {
+        let nothing = ChannelRecords::default();
+        let path = ChannelPath::Gateway { alignment: None };
+        let account = account(&nothing, &AccountContext::new(path));
+        let clock = Clock {
+            relation: "not aligned",
+            exchange_count: None,
+            offset_ns: None,
+        };
+        let of = ("x", "total", Duration::from_secs(1));
+        let text = answer(of, Some(&account), &clock, false).unwrap();
+        assert!(text.contains("unavailable: clocks not aligned"), "{text}");
+        let json: Value =
+            serde_json::from_str(&answer(of, Some(&account), &clock, true).unwrap()).unwrap();
+        assert_eq!(
+            json["account"]["end_to_end"]["unavailable"],
+            "clocks not aligned"
+        );
+        assert!(json["account"]["bound_ns"].is_null());
+        assert!(
+            answer(of, None, &clock, true)
+                .unwrap()
+                .contains("\"account\":null")
+        );
+    }
+}

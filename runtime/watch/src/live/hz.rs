@@ -1,0 +1,161 @@
+//! `channel hz`: how regularly the messages of a channel come, window by window.
+
+use serde::Serialize;
+
+use super::channel::{ChannelError, End, Told};
+use super::cli::WindowArgs;
+use super::observer::Observer;
+use super::pace::{Pace, PaceFigures};
+use hil_platform::console::Console;
+use hil_platform::signals::Signals;
+use hil_platform::words::counted;
+use hil_report::terminal::{JOINT, duration};
+use hil_rundir::live_run::Source;
+
+/// One answer.
+#[derive(Debug, Serialize)]
+struct Answer<'a> {
+    channel: &'a str,
+    /// `publication` or `arrival`.
+    seen_at: &'a str,
+    /// `window`, or `total` of all of them.
+    of: &'a str,
+    window_s: f64,
+    #[serde(flatten)]
+    figures: &'a PaceFigures,
+}
+
+pub(super) fn run(
+    mut observer: Observer,
+    args: &WindowArgs,
+    signals: &Signals,
+    console: &mut Console,
+) -> Result<End, ChannelError> {
+    let name = observer.channel(&args.which.channel)?.name.clone();
+    let seen_at = match observer.source(&name) {
+        Some(Source::SharedMemory {
+            is_forwarded: true, ..
+        }) => "arrival",
+        _ => "publication",
+    };
+    observer.count_unrecorded(&name);
+    let mut told = Told::default();
+    told.tell(&observer, console);
+    let mut pace = Pace::default();
+    let answer = |console: &mut Console, of, figures: &PaceFigures| {
+        let answer = Answer {
+            channel: &name,
+            seen_at,
+            of,
+            window_s: args.window.as_secs_f64(),
+            figures,
+        };
+        let text = if args.json {
+            format!("{}\n", serde_json::to_string(&answer)?)
+        } else {
+            let of = if of == "total" { "in all  " } else { "" };
+            format!("{of}{}\n", words(&name, figures))
+        };
+        Ok::<bool, ChannelError>(console.result(&text))
+    };
+    loop {
+        let is_whole = observer.poll_for(args.window, signals);
+        told.tell(&observer, console);
+        let arrivals = observer.take_arrivals(&name);
+        for arrival in &arrivals {
+            pace.take(arrival);
+        }
+        observer.trim(args.window);
+        if is_whole {
+            let figures = pace.turn();
+            if !answer(console, "window", &figures)? {
+                return Ok(End::Done);
+            }
+            if args.once {
+                return if figures.message_count == 0 {
+                    Err(ChannelError::Nothing {
+                        channel: name.clone(),
+                        why: "no message came",
+                        window_s: args.window.as_secs_f64(),
+                    })
+                } else {
+                    Ok(End::Done)
+                };
+            }
+        }
+        if !is_whole || observer.is_over() {
+            answer(console, "total", &pace.total())?;
+            return Ok(if is_whole {
+                End::Done
+            } else {
+                End::Interrupted
+            });
+        }
+    }
+}
+
+/// The figures on one line.
+fn words(channel: &str, figures: &PaceFigures) -> String {
+    let count = counted(figures.message_count, "message");
+    let mut parts = vec![channel.to_owned(), count];
+    if let (Some(rate_hz), Some(gap)) = (figures.rate_hz, &figures.gap) {
+        let [min, p99, max] = [gap.min_ns, gap.p99_ns, gap.max_ns].map(duration);
+        let mean = rounded(gap.mean_ns);
+        parts.push(format!("{rate_hz:.2} Hz"));
+        parts.push(format!("gaps {min} to {max}, mean {mean}, p99 {p99}"));
+        parts.push(format!("jitter {}", rounded(gap.jitter_ns)));
+    }
+    parts.push(format!("missed {}", figures.missed_count));
+    for (count, what) in [
+        (figures.reordered_count, "out of order"),
+        (figures.restart_count, "restarts"),
+    ] {
+        if count > 0 {
+            parts.push(format!("{count} {what}"));
+        }
+    }
+    parts.join("  ").replace(JOINT, " ")
+}
+
+#[allow(
+    clippy::cast_possible_truncation,
+    reason = "gaps are far below 292 years; beyond, the conversion saturates"
+)]
+fn rounded(ns: f64) -> String {
+    duration(ns.round() as i64)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::live::pace::GapFigures;
+
+    #[test]
+    fn a_line_says_what_is_known_and_no_more() {
+        let mut figures = PaceFigures {
+            message_count: 1_250,
+            rate_hz: Some(250.0),
+            gap: Some(GapFigures {
+                min_ns: 3_900_000,
+                mean_ns: 4e6,
+                p99_ns: 4_100_000,
+                max_ns: 8_200_000,
+                jitter_ns: 45_678.0,
+            }),
+            missed_count: 2,
+            reordered_count: 0,
+            restart_count: 1,
+        };
+        assert_eq!(
+            words("x/command", &figures),
+            "x/command  1,250 messages  250.00 Hz  gaps 3.90 ms to 8.20 ms, mean 4.00 ms, \
+             p99 4.10 ms  jitter 45.7 µs  missed 2  1 restarts"
+        );
+        figures.rate_hz = None;
+        figures.gap = None;
+        assert_eq!(
+            words("x", &figures),
+            "x  1,250 messages  missed 2  1 restarts"
+        );
+    }
+}

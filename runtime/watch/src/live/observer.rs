@@ -1,0 +1,479 @@
+//! One running run as the commands of a terminal need it: its topology, the newest records of each
+//! channel, and how the clocks of its hosts stand to each other. It draws nothing.
+
+mod exchanges;
+
+use std::collections::BTreeMap;
+use std::thread;
+use std::time::{Duration, Instant as WallInstant};
+
+use hil_account::{AccountContext, ChannelAccount, ChannelPath, FLIGHT_TIME_MAX, RunSpan};
+use hil_core::message::Envelope;
+use hil_core::record::RoundTripRecord;
+use hil_core::time::{Alignment, Instant};
+use hil_link::condition::{LinkCondition, LinkConditionRecord};
+use hil_link::spec::Way;
+
+use super::conditions::LinkConditions;
+use super::tail::ChannelTail;
+use crate::{PassiveReader, RecordFollower};
+use hil_platform::clock::MonotonicClock;
+use hil_platform::signals::Signals;
+use hil_rundir::live_run::{LiveRun, Source};
+use hil_rundir::manifest::{ChannelDescription, Manifest};
+use hil_rundir::record::RecordKind;
+use hil_rundir::select;
+use hil_rundir::select::SelectError;
+use hil_shm::{Domain, DomainError};
+use hil_topology;
+use hil_topology::Topology;
+use hil_topology::registry::Registry;
+
+/// How often records and shared memory are read: short against what queues hold.
+pub(crate) const POLL_PERIOD: Duration = Duration::from_millis(10);
+/// Bytes of records read per poll.
+const POLL_BYTES_MAX: usize = 4 << 20;
+/// Messages taken from one channel's shared memory per poll.
+const POLL_MESSAGES_MAX: usize = 4096;
+/// Exchanges older than this say nothing about now.
+const EXCHANGES_SPAN_NS: i64 = 30_000_000_000;
+/// The processes of a run write their records every 20 ms, each at its own time: a message is
+/// missed only when its records are late by more than this.
+const WRITING: Duration = Duration::from_millis(100);
+
+/// Why a run cannot be observed.
+#[derive(Debug, thiserror::Error)]
+pub enum ObserveError {
+    /// None, or not one.
+    #[error(transparent)]
+    Select(#[from] SelectError),
+    /// What was run.
+    #[error("{run}: cannot read its manifest: {source}")]
+    Manifest {
+        /// The run.
+        run: String,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// No such channel.
+    #[error("run {run} has no channel {channel:?}; it has {known}")]
+    NoChannel {
+        /// The run.
+        run: String,
+        /// What was asked for.
+        channel: String,
+        /// Its channels.
+        known: String,
+    },
+    /// No end of it is here.
+    #[error("channel {channel} has no end on this host; look on {hosts}")]
+    Elsewhere {
+        /// The channel.
+        channel: String,
+        /// Where it is.
+        hosts: String,
+    },
+    /// The shared memory of the run.
+    #[error(transparent)]
+    Domain(#[from] DomainError),
+    /// The channel in it.
+    #[error(transparent)]
+    Channel(#[from] hil_shm::ChannelError),
+}
+
+/// A run that is being observed.
+#[derive(Debug)]
+pub(crate) struct Observer {
+    run: LiveRun,
+    manifest: Manifest,
+    topology: Option<Topology>,
+    follower: RecordFollower,
+    tails: BTreeMap<String, ChannelTail>,
+    round_trips: BTreeMap<String, Vec<RoundTripRecord>>,
+    arrivals: BTreeMap<String, Vec<Arrival>>,
+    // Before the domains: readers go first.
+    passive: BTreeMap<String, PassiveReader>,
+    domains: BTreeMap<String, Domain>,
+    conditions: LinkConditions,
+    problems: Vec<String>,
+}
+
+/// A message as this host first sees it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Arrival {
+    /// When: its publication if its producer is here, else its arrival; this host's monotonic clock.
+    pub(crate) at_ns: i64,
+    /// The producer's start.
+    pub(crate) epoch: u32,
+    /// Its number.
+    pub(crate) sequence: u64,
+}
+
+impl From<&Envelope> for Arrival {
+    fn from(envelope: &Envelope) -> Self {
+        Self {
+            at_ns: envelope.published_ns,
+            epoch: envelope.epoch,
+            sequence: envelope.sequence,
+        }
+    }
+}
+
+impl Observer {
+    /// Begins to observe the run that `wanted` means, from now on.
+    ///
+    /// # Errors
+    /// When it is none or several, or its manifest cannot be read.
+    pub(crate) fn open(wanted: Option<&str>, registry: &Registry) -> Result<Self, ObserveError> {
+        let run = select::select(wanted)?;
+        let manifest = run.manifest().map_err(|source| ObserveError::Manifest {
+            run: run.name.clone(),
+            source,
+        })?;
+        let mut problems = Vec::new();
+        let topology = topology_of(&manifest, registry)
+            .map_err(|why| problems.push(format!("its topology is not known here: {why}")))
+            .ok();
+        let records = run.run_folder().records();
+        // Before the orders on record are read: none falls between.
+        let follower = RecordFollower::from_now(&records);
+        let mut conditions = topology
+            .as_ref()
+            .map(LinkConditions::of)
+            .unwrap_or_default();
+        problems.extend(conditions.read(&records));
+        Ok(Self {
+            follower,
+            conditions,
+            run,
+            manifest,
+            topology,
+            tails: BTreeMap::new(),
+            round_trips: BTreeMap::new(),
+            arrivals: BTreeMap::new(),
+            passive: BTreeMap::new(),
+            domains: BTreeMap::new(),
+            problems,
+        })
+    }
+
+    /// The run.
+    pub(crate) const fn run(&self) -> &LiveRun {
+        &self.run
+    }
+
+    /// What was run.
+    pub(crate) const fn manifest(&self) -> &Manifest {
+        &self.manifest
+    }
+
+    /// The topology; `None` when this program does not know its case.
+    pub(crate) const fn topology(&self) -> Option<&Topology> {
+        self.topology.as_ref()
+    }
+
+    /// What went wrong so far.
+    pub(crate) fn problems(&self) -> &[String] {
+        &self.problems
+    }
+
+    /// True when the run is over.
+    pub(crate) fn is_over(&self) -> bool {
+        !self.run.is_announced() || self.run.is_supervisor_gone()
+    }
+
+    /// The channel called `name`, which must have an end here.
+    ///
+    /// # Errors
+    /// When there is none, with those there are.
+    pub(crate) fn channel(&self, name: &str) -> Result<&ChannelDescription, ObserveError> {
+        let mut channels = self.manifest.channels.iter();
+        let found = channels.find(|one| one.name == name);
+        let description = found.ok_or_else(|| ObserveError::NoChannel {
+            run: self.run.name.clone(),
+            channel: name.to_owned(),
+            known: self.channel_names().join(", "),
+        })?;
+        if self.source(name).is_none() {
+            let hosts = [&description.from_host, &description.to_host];
+            let mut hosts: Vec<&str> = hosts.into_iter().flatten().map(String::as_str).collect();
+            hosts.dedup();
+            return Err(ObserveError::Elsewhere {
+                channel: name.to_owned(),
+                hosts: hosts.join(" or "),
+            });
+        }
+        Ok(description)
+    }
+
+    fn channel_names(&self) -> Vec<&str> {
+        let channels = self.manifest.channels.iter();
+        channels.map(|one| one.name.as_str()).collect()
+    }
+
+    /// Where the messages of `channel` can be had; `None` when it has no end here.
+    pub(crate) fn source(&self, channel: &str) -> Option<&Source> {
+        let mut channels = self.run.channels.iter();
+        let found = channels.find(|one| one.name == channel)?;
+        Some(&found.source)
+    }
+
+    /// The shared memory of `host`.
+    ///
+    /// # Errors
+    /// When it cannot be joined.
+    pub(crate) fn domain(&mut self, host: &str) -> Result<&Domain, ObserveError> {
+        if !self.domains.contains_key(host) {
+            let address = self.run.domain(host).map_err(DomainError::Address)?;
+            let domain = Domain::observe(&address)?.with_open_within(PassiveReader::OPEN_WITHIN);
+            self.domains.insert(host.to_owned(), domain);
+        }
+        Ok(&self.domains[host])
+    }
+
+    /// A reader of the shared memory of `channel` on `host`.
+    ///
+    /// # Errors
+    /// When the channel has all its readers, or is not there.
+    pub(crate) fn reader(
+        &mut self,
+        host: &str,
+        channel: &ChannelDescription,
+    ) -> Result<PassiveReader, ObserveError> {
+        let domain = self.domain(host)?;
+        Ok(PassiveReader::open(
+            domain,
+            &channel.name,
+            channel.size_bytes,
+        )?)
+    }
+
+    /// Also counts the messages of `channel` in shared memory, if nobody here records them: of a
+    /// user's own program.
+    pub(crate) fn count_unrecorded(&mut self, channel: &str) {
+        let Some(Source::SharedMemory {
+            host,
+            is_forwarded: false,
+        }) = self.source(channel).cloned()
+        else {
+            return;
+        };
+        let description = self.channel(channel).cloned();
+        match description.and_then(|description| self.reader(&host, &description)) {
+            Ok(reader) => {
+                self.passive.insert(channel.to_owned(), reader);
+            }
+            Err(error) => self.problems.push(error.to_string()),
+        }
+    }
+
+    /// Reads what came since the last poll. Call it every few milliseconds, so that no queue of
+    /// shared memory overflows.
+    pub(crate) fn poll(&mut self) {
+        let Self {
+            follower,
+            tails,
+            round_trips,
+            arrivals,
+            passive,
+            conditions,
+            problems,
+            ..
+        } = self;
+        follower.poll(POLL_BYTES_MAX, &mut |batch| {
+            let channel = batch.header.channel.as_str();
+            match batch.header.kind {
+                RecordKind::RoundTrip => {
+                    let known = round_trips.entry(channel.to_owned()).or_default();
+                    known.extend(batch.records::<RoundTripRecord>());
+                }
+                RecordKind::Message => {
+                    let known = arrivals.entry(channel.to_owned()).or_default();
+                    let each = batch.messages();
+                    known.extend(each.map(|(envelope, _)| Arrival::from(&envelope)));
+                }
+                RecordKind::LinkCondition => {
+                    conditions.add(channel, batch.records::<LinkConditionRecord>());
+                }
+                _ => tails.entry(channel.to_owned()).or_default().add(batch),
+            }
+        });
+        // A link that lets nothing through leaves its far end's records as they are: they are at hand.
+        for header in follower.headers() {
+            if let Some(tail) = tails.get_mut(&header.channel) {
+                tail.expect(header.kind);
+            }
+        }
+        problems.extend(follower.take_problems());
+        passive.retain(|channel, reader| {
+            let known = arrivals.entry(channel.clone()).or_default();
+            let polled = reader.poll(POLL_MESSAGES_MAX, &mut |envelope, _| {
+                known.push(envelope.into());
+            });
+            polled
+                .map_err(|error| problems.push(error.to_string()))
+                .is_ok()
+        });
+    }
+
+    /// Polls for `window`; false when a signal came before it was over.
+    pub(crate) fn poll_for(&mut self, window: Duration, signals: &Signals) -> bool {
+        let began = WallInstant::now();
+        let mut is_whole = true;
+        while is_whole && began.elapsed() < window {
+            self.poll();
+            thread::sleep(POLL_PERIOD.min(window.saturating_sub(began.elapsed())));
+            is_whole = signals.received().is_none();
+        }
+        self.poll();
+        is_whole
+    }
+
+    /// Forgets what lies further back than `window`.
+    pub(crate) fn trim(&mut self, window: Duration) {
+        let now_ns = MonotonicClock::now().as_ns();
+        let span_ns = nanoseconds(window + self.longest_settling());
+        for tail in self.tails.values_mut() {
+            tail.trim(span_ns, now_ns);
+        }
+        for arrivals in self.arrivals.values_mut() {
+            let oldest_ns = now_ns.saturating_sub(span_ns);
+            arrivals.retain(|one| one.at_ns >= oldest_ns);
+        }
+        for round_trips in self.round_trips.values_mut() {
+            let newest_ns = round_trips.iter().map(|one| one.t1_ns).max();
+            let oldest_ns = newest_ns.unwrap_or(0).saturating_sub(EXCHANGES_SPAN_NS);
+            round_trips.retain(|one| one.t1_ns >= oldest_ns);
+        }
+    }
+
+    /// The messages of `channel` as this host first sees them, in the order in which they came.
+    /// `None` when nothing tells of it.
+    pub(crate) fn arrivals(&self, channel: &str) -> Option<Vec<Arrival>> {
+        if let Some(Source::SharedMemory {
+            is_forwarded: true, ..
+        }) = self.source(channel)
+        {
+            return Some(self.tails.get(channel)?.arrivals());
+        }
+        self.arrivals.get(channel).cloned()
+    }
+
+    /// How many messages of `channel` a gateway of this host brought. `None` when none is here that
+    /// could have.
+    pub(crate) fn brought_count(&self, channel: &str) -> Option<usize> {
+        let to_host = self.ends(channel).1?;
+        let is_here = self.run.hosts().any(|here| here == to_host);
+        let tail = self.tails.get(channel).filter(|_| is_here)?;
+        Some(tail.arrivals().len())
+    }
+
+    /// True when the records of `channel` are kept here, whatever is in them.
+    pub(crate) fn is_recorded(&self, channel: &str) -> bool {
+        self.follower.headers().any(|one| one.channel == channel)
+    }
+
+    /// As [`Self::arrivals`], and forgets them.
+    pub(crate) fn take_arrivals(&mut self, channel: &str) -> Vec<Arrival> {
+        let arrivals = self.arrivals(channel).unwrap_or_default();
+        self.arrivals.remove(channel);
+        self.tails.remove(channel);
+        arrivals
+    }
+
+    /// The account of the messages of `channel` of the last `window`; `None` when no record tells of
+    /// them.
+    pub(crate) fn account(&self, channel: &str, window: Duration) -> Option<ChannelAccount> {
+        let tail = self.tails.get(channel).filter(|tail| !tail.is_empty())?;
+        let hosts = self.hosts_of(channel);
+        let map = hosts
+            .as_ref()
+            .and_then(|(from, to)| self.clock_map(from, to));
+        let path = match (&hosts, &map) {
+            (None, _) => ChannelPath::SharedMemory,
+            (Some(_), _) if self.has_one_clock() => ChannelPath::Gateway {
+                alignment: Some(Alignment::SAME_CLOCK),
+            },
+            (Some(_), Some(map)) => ChannelPath::Mapped { map },
+            (Some(_), None) => ChannelPath::Gateway { alignment: None },
+        };
+        let now = MonotonicClock::now();
+        let span = RunSpan {
+            start: Instant::ZERO,
+            end: now,
+        };
+        let is_here = |host: Option<&String>| {
+            host.is_some_and(|host| self.run.hosts().any(|here| here == host))
+        };
+        let (from, to) = self.ends(channel);
+        let context = AccountContext {
+            producer_run: is_here(from).then_some(span),
+            consumer_run: is_here(to).then_some(span),
+            flight_time_max: FLIGHT_TIME_MAX + self.settling(channel),
+            ..AccountContext::new(path)
+        };
+        let span = (nanoseconds(window), nanoseconds(self.settling(channel)));
+        Some(tail.account(span, &context))
+    }
+
+    /// True when all hosts of the run read one clock.
+    pub(crate) fn has_one_clock(&self) -> bool {
+        let is_whole = self
+            .topology
+            .as_ref()
+            .is_some_and(|topology| topology.hosts().len() == self.run.domains.len());
+        is_whole || self.run.has_one_clock == Some(true)
+    }
+
+    /// Both hosts of a channel that crosses a link; without a topology, of one between two hosts.
+    pub(crate) fn hosts_of(&self, channel: &str) -> Option<(String, String)> {
+        let (from, to) = self.ends(channel);
+        let (from, to) = (from?, to?);
+        let is_between = match &self.topology {
+            Some(topology) => topology.crossing(topology.channel(channel)?).is_some(),
+            // Two hosts may have two clocks: they are one only where that is known.
+            None => from != to,
+        };
+        is_between.then(|| (from.clone(), to.clone()))
+    }
+
+    /// What the direction `way` of `link` was ordered to do, as far as this host knows.
+    pub(crate) fn link_condition(&self, link: &str, way: Way) -> LinkCondition {
+        self.conditions.now(link, way)
+    }
+
+    /// Polls for as long as the first messages of the first window need to be written down by all
+    /// who meet them; false when a signal came before.
+    pub(crate) fn settle(&mut self, signals: &Signals) -> bool {
+        self.poll_for(self.longest_settling(), signals)
+    }
+
+    fn longest_settling(&self) -> Duration {
+        WRITING + self.conditions.longest_flight_time()
+    }
+
+    /// How long after its publication a message may still be on its way, or that to a file.
+    fn settling(&self, channel: &str) -> Duration {
+        WRITING + self.conditions.flight_time(channel)
+    }
+
+    fn ends(&self, channel: &str) -> (Option<&String>, Option<&String>) {
+        let mut channels = self.manifest.channels.iter();
+        let found = channels.find(|one| one.name == channel);
+        found.map_or((None, None), |one| {
+            (one.from_host.as_ref(), one.to_host.as_ref())
+        })
+    }
+}
+
+fn nanoseconds(time: Duration) -> i64 {
+    i64::try_from(time.as_nanos()).unwrap_or(i64::MAX)
+}
+
+/// The topology that a run wrote into its manifest.
+fn topology_of(manifest: &Manifest, registry: &Registry) -> Result<Topology, String> {
+    let table = toml::Table::try_from(&manifest.topology).map_err(|error| error.to_string())?;
+    let text = toml::to_string(&table).map_err(|error| error.to_string())?;
+    hil_topology::parse("manifest.json", &text, &[], registry.known())
+        .map_err(|errors| errors.to_string())
+}

@@ -1,0 +1,85 @@
+//! `hil-runtime top`: a running run at a glance, on a terminal until `q`, or once as plain text.
+
+mod draw;
+mod gather;
+mod screen;
+mod view;
+
+use std::io::{self, IsTerminal};
+
+use super::cli::TopArgs;
+use super::observer::{ObserveError, Observer};
+use hil_platform::console::Console;
+use hil_platform::signals::Signals;
+use hil_topology::registry::Registry;
+
+pub(crate) use gather::via;
+
+/// Why there is no view.
+#[derive(Debug, thiserror::Error)]
+pub enum TopError {
+    /// The run.
+    #[error(transparent)]
+    Observe(#[from] ObserveError),
+    /// The terminal.
+    #[error("cannot use this terminal: {0}; --once prints plain text")]
+    Terminal(#[source] io::Error),
+    /// A view that is no JSON.
+    #[error("cannot write the view: {0}")]
+    Json(#[from] serde_json::Error),
+}
+
+/// How it ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum TopEnd {
+    /// All was shown, or the user left.
+    Done,
+    /// By a signal.
+    Interrupted,
+}
+
+/// Shows the run until the user leaves or it ends; once where nobody looks at a terminal.
+///
+/// # Errors
+/// When no run can be found, or the terminal cannot be written.
+pub fn run(
+    args: &TopArgs,
+    columns: usize,
+    registry: &Registry,
+    (signals, console): (&Signals, &mut Console),
+) -> Result<TopEnd, TopError> {
+    let mut observer = Observer::open(args.run.as_deref(), registry)?;
+    let names: Vec<String> = observer
+        .manifest()
+        .channels
+        .iter()
+        .map(|one| one.name.clone())
+        .collect();
+    for name in names {
+        observer.count_unrecorded(&name);
+    }
+    let mut gatherer = gather::Gatherer::default();
+    observer.settle(signals);
+    // What processes used is a difference of two looks.
+    gatherer.look(&observer, args.window);
+    if !args.json && !args.once && io::stdout().is_terminal() {
+        return screen::run((observer, gatherer), args.window, signals).map_err(TopError::Terminal);
+    }
+    loop {
+        let is_whole = observer.poll_for(args.window, signals);
+        observer.trim(args.window);
+        let view = gatherer.look(&observer, args.window);
+        let text = if args.json {
+            format!("{}\n", serde_json::to_string(&view)?)
+        } else {
+            draw::plain(&view, columns)
+        };
+        let is_heard = console.result(&text);
+        if !is_whole {
+            return Ok(TopEnd::Interrupted);
+        }
+        if args.once || !args.json || !is_heard || observer.is_over() {
+            return Ok(TopEnd::Done);
+        }
+    }
+}
