@@ -71,6 +71,7 @@ if [[ "$mode" == long ]]; then
     step tests nextest --workspace --profile long --run-ignored all
 else
     step format cargo fmt --all --check
+    # All targets: the benches are checked here and not built with optimisation.
     step lints cargo clippy --workspace --all-targets -- -D warnings
     if [[ "$mode" == quick ]]; then
         step tests nextest --workspace --lib --bins --test tidy --profile ci \
@@ -78,7 +79,6 @@ else
     else
         step dependencies dependencies
         step docs documentation
-        step benches cargo bench --package hil-benches --no-run
         # Compile-fail guards, e.g. that instants and durations do not mix (models).
         step doctests cargo test --workspace --doc
         step tests nextest --workspace --profile ci

@@ -10,7 +10,7 @@ const END: u16 = 32_000;
 /// What a link between two hosts needs for its channels, with room.
 const BLOCK: u16 = 20;
 
-/// The first of [`BLOCK`] ports that no other test of this machine is given until all others have been.
+/// The first of `BLOCK` ports that no other test of this machine is given until all others have been.
 ///
 /// # Panics
 /// When it cannot be noted that they are taken.

@@ -124,7 +124,7 @@ enum State {
 /// See the module documentation.
 ///
 /// ```
-/// use crate::reader::{CaptureReader, Step};
+/// use hil_capture::reader::{CaptureReader, Step};
 ///
 /// let mut reader = CaptureReader::default();
 /// reader.feed(b"a file of something else");

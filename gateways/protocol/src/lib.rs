@@ -17,7 +17,7 @@
 //!
 //! ```
 //! use std::time::Duration;
-//! use crate::{
+//! use hil_protocol::{
 //!     ArrivalStamps, ChannelIdentity, EgressBridge, EgressSettings, IngressBridge, IngressSettings,
 //! };
 //! use hil_core::message::Envelope;

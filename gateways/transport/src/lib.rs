@@ -139,8 +139,8 @@ impl SendRefusal {
 ///
 /// ```
 /// use hil_net::TxToken;
-/// use crate::queue::{QueueSettings, queue_pair};
-/// use crate::{DatagramReceiver, DatagramSender};
+/// use hil_transport::queue::{QueueSettings, queue_pair};
+/// use hil_transport::{DatagramReceiver, DatagramSender};
 /// use hil_core::time::Instant;
 ///
 /// let (mut sender, mut receiver) = queue_pair(&QueueSettings::default());

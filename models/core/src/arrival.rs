@@ -33,7 +33,7 @@ const STEP_COUNT: u32 = 3;
 ///
 /// ```
 /// use core::time::Duration;
-/// use hil_models::{arrival::ArrivalPredictor, time::Instant};
+/// use hil_core::{arrival::ArrivalPredictor, time::Instant};
 ///
 /// let mut predictor = ArrivalPredictor::default();
 /// for index in 0..10 {

@@ -147,16 +147,16 @@ impl<V: FieldValue, const N: usize> FieldValue for [V; N] {
 ///
 /// ```
 /// use bytemuck::{Pod, Zeroable};
-/// use crate::layout::{FieldKind, FieldValue};
-/// use crate::message::Message;
+/// use hil_core::layout::{FieldKind, FieldValue};
+/// use hil_core::message::Message;
 ///
 /// #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 /// #[repr(C)]
 /// struct Wheels { speed_mps: [f64; 2], flags: u64 }
-/// crate::layout!(Wheels { speed_mps, flags });
+/// hil_core::layout!(Wheels { speed_mps, flags });
 /// impl Message for Wheels {
 ///     const NAME: &'static str = "example.Wheels.v1";
-///     const FIELDS: &'static [crate::layout::Field] = Wheels::LAYOUT;
+///     const FIELDS: &'static [hil_core::layout::Field] = Wheels::LAYOUT;
 /// }
 /// assert_eq!(Wheels::FIELDS[0].count, Some(2));
 /// assert_eq!(Wheels::FIELDS[1].kind, FieldKind::U64);

@@ -11,13 +11,13 @@ use crate::layout::Field;
 ///
 /// ```
 /// use bytemuck::{Pod, Zeroable};
-/// use crate::message::Message;
+/// use hil_core::message::Message;
 ///
 /// #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 /// #[repr(C)]
 /// struct Wheels { speed_mps: [f64; 2] }
 /// impl Message for Wheels { const NAME: &'static str = "example.Wheels.v1"; }
-/// assert_eq!(crate::message::MessageType::of::<Wheels>().size_bytes, 16);
+/// assert_eq!(hil_core::message::MessageType::of::<Wheels>().size_bytes, 16);
 /// ```
 pub trait Message: Pod + Debug + Send + 'static {
     /// Name and version, e.g. `hil.EgmCommand.v1`. A changed layout needs a new version.
@@ -148,12 +148,22 @@ impl<M: Message> MessageSet for M {
 /// Defines an enum of messages, one port per variant in the order written.
 ///
 /// ```
-/// use crate::message::{Message, MessageSet};
-/// use hil_shuttle::{ShuttleCommand, ShuttleStatus};
+/// use hil_core::message::{Message, MessageSet};
+/// # use bytemuck::{Pod, Zeroable};
 ///
-/// crate::message_set! {
+/// #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+/// #[repr(C)]
+/// pub struct Speed { mps: f64 }
+/// impl Message for Speed { const NAME: &'static str = "example.Speed.v1"; }
+///
+/// #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+/// #[repr(C)]
+/// pub struct Position { m: f64 }
+/// impl Message for Position { const NAME: &'static str = "example.Position.v1"; }
+///
+/// hil_core::message_set! {
 ///     /// Everything an observer hears.
-///     pub enum Heard { Command(ShuttleCommand), Status(ShuttleStatus) }
+///     pub enum Heard { Speed(Speed), Position(Position) }
 /// }
 /// assert_eq!(Heard::PORTS.len(), 2);
 /// ```

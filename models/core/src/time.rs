@@ -67,7 +67,7 @@ pub fn duration_ns(duration: Duration) -> i64 {
 /// which brings its error bound along.
 ///
 /// ```compile_fail
-/// use crate::time::{Instant, RemoteInstant};
+/// use hil_core::time::{Instant, RemoteInstant};
 /// let _ = Instant::from_ns(5).ns_since(RemoteInstant::from_ns(3));
 /// ```
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]

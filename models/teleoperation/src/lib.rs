@@ -27,7 +27,7 @@
 //! use hil_core::case_study::CaseStudy;
 //! use hil_arm::egm::parameters::EgmParameters;
 //! use hil_core::simulation::Simulation;
-//! use crate::{Teleoperation, TeleoperationParameters};
+//! use hil_teleoperation::{Teleoperation, TeleoperationParameters};
 //!
 //! let parameters = TeleoperationParameters {
 //!     egm: EgmParameters { position_gain_per_s: Some(5.0), ..Default::default() },

@@ -24,7 +24,7 @@ pub enum Wake {
 /// `acpi_pm` it is a system call of a microsecond and more, which `hil-runtime doctor` measures.
 ///
 /// ```
-/// use crate::clock::MonotonicClock;
+/// use hil_platform::clock::MonotonicClock;
 /// let (first, second) = (MonotonicClock::now(), MonotonicClock::now());
 /// assert!(second >= first);
 /// ```

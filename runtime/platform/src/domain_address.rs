@@ -16,12 +16,12 @@ const PREFIX_LENGTH: usize = "h0123abcd_".len();
 /// How a process finds its domain: hand it over as one argument or environment variable.
 ///
 /// ```
-/// use crate::domain_address::DomainAddress;
+/// use hil_platform::domain_address::DomainAddress;
 ///
 /// let address: DomainAddress = "h0123abcd_@/run/hil/trial-7".parse()?;
 /// assert_eq!(address.root_path().to_str(), Some("/run/hil/trial-7"));
 /// assert_eq!(address.to_string(), "h0123abcd_@/run/hil/trial-7");
-/// # Ok::<(), crate::domain_address::DomainAddressError>(())
+/// # Ok::<(), hil_platform::domain_address::DomainAddressError>(())
 /// ```
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DomainAddress {

@@ -124,7 +124,7 @@ pub fn case_by_name(
 ///
 /// ```
 /// use hil_shuttle::Shuttle;
-/// use crate::{KnownCases, parse};
+/// use hil_topology::{KnownCases, parse};
 ///
 /// let text = r#"
 /// version = 1

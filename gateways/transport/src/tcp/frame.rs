@@ -29,7 +29,7 @@ pub struct BadLength {
 /// What goes before a datagram; `None` when it is longer than a frame can be.
 ///
 /// ```
-/// use crate::tcp::frame::prefix;
+/// use hil_transport::tcp::frame::prefix;
 ///
 /// assert_eq!(prefix(64), Some([64, 0, 0, 0]));
 /// assert_eq!(prefix(65_536), None);

@@ -1,7 +1,7 @@
 //! What the network did to the messages of one channel and direction, in the terms of the
 //! Internet's measurement standards: one-way delay and its variation (RFC 5481, RFC 3393,
 //! RFC 3550), loss and its bursts (RFC 3611), reordering (RFC 4737), throughput. It reads
-//! [`Passage`]s, which [`super::account::passages`] makes from records; it opens no file and knows
+//! [`Passage`]s, which [`crate::passages`] makes from records; it opens no file and knows
 //! no robot.
 //!
 //! The network begins where the sending gateway hands a message to the kernel and ends where the

@@ -12,11 +12,11 @@
 //! virtual time:
 //!
 //! ```
-//! use crate::egm::controller::Controller;
-//! use crate::egm::messages::{EgmCommand, EgmEvent, EgmEventKind, Side};
-//! use crate::egm::parameters::{EgmParameters, StartMode};
+//! use hil_arm::egm::controller::Controller;
+//! use hil_arm::egm::messages::{EgmCommand, EgmEvent, EgmEventKind, Side};
+//! use hil_arm::egm::parameters::{EgmParameters, StartMode};
 //! use hil_core::time::Instant;
-//! use crate::yumi::arm::RIGHT_START_RAD;
+//! use hil_arm::yumi::arm::RIGHT_START_RAD;
 //!
 //! let parameters = EgmParameters { start: Some(StartMode::PowerOn), ..Default::default() };
 //! let settings = parameters.settings()?;

@@ -45,7 +45,7 @@ pub struct Contest<'a> {
 ///
 /// ```
 /// use core::cmp::Ordering;
-/// use crate::coordinator::policy::{Contest, OrderingPolicy};
+/// use hil_fleet::coordinator::policy::{Contest, OrderingPolicy};
 ///
 /// /// The faster one goes first.
 /// #[derive(Debug)]

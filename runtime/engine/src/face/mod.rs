@@ -7,7 +7,7 @@
 //! - *Sensor face*: we are the sensor. Each `EgmRobot` that comes becomes a feedback, and commands
 //!   go out as `EgmSensor` to where it came from.
 //!
-//! Read in this order: [`launch`], `process`, `arm`, then `robot` or `sensor`; [`mod@record`] is what
+//! Read in this order: [`hil_rundir::face_launch`], `process`, `arm`, then `robot` or `sensor`; [`hil_rundir::face_record`] is what
 //! they note, `figures` what that comes to.
 //!
 //! On the measured path nothing allocates once the protocol's lists have grown, but for what a joint

@@ -1,5 +1,5 @@
 //! Reports as files: one self-contained page with figures, or the same data as Markdown, LaTeX, CSV,
-//! JSON or SVG, or through a user's own template. [`read`] and [`write`] touch files; everything
+//! JSON or SVG, or through a user's own template. [`read`] and [`mod@write`] touch files; everything
 //! else turns what was read into text.
 
 mod axis;

@@ -11,11 +11,11 @@
 //!
 //! ```
 //! use core::time::Duration;
-//! use crate::egm::face::*;
-//! use crate::egm::messages::{EgmCommand, EgmFeedback, SessionState, Side};
+//! use hil_arm::egm::face::*;
+//! use hil_arm::egm::messages::{EgmCommand, EgmFeedback, SessionState, Side};
 //! use hil_core::time::Instant;
 //! # use bytemuck::Zeroable;
-//! # use crate::yumi::arm::{Arm, RIGHT_START_RAD};
+//! # use hil_arm::yumi::arm::{Arm, RIGHT_START_RAD};
 //! # let feedback = EgmFeedback {
 //! #     measured_rad: RIGHT_START_RAD,
 //! #     planned_rad: RIGHT_START_RAD,
@@ -50,7 +50,7 @@
 //! assert!(sensor.poll_transmit(now, &mut datagram));
 //! let taken = robot.decode(&datagram)?;
 //! assert!((taken.position_rad[2] - command.position_rad[2]).abs() < 1e-15);
-//! # Ok::<(), crate::egm::wire::Refusal>(())
+//! # Ok::<(), hil_arm::egm::wire::Refusal>(())
 //! ```
 
 mod checks;

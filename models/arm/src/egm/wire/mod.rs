@@ -16,8 +16,8 @@
 //! Decoding a robot's datagram and answering it:
 //!
 //! ```
-//! use crate::egm::wire::{self, EgmSensor, MessageType, messages::*};
-//! # use crate::egm::wire::{EgmRobot, Release};
+//! use hil_arm::egm::wire::{self, EgmSensor, MessageType, messages::*};
+//! # use hil_arm::egm::wire::{EgmRobot, Release};
 //! # let mut datagram = Vec::new();
 //! # let joints = EgmJoints { joints: vec![0.0, -130.0, 30.0, 0.0, 40.0, 0.0] };
 //! # wire::encode(
