@@ -10,11 +10,10 @@ mod arguments;
 
 pub use arguments::Arguments;
 
-use std::fs;
+use std::{fs, thread};
 use std::ops::Range;
 use std::path::Path;
 use std::process::ExitCode;
-use std::thread;
 use std::time::Duration;
 
 use hil_core::random::RandomStream;

@@ -5,10 +5,9 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
-use crate::analytic;
+use crate::{analytic, layout};
 use crate::geometry::{Bounds, Footprint, Pose};
-use crate::layout;
-use crate::layout::BAYS_PER_SIDE;
+use crate::layout::{BAYS_PER_SIDE, self};
 use crate::map::Map;
 use crate::section::MergePolicy;
 use crate::world::{BayIndex, Vehicle, World};

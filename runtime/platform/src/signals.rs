@@ -1,10 +1,8 @@
 //! Ctrl-C and SIGTERM as a flag the supervisor looks at. A second one ends the program at once.
 
-use std::io;
-use std::process;
+use std::{io, process, thread};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use std::thread;
 use std::time::Duration;
 
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};

@@ -6,16 +6,14 @@ mod network;
 mod watched;
 
 use std::collections::BTreeMap;
-use std::fs;
-use std::io;
+use std::{fs, io};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use hil_account::{
     ChannelAccount, Closing, EndToEnd, FateCounts, Gaps, MessageFate, StampCoverage,
 };
-use hil_core::link_model::LinkModel;
-use hil_core::link_model::ReplayTally;
+use hil_core::link_model::{LinkModel, ReplayTally};
 use hil_core::plot::PlotSeries;
 use hil_core::run_log::RunLog;
 use hil_core::simulation::{Carrier, ChannelCounts, Simulation, SimulationError, SimulationResult};
@@ -24,13 +22,12 @@ use hil_stats::histogram::Distribution;
 
 use crate::analysis::figures::shell_words;
 use crate::analysis::outages::OutageStory;
-use crate::event_log;
+use crate::{event_log, terminal};
 use crate::summary::{
     ChannelSummary, CountByName, DirectionSummary, Fact, LinkKind, Outcome, RecordedFigures,
     RunFacts, RunSummary, ScoreMetric,
 };
-use crate::terminal;
-use crate::terminal::{Style, percent};
+use crate::terminal::{Style, percent, self};
 use hil_rundir::launch::Side;
 use hil_rundir::pipe::CounterGroup;
 use hil_rundir::run_folder::RunFolder;

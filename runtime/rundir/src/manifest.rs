@@ -2,8 +2,7 @@
 //! case study. It describes; who runs what is decided elsewhere.
 
 use std::collections::BTreeMap;
-use std::fs;
-use std::io;
+use std::{fs, io};
 use std::path::Path;
 use std::time::SystemTime;
 
@@ -13,8 +12,7 @@ use serde_json::{Value, json};
 
 use crate::run_folder::{RunFolder, utc_text};
 use hil_platform::host_facts::HostFacts;
-use hil_topology;
-use hil_topology::{KnownCases, Topology, TopologyErrors};
+use hil_topology::{KnownCases, Topology, TopologyErrors, self};
 
 /// Version of the layout of `manifest.json`. Within one, fields are only added.
 pub const MANIFEST_VERSION: u32 = 1;

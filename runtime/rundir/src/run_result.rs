@@ -2,8 +2,7 @@
 //! folder. With the manifest and the records beside it, every figure can be computed again.
 
 use std::collections::BTreeMap;
-use std::fs;
-use std::io;
+use std::{fs, io};
 use std::path::PathBuf;
 use std::time::Duration;
 

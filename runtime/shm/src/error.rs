@@ -2,9 +2,8 @@
 //! not errors.
 
 use core::fmt::{Debug, Write as _};
-use std::io;
+use std::{io, thread};
 use std::path::PathBuf;
-use std::thread;
 use std::time::{Duration, Instant};
 
 use hil_platform::domain_address::DomainAddressError;

@@ -2,8 +2,7 @@
 //! files; what a message meets then is `hil_link::trace`.
 
 use std::collections::BTreeMap;
-use std::fs;
-use std::io;
+use std::{fs, io};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -11,9 +10,7 @@ use std::time::Duration;
 use hil_core::link_model::TraceMatch;
 use hil_link::trace::{ReplayError, TraceEnd, TraceLink, TraceReplay};
 use hil_trace::fault::TraceFault;
-use hil_trace::wire;
-use hil_trace::wire::Decoded;
-use hil_trace::{Trace, csv};
+use hil_trace::wire::{Decoded, self};
 use serde::{Deserialize, Serialize};
 
 use crate::Topology;

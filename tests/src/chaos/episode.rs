@@ -1,9 +1,8 @@
 //! One episode: two hosts, a run of two seconds between them, what was drawn for it, and the wait
 //! for its end.
 
-use std::fs;
+use std::{fs, thread};
 use std::path::{Path, PathBuf};
-use std::thread;
 use std::time::{Duration, Instant};
 
 use nix::unistd::Pid;

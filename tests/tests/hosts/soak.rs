@@ -3,10 +3,8 @@
 //! `HIL_SOAK_MINUTES=60 cargo test --package hil-tests --test hosts soak:: -- --ignored --nocapture`
 
 use std::collections::BTreeMap;
-use std::env;
-use std::fs;
+use std::{env, fs, thread};
 use std::path::Path;
-use std::thread;
 use std::time::{Duration, Instant};
 
 use hil_account::MessageFate;

@@ -129,9 +129,9 @@ fn systemd_finds_no_fault_with_the_units() {
     assert!(words.contains("KillMood"), "a planted fault: {words}");
 }
 
-/// Sources of the package's files in `runtime/Cargo.toml`, and where they go.
+/// Sources of the package's files in `runtime/cli/Cargo.toml`, and where they go.
 fn assets() -> Vec<(String, String)> {
-    let manifest = read("runtime/Cargo.toml");
+    let manifest = read("runtime/cli/Cargo.toml");
     let (_, list) = manifest.split_once("assets = [").unwrap();
     let lines = list.lines().filter(|line| line.trim().starts_with("[\""));
     let assets = lines.map(|line| {
@@ -147,7 +147,7 @@ fn every_file_of_the_package_is_there() {
     assert!(assets.len() > 15, "{assets:?}");
     for (source, _) in &assets {
         // What the package's script makes is not there before it ran.
-        let Some(path) = source.strip_prefix("../") else {
+        let Some(path) = source.strip_prefix("../../") else {
             assert!(source.starts_with("target/release/deb/"), "{source}");
             continue;
         };

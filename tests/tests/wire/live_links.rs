@@ -206,7 +206,7 @@ fn check_refusals(run: &Path) {
         (&["set", "hop", "--loss", "1.5"], "1.5 is outside 0 to 1"),
         (
             &["set", "hop", "--delay", "50"],
-            "--delay 50: has no unit; allowed: h, min, s, ms, us, ns",
+            "'50' for '--delay <TIME>': has no unit; allowed: h, min, s, ms, us, ns",
         ),
         (&["set", "hop", "--delay", "50s"], "room for 10."),
     ] {

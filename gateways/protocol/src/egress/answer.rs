@@ -6,8 +6,7 @@ use super::{EgressBridge, EgressEvent, HELLO_PERIOD_REFUSED, PeerState};
 use crate::body::{HelloAck, HelloStatus, SyncResponse};
 use crate::refusal::Refusal;
 use crate::stamps::ArrivalStamps;
-use crate::wire;
-use crate::wire::{Body, Header, Kind, Prefix};
+use crate::wire::{Body, Header, Kind, Prefix, self};
 
 impl EgressBridge {
     pub(super) fn accept(

@@ -25,9 +25,8 @@ mod spare;
 #[cfg(test)]
 mod tests;
 
-use std::io;
+use std::{io, thread};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::thread;
 use std::time::Duration;
 
 use hil_transport::udp::UdpError;

@@ -12,9 +12,8 @@ use std::time::{Duration, Instant};
 
 use super::frame::{Frame, PeerHello, PeerMessage, read_frame_within, write_message};
 use super::peer::{ControlEnds, ControlReader, ControlWriter};
-use crate::security::PreSharedKey;
-use crate::security::greeting;
-use crate::security::greeting::{GreetingError, MAGIC, TimedStream, Why};
+use crate::security::{PreSharedKey, greeting};
+use crate::security::greeting::{GreetingError, MAGIC, TimedStream, Why, self};
 
 /// How long a greeting may take altogether.
 pub(super) const GREETING_TIMEOUT: Duration = Duration::from_secs(3);

@@ -1,8 +1,7 @@
 //! Reads the kernel's text files (`/proc`, `/sys`, `/etc`) below a root that tests can move.
 //! It writes nothing and interprets nothing beyond numbers and CPU lists.
 
-use std::fs;
-use std::io;
+use std::{fs, io};
 use std::path::PathBuf;
 
 use super::Fact;

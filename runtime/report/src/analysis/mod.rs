@@ -22,8 +22,7 @@ mod robot_series;
 mod score_clock;
 mod stalls;
 
-use std::fs;
-use std::io;
+use std::{fs, io};
 use std::path::{Path, PathBuf};
 
 use hil_account::MessageFate;
@@ -36,10 +35,9 @@ use figures::{channel_summary, process_summary, realtime_facts, run_event, run_f
 use outages::OutageStory;
 use records::RunRecords;
 
-use crate::event_log;
+use crate::{event_log, terminal};
 use crate::summary::{Fact, RunSummary, ScoreMetric, SummaryError};
-use crate::terminal;
-use crate::terminal::Style;
+use crate::terminal::{Style, self};
 use crate::trace::capture;
 use hil_rundir::manifest::{Manifest, ManifestTopologyError};
 use hil_rundir::run_folder::RunFolder;

@@ -5,10 +5,9 @@
 mod pool;
 mod render;
 
-use std::fs;
+use std::{fs, thread};
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
-use std::thread;
 use std::time::Duration;
 
 use hil_core::study::{Batch, StudyReport};

@@ -1,8 +1,7 @@
 //! The bytes of a message as named values, by its layout. Numbers stay what they are: nothing is
 //! scaled or rounded.
 
-use core::fmt;
-use core::fmt::Write as _;
+use core::fmt::{Write as _, self};
 
 use serde::ser::{SerializeMap, SerializeSeq};
 use serde::{Serialize, Serializer};
