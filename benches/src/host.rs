@@ -1,6 +1,7 @@
 //! What the machine was like while a bench ran. It describes; it does not tune.
 
-use std::{fs, io};
+use std::fs;
+use std::io;
 
 use nix::sched::{CpuSet, sched_setaffinity};
 use nix::unistd::Pid;

@@ -10,10 +10,11 @@ mod arguments;
 
 pub use arguments::Arguments;
 
-use std::{fs, thread};
+use std::fs;
 use std::ops::Range;
 use std::path::Path;
 use std::process::ExitCode;
+use std::thread;
 use std::time::Duration;
 
 use hil_core::random::RandomStream;

@@ -3,7 +3,9 @@
 //! declare the same name. What it writes: `page.html`, and the digests by which the page's policy
 //! knows its own style and script.
 
-use std::{env, fs, io};
+use std::env;
+use std::fs;
+use std::io;
 use std::path::PathBuf;
 
 use base64::Engine as _;

@@ -1,7 +1,8 @@
 //! How long messages took around the moments at which something was done beside a run, against all others of
 //! the same run.
 
-use std::{fmt, fs};
+use std::fmt;
+use std::fs;
 use std::ops::Range;
 use std::path::Path;
 

@@ -2,9 +2,10 @@
 //! anything is left where nothing should be. It judges no figure; see [`crate::account`].
 
 use std::ffi::OsString;
-use std::{fs, thread};
+use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::thread;
 use std::time::{Duration, Instant};
 
 use hil_engine::security::PreSharedKey;

@@ -2,16 +2,19 @@
 //! gateway direction at either end, opened as the gateway process opens it.
 
 use std::error::Error;
-use std::{fs, process, thread};
+use std::fs;
 use std::path::PathBuf;
+use std::process;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::thread;
 use std::time::{Duration, Instant};
 
 use hil_core::message::MessageType;
 use hil_core::record::{EgressRecord, IngressRecord};
-use hil_engine::gateway::{Surroundings, direction};
-use hil_engine::gateway::direction::{Direction, Opened, self};
+use hil_engine::gateway::Surroundings;
+use hil_engine::gateway::direction;
+use hil_engine::gateway::direction::{Direction, Opened};
 use hil_platform::domain_address::DomainAddress;
 use hil_platform::realtime::RealtimeRequest;
 use hil_platform::wait::WaitMode;

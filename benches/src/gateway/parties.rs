@@ -4,7 +4,8 @@
 use std::fs;
 use std::time::{Duration, Instant};
 
-use hil_platform::realtime::{RealtimeRequest, SchedulingPolicy, self};
+use hil_platform::realtime;
+use hil_platform::realtime::{RealtimeRequest, SchedulingPolicy};
 use nix::unistd::gettid;
 
 /// Real-time priority that benches ask for: above ordinary work, below interrupt threads.

@@ -3,7 +3,8 @@
 
 use super::stage::MessageFate;
 use super::{AccountContext, ChannelRecords, each_judged};
-use hil_core::record::{EgressRecord, stamp};
+use hil_core::record::EgressRecord;
+use hil_core::record::stamp;
 
 /// What became of a message behind the sending radio.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

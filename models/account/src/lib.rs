@@ -49,7 +49,8 @@ pub use outage::{
     OutageFinder, Standing, foregoing, outages,
 };
 pub use passage::passages;
-pub use source::{RecordSource, each};
+pub use source::RecordSource;
+pub use source::each;
 pub use stage::{MessageFate, Side, Stage};
 pub use story::{MessageStory, stories};
 

@@ -5,9 +5,10 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{analytic, layout};
+use crate::analytic;
 use crate::geometry::{Bounds, Footprint, Pose};
-use crate::layout::{BAYS_PER_SIDE, self};
+use crate::layout;
+use crate::layout::BAYS_PER_SIDE;
 use crate::map::Map;
 use crate::section::MergePolicy;
 use crate::world::{BayIndex, Vehicle, World};

@@ -1,7 +1,8 @@
 //! A link whose condition can be changed while messages are under way: what was offered before keeps
 //! its fate. It decides neither when nor to what.
 
-use hil_core::link_model::{ReplayTally, Fate, LinkModel, LossCauses, MessageNumber};
+use hil_core::link_model::ReplayTally;
+use hil_core::link_model::{Fate, LinkModel, LossCauses, MessageNumber};
 use hil_core::time::Instant;
 
 /// What takes the place of the topology's link.

@@ -3,7 +3,8 @@
 //! the kernel's part of the file all the same; here it is counted.
 
 use hil_capture::flow::FlowFilter;
-use hil_capture::{writer, CARD_CLOCK, CaptureInterface};
+use hil_capture::writer;
+use hil_capture::{CARD_CLOCK, CaptureInterface};
 use hil_net::card_clock::{CardClock, CardPair};
 use hil_net::filter::PacketFilter;
 use hil_net::packet_ring::{PacketRing, RingCounters, RingSettings, RingStamps};

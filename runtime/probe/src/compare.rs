@@ -4,7 +4,8 @@
 
 use core::fmt::Write as _;
 use std::collections::{BTreeMap, BTreeSet};
-use std::{fs, io};
+use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
 
 use hil_capture::flow::OwnHeader;

@@ -1,12 +1,14 @@
 //! The live capture: rings looked into every few milliseconds, a pcapng file, a line of progress.
 //! It analyses nothing. Nothing waits for a packet, so that no sender pays for waking the probe.
 
-use std::{io, thread};
+use std::io;
 use std::path::PathBuf;
+use std::thread;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-use hil_capture::{CaptureInterface, writer};
+use hil_capture::CaptureInterface;
 use hil_capture::flow::FlowFilter;
+use hil_capture::writer;
 use hil_net::Direction;
 use hil_net::filter::PacketFilter;
 use hil_net::packet_ring::{PacketRing, RingCounters, RingError, RingSettings, RingStamps};

@@ -1,10 +1,12 @@
 //! The end of work that looks for signals only now and then: it gets a moment to end by itself, then the
 //! program ends without it and takes along what it had begun to write.
 
-use std::{fs, process, thread};
+use std::fs;
 use std::path::PathBuf;
+use std::process;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread;
 use std::time::Duration;
 
 use hil_platform::console::Console;

@@ -3,12 +3,14 @@
 //! [`crate::split`].
 
 use std::collections::BTreeMap;
-use std::{io, thread};
+use std::io;
 use std::path::PathBuf;
+use std::thread;
 use std::time::{Duration, Instant};
 
 use hil_rundir::live_run::LiveRun;
-use hil_rundir::select::{select, SelectError, select_below};
+use hil_rundir::select::select;
+use hil_rundir::select::{SelectError, select_below};
 use hil_watch::{Event, Feed, FeedError, Poll};
 
 use crate::facts::{self, Words};

@@ -2,7 +2,8 @@
 //! rest is used. It makes no topic of anything.
 
 use std::collections::BTreeMap;
-use std::{fs, io};
+use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
 
 use hil_platform::words::counted_plainly;

@@ -7,7 +7,8 @@
 
 use std::collections::BTreeSet;
 
-use hil_rundir::layout::{LayoutFault, self};
+use hil_rundir::layout;
+use hil_rundir::layout::LayoutFault;
 use hil_rundir::manifest::{FieldDescription, KindDescription};
 use prost::Message as _;
 use prost_types::field_descriptor_proto::{Label, Type};

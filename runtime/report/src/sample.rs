@@ -19,7 +19,8 @@ use super::summary::{
     ScoreMetric, SummaryError,
 };
 use super::terminal::{Style, render};
-use hil_platform::host_facts::{HostFact, HostFacts, self};
+use hil_platform::host_facts;
+use hil_platform::host_facts::{HostFact, HostFacts};
 use hil_rundir::event::{EventKind, ProcessKind};
 use hil_rundir::launch::Side;
 use hil_topology::FaceKind;

@@ -6,14 +6,16 @@ mod network;
 mod watched;
 
 use std::collections::BTreeMap;
-use std::{fs, io};
+use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use hil_account::{
     ChannelAccount, Closing, EndToEnd, FateCounts, Gaps, MessageFate, StampCoverage,
 };
-use hil_core::link_model::{LinkModel, ReplayTally};
+use hil_core::link_model::LinkModel;
+use hil_core::link_model::ReplayTally;
 use hil_core::plot::PlotSeries;
 use hil_core::run_log::RunLog;
 use hil_core::simulation::{Carrier, ChannelCounts, Simulation, SimulationError, SimulationResult};
@@ -22,12 +24,13 @@ use hil_stats::histogram::Distribution;
 
 use crate::analysis::figures::shell_words;
 use crate::analysis::outages::OutageStory;
-use crate::{event_log, terminal};
+use crate::event_log;
 use crate::summary::{
     ChannelSummary, CountByName, DirectionSummary, Fact, LinkKind, Outcome, RecordedFigures,
     RunFacts, RunSummary, ScoreMetric,
 };
-use crate::terminal::{Style, percent, self};
+use crate::terminal;
+use crate::terminal::{Style, percent};
 use hil_rundir::launch::Side;
 use hil_rundir::pipe::CounterGroup;
 use hil_rundir::run_folder::RunFolder;

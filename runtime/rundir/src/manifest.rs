@@ -2,7 +2,8 @@
 //! case study. It describes; who runs what is decided elsewhere.
 
 use std::collections::BTreeMap;
-use std::{fs, io};
+use std::fs;
+use std::io;
 use std::path::Path;
 use std::time::SystemTime;
 
@@ -12,7 +13,8 @@ use serde_json::{Value, json};
 
 use crate::run_folder::{RunFolder, utc_text};
 use hil_platform::host_facts::HostFacts;
-use hil_topology::{KnownCases, Topology, TopologyErrors, self};
+use hil_topology;
+use hil_topology::{KnownCases, Topology, TopologyErrors};
 
 /// Version of the layout of `manifest.json`. Within one, fields are only added.
 pub const MANIFEST_VERSION: u32 = 1;

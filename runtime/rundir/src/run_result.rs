@@ -2,7 +2,8 @@
 //! folder. With the manifest and the records beside it, every figure can be computed again.
 
 use std::collections::BTreeMap;
-use std::{fs, io};
+use std::fs;
+use std::io;
 use std::path::PathBuf;
 use std::time::Duration;
 

@@ -2,8 +2,9 @@
 //! not errors.
 
 use core::fmt::{Debug, Write as _};
-use std::{io, thread};
+use std::io;
 use std::path::PathBuf;
+use std::thread;
 use std::time::{Duration, Instant};
 
 use hil_platform::domain_address::DomainAddressError;

@@ -46,6 +46,7 @@ pub use members::ForeignNodes;
 pub use observer::observer_depth;
 pub use ports::{ShmInput, ShmOutput, TypedInput, TypedOutput};
 pub use raw::{ENVELOPE_TYPE_NAME, RawInput, RawOutput};
-pub use sequence::{InputCounters, OutputSettings, Stamp, SequenceTracker, Sequencer};
+pub use sequence::{InputCounters, OutputSettings, Stamp};
+pub use sequence::{SequenceTracker, Sequencer};
 pub use type_info::TypeInfo;
 pub use wake::{WAITER_CHANNELS_MAX, Waiter, Wake};

@@ -1,13 +1,14 @@
 //! What the tables say about each other: hosts and processes. Channels and links follow in
 //! `check_channels`. Nothing is read here; the result is the checked topology.
 
-use super::{check_channels, limits};
+use super::check_channels;
 use super::check_face::{check_face, check_faces, is_dispensable};
 use super::clock_path::{self, ClockEntry};
 use super::errors::{Fault, Faults, Place};
 use super::face::EgmFace;
 use super::file::{CaseEntry, File, HostEntry, ProcessEntry};
 use super::known::{KnownCase, KnownCases, ParameterFault};
+use super::limits;
 use super::model::{Case, Host, OnExit, Process, Program, Topology};
 use super::reader::At;
 use super::tree::{Node, Table, Value, join, to_plain_table};

@@ -2,7 +2,8 @@
 //! the shells. They are made from the same definitions that `--help` is, so they cannot differ from
 //! it. The schema of topology files and the description of the robot are laid beside them.
 
-use std::{fs, io};
+use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
 
 use clap::Command;

@@ -49,7 +49,8 @@ use std::path::Path;
 
 pub use card::{CardChannel, ProcessCard};
 pub use check_face::{command_channel, feedback_channel};
-pub use clock_path::{describe_end, ClockEnd, ClockPath};
+pub use clock_path::describe_end;
+pub use clock_path::{ClockEnd, ClockPath};
 pub use errors::{Fault, Location, TopologyError, TopologyErrors};
 pub use face::{EgmFace, FaceKind, FaceSend};
 pub use host::{HOST_VARIABLE, HostChoice, HostError, MachineIdentity, which_host};

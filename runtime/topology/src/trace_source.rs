@@ -2,7 +2,8 @@
 //! files; what a message meets then is `hil_link::trace`.
 
 use std::collections::BTreeMap;
-use std::{fs, io};
+use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -10,7 +11,9 @@ use std::time::Duration;
 use hil_core::link_model::TraceMatch;
 use hil_link::trace::{ReplayError, TraceEnd, TraceLink, TraceReplay};
 use hil_trace::fault::TraceFault;
-use hil_trace::wire::{Decoded, self};
+use hil_trace::wire;
+use hil_trace::wire::Decoded;
+use hil_trace::{Trace, csv};
 use serde::{Deserialize, Serialize};
 
 use crate::Topology;

@@ -4,7 +4,8 @@ use hil_core::record::{IngressRecord, UNAVAILABLE};
 
 use super::passive::{PassiveCounters, PassiveReader};
 use super::seen::Seen;
-use hil_shm::{ChannelError, observer_depth};
+use hil_shm::ChannelError;
+use hil_shm::observer_depth;
 
 /// A channel that is read from shared memory.
 #[derive(Debug)]

@@ -3,7 +3,9 @@
 use hil_capture::flow::FlowFilter;
 use hil_capture::observe::Observer;
 use hil_capture::reader::{CaptureReader, Step};
-use hil_capture::writer::{PacketToWrite, self};
+use hil_capture::writer;
+use hil_capture::writer::PacketToWrite;
+use hil_capture::{CaptureFault, CaptureInterface, CapturedPacket, esl, link};
 use hil_net::{Direction, link_type};
 
 use crate::Verdict;

@@ -1,7 +1,8 @@
 //! One page of a browser: where it goes, what a user does to it, what it shows, says and asks for.
 
-use std::{fs, thread};
+use std::fs;
 use std::path::Path;
+use std::thread;
 use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};

@@ -1,8 +1,9 @@
 //! `kill -9` during a split run: of each gateway and component in turn, of the robot when its end
 //! is to end the run, and of a whole supervisor.
 
-use std::{fs, thread};
+use std::fs;
 use std::process::Command;
+use std::thread;
 use std::time::Duration;
 
 use hil_account::{InterruptionFigures, MessageFate};

@@ -3,8 +3,10 @@
 //! `HIL_SOAK_MINUTES=60 cargo test --package hil-tests --test hosts soak:: -- --ignored --nocapture`
 
 use std::collections::BTreeMap;
-use std::{env, fs, thread};
+use std::env;
+use std::fs;
 use std::path::Path;
+use std::thread;
 use std::time::{Duration, Instant};
 
 use hil_account::MessageFate;

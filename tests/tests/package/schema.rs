@@ -2,7 +2,8 @@
 //! Python with `tests/mcap_reader/requirements.txt`. Every shipped topology fits; what the reader refuses as
 //! unknown, mistyped or out of range does not.
 
-use std::{env, fs};
+use std::env;
+use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 

@@ -4,9 +4,10 @@
 //! `tests/egm_clients/requirements.txt`), `HIL_EGM_CLIENT_SECONDS` how long each drives (20;
 //! the acceptance asks for 60).
 
-use std::{env, thread};
+use std::env;
 use std::net::{Ipv4Addr, UdpSocket};
 use std::process::Command;
+use std::thread;
 use std::time::Duration;
 
 use hil_account::MessageFate;

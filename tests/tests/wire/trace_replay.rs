@@ -2,7 +2,8 @@
 //! virtual time over those traces loses the same messages and comes to the same score. And what
 //! `hil-runtime trace` says of traces that are whole, damaged or none.
 
-use std::{env, fs};
+use std::env;
+use std::fs;
 use std::path::Path;
 use std::process::{Command, Output};
 use std::time::Duration;

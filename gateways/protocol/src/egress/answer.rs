@@ -6,7 +6,8 @@ use super::{EgressBridge, EgressEvent, HELLO_PERIOD_REFUSED, PeerState};
 use crate::body::{HelloAck, HelloStatus, SyncResponse};
 use crate::refusal::Refusal;
 use crate::stamps::ArrivalStamps;
-use crate::wire::{Body, Header, Kind, Prefix, self};
+use crate::wire;
+use crate::wire::{Body, Header, Kind, Prefix};
 
 impl EgressBridge {
     pub(super) fn accept(

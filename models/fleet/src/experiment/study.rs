@@ -5,7 +5,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::experiment::cells::{Cell, SCENARIOS, mechanism_cells, published_cells, scenario_name};
 use crate::experiment::driver::Experiment;
-use crate::experiment::report::{Results, self};
+use crate::experiment::report;
+use crate::experiment::report::Results;
 use crate::experiment::setup::Setup;
 use crate::experiment::tally::FleetTally;
 use crate::parameters::FleetParameters;

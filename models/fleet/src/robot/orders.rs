@@ -5,8 +5,9 @@ use std::sync::Arc;
 
 use crate::messages::{Authority, Header, MessageOrder, Mission, Phase, Truth, TruthKind};
 use crate::path::{Path, PathId};
-use crate::robot::{Robot, authority};
-use crate::robot::authority::{Grant, Proposal, Verdict, is_newer, reach_of, self};
+use crate::robot::Robot;
+use crate::robot::authority;
+use crate::robot::authority::{Grant, Proposal, Verdict, is_newer, reach_of};
 use hil_core::time::Instant;
 
 impl Robot {

@@ -9,12 +9,17 @@ use hil_core::study::Batch;
 use hil_platform::console::Console;
 use hil_platform::progress::Progress;
 use hil_platform::signals::Signals;
-use hil_report::{replay, simulate, study, terminal};
-use hil_report::study::{BatchArgs, StudyEnd, StudyError, Wanted, self};
-use hil_report::terminal::{Style, self};
+use hil_report::replay;
+use hil_report::simulate;
+use hil_report::study;
+use hil_report::study::BatchArgs;
+use hil_report::study::{StudyEnd, StudyError, Wanted};
+use hil_report::terminal;
+use hil_report::terminal::Style;
 use hil_rundir::run_folder::RunFolder;
-use hil_topology::{Topology, TopologyErrors, self};
+use hil_topology;
 use hil_topology::registry::Registry;
+use hil_topology::{Topology, TopologyErrors};
 
 use super::{columns, exit, interrupted, load, signals};
 

@@ -5,9 +5,10 @@ use std::io::IsTerminal;
 use std::path::Path;
 
 use super::{exit, hosts_here, interrupted, load, signals};
-use hil_doctor::{DoctorReport, DoctorRequest, Plan, Severity, self};
+use hil_doctor;
 use hil_doctor::cli::DoctorArgs;
 use hil_doctor::latency::{LatencyReport, LatencyRequest, Watch, measure};
+use hil_doctor::{DoctorReport, DoctorRequest, Plan, Severity};
 use hil_platform::console::Console;
 use hil_platform::host_facts::{HostFiles, isolated_or_online};
 use hil_platform::progress::Progress;

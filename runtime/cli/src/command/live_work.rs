@@ -3,9 +3,11 @@
 use super::{columns_or, exit, interrupted, signals};
 use hil_platform::console::Console;
 use hil_topology::registry::Registry;
-use hil_watch::live::channel::{End, self};
+use hil_watch::live::channel;
+use hil_watch::live::channel::End;
 use hil_watch::live::cli::{ChannelArgs, TopArgs};
-use hil_watch::live::top::{TopEnd, TopError, self};
+use hil_watch::live::top;
+use hil_watch::live::top::{TopEnd, TopError};
 
 /// `channel`.
 pub(super) fn channel(args: ChannelArgs, registry: &Registry, console: &mut Console) -> u8 {

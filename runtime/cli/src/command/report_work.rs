@@ -6,11 +6,13 @@ use std::path::{Path, PathBuf};
 use crate::arguments::ReportArgs;
 use hil_platform::console::Console;
 use hil_platform::progress::Progress;
-use hil_report::{analysis, page, terminal};
-use hil_report::page::{Format, read, write, self};
+use hil_report::analysis;
+use hil_report::page;
 use hil_report::page::material::Material;
+use hil_report::page::{Format, read, write};
 use hil_report::summary::{RunSummary, SummaryError};
-use hil_report::terminal::{Style, self};
+use hil_report::terminal;
+use hil_report::terminal::Style;
 use hil_rundir::run_folder::RunFolder;
 use hil_topology::registry::Registry;
 

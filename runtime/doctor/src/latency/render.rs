@@ -3,7 +3,8 @@
 
 use core::fmt::Write as _;
 
-use super::{claims, Gaps, LatencyReport, Standing, Wakeups};
+use super::claims;
+use super::{Gaps, LatencyReport, Standing, Wakeups};
 use crate::render::{Tone, mark, wrapped};
 use hil_platform::host_facts::Fact;
 

@@ -25,8 +25,9 @@ mod spare;
 #[cfg(test)]
 mod tests;
 
-use std::{io, thread};
+use std::io;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread;
 use std::time::Duration;
 
 use hil_transport::udp::UdpError;

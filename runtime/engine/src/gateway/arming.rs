@@ -9,7 +9,8 @@ use hil_net::interface::interface_with_address;
 use hil_net::timestamping::TimestampMode;
 use hil_transport::probe::{Availability, ProbeReport, ProbeSettings, Sentinel, arm_and_probe};
 
-use super::{GatewayError, direction};
+use super::GatewayError;
+use super::direction;
 use super::process::PROBE_BOUND;
 use super::socket::stamps_of;
 use super::stamp_plan::StampPlan;

@@ -1,7 +1,8 @@
 //! Where the condition of an emulated link changes under a thread that carries messages: changes come
 //! to it ready made through a bounded ring, and what they replace goes back to be dropped elsewhere.
 
-use hil_core::link_model::{ReplayTally, Fate, LinkModel, LossCauses, MessageNumber};
+use hil_core::link_model::ReplayTally;
+use hil_core::link_model::{Fate, LinkModel, LossCauses, MessageNumber};
 use hil_core::time::Instant;
 use hil_link::condition::LinkCondition;
 use hil_link::spec::LinkPlace;

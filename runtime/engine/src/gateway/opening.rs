@@ -2,7 +2,8 @@
 //! once what is wrong with its path; one that comes back while the run goes on waits for a path that is away,
 //! as one that never left would. It moves no datagram.
 
-use std::{io, thread};
+use std::io;
+use std::thread;
 use std::time::Duration;
 
 use hil_core::time::Instant;

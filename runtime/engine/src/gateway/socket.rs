@@ -5,10 +5,12 @@ use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
-use hil_core::link_model::{ReplayTally, Fate, LinkModel, LossCauses, MessageNumber};
+use hil_core::link_model::ReplayTally;
+use hil_core::link_model::{Fate, LinkModel, LossCauses, MessageNumber};
 use hil_core::time::{Instant, RemoteInstant};
 use hil_net::timestamping::TimestampMode;
-use hil_protocol::wire::{Kind, self};
+use hil_protocol::wire;
+use hil_protocol::wire::Kind;
 use hil_transport::emulated::{EmulatedReceiver, EmulatedSettings};
 use hil_transport::sealed::{SealedReceiver, SealedSender};
 use hil_transport::tcp::{

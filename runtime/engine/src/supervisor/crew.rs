@@ -2,7 +2,8 @@
 //! by policy, stopped in order. Each single one is a [`Child`].
 
 use std::collections::BTreeMap;
-use std::{env, io};
+use std::env;
+use std::io;
 use std::os::unix::process::ExitStatusExt;
 use std::path::PathBuf;
 use std::process::{Command, ExitStatus};
@@ -16,7 +17,8 @@ use super::launching::write_launch;
 use super::plan::{ProcessPlan, ProcessTask};
 use crate::process::own_program;
 use hil_platform::clock::MonotonicClock;
-use hil_rundir::event::{EventKind, Event, Interruption};
+use hil_rundir::event::EventKind;
+use hil_rundir::event::{Event, Interruption};
 use hil_rundir::launch::{LaunchError, write};
 use hil_rundir::pipe::{ChannelProgress, FromProcess, ProcessReport, ToProcess};
 use hil_rundir::run_folder::RunFolder;

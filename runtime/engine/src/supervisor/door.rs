@@ -12,8 +12,9 @@ use std::time::{Duration, Instant};
 
 use super::frame::{Frame, PeerHello, PeerMessage, read_frame_within, write_message};
 use super::peer::{ControlEnds, ControlReader, ControlWriter};
-use crate::security::{PreSharedKey, greeting};
-use crate::security::greeting::{GreetingError, MAGIC, TimedStream, Why, self};
+use crate::security::PreSharedKey;
+use crate::security::greeting;
+use crate::security::greeting::{GreetingError, MAGIC, TimedStream, Why};
 
 /// How long a greeting may take altogether.
 pub(super) const GREETING_TIMEOUT: Duration = Duration::from_secs(3);

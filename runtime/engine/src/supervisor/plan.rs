@@ -22,7 +22,11 @@ use hil_rundir::face_launch::{ArmLaunch, FaceSettings};
 use hil_rundir::launch::{DirectionLaunch, Side, SocketLaunch, Transport};
 use hil_rundir::live_run::Source;
 use hil_topology::emulation::EmulationLaunch;
-use hil_topology::{gateway_name, CardChannel, Channel, Crossing, EgmFace, Execution, FaceKind, Host, OnExit, Process, ProcessCard, Program, Scheduling, Topology, Via, Wait, command_channel, feedback_channel};
+use hil_topology::gateway_name;
+use hil_topology::{
+    CardChannel, Channel, Crossing, EgmFace, Execution, FaceKind, Host, OnExit, Process,
+    ProcessCard, Program, Scheduling, Topology, Via, Wait, command_channel, feedback_channel,
+};
 
 /// Everything one supervisor is responsible for.
 #[derive(Debug)]

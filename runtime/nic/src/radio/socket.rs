@@ -10,7 +10,8 @@ use nix::sys::socket::{MsgFlags, SockProtocol, recv};
 
 use super::conversation::{Conversation, netlink_socket};
 use super::netlink::{Answer, Answers, Attributes};
-use super::nl80211::{Happening, Station, Wireless, attribute, self};
+use super::nl80211;
+use super::nl80211::{Happening, Station, Wireless, attribute};
 use hil_rundir::radio_record::command;
 
 /// The longest event of the kernel: it fills pages of 32 KiB at most.

@@ -1,15 +1,19 @@
 //! Where recorded messages go: the channels of a run that goes on this host. A channel is only fed
 //! when nobody else writes it: two writers at once would be two truths.
 
-use std::{env, fs, io, thread};
+use std::env;
+use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
+use std::thread;
 use std::time::{Duration, Instant as WallInstant};
 
 use hil_core::message::Envelope;
 use hil_platform::clock::MonotonicClock;
 use hil_rundir::live_run::LiveRun;
 use hil_rundir::manifest::{ChannelDescription, Manifest};
-use hil_rundir::select::{SelectError, select};
+use hil_rundir::select::SelectError;
+use hil_rundir::select::select;
 use hil_rundir::status::has_begun;
 use hil_shm::{Census, ChannelError, Domain, DomainError, RawOutput};
 use serde_json::Value;

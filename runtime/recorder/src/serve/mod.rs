@@ -16,10 +16,11 @@ mod viewers;
 
 pub(crate) use access::{host, origin};
 
-use std::{fs, thread};
+use std::fs;
 use std::net::{IpAddr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::thread;
 use std::time::{Duration, Instant};
 
 use hil_platform::console::Console;
@@ -27,7 +28,8 @@ use hil_platform::progress::Progress;
 use hil_platform::signals::{EXIT_INTERRUPTED, Signals};
 use hil_rundir::live_run::LiveRun;
 use hil_rundir::run_folder::RunFolder;
-use hil_rundir::select::{SelectError, select};
+use hil_rundir::select::SelectError;
+use hil_rundir::select::select;
 use hil_watch::FeedError;
 use tokio::runtime::Runtime;
 

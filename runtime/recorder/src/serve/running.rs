@@ -7,8 +7,10 @@ use std::time::Duration;
 
 use hil_platform::clock::MonotonicClock;
 use hil_report::summary::RunSummary;
-use hil_rundir::live_run::{LiveRun, self};
-use hil_rundir::status::{Overruns, self};
+use hil_rundir::live_run;
+use hil_rundir::live_run::LiveRun;
+use hil_rundir::status;
+use hil_rundir::status::Overruns;
 use hil_watch::{Event, Feed, FeedError, Origin, Poll};
 
 use super::engine::REST;

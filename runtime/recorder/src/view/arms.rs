@@ -3,7 +3,9 @@
 
 use hil_arm::egm::messages::{EgmCommand, EgmFeedback, Side};
 use hil_arm::yumi::arm::Arm;
-use hil_arm::yumi::description::{Rod, self};
+use hil_arm::yumi::description;
+use hil_arm::yumi::description::Rod;
+use hil_arm::yumi::{Joints, Pose};
 use hil_core::message::Message;
 use serde_json::{Value, json};
 

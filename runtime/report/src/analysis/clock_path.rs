@@ -8,7 +8,8 @@ use super::clocks;
 use super::records::RunRecords;
 use crate::clock_summary::{ClockPathEnd, ClockPathSummary, ClockRung, HostPairClock};
 use hil_rundir::run_result::RunResult;
-use hil_topology::{clock_process_name, ClockPath, Host, Topology};
+use hil_topology::clock_process_name;
+use hil_topology::{ClockPath, Host, Topology};
 
 /// A clock path that was silent for longer in a run is warned of: gateways on the data path exchange
 /// clocks ten times a second, so by then it is the worse source.

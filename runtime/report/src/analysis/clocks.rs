@@ -10,7 +10,8 @@ use hil_core::time::{Alignment, Instant, RemoteInstant};
 use super::clock_path;
 use super::records::RunRecords;
 use crate::clock_summary::{ClockRung, ClockSection, DisciplinedOffset, HostPairClock};
-use hil_platform::clock_discipline::{HostDiscipline, self};
+use hil_platform::clock_discipline;
+use hil_platform::clock_discipline::HostDiscipline;
 use hil_rundir::run_result::RunResult;
 use hil_topology::Topology;
 

@@ -16,7 +16,8 @@ use crate::summary::{
 use hil_platform::realtime::GrantOutcome;
 use hil_rundir::event::{Event, ProcessStory};
 
-use hil_rundir::run_result::{RunResult, self};
+use hil_rundir::run_result;
+use hil_rundir::run_result::RunResult;
 use hil_topology::{Channel, Topology};
 
 pub(super) fn run_facts(

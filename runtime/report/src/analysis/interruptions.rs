@@ -10,7 +10,8 @@ use hil_core::time::{Instant, duration_ns};
 use super::channel_files::{ChannelFiles, all};
 use super::records::RunRecords;
 use hil_rundir::run_result::RunResult;
-use hil_topology::{gateway_name, Channel, Topology};
+use hil_topology::gateway_name;
+use hil_topology::{Channel, Topology};
 
 /// Longest time after a receiving gateway is back in which a loss is still put down to its start. Its
 /// sender learns of that by an answer of its kernel (ICMP), or where none comes by clock exchanges that

@@ -21,12 +21,14 @@ use hil_shuttle::{Shuttle, ShuttleCommand, ShuttleStatus};
 
 use super::{analyse, conclude};
 use hil_platform::host_facts::HostFacts;
-use hil_rundir::manifest::{ManifestContent, self};
+use hil_rundir::manifest;
+use hil_rundir::manifest::ManifestContent;
 use hil_rundir::record::RecordKind;
 use hil_rundir::record::file::RecordHeader;
 use hil_rundir::run_folder::RunFolder;
 use hil_rundir::run_result::{Outcome, RunResult};
-use hil_topology::{Topology, self};
+use hil_topology;
+use hil_topology::Topology;
 use hil_topology::registry::Registry;
 
 /// Says to a process of this test which run to conclude.

@@ -22,7 +22,8 @@ mod robot_series;
 mod score_clock;
 mod stalls;
 
-use std::{fs, io};
+use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
 
 use hil_account::MessageFate;
@@ -35,9 +36,10 @@ use figures::{channel_summary, process_summary, realtime_facts, run_event, run_f
 use outages::OutageStory;
 use records::RunRecords;
 
-use crate::{event_log, terminal};
+use crate::event_log;
 use crate::summary::{Fact, RunSummary, ScoreMetric, SummaryError};
-use crate::terminal::{Style, self};
+use crate::terminal;
+use crate::terminal::Style;
 use crate::trace::capture;
 use hil_rundir::manifest::{Manifest, ManifestTopologyError};
 use hil_rundir::run_folder::RunFolder;

@@ -14,7 +14,8 @@ use hil_core::case_study::ErrorSeries;
 use hil_core::plot::PlotSeries;
 use hil_core::random::RandomStream;
 use hil_core::record::IngressRecord;
-use hil_stats::correlation::{LagWindow, self};
+use hil_stats::correlation;
+use hil_stats::correlation::LagWindow;
 
 use super::axis::RunAxis;
 use super::events::start_on;

@@ -18,10 +18,11 @@ use hil_core::record::{EgressRecord, IngressRecord, RoundTripRecord};
 use hil_core::run_log::RunLog;
 use hil_link::condition::LinkConditionRecord;
 
-use super::{AnalysisError, interruptions, link_changes, stalls};
+use super::AnalysisError;
 use super::channel_files::{ChannelFiles, Signs, all, widen};
 use super::clocks::HostClocks;
 use super::message_records::missing_count;
+use super::{interruptions, link_changes, stalls};
 use crate::summary::RecordedFigures;
 use hil_rundir::face_record::{FaceReceivedRecord, FaceSentRecord};
 use hil_rundir::radio_record::RadioRecord;

@@ -9,7 +9,8 @@ use hil_core::time::{Instant, duration_ns};
 use super::channel_files::all;
 use super::records::RunRecords;
 use hil_rundir::run_result::RunResult;
-use hil_topology::{gateway_name, Channel, Topology};
+use hil_topology::gateway_name;
+use hil_topology::{Channel, Topology};
 
 /// Those on the way of `channel` that had something to take and left no record from before it came
 /// until the end of the run.

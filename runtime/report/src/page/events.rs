@@ -9,7 +9,8 @@ use super::drawings;
 use super::words::UNAVAILABLE;
 use crate::network::{Correlation, NetworkReport, TimedEvent};
 use crate::score_event::{ExplainedEvent, ScoreEvents};
-use crate::terminal::{percent, seconds, self};
+use crate::terminal;
+use crate::terminal::{percent, seconds};
 use hil_platform::text::grouped;
 
 /// Events of the score that a page lists.

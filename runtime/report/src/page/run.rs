@@ -3,16 +3,19 @@
 
 use super::channel::{self, Sources};
 use super::data::{Channel, FactGroup, Figure, Run, RunKind, Table, Verdict};
-use super::{drawings, paper, timeline};
+use super::drawings;
 use super::events::{correlation, network_events, score_events};
 use super::material::{Found, Material};
+use super::paper;
+use super::timeline;
 use super::unfinished::unfinished;
 use super::words::{UNAVAILABLE, count};
 use crate::assessment::Assessment;
 use crate::clock_summary::ClockSection;
 use crate::score_event::ScoreEvents;
 use crate::summary::{ChannelSummary, Fact, LinkKind, RunSummary, ScoreMetric, host_words};
-use crate::terminal::{duration, seconds, self};
+use crate::terminal;
+use crate::terminal::{duration, seconds};
 use hil_platform::text::grouped;
 use hil_platform::words::counted;
 

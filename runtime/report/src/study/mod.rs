@@ -5,9 +5,10 @@
 mod pool;
 mod render;
 
-use std::{fs, thread};
+use std::fs;
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
+use std::thread;
 use std::time::Duration;
 
 use hil_core::study::{Batch, StudyReport};

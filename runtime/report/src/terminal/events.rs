@@ -7,7 +7,8 @@ use hil_core::case_study::Severity;
 use super::canvas::{Canvas, INDENT, Tone};
 use super::units::{duration_s, seconds};
 use crate::score_event::{ExplainedEvent, ExplainedMessage, ScoreEvents};
-use hil_platform::text::{grouped, shortened};
+use hil_platform::text::grouped;
+use hil_platform::text::shortened;
 use hil_platform::words::counted;
 
 /// Events on the page, and messages of each; all of them are in the summary.

@@ -1,7 +1,8 @@
 //! The bytes of a message as named values, by its layout. Numbers stay what they are: nothing is
 //! scaled or rounded.
 
-use core::fmt::{Write as _, self};
+use core::fmt;
+use core::fmt::Write as _;
 
 use serde::ser::{SerializeMap, SerializeSeq};
 use serde::{Serialize, Serializer};

@@ -1,9 +1,11 @@
 //! Processes killed at random moments, start-up included: the channel must stay usable, and the
 //! run must leave nothing. The children are this test binary itself.
 
-use std::{env, fs, thread};
+use std::env;
+use std::fs;
 use std::path::Path;
 use std::process::{self, Child, Command, Stdio};
+use std::thread;
 use std::time::{Duration, Instant};
 
 use hil_core::endpoint::{InputPort, OutputPort};

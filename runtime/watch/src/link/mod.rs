@@ -6,8 +6,10 @@ pub mod cli;
 pub mod work;
 
 use std::collections::BTreeMap;
-use std::{fs, io, thread};
+use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
+use std::thread;
 use std::time::Duration;
 
 use hil_core::case_study::ParameterError;
@@ -21,7 +23,8 @@ use serde_json::Value;
 
 use hil_platform::clock::MonotonicClock;
 use hil_platform::domain_address::{DomainAddress, DomainAddressError};
-use hil_rundir::launch::{GatewayLaunch, self};
+use hil_rundir::launch;
+use hil_rundir::launch::GatewayLaunch;
 use hil_rundir::link_orders::{in_force, orders_on_record};
 use hil_rundir::manifest::Manifest;
 use hil_rundir::record::RecordFileError;

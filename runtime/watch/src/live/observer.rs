@@ -22,9 +22,11 @@ use hil_platform::signals::Signals;
 use hil_rundir::live_run::{LiveRun, Source};
 use hil_rundir::manifest::{ChannelDescription, Manifest};
 use hil_rundir::record::RecordKind;
-use hil_rundir::select::{SelectError, self};
+use hil_rundir::select;
+use hil_rundir::select::SelectError;
 use hil_shm::{Domain, DomainError};
-use hil_topology::{Topology, self};
+use hil_topology;
+use hil_topology::Topology;
 use hil_topology::registry::Registry;
 
 /// How often records and shared memory are read: short against what queues hold.

@@ -5,7 +5,8 @@
 //! cargo run --package hil-decoders --bin make_corpus
 //! ```
 
-use std::{fs, io};
+use std::fs;
+use std::io;
 
 use hil_decoders::TARGETS;
 

@@ -7,7 +7,9 @@ use hil_arm::egm::face::{
 };
 use hil_arm::egm::messages::{EgmCommand, Side};
 use hil_arm::yumi::arm::RIGHT_START_RAD;
-use hil_capture::writer::{PacketToWrite, self};
+use hil_capture::writer;
+use hil_capture::writer::PacketToWrite;
+use hil_capture::{CaptureInterface, esl};
 use hil_core::message::Envelope;
 use hil_core::time::Instant;
 use hil_net::{Direction, link_type};

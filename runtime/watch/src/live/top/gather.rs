@@ -21,7 +21,8 @@ use crate::live::observer::Observer;
 use crate::live::pace::Pace;
 use crate::live::process;
 use hil_platform::clock::MonotonicClock;
-use hil_rundir::status::{Phase, ProcessStatus, RunStatus, self};
+use hil_rundir::status;
+use hil_rundir::status::{Phase, ProcessStatus, RunStatus};
 use hil_topology::{Channel, Direction, Link, Topology};
 
 /// The supervisor tells of its processes twice a second; what is older than this is said to be old.
