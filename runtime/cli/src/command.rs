@@ -249,13 +249,18 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u
                 exit::RAN if is_incomplete => exit::FAILED,
                 code => code,
             };
-            let origin = (path.as_path(), options.command_line.as_slice());
             let concluded = Progress::begin().during(console, "drawing up the account", |_| {
                 let written = result.write().map_err(AnalysisError::from);
                 let analysed = written.and_then(|()| analysis::analyse(&result.folder, registry));
                 // What the folder cannot give back, because its disk is full, is still in memory.
                 analysed.or_else(|error| {
-                    let concluded = analysis::conclude(&topology, &result, registry, origin)?;
+                    let concluded = analysis::conclude(
+                        &topology,
+                        &result,
+                        registry,
+                        &path,
+                        &options.command_line,
+                    )?;
                     Ok::<_, AnalysisError>(Concluded {
                         unwritten: concluded.unwritten.or(Some(error)),
                         ..concluded

@@ -48,7 +48,7 @@ pub enum ChangedTo {
 
 impl LinkChange {
     /// From what the gateway wrote; `at_s` is its instant on the axis of the run.
-    pub fn of((link, way): (&str, Way), record: &LinkConditionRecord, at_s: Option<f64>) -> Self {
+    pub fn of(link: &str, way: Way, record: &LinkConditionRecord, at_s: Option<f64>) -> Self {
         let to = match record.condition() {
             Some(LinkCondition::Topology) => ChangedTo::Topology,
             Some(LinkCondition::Fixed { delay, loss_ratio }) if loss_ratio.is_finite() => {
@@ -145,7 +145,7 @@ mod tests {
         };
         let of = |condition, outcome| {
             let record = record(condition, outcome);
-            LinkChange::of(("hop", Way::Backward), &record, Some(12.3))
+            LinkChange::of("hop", Way::Backward, &record, Some(12.3))
         };
         let change = of(fixed, OrderOutcome::InForce);
         let plain = |text: String| text.replace(JOINT, " ");

@@ -115,7 +115,7 @@ pub(super) fn network(names: [&str; 2], events: &mut ScoreEvents) -> NetworkRepo
     let axis = AxisClocks {
         bound_s: (!events.clocks_differ).then_some(0.0),
     };
-    let (report, series) = builder.finish(events, vec![error()], (42, axis)).unwrap();
+    let (report, series) = builder.finish(events, vec![error()], 42, axis).unwrap();
     assert_eq!(series.len(), 2);
     report
 }

@@ -95,15 +95,10 @@ impl<'a> RunAxis<'a> {
         if self.is_split() {
             return None;
         }
-        let mut largest_ns: Vec<u64> = self.bounds_ns.borrow().values().copied().collect();
-        largest_ns.sort_unstable_by(|a, b| b.cmp(a));
-        Some(
-            largest_ns
-                .iter()
-                .take(2)
-                .copied()
-                .fold(0, u64::saturating_add),
-        )
+        let mut bounds_ns: Vec<u64> = self.bounds_ns.borrow().values().copied().collect();
+        bounds_ns.sort_unstable();
+        let largest_ns = bounds_ns.iter().rev().take(2).copied();
+        Some(largest_ns.fold(0, u64::saturating_add))
     }
 
     fn note(&self, reader: &str, bound_ns: u64) {
@@ -124,21 +119,31 @@ mod tests {
 
     const SECOND: i64 = 1_000_000_000;
 
-    /// What a clock shows `true_ns` after the run began, that runs `ppm` fast from `origin_ns` on.
-    fn shown(true_ns: i64, (origin_ns, ppm): (i64, i64)) -> i64 {
-        origin_ns + true_ns + true_ns / 1_000_000 * ppm
+    /// A host whose clock shows `origin_ns` as the run begins and runs `ppm` fast from then on.
+    #[derive(Clone, Copy)]
+    struct Host {
+        name: &'static str,
+        origin_ns: i64,
+        ppm: i64,
+    }
+
+    impl Host {
+        /// What its clock shows `true_ns` after the run began.
+        fn shown(self, true_ns: i64) -> i64 {
+            self.origin_ns + true_ns + true_ns / 1_000_000 * self.ppm
+        }
     }
 
     /// Exchanges every 100 ms for ten minutes, that `local` asks for; 100 us either way.
-    fn map(local: (i64, i64), remote: (i64, i64)) -> ClockMap {
+    fn map(local: Host, remote: Host) -> ClockMap {
         let exchange = |index: i64| {
             let sent_ns = index * SECOND / 10;
             let record = RoundTripRecord {
                 sequence: 1,
-                t1_ns: shown(sent_ns, local),
-                t2_ns: shown(sent_ns + 100_000, remote),
-                t3_ns: shown(sent_ns + 105_000, remote),
-                t4_ns: shown(sent_ns + 205_000, local),
+                t1_ns: local.shown(sent_ns),
+                t2_ns: remote.shown(sent_ns + 100_000),
+                t3_ns: remote.shown(sent_ns + 105_000),
+                t4_ns: local.shown(sent_ns + 205_000),
                 session: 1,
                 sources: [0; 4],
             };
@@ -148,17 +153,26 @@ mod tests {
         ClockMap::new(&exchanges, ClockSettings::default())
     }
 
-    const CLOCKS: [(&str, (i64, i64)); 3] = [
-        ("a", (0, 50)),
-        ("b", (1_000 * SECOND, -50)),
-        ("c", (77 * SECOND, 20)),
+    const fn host(name: &'static str, origin_ns: i64, ppm: i64) -> Host {
+        Host {
+            name,
+            origin_ns,
+            ppm,
+        }
+    }
+
+    const HOSTS: [Host; 3] = [
+        host("a", 0, 50),
+        host("b", 1_000 * SECOND, -50),
+        host("c", 77 * SECOND, 20),
     ];
 
     /// All hosts related to each other but for `without`.
     fn clocks(without: &[(&str, &str)]) -> HostClocks {
         let mut maps = Vec::new();
-        for (from, remote) in CLOCKS {
-            for (to, local) in CLOCKS {
+        for remote in HOSTS {
+            for local in HOSTS {
+                let (from, to) = (remote.name, local.name);
                 if from != to && !without.contains(&(from, to)) && !without.contains(&(to, from)) {
                     maps.push(((from.to_owned(), to.to_owned()), map(local, remote)));
                 }
@@ -168,11 +182,11 @@ mod tests {
     }
 
     fn spans() -> Spans {
-        let span = |(host, clock): (&str, (i64, i64))| {
-            let at = |true_ns| Instant::from_ns(shown(true_ns, clock));
-            (host.to_owned(), (at(0), at(600 * SECOND)))
+        let span = |host: Host| {
+            let at = |true_ns| Instant::from_ns(host.shown(true_ns));
+            (host.name.to_owned(), (at(0), at(600 * SECOND)))
         };
-        CLOCKS.into_iter().map(span).collect()
+        HOSTS.into_iter().map(span).collect()
     }
 
     #[test]
@@ -181,8 +195,7 @@ mod tests {
         let axis = RunAxis::of(&clocks, &spans, Some("b"));
         for true_s in [0, 1, 60, 300, 599] {
             let true_ns = true_s * SECOND;
-            let times =
-                CLOCKS.map(|(host, clock)| axis.place_ns(host, shown(true_ns, clock)).unwrap());
+            let times = HOSTS.map(|host| axis.place_ns(host.name, host.shown(true_ns)).unwrap());
             let bound_ns = axis.bound_ns().unwrap();
             for at_ns in times {
                 // Ten minutes at 100 ppm are 60 ms; a round trip is 0.2 ms.
@@ -193,7 +206,7 @@ mod tests {
         }
         // What only the starts of the hosts' clocks say is out of that bound.
         let since_own_start_ns =
-            CLOCKS.map(|(host, clock)| shown(599 * SECOND, clock) - spans[host].0.as_ns());
+            HOSTS.map(|host| host.shown(599 * SECOND) - spans[host.name].0.as_ns());
         let apart_ns = since_own_start_ns[0].abs_diff(since_own_start_ns[1]);
         assert!(apart_ns > 10 * axis.bound_ns().unwrap(), "{apart_ns}");
     }
@@ -202,12 +215,12 @@ mod tests {
     fn the_bound_is_that_of_both_conversions_and_of_the_score() {
         let (clocks, spans) = (clocks(&[]), spans());
         let axis = RunAxis::of(&clocks, &spans, Some("b"));
-        let error_ns = |(host, clock): (&str, (i64, i64))| {
-            let ns = shown(300 * SECOND, clock);
-            assert!(axis.place_ns(host, ns).is_some());
-            axis.at(host, ns).unwrap().1
+        let error_ns = |host: Host| {
+            let ns = host.shown(300 * SECOND);
+            assert!(axis.place_ns(host.name, ns).is_some());
+            axis.at(host.name, ns).unwrap().1
         };
-        let [a_ns, b_ns, c_ns] = CLOCKS.map(error_ns);
+        let [a_ns, b_ns, c_ns] = HOSTS.map(error_ns);
         assert_eq!(b_ns, 0, "it is the clock that counts");
         assert_eq!(axis.bound_ns(), Some(a_ns + c_ns));
         axis.note_score(SECOND as u64);
@@ -219,7 +232,7 @@ mod tests {
     fn partly_aligned_hosts_count_from_their_own_starts_and_have_no_bound() {
         let (clocks, spans) = (clocks(&[("a", "c")]), spans());
         let axis = RunAxis::of(&clocks, &spans, Some("b"));
-        let at_ns = axis.place_ns("a", shown(60 * SECOND, CLOCKS[0].1));
+        let at_ns = axis.place_ns("a", HOSTS[0].shown(60 * SECOND));
         assert_eq!(at_ns, Some(60 * SECOND + 3_000_000));
         assert!(axis.is_split());
         assert_eq!(axis.bound_ns(), None);

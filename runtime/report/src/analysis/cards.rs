@@ -8,14 +8,11 @@ use super::records::RunRecords;
 use crate::card_figures::{CardSummary, HardwareStamps, Places, channel_stamps};
 use hil_rundir::card_story::CardStory;
 use hil_rundir::run_result::RunResult;
-use hil_topology::{Crossing, Timestamps, Topology, Via};
+use hil_topology::{Crossing, Timestamps, Via};
 
 /// What the cards of the run say; `None` when hardware stamps were not asked for.
-pub(super) fn hardware_stamps(
-    topology: &Topology,
-    result: &RunResult,
-    records: &RunRecords,
-) -> Option<HardwareStamps> {
+pub(super) fn hardware_stamps(records: &RunRecords<'_>) -> Option<HardwareStamps> {
+    let result = records.result;
     let timelines: BTreeMap<&str, CardTimeline> = result
         .cards
         .iter()
@@ -30,17 +27,20 @@ pub(super) fn hardware_stamps(
             .get(card.host.as_str())
             .and_then(CardTimeline::figures),
     });
-    let passing = topology.crossings().filter(passes_card);
+    let passing = records.topology.crossings().filter(passes_card);
     let channels = passing.map(|crossing| {
-        let (egress, ingress) = records.of_gateways(&crossing.channel.name);
-        records.consult((topology, result), crossing.channel, |_, context| {
+        let name = &crossing.channel.name;
+        let egress = records.of_kind(name, |files| files.egress.as_ref());
+        let ingress = records.of_kind(name, |files| files.ingress.as_ref());
+        let (egress, ingress) = (egress.collect::<Vec<_>>(), ingress.collect::<Vec<_>>());
+        records.consult(crossing.channel, |_, context| {
             let places = Places {
                 sender: timelines.get(crossing.from_host.name.as_str()),
                 receiver: timelines.get(crossing.to_host.name.as_str()),
                 path: context.path,
                 receiving_card: card_of(result, &crossing.to_host.name),
             };
-            channel_stamps(&crossing.channel.name, &egress, &ingress, &places)
+            channel_stamps(name, &egress, &ingress, &places)
         })
     });
     let stamps = HardwareStamps {

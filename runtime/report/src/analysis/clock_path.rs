@@ -8,8 +8,7 @@ use super::clocks;
 use super::records::RunRecords;
 use crate::clock_summary::{ClockPathEnd, ClockPathSummary, ClockRung, HostPairClock};
 use hil_rundir::run_result::RunResult;
-use hil_topology::clock_process_name;
-use hil_topology::{ClockPath, Host, Topology};
+use hil_topology::{ClockPath, Host, clock_process_name};
 
 /// A clock path that was silent for longer in a run is warned of: gateways on the data path exchange
 /// clocks ten times a second, so by then it is the worse source.
@@ -17,12 +16,8 @@ const SILENCE_NS: u64 = 1_000_000_000;
 
 /// The exchanges over the clock path of two hosts, for instants of the first on the clock of the
 /// second.
-pub(super) fn exchanges(
-    topology: &Topology,
-    records: &RunRecords,
-    (from, to): (&str, &str),
-) -> Vec<Exchange> {
-    let Some(path) = topology.clock_path_between(from, to) else {
+pub(super) fn exchanges(records: &RunRecords<'_>, from: &str, to: &str) -> Vec<Exchange> {
+    let Some(path) = records.topology.clock_path_between(from, to) else {
         return Vec::new();
     };
     let requester = if path.from.name == to {
@@ -38,17 +33,14 @@ pub(super) fn exchanges(
 
 /// Says in `pair` what came over its clock path, and takes back its alignment if that and the data
 /// path exclude each other.
-pub(super) fn compare(
-    pair: &mut HostPairClock,
-    (topology, result): (&Topology, &RunResult),
-    records: &RunRecords,
-) {
-    let (from, to) = (pair.from.clone(), pair.to.clone());
-    let Some(path) = topology.clock_path_between(&from, &to) else {
+pub(super) fn compare(pair: &mut HostPairClock, records: &RunRecords<'_>) {
+    let result = records.result;
+    let (from, to) = (pair.from.as_str(), pair.to.as_str());
+    let Some(path) = records.topology.clock_path_between(from, to) else {
         return;
     };
-    let over_path = exchanges(topology, records, (&from, &to));
-    let over_data = clocks::exchanges(topology, records, (&from, &to));
+    let over_path = exchanges(records, from, to);
+    let over_data = clocks::exchanges(records, from, to);
     let [path_map, data_map] =
         [&over_path, &over_data].map(|some| ClockMap::new(some, ClockSettings::default()));
     let figures = |map: &ClockMap| -> Option<ClockFigures> {
@@ -69,7 +61,7 @@ pub(super) fn compare(
         longest_gap_ns: result
             .spans
             .get(&path.from.name)
-            .and_then(|span| longest_gap_ns(asked, *span)),
+            .and_then(|(start, end)| longest_gap_ns(asked, *start, *end)),
     };
     if !summary.has_exchanges() && pair.rung == ClockRung::Exchanges {
         let words = "; the clock path gave none, so these are the data path's alone";
@@ -80,7 +72,7 @@ pub(super) fn compare(
         return;
     }
     let instants = over_path.iter().chain(&over_data).map(Exchange::remote_ns);
-    if let Some(why) = contradiction((&path_map, &data_map), instants) {
+    if let Some(why) = contradiction(&path_map, &data_map, instants) {
         pair.rung = ClockRung::None;
         "clock path and data path contradict each other".clone_into(&mut pair.basis);
         pair.contradiction = Some(why);
@@ -110,7 +102,7 @@ fn state(path: &ClockPath<'_>, result: &RunResult) -> String {
 
 /// The longest time between the run's start, the exchanges begun in it, and its end; `None` without
 /// any.
-fn longest_gap_ns(mut asked_ns: Vec<i64>, (start, end): (Instant, Instant)) -> Option<u64> {
+fn longest_gap_ns(mut asked_ns: Vec<i64>, start: Instant, end: Instant) -> Option<u64> {
     let (start_ns, end_ns) = (start.as_ns(), end.as_ns());
     if asked_ns.is_empty() {
         return None;
@@ -127,7 +119,8 @@ fn longest_gap_ns(mut asked_ns: Vec<i64>, (start, end): (Instant, Instant)) -> O
 /// Where two maps of the same clocks exclude each other by the most, in words: one of the two sets
 /// of exchanges is not what it is taken for.
 fn contradiction(
-    (path, data): (&ClockMap, &ClockMap),
+    path: &ClockMap,
+    data: &ClockMap,
     instants: impl Iterator<Item = i64>,
 ) -> Option<String> {
     let apart = instants.filter_map(|at_ns| {
@@ -186,7 +179,7 @@ mod tests {
 
     /// Exchanges over a second, one each `period_ns`, on a path that takes `there_ns` and `back_ns`;
     /// the clock converted to is ahead by `offset_ns`.
-    fn map(period_ns: i64, (there_ns, back_ns): (i64, i64), offset_ns: i64) -> ClockMap {
+    fn map(period_ns: i64, there_ns: i64, back_ns: i64, offset_ns: i64) -> ClockMap {
         let exchange = |index: i64| {
             let sent_ns = index * period_ns;
             let arrived_ns = sent_ns + there_ns + offset_ns;
@@ -211,37 +204,37 @@ mod tests {
 
     #[test]
     fn a_wide_lopsided_path_and_a_narrow_one_agree_on_the_same_clocks() {
-        let path = map(10_000_000, (8_000, 12_000), 7 * SECOND_NS);
+        let path = map(10_000_000, 8_000, 12_000, 7 * SECOND_NS);
         for ways in [(9_000_000, 1_000), (1_000, 9_000_000), (5_000, 5_000)] {
-            let data = map(100_000_000, ways, 7 * SECOND_NS);
-            assert_eq!(contradiction((&path, &data), instants()), None, "{ways:?}");
+            let data = map(100_000_000, ways.0, ways.1, 7 * SECOND_NS);
+            assert_eq!(contradiction(&path, &data, instants()), None, "{ways:?}");
         }
         let nothing = ClockMap::new(&[], ClockSettings::default());
-        assert_eq!(contradiction((&path, &nothing), instants()), None);
+        assert_eq!(contradiction(&path, &nothing, instants()), None);
     }
 
     #[test]
     fn two_paths_to_different_clocks_exclude_each_other_whichever_is_ahead() {
-        let path = map(10_000_000, (8_000, 12_000), 7 * SECOND_NS);
+        let path = map(10_000_000, 8_000, 12_000, 7 * SECOND_NS);
         for apart_ns in [-400_000, 400_000] {
-            let data = map(100_000_000, (100_000, 100_000), 7 * SECOND_NS + apart_ns);
-            let why = contradiction((&path, &data), instants()).unwrap();
+            let data = map(100_000_000, 100_000, 100_000, 7 * SECOND_NS + apart_ns);
+            let why = contradiction(&path, &data, instants()).unwrap();
             assert!(
                 why.contains("over the clock path prove an offset of"),
                 "{why}"
             );
-            let why = contradiction((&data, &path), instants());
+            let why = contradiction(&data, &path, instants());
             assert!(why.is_some());
         }
         // A difference that the wide path leaves room for proves nothing.
-        let data = map(100_000_000, (300_000, 300_000), 7 * SECOND_NS + 200_000);
-        assert_eq!(contradiction((&path, &data), instants()), None);
+        let data = map(100_000_000, 300_000, 300_000, 7 * SECOND_NS + 200_000);
+        assert_eq!(contradiction(&path, &data, instants()), None);
     }
 
     #[test]
     fn the_longest_silence_counts_from_the_start_to_the_end_of_the_run() {
-        let span = (Instant::from_ns(1_000), Instant::from_ns(2_000));
-        let gap = |asked: &[i64]| longest_gap_ns(asked.to_vec(), span);
+        let [start, end] = [1_000, 2_000].map(Instant::from_ns);
+        let gap = |asked: &[i64]| longest_gap_ns(asked.to_vec(), start, end);
         assert_eq!(gap(&[]), None);
         assert_eq!(gap(&[1_100, 1_400, 1_900]), Some(500));
         assert_eq!(gap(&[1_900, 1_400]), Some(500));

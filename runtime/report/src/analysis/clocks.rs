@@ -10,17 +10,16 @@ use hil_core::time::{Alignment, Instant, RemoteInstant};
 use super::clock_path;
 use super::records::RunRecords;
 use crate::clock_summary::{ClockRung, ClockSection, DisciplinedOffset, HostPairClock};
-use hil_platform::clock_discipline;
-use hil_platform::clock_discipline::HostDiscipline;
-use hil_rundir::run_result::RunResult;
-use hil_topology::Topology;
+use hil_platform::clock_discipline::{self, HostDiscipline};
+use hil_topology::{Channel, Topology};
 
 /// How instants get from any host of the run to any other.
 #[derive(Debug, Default)]
 pub(crate) struct HostClocks {
     has_one_clock: bool,
     relations: BTreeMap<(String, String), Relation>,
-    section: ClockSection,
+    /// For the summary.
+    pub(super) section: ClockSection,
 }
 
 #[derive(Debug)]
@@ -30,8 +29,9 @@ enum Relation {
 }
 
 impl HostClocks {
-    /// Of the hosts of `result`, from what their gateways and supervisors recorded.
-    pub(super) fn of(topology: &Topology, result: &RunResult, records: &RunRecords) -> Self {
+    /// Of the hosts of a run, from what their gateways and supervisors recorded.
+    pub(super) fn of(records: &RunRecords<'_>) -> Self {
+        let (topology, result) = (records.topology, records.result);
         let mut clocks = Self {
             has_one_clock: result.has_one_clock,
             relations: BTreeMap::new(),
@@ -48,7 +48,7 @@ impl HostClocks {
             }
         }
         for (one, other) in pairs {
-            clocks.relate((topology, result), records, (one, other));
+            clocks.relate(records, one, other);
         }
         clocks
     }
@@ -66,11 +66,6 @@ impl HostClocks {
             },
             None => ChannelPath::Gateway { alignment: None },
         }
-    }
-
-    /// For the summary.
-    pub(super) const fn section(&self) -> &ClockSection {
-        &self.section
     }
 
     /// What a reader must know of pairs whose one-way figures are missing or invalid.
@@ -129,19 +124,14 @@ impl HostClocks {
         }
     }
 
-    fn relate(
-        &mut self,
-        (topology, result): (&Topology, &RunResult),
-        records: &RunRecords,
-        (from, to): (String, String),
-    ) {
+    fn relate(&mut self, records: &RunRecords<'_>, from: String, to: String) {
         let map = |from: &str, to: &str| {
-            let mut exchanges = exchanges(topology, records, (from, to));
-            exchanges.extend(clock_path::exchanges(topology, records, (from, to)));
+            let mut exchanges = exchanges(records, from, to);
+            exchanges.extend(clock_path::exchanges(records, from, to));
             ClockMap::new(&exchanges, ClockSettings::default())
         };
         let (there, back) = (map(&from, &to), map(&to, &from));
-        let disciplined = disciplined((topology, result), records, (&from, &to));
+        let disciplined = disciplined(records, &from, &to);
         let mut pair = HostPairClock {
             from: from.clone(),
             to: to.clone(),
@@ -152,8 +142,8 @@ impl HostClocks {
             contradiction: None,
             clock_path: None,
         };
-        choose(&mut pair, (result.has_one_clock, &there), disciplined);
-        clock_path::compare(&mut pair, (topology, result), records);
+        choose(&mut pair, self.has_one_clock, &there, disciplined);
+        clock_path::compare(&mut pair, records);
         let (forwards, backwards) = match (pair.rung, pair.disciplined) {
             (ClockRung::Exchanges, _) => (
                 Relation::Mapped(Box::new(there)),
@@ -180,7 +170,8 @@ impl HostClocks {
 /// Takes the highest rung that holds, and holds it against the exchanges.
 fn choose(
     pair: &mut HostPairClock,
-    (has_one_clock, map): (bool, &ClockMap),
+    has_one_clock: bool,
+    map: &ClockMap,
     disciplined: Result<DisciplinedOffset, String>,
 ) {
     if has_one_clock {
@@ -245,17 +236,17 @@ fn contradiction(claimed: DisciplinedOffset, exchanges: &ClockFigures) -> Option
 /// Both hosts' system clocks follow one reference, so their real-time clocks are equal within both
 /// bounds, and their monotonic clocks differ as much as their own offsets do.
 fn disciplined(
-    (topology, result): (&Topology, &RunResult),
-    records: &RunRecords,
-    (from, to): (&str, &str),
+    records: &RunRecords<'_>,
+    from: &str,
+    to: &str,
 ) -> Result<DisciplinedOffset, String> {
     let of = |host: &str| -> Result<&HostDiscipline, String> {
-        let told = result.disciplines.get(host);
+        let told = records.result.disciplines.get(host);
         told.ok_or_else(|| format!("{host} told nothing of its system clock"))
     };
     let bound_ns = clock_discipline::common_bound_ns((from, of(from)?), (to, of(to)?))?;
     let realtime = |host: &str| {
-        let offset_ns = records.realtime_offset_ns(topology, host);
+        let offset_ns = records.realtime_offset_ns(host);
         offset_ns.ok_or_else(|| format!("{host} recorded no system clock, or stepped it"))
     };
     // monotonic_to = realtime − offset_to, and realtime = monotonic_from + offset_from.
@@ -267,14 +258,10 @@ fn disciplined(
 
 /// The exchanges of all channels between two hosts, for instants of the first on the clock of the
 /// second.
-pub(super) fn exchanges(
-    topology: &Topology,
-    records: &RunRecords,
-    (from, to): (&str, &str),
-) -> Vec<Exchange> {
+pub(super) fn exchanges(records: &RunRecords<'_>, from: &str, to: &str) -> Vec<Exchange> {
     let mut found = Vec::new();
-    for channel in topology.channels() {
-        let Some((sender, receiver)) = hosts_of(topology, channel) else {
+    for channel in records.topology.channels() {
+        let Some((sender, receiver)) = hosts_of(records.topology, channel) else {
             continue;
         };
         // The sending gateway asks.
@@ -292,10 +279,7 @@ pub(super) fn exchanges(
 }
 
 /// Both ends of a channel that a link carries between two hosts.
-pub(super) fn hosts_of(
-    topology: &Topology,
-    channel: &hil_topology::Channel,
-) -> Option<(String, String)> {
+fn hosts_of(topology: &Topology, channel: &Channel) -> Option<(String, String)> {
     topology.crossing(channel)?;
     let from = &topology.process(&channel.from)?.host;
     let to = &topology.process(channel.to.as_deref()?)?.host;
@@ -338,7 +322,7 @@ mod tests {
             contradiction: None,
             clock_path: None,
         };
-        choose(&mut pair, (false, map), Ok(claimed));
+        choose(&mut pair, false, map, Ok(claimed));
         pair
     }
 

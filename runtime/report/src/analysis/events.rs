@@ -3,35 +3,34 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use hil_account::{Happening, MessageFate, MessageStory, Side};
+use hil_account::{Happening, MessageFate, MessageStory, Side, stories};
 use hil_core::case_study::{ChannelSpec, MessageRef, Score, ScoreEvent};
 use hil_core::time::{Instant, RemoteInstant};
 
 use super::axis::RunAxis;
-use super::clocks::HostClocks;
 use super::outages::OutageStory;
 use super::records::RunRecords;
 use crate::network::within;
 use crate::score_event::{EventOutage, ExplainedEvent, ExplainedMessage, ScoreEvents};
 use crate::summary::{ChannelSummary, CounterGroup, LinkKind};
 use crate::terminal::duration_s;
-use hil_rundir::run_result::RunResult;
 use hil_topology::{Channel, Topology};
 
 /// The events of `score` with the fates of their messages and the outages before them.
 pub(super) fn explained(
     score: &Score,
-    run: (&Topology, &RunResult),
-    (records, axis): (&RunRecords, &RunAxis<'_>),
+    records: &RunRecords<'_>,
+    axis: &RunAxis<'_>,
     channels: &[ChannelSummary],
-    (specs, outages): (&[ChannelSpec], &[OutageStory]),
+    specs: &[ChannelSpec],
+    outages: &[OutageStory],
 ) -> ScoreEvents {
     let mut wanted: BTreeMap<&str, BTreeSet<(u32, u64)>> = BTreeMap::new();
     for message in score.events.iter().flat_map(|event| &event.messages) {
         let of_channel = wanted.entry(message.channel).or_default();
         of_channel.insert((message.epoch, message.sequence));
     }
-    let (topology, _) = run;
+    let topology = records.topology;
     let ways = wanted.iter().filter_map(|(name, wanted)| {
         let channel = topology.channel(name)?;
         let way = Way {
@@ -40,7 +39,7 @@ pub(super) fn explained(
             stories: if channel.is_recorded_only() {
                 BTreeMap::new()
             } else {
-                records.stories(run, channel, wanted)
+                records.consult(channel, |files, context| stories(files, context, wanted))
             },
             channel,
             summary: channels.iter().find(|one| one.name == *name)?,
@@ -52,8 +51,8 @@ pub(super) fn explained(
     ScoreEvents {
         events: events
             .map(|event| ExplainedEvent {
-                outages: outages_before(event, (run, records.clocks()), (specs, outages), &ways),
-                ..explain(event, topology, (axis, &ways))
+                outages: outages_before(event, records, specs, outages, &ways),
+                ..explain(event, topology, axis, &ways)
             })
             .collect(),
         dropped_count: score.events_dropped_count,
@@ -61,23 +60,11 @@ pub(super) fn explained(
     }
 }
 
-/// Start of the run on the clock of `host`. Hosts begin milliseconds apart; where their clocks are
-/// aligned, one beginning holds for all, lest an effect come before its cause, and a start that does not
-/// convert is unknown. Where they are not, each host counts from its own, and the report says so.
-pub(super) fn start_on(result: &RunResult, host: &str, clocks: &HostClocks) -> Option<Instant> {
-    let own = result.spans.get(host).map(|span| span.0)?;
-    let starts = result.spans.iter().map(|(host, span)| (host, span.0));
-    if clocks.are_aligned(result.spans.keys()) {
-        clocks.earliest_on(host, starts)
-    } else {
-        Some(own)
-    }
-}
-
 fn explain(
     event: &ScoreEvent,
     topology: &Topology,
-    (axis, ways): (&RunAxis<'_>, &BTreeMap<&str, Way<'_>>),
+    axis: &RunAxis<'_>,
+    ways: &BTreeMap<&str, Way<'_>>,
 ) -> ExplainedEvent {
     let clock_of = topology.channel(event.clock_of);
     let process = clock_of.and_then(|channel| topology.process(&channel.from));
@@ -102,10 +89,12 @@ fn explain(
 /// What the channels that `event` concerns went through when it happened.
 fn outages_before(
     event: &ScoreEvent,
-    ((topology, _), clocks): ((&Topology, &RunResult), &HostClocks),
-    (specs, stories): (&[ChannelSpec], &[OutageStory]),
+    records: &RunRecords<'_>,
+    specs: &[ChannelSpec],
+    stories: &[OutageStory],
     ways: &BTreeMap<&str, Way<'_>>,
 ) -> Vec<EventOutage> {
+    let topology = records.topology;
     let host_of = |process: &str| topology.process(process).map(|one| &one.host);
     let teller = topology.channel(event.clock_of);
     let Some(here) = teller.and_then(|one| host_of(&one.from)) else {
@@ -118,7 +107,7 @@ fn outages_before(
         let is_consumers = channel.to.as_deref().is_some_and(is_here);
         let on_producers_clock = host_of(&channel.from).and_then(|producers| {
             let remote = RemoteInstant::from_ns(event.at.as_ns());
-            let (at, bound_ns) = clocks.path(here, producers).localise(remote)?;
+            let (at, bound_ns) = records.clocks.path(here, producers).localise(remote)?;
             Some((at, Side::Producer, bound_ns))
         });
         let lost_published_ns = ways

@@ -7,24 +7,18 @@ use crate::summary::Fact;
 use hil_arm::egm::messages::Side;
 use hil_rundir::pipe::FaceReport;
 use hil_rundir::run_result::RunResult;
-use hil_topology::{
-    EgmFace, FaceKind, Process, Program, Topology, command_channel, feedback_channel,
-};
+use hil_topology::{EgmFace, FaceKind, Process, Program, command_channel, feedback_channel};
 
 /// Every arm of every face, in the order of the topology.
-pub(super) fn face_summaries(
-    topology: &Topology,
-    result: &RunResult,
-    records: &RunRecords,
-) -> Vec<FaceSummary> {
+pub(super) fn face_summaries(records: &RunRecords<'_>) -> Vec<FaceSummary> {
     let mut summaries = Vec::new();
-    for process in topology.processes() {
+    for process in records.topology.processes() {
         let Program::Egm { face, .. } = &process.program else {
             continue;
         };
         for side in Side::BOTH {
             if face.address(side).is_some() {
-                summaries.push(face_summary((process, face, side), result, records));
+                summaries.push(face_summary(records, process, face, side));
             }
         }
     }
@@ -32,17 +26,20 @@ pub(super) fn face_summaries(
 }
 
 fn face_summary(
-    (process, face, side): (&Process, &EgmFace, Side),
-    result: &RunResult,
-    records: &RunRecords,
+    records: &RunRecords<'_>,
+    process: &Process,
+    face: &EgmFace,
+    side: Side,
 ) -> FaceSummary {
     let (out, back) = match face.kind {
         FaceKind::Robot => (feedback_channel(side), command_channel(side)),
         FaceKind::Sensor => (command_channel(side), feedback_channel(side)),
     };
-    let (sent, received) = records.of_face(out, back);
+    let sent = records.of_kind(out, |files| files.face_sent.as_ref());
+    let received = records.of_kind(back, |files| files.face_received.as_ref());
+    let (sent, received) = (sent.collect::<Vec<_>>(), received.collect::<Vec<_>>());
     let figures = figures(face.kind, &sent, &received);
-    let report = report_of(result, &process.name, side);
+    let report = report_of(records.result, &process.name, side);
     FaceSummary {
         process: process.name.clone(),
         host: process.host.clone(),

@@ -4,7 +4,8 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use hil_core::time::Instant;
+use hil_account::account;
+use hil_core::record::IngressRecord;
 
 use super::axis::RunAxis;
 use super::records::RunRecords;
@@ -15,9 +16,7 @@ use crate::summary::{
 };
 use hil_platform::realtime::GrantOutcome;
 use hil_rundir::event::{Event, ProcessStory};
-
-use hil_rundir::run_result;
-use hil_rundir::run_result::RunResult;
+use hil_rundir::run_result::{self, RunResult};
 use hil_topology::{Channel, Topology};
 
 pub(super) fn run_facts(
@@ -49,6 +48,9 @@ pub(super) fn run_facts(
             "what happened to the robot, one line each, with the outage before it",
         ),
     ];
+    // The run on the clock of this supervisor.
+    let own_host = result.own_hosts.first();
+    let own_span = own_host.and_then(|host| result.spans.get(host));
     RunFacts {
         name: result.folder.name(),
         case: topology
@@ -67,18 +69,13 @@ pub(super) fn run_facts(
             .iter()
             .map(|(host, (start, _))| (host.clone(), start.as_ns()))
             .collect(),
-        duration_s: own_span(result).map_or(0.0, |(start, end)| end.seconds_since(start)),
+        duration_s: own_span.map_or(0.0, |(start, end)| end.seconds_since(*start)),
         outcome,
         exit_reason: result.outcome.reason(),
         folder: result.folder.root().display().to_string(),
         files: files.map(|(name, what)| Fact::new(name, what)).to_vec(),
         repeat_command: shell_words(command_line),
     }
-}
-
-/// The run on the clock of this supervisor.
-fn own_span(result: &RunResult) -> Option<(Instant, Instant)> {
-    result.spans.get(result.own_hosts.first()?).copied()
 }
 
 /// What the kernel granted and refused, each item once with the threads it concerns.
@@ -167,12 +164,8 @@ pub(super) fn run_event(axis: &RunAxis<'_>, event: &Event) -> RunEvent {
     }
 }
 
-pub(super) fn channel_summary(
-    topology: &Topology,
-    result: &RunResult,
-    channel: &Channel,
-    records: &RunRecords,
-) -> ChannelSummary {
+pub(super) fn channel_summary(records: &RunRecords<'_>, channel: &Channel) -> ChannelSummary {
+    let result = records.result;
     let directions = directions(result, &channel.name);
     let reports = result.processes.iter().flat_map(|one| &one.report);
     let trace_replay = reports
@@ -196,11 +189,14 @@ pub(super) fn channel_summary(
         name: channel.name.clone(),
         from: channel.from.clone(),
         to: channel.to.clone(),
-        link: LinkKind::of(topology, channel),
+        link: LinkKind::of(records.topology, channel),
         account: (records.has(&channel.name) && !channel.is_recorded_only())
-            .then(|| records.account(topology, result, channel)),
+            .then(|| records.consult(channel, account)),
         outages: None,
-        emulation: EmulationFigures::of(records.arrivals(&channel.name), overflow_count),
+        emulation: EmulationFigures::of(
+            records.of_kind::<IngressRecord>(&channel.name, |files| files.ingress.as_ref()),
+            overflow_count,
+        ),
         trace_replay,
         recorded: channel
             .is_recorded_only()
@@ -215,14 +211,8 @@ pub(super) fn channel_summary(
 fn directions(result: &RunResult, channel: &str) -> Vec<DirectionSummary> {
     let mut found = Vec::new();
     for process in &result.processes {
-        let Some(report) = &process.report else {
-            continue;
-        };
-        for direction in report
-            .directions
-            .iter()
-            .filter(|one| one.channel == channel)
-        {
+        let directions = process.report.iter().flat_map(|report| &report.directions);
+        for direction in directions.filter(|one| one.channel == channel) {
             found.push(DirectionSummary {
                 process: process.name.clone(),
                 direction: direction.direction,

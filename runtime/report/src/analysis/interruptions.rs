@@ -9,9 +9,7 @@ use hil_core::time::{Instant, duration_ns};
 
 use super::channel_files::{ChannelFiles, all};
 use super::records::RunRecords;
-use hil_rundir::run_result::RunResult;
-use hil_topology::gateway_name;
-use hil_topology::{Channel, Topology};
+use hil_topology::{Channel, gateway_name};
 
 /// Longest time after a receiving gateway is back in which a loss is still put down to its start. Its
 /// sender learns of that by an answer of its kernel (ICMP), or where none comes by clock exchanges that
@@ -20,11 +18,8 @@ use hil_topology::{Channel, Topology};
 const RECOVERY_MAX: Duration = Duration::from_secs(2);
 
 /// Those of processes on the way of `channel`.
-pub(super) fn noted(
-    records: &RunRecords,
-    (topology, result): (&Topology, &RunResult),
-    channel: &Channel,
-) -> Vec<Interruption> {
+pub(super) fn noted(records: &RunRecords<'_>, channel: &Channel) -> Vec<Interruption> {
+    let (topology, result) = (records.topology, records.result);
     let gateway = |process: &str| {
         let host = &topology.process(process)?.host;
         Some(gateway_name(channel.link.as_deref()?, host))
@@ -65,7 +60,7 @@ pub(super) fn noted(
                     let end = end_of(&event.host);
                     let latest = next.map_or(end, |next| next.min(end));
                     let files = records.channels.get(&channel.name);
-                    files.map_or(back, |files| reached(files, (event.at, back, latest)))
+                    files.map_or(back, |files| reached(files, event.at, back, latest))
                 }
                 Some(back) => back,
                 None => end_of(&event.host),
@@ -83,9 +78,9 @@ pub(super) fn noted(
 }
 
 /// See [`works_again`]; without the gateway's records, nobody knows what reached it.
-fn reached(files: &ChannelFiles, times: (Instant, Instant, Instant)) -> Instant {
+fn reached(files: &ChannelFiles, dead: Instant, back: Instant, end: Instant) -> Instant {
     if files.ingress.is_none() {
-        return times.1;
+        return back;
     }
     let messages = all::<IngressRecord>(files.ingress.as_ref());
     // An emulated link holds a message back after it has reached the gateway.
@@ -95,13 +90,15 @@ fn reached(files: &ChannelFiles, times: (Instant, Instant, Instant)) -> Instant 
     });
     // So does a clock exchange that it answered reach it, on a channel that speaks seldom.
     let exchanges_ns = files.round_trips.values().map(|one| one.t2_ns);
-    works_again(times, messages_ns.chain(exchanges_ns))
+    works_again(dead, back, end, messages_ns.chain(exchanges_ns))
 }
 
 /// When messages reached a gateway that was found dead at `dead` and is `back` since then: at once if some did in
 /// between, no later than [`RECOVERY_MAX`] after, and not after `end`.
 fn works_again(
-    (dead, back, end): (Instant, Instant, Instant),
+    dead: Instant,
+    back: Instant,
+    end: Instant,
     reached_ns: impl Iterator<Item = i64>,
 ) -> Instant {
     let of_successor = reached_ns.filter(|at| *at != UNAVAILABLE && *at >= dead.as_ns());
@@ -145,7 +142,7 @@ mod tests {
         ] {
             let received = received_ms.iter().map(|ms| ms * MS);
             let received = received.chain([UNAVAILABLE]);
-            let until = works_again((at(100), at(160), at(end_ms)), received);
+            let until = works_again(at(100), at(160), at(end_ms), received);
             assert_eq!(until, at(expected_ms), "{what}");
         }
     }
@@ -154,6 +151,6 @@ mod tests {
     fn without_the_gateways_records_it_is_back_when_its_supervisor_says_so() {
         let times = [100, 160, 9_000].map(|ms| Instant::from_ns(ms * MS));
         let [dead, back, end] = times;
-        assert_eq!(reached(&ChannelFiles::default(), (dead, back, end)), back);
+        assert_eq!(reached(&ChannelFiles::default(), dead, back, end), back);
     }
 }

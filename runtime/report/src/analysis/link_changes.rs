@@ -14,12 +14,9 @@ use crate::link_change::LinkChange;
 use hil_topology::emulation::EmulationLaunch;
 use hil_topology::{Crossing, Topology};
 
-/// Every order that was given to a link of `topology`, in order of time.
-pub(super) fn of_run(
-    topology: &Topology,
-    records: &RunRecords,
-    axis: &RunAxis<'_>,
-) -> Vec<LinkChange> {
+/// Every order that was given to a link of the run, in order of time.
+pub(super) fn of_run(records: &RunRecords<'_>, axis: &RunAxis<'_>) -> Vec<LinkChange> {
+    let topology = records.topology;
     let mut directions: BTreeMap<String, (String, Way, String)> = BTreeMap::new();
     for crossing in topology.crossings() {
         if let Some((channel, way)) = channel_of(topology, &crossing) {
@@ -31,7 +28,7 @@ pub(super) fn of_run(
     for (channel, (link, way, host)) in &directions {
         for record in records.link_orders(channel) {
             let at_s = axis.place_s(host, Instant::from_ns(record.from_ns));
-            changes.push(LinkChange::of((link, *way), record, at_s));
+            changes.push(LinkChange::of(link, *way, record, at_s));
         }
     }
     let time = |change: &LinkChange| change.at_s.unwrap_or(f64::MAX);
@@ -46,11 +43,10 @@ fn channel_of(topology: &Topology, crossing: &Crossing<'_>) -> Option<(String, W
 
 /// Orders to the direction that `crossing` goes, which took effect.
 pub(crate) fn in_force_on<'a>(
-    topology: &Topology,
-    records: &'a RunRecords,
+    records: &'a RunRecords<'_>,
     crossing: &Crossing<'_>,
-) -> impl Iterator<Item = &'a LinkConditionRecord> + use<'a> {
-    let channel = channel_of(topology, crossing).map(|(channel, _)| channel);
+) -> impl Iterator<Item = &'a LinkConditionRecord> {
+    let channel = channel_of(records.topology, crossing).map(|(channel, _)| channel);
     let orders = channel.map_or(&[][..], |channel| records.link_orders(&channel));
     let is_in_force =
         |record: &&LinkConditionRecord| record.outcome() == Some(OrderOutcome::InForce);
@@ -58,12 +54,8 @@ pub(crate) fn in_force_on<'a>(
 }
 
 /// The longest delay that the direction of `crossing` was changed to; zero when it was not.
-pub(super) fn longest_delay(
-    topology: &Topology,
-    records: &RunRecords,
-    crossing: &Crossing<'_>,
-) -> Duration {
-    let delays = in_force_on(topology, records, crossing)
+pub(super) fn longest_delay(records: &RunRecords<'_>, crossing: &Crossing<'_>) -> Duration {
+    let delays = in_force_on(records, crossing)
         .filter_map(LinkConditionRecord::condition)
         .map(LinkCondition::delay);
     delays.max().unwrap_or(Duration::ZERO)

@@ -21,8 +21,7 @@ use hil_shuttle::{Shuttle, ShuttleCommand, ShuttleStatus};
 
 use super::{analyse, conclude};
 use hil_platform::host_facts::HostFacts;
-use hil_rundir::manifest;
-use hil_rundir::manifest::ManifestContent;
+use hil_rundir::manifest::{self, ManifestContent};
 use hil_rundir::record::RecordKind;
 use hil_rundir::record::file::RecordHeader;
 use hil_rundir::run_folder::RunFolder;
@@ -133,7 +132,7 @@ struct Written<'a> {
 }
 
 impl<'a> Written<'a> {
-    fn new(folder: &Path, (channel, is_robot): (&'a str, bool), payload: usize) -> Self {
+    fn new(folder: &Path, channel: &'a str, is_robot: bool, payload: usize) -> Self {
         let sink = |kind, bytes| Sink::new(folder, kind, channel, bytes);
         Self {
             is_robot,
@@ -201,7 +200,7 @@ impl<'a> Written<'a> {
         // Losses in bursts, the longest of which are outages.
         let is_lost = index / 37 % 211 == 5 || index % 60_000 > 59_700;
         if !is_lost {
-            self.arrival((at, here), handed, sequence);
+            self.arrival(at, here, handed, sequence);
         }
     }
 
@@ -210,7 +209,7 @@ impl<'a> Written<'a> {
         (-(1.0 - self.random.uniform()).ln() * mean_ns) as i64
     }
 
-    fn arrival(&mut self, (at, published_ns): (i64, i64), handed: i64, sequence: u64) {
+    fn arrival(&mut self, at: i64, published_ns: i64, handed: i64, sequence: u64) {
         let is_displaced = self.random.uniform() < 0.005;
         let more = if is_displaced { 3_500_000 } else { 0 };
         let received = handed + 180_000 + more + self.jitter(60_000.0);
@@ -301,7 +300,7 @@ fn write_run(root: &Path, count: i64) {
         ("shuttle/status", true, size_of::<ShuttleStatus>()),
     ];
     for (channel, is_robot, payload) in channels {
-        let mut written = Written::new(&folder, (channel, is_robot), payload);
+        let mut written = Written::new(&folder, channel, is_robot, payload);
         for index in 0..count {
             written.message(index);
         }
@@ -354,7 +353,8 @@ fn conclude_here(root: &Path) {
         &topology(&registry),
         &result(root, count),
         &registry,
-        (Path::new("long.toml"), &[]),
+        Path::new("long.toml"),
+        &[],
     );
     let concluded = concluded.unwrap();
     assert!(concluded.unwritten.is_none(), "{:?}", concluded.unwritten);
@@ -410,7 +410,7 @@ fn the_folder_alone_gives_the_same_summary() {
     manifest::write(&content, &result.folder).unwrap();
     result.write().unwrap();
     assert_eq!(RunResult::read(&result.folder).unwrap(), result);
-    let from_memory = conclude(&topology, &result, &registry, (file, &command_line)).unwrap();
+    let from_memory = conclude(&topology, &result, &registry, file, &command_line).unwrap();
     fs::remove_file(result.folder.summary()).unwrap();
     let from_folder = analyse(&result.folder, &registry).unwrap();
     assert_eq!(from_folder.summary, from_memory.summary);

@@ -38,8 +38,7 @@ use records::RunRecords;
 
 use crate::event_log;
 use crate::summary::{Fact, RunSummary, ScoreMetric, SummaryError};
-use crate::terminal;
-use crate::terminal::Style;
+use crate::terminal::{self, Style};
 use crate::trace::capture;
 use hil_rundir::manifest::{Manifest, ManifestTopologyError};
 use hil_rundir::run_folder::RunFolder;
@@ -119,11 +118,8 @@ pub fn analyse(folder: &RunFolder, registry: &Registry) -> Result<Concluded, Ana
         Err(source) => return Err(AnalysisError::Topology { path, source }),
     };
     let result = RunResult::read(folder)?;
-    let origin = (
-        Path::new(&manifest.topology_file),
-        manifest.command_line.as_slice(),
-    );
-    conclude(&topology, &result, registry, origin)
+    let file = Path::new(&manifest.topology_file);
+    conclude(&topology, &result, registry, file, &manifest.command_line)
 }
 
 /// Draws up the summary of a finished run and writes it with its report into the run's folder.
@@ -134,64 +130,60 @@ pub fn conclude(
     topology: &Topology,
     result: &RunResult,
     registry: &Registry,
-    (topology_file, command_line): (&Path, &[String]),
+    topology_file: &Path,
+    command_line: &[String],
 ) -> Result<Concluded, AnalysisError> {
-    let mut records = RunRecords::read(&result.folder.records())?;
-    let clocks = HostClocks::of(topology, result, &records);
-    records.set_clocks(clocks);
+    let mut records = RunRecords::read(topology, result)?;
+    records.clocks = HostClocks::of(&records);
     let case = registry.make_case(topology)?;
-    let unscored = score_clock::apply(&mut records, (topology, result), case.as_ref());
+    let unscored = score_clock::apply(&mut records, case.as_ref());
     let score_host = score_clock::host(topology, case.as_ref());
-    let axis = RunAxis::of(records.clocks(), &result.spans, score_host);
+    let axis = RunAxis::of(&records.clocks, &result.spans, score_host);
     let mut summary = RunSummary::new(run_facts(topology, result, topology_file, command_line));
     summary.host_facts = result.facts.clone();
     for process in &result.processes {
         summary.processes.push(process_summary(process));
     }
-    summary.clocks = Some(records.clocks().section().clone());
+    summary.clocks = Some(records.clocks.section.clone());
     summary.realtime = realtime_facts(&result.processes);
     summary.events = result
         .events
         .iter()
         .map(|event| run_event(&axis, event))
         .collect();
-    summary.link_changes = link_changes::of_run(topology, &records, &axis);
+    summary.link_changes = link_changes::of_run(&records, &axis);
     summary.channels = topology
         .channels()
         .iter()
-        .map(|channel| channel_summary(topology, result, channel, &records))
+        .map(|channel| channel_summary(&records, channel))
         .collect();
-    capture::write(&mut summary, (topology, result), &records);
-    summary.faces = faces::face_summaries(topology, result, &records);
-    summary.hardware_stamps = cards::hardware_stamps(topology, result, &records);
-    let outages = add_outages(&mut summary, (topology, result), (&records, &axis));
+    capture::write(&mut summary, &records);
+    summary.faces = faces::face_summaries(&records);
+    summary.hardware_stamps = cards::hardware_stamps(&records);
+    let outages = add_outages(&mut summary, &records, &axis);
     let (specs, score) = match &case {
-        Some((entry, case)) => (entry.channels, case.score(records.log())),
+        Some((entry, case)) => (entry.channels, case.score(&records.log)),
         None => (&[][..], Score::default()),
     };
     summary.score = ScoreMetric::all_of(&score);
-    summary.score_events = events::explained(
-        &score,
-        (topology, result),
-        (&records, &axis),
-        &summary.channels,
-        (specs, &outages),
-    );
-    let errors = case.as_ref().map(|(_, case)| case.errors(records.log()));
+    summary.score_events =
+        events::explained(&score, &records, &axis, &summary.channels, specs, &outages);
+    let errors = case.as_ref().map(|(_, case)| case.errors(&records.log));
     let network = network::of_run(
-        (topology, result),
-        (&records, &axis),
+        &records,
+        &axis,
         errors.unwrap_or_default(),
-        (&mut summary.score_events, &mut summary.warnings),
+        &mut summary.score_events,
+        &mut summary.warnings,
     );
     let (network, network_series) = network.unzip();
     summary.network = network;
-    radio::add(&mut summary, (topology, result), (&records, &axis));
-    add_warnings(&mut summary, result, &records);
+    radio::add(&mut summary, &records, &axis);
+    add_warnings(&mut summary, &records);
     summary.warnings.extend(unscored);
     let case = case.as_ref().map(|(_, case)| case.as_ref());
     let network_series = network_series.unwrap_or_default();
-    write_series(&mut summary, result, (case, network_series), records);
+    write_series(&mut summary, case, network_series, records);
     let unwritten = write_texts(&summary, result).err();
     Ok(Concluded { summary, unwritten })
 }
@@ -214,15 +206,15 @@ fn write_texts(summary: &RunSummary, result: &RunResult) -> Result<(), AnalysisE
 /// The outages of every channel, their figures put into the summary.
 fn add_outages(
     summary: &mut RunSummary,
-    run: (&Topology, &RunResult),
-    (records, axis): (&RunRecords, &RunAxis<'_>),
+    records: &RunRecords<'_>,
+    axis: &RunAxis<'_>,
 ) -> Vec<OutageStory> {
     let mut stories = Vec::new();
-    for (summary, channel) in summary.channels.iter_mut().zip(run.0.channels()) {
+    for (summary, channel) in summary.channels.iter_mut().zip(records.topology.channels()) {
         let unknown = MessageFate::UnknownPeerRecordsUnavailable;
         let fates = summary.account.as_ref().map(|account| &account.fates);
         let is_partial = fates.is_some_and(|fates| fates.of(unknown) > 0);
-        if let Some(story) = OutageStory::of(run, channel, (records, axis), is_partial) {
+        if let Some(story) = OutageStory::of(records, axis, channel, is_partial) {
             summary.outages = story.figures();
             stories.push(story);
         }
@@ -233,15 +225,16 @@ fn add_outages(
 /// Writes what the case and the network have to plot. A run whose plots cannot be written has its report still.
 fn write_series(
     summary: &mut RunSummary,
-    result: &RunResult,
-    (case, network): (Option<&dyn Case>, Vec<PlotSeries>),
-    records: RunRecords,
+    case: Option<&dyn Case>,
+    network: Vec<PlotSeries>,
+    records: RunRecords<'_>,
 ) {
-    let mut made = case.map_or_else(Vec::new, |case| case.series(records.log()));
+    let folder = records.result.folder.series();
+    let mut made = case.map_or_else(Vec::new, |case| case.series(&records.log));
     made.extend(network);
     // They are as large as the messages; only one of the two need be in memory.
     drop(records);
-    match series::write(&result.folder.series(), made) {
+    match series::write(&folder, made) {
         Ok(names) if names.is_empty() => {}
         Ok(names) => {
             let what = format!("{}; columns in series/series.json", names.join(", "));
@@ -254,7 +247,8 @@ fn write_series(
 }
 
 /// What spoils the run or the reading of its figures.
-fn add_warnings(summary: &mut RunSummary, result: &RunResult, records: &RunRecords) {
+fn add_warnings(summary: &mut RunSummary, records: &RunRecords<'_>) {
+    let result = records.result;
     summary
         .warnings
         .extend(result.problems.iter().cloned().chain(records.problems()));
@@ -277,8 +271,8 @@ fn add_warnings(summary: &mut RunSummary, result: &RunResult, records: &RunRecor
             ));
         }
     }
-    summary.warnings.extend(records.clocks().warnings());
-    let pairs = &records.clocks().section().pairs;
+    summary.warnings.extend(records.clocks.warnings());
+    let pairs = &records.clocks.section.pairs;
     let paths = pairs.iter().filter_map(clock_path::warning);
     summary.warnings.extend(paths);
 }

@@ -14,11 +14,11 @@ use hil_core::case_study::ErrorSeries;
 use hil_core::plot::PlotSeries;
 use hil_core::random::RandomStream;
 use hil_core::record::IngressRecord;
-use hil_stats::correlation;
-use hil_stats::correlation::LagWindow;
+use hil_core::time::Instant;
+use hil_stats::correlation::{self, LagWindow};
 
 use super::axis::RunAxis;
-use super::events::start_on;
+use super::clocks::HostClocks;
 use super::records::RunRecords;
 pub(crate) use super::robot_series::RobotSeries;
 use super::robot_series::{index_of, without_holes};
@@ -28,7 +28,7 @@ use crate::network::{
 };
 use crate::score_event::ScoreEvents;
 use hil_rundir::run_result::RunResult;
-use hil_topology::{Channel, Topology};
+use hil_topology::Channel;
 
 /// Network events a summary keeps, and of those before one event of the score.
 const EVENTS_MAX: usize = 2_000;
@@ -92,7 +92,7 @@ impl NetworkBuilder {
         let mut events = network_events(one.passages);
         events.extend(one.other_events);
         for event in events {
-            self.add_event(one.channel, event, (one.duration_ns, one.place));
+            self.add_event(one.channel, event, one.duration_ns, one.place);
         }
         let width_ns = bin_width_ns(one.duration_ns);
         let bins = NetworkBins::of(one.passages, (one.duration_ns, width_ns), one.place);
@@ -104,7 +104,8 @@ impl NetworkBuilder {
         &mut self,
         channel: &str,
         event: NetworkEvent,
-        (duration_ns, place): (i64, &Place<'_>),
+        duration_ns: i64,
+        place: &Place<'_>,
     ) {
         let interruption = match &event.kind {
             NetworkEventKind::ProcessDown { process, .. } => Some((process.clone(), event.from.ns)),
@@ -162,7 +163,8 @@ impl NetworkBuilder {
         mut self,
         score: &mut ScoreEvents,
         errors: Vec<RobotSeries>,
-        (seed, axis): (u64, AxisClocks),
+        seed: u64,
+        axis: AxisClocks,
     ) -> Option<(NetworkReport, Vec<PlotSeries>)> {
         let (_, first) = self.bins.first()?;
         let (width_s, count) = (first.width_ns as f64 * 1e-9, first.bins.len());
@@ -185,11 +187,11 @@ impl NetworkBuilder {
         let dropped = self.events.len().saturating_sub(EVENTS_MAX);
         let report = NetworkReport {
             foregoing_s: FOREGOING_S,
-            foregoing_chance_ratio: covered_s(&self.events, (run_s, bound_s)) / run_s,
+            foregoing_chance_ratio: covered_s(&self.events, run_s, bound_s) / run_s,
             clocks_differ: axis.bound_s.is_none(),
             clock_bound_s: axis.bound_s,
             timeline: timeline(&self.bins, &robot, width_s),
-            correlation: correlate(&self.bins, &robot, (width_s, seed)),
+            correlation: correlate(&self.bins, &robot, width_s, seed),
             events: TimedEvent::kept(self.events, EVENTS_MAX),
             events_dropped_count: dropped as u64,
             channels: self.channels,
@@ -237,7 +239,7 @@ impl NetworkBuilder {
 }
 
 /// How much of the run has an event in the time looked at before it.
-fn covered_s(events: &[TimedEvent], (run_s, clock_bound_s): (f64, f64)) -> f64 {
+fn covered_s(events: &[TimedEvent], run_s: f64, clock_bound_s: f64) -> f64 {
     let (mut covered_s, mut until_s) = (0.0, 0.0_f64);
     for event in events {
         let from_s = (event.from_s - clock_bound_s).clamp(until_s, run_s);
@@ -317,7 +319,8 @@ fn timeline(all: &[(String, NetworkBins)], robot: &RobotBins, width_s: f64) -> T
 fn correlate(
     all: &[(String, NetworkBins)],
     robot: &RobotBins,
-    (width_s, seed): (f64, u64),
+    width_s: f64,
+    seed: u64,
 ) -> Correlation {
     let mut names = Vec::new();
     let mut causes = Vec::new();
@@ -384,16 +387,17 @@ fn correlate(
 
 /// Everything the records of a live run say of its network; see [`NetworkBuilder::finish`].
 pub(super) fn of_run(
-    run: (&Topology, &RunResult),
-    (records, axis): (&RunRecords, &RunAxis<'_>),
+    records: &RunRecords<'_>,
+    axis: &RunAxis<'_>,
     errors: Vec<ErrorSeries>,
-    (score, warnings): (&mut ScoreEvents, &mut Vec<String>),
+    score: &mut ScoreEvents,
+    warnings: &mut Vec<String>,
 ) -> Option<(NetworkReport, Vec<PlotSeries>)> {
-    let (topology, _) = run;
+    let topology = records.topology;
     let mut builder = NetworkBuilder::default();
     for channel in topology.channels() {
         if topology.crossing(channel).is_some() && records.has(&channel.name) {
-            let added = add_channel(&mut builder, run, (records, axis), channel);
+            let added = add_channel(&mut builder, records, axis, channel);
             warnings.extend(added.err().map(|missing| {
                 let name = &channel.name;
                 format!("{name}: left out of the network's figures: {missing}")
@@ -409,20 +413,33 @@ pub(super) fn of_run(
     });
     let errors = errors.collect();
     // The stamps that events and errors were made of may have been brought to the score's clock.
-    axis.note_score(records.log().stamp_bound_ns());
+    axis.note_score(records.log.stamp_bound_ns());
     let clocks = AxisClocks {
         bound_s: axis.bound_ns().map(|ns| ns as f64 * 1e-9),
     };
-    builder.finish(score, errors, (topology.run().seed, clocks))
+    builder.finish(score, errors, topology.run().seed, clocks)
+}
+
+/// Start of the run on the clock of `host`. Hosts begin milliseconds apart; where their clocks are
+/// aligned, one beginning holds for all, lest an effect come before its cause, and a start that does not
+/// convert is unknown. Where they are not, each host counts from its own, and the report says so.
+fn start_on(result: &RunResult, host: &str, clocks: &HostClocks) -> Option<Instant> {
+    let own = result.spans.get(host).map(|span| span.0)?;
+    let starts = result.spans.iter().map(|(host, span)| (host, span.0));
+    if clocks.are_aligned(result.spans.keys()) {
+        clocks.earliest_on(host, starts)
+    } else {
+        Some(own)
+    }
 }
 
 fn add_channel(
     builder: &mut NetworkBuilder,
-    run: (&Topology, &RunResult),
-    (records, axis): (&RunRecords, &RunAxis<'_>),
+    records: &RunRecords<'_>,
+    axis: &RunAxis<'_>,
     channel: &Channel,
 ) -> Result<(), String> {
-    let (topology, result) = run;
+    let (topology, result) = (records.topology, records.result);
     let to = channel.to.as_deref().ok_or("nobody receives it")?;
     let hosts = [&channel.from, to].map(|process| {
         let host = topology.process(process).map(|process| &process.host);
@@ -437,8 +454,8 @@ fn add_channel(
     let [producer_end, consumer_end] = hosts.map(|host| end_on(host).ok_or_else(|| missing(host)));
     let ((producer_end, one_ns), (_, other_ns)) = (producer_end?, consumer_end?);
     let producer_start =
-        start_on(result, hosts[0], records.clocks()).ok_or_else(|| missing(hosts[0]))?;
-    let payload_bytes = records.log().raw(&channel.name).first();
+        start_on(result, hosts[0], &records.clocks).ok_or_else(|| missing(hosts[0]))?;
+    let payload_bytes = records.log.raw(&channel.name).first();
     let payload_bytes = payload_bytes.map(|message| message.payload.len() as u64);
     let place = |at: Moment| {
         let host = match at.side {
@@ -447,7 +464,7 @@ fn add_channel(
         };
         axis.place_ns(host, at.ns)
     };
-    records.consult(run, channel, |files, context| {
+    records.consult(channel, |files, context| {
         let ways = passages(files, context);
         let is_copy = |record: &IngressRecord| record.flags & IngressRecord::DUPLICATE != 0;
         let mut other_events = interruptions(context);

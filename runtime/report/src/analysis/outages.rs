@@ -1,18 +1,17 @@
 //! The outages of each channel of a finished run, and which of them went before an event. They are
 //! found in the records of the messages alone; no link is asked what it did.
 
-use hil_account::{Happening, Outage, OutageFigures, Side, Standing, foregoing};
-use hil_core::time::Instant;
-
 use std::collections::BTreeMap;
+
+use hil_account::{Happening, Outage, OutageFigures, Side, Standing, foregoing, outages};
+use hil_core::time::Instant;
 
 use super::axis::RunAxis;
 use super::records::RunRecords;
 use crate::score_event::EventOutage;
 use crate::terminal::{duration_s, seconds};
 use hil_platform::text::grouped;
-use hil_rundir::run_result::RunResult;
-use hil_topology::{Channel, Topology};
+use hil_topology::Channel;
 
 /// The outages of one channel, with what gives their times a meaning.
 #[derive(Debug)]
@@ -35,23 +34,25 @@ pub(crate) struct OutageStory {
 impl OutageStory {
     /// The outages of `channel` as its records have them; `None` when it leaves none.
     pub(super) fn of(
-        run: (&Topology, &RunResult),
+        records: &RunRecords<'_>,
+        axis: &RunAxis<'_>,
         channel: &Channel,
-        (records, axis): (&RunRecords, &RunAxis<'_>),
         is_partial: bool,
     ) -> Option<Self> {
         if channel.is_recorded_only() || !records.has(&channel.name) {
             return None;
         }
-        let (topology, result) = run;
-        let host = &topology.process(&channel.from)?.host;
-        let outages = records.outages(run, channel);
+        let host = &records.topology.process(&channel.from)?.host;
+        let outages = records.consult(channel, outages);
         Some(Self {
             channel: channel.name.clone(),
             placed_ns: placed(&outages, |ns| axis.place_ns(host, ns)),
             outages,
-            end: result.spans.get(host).map(|span| span.1),
-            interrupted: records.interrupted(run, channel),
+            end: records.result.spans.get(host).map(|span| span.1),
+            interrupted: records.consult(channel, |_, context| {
+                let interruptions = context.interruptions.iter();
+                interruptions.map(|one| one.process.clone()).collect()
+            }),
             is_partial,
         })
     }

@@ -6,6 +6,7 @@ use std::fmt::Write as _;
 use std::fs;
 use std::path::Path;
 
+use hil_account::radio::{radio_figures, transmit_stamps};
 use hil_core::record::UNAVAILABLE;
 use hil_core::time::Instant;
 
@@ -16,25 +17,20 @@ use crate::summary::{CounterGroup, Fact, RadioChange, RunEvent, RunEventKind, Ru
 use hil_rundir::radio_record::{
     NO_CODE, NO_RATE, NO_SIGNAL, RadioRecord, RateRecord, SAMPLE, command,
 };
-use hil_rundir::run_result::RunResult;
-use hil_topology::Topology;
 
 /// Puts everything about radios into the summary.
-pub(super) fn add(
-    summary: &mut RunSummary,
-    (topology, result): (&Topology, &RunResult),
-    (records, axis): (&RunRecords, &RunAxis<'_>),
-) {
+pub(super) fn add(summary: &mut RunSummary, records: &RunRecords<'_>, axis: &RunAxis<'_>) {
+    let (topology, result) = (records.topology, records.result);
     let mut report = RadioReport::default();
     for channel in topology.channels() {
         if topology.crossing(channel).is_some() {
-            let (transmit_stamps, acknowledgements) =
-                records.radio_figures((topology, result), channel);
-            report.channels.push(ChannelRadio {
-                channel: channel.name.clone(),
-                transmit_stamps,
-                acknowledgements,
-            });
+            report
+                .channels
+                .push(records.consult(channel, |files, context| ChannelRadio {
+                    channel: channel.name.clone(),
+                    transmit_stamps: files.egress.map(transmit_stamps),
+                    acknowledgements: radio_figures(files, context),
+                }));
         }
     }
     for (name, samples) in &records.radios {
@@ -73,21 +69,18 @@ pub(super) fn add(
 
 /// Marks that did not survive the way: the access category at the far end is not the one meant.
 fn add_mark_warnings(summary: &mut RunSummary) {
-    let mut warnings = Vec::new();
     for channel in &summary.channels {
         for direction in &channel.directions {
             let changed = direction.count(CounterGroup::Socket, "mark_changed_count");
             if let Some(changed) = changed.filter(|count| *count > 0) {
-                warnings.push(format!(
-                    "{}: {} datagrams arrived with another code point than they should: {}",
-                    channel.name,
-                    changed,
-                    "something on the way changes marks, or the other host sets another dscp"
+                summary.warnings.push(format!(
+                    "{}: {changed} datagrams arrived with another code point than they should: \
+                     something on the way changes marks, or the other host sets another dscp",
+                    channel.name
                 ));
             }
         }
     }
-    summary.warnings.append(&mut warnings);
 }
 
 fn summarise(samples: &[RadioRecord]) -> RadioHopSummary {

@@ -2,29 +2,28 @@
 //! the account means for a reader is decided elsewhere.
 
 use std::cell::RefCell;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
+use bytemuck::Pod;
 use hil_account::card_clock::{CardClockRecord, CardTimeline};
-use hil_account::radio::{RadioFigures, TransmitStampFigures, radio_figures, transmit_stamps};
 use hil_account::{
-    AccountContext, ChannelAccount, ChannelPath, ChannelRecords, FLIGHT_TIME_MAX, Interruption,
-    MessageStory, ORDER_TOLERANCE_NS, Outage, RunSpan, account, outages, stories,
+    AccountContext, ChannelPath, ChannelRecords, FLIGHT_TIME_MAX, Interruption, ORDER_TOLERANCE_NS,
+    RunSpan,
 };
-use hil_core::record::{EgressRecord, IngressRecord, RoundTripRecord};
+use hil_core::record::RoundTripRecord;
 use hil_core::run_log::RunLog;
 use hil_link::condition::LinkConditionRecord;
 
 use super::AnalysisError;
-use super::channel_files::{ChannelFiles, Signs, all, widen};
+use super::channel_files::{ChannelFiles, Signs, widen};
 use super::clocks::HostClocks;
 use super::message_records::missing_count;
 use super::{interruptions, link_changes, stalls};
 use crate::summary::RecordedFigures;
-use hil_rundir::face_record::{FaceReceivedRecord, FaceSentRecord};
 use hil_rundir::radio_record::RadioRecord;
 use hil_rundir::record::stored::{
     ReadFaults, StoredFile, StoredRecords, file_bytes, sort_by_start,
@@ -38,13 +37,17 @@ use hil_topology::{Channel, Topology};
 /// at the end of a run, what is younger may still arrive.
 const FLIGHT_QUANTILE: f64 = 0.9999;
 
-/// Every record file of a run.
-#[derive(Debug, Default)]
-pub(crate) struct RunRecords {
+/// A finished run: what it was to be, how it went, and every record file that it left.
+#[derive(Debug)]
+pub(crate) struct RunRecords<'a> {
+    pub(crate) topology: &'a Topology,
+    pub(crate) result: &'a RunResult,
     pub(super) channels: BTreeMap<String, ChannelFiles>,
     cards: BTreeMap<String, Vec<CardClockRecord>>,
-    log: RunLog,
-    clocks: HostClocks,
+    /// Every message of the run.
+    pub(super) log: RunLog,
+    /// How the hosts' clocks relate; none are aligned before they are related.
+    pub(super) clocks: HostClocks,
     /// Records of radios, by `<process>/<interface>`.
     pub(super) radios: BTreeMap<String, Vec<RadioRecord>>,
     /// Orders to emulated links, by the channel on which they were given.
@@ -57,15 +60,31 @@ pub(crate) struct RunRecords {
     interruptions: RefCell<BTreeMap<String, Vec<Interruption>>>,
 }
 
-impl RunRecords {
+impl<'a> RunRecords<'a> {
     /// Opens the files of the records folder. What a channel has of every message stays in them.
-    pub(crate) fn read(folder: &Path) -> Result<Self, AnalysisError> {
-        let mut records = Self::default();
+    pub(crate) fn read(
+        topology: &'a Topology,
+        result: &'a RunResult,
+    ) -> Result<Self, AnalysisError> {
+        let mut records = Self {
+            topology,
+            result,
+            channels: BTreeMap::new(),
+            cards: BTreeMap::new(),
+            log: RunLog::default(),
+            clocks: HostClocks::default(),
+            radios: BTreeMap::new(),
+            link_orders: BTreeMap::new(),
+            problems: Vec::new(),
+            faults: ReadFaults::default(),
+            interruptions: RefCell::default(),
+        };
         let mut add = |path: &Path| {
             records.add(StoredFile::open(path)?);
             Ok(())
         };
-        let problems = each_file(folder, &|_| true, &|_| {}, &mut add)?;
+        let folder = result.folder.records();
+        let problems = each_file(&folder, &|_| true, &|_| {}, &mut add)?;
         records.problems = problems;
         for (name, files) in &mut records.channels {
             files.signs = Signs::of(files);
@@ -144,27 +163,14 @@ impl RunRecords {
         self.cards.get(card).map(|pairs| CardTimeline::new(pairs))
     }
 
-    /// What the gateways recorded of `channel`: what they sent and what they received.
-    pub(super) fn of_gateways(&self, channel: &str) -> (Vec<EgressRecord>, Vec<IngressRecord>) {
-        let files = self.channels.get(channel);
-        let egress = all(files.and_then(|files| files.egress.as_ref()));
-        let ingress = all(files.and_then(|files| files.ingress.as_ref()));
-        (egress.collect(), ingress.collect())
-    }
-
-    /// Every message of the run, to bring them to one clock.
-    pub(super) const fn log_mut(&mut self) -> &mut RunLog {
-        &mut self.log
-    }
-
-    /// Relates the hosts' clocks; until then none are aligned.
-    pub(super) fn set_clocks(&mut self, clocks: HostClocks) {
-        self.clocks = clocks;
-    }
-
-    /// How the hosts' clocks relate.
-    pub(super) const fn clocks(&self) -> &HostClocks {
-        &self.clocks
+    /// The records that `channel` has of one kind; none when nobody left any.
+    pub(super) fn of_kind<R: Pod>(
+        &self,
+        channel: &str,
+        kind: fn(&ChannelFiles) -> Option<&StoredRecords>,
+    ) -> impl Iterator<Item = R> + '_ {
+        let files = self.channels.get(channel).and_then(kind);
+        files.into_iter().flat_map(StoredRecords::records)
     }
 
     /// The clock exchanges of the gateways of `channel`.
@@ -177,14 +183,11 @@ impl RunRecords {
 
     /// Real-time minus monotonic clock of `host` as its gateways noted it; `None` when none did, or
     /// the clock was stepped.
-    pub(super) fn realtime_offset_ns(&self, topology: &Topology, host: &str) -> Option<i64> {
-        let is_here = |process: &str| {
-            topology
-                .process(process)
-                .is_some_and(|one| one.host == host)
-        };
+    pub(super) fn realtime_offset_ns(&self, host: &str) -> Option<i64> {
+        let process = |name: &str| self.topology.process(name);
+        let is_here = |name: &str| process(name).is_some_and(|one| one.host == host);
         let mut ends: Option<(i64, i64)> = None;
-        for channel in topology.channels() {
+        for channel in self.topology.channels() {
             let Some(files) = self.channels.get(&channel.name) else {
                 continue;
             };
@@ -210,17 +213,6 @@ impl RunRecords {
         self.channels.contains_key(channel)
     }
 
-    /// What the receiving gateway of `channel` noted of each datagram; empty when it left nothing.
-    pub(super) fn arrivals(&self, channel: &str) -> impl Iterator<Item = IngressRecord> + '_ {
-        let files = self.channels.get(channel);
-        all(files.and_then(|files| files.ingress.as_ref()))
-    }
-
-    /// Every message of the run.
-    pub(crate) fn log(&self) -> &RunLog {
-        &self.log
-    }
-
     /// What there is of a channel that is only recorded; `None` when nothing is.
     pub(super) fn recorded(&self, channel: &str) -> Option<RecordedFigures> {
         let messages = self.log.raw(channel);
@@ -230,80 +222,16 @@ impl RunRecords {
         })
     }
 
-    /// What a face recorded that sends the messages of `out` and publishes on `back`.
-    pub(super) fn of_face(
-        &self,
-        out: &str,
-        back: &str,
-    ) -> (Vec<FaceSentRecord>, Vec<FaceReceivedRecord>) {
-        let sent = self.channels.get(out);
-        let sent = all(sent.and_then(|files| files.face_sent.as_ref()));
-        let received = self.channels.get(back);
-        let received = all(received.and_then(|files| files.face_received.as_ref()));
-        (sent.collect(), received.collect())
-    }
-
-    /// The account of `channel`.
-    pub(crate) fn account(
-        &self,
-        topology: &Topology,
-        result: &RunResult,
-        channel: &Channel,
-    ) -> ChannelAccount {
-        self.consult((topology, result), channel, account)
-    }
-
-    /// Where the messages of `channel` were stamped, and what the radio said of them.
-    pub(super) fn radio_figures(
-        &self,
-        run: (&Topology, &RunResult),
-        channel: &Channel,
-    ) -> (Option<TransmitStampFigures>, Option<RadioFigures>) {
-        self.consult(run, channel, |records, context| {
-            let stamps = records.egress.map(transmit_stamps);
-            (stamps, radio_figures(records, context))
-        })
-    }
-
-    /// What became of the `wanted` messages of `channel`, by start of the producer and number.
-    pub(super) fn stories(
-        &self,
-        run: (&Topology, &RunResult),
-        channel: &Channel,
-        wanted: &BTreeSet<(u32, u64)>,
-    ) -> BTreeMap<(u32, u64), MessageStory> {
-        self.consult(run, channel, |records, context| {
-            stories(records, context, wanted)
-        })
-    }
-
-    /// The outages of `channel`, in the order of its messages.
-    pub(super) fn outages(&self, run: (&Topology, &RunResult), channel: &Channel) -> Vec<Outage> {
-        self.consult(run, channel, outages)
-    }
-
-    /// The processes on the way of `channel` that were down, one for each interruption.
-    pub(super) fn interrupted(
-        &self,
-        run: (&Topology, &RunResult),
-        channel: &Channel,
-    ) -> Vec<String> {
-        self.consult(run, channel, |_, context| {
-            let interruptions = context.interruptions.iter();
-            interruptions.map(|one| one.process.clone()).collect()
-        })
-    }
-
     /// Asks something of the records of `channel` and of what the run knows about its way.
     pub(crate) fn consult<T>(
         &self,
-        (topology, result): (&Topology, &RunResult),
         channel: &Channel,
         ask: impl FnOnce(&ChannelRecords<'_>, &AccountContext<'_>) -> T,
     ) -> T {
+        let (topology, result) = (self.topology, self.result);
         let nothing = ChannelFiles::default();
         let files = self.channels.get(&channel.name).unwrap_or(&nothing);
-        let interruptions = self.interruptions((topology, result), channel);
+        let interruptions = self.interruptions(channel);
         let span_of = |process: &str| {
             let (start, end) = *result.spans.get(&topology.process(process)?.host)?;
             Some(RunSpan { start, end })
@@ -324,7 +252,7 @@ impl RunRecords {
         // A link that delays on purpose keeps messages under way for that much longer.
         let changed = crossing
             .as_ref()
-            .map(|crossing| link_changes::longest_delay(topology, self, crossing));
+            .map(|crossing| link_changes::longest_delay(self, crossing));
         let delay = crossing
             .and_then(|crossing| EmulationLaunch::of(&crossing, topology.run().seed))
             .map(|emulation| match emulation.trace {
@@ -358,12 +286,12 @@ impl RunRecords {
     }
 
     /// Both kinds read what the channel's processes left.
-    fn interruptions(&self, run: (&Topology, &RunResult), channel: &Channel) -> Vec<Interruption> {
+    fn interruptions(&self, channel: &Channel) -> Vec<Interruption> {
         if let Some(known) = self.interruptions.borrow().get(&channel.name) {
             return known.clone();
         }
-        let mut found = interruptions::noted(self, run, channel);
-        found.extend(stalls::at_end(self, run, channel));
+        let mut found = interruptions::noted(self, channel);
+        found.extend(stalls::at_end(self, channel));
         let mut interruptions = self.interruptions.borrow_mut();
         interruptions.insert(channel.name.clone(), found.clone());
         found

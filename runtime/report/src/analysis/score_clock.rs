@@ -6,7 +6,6 @@ use hil_core::time::RemoteInstant;
 
 use super::clocks::HostClocks;
 use super::records::RunRecords;
-use hil_rundir::run_result::RunResult;
 use hil_topology::Topology;
 use hil_topology::registry::MadeCase;
 
@@ -24,31 +23,25 @@ fn host_of<'a>(topology: &'a Topology, channel: &str) -> Option<&'a str> {
 /// Brings every message of the log to the clock that `case` keeps its score on; gives why not, when the
 /// clocks are aligned and it cannot be done. The log of hosts with unrelated clocks stays as it was
 /// read, which the score then knows.
-pub(super) fn apply(
-    records: &mut RunRecords,
-    (topology, result): (&Topology, &RunResult),
-    case: Option<&MadeCase<'_>>,
-) -> Option<String> {
-    if result.has_one_clock {
+pub(super) fn apply(records: &mut RunRecords<'_>, case: Option<&MadeCase<'_>>) -> Option<String> {
+    if records.result.has_one_clock {
         return None;
     }
-    records.log_mut().set_clocks_differ();
+    records.log.set_clocks_differ();
     let score_clock = case?.0.score_clock?;
+    let topology = records.topology;
     let host_of = |channel: &str| host_of(topology, channel).map(str::to_owned);
-    let mut log = core::mem::take(records.log_mut());
-    let why = bring(&mut log, records.clocks(), (score_clock, &host_of));
-    *records.log_mut() = log;
+    let why = bring(&mut records.log, &records.clocks, score_clock, &host_of);
     why.map(|why| format!("the score takes the hosts' clocks as not aligned: {why}"))
 }
 
-/// Gives the host of a channel's producer; `None` of a channel that the topology lacks.
-type HostOf<'a> = &'a dyn Fn(&str) -> Option<String>;
-
-/// Brings `log` to the clock of the producer of `score_clock`; `host_of` gives the host of a channel's.
+/// Brings `log` to the clock of the producer of `score_clock`; `host_of` gives the host of a channel's
+/// producer, and `None` of a channel that the topology lacks.
 fn bring(
     log: &mut RunLog,
     clocks: &HostClocks,
-    (score_clock, host_of): (&str, HostOf<'_>),
+    score_clock: &str,
+    host_of: &dyn Fn(&str) -> Option<String>,
 ) -> Option<String> {
     let Some(here) = host_of(score_clock) else {
         return Some(format!(
@@ -137,7 +130,7 @@ mod tests {
     #[test]
     fn messages_before_the_exchanges_count_and_say_what_they_take_for_granted() {
         let mut log = log(&[("command", 2), ("status", 2), ("status", 12)]);
-        assert_eq!(bring(&mut log, &clocks(), ("command", &host_of)), None);
+        assert_eq!(bring(&mut log, &clocks(), "command", &host_of), None);
         assert!(log.has_one_clock());
         let at_ns = log.raw("status").first().unwrap().envelope.published_ns;
         assert!(at_ns.abs_diff(2 * SECOND) <= log.clock_bound_ns());
@@ -164,7 +157,7 @@ mod tests {
             ),
         ] {
             let mut log = log(&messages);
-            let why = bring(&mut log, &clocks(), (score_clock, &host_of)).unwrap();
+            let why = bring(&mut log, &clocks(), score_clock, &host_of).unwrap();
             assert!(why.contains(expected), "{why}");
             assert!(!log.has_one_clock());
         }

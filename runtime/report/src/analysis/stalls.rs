@@ -9,16 +9,12 @@ use hil_core::time::{Instant, duration_ns};
 use super::channel_files::all;
 use super::records::RunRecords;
 use hil_rundir::run_result::RunResult;
-use hil_topology::gateway_name;
-use hil_topology::{Channel, Topology};
+use hil_topology::{Channel, gateway_name};
 
 /// Those on the way of `channel` that had something to take and left no record from before it came
 /// until the end of the run.
-pub(super) fn at_end(
-    records: &RunRecords,
-    (topology, result): (&Topology, &RunResult),
-    channel: &Channel,
-) -> Vec<Interruption> {
+pub(super) fn at_end(records: &RunRecords<'_>, channel: &Channel) -> Vec<Interruption> {
+    let (topology, result) = (records.topology, records.result);
     let mut found = Vec::new();
     let Some(files) = records.channels.get(&channel.name) else {
         return found;
@@ -36,7 +32,7 @@ pub(super) fn at_end(
         let stall = Stall {
             process: gateway_name(link, host),
             place: PathProcess::SendingGateway,
-            last_sign_ns: gateway_sign(records, topology, (link, host)),
+            last_sign_ns: gateway_sign(records, link, host),
         };
         found.extend(stall.interruption(result, host, &mut published()));
     }
@@ -51,7 +47,7 @@ pub(super) fn at_end(
         let stall = Stall {
             process: consumer.to_owned(),
             place: PathProcess::Consumer,
-            last_sign_ns: component_sign(records, topology, consumer),
+            last_sign_ns: component_sign(records, consumer),
         };
         found.extend(if is_crossing {
             stall.interruption(result, host, &mut forwarded())
@@ -96,16 +92,10 @@ impl Stall {
 }
 
 /// When the gateway of this link on this host last took or received a message.
-fn gateway_sign(
-    records: &RunRecords,
-    topology: &Topology,
-    (link, host): (&str, &str),
-) -> Option<i64> {
-    let is_there = |process: &str| {
-        topology
-            .process(process)
-            .is_some_and(|one| one.host == host)
-    };
+fn gateway_sign(records: &RunRecords<'_>, link: &str, host: &str) -> Option<i64> {
+    let topology = records.topology;
+    let process = |name: &str| topology.process(name);
+    let is_there = |name: &str| process(name).is_some_and(|one| one.host == host);
     let of_link = topology.channels().iter();
     let of_link = of_link.filter(|channel| channel.link.as_deref() == Some(link));
     let signs = of_link.filter_map(|channel| {
@@ -122,8 +112,8 @@ fn gateway_sign(
 }
 
 /// When a component last published or took a message of any channel.
-fn component_sign(records: &RunRecords, topology: &Topology, process: &str) -> Option<i64> {
-    let signs = topology.channels().iter().filter_map(|channel| {
+fn component_sign(records: &RunRecords<'_>, process: &str) -> Option<i64> {
+    let signs = records.topology.channels().iter().filter_map(|channel| {
         let signs = &records.channels.get(&channel.name)?.signs;
         let published_ns = signs.published_ns.filter(|_| channel.from == process);
         let is_taker = channel.to.as_deref() == Some(process);

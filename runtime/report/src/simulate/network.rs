@@ -50,5 +50,5 @@ pub(super) fn of_simulation(
     }
     let errors = errors.into_iter();
     let errors = errors.map(|one| RobotSeries::of(one, |at| Some(at.seconds_since(Instant::ZERO))));
-    builder.finish(events, errors.collect(), (seed, AxisClocks::ONE))
+    builder.finish(events, errors.collect(), seed, AxisClocks::ONE)
 }

@@ -14,21 +14,17 @@ use crate::analysis::records::RunRecords;
 use crate::summary::{Fact, RunSummary};
 use hil_rundir::run_result::RunResult;
 use hil_topology::trace_source::file_name;
-use hil_topology::{Crossing, Direction, Topology, Via};
+use hil_topology::{Crossing, Direction, Via};
 
 /// What a trace of clocks without a relation says of them.
 pub(crate) const NOT_ALIGNED: &str = "clocks not aligned";
 
 /// Writes the traces of a finished run and says so in its summary.
-pub(crate) fn write(
-    summary: &mut RunSummary,
-    (topology, result): (&Topology, &RunResult),
-    records: &RunRecords,
-) {
-    let folder = result.folder.traces();
+pub(crate) fn write(summary: &mut RunSummary, records: &RunRecords<'_>) {
+    let folder = records.result.folder.traces();
     let mut written_count = 0;
-    for crossing in topology.crossings() {
-        match write_one((topology, result), records, &crossing, &folder) {
+    for crossing in records.topology.crossings() {
+        match write_one(records, &crossing, &folder) {
             Ok(is_written) => written_count += usize::from(is_written),
             Err(why) => {
                 let channel = &crossing.channel.name;
@@ -47,8 +43,7 @@ pub(crate) fn write(
 
 /// False when nothing was recorded of the channel.
 fn write_one(
-    run: (&Topology, &RunResult),
-    records: &RunRecords,
+    records: &RunRecords<'_>,
     crossing: &Crossing<'_>,
     folder: &Path,
 ) -> Result<bool, String> {
@@ -57,17 +52,17 @@ fn write_one(
         size_bytes: u32::try_from(channel.message.size_bytes).unwrap_or(u32::MAX),
         is_emulated: matches!(crossing.link.via, Via::Emulated(..)),
     };
-    records.consult(run, channel, |files, context| {
+    records.consult(channel, |files, context| {
         let mut seen = Seen::default();
         each_traced(files, context, traced, |record| seen.note(&record))
             .map_err(|error| error.to_string())?;
         if seen.count == 0 {
             return Ok(false);
         }
-        let change_count = link_changes::in_force_on(run.0, records, crossing).count();
+        let change_count = link_changes::in_force_on(records, crossing).count();
         let header = TraceHeader {
             link_change_count: u16::try_from(change_count).unwrap_or(u16::MAX),
-            ..header(run.1, crossing, seen.has_delay)
+            ..header(records.result, crossing, seen.has_delay)
         };
         fs::create_dir_all(folder).map_err(|error| format!("{}: {error}", folder.display()))?;
         let path = folder.join(file_name(&channel.name));
