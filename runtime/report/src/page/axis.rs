@@ -27,14 +27,7 @@ const LINE_PX: f64 = 13.0;
 const WORDS_PX: f64 = 46.0;
 
 impl Axis {
-    /// From `low` to `high`; a span of nothing is widened so that there is something to draw in.
-    pub(super) fn linear((low, high): (f64, f64), (from_px, until_px): (f64, f64)) -> Self {
-        let high = if high > low {
-            high
-        } else {
-            low + low.abs().max(1.0) * 0.5
-        };
-        let scale = Scale::Linear;
+    const fn new(scale: Scale, low: f64, high: f64, from_px: f64, until_px: f64) -> Self {
         Self {
             scale,
             low,
@@ -44,31 +37,25 @@ impl Axis {
         }
     }
 
-    /// From `low`, which is above zero, to `high`.
-    pub(super) fn logarithmic((low, high): (f64, f64), (from_px, until_px): (f64, f64)) -> Self {
+    /// From `low` at `from_px` to `high` at `until_px`; a span of nothing is widened so that there is
+    /// something to draw in.
+    pub(super) fn linear(low: f64, high: f64, from_px: f64, until_px: f64) -> Self {
+        let widened = low + low.abs().max(1.0) * 0.5;
+        let high = if high > low { high } else { widened };
+        Self::new(Scale::Linear, low, high, from_px, until_px)
+    }
+
+    /// From `low`, which is above zero, at `from_px` to `high` at `until_px`.
+    pub(super) fn logarithmic(low: f64, high: f64, from_px: f64, until_px: f64) -> Self {
         let low = low.max(f64::MIN_POSITIVE);
         let high = if high > low * 1.2 { high } else { low * 2.0 };
         let low = if high > low * 2.5 { low } else { low / 2.0 };
-        let scale = Scale::Logarithmic;
-        Self {
-            scale,
-            low,
-            high,
-            from_px,
-            until_px,
-        }
+        Self::new(Scale::Logarithmic, low, high, from_px, until_px)
     }
 
-    /// Shares from none to `1 - 10^-nines`.
-    pub(super) const fn nines(nines: f64, (from_px, until_px): (f64, f64)) -> Self {
-        let scale = Scale::Nines;
-        Self {
-            scale,
-            low: 0.0,
-            high: nines,
-            from_px,
-            until_px,
-        }
+    /// Shares from none at `from_px` to `1 - 10^-nines` at `until_px`.
+    pub(super) const fn nines(nines: f64, from_px: f64, until_px: f64) -> Self {
+        Self::new(Scale::Nines, 0.0, nines, from_px, until_px)
     }
 
     /// Where `value` lies, kept within the axis.
@@ -241,9 +228,7 @@ impl Unit {
             Self::Share => format!("{}{JOINT}%", number(value * 100.0, step * 100.0)),
         }
     }
-}
 
-impl Unit {
     /// As [`Self::words`], but with as many digits as tell values apart that differ by `step`.
     fn words_apart(self, value: f64, step: f64) -> String {
         let ns = match self {
@@ -292,14 +277,8 @@ fn number(value: f64, step: f64) -> String {
         .ceil()
         .clamp(0.0, 9.0) as usize;
     let text = format!("{value:.decimals$}");
-    if text
-        .trim_start_matches('-')
-        .bytes()
-        .all(|b| b == b'0' || b == b'.')
-    {
-        return "0".to_owned();
-    }
-    text
+    let is_zero = text.bytes().all(|b| matches!(b, b'-' | b'0' | b'.'));
+    if is_zero { "0".to_owned() } else { text }
 }
 
 #[cfg(test)]
@@ -315,45 +294,45 @@ mod tests {
 
     #[test]
     fn ticks_are_round_and_within() {
-        let axis = Axis::linear((0.0, 61.0), (0.0, 500.0));
+        let axis = Axis::linear(0.0, 61.0, 0.0, 500.0);
         assert_eq!(
             words(&axis.ticks(Unit::Seconds)),
             ["0", "10", "20", "30", "40", "50", "60"]
         );
-        let axis = Axis::logarithmic((2e4, 3e7), (0.0, 300.0));
+        let axis = Axis::logarithmic(2e4, 3e7, 0.0, 300.0);
         assert_eq!(
             words(&axis.ticks(Unit::Nanoseconds)),
             ["100 µs", "1 ms", "10 ms"]
         );
-        let axis = Axis::nines(3.0, (0.0, 100.0));
+        let axis = Axis::nines(3.0, 0.0, 100.0);
         assert_eq!(
             words(&axis.ticks(Unit::Share)),
             ["50 %", "0 %", "90 %", "99 %", "99.9 %"]
         );
-        let axis = Axis::linear((-0.02, 0.02), (0.0, 140.0));
+        let axis = Axis::linear(-0.02, 0.02, 0.0, 140.0);
         assert_eq!(words(&axis.ticks(Unit::Number)), ["-0.02", "0", "0.02"]);
     }
 
     #[test]
     fn nothing_lies_outside_and_no_span_is_empty() {
         for axis in [
-            Axis::linear((5.0, 5.0), (0.0, 100.0)),
-            Axis::logarithmic((5.0, 5.0), (0.0, 100.0)),
-            Axis::logarithmic((0.0, 0.0), (0.0, 100.0)),
+            Axis::linear(5.0, 5.0, 0.0, 100.0),
+            Axis::logarithmic(5.0, 5.0, 0.0, 100.0),
+            Axis::logarithmic(0.0, 0.0, 0.0, 100.0),
         ] {
             for value in [-1.0, 0.0, 5.0, 1e300] {
                 let place = axis.at(value);
                 assert!((0.0..=100.0).contains(&place), "{axis:?} {value} {place}");
             }
         }
-        assert!((Axis::nines(2.0, (100.0, 0.0)).at(0.99) - 0.0).abs() < 1e-6);
-        assert!((Axis::nines(2.0, (100.0, 0.0)).at(0.0) - 100.0).abs() < 1e-6);
+        assert!((Axis::nines(2.0, 100.0, 0.0).at(0.99) - 0.0).abs() < 1e-6);
+        assert!((Axis::nines(2.0, 100.0, 0.0).at(0.0) - 100.0).abs() < 1e-6);
     }
     #[test]
     fn words_do_not_lie_on_each_other() {
         // What a figure has room for, over half a decade and over one and a half.
         for (low, high) in [(18e3, 110e3), (2e4, 7e5), (2e6, 9e6), (15e3, 95e3)] {
-            let axis = Axis::logarithmic((low, high), (110.0, 20.0));
+            let axis = Axis::logarithmic(low, high, 110.0, 20.0);
             let ticks = axis.ticks(Unit::Nanoseconds);
             assert!(ticks.len() >= TICKS_MIN, "{low} to {high}: {ticks:?}");
             for two in ticks.windows(2) {
@@ -372,8 +351,8 @@ mod tests {
             (7.0, 7.9),
         ] {
             let axes = [
-                Axis::linear((low, high), (100.0, 20.0)),
-                Axis::logarithmic((low, high), (100.0, 20.0)),
+                Axis::linear(low, high, 100.0, 20.0),
+                Axis::logarithmic(low, high, 100.0, 20.0),
             ];
             for axis in axes {
                 let ticks = axis.ticks(Unit::Length);

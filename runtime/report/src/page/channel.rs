@@ -3,7 +3,7 @@
 
 use hil_account::network::{DelayQuantile, Figure as Measured, NetworkFigures};
 use hil_account::{ChannelAccount, Coverage, MessageFate, OutageFigures, SegmentFigures};
-use hil_stats::histogram::{Distribution, LatencySummary};
+use hil_stats::histogram::Distribution;
 use hil_stats::statistics::{CONFIDENCE, IntervalNs, wilson};
 
 use super::data::{Channel, Figure, Table};
@@ -60,7 +60,7 @@ pub(super) fn fill(channel: &mut Channel, sources: &Sources<'_>) {
 
 fn counts(sources: &Sources<'_>) -> Vec<Figure> {
     let figure = |name, label, count: Option<u64>, reason: &str| {
-        Figure::maybe((name, label, "1"), count.map(|count| count as f64), reason)
+        Figure::maybe(name, label, "1", count.map(|count| count as f64), reason)
     };
     let account = sources.account;
     let live = |of: fn(&ChannelAccount) -> u64| account.map(of);
@@ -83,15 +83,16 @@ fn counts(sources: &Sources<'_>) -> Vec<Figure> {
 }
 
 fn loss_ratio(network: Option<&NetworkFigures>) -> Figure {
-    let names = ("loss_ratio", "lost by the network", "share");
+    let unavailable =
+        |reason: &str| Figure::unavailable("loss_ratio", "lost by the network", "share", reason);
     let Some(network) = network else {
-        return Figure::maybe(names, None, NO_NETWORK);
+        return unavailable(NO_NETWORK);
     };
     match &network.loss {
         Measured::Measured(loss) => {
             let interval = (loss.interval.low, loss.interval.high);
             let independent = loss.independent_interval;
-            Figure::new(names.0, names.1, names.2, loss.ratio)
+            Figure::new("loss_ratio", "lost by the network", "share", loss.ratio)
                 .within(Some(interval))
                 .by(&format!(
                     "95 %, Wilson on {} independent messages' worth of {}, as losses come in \
@@ -102,7 +103,7 @@ fn loss_ratio(network: Option<&NetworkFigures>) -> Figure {
                     percent(independent.high)
                 ))
         }
-        Measured::Unavailable { reason } => Figure::maybe(names, None, reason),
+        Measured::Unavailable { reason } => unavailable(reason),
     }
 }
 
@@ -118,7 +119,6 @@ fn grouped_f(value: f64) -> String {
 /// Late, duplicated, reordered: counts, each with its share of what arrived.
 fn order(sources: &Sources<'_>) -> Vec<Figure> {
     let account = sources.account;
-
     let reason = match (account, sources.network) {
         (None, None) => NO_ACCOUNT,
         _ => "the receiving gateway's records are not at hand",
@@ -133,12 +133,12 @@ fn order(sources: &Sources<'_>) -> Vec<Figure> {
         .and_then(|one| one.reordered_count)
         .or_else(by_network);
     let mut figures = Vec::new();
-    for (name, label, found, reason) in [
-        ("late", "too late for the gateway", late, reason),
-        ("duplicated", "duplicated", duplicated, reason),
-        ("reordered", "reordered", reordered, reason),
+    for (name, label, found) in [
+        ("late", "too late for the gateway", late),
+        ("duplicated", "duplicated", duplicated),
+        ("reordered", "reordered", reordered),
     ] {
-        let figure = Figure::maybe((name, label, "1"), found.map(|found| found as f64), reason);
+        let figure = Figure::maybe(name, label, "1", found.map(|found| found as f64), reason);
         let shares = found.zip(arrived).and_then(|(found, arrived)| {
             let interval = wilson(found.min(arrived), arrived, CONFIDENCE)?;
             let share = percent(found as f64 / arrived as f64);
@@ -153,54 +153,71 @@ fn order(sources: &Sources<'_>) -> Vec<Figure> {
     figures
 }
 
-fn quantile_figures(
-    (prefix, words): (&str, &str),
-    values: &[(&str, &str, i64, Option<IntervalNs>)],
-    method: &str,
-) -> Vec<Figure> {
-    let figure = |&(name, label, ns, interval): &(&str, &str, i64, Option<IntervalNs>)| {
-        let interval = interval.map(|one| (ns_s(one.low_ns), ns_s(one.high_ns)));
-        let method = if interval.is_some() { method } else { "" };
-        Figure::new(
-            &format!("{prefix}{name}"),
-            &format!("{words}, {label}"),
-            "s",
-            ns_s(ns),
-        )
-        .within(interval)
-        .by(method)
-    };
-    values.iter().map(figure).collect()
+/// The delay of which a channel has quantiles: what the names and the labels of its figures begin with.
+#[derive(Clone, Copy)]
+struct DelayKind {
+    prefix: &'static str,
+    label: &'static str,
 }
 
-fn unavailable_quantiles((prefix, words): (&str, &str), reason: &str) -> Vec<Figure> {
-    let names = [
-        ("p50", "p50"),
-        ("p99", "p99"),
-        ("p999", "p99.9"),
-        ("max", "largest"),
-    ];
-    let figure = |(name, label): (&str, &str)| {
-        Figure::unavailable(
-            &format!("{prefix}{name}"),
-            &format!("{words}, {label}"),
-            "s",
-            reason,
+const END_TO_END: DelayKind = DelayKind {
+    prefix: "",
+    label: "published → taken",
+};
+const ONE_WAY: DelayKind = DelayKind {
+    prefix: "network_",
+    label: "network, one way",
+};
+
+impl DelayKind {
+    fn figure(self, name: &str, label: &str, ns: i64, interval: Option<IntervalNs>) -> Figure {
+        let (name, label) = self.names(name, label);
+        let method = if interval.is_some() { BOOTSTRAP } else { "" };
+        let interval = interval.map(|one| (ns_s(one.low_ns), ns_s(one.high_ns)));
+        Figure::new(&name, &label, "s", ns_s(ns))
+            .within(interval)
+            .by(method)
+    }
+
+    fn names(self, name: &str, label: &str) -> (String, String) {
+        (
+            [self.prefix, name].concat(),
+            [self.label, ", ", label].concat(),
         )
-    };
-    names.map(figure).to_vec()
+    }
+
+    fn unavailable(self, reason: &str) -> Vec<Figure> {
+        let names = [
+            ("p50", "p50"),
+            ("p99", "p99"),
+            ("p999", "p99.9"),
+            ("max", "largest"),
+        ];
+        let figure = |(name, label): (&str, &str)| {
+            let (name, label) = self.names(name, label);
+            Figure::unavailable(&name, &label, "s", reason)
+        };
+        names.map(figure).to_vec()
+    }
 }
 
 fn end_to_end(sources: &Sources<'_>) -> Vec<Figure> {
-    let names = ("", "published → taken");
     let Some(account) = sources.account else {
-        return unavailable_quantiles(names, NO_ACCOUNT);
+        return END_TO_END.unavailable(NO_ACCOUNT);
     };
     let whole = &account.end_to_end;
     match &whole.distribution {
-        Distribution::Unavailable { reason } => unavailable_quantiles(names, reason),
+        Distribution::Unavailable { reason } => END_TO_END.unavailable(reason),
         Distribution::Measured(summary) => {
-            let mut figures = of_summary(names, summary, (whole.p50_interval, whole.p99_interval));
+            let figure = |name, label, ns, interval| END_TO_END.figure(name, label, ns, interval);
+            let mut figures = vec![
+                figure("min", "least", summary.min_ns, None),
+                figure("p50", "p50", summary.p50_ns, whole.p50_interval),
+                figure("p90", "p90", summary.p90_ns, None),
+                figure("p99", "p99", summary.p99_ns, whole.p99_interval),
+                figure("p999", "p99.9", summary.p999_ns, None),
+                figure("max", "largest", summary.max_ns, None),
+            ];
             if let Some(bound_ns) = whole.alignment_bound_ns.filter(|bound_ns| *bound_ns > 0) {
                 let bound = Figure::new(
                     "clock_bound",
@@ -216,80 +233,47 @@ fn end_to_end(sources: &Sources<'_>) -> Vec<Figure> {
     }
 }
 
-fn of_summary(
-    names: (&str, &str),
-    summary: &LatencySummary,
-    (p50, p99): (Option<IntervalNs>, Option<IntervalNs>),
-) -> Vec<Figure> {
-    let values = [
-        ("min", "least", summary.min_ns, None),
-        ("p50", "p50", summary.p50_ns, p50),
-        ("p90", "p90", summary.p90_ns, None),
-        ("p99", "p99", summary.p99_ns, p99),
-        ("p999", "p99.9", summary.p999_ns, None),
-        ("max", "largest", summary.max_ns, None),
-    ];
-    quantile_figures(names, &values, BOOTSTRAP)
-}
-
 fn network(sources: &Sources<'_>) -> Vec<Figure> {
-    let names = ("network_", "network, one way");
     let Some(network) = sources.network else {
-        return unavailable_quantiles(names, NO_NETWORK);
+        return ONE_WAY.unavailable(NO_NETWORK);
     };
     let mut figures = match &network.delay {
-        Measured::Unavailable { reason } => unavailable_quantiles(names, reason),
+        Measured::Unavailable { reason } => ONE_WAY.unavailable(reason),
         Measured::Measured(delay) => {
-            let of = |name, label, one: DelayQuantile| (name, label, one.value_ns, one.interval);
-            let values = [
-                ("min", "least", delay.min_ns, None),
+            let of = |name, label, one: DelayQuantile| {
+                ONE_WAY.figure(name, label, one.value_ns, one.interval)
+            };
+            let variation = ns_s(delay.variation.p99_ns);
+            vec![
+                ONE_WAY.figure("min", "least", delay.min_ns, None),
                 of("p50", "p50", delay.p50),
                 of("p95", "p95", delay.p95),
                 of("p99", "p99", delay.p99),
                 of("p999", "p99.9", delay.p999),
-                ("max", "largest", delay.max_ns, None),
-            ];
-            let mut figures = quantile_figures(names, &values, BOOTSTRAP);
-            let variation = delay.variation.p99_ns;
-            figures.push(
-                Figure::new(
-                    "variation_p99",
-                    "delay variation, p99",
-                    "s",
-                    ns_s(variation),
-                )
-                .by("above the smallest delay of the run (RFC 5481, PDV)"),
-            );
-            figures
+                ONE_WAY.figure("max", "largest", delay.max_ns, None),
+                Figure::new("variation_p99", "delay variation, p99", "s", variation)
+                    .by("above the smallest delay of the run (RFC 5481, PDV)"),
+            ]
         }
     };
-    match &network.successive {
-        Measured::Measured(successive) => figures.push(
-            Figure::new(
-                "jitter_mean",
-                "jitter, mean",
-                "s",
-                successive.jitter.mean_ns * 1e-9,
-            )
-            .by("RFC 3550; needs no aligned clocks"),
-        ),
-        Measured::Unavailable { reason } => {
-            figures.push(Figure::unavailable(
-                "jitter_mean",
-                "jitter, mean",
-                "s",
-                reason,
-            ));
-        }
-    }
-    let round_trip = network.round_trip.measured();
-    let round_trip = round_trip.map(|one| ns_s(one.p50_ns));
-    let reason = match &network.round_trip {
-        Distribution::Unavailable { reason } => reason.as_str(),
-        Distribution::Measured(_) => "",
+    let (jitter_s, reason) = match &network.successive {
+        Measured::Measured(successive) => (Some(successive.jitter.mean_ns * 1e-9), ""),
+        Measured::Unavailable { reason } => (None, reason.as_str()),
     };
-    let names = ("round_trip_p50", "round trip of the gateways, p50", "s");
-    figures.push(Figure::maybe(names, round_trip, reason));
+    let jitter = Figure::maybe("jitter_mean", "jitter, mean", "s", jitter_s, reason);
+    figures.push(jitter.by("RFC 3550; needs no aligned clocks"));
+    let (round_trip_s, reason) = match &network.round_trip {
+        Distribution::Measured(one) => (Some(ns_s(one.p50_ns)), ""),
+        Distribution::Unavailable { reason } => (None, reason.as_str()),
+    };
+    let label = "round trip of the gateways, p50";
+    figures.push(Figure::maybe(
+        "round_trip_p50",
+        label,
+        "s",
+        round_trip_s,
+        reason,
+    ));
     figures
 }
 
@@ -309,7 +293,9 @@ fn outage_figures(outages: &OutageFigures) -> Vec<Figure> {
         Figure::new("outage_count", "outages", "1", outages.outage_count as f64)
             .by("runs of lost messages"),
         Figure::maybe(
-            ("outage_longest", "longest outage", "s"),
+            "outage_longest",
+            "longest outage",
+            "s",
             longest,
             "there was none",
         )

@@ -193,7 +193,9 @@ impl Figure {
 
     /// A figure, or none because of `reason`.
     pub(crate) fn maybe(
-        (name, label, unit): (&str, &str, &str),
+        name: &str,
+        label: &str,
+        unit: &str,
         value: Option<f64>,
         reason: &str,
     ) -> Self {

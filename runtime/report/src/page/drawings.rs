@@ -21,7 +21,7 @@ pub(super) fn name_of(parts: &[&str]) -> String {
 }
 
 /// The figures of one channel.
-pub(super) fn of_channel((key, channel): (&str, &str), sources: &Sources<'_>) -> Vec<Drawing> {
+pub(super) fn of_channel(key: &str, channel: &str, sources: &Sources<'_>) -> Vec<Drawing> {
     let mut drawings = Vec::new();
     let mut push = |kind: &str, title: &str, caption: &str, svg: Option<String>| {
         if let Some(svg) = svg {

@@ -9,8 +9,7 @@ use super::drawings;
 use super::words::UNAVAILABLE;
 use crate::network::{Correlation, NetworkReport, TimedEvent};
 use crate::score_event::{ExplainedEvent, ScoreEvents};
-use crate::terminal;
-use crate::terminal::{percent, seconds};
+use crate::terminal::{self, percent, seconds};
 use hil_platform::text::grouped;
 
 /// Events of the score that a page lists.
@@ -28,20 +27,10 @@ pub(super) fn score_events(events: &ScoreEvents) -> EventList {
     let mut chosen: Vec<&ExplainedEvent> = events.events.iter().collect();
     // The gravest stay, in order of time.
     if total > EVENTS_MAX {
-        let grave = |event: &&ExplainedEvent| {
-            core::cmp::Reverse(match event.severity {
-                Severity::Incident => 2,
-                Severity::Hazard => 1,
-                Severity::Notice => 0,
-            })
-        };
-        chosen.sort_by_key(grave);
+        chosen.sort_by_key(|event| core::cmp::Reverse(event.severity));
         chosen.truncate(EVENTS_MAX);
-        chosen.sort_by(|a, b| {
-            a.at_s
-                .unwrap_or(f64::MAX)
-                .total_cmp(&b.at_s.unwrap_or(f64::MAX))
-        });
+        let time_s = |event: &ExplainedEvent| event.at_s.unwrap_or(f64::MAX);
+        chosen.sort_by(|a, b| time_s(a).total_cmp(&time_s(b)));
     }
     let mut notes = Vec::new();
     if total > EVENTS_MAX {
@@ -73,17 +62,11 @@ pub(super) fn score_events(events: &ScoreEvents) -> EventList {
 }
 
 fn score_event(event: &ExplainedEvent, clocks_differ: bool) -> Event {
-    let mut beside: Vec<String> = event
-        .outages
-        .iter()
-        .map(|outage| outage.words.clone())
+    let outages = event.outages.iter().map(|one| one.words.clone());
+    let network = event.network_beside().into_iter();
+    let mut beside: Vec<String> = outages
+        .chain(network.map(|one| one.words.clone()))
         .collect();
-    beside.extend(
-        event
-            .network_beside()
-            .into_iter()
-            .map(|one| one.words.clone()),
-    );
     if let Some(network) = &event.network {
         if network.more_count > 0 {
             beside.push(format!("{} more", grouped(network.more_count)));

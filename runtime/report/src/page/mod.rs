@@ -149,13 +149,13 @@ pub fn render(
     loop {
         let page = page_of(materials, steps);
         let text = match (template, format) {
-            (Some(own), _) => template::own(own, &page)?,
+            (Some((name, text)), _) => template::own(name, text, &page)?,
             (None, Format::Html) => template::html(&page)?,
             (None, Format::Md) => template::markdown(&page)?,
             (None, Format::Tex) => template::tex(&page)?,
             (None, Format::Csv) => csv::text(&page),
             (None, Format::Json) => json(&page),
-            (None, Format::Svg) => all_figures(&page),
+            (None, Format::Svg) => figures(&page).iter().map(|one| one.svg.as_str()).collect(),
         };
         let is_page = template.is_none() && format == Format::Html;
         if !is_page || text.len() <= PAGE_BYTES_MAX || steps <= STEPS_MIN {
@@ -169,10 +169,6 @@ fn json(page: &Page) -> String {
     // The joint is for pages; in JSON it would only surprise.
     let text = serde_json::to_string_pretty(page).expect("texts, numbers and lists");
     text.replace(JOINT, " ") + "\n"
-}
-
-fn all_figures(page: &Page) -> String {
-    figures(page).iter().map(|one| one.svg.as_str()).collect()
 }
 
 /// Every figure of a page.

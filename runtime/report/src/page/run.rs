@@ -40,20 +40,23 @@ pub(super) fn of(material: &Material, index: usize, steps: usize) -> Run {
         Found::Ended(summary) => live(&key, summary),
         Found::Unfinished(manifest) => unfinished(&key, manifest, &material.folder),
     };
-    let (network, events) = match &material.found {
-        Found::Ended(summary) => (summary.network.as_ref(), &summary.score_events),
-        Found::Unfinished(_) => (None, &ScoreEvents::default()),
-    };
-    let changes = match &material.found {
-        Found::Ended(summary) => summary.link_changes.as_slice(),
-        Found::Unfinished(_) => &[],
+    let nothing = ScoreEvents::default();
+    let (network, events, changes) = match &material.found {
+        Found::Ended(one) => (
+            one.network.as_ref(),
+            &one.score_events,
+            &one.link_changes[..],
+        ),
+        Found::Unfinished(_) => (None, &nothing, &[][..]),
     };
     if let Some(report) = network {
         run.drawings.push(timeline::over_run(
             &key,
             report,
-            (events, changes),
-            (&material.series, steps),
+            events,
+            changes,
+            &material.series,
+            steps,
         ));
         run.network_events = network_events(report);
         run.correlation = correlation(report);
@@ -251,7 +254,7 @@ fn live_channel(key: &str, one: &ChannelSummary, summary: &RunSummary) -> Channe
     };
     channel::fill(&mut channel, &sources);
     channel.notes.extend(notes(one));
-    channel.drawings = drawings::of_channel((key, &one.name), &sources);
+    channel.drawings = drawings::of_channel(key, &one.name, &sources);
     channel
 }
 
@@ -295,7 +298,7 @@ fn notes(one: &ChannelSummary) -> Vec<String> {
 /// The figures of a score.
 pub(super) fn score(metrics: &[ScoreMetric]) -> Vec<Figure> {
     let figure = |one: &ScoreMetric| {
-        Figure::maybe((&one.name, &one.label, &one.unit), one.value, &one.method)
+        Figure::maybe(&one.name, &one.label, &one.unit, one.value, &one.method)
             .within(one.interval)
             .by(&one.method)
     };

@@ -1,6 +1,8 @@
 //! Series over time, read from CSV and thinned for a page: each step of the axis keeps the smallest
 //! and the largest value within it, so that no peak is lost. It reads no file.
 
+use core::ops::Range;
+
 use serde::Serialize;
 
 use hil_rundir::series::{SeriesColumn, SeriesEntry};
@@ -98,18 +100,19 @@ pub(crate) struct Thinned {
     pub(crate) low: Vec<Option<f64>>,
 }
 
-/// Thins points to `count` steps from `span.0` to `span.1`.
+/// Thins points to `count` steps of `span`.
 pub(crate) fn thinned(
-    (name, channel): (&str, &str),
+    name: &str,
+    channel: &str,
     points: impl Iterator<Item = (f64, f64)>,
-    span: (f64, f64),
+    span: &Range<f64>,
     count: usize,
 ) -> Thinned {
     let mut high: Vec<Option<f64>> = vec![None; count];
     let mut low = high.clone();
-    let scale = count as f64 / (span.1 - span.0).max(f64::MIN_POSITIVE);
+    let scale = count as f64 / (span.end - span.start).max(f64::MIN_POSITIVE);
     for (at, value) in points {
-        let index = step_of((at - span.0) * scale, count);
+        let index = step_of((at - span.start) * scale, count);
         let Some(index) = index.filter(|_| value.is_finite()) else {
             continue;
         };
@@ -190,9 +193,10 @@ mod tests {
         let points = values.iter().enumerate();
         let points = points.map(|(index, value)| (index as f64 * 0.001, *value));
         let thin = thinned(
-            ("a", ""),
+            "a",
+            "",
             points.filter(|(at, _)| *at < 90.0),
-            (0.0, 100.0),
+            &(0.0..100.0),
             300,
         );
         assert_eq!((thin.high.len(), thin.low.len()), (300, 300));
@@ -200,14 +204,15 @@ mod tests {
         assert_eq!(thin.low[37], Some(-900.0));
         assert_eq!(thin.high[299], None);
         let thin = thinned(
-            ("a", ""),
+            "a",
+            "",
             [(1.0, 2.0), (5.0, 3.0)].into_iter(),
-            (0.0, 5.0),
+            &(0.0..5.0),
             5,
         );
         assert!(thin.low.is_empty());
         assert_eq!(thin.high, [None, Some(2.0), None, None, Some(3.0)]);
-        let none = thinned(("a", ""), [(9.0, 1.0)].into_iter(), (0.0, 5.0), 2);
+        let none = thinned("a", "", [(9.0, 1.0)].into_iter(), &(0.0..5.0), 2);
         assert_eq!(none.high, [None, None]);
     }
 }

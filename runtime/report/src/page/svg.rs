@@ -35,6 +35,12 @@ pub(super) fn escaped(text: &str) -> String {
     out
 }
 
+/// Attributes of an element with their values escaped.
+fn attribute_list<'a>(attributes: impl Iterator<Item = (&'a str, &'a str)>) -> String {
+    let attributes = attributes.map(|(name, value)| format!(" {name}=\"{}\"", escaped(value)));
+    attributes.collect()
+}
+
 /// A coordinate: a tenth of a pixel is enough.
 pub(super) fn px(value: f64) -> String {
     let text = format!("{value:.1}");
@@ -82,16 +88,24 @@ impl Svg {
         self.body.push('\n');
     }
 
-    pub(super) fn line(&mut self, class: &str, from: (f64, f64), to: (f64, f64)) {
-        let [x1, y1, x2, y2] = [from.0, from.1, to.0, to.1].map(px);
+    pub(super) fn line(&mut self, class: &str, x1: f64, y1: f64, x2: f64, y2: f64) {
+        let [x1, y1, x2, y2] = [x1, y1, x2, y2].map(px);
         self.put(format_args!(
             r#"<line class="{class}" x1="{x1}" y1="{y1}" x2="{x2}" y2="{y2}"/>"#
         ));
     }
 
     /// A rectangle with what a pointer that rests on it is told.
-    pub(super) fn rect(&mut self, class: &str, at: (f64, f64), size: (f64, f64), title: &str) {
-        let [x, y, width, height] = [at.0, at.1, size.0.max(0.0), size.1.max(0.0)].map(px);
+    pub(super) fn rect(
+        &mut self,
+        class: &str,
+        x: f64,
+        y: f64,
+        width: f64,
+        height: f64,
+        title: &str,
+    ) {
+        let [x, y, width, height] = [x, y, width.max(0.0), height.max(0.0)].map(px);
         let title = if title.is_empty() {
             String::new()
         } else {
@@ -102,8 +116,8 @@ impl Svg {
         ));
     }
 
-    pub(super) fn circle(&mut self, class: &str, at: (f64, f64), radius: f64) {
-        let [x, y, r] = [at.0, at.1, radius].map(px);
+    pub(super) fn circle(&mut self, class: &str, x: f64, y: f64, radius: f64) {
+        let [x, y, r] = [x, y, radius].map(px);
         self.put(format_args!(
             r#"<circle class="{class}" cx="{x}" cy="{y}" r="{r}"/>"#
         ));
@@ -116,13 +130,13 @@ impl Svg {
         }
     }
 
-    pub(super) fn text(&mut self, class: &str, at: (f64, f64), anchor: Anchor, text: &str) {
+    pub(super) fn text(&mut self, class: &str, x: f64, y: f64, anchor: Anchor, text: &str) {
         let anchor = match anchor {
             Anchor::Start => "start",
             Anchor::Middle => "middle",
             Anchor::End => "end",
         };
-        let ([x, y], text) = ([at.0, at.1].map(px), escaped(text));
+        let ([x, y], text) = ([x, y].map(px), escaped(text));
         self.put(format_args!(
             r#"<text class="{class}" x="{x}" y="{y}" text-anchor="{anchor}">{text}</text>"#
         ));
@@ -130,10 +144,7 @@ impl Svg {
 
     /// Begins a group; `attributes` are pairs whose values get escaped.
     pub(super) fn open(&mut self, attributes: &[(&str, &str)]) {
-        let list = attributes
-            .iter()
-            .map(|(name, value)| format!(" {name}=\"{}\"", escaped(value)));
-        let list: String = list.collect();
+        let list = attribute_list(attributes.iter().copied());
         self.put(format_args!("<g{list}>"));
     }
 
@@ -142,8 +153,8 @@ impl Svg {
     }
 
     /// Nothing outside this rectangle is seen of groups that name it.
-    pub(super) fn clip(&mut self, id: &str, at: (f64, f64), size: (f64, f64)) {
-        let [x, y, width, height] = [at.0, at.1, size.0, size.1].map(px);
+    pub(super) fn clip(&mut self, id: &str, x: f64, y: f64, width: f64, height: f64) {
+        let [x, y, width, height] = [x, y, width, height].map(px);
         let id = escaped(id);
         self.put(format_args!(
             r#"<clipPath id="{id}"><rect x="{x}" y="{y}" width="{width}" height="{height}"/></clipPath>"#
@@ -153,10 +164,8 @@ impl Svg {
     /// The picture; `attributes` go to its outermost element, `title` is what a reader without eyes
     /// is told.
     pub(super) fn finish(self, title: &str, attributes: &[(&str, String)]) -> String {
-        let list = attributes
-            .iter()
-            .map(|(name, value)| format!(" {name}=\"{}\"", escaped(value)));
-        let list: String = list.collect();
+        let attributes = attributes.iter();
+        let list = attribute_list(attributes.map(|(name, value)| (*name, value.as_str())));
         let ([width, height], title) = ([self.width, self.height].map(px), escaped(title));
         format!(
             "<svg xmlns=\"http://www.w3.org/2000/svg\" class=\"figure\" role=\"img\" viewBox=\"0 0 {width} \
@@ -188,8 +197,8 @@ mod tests {
             "&lt;b a=&#39;1&#39;&gt;&quot;&amp;\u{fffd}\u{fffd}µ"
         );
         let mut svg = Svg::new(10.0, 20.0);
-        svg.text("x", (1.0, 2.04), Anchor::Middle, "</text><script>");
-        svg.rect("x", (0.0, 0.0), (-1.0, 2.0), "a<b");
+        svg.text("x", 1.0, 2.04, Anchor::Middle, "</text><script>");
+        svg.rect("x", 0.0, 0.0, -1.0, 2.0, "a<b");
         let text = svg.finish("<t>", &[("data-x", "\"y".to_owned())]);
         assert!(text.contains("&lt;/text&gt;&lt;script&gt;"), "{text}");
         assert!(text.contains("data-x=\"&quot;y\""), "{text}");

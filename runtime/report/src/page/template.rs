@@ -66,29 +66,25 @@ pub(super) fn html(page: &Page) -> Result<String, TemplateError> {
         plots => Value::from_safe_string(data),
         mark => MARK,
     };
-    rendered(("page.html", PAGE), page, extra)
+    rendered("page.html", PAGE, page, extra)
 }
 
 pub(super) fn markdown(page: &Page) -> Result<String, TemplateError> {
     let extra = context! { mark => MARK };
-    Ok(rendered(("report.md", MARKDOWN), page, extra)?.replace(JOINT, " "))
+    Ok(rendered("report.md", MARKDOWN, page, extra)?.replace(JOINT, " "))
 }
 
 pub(super) fn tex(page: &Page) -> Result<String, TemplateError> {
     let extra = context! { mark => MARK };
-    Ok(rendered(("table.tex", TEX), page, extra)?.replace(JOINT, "~"))
+    Ok(rendered("table.tex", TEX, page, extra)?.replace(JOINT, "~"))
 }
 
 /// A user's own template: its name, whose ending decides about escaping, and its text.
-pub(super) fn own((name, text): (&str, &str), page: &Page) -> Result<String, TemplateError> {
-    rendered((name, text), page, context! {})
+pub(super) fn own(name: &str, text: &str, page: &Page) -> Result<String, TemplateError> {
+    rendered(name, text, page, context! {})
 }
 
-fn rendered(
-    (name, text): (&str, &str),
-    page: &Page,
-    extra: Value,
-) -> Result<String, TemplateError> {
+fn rendered(name: &str, text: &str, page: &Page, extra: Value) -> Result<String, TemplateError> {
     let failed = |error: minijinja::Error| TemplateError::of(name, &error);
     let mut environment = Environment::new();
     environment.set_undefined_behavior(UndefinedBehavior::Strict);
@@ -218,15 +214,15 @@ mod tests {
     #[test]
     fn a_faulty_template_is_named_with_its_line() {
         let page = super::super::page_of(&[], 10);
-        let error = own(("mine.txt", "a\n{{ title }\n"), &page)
+        let error = own("mine.txt", "a\n{{ title }\n", &page)
             .unwrap_err()
             .to_string();
         assert!(error.starts_with("template mine.txt, line 2: "), "{error}");
-        let error = own(("mine.txt", "{{ titel }}"), &page)
+        let error = own("mine.txt", "{{ titel }}", &page)
             .unwrap_err()
             .to_string();
         assert!(error.contains("undefined"), "{error}");
-        assert_eq!(own(("mine.txt", "{{ title }}"), &page).unwrap(), "0 runs");
+        assert_eq!(own("mine.txt", "{{ title }}", &page).unwrap(), "0 runs");
     }
 
     #[test]
@@ -234,7 +230,7 @@ mod tests {
         let page = super::super::page_of(&[], 10);
         let used = |figures: &str| {
             let text = format!("\n{{{{ [{figures}]|alike|length }}}}");
-            own(("mine.txt", &text), &page)
+            own("mine.txt", &text, &page)
         };
         assert_eq!(
             used("{'label': 'a', 'value': 1, 'method': ''}").unwrap(),

@@ -1,6 +1,8 @@
 //! Figures over time: the network and the robot on the axis of the run, and the case's own series on
 //! theirs.
 
+use core::ops::Range;
+
 use hil_core::case_study::Severity;
 
 use super::data::Drawing;
@@ -23,15 +25,17 @@ const BANDS_MAX: usize = 300;
 pub(super) fn over_run(
     key: &str,
     report: &NetworkReport,
-    (events, changes): (&ScoreEvents, &[LinkChange]),
-    (series, point_count): (&[Series], usize),
+    events: &ScoreEvents,
+    changes: &[LinkChange],
+    series: &[Series],
+    point_count: usize,
 ) -> Drawing {
     let rows = &report.timeline.rows;
     let step_s = report.timeline.step_s;
     let ends = rows.iter().map(|row| row.values.len() as f64 * step_s);
     let until_s = ends.fold(0.0, f64::max);
-    let span = (0.0, if until_s > 0.0 { until_s } else { 1.0 });
-    let (mut panels, width_s) = network_panels(report, series, (span, point_count));
+    let span = 0.0..if until_s > 0.0 { until_s } else { 1.0 };
+    let (mut panels, width_s) = network_panels(report, series, &span, point_count);
     for row in rows {
         let TimelineSubject::Robot { label } = &row.subject else {
             continue;
@@ -51,17 +55,17 @@ pub(super) fn over_run(
     let by_hand = changes.iter().filter_map(changed_at);
     let moments = events.events.iter().filter_map(moment);
     let moments: Vec<Mark> = moments.chain(by_hand).collect();
-    let caption = run_caption(report, (step_s, width_s), bands.len() == BANDS_MAX);
+    let caption = run_caption(report, step_s, width_s, bands.len() == BANDS_MAX);
     let plot = Plot {
         axis: format!("{key}-run"),
-        from_s: span.0,
-        until_s: span.1,
+        from_s: span.start,
+        until_s: span.end,
         panels,
     };
     let name = name_of(&[key, "timeline"]);
     let title = "Network and robot over time";
     Drawing {
-        svg: over_time((&name, title), &plot, &bands, &moments),
+        svg: over_time(&name, title, &plot, &bands, &moments),
         name,
         title: title.to_owned(),
         caption,
@@ -90,7 +94,7 @@ fn bands(report: &NetworkReport) -> Vec<Mark> {
         .collect()
 }
 
-fn run_caption(report: &NetworkReport, (robot_s, width_s): (f64, f64), is_cut: bool) -> String {
+fn run_caption(report: &NetworkReport, robot_s: f64, width_s: f64, is_cut: bool) -> String {
     let mut caption = format!(
         "Above the network, below the robot. Each point stands for up to {} and has the smallest and \
          largest value within; the robot's for {}. Figures are from all messages. Shaded: outages{}.",
@@ -165,7 +169,8 @@ const PANELS: [(&str, &str, Option<NetworkQuantity>); 4] = [
 fn network_panels(
     report: &NetworkReport,
     series: &[Series],
-    (span, steps): ((f64, f64), usize),
+    span: &Range<f64>,
+    steps: usize,
 ) -> (Vec<PlotPanel>, f64) {
     let mut panels: Vec<PlotPanel> = PANELS
         .iter()
@@ -182,7 +187,7 @@ fn network_panels(
         let found = series.iter().find(|one| one.name == file);
         if let Some(found) = found.filter(|found| !found.rows.is_empty()) {
             let steps = steps.min(found.rows.len()).max(1);
-            width_s = width_s.max((span.1 - span.0) / steps as f64);
+            width_s = width_s.max((span.end - span.start) / steps as f64);
             // A channel that speaks seldom has no silence to tell of; see the summary's timeline.
             let told = |quantity: Option<NetworkQuantity>| {
                 let mut rows = report.timeline.rows.iter();
@@ -193,7 +198,7 @@ fn network_panels(
                 if !told(quantity) {
                     continue;
                 }
-                let thin = thinned((channel, channel), points.into_iter(), span, steps);
+                let thin = thinned(channel, channel, points.into_iter(), span, steps);
                 panel.series.push(thin);
             }
             continue;
@@ -217,16 +222,11 @@ fn network_panels(
 
 /// Median delay, largest delay, share lost, silence; each at the middle of its bin.
 fn network_points(series: &Series) -> [Vec<(f64, f64)>; 4] {
-    let starts = || {
-        series
-            .rows
-            .iter()
-            .filter_map(|row| row.first().copied().flatten())
+    let starts = series.rows.iter().filter_map(|row| *row.first()?);
+    let width_s = match starts.take(2).collect::<Vec<_>>()[..] {
+        [first, second] => second - first,
+        _ => 0.0,
     };
-    let width_s = starts()
-        .nth(1)
-        .zip(starts().next())
-        .map_or(0.0, |(second, first)| second - first);
     let column = |name: &str| -> Vec<(f64, f64)> {
         let index = series.column(name);
         let points = index.map(|index| series.points(index).collect::<Vec<_>>());
@@ -272,7 +272,7 @@ pub(super) fn of_case(
     if until_s <= from_s {
         return (None, Vec::new());
     }
-    let (panels, left_out) = case_panels(&timed, (from_s, until_s), steps);
+    let (panels, left_out) = case_panels(&timed, &(from_s..until_s), steps);
     let axis_words = timed
         .iter()
         .map(|one| one.columns[0].label.as_str())
@@ -292,7 +292,7 @@ pub(super) fn of_case(
         duration_s((until_s - from_s) / steps.max(1) as f64)
     );
     let drawing = Drawing {
-        svg: over_time((&name, title), &plot, &[], &[]),
+        svg: over_time(&name, title, &plot, &[], &[]),
         name,
         title: title.to_owned(),
         caption,
@@ -303,7 +303,11 @@ pub(super) fn of_case(
 }
 
 /// Panels of the case's series, and the files that found no room.
-fn case_panels(timed: &[&Series], span: (f64, f64), steps: usize) -> (Vec<PlotPanel>, Vec<String>) {
+fn case_panels(
+    timed: &[&Series],
+    span: &Range<f64>,
+    steps: usize,
+) -> (Vec<PlotPanel>, Vec<String>) {
     let mut panels = Vec::new();
     let mut left_out = Vec::new();
     for one in timed {
@@ -320,7 +324,7 @@ fn case_panels(timed: &[&Series], span: (f64, f64), steps: usize) -> (Vec<PlotPa
                 } else {
                     &label.label
                 };
-                thinned((words, ""), one.points(*column), span, steps)
+                thinned(words, "", one.points(*column), span, steps)
             };
             let first = &one.columns[chunk[0]];
             let title = if one.title.is_empty() {

@@ -57,7 +57,7 @@ pub(in crate::page) fn loss_bursts(title: &str, runs: &[BurstCount]) -> Option<S
         bottom: 252.0,
     };
     let mut svg = Svg::new(HALF_WIDTH, frame.bottom + 42.0);
-    let y_axis = Axis::linear((0.0, most as f64), (frame.bottom, frame.top));
+    let y_axis = Axis::linear(0.0, most as f64, frame.bottom, frame.top);
     frame.y_axis(&mut svg, &y_axis, Unit::Count);
     let pitch = (frame.right - frame.left) / bars.len() as f64;
     for (index, (words, count)) in bars.iter().enumerate() {
@@ -65,33 +65,19 @@ pub(in crate::page) fn loss_bursts(title: &str, runs: &[BurstCount]) -> Option<S
         let width = (pitch * 0.7).min(48.0);
         if *count > 0 {
             let top = y_axis.at(*count as f64).min(frame.bottom - 1.0);
-            let size = (width, frame.bottom - top);
-            svg.rect("bar", (middle - width / 2.0, top), size, "");
-            svg.text("", (middle, top - 4.0), Anchor::Middle, &grouped(*count));
+            let left = middle - width / 2.0;
+            svg.rect("bar", left, top, width, frame.bottom - top, "");
+            svg.text("", middle, top - 4.0, Anchor::Middle, &grouped(*count));
         }
         // Words of neighbours must not run into each other.
         if bars.len() <= 9 || index % 2 == 0 {
-            svg.text(
-                "faint",
-                (middle, frame.bottom + 16.0),
-                Anchor::Middle,
-                words,
-            );
+            svg.text("faint", middle, frame.bottom + 16.0, Anchor::Middle, words);
         }
     }
-    svg.line(
-        "axis",
-        (frame.left, frame.bottom),
-        (frame.right, frame.bottom),
-    );
+    svg.line("axis", frame.left, frame.bottom, frame.right, frame.bottom);
     let middle = f64::midpoint(frame.left, frame.right);
     let words = "messages lost in a row; bars: how often";
-    svg.text(
-        "faint",
-        (middle, frame.bottom + 34.0),
-        Anchor::Middle,
-        words,
-    );
+    svg.text("faint", middle, frame.bottom + 34.0, Anchor::Middle, words);
     Some(svg.finish(title, &[]))
 }
 

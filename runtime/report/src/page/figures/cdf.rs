@@ -78,14 +78,14 @@ pub(in crate::page) fn delay_cdf(title: &str, curves: &[Curve<'_>]) -> Option<St
         bottom: top + 240.0,
     };
     let mut svg = Svg::new(HALF_WIDTH, frame.bottom + 42.0);
-    legend(&mut svg, (8.0, 16.0), HALF_WIDTH - 8.0, &entries);
+    legend(&mut svg, 8.0, 16.0, HALF_WIDTH - 8.0, &entries);
     let counts = drawn
         .iter()
         .filter_map(|(curve, _)| Some(curve.summary?.count));
     let most = counts.max().unwrap_or(1).max(2) as f64;
     let nines = most.log10().clamp(2.0, 6.0);
-    let x_axis = Axis::logarithmic((low, high), (frame.left, frame.right));
-    let y_axis = Axis::nines(nines, (frame.bottom, frame.top + 6.0));
+    let x_axis = Axis::logarithmic(low, high, frame.left, frame.right);
+    let y_axis = Axis::nines(nines, frame.bottom, frame.top + 6.0);
     frame.x_axis(&mut svg, &x_axis, Unit::Nanoseconds, "time, logarithmic");
     frame.y_axis(&mut svg, &y_axis, Unit::Share);
     for ((curve, points), (class, _)) in drawn.iter().zip(&entries) {
@@ -95,7 +95,7 @@ pub(in crate::page) fn delay_cdf(title: &str, curves: &[Curve<'_>]) -> Option<St
         svg.path(class, &path_through(places));
         if curve.bins.is_empty() {
             for (ns, share) in points {
-                svg.circle(class, (x_axis.at(*ns), y_axis.at(*share)), 2.5);
+                svg.circle(class, x_axis.at(*ns), y_axis.at(*share), 2.5);
             }
         }
     }

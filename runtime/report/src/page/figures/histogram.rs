@@ -22,8 +22,8 @@ pub(in crate::page) fn delay_histogram(title: &str, bins: &[DurationBin]) -> Opt
     };
     let low = (first.from_ns() as f64).max(1.0);
     let mut svg = Svg::new(HALF_WIDTH, frame.bottom + 42.0);
-    let x_axis = Axis::logarithmic((low, last.until_ns as f64), (frame.left, frame.right));
-    let y_axis = Axis::linear((0.0, most as f64), (frame.bottom, frame.top));
+    let x_axis = Axis::logarithmic(low, last.until_ns as f64, frame.left, frame.right);
+    let y_axis = Axis::linear(0.0, most as f64, frame.bottom, frame.top);
     frame.x_axis(
         &mut svg,
         &x_axis,
@@ -45,7 +45,7 @@ pub(in crate::page) fn delay_histogram(title: &str, bins: &[DurationBin]) -> Opt
             grouped(bin.count)
         );
         let width = (right - left - 0.6).max(1.0);
-        svg.rect("bar", (left, top), (width, frame.bottom - top), &words);
+        svg.rect("bar", left, top, width, frame.bottom - top, &words);
     }
     Some(svg.finish(title, &[]))
 }

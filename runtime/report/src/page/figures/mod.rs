@@ -29,43 +29,43 @@ impl Frame {
     fn x_axis(self, svg: &mut Svg, axis: &Axis, unit: Unit, title: &str) {
         for (value, word) in axis.ticks(unit) {
             let x = axis.at(value);
-            svg.line("grid", (x, self.top), (x, self.bottom));
-            svg.text("faint", (x, self.bottom + 16.0), Anchor::Middle, &word);
+            svg.line("grid", x, self.top, x, self.bottom);
+            svg.text("faint", x, self.bottom + 16.0, Anchor::Middle, &word);
         }
-        svg.line("axis", (self.left, self.bottom), (self.right, self.bottom));
+        svg.line("axis", self.left, self.bottom, self.right, self.bottom);
         let middle = f64::midpoint(self.left, self.right);
-        svg.text("faint", (middle, self.bottom + 33.0), Anchor::Middle, title);
+        svg.text("faint", middle, self.bottom + 33.0, Anchor::Middle, title);
     }
 
     /// Lines and words of the vertical axis, to the left.
     fn y_axis(self, svg: &mut Svg, axis: &Axis, unit: Unit) {
         for (value, word) in axis.ticks(unit) {
             let y = axis.at(value);
-            svg.line("grid", (self.left, y), (self.right, y));
-            svg.text("faint", (self.left - 6.0, y + 4.0), Anchor::End, &word);
+            svg.line("grid", self.left, y, self.right, y);
+            svg.text("faint", self.left - 6.0, y + 4.0, Anchor::End, &word);
         }
     }
 }
 
 /// Words of a legend with their marks, in rows of the frame's width; gives its height.
-fn legend(svg: &mut Svg, at: (f64, f64), right: f64, entries: &[(String, String)]) -> f64 {
-    let (mut x, mut y) = at;
+fn legend(svg: &mut Svg, left: f64, top: f64, right: f64, entries: &[(String, String)]) -> f64 {
+    let (mut x, mut y) = (left, top);
     for (class, words) in entries {
         // An estimate: the width of a letter is for the reader's font to say.
         let width = 30.0 + 7.0 * words.chars().count() as f64;
-        if x > at.0 && x + width > right {
-            (x, y) = (at.0, y + 17.0);
+        if x > left && x + width > right {
+            (x, y) = (left, y + 17.0);
         }
-        svg.line(class, (x, y - 4.0), (x + 18.0, y - 4.0));
-        svg.text("", (x + 23.0, y), Anchor::Start, words);
+        svg.line(class, x, y - 4.0, x + 18.0, y - 4.0);
+        svg.text("", x + 23.0, y, Anchor::Start, words);
         x += width + 6.0;
     }
-    y - at.1 + 17.0
+    y - top + 17.0
 }
 
 /// Height that [`legend`] will take.
 fn legend_height(entries: &[(String, String)], left: f64, right: f64) -> f64 {
-    legend(&mut Svg::new(0.0, 0.0), (left, 0.0), right, entries)
+    legend(&mut Svg::new(0.0, 0.0), left, 0.0, right, entries)
 }
 
 /// The `d` of a path through points, begun anew after each gap.

@@ -52,12 +52,13 @@ impl MarkClass {
 
 /// The figure: panels, and below them a row of marks for what happened to the robot.
 pub(in crate::page) fn over_time(
-    (name, title): (&str, &str),
+    name: &str,
+    title: &str,
     plot: &Plot,
     bands: &[Mark],
     moments: &[Mark],
 ) -> String {
-    let axis = Axis::linear((plot.from_s, plot.until_s), (LEFT, RIGHT));
+    let axis = Axis::linear(plot.from_s, plot.until_s, LEFT, RIGHT);
     let colours = Colours::of(plot);
     let legends: Vec<_> = plot
         .panels
@@ -71,24 +72,24 @@ pub(in crate::page) fn over_time(
     let height = heights.sum::<f64>() + marks_height;
     let mut svg = Svg::new(FULL_WIDTH, height + 46.0);
     let clip = format!("clip-{name}");
-    svg.clip(&clip, (LEFT, 0.0), (RIGHT - LEFT, height));
+    svg.clip(&clip, LEFT, 0.0, RIGHT - LEFT, height);
     let url = format!("url(#{clip})");
     let mut top = 0.0;
     for (panel, entries) in plot.panels.iter().zip(&legends) {
-        svg.text("strong", (8.0, top + 15.0), Anchor::Start, &panel.title);
+        svg.text("strong", 8.0, top + 15.0, Anchor::Start, &panel.title);
         let below = top + 33.0;
-        let used = legend(&mut svg, (LEFT, below), RIGHT, entries);
+        let used = legend(&mut svg, LEFT, below, RIGHT, entries);
         let frame = Frame {
             left: LEFT,
             top: below + used - 12.0,
             right: RIGHT,
             bottom: below + used - 12.0 + PANEL_HEIGHT,
         };
-        draw_panel(&mut svg, (panel, &colours), frame, (&axis, &url), bands);
+        draw_panel(&mut svg, panel, &colours, frame, &axis, &url, bands);
         top += 24.0 + used + PANEL_HEIGHT + 8.0;
     }
     if !moments.is_empty() {
-        draw_moments(&mut svg, moments, top, (&axis, &url));
+        draw_moments(&mut svg, moments, top, &axis, &url);
     }
     let bottom = Frame {
         left: LEFT,
@@ -114,7 +115,7 @@ pub(in crate::page) fn over_time(
     )
 }
 
-fn draw_moments(svg: &mut Svg, moments: &[Mark], top: f64, (axis, url): (&Axis, &str)) {
+fn draw_moments(svg: &mut Svg, moments: &[Mark], top: f64, axis: &Axis, url: &str) {
     let is_change = |mark: &Mark| mark.class == MarkClass::Change;
     let title = if moments.iter().all(is_change) {
         "Links changed by hand (dashed)"
@@ -123,7 +124,7 @@ fn draw_moments(svg: &mut Svg, moments: &[Mark], top: f64, (axis, url): (&Axis, 
     } else {
         "What happened to the robot"
     };
-    svg.text("strong", (8.0, top + 15.0), Anchor::Start, title);
+    svg.text("strong", 8.0, top + 15.0, Anchor::Start, title);
     svg.open(&[("clip-path", url)]);
     svg.open(&[("class", "zoom")]);
     for mark in moments {
@@ -133,7 +134,7 @@ fn draw_moments(svg: &mut Svg, moments: &[Mark], top: f64, (axis, url): (&Axis, 
             MarkClass::Notice => top + 30.0,
         };
         let x = axis.at(mark.from_s);
-        svg.line(mark.class.word(), (x, y), (x, top + 44.0));
+        svg.line(mark.class.word(), x, y, x, top + 44.0);
     }
     svg.close();
     svg.close();
@@ -188,15 +189,15 @@ fn value_axis(panel: &PlotPanel, frame: Frame) -> (Axis, Unit) {
         values().fold(f64::NEG_INFINITY, f64::max),
     );
     let unit = Unit::of(&panel.unit);
-    let place = (frame.bottom, frame.top + 4.0);
+    let (bottom, top) = (frame.bottom, frame.top + 4.0);
     if !low.is_finite() || !high.is_finite() {
-        return (Axis::linear((0.0, 1.0), place), unit);
+        return (Axis::linear(0.0, 1.0, bottom, top), unit);
     }
     let least = values()
         .filter(|value| *value > 0.0)
         .fold(f64::INFINITY, f64::min);
     if unit == Unit::Length && low >= 0.0 && high > least * WIDE_RATIO {
-        return (Axis::logarithmic((least, high), place), unit);
+        return (Axis::logarithmic(least, high, bottom, top), unit);
     }
     let low = if low >= 0.0 && low < high * 0.8 {
         0.0
@@ -205,22 +206,26 @@ fn value_axis(panel: &PlotPanel, frame: Frame) -> (Axis, Unit) {
     };
     let margin = (high - low) * 0.04;
     let low = if low < 0.0 { low - margin } else { low };
-    (Axis::linear((low, high + margin), place), unit)
+    (Axis::linear(low, high + margin, bottom, top), unit)
 }
 
 fn draw_panel(
     svg: &mut Svg,
-    (panel, colours): (&PlotPanel, &Colours),
+    panel: &PlotPanel,
+    colours: &Colours,
     frame: Frame,
-    (time, url): (&Axis, &str),
+    time: &Axis,
+    url: &str,
     bands: &[Mark],
 ) {
     let (axis, unit) = value_axis(panel, frame);
     frame.y_axis(svg, &axis, unit);
     svg.rect(
         "panel",
-        (frame.left, frame.top),
-        (frame.right - frame.left, frame.bottom - frame.top),
+        frame.left,
+        frame.top,
+        frame.right - frame.left,
+        frame.bottom - frame.top,
         "",
     );
     svg.open(&[("clip-path", url)]);
@@ -231,9 +236,16 @@ fn draw_panel(
     {
         let left = time.at(band.from_s);
         let right = time.at(band.until_s.unwrap_or(time.ends().1));
-        let size = ((right - left).max(1.0), frame.bottom - frame.top);
+        let width = (right - left).max(1.0);
         svg.open(&[("data-channel", &band.channel)]);
-        svg.rect("band", (left, frame.top), size, &band.words);
+        svg.rect(
+            "band",
+            left,
+            frame.top,
+            width,
+            frame.bottom - frame.top,
+            &band.words,
+        );
         svg.close();
     }
     for (index, one) in panel.series.iter().enumerate() {
@@ -308,7 +320,7 @@ mod tests {
             words: String::new(),
         };
         let values = vec![Some(0.1), None, Some(0.2), Some(0.3)];
-        let svg = over_time(("a", "t"), &plot(values), &[], &[mark]);
+        let svg = over_time("a", "t", &plot(values), &[], &[mark]);
         let path = svg.split("<path").nth(1).unwrap();
         assert_eq!(path.matches('M').count(), 2, "{path}");
         assert!(svg.contains("delay &lt;x&gt;"));
@@ -317,7 +329,7 @@ mod tests {
 
     #[test]
     fn a_panel_without_a_value_is_drawn_empty() {
-        let svg = over_time(("a", "t"), &plot(vec![None, None]), &[], &[]);
+        let svg = over_time("a", "t", &plot(vec![None, None]), &[], &[]);
         assert!(!svg.contains("<path"), "{svg}");
         assert!(!svg.contains("NaN") && !svg.contains("inf"), "{svg}");
     }

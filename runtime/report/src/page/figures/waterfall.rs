@@ -47,32 +47,27 @@ pub(in crate::page) fn waterfall(title: &str, bars: &[Bar]) -> Option<String> {
     let (left, right) = (8.0, FULL_WIDTH - 8.0);
     let top = 10.0 + legend_height(&entries, left, right);
     let mut svg = Svg::new(FULL_WIDTH, top + bars.len() as f64 * 52.0 + 4.0);
-    legend(&mut svg, (left, 16.0), right, &entries);
+    legend(&mut svg, left, 16.0, right, &entries);
     for (index, bar) in bars.iter().enumerate() {
         let y = top + index as f64 * 52.0;
         let total: i64 = bar.parts.iter().map(|part| part.1.max(0)).sum();
         svg.open(&[("data-channel", &bar.channel)]);
-        svg.text("strong", (left, y + 13.0), Anchor::Start, &bar.channel);
+        svg.text("strong", left, y + 13.0, Anchor::Start, &bar.channel);
         let whole = bar.whole_ns.map_or_else(
             || "median of the whole unavailable".to_owned(),
             |ns| format!("median of the whole {}", duration(ns)),
         );
-        svg.text("faint", (right, y + 13.0), Anchor::End, &whole);
+        svg.text("faint", right, y + 13.0, Anchor::End, &whole);
         let mut x = left;
         for (name, ns) in &bar.parts {
             let share = (*ns).max(0) as f64 / total as f64;
             let width = share * (right - left);
             let words = format!("{name}: {} ({})", duration(*ns), percent(share));
             let class = format!("f{}", colour(name));
-            svg.rect(
-                &class,
-                (x, y + 20.0),
-                ((width - 0.7).max(0.3), 22.0),
-                &words,
-            );
+            svg.rect(&class, x, y + 20.0, (width - 0.7).max(0.3), 22.0, &words);
             if width > 64.0 {
-                let middle = (x + width / 2.0, y + 35.0);
-                svg.text("inside", middle, Anchor::Middle, &duration(*ns));
+                let middle = x + width / 2.0;
+                svg.text("inside", middle, y + 35.0, Anchor::Middle, &duration(*ns));
             }
             x += width;
         }
