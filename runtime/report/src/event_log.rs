@@ -3,8 +3,6 @@
 
 use core::fmt::Write;
 
-use hil_core::case_study::Severity;
-
 use super::link_change::LinkChange;
 use super::score_event::{ExplainedEvent, ScoreEvents};
 use super::terminal::JOINT;
@@ -47,14 +45,7 @@ pub(crate) fn text(name: &str, all: &ScoreEvents, changes: &[LinkChange]) -> Str
 }
 
 fn line(event: &ExplainedEvent, clocks_differ: bool) -> String {
-    let time = event
-        .at_s
-        .map_or_else(|| "-".to_owned(), |at_s| format!("{at_s:.6}"));
-    let severity = match event.severity {
-        Severity::Notice => "notice",
-        Severity::Hazard => "hazard",
-        Severity::Incident => "incident",
-    };
+    let (time, severity) = (time_s(event.at_s), event.severity_word());
     let mut line = format!("{time:>14} {severity:<8} {}", event.what.replace('|', "/"));
     if clocks_differ {
         line.push_str(&[" (clock of ", &event.clock, ")"].concat());
@@ -72,11 +63,13 @@ fn line(event: &ExplainedEvent, clocks_differ: bool) -> String {
     one_line(&line)
 }
 
+fn time_s(at_s: Option<f64>) -> String {
+    at_s.map_or_else(|| "-".to_owned(), |at_s| format!("{at_s:.6}"))
+}
+
 /// A change of an emulated link. It is no event of the score, and nothing the network did.
 fn change_line(change: &LinkChange) -> String {
-    let time = change
-        .at_s
-        .map_or_else(|| "-".to_owned(), |at_s| format!("{at_s:.6}"));
+    let time = time_s(change.at_s);
     one_line(&format!("{time:>14} notice   {}", change.what()))
 }
 
@@ -88,6 +81,8 @@ fn one_line(text: &str) -> String {
 
 #[cfg(test)]
 mod tests {
+    use hil_core::case_study::Severity;
+
     use super::*;
     use crate::link_change::ChangedTo;
     use crate::network::ForegoingNetwork;

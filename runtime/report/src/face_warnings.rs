@@ -4,7 +4,7 @@
 use hil_arm::egm::wire::Cause;
 
 use super::face::FaceSummary;
-use hil_platform::text::grouped;
+use hil_platform::words::counted;
 use hil_rundir::pipe::{FaceRefusal, RefusalCount};
 
 /// The warnings of one arm, most important first.
@@ -29,14 +29,10 @@ pub(super) fn face_warnings(face: &FaceSummary) -> Vec<String> {
 }
 
 fn refusal_warning(at: &str, refusal: &RefusalCount, face: &FaceSummary) -> String {
-    let count = grouped(refusal.count);
-    let plural = if refusal.count == 1 { "" } else { "s" };
+    let count = counted(refusal.count, "datagram");
     let advice = advice(refusal.cause, face);
     let advice = advice.map_or_else(String::new, |advice| format!("; {advice}"));
-    format!(
-        "{at}: {count} datagram{plural} refused: {}{advice}",
-        refusal.cause.label()
-    )
+    format!("{at}: {count} refused: {}{advice}", refusal.cause.label())
 }
 
 /// What to do about a cause; `None` where only its sender can know.

@@ -48,6 +48,15 @@ pub struct ExplainedEvent {
 }
 
 impl ExplainedEvent {
+    /// The word for its severity.
+    pub(crate) const fn severity_word(&self) -> &'static str {
+        match self.severity {
+            Severity::Notice => "notice",
+            Severity::Hazard => "hazard",
+            Severity::Incident => "incident",
+        }
+    }
+
     /// What came before it on any network, without outages that [`Self::outages`] tell of.
     pub(crate) fn network_beside(&self) -> Vec<&ForegoingEvent> {
         let is_told = |one: &&ForegoingEvent| {

@@ -5,6 +5,7 @@
 //! `assessment`. Within a schema version fields are only added; a reader ignores what it does
 //! not know. Units are part of the names.
 
+use core::fmt;
 use std::collections::BTreeMap;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -255,6 +256,12 @@ impl Fact {
     }
 }
 
+impl fmt::Display for Fact {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(formatter, "{}: {}", self.label, self.value)
+    }
+}
+
 /// The facts of a host, for a reader.
 pub(crate) fn host_words(host: &HostFacts) -> Vec<Fact> {
     let facts = host.facts.iter();
@@ -459,9 +466,7 @@ impl LinkKind {
             Self::RecordOnly => "recorded only",
         }
     }
-}
 
-impl LinkKind {
     /// The words for a fate of a message on it: what an emulated link lost, no wire did.
     pub const fn fate_label(self, fate: MessageFate) -> &'static str {
         match (self, fate) {
@@ -558,6 +563,12 @@ pub struct DirectionSummary {
 }
 
 impl DirectionSummary {
+    /// How it stood to its peer, and what was granted and found, for a reader.
+    pub(crate) fn words(&self) -> Vec<String> {
+        let peer = core::iter::once(format!("peer {}", self.peer_state));
+        peer.chain(self.facts.iter().map(Fact::to_string)).collect()
+    }
+
     /// What it counted by this name; `None` where it counts no such thing.
     pub fn count(&self, group: CounterGroup, name: &str) -> Option<u64> {
         let mut counters = self.counters.iter();

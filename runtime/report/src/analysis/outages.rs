@@ -10,7 +10,7 @@ use super::axis::RunAxis;
 use super::records::RunRecords;
 use crate::score_event::EventOutage;
 use crate::terminal::{duration_s, seconds};
-use hil_platform::text::grouped;
+use hil_platform::words::counted;
 use hil_topology::Channel;
 
 /// The outages of one channel, with what gives their times a meaning.
@@ -130,12 +130,8 @@ fn words(outage: &EventOutage, interrupted: Option<&str>, later_ns: Option<i64>)
             Some(length_s) => format!("outage of {}", duration_s(length_s)),
             None => "outage of unknown length".to_owned(),
         };
-        let lost = grouped(outage.lost_count);
-        let plural = if outage.lost_count == 1 { "" } else { "s" };
-        format!(
-            "{length} on {}, {time}, {lost} message{plural} lost",
-            outage.channel
-        )
+        let lost = counted(outage.lost_count, "message");
+        format!("{length} on {}, {time}, {lost} lost", outage.channel)
     };
     if let Some(process) = interrupted {
         text.push_str(&[", while ", process, " was down"].concat());
@@ -155,9 +151,8 @@ fn words(outage: &EventOutage, interrupted: Option<&str>, later_ns: Option<i64>)
         Standing::Unknown => {}
     }
     if outage.other_count > 0 {
-        let plural = if outage.other_count == 1 { "" } else { "s" };
-        let count = grouped(outage.other_count);
-        text.push_str(&[" (", &count, " other", plural, " about then)"].concat());
+        let others = counted(outage.other_count, "other");
+        text.push_str(&[" (", &others, " about then)"].concat());
     }
     text
 }

@@ -28,8 +28,22 @@ const OWN: &str = "MOVER of the scores' own intervals";
 const NO_OWN: &str = "no interval: the score has none of its own; repeat the runs";
 const ABSENT: &str = "unavailable on one side";
 
-/// What a delay is: which part of which channel, and which quantile.
-type DelayKey = (String, Part, usize);
+/// What a delay is of.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+struct DelayKey {
+    channel: String,
+    part: Part,
+    /// Place in [`METRICS`].
+    metric: usize,
+}
+
+/// A delay of one run, nanoseconds, and how its interval came about.
+#[derive(Debug, Clone, Copy)]
+struct RunDelay {
+    estimate: Estimate,
+    method: &'static str,
+}
+
 const METRICS: [&str; 4] = ["p50", "p99", "p99.9", "max"];
 
 /// So many runs of the base, and so many new ones.
@@ -108,73 +122,65 @@ fn accounts(run: &ComparedRun) -> impl Iterator<Item = (&str, &ChannelAccount)> 
 }
 
 /// Every delay of a run, in nanoseconds, and how its interval came about.
-fn delays_of(run: &ComparedRun) -> BTreeMap<DelayKey, (Estimate, &'static str)> {
+fn delays_of(run: &ComparedRun) -> BTreeMap<DelayKey, RunDelay> {
     let mut found = BTreeMap::new();
     for (channel, account) in accounts(run) {
-        let whole = &account.end_to_end;
-        let own = [whole.p50_interval, whole.p99_interval, None, None];
-        let mut add = |part: Part, parts: Parts<'_>| {
-            for (index, metric) in METRICS.iter().enumerate() {
-                if let Some(estimate) = delay(metric, index, &parts) {
-                    let key = (channel.to_owned(), part, index);
-                    found.insert(key, estimate);
-                }
+        let mut add = |part, distribution: &Distribution, bins: &[DurationBin], own| {
+            let delays = distribution
+                .measured()
+                .map(|one| run_delays(one, bins, own));
+            for (metric, delay) in delays.into_iter().flatten().enumerate() {
+                let channel = channel.to_owned();
+                let key = DelayKey {
+                    channel,
+                    part,
+                    metric,
+                };
+                found.insert(key, delay);
             }
         };
-        add(Part::EndToEnd, (&whole.distribution, &whole.bins, own));
+        let whole = &account.end_to_end;
+        let own = [whole.p50_interval, whole.p99_interval, None, None];
+        add(Part::EndToEnd, &whole.distribution, &whole.bins, own);
         for segment in &account.segments {
-            let parts = (&segment.distribution, segment.bins.as_slice(), [None; 4]);
-            let part = Part::Segment {
-                from: segment.from,
-                to: segment.to,
-            };
-            add(part, parts);
+            let (from, to) = (segment.from, segment.to);
+            let part = Part::Segment { from, to };
+            add(part, &segment.distribution, &segment.bins, [None; 4]);
         }
     }
     found
 }
 
-type Parts<'a> = (&'a Distribution, &'a [DurationBin], [Option<IntervalNs>; 4]);
-
-fn delay(
-    metric: &str,
-    index: usize,
-    (distribution, bins, own): &Parts<'_>,
-) -> Option<(Estimate, &'static str)> {
-    let figures: &LatencySummary = distribution.measured()?;
-    let (value_ns, quantile) = match metric {
-        "p50" => (figures.p50_ns, 0.5),
-        "p99" => (figures.p99_ns, 0.99),
-        "p99.9" => (figures.p999_ns, 0.999),
-        _ => (figures.max_ns, 1.0),
+/// The delays of [`METRICS`], each with its `own` interval, or that of the `bins` where it has none.
+fn run_delays(
+    figures: &LatencySummary,
+    bins: &[DurationBin],
+    own: [Option<IntervalNs>; 4],
+) -> [RunDelay; 4] {
+    let binned = |quantile| binned_quantile_interval(bins, quantile, CONFIDENCE);
+    let delay = |value_ns: i64, own: Option<IntervalNs>, quantile: Option<f64>| RunDelay {
+        estimate: Estimate {
+            value: value_ns as f64,
+            interval: own.or_else(|| binned(quantile?)).map(|one| Interval {
+                low: one.low_ns as f64,
+                high: one.high_ns as f64,
+            }),
+        },
+        method: if own.is_some() { BOOTSTRAP } else { ORDER },
     };
-    let binned = || {
-        let is_quantile = quantile < 1.0;
-        is_quantile
-            .then(|| binned_quantile_interval(bins, quantile, CONFIDENCE))
-            .flatten()
-    };
-    let (interval, method) = match own[index] {
-        Some(interval) => (Some(interval), BOOTSTRAP),
-        None => (binned(), ORDER),
-    };
-    let estimate = Estimate {
-        value: value_ns as f64,
-        interval: interval.map(|one| Interval {
-            low: one.low_ns as f64,
-            high: one.high_ns as f64,
-        }),
-    };
-    Some((estimate, method))
+    [
+        delay(figures.p50_ns, own[0], Some(0.5)),
+        delay(figures.p99_ns, own[1], Some(0.99)),
+        delay(figures.p999_ns, own[2], Some(0.999)),
+        delay(figures.max_ns, own[3], None),
+    ]
 }
 
 fn delays(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedFigure> {
     let collect = |runs: &[ComparedRun]| {
-        let mut all: BTreeMap<DelayKey, Vec<(Estimate, &'static str)>> = BTreeMap::new();
-        for run in runs {
-            for (key, one) in delays_of(run) {
-                all.entry(key).or_default().push(one);
-            }
+        let mut all: BTreeMap<DelayKey, Vec<RunDelay>> = BTreeMap::new();
+        for (key, one) in runs.iter().flat_map(delays_of) {
+            all.entry(key).or_default().push(one);
         }
         all
     };
@@ -184,56 +190,76 @@ fn delays(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedFigure> {
     keys.dedup();
     keys.into_iter()
         .map(|key| {
-            let of = |all: &BTreeMap<DelayKey, Vec<(Estimate, &'static str)>>| {
-                all.get(key).cloned().unwrap_or_default()
-            };
-            let (found_base, found_new) = (of(&b), of(&n));
-            delay_figure(key, (&found_base, &found_new), [base.len(), new.len()])
+            let [b, n] = [&b, &n].map(|all| all.get(key).map_or(&[][..], Vec::as_slice));
+            delay_figure(key, b, n, [base.len(), new.len()])
         })
         .collect()
 }
 
-type Side<'a> = &'a [(Estimate, &'static str)];
-
-fn delay_figure(
-    (channel, part, metric): &DelayKey,
-    (base, new): (Side<'_>, Side<'_>),
-    of: Counts,
-) -> ComparedFigure {
+fn delay_figure(key: &DelayKey, base: &[RunDelay], new: &[RunDelay], of: Counts) -> ComparedFigure {
     let b = of_all(geometric(base), base.len(), of[0]);
     let n = of_all(geometric(new), new.len(), of[1]);
     let both = b.zip(n);
     let (interval, method) = match both {
         None => (None, ABSENT),
         Some(_) if is_partial([base.len(), new.len()], of) => (None, PARTIAL),
-        Some(both) => delay_interval((base, new), both, METRICS[*metric]),
+        Some((b, n)) => delay_interval(base, new, b, n, METRICS[key.metric]),
     };
     let is_repeated = base.len() > 1 && new.len() > 1;
     ComparedFigure {
-        channel: Some(channel.clone()),
-        part: Some(*part),
-        metric: METRICS[*metric].to_owned(),
-        kind: FigureKind::Delay,
+        channel: Some(key.channel.clone()),
+        part: Some(key.part),
         unit: "ns".to_owned(),
-        base: b,
-        new: n,
-        base_count: base.len(),
-        new_count: new.len(),
-        ratio: both.and_then(|(b, n)| (b.value > 0.0).then(|| n.value / b.value)),
         ratio_interval: interval,
-        difference: both.map(|(b, n)| n.value - b.value),
         difference_interval: both
             .filter(|_| !is_repeated)
             .and_then(|(b, n)| difference(b, n)),
         verdict: verdict(interval, 1.0, [Verdict::Faster, Verdict::Slower]),
         method: method.to_owned(),
+        ..figure(
+            FigureKind::Delay,
+            METRICS[key.metric],
+            b,
+            n,
+            [base.len(), new.len()],
+        )
+    }
+}
+
+/// What two sides come to in every figure, of which `have` runs have it.
+fn figure(
+    kind: FigureKind,
+    metric: &str,
+    base: Option<Estimate>,
+    new: Option<Estimate>,
+    have: Counts,
+) -> ComparedFigure {
+    let both = base.zip(new);
+    ComparedFigure {
+        channel: None,
+        part: None,
+        metric: metric.to_owned(),
+        kind,
+        unit: "1".to_owned(),
+        base,
+        new,
+        base_count: have[0],
+        new_count: have[1],
+        ratio: both.and_then(|(b, n)| (b.value > 0.0).then(|| n.value / b.value)),
+        ratio_interval: None,
+        difference: both.map(|(b, n)| n.value - b.value),
+        difference_interval: None,
+        verdict: Verdict::NotTested,
+        method: String::new(),
     }
 }
 
 /// The interval of the ratio, and how it came about or why there is none.
 fn delay_interval(
-    (base, new): (Side<'_>, Side<'_>),
-    (b, n): (Estimate, Estimate),
+    base: &[RunDelay],
+    new: &[RunDelay],
+    b: Estimate,
+    n: Estimate,
     metric: &str,
 ) -> (Option<Interval>, &'static str) {
     let repeated_count = [base, new].iter().filter(|side| side.len() > 1).count();
@@ -245,7 +271,7 @@ fn delay_interval(
         1 => (ratio(b, n), MIXED),
         // A histogram's bins are wider than what it was made of, so say which.
         _ => {
-            let methods = base.iter().chain(new).map(|one| one.1);
+            let methods = base.iter().chain(new).map(|one| one.method);
             (ratio(b, n), methods.max().unwrap_or(ABSENT))
         }
     };
@@ -257,8 +283,8 @@ fn delay_interval(
     }
 }
 
-fn logarithms(side: Side<'_>) -> Vec<f64> {
-    side.iter().map(|one| one.0.value.ln()).collect()
+fn logarithms(side: &[RunDelay]) -> Vec<f64> {
+    side.iter().map(|one| one.estimate.value.ln()).collect()
 }
 
 /// Back from an interval of logarithms; `None` where that cannot be written as a number.
@@ -269,10 +295,10 @@ fn exponential(one: Interval) -> Option<Interval> {
 }
 
 /// One run's figure as it is; of several the geometric mean, with Student's interval of the logarithms.
-fn geometric(side: Side<'_>) -> Option<Estimate> {
+fn geometric(side: &[RunDelay]) -> Option<Estimate> {
     match side {
         [] => None,
-        [only] => Some(only.0),
+        [only] => Some(only.estimate),
         several => {
             let logs = logarithms(several);
             let value = (logs.iter().sum::<f64>() / logs.len() as f64).exp();
@@ -317,15 +343,12 @@ fn losses(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedFigure> {
         all
     };
     let (b, n) = (collect(base), collect(new));
-    let none = Vec::new();
     channel_order(base, new)
         .into_iter()
         .filter(|channel| b.contains_key(channel) || n.contains_key(channel))
         .map(|channel| {
-            let of =
-                |all: &BTreeMap<String, Vec<Share>>| all.get(&channel).unwrap_or(&none).clone();
-            let found: [Vec<Share>; 2] = [of(&b), of(&n)];
-            loss_figure(&channel, (&found[0], &found[1]), [base.len(), new.len()])
+            let [b, n] = [&b, &n].map(|all| all.get(&channel).map_or(&[][..], Vec::as_slice));
+            loss_figure(&channel, b, n, [base.len(), new.len()])
         })
         .collect()
 }
@@ -362,7 +385,7 @@ fn values_of(side: &[Share]) -> Vec<f64> {
     shares.map(|one| one.count as f64 / one.of as f64).collect()
 }
 
-fn loss_figure(channel: &str, (base, new): (&[Share], &[Share]), of: Counts) -> ComparedFigure {
+fn loss_figure(channel: &str, base: &[Share], new: &[Share], of: Counts) -> ComparedFigure {
     let ((be, is_base_spread), (ne, is_new_spread)) = (mean_share(base), mean_share(new));
     let be = of_all(be, base.len(), of[0]);
     let ne = of_all(ne, new.len(), of[1]);
@@ -378,20 +401,10 @@ fn loss_figure(channel: &str, (base, new): (&[Share], &[Share]), of: Counts) -> 
     };
     ComparedFigure {
         channel: Some(channel.to_owned()),
-        part: None,
-        metric: "loss".to_owned(),
-        kind: FigureKind::Loss,
-        unit: "1".to_owned(),
-        base: be,
-        new: ne,
-        base_count: base.len(),
-        new_count: new.len(),
-        ratio: both.and_then(|(b, n)| (b.value > 0.0).then(|| n.value / b.value)),
-        ratio_interval: None,
-        difference: both.map(|(b, n)| n.value - b.value),
         difference_interval: interval,
         verdict: verdict(interval, 0.0, [Verdict::LosesLess, Verdict::LosesMore]),
         method: method.to_owned(),
+        ..figure(FigureKind::Loss, "loss", be, ne, [base.len(), new.len()])
     }
 }
 
@@ -404,14 +417,11 @@ fn scores(base: &[ComparedRun], new: &[ComparedRun]) -> Vec<ComparedFigure> {
     }
     names
         .into_iter()
-        .map(|metric| score_figure(metric, (base, new)))
+        .map(|metric| score_figure(metric, base, new))
         .collect()
 }
 
-fn score_figure(
-    metric: &ScoreMetric,
-    (base, new): (&[ComparedRun], &[ComparedRun]),
-) -> ComparedFigure {
+fn score_figure(metric: &ScoreMetric, base: &[ComparedRun], new: &[ComparedRun]) -> ComparedFigure {
     let (bs, ns) = (scores_of(metric, base), scores_of(metric, new));
     let (have, of) = ([bs.len(), ns.len()], [base.len(), new.len()]);
     let b = of_all(mean_score(&bs), have[0], of[0]);
@@ -429,25 +439,15 @@ fn score_figure(
         (_, None, None) if repeated_count == 2 => (None, NO_SPREAD),
         (_, None, None) => (None, NO_OWN),
     };
-    let quotient = both.and_then(|(b, n)| (b.value > 0.0).then(|| n.value / b.value));
     ComparedFigure {
-        channel: None,
-        part: None,
-        metric: metric.name.clone(),
-        kind: FigureKind::Score,
         unit: metric.unit.clone(),
-        base: b,
-        new: n,
-        base_count: have[0],
-        new_count: have[1],
-        ratio: quotient,
         ratio_interval: both
             .filter(|_| repeated.is_none())
             .and_then(|(b, n)| ratio(b, n)),
-        difference: both.map(|(b, n)| n.value - b.value),
         difference_interval: interval,
         verdict: verdict(interval, 0.0, [Verdict::Lower, Verdict::Higher]),
         method: method.to_owned(),
+        ..figure(FigureKind::Score, &metric.name, b, n, have)
     }
 }
 

@@ -10,7 +10,7 @@ use super::data::{Channel, Figure, Table};
 use super::figures::waterfall::Bar;
 use super::words::{UNAVAILABLE, count, ns_s};
 use crate::summary::LinkKind;
-use crate::terminal::{JOINT, duration, percent};
+use crate::terminal::{JOINT, duration, percent, unsigned_duration};
 use hil_platform::text::grouped;
 use hil_platform::words::counted;
 
@@ -340,7 +340,7 @@ fn segment_row(name: &str, figures: &Distribution, bound: Option<u64>) -> Vec<St
             let values = [one.p50_ns, one.p90_ns, one.p99_ns, one.p999_ns, one.max_ns];
             let bound = match bound {
                 None | Some(0) => "–".to_owned(),
-                Some(ns) => duration(i64::try_from(ns).unwrap_or(i64::MAX)),
+                Some(ns) => unsigned_duration(ns),
             };
             let values = values.map(duration).to_vec();
             [vec![name.to_owned()], values, vec![bound]].concat()
@@ -380,7 +380,7 @@ fn segment_table(account: &ChannelAccount) -> Table {
 }
 
 /// Both ends, and whether stages between were missing.
-pub(super) fn segment_name(segment: &SegmentFigures) -> String {
+fn segment_name(segment: &SegmentFigures) -> String {
     let combined = if segment.is_combined {
         " (combined: a stamp between is missing)"
     } else {

@@ -7,8 +7,6 @@ use super::figures::cdf::{Curve, delay_cdf};
 use super::figures::histogram::delay_histogram;
 use super::figures::waterfall::{Bar, waterfall};
 use hil_account::ChannelAccount;
-use hil_core::case_study::Severity;
-
 use hil_platform::text::grouped;
 
 /// A name that is fit to be a file and an identifier.
@@ -153,13 +151,4 @@ pub(super) fn of_accounts<'a>(
         is_wide: true,
         plot: None,
     })
-}
-
-/// The class and word of a severity.
-pub(super) const fn severity_word(severity: Severity) -> &'static str {
-    match severity {
-        Severity::Notice => "notice",
-        Severity::Hazard => "hazard",
-        Severity::Incident => "incident",
-    }
 }

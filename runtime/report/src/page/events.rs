@@ -5,7 +5,6 @@ use hil_account::network::NetworkEventKind;
 use hil_core::case_study::Severity;
 
 use super::data::{Event, EventList};
-use super::drawings;
 use super::words::UNAVAILABLE;
 use crate::network::{Correlation, NetworkReport, TimedEvent};
 use crate::score_event::{ExplainedEvent, ScoreEvents};
@@ -83,7 +82,7 @@ fn score_event(event: &ExplainedEvent, clocks_differ: bool) -> Event {
     };
     Event {
         at: format!("{at}{clock}"),
-        severity: drawings::severity_word(event.severity),
+        severity: event.severity_word(),
         what: event.what.clone(),
         beside,
     }

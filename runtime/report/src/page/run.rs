@@ -14,16 +14,13 @@ use crate::assessment::Assessment;
 use crate::clock_summary::ClockSection;
 use crate::score_event::ScoreEvents;
 use crate::summary::{ChannelSummary, Fact, LinkKind, RunSummary, ScoreMetric, host_words};
-use crate::terminal;
-use crate::terminal::{duration, seconds};
+use crate::terminal::{self, duration, seconds, unsigned_duration};
 use hil_platform::text::grouped;
 use hil_platform::words::counted;
 
 /// How figures came about, for every run.
-pub(super) const METHOD: [&str; 3] = [
-    "Each message is joined across records by the producer's start and its sequence number. It \
-     closes when every stage is recorded, in order, and the segments add up to published → taken \
-     within 1 µs; on one clock the wire is the difference of raw kernel stamps.",
+const METHOD: [&str; 3] = [
+    terminal::CLOSING_METHOD,
     "Quantiles are from histograms with three digits, of messages that were taken; of the network, of \
      messages that arrived. Intervals are 95 %: Wilson for shares, Clopper and Pearson where a score \
      says so, block bootstrap for quantiles, because successive delays are correlated. The error of \
@@ -281,14 +278,9 @@ fn notes(one: &ChannelSummary) -> Vec<String> {
         notes.push(format!("datagrams refused: {}", refusals.join(", ")));
     }
     for direction in &one.directions {
-        let facts = direction.facts.iter();
-        let facts = facts.map(|fact| format!("{}: {}", fact.label, fact.value));
+        let mut words = direction.words();
         let stalls = direction.stalls.iter();
-        let stalls = stalls.map(|stalls| format!("stalls: {}", terminal::stall_words(stalls)));
-        let words: Vec<String> = core::iter::once(format!("peer {}", direction.peer_state))
-            .chain(facts)
-            .chain(stalls)
-            .collect();
+        words.extend(stalls.map(|one| format!("stalls: {}", terminal::stall_words(one))));
         let way = direction.direction.word();
         notes.push(format!("{way}: {}", words.join(", ")));
     }
@@ -358,8 +350,8 @@ fn clocks(section: &ClockSection) -> Vec<String> {
         let bound = bound.map_or_else(
             || format!("bound of the exchanges {UNAVAILABLE}"),
             |bound| {
-                let largest = i64::try_from(bound.largest_ns).unwrap_or(i64::MAX);
-                format!("exchanges bound the error by {}", duration(largest))
+                let largest = unsigned_duration(bound.largest_ns);
+                format!("exchanges bound the error by {largest}")
             },
         );
         let (from, to, rung) = (&pair.from, &pair.to, pair.rung_words());

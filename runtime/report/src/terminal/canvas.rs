@@ -3,7 +3,6 @@
 use anstyle::{AnsiColor, Style as Ansi};
 
 use super::units::JOINT;
-
 use hil_platform::text::{clean, columns, shortened};
 
 /// Whether the text carries colour sequences.
@@ -99,14 +98,19 @@ impl Canvas {
         self.text.push('\n');
     }
 
+    /// A whole line in `tone`.
+    pub(super) fn painted_line(&mut self, tone: Tone, text: &str) {
+        let line = self.paint(tone, text);
+        self.line(&line);
+    }
+
     pub(super) fn blank(&mut self) {
         self.text.push('\n');
     }
 
     /// A rule across the page.
     pub(super) fn rule(&mut self, tone: Tone) {
-        let rule = self.paint(tone, &"─".repeat(self.width));
-        self.line(&rule);
+        self.painted_line(tone, &"─".repeat(self.width));
     }
 
     /// A heading, with something faint beside it.
@@ -130,14 +134,15 @@ impl Canvas {
 
     /// As [`Canvas::field`], with a label column of `label_width`.
     pub(super) fn field_of(&mut self, label_width: usize, label: &str, tone: Tone, text: &str) {
-        self.field_at(INDENT, (label_width, label), tone, text);
+        self.field_at(INDENT, label_width, label, tone, text);
     }
 
     /// As [`Canvas::field_of`], behind `margin` columns.
     pub(super) fn field_at(
         &mut self,
         margin: usize,
-        (label_width, label): (usize, &str),
+        label_width: usize,
+        label: &str,
         tone: Tone,
         text: &str,
     ) {

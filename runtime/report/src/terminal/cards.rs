@@ -4,9 +4,10 @@
 use core::fmt::Write as _;
 
 use hil_account::card_clock::CardClockFigures;
+use hil_stats::histogram::Distribution;
 
 use super::canvas::{Canvas, INDENT, Tone};
-use super::units::{duration, percent};
+use super::units::{duration, percent, unsigned_duration};
 use crate::card_figures::{CardSegment, CardSummary, ChannelStamps, HardwareStamps};
 use hil_platform::text::grouped;
 
@@ -42,18 +43,14 @@ fn card_lines(canvas: &mut Canvas, card: &CardSummary) {
     }
 }
 
-fn unsigned(ns: u64) -> String {
-    duration(i64::try_from(ns).unwrap_or(i64::MAX))
-}
-
 fn clock_words(clock: &CardClockFigures) -> String {
     let mut text = format!(
         "{} against the system's, ±{} at the end; {} pairs, bound p50 {}, max {}",
         duration(clock.offset_ns),
-        unsigned(clock.offset_bound_ns),
+        unsigned_duration(clock.offset_bound_ns),
         grouped(clock.pair_count),
-        unsigned(clock.bound_p50_ns),
-        unsigned(clock.bound_max_ns),
+        unsigned_duration(clock.bound_p50_ns),
+        unsigned_duration(clock.bound_max_ns),
     );
     match clock.frequency {
         Some(frequency) => {
@@ -98,15 +95,13 @@ fn channel_lines(canvas: &mut Canvas, channel: &ChannelStamps) {
     };
     canvas.field("hardware RX", Tone::Plain, &format!("{received}{reason}"));
     for segment in &channel.segments {
-        canvas.paragraph(INDENT + 2, segment_tone(segment), &segment_words(segment));
-    }
-}
-
-fn segment_tone(segment: &CardSegment) -> Tone {
-    if segment.distribution.measured().is_some() {
-        Tone::Plain
-    } else {
-        Tone::Faint
+        let is_measured = segment.distribution.measured().is_some();
+        let tone = if is_measured {
+            Tone::Plain
+        } else {
+            Tone::Faint
+        };
+        canvas.paragraph(INDENT + 2, tone, &segment_words(segment));
     }
 }
 
@@ -128,10 +123,10 @@ fn segment_words(segment: &CardSegment) -> String {
             text
         }
         _ => match &segment.distribution {
-            hil_stats::histogram::Distribution::Unavailable { reason } => {
+            Distribution::Unavailable { reason } => {
                 format!("{}: unavailable: {reason}", segment.name)
             }
-            hil_stats::histogram::Distribution::Measured(_) => segment.name.clone(),
+            Distribution::Measured(_) => segment.name.clone(),
         },
     };
     if segment.unplaced_count > 0 {

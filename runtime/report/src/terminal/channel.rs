@@ -1,6 +1,8 @@
 //! One channel of a report: fates, the way of a message as a waterfall, closing, stamps and
 //! silences.
 
+use core::ops::Range;
+
 use hil_account::{
     BurstCount, ChannelAccount, Closing, ClosingFigures, Coverage, Gap, MessageFate, SegmentFigures,
 };
@@ -9,7 +11,7 @@ use hil_stats::statistics::IntervalNs;
 
 use super::canvas::{Canvas, INDENT, Tone, bar, left, right};
 use super::clocks;
-use super::units::{duration, percent};
+use super::units::{duration, percent, unsigned_duration};
 use crate::summary::{ChannelSummary, LinkKind, RecordedFigures};
 use hil_platform::text::grouped;
 use hil_platform::words::counted;
@@ -60,12 +62,8 @@ pub(super) fn channel(canvas: &mut Canvas, channel: &ChannelSummary) {
         canvas.field("refused", Tone::Caution, &text);
     }
     for direction in &channel.directions {
-        let facts = direction.facts.iter();
-        let facts = facts.map(|fact| format!("{}: {}", fact.label, fact.value));
-        let words: Vec<_> = core::iter::once(format!("peer {}", direction.peer_state))
-            .chain(facts)
-            .collect();
-        canvas.field(direction.direction.word(), Tone::Faint, &words.join(" · "));
+        let words = direction.words().join(" · ");
+        canvas.field(direction.direction.word(), Tone::Faint, &words);
         // Whether a stream stood still is a result, and not one to be looked for among options.
         if let Some(stalls) = &direction.stalls {
             canvas.field("stalls", Tone::Plain, &stall_words(stalls));
@@ -75,8 +73,7 @@ pub(super) fn channel(canvas: &mut Canvas, channel: &ChannelSummary) {
 
 /// How often a stream stood still, and what counts as that.
 pub(crate) fn stall_words(stalls: &StallFigures) -> String {
-    let time = |ns: u64| duration(i64::try_from(ns).unwrap_or(i64::MAX));
-    let threshold = time(stalls.threshold_ns);
+    let threshold = unsigned_duration(stalls.threshold_ns);
     let rule = format!(
         "a byte unacknowledged for over {threshold}: twice the smallest round trip and 50 ms"
     );
@@ -86,8 +83,8 @@ pub(crate) fn stall_words(stalls: &StallFigures) -> String {
     format!(
         "{}, {} together, longest {} ({rule})",
         grouped(stalls.count),
-        time(stalls.total_ns),
-        time(stalls.longest_ns)
+        unsigned_duration(stalls.total_ns),
+        unsigned_duration(stalls.longest_ns)
     )
 }
 
@@ -172,8 +169,7 @@ fn waterfall(canvas: &mut Canvas, account: &ChannelAccount) {
         "p99.9",
         "max"
     );
-    let header = canvas.paint(Tone::Faint, &header);
-    canvas.line(&header);
+    canvas.painted_line(Tone::Faint, &header);
     let (chain, combined): (Vec<_>, Vec<_>) = account
         .segments
         .iter()
@@ -187,25 +183,17 @@ fn waterfall(canvas: &mut Canvas, account: &ChannelAccount) {
     for segment in &chain {
         let end = start + median(segment);
         let name = format!("→ {}", segment.to);
-        row(
-            canvas,
-            (Tone::Plain, &name),
-            &segment.distribution,
-            (start / scale, end / scale),
-        );
+        let bar = start / scale..end / scale;
+        row(canvas, Tone::Plain, &name, &segment.distribution, bar);
         start = end;
     }
     if let Some(hardware) = &account.hardware_wire
         && hardware.measured().is_some()
     {
-        row(canvas, (Tone::Plain, "card to card"), hardware, (0.0, 0.0));
+        row(canvas, Tone::Plain, "card to card", hardware, 0.0..0.0);
     }
-    row(
-        canvas,
-        (Tone::Strong, "published → taken"),
-        &account.end_to_end.distribution,
-        (0.0, 0.0),
-    );
+    let whole = &account.end_to_end.distribution;
+    row(canvas, Tone::Strong, "published → taken", whole, 0.0..0.0);
     intervals(canvas, account);
     clocks::one_way(canvas, account);
     for segment in combined {
@@ -221,20 +209,22 @@ fn waterfall(canvas: &mut Canvas, account: &ChannelAccount) {
         canvas.paragraph(INDENT, Tone::Faint, &name);
         row(
             canvas,
-            (Tone::Plain, "  combined"),
+            Tone::Plain,
+            "  combined",
             &segment.distribution,
-            (0.0, 0.0),
+            0.0..0.0,
         );
     }
 }
 
-fn row(canvas: &mut Canvas, (tone, name): (Tone, &str), figures: &Distribution, span: (f64, f64)) {
+/// One line of the waterfall; `shares` are where its bar begins and ends.
+fn row(canvas: &mut Canvas, tone: Tone, name: &str, figures: &Distribution, shares: Range<f64>) {
     let name = canvas.paint(tone, &left(name, NAME_WIDTH));
     let line = match figures {
         Distribution::Measured(summary) => {
             let bar_width = canvas.width() - INDENT - NAME_WIDTH - 4 * FIGURE_WIDTH - BAR_GAP;
             let figures = canvas.paint(tone, &quantiles(summary));
-            let bar = canvas.paint(Tone::Bar, &bar(span.0, span.1, bar_width));
+            let bar = canvas.paint(Tone::Bar, &bar(shares.start, shares.end, bar_width));
             format!("{:INDENT$}{name}{figures}{:BAR_GAP$}{bar}", "", "")
         }
         Distribution::Unavailable { reason } => {
@@ -275,7 +265,7 @@ fn intervals(canvas: &mut Canvas, account: &ChannelAccount) {
         .alignment_bound_ns
         .filter(|bound_ns| *bound_ns > 0)
     {
-        let bound = duration(i64::try_from(bound_ns).unwrap_or(i64::MAX));
+        let bound = unsigned_duration(bound_ns);
         words.push(format!("clock alignment within ±{bound}"));
     }
     if !words.is_empty() {

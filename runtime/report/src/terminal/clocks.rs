@@ -7,7 +7,7 @@ use hil_stats::bounds::BoundFigures;
 use hil_stats::histogram::Distribution;
 
 use super::canvas::{Canvas, INDENT, Tone};
-use super::units::{duration, duration_s};
+use super::units::{duration, duration_s, unsigned_duration};
 use crate::clock_summary::{ClockPathSummary, ClockRung, ClockSection, HostPairClock};
 use hil_platform::text::grouped;
 
@@ -33,7 +33,7 @@ pub(super) fn clocks(canvas: &mut Canvas, section: &ClockSection) {
             "the kernel calls it unsynchronised"
         };
         let bound = discipline.bound_ns.map_or_else(String::new, |bound_ns| {
-            [", within ±", &duration(signed(bound_ns))].concat()
+            [", within ±", &unsigned_duration(bound_ns)].concat()
         });
         let text = format!("{}{bound}; {kernel}", discipline.basis);
         let label = format!("system clock, {host}");
@@ -60,7 +60,7 @@ fn pair_lines(canvas: &mut Canvas, pair: &HostPairClock) {
         let text = format!(
             "offset {}, within ±{}",
             precise(offset.offset_ns),
-            duration(signed(offset.bound_ns))
+            unsigned_duration(offset.bound_ns)
         );
         line("system clocks", Tone::Plain, &text);
     }
@@ -89,7 +89,7 @@ fn path_words(path: &ClockPathSummary) -> Vec<(&'static str, Tone, String)> {
     };
     let mut text = format!("{}; {}", path.describe(), path.state);
     if let Some(gap_ns) = path.longest_gap_ns {
-        let gap = duration(signed(gap_ns));
+        let gap = unsigned_duration(gap_ns);
         text.push_str(&["; longest time of the run without an exchange ", &gap].concat());
     }
     let bounds = format!(
@@ -174,8 +174,8 @@ fn exchange_words(
 fn bound_words(bound: BoundFigures) -> String {
     format!(
         "median ±{}, largest ±{}",
-        duration(signed(bound.median_ns)),
-        duration(signed(bound.largest_ns))
+        unsigned_duration(bound.median_ns),
+        unsigned_duration(bound.largest_ns)
     )
 }
 
@@ -200,7 +200,7 @@ pub(super) fn one_way(canvas: &mut Canvas, account: &ChannelAccount) {
         canvas.field("one-way bound", Tone::Faint, &text);
         is_wider |= distribution
             .measured()
-            .is_some_and(|summary| signed(bound.median_ns) > summary.p50_ns.saturating_abs());
+            .is_some_and(|summary| bound.median_ns > summary.p50_ns.unsigned_abs());
     }
     if !is_wider {
         return;
@@ -222,10 +222,6 @@ pub(super) fn one_way(canvas: &mut Canvas, account: &ChannelAccount) {
 /// An offset to the nanosecond: seconds of another boot, and still more than its bound shows.
 fn precise(offset_ns: i64) -> String {
     format!("{:+.9} s", offset_ns as f64 * 1e-9)
-}
-
-fn signed(ns: u64) -> i64 {
-    i64::try_from(ns).unwrap_or(i64::MAX)
 }
 
 #[cfg(test)]

@@ -7,8 +7,7 @@ use hil_core::case_study::Severity;
 use super::canvas::{Canvas, INDENT, Tone};
 use super::units::{duration_s, seconds};
 use crate::score_event::{ExplainedEvent, ExplainedMessage, ScoreEvents};
-use hil_platform::text::grouped;
-use hil_platform::text::shortened;
+use hil_platform::text::{grouped, shortened};
 use hil_platform::words::counted;
 
 /// Events on the page, and messages of each; all of them are in the summary.
@@ -100,7 +99,7 @@ fn one_event(canvas: &mut Canvas, event: &ExplainedEvent, clocks_differ: bool) {
             Some(_) => Tone::Plain,
         };
         let name = shortened(&name(message), NAME_WIDTH - 1);
-        canvas.field_at(MESSAGE_MARGIN, (NAME_WIDTH, &name), tone, &message.words);
+        canvas.field_at(MESSAGE_MARGIN, NAME_WIDTH, &name, tone, &message.words);
     }
     let hidden = event.messages.len().saturating_sub(MESSAGES_SHOWN_COUNT) as u64;
     let more = hidden.saturating_add(event.messages_dropped_count);

@@ -6,6 +6,7 @@ use hil_stats::histogram::Distribution;
 use super::canvas::{Canvas, INDENT, Tone, left, right};
 use super::units::{duration, percent};
 use crate::face::{FaceSegment, FaceSummary};
+use crate::summary::Fact;
 use hil_platform::text::grouped;
 
 /// Share of the robot's messages that a sensor should answer in time.
@@ -35,10 +36,7 @@ pub(super) fn face(canvas: &mut Canvas, face: &FaceSummary) {
     if !words.is_empty() {
         canvas.field("counted", Tone::Faint, &words.join(" · "));
     }
-    let facts = face.facts.iter();
-    let words: Vec<_> = facts
-        .map(|fact| format!("{}: {}", fact.label, fact.value))
-        .collect();
+    let words: Vec<_> = face.facts.iter().map(Fact::to_string).collect();
     canvas.field("found", Tone::Faint, &words.join(" · "));
 }
 
@@ -83,8 +81,7 @@ fn segments(canvas: &mut Canvas, face: &FaceSummary) {
         right("p99.9", FIGURE_WIDTH),
         right("p99/cycle", FIGURE_WIDTH),
     );
-    let header = canvas.paint(Tone::Faint, &header);
-    canvas.line(&header);
+    canvas.painted_line(Tone::Faint, &header);
     for segment in &face.segments {
         segment_line(canvas, segment, name_width, face.cycle_ns);
     }
@@ -121,7 +118,6 @@ fn segment_line(
 mod tests {
     use super::*;
     use crate::face::Answers;
-    use crate::summary::Fact;
     use crate::terminal::Style;
     use hil_arm::egm::messages::Side;
     use hil_arm::egm::wire::Cause;

@@ -21,15 +21,12 @@ pub(crate) use canvas::{Tone, wrapped};
 pub(crate) use channel::{closing_text, stall_words};
 use hil_platform::text::{grouped, shortened};
 pub(crate) use trace::{render_fit, render_trace, render_trace_plots};
-pub use units::{JOINT, duration, percent};
+pub use units::{JOINT, duration, percent, unsigned_duration};
 pub(crate) use units::{duration_s, figure, seconds};
 
 use canvas::{Canvas, INDENT};
 
 use super::assessment::{Assessment, NetworkVerdict, SKIPPED_TICK_RATIO_MAX};
-use super::link_change::LinkChange;
-use super::network::NetworkReport;
-use super::score_event::ScoreEvents;
 use super::summary::{Outcome, RunSummary};
 use hil_rundir::protection::HopProtection;
 
@@ -43,8 +40,9 @@ pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> Strin
     tables::score(&mut canvas, &summary.score);
     events::score_events(&mut canvas, &summary.score_events);
     if let Some(report) = &summary.network {
-        let changes = &summary.link_changes;
-        network_sections(&mut canvas, report, (&summary.score_events, changes));
+        timeline::timeline(&mut canvas, &report.timeline, &summary.link_changes);
+        network::what_preceded_what(&mut canvas, report, &summary.score_events);
+        network::network(&mut canvas, report);
     }
     for channel in &summary.channels {
         channel::channel(&mut canvas, channel);
@@ -70,23 +68,11 @@ pub fn render(summary: &RunSummary, width_columns: usize, style: Style) -> Strin
     canvas.finish()
 }
 
-/// The network of a run and how the robot stood to it.
-fn network_sections(
-    canvas: &mut Canvas,
-    report: &NetworkReport,
-    (events, changes): (&ScoreEvents, &[LinkChange]),
-) {
-    timeline::timeline(canvas, &report.timeline, changes);
-    network::what_preceded_what(canvas, report, events);
-    network::network(canvas, report);
-}
-
 fn title(canvas: &mut Canvas, summary: &RunSummary) {
     let run = &summary.run;
     canvas.rule(Tone::Faint);
     let title = shortened(&format!("{} · {}", run.case, run.name), canvas.width());
-    let line = canvas.paint(Tone::Strong, &title);
-    canvas.line(&line);
+    canvas.painted_line(Tone::Strong, &title);
     let facts = format!(
         "{} · {} long · seed {} · host {} · topology {} ({})",
         run.started,
@@ -157,10 +143,7 @@ pub(crate) const fn network_word(verdict: &NetworkVerdict) -> &'static str {
 pub(crate) fn network_words(verdict: &NetworkVerdict) -> (Tone, String) {
     let limit = percent(SKIPPED_TICK_RATIO_MAX);
     match verdict {
-        NetworkVerdict::RunFailed => {
-            let text = "no verdict: the run failed";
-            (Tone::Caution, text.to_owned())
-        }
+        NetworkVerdict::RunFailed => (Tone::Caution, "no verdict: the run failed".to_owned()),
         NetworkVerdict::VirtualTime => {
             let text = "virtual time: a result about the link models, not about a network";
             (Tone::Plain, text.to_owned())
@@ -219,15 +202,18 @@ pub(crate) fn network_words(verdict: &NetworkVerdict) -> (Tone, String) {
     }
 }
 
+/// How messages are joined and when one closes.
+pub(crate) const CLOSING_METHOD: &str = "Each message is joined across records by the producer's start and its sequence number. It \
+     closes when every stage is recorded, in order, and the segments add up to published → taken \
+     within 1 µs; on one clock the wire is the difference of raw kernel stamps.";
+
 fn method(canvas: &mut Canvas, summary: &RunSummary) {
     if summary.channels.is_empty() {
         return;
     }
     canvas.heading("How to read this", "");
     for text in [
-        "Each message is joined across records by the producer's start and its sequence number. \
-         It closes when every stage is recorded, in order, and the segments add up to published → \
-         taken within 1 µs; on one clock the wire is the difference of raw kernel stamps.",
+        CLOSING_METHOD,
         "Quantiles are from histograms with three digits, of taken messages. Bars show medians \
          end to end. Intervals are 95 %: Wilson for shares, block bootstrap for quantiles, because \
          successive delays are correlated.",

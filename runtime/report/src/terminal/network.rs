@@ -10,7 +10,7 @@ use hil_account::network::{
 };
 
 use super::canvas::{Canvas, INDENT, Tone, left, right};
-use super::units::{JOINT, duration, duration_s, figure, percent, seconds};
+use super::units::{JOINT, duration, duration_s, figure, percent, seconds, unsigned_duration};
 use crate::network::{ChannelNetwork, Correlation, CorrelationTests, NetworkReport, TestedPair};
 use crate::score_event::ScoreEvents;
 use hil_platform::text::grouped;
@@ -49,8 +49,7 @@ pub(super) fn network(canvas: &mut Canvas, report: &NetworkReport) {
     };
     let head = cells(&HEADS.map(str::to_owned));
     let line = format!("{:INDENT$}{}{head}", "", left("", name_width));
-    let line = canvas.paint(Tone::Faint, &line);
-    canvas.line(&line);
+    canvas.painted_line(Tone::Faint, &line);
     for one in &report.channels {
         let cells = cells(&row(&one.figures));
         let name = left(&one.channel, name_width);
@@ -77,7 +76,7 @@ fn row(figures: &NetworkFigures) -> [String; 8] {
         of_delay(|delay| delay.max_ns),
         delay.map_or_else(
             || NONE.to_owned(),
-            |delay| format!("±{}", unsigned(delay.alignment_bound_ns)),
+            |delay| format!("±{}", unsigned_duration(delay.alignment_bound_ns)),
         ),
         loss.map_or_else(|| NONE.to_owned(), |loss| percent(loss.ratio)),
         longest.map_or_else(|| NONE.to_owned(), duration),
@@ -90,7 +89,7 @@ fn channel(canvas: &mut Canvas, one: &ChannelNetwork) {
     let way = format!("{} from {} to {}", one.channel, one.from_host, one.to_host);
     canvas.paragraph(INDENT, Tone::Strong, &way);
     let mut line = |label: &str, text: &str| {
-        canvas.field_at(LINE_MARGIN, (LABEL_WIDTH, label), Tone::Plain, text);
+        canvas.field_at(LINE_MARGIN, LABEL_WIDTH, label, Tone::Plain, text);
     };
     match &figures.delay {
         Figure::Measured(delay) => {
@@ -168,11 +167,11 @@ fn bound_words(delay: &DelayFigures, figures: &NetworkFigures) -> String {
         (_, false) => format!(
             "{} messages, each within ±{} by the clocks' alignment",
             grouped(delay.count),
-            unsigned(bound)
+            unsigned_duration(bound)
         ),
         (_, true) => format!(
             "the clocks' alignment allows ±{}, wider than the median: these figures say little; {}",
-            unsigned(bound),
+            unsigned_duration(bound),
             round_trip_words(figures)
         ),
     }
@@ -218,12 +217,11 @@ fn error_words(bound_ns: u64, is_wider: bool) -> String {
     };
     match bound_ns {
         0 => String::new(),
-        _ => format!("; each within ±{} by the clocks{wide}", unsigned(bound_ns)),
+        _ => format!(
+            "; each within ±{} by the clocks{wide}",
+            unsigned_duration(bound_ns)
+        ),
     }
-}
-
-fn unsigned(ns: u64) -> String {
-    duration(i64::try_from(ns).unwrap_or(i64::MAX))
 }
 
 fn successive_words(successive: &SuccessiveVariation) -> String {

@@ -5,6 +5,7 @@ use hil_account::{LongestOutage, OutageClass, OutageFigures};
 use super::canvas::{Canvas, INDENT, Tone, bar, right};
 use super::units::{duration, seconds};
 use hil_platform::text::grouped;
+use hil_platform::words::{counted, plural};
 
 /// Columns of the label, of a class and of a count, and the gaps beside the bar.
 const LABEL_WIDTH: usize = 14;
@@ -34,18 +35,16 @@ pub(super) fn outages(canvas: &mut Canvas, figures: &OutageFigures) {
 
 fn total(figures: &OutageFigures) -> String {
     let count = figures.outage_count;
-    let plural = if count == 1 { "" } else { "s" };
     let mut text = format!(
-        "{} with {} message{} lost, {} in all, from the first lost publication to the next one \
-         that arrived",
+        "{} with {} lost, {} in all, from the first lost publication to the next one that arrived",
         grouped(count),
-        grouped(figures.lost_count),
-        if figures.lost_count == 1 { "" } else { "s" },
+        counted(figures.lost_count, "message"),
         duration(figures.total_ns),
     );
     if figures.unknown_length_count > 0 {
         let unknown = grouped(figures.unknown_length_count);
-        text.push_str(&["; ", &unknown, " outage", plural, " of unknown length"].concat());
+        let outages = plural(count, "outage");
+        text.push_str(&["; ", &unknown, " ", &outages, " of unknown length"].concat());
     }
     text
 }
@@ -59,11 +58,10 @@ fn longest_words(longest: LongestOutage) -> String {
         seconds_of(end)
     };
     format!(
-        "longest {}, {} to {until}, {} message{} lost from {} on",
+        "longest {}, {} to {until}, {} lost from {} on",
         duration(longest.length_ns),
         seconds_of(longest.start_ns),
-        grouped(longest.lost_count),
-        if longest.lost_count == 1 { "" } else { "s" },
+        counted(longest.lost_count, "message"),
         grouped(longest.first_sequence),
     )
 }

@@ -88,8 +88,7 @@ pub(super) fn processes(canvas: &mut Canvas, processes: &[ProcessSummary]) {
         "CPU time",
         "sw. own/forced"
     );
-    let header = canvas.paint(Tone::Faint, &header);
-    canvas.line(&header);
+    canvas.painted_line(Tone::Faint, &header);
     for process in processes {
         let count = |count: Option<u64>| count.map_or_else(|| "–".to_owned(), grouped);
         let restarts = right(&grouped(process.restart_count), 9);
@@ -167,12 +166,10 @@ pub(super) fn realtime(canvas: &mut Canvas, realtime: &RealtimeFacts) {
     }
     canvas.heading("Real time", "");
     for fact in &realtime.refused {
-        let text = format!("{}: {}", fact.label, fact.value);
-        canvas.field("refused", Tone::Caution, &text);
+        canvas.field("refused", Tone::Caution, &fact.to_string());
     }
     for fact in &realtime.granted {
-        let text = format!("{}: {}", fact.label, fact.value);
-        canvas.field("granted", Tone::Plain, &text);
+        canvas.field("granted", Tone::Plain, &fact.to_string());
     }
 }
 

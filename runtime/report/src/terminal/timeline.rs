@@ -50,13 +50,13 @@ pub(super) fn timeline(canvas: &mut Canvas, all: &Timeline, changes: &[LinkChang
             "{:INDENT$}{}{}  {}",
             "",
             canvas.paint(Tone::Faint, &label),
-            canvas.paint(tone, &pad(&strip(&row.values, room), room)),
+            canvas.paint(tone, &strip(&row.values, room)),
             canvas.paint(Tone::Faint, &right(&scale(row), SCALE_WIDTH)),
         );
         canvas.line(&line);
     }
     let axis_margin = INDENT + name_width + WHAT_WIDTH;
-    if let Some(marks) = change_marks(changes, (whole_s, room)) {
+    if let Some(marks) = change_marks(changes, whole_s, room) {
         let label = left("link changed by hand", name_width + WHAT_WIDTH);
         let line = format!(
             "{:INDENT$}{}{}",
@@ -75,12 +75,11 @@ pub(super) fn timeline(canvas: &mut Canvas, all: &Timeline, changes: &[LinkChang
         left(&middle, half.saturating_sub(6)),
         right(&end, room.saturating_sub(2 * half) + 10)
     );
-    let axis = canvas.paint(Tone::Faint, &axis);
-    canvas.line(&axis);
+    canvas.painted_line(Tone::Faint, &axis);
 }
 
 /// A mark in each column in which a link was changed; `None` when none was.
-fn change_marks(changes: &[LinkChange], (whole_s, room): (f64, usize)) -> Option<String> {
+fn change_marks(changes: &[LinkChange], whole_s: f64, room: usize) -> Option<String> {
     let in_force = changes.iter().filter(|change| change.is_in_force());
     let times: Vec<f64> = in_force.filter_map(|change| change.at_s).collect();
     let column_s = whole_s / room as f64;
@@ -98,11 +97,6 @@ fn change_marks(changes: &[LinkChange], (whole_s, room): (f64, usize)) -> Option
         }
     };
     (!times.is_empty()).then(|| (0..room).map(mark).collect())
-}
-
-fn pad(text: &str, width: usize) -> String {
-    let missing = width.saturating_sub(text.chars().count());
-    format!("{text}{:missing$}", "")
 }
 
 /// `width` columns, each as high as the largest value of its time.

@@ -3,6 +3,7 @@
 
 use core::fmt::Write as _;
 
+use hil_stats::histogram::Distribution;
 use hil_trace::figures::{Memory, RunCount, TraceFigures};
 use hil_trace::fit::{Fit, Ranking, TraceFit};
 use hil_trace::{Trace, TraceHeader};
@@ -186,7 +187,6 @@ fn memory_words(memory: Option<&Memory>) -> String {
 }
 
 fn delay_words(figures: &TraceFigures) -> String {
-    use hil_stats::histogram::Distribution;
     match &figures.delay {
         Distribution::Unavailable { reason } => format!("unavailable: {reason}"),
         Distribution::Measured(delay) => {
@@ -215,7 +215,6 @@ fn delay_words(figures: &TraceFigures) -> String {
 
 /// Of messages that arrived and were not published.
 fn late_words(figures: &TraceFigures) -> String {
-    use hil_stats::histogram::Distribution;
     match &figures.late_delay {
         Distribution::Unavailable { reason } => format!("unavailable: {reason}"),
         Distribution::Measured(late) => format!(
@@ -267,10 +266,7 @@ pub(crate) fn render_fit(
 }
 
 fn ranking(canvas: &mut Canvas, title: &str, ranking: &Ranking) {
-    canvas.blank();
-    let title = format!("{:INDENT$}{title}", "");
-    let title = canvas.paint(Tone::Strong, &title);
-    canvas.line(&title);
+    section(canvas, title);
     if !ranking.fits.is_empty() {
         let names = format!(
             "{:INDENT$}  {}{}{}{}{}",
@@ -281,16 +277,14 @@ fn ranking(canvas: &mut Canvas, title: &str, ranking: &Ranking) {
             right("bursts p", 12),
             right("KS (p)", 18)
         );
-        let names = canvas.paint(Tone::Faint, &names);
-        canvas.line(&names);
+        canvas.painted_line(Tone::Faint, &names);
     }
     for (index, fit) in ranking.fits.iter().enumerate() {
         let is_best = ranking.best == Some(index);
         let tone = if is_best { Tone::Good } else { Tone::Plain };
         let mark = if is_best { "→ " } else { "  " };
         let line = format!("{:INDENT$}{mark}{}", "", fit_line(fit));
-        let line = canvas.paint(tone, &line);
-        canvas.line(&line);
+        canvas.painted_line(tone, &line);
         canvas.paragraph(
             INDENT + 4,
             Tone::Faint,
@@ -375,8 +369,7 @@ pub(crate) fn render_trace_plots(
 fn section(canvas: &mut Canvas, title: &str) {
     canvas.blank();
     let title = format!("{:INDENT$}{title}", "");
-    let title = canvas.paint(Tone::Strong, &title);
-    canvas.line(&title);
+    canvas.painted_line(Tone::Strong, &title);
 }
 
 fn bar_line(canvas: &mut Canvas, name: &str, value: &str, share: f64) {

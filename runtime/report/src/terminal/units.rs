@@ -20,6 +20,11 @@ pub fn duration(ns: i64) -> String {
     )
 }
 
+/// As [`duration`], of what is never below zero.
+pub fn unsigned_duration(ns: u64) -> String {
+    duration(i64::try_from(ns).unwrap_or(i64::MAX))
+}
+
 /// As [`duration`], of seconds.
 #[allow(
     clippy::cast_possible_truncation,

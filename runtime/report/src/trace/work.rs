@@ -16,8 +16,7 @@ use serde_json::{Value, json};
 use super::cli::{TraceCommand, TraceFiles, TraceForm};
 use super::open::{Opened, files, open};
 use super::plots;
-use crate::terminal;
-use crate::terminal::Style;
+use crate::terminal::{self, Style};
 use hil_platform::console::Console;
 use hil_platform::progress::Progress;
 use hil_rundir::series;
@@ -55,7 +54,11 @@ pub fn work(command: TraceCommand, columns: usize, console: &mut Console) -> End
             link,
         } => {
             let is_one = files(&asked.files).is_ok_and(|all| all.len() == 1);
-            let mut written = FittedLinks::new(link, is_one);
+            let mut written = FittedLinks {
+                named: link,
+                is_one,
+                tables: BTreeSet::new(),
+            };
             each(&asked, console, &mut |opened, is_json, talk| {
                 let words = format!("fitting {}", opened.path.display());
                 let fit = talk.during(&words, || TraceFit::of(&opened.trace, seed));
@@ -76,7 +79,7 @@ pub fn work(command: TraceCommand, columns: usize, console: &mut Console) -> End
         }
         TraceCommand::Plot { files, output } => {
             each(&files, console, &mut |opened, is_json, talk| {
-                plot(opened, is_json, (output.as_deref(), columns), talk)
+                plot(opened, is_json, output.as_deref(), columns, talk)
             })
         }
         TraceCommand::Convert {
@@ -84,7 +87,7 @@ pub fn work(command: TraceCommand, columns: usize, console: &mut Console) -> End
             into,
             to,
             force,
-        } => convert(&from, (&into, to, force), console),
+        } => convert(&from, &into, to, force, console),
     }
 }
 
@@ -98,14 +101,6 @@ struct FittedLinks {
 }
 
 impl FittedLinks {
-    const fn new(named: Option<String>, is_one: bool) -> Self {
-        Self {
-            named,
-            is_one,
-            tables: BTreeSet::new(),
-        }
-    }
-
     /// The lines for one trace, and above them where they come from.
     fn toml(&mut self, opened: &Opened, fit: &TraceFit) -> String {
         let header = &opened.trace.header;
@@ -272,7 +267,8 @@ fn info_json(opened: &Opened, figures: &TraceFigures) -> Value {
 fn plot(
     opened: &Opened,
     is_json: bool,
-    (output, columns): (Option<&Path>, usize),
+    output: Option<&Path>,
+    columns: usize,
     talk: &mut Talk<'_>,
 ) -> Result<Value, String> {
     let figures = talk.figures_of(opened);
@@ -312,7 +308,9 @@ fn plots_json(opened: &Opened, made: &[PlotSeries]) -> Value {
 
 fn convert(
     from: &Path,
-    (into, to, force): (&Path, Option<TraceForm>, bool),
+    into: &Path,
+    to: Option<TraceForm>,
+    force: bool,
     console: &mut Console,
 ) -> End {
     let Some(form) = to.or_else(|| form_of(into)) else {

@@ -5,7 +5,7 @@ use crate::compare::Comparison;
 use crate::compare::conditions::{Condition, Verdicts};
 
 fn p99(base_ms: &[f64], new_ms: &[f64], of: Counts) -> ComparedFigure {
-    let side = |all: &[f64]| -> Vec<(Estimate, &'static str)> {
+    let side = |all: &[f64]| -> Vec<RunDelay> {
         let estimate = |ms: &f64| Estimate {
             value: ms * 1e6,
             interval: Some(Interval {
@@ -13,10 +13,18 @@ fn p99(base_ms: &[f64], new_ms: &[f64], of: Counts) -> ComparedFigure {
                 high: ms * 1.01e6,
             }),
         };
-        all.iter().map(|ms| (estimate(ms), BOOTSTRAP)).collect()
+        let delay = |ms: &f64| RunDelay {
+            estimate: estimate(ms),
+            method: BOOTSTRAP,
+        };
+        all.iter().map(delay).collect()
     };
-    let key = ("a/b".to_owned(), Part::EndToEnd, 1);
-    delay_figure(&key, (&side(base_ms), &side(new_ms)), of)
+    let key = DelayKey {
+        channel: "a/b".to_owned(),
+        part: Part::EndToEnd,
+        metric: 1,
+    };
+    delay_figure(&key, &side(base_ms), &side(new_ms), of)
 }
 
 fn loss(base: &[u64], new: &[u64], of: Counts) -> ComparedFigure {
@@ -27,7 +35,7 @@ fn loss(base: &[u64], new: &[u64], of: Counts) -> ComparedFigure {
         };
         all.iter().map(share).collect()
     };
-    loss_figure("a/b", (&side(base), &side(new)), of)
+    loss_figure("a/b", &side(base), &side(new), of)
 }
 
 /// Whether a condition holds, or why it cannot be judged.
