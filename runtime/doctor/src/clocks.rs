@@ -3,8 +3,7 @@
 
 use std::hint::black_box;
 
-use super::Finding;
-use super::finding::Severity;
+use super::{Finding, finding::Severity};
 use hil_platform::clock::MonotonicClock;
 use hil_platform::clock_discipline::{HostDiscipline, common_bound_ns};
 

@@ -3,9 +3,7 @@
 
 use std::collections::BTreeMap;
 
-use super::Finding;
-use super::network::has_device;
-use super::plan::Plan;
+use super::{Finding, network::has_device, plan::Plan};
 use hil_platform::host_facts::{Fact, HostFiles, format_cpu_list};
 
 /// An interrupt of a card.

@@ -1,9 +1,7 @@
 //! The kernel: how it preempts, what it keeps back from real-time tasks, how it was built, what else
 //! it does in the background. It reads settings only; what they cost is measured by the wake-ups.
 
-use super::Finding;
-use super::finding::Severity;
-use super::plan::Plan;
+use super::{Finding, finding::Severity, plan::Plan};
 use hil_platform::host_facts::{
     Fact, HostFiles, KernelOptions, PreemptionMode, RealtimeThrottle, boot_parameter, clocksource,
     format_cpu_list, has_fair_server, load_average, online_cpus, preemption, virtual_machine,
@@ -219,13 +217,7 @@ fn load(files: &HostFiles) -> Finding {
         Fact::Unavailable(reason) => return Finding::cannot_tell(id, reason),
     };
     let per_cpu = minute / cpus.max(1) as f64;
-    let severity = if per_cpu > 1.0 {
-        Severity::Warning
-    } else if per_cpu > LOAD_PER_CPU_BUSY {
-        Severity::Note
-    } else {
-        Severity::Ok
-    };
+    let severity = Severity::of_size(per_cpu, LOAD_PER_CPU_BUSY, 1.0);
     Finding::new(id, severity, format!("{words}, {cpus} CPUs"))
 }
 

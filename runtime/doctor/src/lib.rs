@@ -38,10 +38,9 @@ use hil_net::timestamping::TimestampCapabilities;
 use serde::{Deserialize, Serialize};
 
 pub use self::finding::{Finding, Severity};
-use self::latency::LatencyReport;
-use self::network::StampQuery;
 pub use self::plan::{LinkLoad, Peer, Pin, Plan, Protocol, WantedPort};
 use self::privileges::Rights;
+use self::{latency::LatencyReport, network::StampQuery};
 use hil_nic::card_clock::probing::probe_card;
 use hil_platform::clock_discipline::HostDiscipline;
 use hil_platform::domain_address::domain_base_candidates;

@@ -2,17 +2,14 @@
 //! buffer. Claims only: drivers lie, so a run probes its stamps by sending and reports the share that
 //! came back.
 
-use std::collections::BTreeMap;
-use std::net::IpAddr;
+use std::{collections::BTreeMap, net::IpAddr};
 
 use hil_net::timestamping::TimestampCapabilities;
 use nix::ifaddrs::{InterfaceAddress, getifaddrs};
 use nix::net::if_::InterfaceFlags;
 use nix::sys::socket::SockaddrStorage;
 
-use super::Finding;
-use super::finding::Severity;
-use super::plan::Plan;
+use super::{Finding, finding::Severity, plan::Plan};
 use hil_platform::host_facts::{Fact, HostFiles};
 
 /// A second of 1 kHz messages with their stamps; the kernel charges about 800 bytes for each.
@@ -163,11 +160,7 @@ fn judge(
             ", link down"
         }
     );
-    let severity = if has_software_both_ways(claims) && !is_wireless {
-        Severity::Ok
-    } else {
-        Severity::Note
-    };
+    let severity = Severity::Note.unless(has_software_both_ways(claims) && !is_wireless);
     let finding = Finding::new("timestamps", severity, value).of(name);
     if is_wireless {
         return finding
@@ -192,13 +185,8 @@ fn buffers(files: &HostFiles) -> Finding {
     match (read("rmem_max"), read("wmem_max")) {
         (Fact::Available(receive), Fact::Available(send)) => {
             let is_enough = receive >= BUFFER_BYTES_MIN && send >= BUFFER_BYTES_MIN;
-            let severity = if is_enough {
-                Severity::Ok
-            } else {
-                Severity::Note
-            };
             let value = format!("receive {receive} bytes, send {send} bytes");
-            Finding::new(id, severity, value)
+            Finding::new(id, Severity::Note.unless(is_enough), value)
         }
         // A network namespace other than the first one hides these limits.
         (Fact::Unavailable(reason), _) | (_, Fact::Unavailable(reason)) => {

@@ -3,9 +3,8 @@
 
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
 
-use super::Finding;
-use super::network::Interfaces;
 use super::plan::{LinkLoad, Peer, Plan};
+use super::{Finding, network::Interfaces};
 use hil_platform::host_facts::{Fact, HostFiles};
 
 /// The discard port (RFC 863); nothing is sent to it.

@@ -2,9 +2,7 @@
 //! deep they sleep, with whom they share a core. It reads settings only; what they cost is measured
 //! by the wake-ups.
 
-use super::Finding;
-use super::finding::Severity;
-use super::plan::Plan;
+use super::{Finding, finding::Severity, plan::Plan};
 use hil_platform::host_facts::{
     CPU_FOLDER, Fact, HostFiles, IsolatedCpus, KernelOptions, format_cpu_list, governors,
     online_cpus,
@@ -174,13 +172,7 @@ fn idle_states(files: &HostFiles, plan: &Plan) -> Finding {
         Fact::Available(_) => (exit_us, "; nobody holds /dev/cpu_dma_latency".to_owned()),
         Fact::Unavailable(reason) => (exit_us, format!("; a bound on it is unknown ({reason})")),
     };
-    let severity = if bound > IDLE_EXIT_US_NOTE {
-        Severity::Warning
-    } else if bound > IDLE_EXIT_US_OK {
-        Severity::Note
-    } else {
-        Severity::Ok
-    };
+    let severity = Severity::of_size(bound, IDLE_EXIT_US_OK, IDLE_EXIT_US_NOTE);
     Finding::new(id, severity, format!("{words}{also}"))
 }
 

@@ -1,8 +1,7 @@
 //! The radios of this host: what each is used as, and whether it sleeps to save power. Wired
 //! interfaces have no finding here.
 
-use super::Finding;
-use super::finding::Severity;
+use super::{Finding, finding::Severity};
 use hil_nic::radio::nl80211::Station;
 use hil_nic::radio::socket::{RadioError, RadioSocket};
 
@@ -47,11 +46,7 @@ fn judge(
                 .fixed_by("bring the hosts and the access point nearer, or take another channel")
         }
         Ok(false) => {
-            let severity = if kbps.is_some() {
-                Severity::Ok
-            } else {
-                Severity::Note
-            };
+            let severity = Severity::Note.unless(kbps.is_some());
             Finding::new(id, severity, format!("{what}, power save off, {rate}"))
         }
         Err(reason) => {

@@ -1,16 +1,14 @@
 //! Where channels live: `/dev/shm` and the runtime folder. It looks and does not clean: removing
 //! another run's segments is a decision, and the run may be alive.
 
-use std::collections::BTreeMap;
-use std::fs;
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
+use std::{collections::BTreeMap, fs};
 
 use nix::sys::statvfs::statvfs;
 use nix::unistd::{AccessFlags, access};
 
-use super::Finding;
-use super::finding::Severity;
+use super::{Finding, finding::Severity};
 use hil_platform::host_facts::{Fact, HostFiles};
 use hil_shm::{Domain, ForeignNodes};
 

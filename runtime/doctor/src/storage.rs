@@ -6,8 +6,7 @@ use std::path::{Path, PathBuf};
 use nix::sys::statvfs::statvfs;
 use nix::unistd::{AccessFlags, Uid, access};
 
-use super::Finding;
-use super::finding::Severity;
+use super::{Finding, finding::Severity};
 use hil_platform::host_facts::{Fact, HostFiles};
 
 const MEBIBYTE: u64 = 1024 * 1024;

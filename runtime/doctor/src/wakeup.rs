@@ -1,8 +1,6 @@
 //! The finding that a measurement of wake-ups comes to. The measurement is in [`super::latency`].
 
-use super::Finding;
-use super::finding::Severity;
-use super::latency::LatencyReport;
+use super::{Finding, finding::Severity, latency::LatencyReport};
 use hil_platform::host_facts::Fact;
 
 /// A wake-up p99 below this leaves room for claims in tens of microseconds.

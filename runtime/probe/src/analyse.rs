@@ -36,7 +36,7 @@ impl Reading {
         let mut of_cards = Observer::new(flows);
         let mut files = Vec::with_capacity(paths.len());
         for (index, path) in paths.iter().enumerate() {
-            files.push(read(path, index, (&mut observer, &mut of_cards), look)?);
+            files.push(read(path, index, &mut observer, &mut of_cards, look)?);
         }
         Ok(Self {
             files,
@@ -243,23 +243,17 @@ impl Report {
     }
 
     pub(super) fn to_text(&self) -> String {
-        let mut text = String::new();
-        for file in &self.files {
-            line(&mut text, &file_line(file));
-        }
+        let mut lines: Vec<String> = self.files.iter().map(file_line).collect();
         let counts = &self.packets;
-        line(
-            &mut text,
-            &format!(
-                "{} packets: {} followed, {} of other flows, {} not IP, {} not UDP, {} unreadable",
-                counts.packet_count,
-                counts.followed_count,
-                counts.other_flow_count,
-                counts.not_ip_count,
-                counts.not_udp_count,
-                counts.unreadable_count
-            ),
-        );
+        lines.push(format!(
+            "{} packets: {} followed, {} of other flows, {} not IP, {} not UDP, {} unreadable",
+            counts.packet_count,
+            counts.followed_count,
+            counts.other_flow_count,
+            counts.not_ip_count,
+            counts.not_udp_count,
+            counts.unreadable_count
+        ));
         for (count, what) in [
             (
                 counts.foreign_count,
@@ -286,28 +280,29 @@ impl Report {
             ),
         ] {
             if count > 0 {
-                line(&mut text, &format!("  {count} {what}"));
+                lines.push(format!("  {count} {what}"));
             }
         }
         for point in &self.points {
-            line(&mut text, "");
-            let head = format!("{}  at {}", stream_line(&point.stream), point.point);
-            line(&mut text, &head);
+            lines.push(String::new());
+            lines.push(format!(
+                "{}  at {}",
+                stream_line(&point.stream),
+                point.point
+            ));
             if let Some(all) = point.kernel_stamped_count {
-                line(&mut text, &format!("  {all} arrived, of which"));
+                lines.push(format!("  {all} arrived, of which"));
             }
-            point_text(&mut text, &point.figures);
+            point_lines(&mut lines, &point.figures);
         }
         for joined in &self.joins {
-            line(&mut text, "");
-            line(&mut text, &stream_line(&joined.stream));
-            let ends = format!("  from {} to {}", joined.first, joined.second);
-            line(&mut text, &ends);
-            let clocks = format!("  clock       {}", joined.clocks.words());
-            line(&mut text, &clocks);
-            join_text(&mut text, &joined.figures);
+            lines.push(String::new());
+            lines.push(stream_line(&joined.stream));
+            lines.push(format!("  from {} to {}", joined.first, joined.second));
+            lines.push(format!("  clock       {}", joined.clocks.words()));
+            join_lines(&mut lines, &joined.figures);
         }
-        text
+        lines.join("\n") + "\n"
     }
 }
 
@@ -359,108 +354,77 @@ fn stream_line(stream: &StreamReport) -> String {
     )
 }
 
-fn line(text: &mut String, line: &str) {
-    text.push_str(line);
-    text.push('\n');
-}
-
-fn point_text(text: &mut String, figures: &PointFigures) {
+fn point_lines(lines: &mut Vec<String>, figures: &PointFigures) {
     let seconds = figures.last_ns.saturating_sub(figures.first_ns) as f64 * 1e-9;
-    line(
-        text,
-        &format!(
-            "  {} datagrams, {} bytes in {seconds:.3} s",
-            figures.datagram_count, figures.payload_bytes
-        ),
-    );
-    line(
-        text,
-        &format!("  interval    {}", quantiles(&figures.interval)),
-    );
+    lines.push(format!(
+        "  {} datagrams, {} bytes in {seconds:.3} s",
+        figures.datagram_count, figures.payload_bytes
+    ));
+    lines.push(format!("  interval    {}", quantiles(&figures.interval)));
     if let Some(gap) = figures.longest_gap {
         let after = gap.from_ns.saturating_sub(figures.first_ns) as f64 * 1e-9;
-        line(
-            text,
-            &format!("  longest gap {} after {after:.3} s", time(gap.length_ns)),
-        );
+        let length = time(gap.length_ns);
+        lines.push(format!("  longest gap {length} after {after:.3} s"));
     }
     if let Some(numbers) = figures.numbers {
         let repeated = numbers.repeated_count;
         let repeated = repeated.map_or("unknown (pieces)".to_owned(), |count| count.to_string());
-        line(
-            text,
-            &format!(
-                "  numbers     {} series, step {}, {} skipped, {repeated} repeated, {} reordered",
-                numbers.series_count, numbers.step, numbers.skipped_count, numbers.reordered_count
-            ),
-        );
+        lines.push(format!(
+            "  numbers     {} series, step {}, {} skipped, {repeated} repeated, {} reordered",
+            numbers.series_count, numbers.step, numbers.skipped_count, numbers.reordered_count
+        ));
     }
 }
 
-fn join_text(text: &mut String, figures: &JoinFigures) {
+fn join_lines(lines: &mut Vec<String>, figures: &JoinFigures) {
     let order = match figures.order {
         OrderSource::PacketDirection => "by the packets' direction",
         OrderSource::Stamps => "by most stamps",
     };
-    line(
-        text,
-        &format!(
-            "  seen        {} then {} ({order}), {} at both, {} at an edge",
-            figures.first_count, figures.second_count, figures.matched_count, figures.edge_count
-        ),
-    );
-    line(
-        text,
-        &format!(
-            "  lost        {}{}, {} duplicated, {} unexplained",
-            figures.lost_count,
-            percent(figures.loss_ratio, figures.loss_interval),
-            figures.duplicated_count,
-            figures.unexplained_count
-        ),
-    );
+    lines.push(format!(
+        "  seen        {} then {} ({order}), {} at both, {} at an edge",
+        figures.first_count, figures.second_count, figures.matched_count, figures.edge_count
+    ));
+    lines.push(format!(
+        "  lost        {}{}, {} duplicated, {} unexplained",
+        figures.lost_count,
+        percent(figures.loss_ratio, figures.loss_interval),
+        figures.duplicated_count,
+        figures.unexplained_count
+    ));
     if !figures.loss_bursts.is_empty() {
         let bursts = figures.loss_bursts.iter();
-        let words: Vec<String> = bursts
-            .map(|(length, count)| format!("{count}x{length}"))
-            .collect();
-        line(text, &format!("  loss bursts {}", words.join(" ")));
+        let bursts = bursts.map(|(length, count)| format!("{count}x{length}"));
+        let words: Vec<String> = bursts.collect();
+        lines.push(format!("  loss bursts {}", words.join(" ")));
     }
-    line(
-        text,
-        &format!("  delay       {}", quantiles(&figures.delay)),
-    );
+    lines.push(format!("  delay       {}", quantiles(&figures.delay)));
     for (name, interval) in [
         ("p50", figures.delay_p50_interval),
         ("p99", figures.delay_p99_interval),
     ] {
         if let Some(IntervalNs { low_ns, high_ns }) = interval {
-            let ends = format!("{} to {}", time(low_ns), time(high_ns));
-            line(
-                text,
-                &format!("    {name} in {ends} (95 %, block bootstrap)"),
-            );
+            let (low, high) = (time(low_ns), time(high_ns));
+            lines.push(format!(
+                "    {name} in {low} to {high} (95 %, block bootstrap)"
+            ));
         }
     }
-    line(
-        text,
-        &format!("  variation   {} (RFC 5481)", quantiles(&figures.variation)),
-    );
+    lines.push(format!(
+        "  variation   {} (RFC 5481)",
+        quantiles(&figures.variation)
+    ));
     if let (Some(last), Some(mean)) = (figures.jitter_last_ns, figures.jitter_mean_ns) {
         let (last, mean) = (last * 1e-3, mean * 1e-3);
-        line(
-            text,
-            &format!("  jitter      {last:.2} us at the end, {mean:.2} us mean (RFC 3550)"),
-        );
+        lines.push(format!(
+            "  jitter      {last:.2} us at the end, {mean:.2} us mean (RFC 3550)"
+        ));
     }
     let interval = percent(None, figures.reordered_interval);
-    line(
-        text,
-        &format!(
-            "  reordered   {}{interval}, extent at most {} (RFC 4737)",
-            figures.reordered_count, figures.reordering_extent_max
-        ),
-    );
+    lines.push(format!(
+        "  reordered   {}{interval}, extent at most {} (RFC 4737)",
+        figures.reordered_count, figures.reordering_extent_max
+    ));
 }
 
 fn percent(ratio: Option<f64>, interval: Option<(f64, f64)>) -> String {

@@ -1,7 +1,6 @@
 //! The command line of the probe: definitions only.
 
-use std::path::PathBuf;
-use std::time::Duration;
+use std::{path::PathBuf, time::Duration};
 
 use clap::{Args, Subcommand, ValueEnum};
 use hil_capture::flow::FlowFilter;

@@ -155,7 +155,8 @@ impl CardTap {
     pub(super) fn finish(
         mut self,
         index: u32,
-        (from_ns, to_ns): (u64, u64),
+        from_ns: u64,
+        to_ns: u64,
         buffer: &mut Vec<u8>,
     ) -> CardResult {
         let span = (on_card(from_ns, self.start), on_card(to_ns, self.end));

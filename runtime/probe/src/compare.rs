@@ -4,9 +4,8 @@
 
 use core::fmt::Write as _;
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs;
-use std::io;
 use std::path::{Path, PathBuf};
+use std::{fs, io};
 
 use hil_capture::flow::OwnHeader;
 use hil_capture::join::Joined;
@@ -188,17 +187,12 @@ pub(super) fn compare(
     let numbers = channel_numbers(&sides, captures);
     let channels = sides.iter().map(|(name, side)| {
         let sockets = summary.as_ref().map(|summary| socket_counts(summary, name));
-        let number = numbers.get(name).copied();
-        channel(
-            name,
-            side,
-            sockets.unwrap_or_default(),
-            &Probe {
-                captures,
-                joined: &joined,
-                number,
-            },
-        )
+        let probe = Probe {
+            captures,
+            joined: &joined,
+            number: numbers.get(name).copied(),
+        };
+        channel(name, side, sockets.unwrap_or_default(), &probe)
     });
     Ok(Comparison {
         schema_version: 1,
@@ -244,15 +238,13 @@ fn gateway_sides(
         stage.reach(read_bytes as f64 / all_bytes.max(1) as f64);
         read_bytes += bytes;
         let file = RecordFile::read(&path)?;
-        let channel = file.header.channel.clone();
+        let side = sides.entry(file.header.channel.clone());
         match file.header.kind {
-            RecordKind::Egress => sides
-                .entry(channel)
+            RecordKind::Egress => side
                 .or_default()
                 .egress
                 .extend(file.records::<EgressRecord>()),
-            RecordKind::Ingress => sides
-                .entry(channel)
+            RecordKind::Ingress => side
                 .or_default()
                 .ingress
                 .extend(file.records::<IngressRecord>()),
@@ -278,9 +270,15 @@ fn summary(folder: &RunFolder) -> Result<Option<RunSummary>, CompareError> {
         .map_err(|source| CompareError::Summary { path, source })
 }
 
-/// Datagrams sent and received by the sockets of a channel, by the run's summary. Farewells received
-/// are left out: whether one is depends on which gateway ends first.
-fn socket_counts(summary: &RunSummary, channel: &str) -> (Option<u64>, Option<u64>) {
+/// Datagrams of a channel's sockets, where the run's summary has them.
+#[derive(Debug, Clone, Copy, Default)]
+struct SocketCounts {
+    sent: Option<u64>,
+    /// Without farewells: whether one is received depends on which gateway ends first.
+    received: Option<u64>,
+}
+
+fn socket_counts(summary: &RunSummary, channel: &str) -> SocketCounts {
     let of = |side: Side, group: CounterGroup, name: &str| {
         let channel = summary.channels.iter().find(|one| one.name == channel)?;
         let ways = channel.directions.iter();
@@ -289,15 +287,14 @@ fn socket_counts(summary: &RunSummary, channel: &str) -> (Option<u64>, Option<u6
             .filter_map(|one| one.count(group, name));
         counts.reduce(|a, b| a + b)
     };
-    let received = of(Side::Ingress, CounterGroup::Socket, "received_count").zip(of(
-        Side::Ingress,
-        CounterGroup::Own,
-        "bye_count",
-    ));
-    (
-        of(Side::Egress, CounterGroup::Socket, "sent_count"),
-        received.and_then(|(all, farewells)| all.checked_sub(farewells)),
-    )
+    let all = of(Side::Ingress, CounterGroup::Socket, "received_count");
+    let farewells = of(Side::Ingress, CounterGroup::Own, "bye_count");
+    SocketCounts {
+        sent: of(Side::Egress, CounterGroup::Socket, "sent_count"),
+        received: all
+            .zip(farewells)
+            .and_then(|(all, byes)| all.checked_sub(byes)),
+    }
 }
 
 /// The number by which each channel goes on the wire, found by the first message both sides know:
@@ -417,11 +414,8 @@ fn gateway_wire(side: &GatewaySide) -> BTreeMap<Message, (i64, i64)> {
         .filter(|one| one.tx_software_ns != UNAVAILABLE)
         .map(|one| ((one.epoch, one.sequence), one.tx_software_ns))
         .collect();
-    for one in side
-        .ingress
-        .iter()
-        .filter(|one| one.rx_software_ns != UNAVAILABLE)
-    {
+    let is_stamped = |one: &&IngressRecord| one.rx_software_ns != UNAVAILABLE;
+    for one in side.ingress.iter().filter(is_stamped) {
         let key = (one.epoch, one.sequence);
         if let Some(departure) = departures.get(&key) {
             // A duplicate arrives later under the same number; the first one counts.
@@ -436,7 +430,7 @@ fn gateway_wire(side: &GatewaySide) -> BTreeMap<Message, (i64, i64)> {
 fn channel(
     name: &str,
     side: &GatewaySide,
-    sockets: (Option<u64>, Option<u64>),
+    sockets: SocketCounts,
     probe: &Probe<'_>,
 ) -> ChannelComparison {
     let has_left = |one: &&EgressRecord| one.flags & EgressRecord::REFUSED_BY_KERNEL == 0;
@@ -466,11 +460,11 @@ fn channel(
     ChannelComparison {
         channel: name.to_owned(),
         sent: BothCounts {
-            gateway: sockets.0,
+            gateway: sockets.sent,
             probe: probe.count(Direction::Outbound, is_forward),
         },
         received: BothCounts {
-            gateway: sockets.1,
+            gateway: sockets.received,
             probe: probe.count(Direction::Inbound, is_data) + probe.answered_count(),
         },
         data_sent: BothCounts {

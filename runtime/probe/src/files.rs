@@ -47,7 +47,8 @@ pub(super) struct FileError {
 pub(super) fn read(
     path: &Path,
     file_index: usize,
-    (observer, of_cards): (&mut Observer, &mut Observer),
+    observer: &mut Observer,
+    of_cards: &mut Observer,
     look: &mut dyn FnMut(usize),
 ) -> Result<CaptureFile, FileError> {
     let failed = |source| FileError {

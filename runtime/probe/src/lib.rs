@@ -12,11 +12,10 @@ mod output;
 mod point_clocks;
 
 use core::fmt::Write as _;
-use std::fs;
-use std::path::Path;
-use std::time::Duration;
+use std::{fs, path::Path, time::Duration};
 
 use hil_capture::flow::FlowFilter;
+use hil_core::time::duration_ns;
 use hil_net::filter::FILTER_COUNT_MAX;
 use hil_net::packet_ring::{RingError, RingStamps};
 
@@ -66,7 +65,7 @@ pub fn run(args: &ProbeArgs, console: &mut Console) -> u8 {
             }
             let words = "reading records of the run";
             let compared = Progress::begin().during(console, words, |stage| {
-                compare::compare(run, &captures, window_ns(reading), stage)
+                compare::compare(run, &captures, duration_ns(reading.window), stage)
             });
             match compared {
                 Ok(comparison) => {
@@ -92,10 +91,6 @@ pub fn run(args: &ProbeArgs, console: &mut Console) -> u8 {
 
 fn paths<'a>(file: &'a Path, second: Option<&'a Path>) -> Vec<&'a Path> {
     core::iter::once(file).chain(second).collect()
-}
-
-fn window_ns(reading: &ReadingArgs) -> i64 {
-    i64::try_from(reading.window.as_nanos()).unwrap_or(i64::MAX)
 }
 
 fn json(value: &impl serde::Serialize) -> String {
@@ -145,7 +140,7 @@ fn analyse(
         return exit::USAGE;
     };
     let report = Progress::begin().during(console, "drawing up the figures", |_| {
-        Report::of(&captures, window_ns(reading), is_one_clock)
+        Report::of(&captures, duration_ns(reading.window), is_one_clock)
     });
     let complaints = captures.complaints();
     for complaint in &complaints {

@@ -1,10 +1,8 @@
 //! The live capture: rings looked into every few milliseconds, a pcapng file, a line of progress.
 //! It analyses nothing. Nothing waits for a packet, so that no sender pays for waking the probe.
 
-use std::io;
-use std::path::PathBuf;
-use std::thread;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::{io, path::PathBuf, thread};
 
 use hil_capture::CaptureInterface;
 use hil_capture::flow::FlowFilter;
@@ -119,10 +117,10 @@ pub(super) fn capture(
         let is_over = ended_by.is_some() || request.duration.is_some_and(|d| began.elapsed() >= d);
         let look_ns = realtime_ns();
         for (index, tap) in (0_u32..).zip(&mut taps) {
-            drain(tap, (index, tap_count), &mut file)?;
+            drain(tap, index, tap_count, &mut file)?;
             if is_over {
                 // See `begin`.
-                drain(tap, (index, tap_count), &mut file)?;
+                drain(tap, index, tap_count, &mut file)?;
             }
             watch(tap, look_ns, console);
         }
@@ -136,7 +134,7 @@ pub(super) fn capture(
         }
         thread::sleep(LOOK_PERIOD);
     };
-    conclude(&mut taps, (start_ns, end_ns), &mut file)?;
+    conclude(&mut taps, start_ns, end_ns, &mut file)?;
     file.finish()?;
     Ok(LiveResult {
         interfaces: taps.into_iter().map(|tap| tap.result).collect(),
@@ -206,7 +204,8 @@ fn begin(taps: &mut [Tap]) -> Result<(), LiveError> {
 /// is in no file: all are asked before.
 fn conclude(
     taps: &mut [Tap],
-    (start_ns, end_ns): (u64, u64),
+    start_ns: u64,
+    end_ns: u64,
     file: &mut Output,
 ) -> Result<(), LiveError> {
     for tap in &mut *taps {
@@ -226,7 +225,7 @@ fn conclude(
         writer::statistics(file.buffer(), index, span, counts, None);
         if let Some(card) = tap.card.take() {
             let index = tap_count + index;
-            tap.result.card = Some(card.finish(index, span, file.buffer()));
+            tap.result.card = Some(card.finish(index, span.0, span.1, file.buffer()));
         }
     }
     Ok(())
@@ -258,11 +257,7 @@ pub(super) fn flow_list(flows: &[FlowFilter]) -> String {
 }
 
 /// Everything that is in the ring now.
-fn drain(
-    tap: &mut Tap,
-    (index, tap_count): (u32, u32),
-    file: &mut Output,
-) -> Result<(), LiveError> {
+fn drain(tap: &mut Tap, index: u32, tap_count: u32, file: &mut Output) -> Result<(), LiveError> {
     if let Some(card) = &mut tap.card {
         card.drain(tap_count + index, file)?;
     }

@@ -5,8 +5,7 @@ use std::fs::File;
 use std::io::{self, Seek, Write};
 use std::path::{Path, PathBuf};
 
-use hil_capture::writer;
-use hil_capture::writer::PacketToWrite;
+use hil_capture::writer::{self, PacketToWrite};
 use hil_net::link_type as link;
 use hil_net::ring_frame::RingPacket;
 

@@ -1,5 +1,6 @@
 //! What an observer hears of a run, one thing at a time.
 
+use bytemuck::Pod;
 use hil_account::card_clock::CardClockRecord;
 use hil_core::message::Envelope;
 use hil_core::record::{
@@ -7,8 +8,7 @@ use hil_core::record::{
 };
 use hil_link::condition::LinkConditionRecord;
 
-use super::feed::WatchedChannel;
-use super::follow::Batch;
+use super::{feed::WatchedChannel, follow::Batch};
 use hil_rundir::face_record::{FaceReceivedRecord, FaceSentRecord};
 use hil_rundir::radio_record::RadioRecord;
 use hil_rundir::record::RecordKind;
@@ -93,26 +93,21 @@ pub enum Record {
 impl Record {
     /// The records of a batch, in order; none of a batch of messages.
     pub(super) fn each(batch: &Batch<'_>, take: &mut dyn FnMut(Self)) {
+        fn all<R: Pod>(batch: &Batch<'_>, of: fn(R) -> Record, take: &mut dyn FnMut(Record)) {
+            batch.records().map(of).for_each(take);
+        }
         match batch.header.kind {
-            RecordKind::Published => batch.records().for_each(|one| take(Self::Published(one))),
-            RecordKind::Taken => batch.records().for_each(|one| take(Self::Taken(one))),
-            RecordKind::Egress => batch.records().for_each(|one| take(Self::Egress(one))),
-            RecordKind::Ingress => batch.records().for_each(|one| take(Self::Ingress(one))),
-            RecordKind::FollowUp => batch.records().for_each(|one| take(Self::FollowUp(one))),
-            RecordKind::RoundTrip => batch.records().for_each(|one| take(Self::RoundTrip(one))),
-            RecordKind::FaceSent => batch.records().for_each(|one| take(Self::FaceSent(one))),
-            RecordKind::FaceReceived => {
-                batch
-                    .records()
-                    .for_each(|one| take(Self::FaceReceived(one)));
-            }
-            RecordKind::CardClock => batch.records().for_each(|one| take(Self::CardClock(one))),
-            RecordKind::Radio => batch.records().for_each(|one| take(Self::Radio(one))),
-            RecordKind::LinkCondition => {
-                batch
-                    .records()
-                    .for_each(|one| take(Self::LinkCondition(one)));
-            }
+            RecordKind::Published => all(batch, Self::Published, take),
+            RecordKind::Taken => all(batch, Self::Taken, take),
+            RecordKind::Egress => all(batch, Self::Egress, take),
+            RecordKind::Ingress => all(batch, Self::Ingress, take),
+            RecordKind::FollowUp => all(batch, Self::FollowUp, take),
+            RecordKind::RoundTrip => all(batch, Self::RoundTrip, take),
+            RecordKind::FaceSent => all(batch, Self::FaceSent, take),
+            RecordKind::FaceReceived => all(batch, Self::FaceReceived, take),
+            RecordKind::CardClock => all(batch, Self::CardClock, take),
+            RecordKind::Radio => all(batch, Self::Radio, take),
+            RecordKind::LinkCondition => all(batch, Self::LinkCondition, take),
             RecordKind::Message => {}
         }
     }

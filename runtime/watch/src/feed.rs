@@ -1,15 +1,15 @@
 //! One run as one stream of events: for each channel the feed decides whether its messages are followed
 //! from the records or read from shared memory, and it knows when the run is over.
 
-use std::collections::BTreeMap;
-use std::io;
 use std::time::{Duration, Instant as WallInstant};
+use std::{collections::BTreeMap, io};
+
+use hil_core::message::Envelope;
 
 use super::event::{Event, Origin, Record};
 use super::follow::{Batch, RecordFollower};
 use super::passive::{PassiveCounters, PassiveReader};
-use super::shared::Shared;
-use super::since::Since;
+use super::{shared::Shared, since::Since};
 use hil_platform::clock::MonotonicClock;
 use hil_rundir::live_run::{LiveRun, Source};
 use hil_rundir::manifest::{ChannelDescription, Manifest};
@@ -128,9 +128,9 @@ impl Feed {
             };
             let mut announced = run.channels.iter();
             let comes_again = announced.any(|one| one.name == *name && one.comes_again);
-            let read = (host.clone(), *is_forwarded);
             let size_bytes = channel.description.size_bytes;
-            Some((name.clone(), Shared::new(read, comes_again, size_bytes)))
+            let shared = Shared::new(host.clone(), *is_forwarded, comes_again, size_bytes);
+            Some((name.clone(), shared))
         });
         let mut feed = Self {
             shared: shared.collect(),
@@ -318,7 +318,7 @@ impl Feed {
                 found_count += 1;
                 if seen.insert(envelope.epoch, envelope.sequence) {
                     if let Some(since) = &mut self.since {
-                        since.admits(name, (envelope.epoch, envelope.sequence), true);
+                        since.admits(name, envelope.epoch, envelope.sequence, true);
                     }
                     take(Event::Message {
                         channel,
@@ -374,9 +374,10 @@ impl Feed {
             });
             match channels.get(name) {
                 Some(channel) => {
-                    let mut admits = |message: (u32, u64)| {
-                        let since = since.as_mut();
-                        since.is_none_or(|since| since.admits(name, message, is_of_this_host))
+                    let mut admits = |one: &Envelope| {
+                        since.as_mut().is_none_or(|since| {
+                            since.admits(name, one.epoch, one.sequence, is_of_this_host)
+                        })
                     };
                     give_messages(batch, channel, shared, &mut admits, take);
                 }
@@ -422,7 +423,7 @@ fn give_messages(
     batch: &Batch<'_>,
     channel: &WatchedChannel,
     mut shared: Option<&mut Shared>,
-    admits: &mut dyn FnMut((u32, u64)) -> bool,
+    admits: &mut dyn FnMut(&Envelope) -> bool,
     take: &mut dyn FnMut(Event<'_>),
 ) {
     let origin = match channel.source {
@@ -430,13 +431,11 @@ fn give_messages(
         Some(Source::SharedMemory { .. }) | None => Origin::OtherHost,
     };
     for (envelope, payload) in batch.messages() {
-        if !admits((envelope.epoch, envelope.sequence)) {
-            continue;
-        }
-        let is_new = shared
-            .as_deref_mut()
-            .is_none_or(|shared| shared.seen.insert(envelope.epoch, envelope.sequence));
-        if is_new {
+        let mut is_new = || {
+            let shared = shared.as_deref_mut();
+            shared.is_none_or(|shared| shared.seen.insert(envelope.epoch, envelope.sequence))
+        };
+        if admits(&envelope) && is_new() {
             take(Event::Message {
                 channel,
                 origin,

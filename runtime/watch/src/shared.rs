@@ -4,8 +4,7 @@ use hil_core::record::{IngressRecord, UNAVAILABLE};
 
 use super::passive::{PassiveCounters, PassiveReader};
 use super::seen::Seen;
-use hil_shm::ChannelError;
-use hil_shm::observer_depth;
+use hil_shm::{ChannelError, observer_depth};
 
 /// A channel that is read from shared memory.
 #[derive(Debug)]
@@ -34,7 +33,8 @@ pub(super) struct Shared {
 impl Shared {
     /// Not read yet. Its messages have `size_bytes`.
     pub(super) fn new(
-        (host, is_forwarded): (String, bool),
+        host: String,
+        is_forwarded: bool,
         comes_again: bool,
         size_bytes: usize,
     ) -> Self {

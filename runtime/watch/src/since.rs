@@ -14,13 +14,14 @@ pub(super) struct Since {
 }
 
 impl Since {
-    /// True when message `(epoch, sequence)` of `channel` belongs to the watch. What this host tells
+    /// True when message `sequence` of start `epoch` of `channel` belongs to the watch. What this host tells
     /// does, and sets the beginning; another host's does from there on. A start of the producer
     /// of which nothing was heard here does not: it may have ended long before.
     pub(super) fn admits(
         &mut self,
         channel: &str,
-        (epoch, sequence): (u32, u64),
+        epoch: u32,
+        sequence: u64,
         is_of_this_host: bool,
     ) -> bool {
         if is_of_this_host {
@@ -39,14 +40,14 @@ impl Since {
         record: &Record,
         is_of_this_host: bool,
     ) -> bool {
-        let message = match record {
+        let (epoch, sequence) = match record {
             Record::Published(one) => (one.epoch, one.sequence),
             Record::Taken(one) => (one.epoch, one.sequence),
             Record::Egress(one) => (one.epoch, one.sequence),
             Record::Ingress(one) => (one.epoch, one.sequence),
             _ => return true,
         };
-        self.admits(channel, message, is_of_this_host)
+        self.admits(channel, epoch, sequence, is_of_this_host)
     }
 
     fn note(&mut self, channel: &str, epoch: u32, sequence: u64) {
@@ -68,12 +69,12 @@ mod tests {
     #[test]
     fn another_host_is_heard_from_the_first_message_on_that_was_heard_of_here() {
         let mut since = Since::default();
-        assert!(!since.admits("c", (1, 7), false));
+        assert!(!since.admits("c", 1, 7, false));
         for sequence in [6, 5, 8] {
-            assert!(since.admits("c", (1, sequence), true));
+            assert!(since.admits("c", 1, sequence, true));
         }
-        let admitted = [4, 5, 7, 9].map(|sequence| since.admits("c", (1, sequence), false));
+        let admitted = [4, 5, 7, 9].map(|sequence| since.admits("c", 1, sequence, false));
         assert_eq!(admitted, [false, true, true, true]);
-        assert!(!since.admits("c", (2, 9), false) && !since.admits("d", (1, 9), false));
+        assert!(!since.admits("c", 2, 9, false) && !since.admits("d", 1, 9, false));
     }
 }

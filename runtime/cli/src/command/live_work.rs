@@ -38,12 +38,7 @@ pub(super) fn top(args: &TopArgs, registry: &Registry, console: &mut Console) ->
         Ok(signals) => signals,
         Err(code) => return code,
     };
-    match top::run(
-        args,
-        columns_or(PLAIN_COLUMNS),
-        registry,
-        (&signals, console),
-    ) {
+    match top::run(args, columns_or(PLAIN_COLUMNS), registry, &signals, console) {
         Ok(TopEnd::Done) => exit::RAN,
         Ok(TopEnd::Interrupted) => interrupted(),
         Err(error) => {

@@ -1,13 +1,12 @@
 //! What `hil-runtime link` does: finds the run, asks or orders, prints. The orders are [`super`]'s.
 
-use std::path::PathBuf;
-use std::time::Duration;
+use std::{path::PathBuf, time::Duration};
 
 use hil_link::condition::LinkCondition;
 use serde_json::{Value, json};
 
 use super::cli::{LinkCommand, RunChoice, SetArgs};
-use super::{Confirmed, LinkDirection, LinkError, RunLinks};
+use super::{Carrier, Confirmed, LinkDirection, LinkError, RunLinks};
 use hil_platform::clock::MonotonicClock;
 use hil_platform::console::Console;
 use hil_rundir::select;
@@ -111,12 +110,16 @@ fn show(choice: &RunChoice) -> Outcome<String> {
         }));
         text.push(shown(direction, condition, ago_s));
     }
-    for (link, via) in links.carried() {
-        if via != "emulated" {
-            rows.push(json!({ "direction": link, "via": via }));
-            text.push(format!("{link}: carried by {via}, nothing to set"));
-        } else if links.directions().iter().all(|one| one.link != link) {
-            text.push(format!("{link}: emulated on another host"));
+    for (link, carrier) in links.carried() {
+        match carrier {
+            Carrier::Real(via) => {
+                rows.push(json!({ "direction": link, "via": via }));
+                text.push(format!("{link}: carried by {via}, nothing to set"));
+            }
+            Carrier::Emulated if links.directions().iter().all(|one| one.link != *link) => {
+                text.push(format!("{link}: emulated on another host"));
+            }
+            Carrier::Emulated => {}
         }
     }
     if choice.json {

@@ -7,9 +7,8 @@ use serde::Serialize;
 
 use super::cli::{ChannelArgs, ChannelCommand};
 use super::observer::{ObserveError, Observer};
-use super::pace::Pace;
-use super::top::via;
 use super::{delay, echo, hz};
+use super::{pace::Pace, top::via};
 use hil_platform::console::Console;
 use hil_platform::signals::Signals;
 use hil_rundir::layout::PathFault;
@@ -81,6 +80,16 @@ pub enum End {
     Interrupted,
 }
 
+/// The messages that an answer is of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum Scope {
+    /// Those of the last window.
+    Window,
+    /// All of them.
+    Total,
+}
+
 /// How many of an observer's problems the user was told.
 #[derive(Debug, Default)]
 pub(super) struct Told(usize);
@@ -110,7 +119,7 @@ pub fn run(
     match args.command {
         ChannelCommand::List { run, json, window } => {
             let observer = open(run.as_deref())?;
-            Ok(list(observer, (window, json), signals, console))
+            Ok(list(observer, window, json, signals, console))
         }
         ChannelCommand::Hz(args) => {
             hz::run(open(args.which.run.as_deref())?, &args, signals, console)
@@ -148,7 +157,8 @@ struct HostEnds {
 
 fn list(
     mut observer: Observer,
-    (window, is_json): (Duration, bool),
+    window: Duration,
+    is_json: bool,
     signals: &Signals,
     console: &mut Console,
 ) -> End {

@@ -2,9 +2,7 @@
 //! the orders that were given to them while it goes. Only gateways of this host tell of orders here.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::io;
-use std::path::Path;
-use std::time::Duration;
+use std::{io, path::Path, time::Duration};
 
 use hil_core::time::duration_ns;
 use hil_link::condition::{LinkCondition, LinkConditionRecord, OrderOutcome, order_channel};

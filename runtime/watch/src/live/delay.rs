@@ -6,18 +6,18 @@ use std::time::Duration;
 
 use hil_account::{ChannelAccount, Closing, MessageFate};
 use hil_clock::ClockMap;
+use hil_core::time::duration_ns;
 use hil_stats::histogram::{Distribution, LatencySummary};
 use serde::Serialize;
 use serde_json::{Value, json};
 
-use super::channel::{ChannelError, End, Told};
-use super::cli::WindowArgs;
-use super::observer::Observer;
+use super::channel::{ChannelError, End, Scope, Told};
+use super::{cli::WindowArgs, observer::Observer};
 use hil_platform::console::Console;
 use hil_platform::signals::Signals;
 use hil_platform::text::grouped;
 use hil_platform::words::counted;
-use hil_report::terminal::{JOINT, duration};
+use hil_report::terminal::{JOINT, duration, unsigned_duration};
 
 /// The totals reach back no further: they are of messages that are kept in memory.
 const TOTAL_MAX: Duration = Duration::from_mins(10);
@@ -41,8 +41,9 @@ pub(super) fn run(
         if is_whole {
             let account = observer.account(&name, args.window);
             let clock = clock(&observer, &name);
-            let of = (name.as_str(), "window", args.window);
-            if !console.result(&answer(of, account.as_ref(), &clock, args.json)?) {
+            let (of, account) = (Scope::Window, account.as_ref());
+            let text = answer(&name, of, args.window, account, &clock, args.json)?;
+            if !console.result(&text) {
                 return Ok(End::Done);
             }
             if args.once {
@@ -61,8 +62,8 @@ pub(super) fn run(
         if is_last {
             let account = observer.account(&name, TOTAL_MAX);
             let clock = clock(&observer, &name);
-            let of = (name.as_str(), "total", TOTAL_MAX);
-            console.result(&answer(of, account.as_ref(), &clock, args.json)?);
+            let (of, account) = (Scope::Total, account.as_ref());
+            console.result(&answer(&name, of, TOTAL_MAX, account, &clock, args.json)?);
             return Ok(if is_whole {
                 End::Done
             } else {
@@ -73,11 +74,21 @@ pub(super) fn run(
     }
 }
 
+/// What relates the clocks of a channel's two hosts.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+enum ClockRelation {
+    #[serde(rename = "one clock")]
+    OneClock,
+    #[serde(rename = "exchanges")]
+    Exchanges,
+    #[serde(rename = "not aligned")]
+    NotAligned,
+}
+
 /// How the clocks of a channel's two hosts stand to each other.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 struct Clock {
-    /// `one clock`, `exchanges` or `not aligned`.
-    relation: &'static str,
+    relation: ClockRelation,
     /// Exchanges of the last half minute.
     exchange_count: Option<u64>,
     /// Estimated offset of the consumer's host against the producer's, nanoseconds.
@@ -86,7 +97,7 @@ struct Clock {
 
 fn clock(observer: &Observer, channel: &str) -> Clock {
     let one = Clock {
-        relation: "one clock",
+        relation: ClockRelation::OneClock,
         exchange_count: None,
         offset_ns: Some(0),
     };
@@ -100,9 +111,9 @@ fn clock(observer: &Observer, channel: &str) -> Clock {
     let figures = map.as_ref().map(ClockMap::figures);
     Clock {
         relation: if figures.is_some() {
-            "exchanges"
+            ClockRelation::Exchanges
         } else {
-            "not aligned"
+            ClockRelation::NotAligned
         },
         exchange_count: figures.map(|figures| figures.exchange_count),
         offset_ns: figures.and_then(|figures| Some(figures.offset?.estimate_ns)),
@@ -110,7 +121,9 @@ fn clock(observer: &Observer, channel: &str) -> Clock {
 }
 
 fn answer(
-    (channel, of, window): (&str, &str, Duration),
+    channel: &str,
+    of: Scope,
+    window: Duration,
     account: Option<&ChannelAccount>,
     clock: &Clock,
     is_json: bool,
@@ -126,17 +139,13 @@ fn answer(
         return Ok(format!("{}\n", serde_json::to_string(&all)?));
     }
     let of = match of {
-        "total" => "in all".to_owned(),
-        _ => format!("the last {}", duration_words(window)),
+        Scope::Total => "in all".to_owned(),
+        Scope::Window => format!("the last {}", duration(duration_ns(window))),
     };
     let Some(account) = account else {
         return Ok(format!("{channel}, {of}: no message was recorded here\n"));
     };
     Ok(text(&format!("{channel}, {of}"), account, clock))
-}
-
-fn duration_words(time: Duration) -> String {
-    duration(i64::try_from(time.as_nanos()).unwrap_or(i64::MAX))
 }
 
 fn figures(account: &ChannelAccount, clock: &Clock) -> Value {
@@ -216,14 +225,13 @@ fn text(head: &str, account: &ChannelAccount, clock: &Clock) -> String {
         &end_to_end.distribution,
     ));
     let relation = match (clock.relation, end_to_end.alignment_bound_ns) {
-        ("one clock", _) => "clock: both ends read one clock".to_owned(),
+        (ClockRelation::OneClock, _) => "clock: both ends read one clock".to_owned(),
         (_, Some(bound_ns)) => {
-            let bound_ns = i64::try_from(bound_ns).unwrap_or(i64::MAX);
-            let count = clock.exchange_count.unwrap_or(0);
-            format!(
-                "clock: within ±{}, by {count} exchanges",
-                duration(bound_ns)
-            )
+            let (bound, count) = (
+                unsigned_duration(bound_ns),
+                clock.exchange_count.unwrap_or(0),
+            );
+            format!("clock: within ±{bound}, by {count} exchanges")
         }
         _ => "clock: not aligned".to_owned(),
     };
@@ -263,7 +271,7 @@ mod tests {
     use hil_core::record::{PublishedRecord, TakenRecord, UNAVAILABLE};
 
     const ONE_CLOCK: Clock = Clock {
-        relation: "one clock",
+        relation: ClockRelation::OneClock,
         exchange_count: None,
         offset_ns: Some(0),
     };
@@ -300,7 +308,9 @@ mod tests {
     #[test]
     fn a_page_has_a_row_per_segment_the_clock_and_the_closing() {
         let text = answer(
-            ("x", "window", Duration::from_secs(1)),
+            "x",
+            Scope::Window,
+            Duration::from_secs(1),
             Some(&sample()),
             &ONE_CLOCK,
             false,
@@ -322,24 +332,22 @@ mod tests {
         let path = ChannelPath::Gateway { alignment: None };
         let account = account(&nothing, &AccountContext::new(path));
         let clock = Clock {
-            relation: "not aligned",
+            relation: ClockRelation::NotAligned,
             exchange_count: None,
             offset_ns: None,
         };
-        let of = ("x", "total", Duration::from_secs(1));
-        let text = answer(of, Some(&account), &clock, false).unwrap();
+        let of_account = |account: Option<&ChannelAccount>, is_json| {
+            let second = Duration::from_secs(1);
+            answer("x", Scope::Total, second, account, &clock, is_json).unwrap()
+        };
+        let text = of_account(Some(&account), false);
         assert!(text.contains("unavailable: clocks not aligned"), "{text}");
-        let json: Value =
-            serde_json::from_str(&answer(of, Some(&account), &clock, true).unwrap()).unwrap();
+        let json: Value = serde_json::from_str(&of_account(Some(&account), true)).unwrap();
         assert_eq!(
             json["account"]["end_to_end"]["unavailable"],
             "clocks not aligned"
         );
         assert!(json["account"]["bound_ns"].is_null());
-        assert!(
-            answer(of, None, &clock, true)
-                .unwrap()
-                .contains("\"account\":null")
-        );
+        assert!(of_account(None, true).contains("\"account\":null"));
     }
 }

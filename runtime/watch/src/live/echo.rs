@@ -1,14 +1,12 @@
 //! `channel echo`: the messages of a channel as their run's manifest lays them out, or as bytes.
 
-use std::thread;
-use std::time::Duration;
+use std::{thread, time::Duration};
 
 use hil_core::message::Envelope;
 use serde::Serialize;
 
 use super::channel::{ChannelError, End};
-use super::cli::EchoArgs;
-use super::observer::Observer;
+use super::{cli::EchoArgs, observer::Observer};
 use crate::{PassiveReader, RecordFollower};
 use hil_platform::console::Console;
 use hil_platform::signals::Signals;
@@ -17,7 +15,6 @@ use hil_rundir::layout::{Decoder, Selection, Value, hex};
 use hil_rundir::live_run::Source;
 use hil_rundir::manifest::ChannelDescription;
 use hil_rundir::record::RecordKind;
-use hil_shm;
 
 /// How often it looks for messages.
 const LOOK_PERIOD: Duration = Duration::from_millis(5);
@@ -78,7 +75,7 @@ pub(super) fn run(
         let looked = place.look(&channel.name, &mut |envelope, payload| {
             if wanted.is_none_or(|wanted| shown_count < wanted) {
                 shown_count += 1;
-                texts.push(text(&channel, &form, args.json, (envelope, payload)));
+                texts.push(text(&channel, &form, args.json, envelope, payload));
             }
         });
         let mut is_heard = true;
@@ -199,7 +196,8 @@ fn text(
     channel: &ChannelDescription,
     form: &Form,
     is_json: bool,
-    (envelope, payload): (&Envelope, &[u8]),
+    envelope: &Envelope,
+    payload: &[u8],
 ) -> Result<String, ChannelError> {
     let (mut fields, mut value, mut digits) = (None, None, None);
     match form {

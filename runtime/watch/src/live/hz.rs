@@ -2,10 +2,9 @@
 
 use serde::Serialize;
 
-use super::channel::{ChannelError, End, Told};
-use super::cli::WindowArgs;
-use super::observer::Observer;
+use super::channel::{ChannelError, End, Scope, Told};
 use super::pace::{Pace, PaceFigures};
+use super::{cli::WindowArgs, observer::Observer};
 use hil_platform::console::Console;
 use hil_platform::signals::Signals;
 use hil_platform::words::counted;
@@ -18,8 +17,7 @@ struct Answer<'a> {
     channel: &'a str,
     /// `publication` or `arrival`.
     seen_at: &'a str,
-    /// `window`, or `total` of all of them.
-    of: &'a str,
+    of: Scope,
     window_s: f64,
     #[serde(flatten)]
     figures: &'a PaceFigures,
@@ -53,7 +51,7 @@ pub(super) fn run(
         let text = if args.json {
             format!("{}\n", serde_json::to_string(&answer)?)
         } else {
-            let of = if of == "total" { "in all  " } else { "" };
+            let of = if of == Scope::Total { "in all  " } else { "" };
             format!("{of}{}\n", words(&name, figures))
         };
         Ok::<bool, ChannelError>(console.result(&text))
@@ -68,7 +66,7 @@ pub(super) fn run(
         observer.trim(args.window);
         if is_whole {
             let figures = pace.turn();
-            if !answer(console, "window", &figures)? {
+            if !answer(console, Scope::Window, &figures)? {
                 return Ok(End::Done);
             }
             if args.once {
@@ -84,7 +82,7 @@ pub(super) fn run(
             }
         }
         if !is_whole || observer.is_over() {
-            answer(console, "total", &pace.total())?;
+            answer(console, Scope::Total, &pace.total())?;
             return Ok(if is_whole {
                 End::Done
             } else {

@@ -1,31 +1,27 @@
 //! One running run as the commands of a terminal need it: its topology, the newest records of each
 //! channel, and how the clocks of its hosts stand to each other. It draws nothing.
 
-mod exchanges;
-
-use std::collections::BTreeMap;
-use std::thread;
 use std::time::{Duration, Instant as WallInstant};
+use std::{collections::BTreeMap, thread};
 
 use hil_account::{AccountContext, ChannelAccount, ChannelPath, FLIGHT_TIME_MAX, RunSpan};
+use hil_clock::{ClockMap, ClockSettings, Exchange, Requester};
 use hil_core::message::Envelope;
 use hil_core::record::RoundTripRecord;
-use hil_core::time::{Alignment, Instant};
+use hil_core::time::{Alignment, Instant, duration_ns};
 use hil_link::condition::{LinkCondition, LinkConditionRecord};
 use hil_link::spec::Way;
 
-use super::conditions::LinkConditions;
-use super::tail::ChannelTail;
+use super::{conditions::LinkConditions, tail::ChannelTail};
 use crate::{PassiveReader, RecordFollower};
 use hil_platform::clock::MonotonicClock;
 use hil_platform::signals::Signals;
+use hil_report::clock_summary::ClockRung;
 use hil_rundir::live_run::{LiveRun, Source};
 use hil_rundir::manifest::{ChannelDescription, Manifest};
 use hil_rundir::record::RecordKind;
-use hil_rundir::select;
-use hil_rundir::select::SelectError;
+use hil_rundir::select::{self, SelectError};
 use hil_shm::{Domain, DomainError};
-use hil_topology;
 use hil_topology::Topology;
 use hil_topology::registry::Registry;
 
@@ -332,7 +328,7 @@ impl Observer {
     /// Forgets what lies further back than `window`.
     pub(crate) fn trim(&mut self, window: Duration) {
         let now_ns = MonotonicClock::now().as_ns();
-        let span_ns = nanoseconds(window + self.longest_settling());
+        let span_ns = duration_ns(window + self.longest_settling());
         for tail in self.tails.values_mut() {
             tail.trim(span_ns, now_ns);
         }
@@ -412,8 +408,8 @@ impl Observer {
             flight_time_max: FLIGHT_TIME_MAX + self.settling(channel),
             ..AccountContext::new(path)
         };
-        let span = (nanoseconds(window), nanoseconds(self.settling(channel)));
-        Some(tail.account(span, &context))
+        let (span_ns, settling_ns) = (duration_ns(window), duration_ns(self.settling(channel)));
+        Some(tail.account(span_ns, settling_ns, &context))
     }
 
     /// True when all hosts of the run read one clock.
@@ -464,10 +460,75 @@ impl Observer {
             (one.from_host.as_ref(), one.to_host.as_ref())
         })
     }
-}
 
-fn nanoseconds(time: Duration) -> i64 {
-    i64::try_from(time.as_nanos()).unwrap_or(i64::MAX)
+    /// How the clock of `from` relates to that of `to` by the exchanges of the last half minute;
+    /// `None` without any.
+    pub(crate) fn clock_map(&self, from: &str, to: &str) -> Option<ClockMap> {
+        let exchanges = self.exchanges(from, to);
+        let map = ClockMap::new(&exchanges, ClockSettings::default());
+        map.figures().offset.is_some().then_some(map)
+    }
+
+    /// What figures between the two hosts rest on while the run goes on, in the words of a report. What
+    /// daemons say of system clocks is asked at its end only, so that rung is none of these.
+    pub(crate) fn clock_rung(&self, from: &str, to: &str) -> &'static str {
+        if self.has_one_clock() {
+            return ClockRung::OneClock.label();
+        }
+        if self.clock_map(from, to).is_none() {
+            return ClockRung::None.label();
+        }
+        ClockRung::Exchanges.words(self.has_clock_path_exchanges(from, to))
+    }
+
+    fn has_clock_path_exchanges(&self, from: &str, to: &str) -> bool {
+        let paths = self.topology().into_iter().flat_map(Topology::clock_paths);
+        let mut of_pair = paths.filter(|path| {
+            let ends = (path.from.name.as_str(), path.to.name.as_str());
+            ends == (from, to) || ends == (to, from)
+        });
+        of_pair.any(|path| {
+            let round_trips = self.round_trips.get(&path.name());
+            round_trips.is_some_and(|found| !found.is_empty())
+        })
+    }
+
+    fn exchanges(&self, from: &str, to: &str) -> Vec<Exchange> {
+        let mut found = Vec::new();
+        for (name, round_trips) in &self.round_trips {
+            let Some((asks, answers)) = self.exchanging_hosts(name) else {
+                continue;
+            };
+            // The host that is converted to is the local one.
+            let requester = match (asks.as_str(), answers.as_str()) {
+                pair if pair == (to, from) => Requester::Local,
+                pair if pair == (from, to) => Requester::Remote,
+                _ => continue,
+            };
+            // An exchange whose stamps were bettered later is there twice; the last one counts.
+            let last: BTreeMap<(u32, u64), &RoundTripRecord> = round_trips
+                .iter()
+                .map(|one| ((one.session, one.sequence), one))
+                .collect();
+            found.extend(
+                last.into_values()
+                    .filter_map(|one| Exchange::of(one, requester)),
+            );
+        }
+        found
+    }
+
+    /// The host that asks and the host that answers in the exchanges recorded as `name`: of a
+    /// channel, whose sending gateway asks, or of a clock path.
+    fn exchanging_hosts(&self, name: &str) -> Option<(String, String)> {
+        if let Some(topology) = &self.topology {
+            let clock_path = topology.clock_paths().find(|path| path.name() == name);
+            if let Some(path) = clock_path {
+                return Some((path.from.name.clone(), path.to.name.clone()));
+            }
+        }
+        self.hosts_of(name)
+    }
 }
 
 /// The topology that a run wrote into its manifest.

@@ -168,7 +168,7 @@ mod tests {
 
     const MS: i64 = 1_000_000;
 
-    fn take(pace: &mut Pace, at_ns: i64, (epoch, sequence): (u32, u64)) {
+    fn take(pace: &mut Pace, at_ns: i64, epoch: u32, sequence: u64) {
         pace.take(&Arrival {
             at_ns,
             epoch,
@@ -180,7 +180,7 @@ mod tests {
     fn rate_and_jitter_are_of_the_gaps_between_messages() {
         let mut pace = Pace::default();
         for (number, at_ms) in [0, 4, 8, 14, 16].into_iter().enumerate() {
-            take(&mut pace, at_ms * MS, (1, number as u64));
+            take(&mut pace, at_ms * MS, 1, number as u64);
         }
         let figures = pace.turn();
         assert_eq!(figures.message_count, 5);
@@ -195,7 +195,7 @@ mod tests {
     fn one_message_has_no_rate_and_none_has_nothing() {
         let mut pace = Pace::default();
         assert_eq!(pace.total().rate_hz, None);
-        take(&mut pace, 5, (1, 0));
+        take(&mut pace, 5, 1, 0);
         let figures = pace.turn();
         assert_eq!((figures.message_count, figures.rate_hz), (1, None));
         assert_eq!(figures.gap, None);
@@ -204,9 +204,9 @@ mod tests {
     #[test]
     fn a_gap_over_the_border_of_two_windows_is_counted_once() {
         let mut pace = Pace::default();
-        take(&mut pace, 0, (1, 0));
+        take(&mut pace, 0, 1, 0);
         assert_eq!(pace.turn().gap, None);
-        take(&mut pace, 10 * MS, (1, 3));
+        take(&mut pace, 10 * MS, 1, 3);
         let figures = pace.turn();
         assert_eq!(figures.gap.unwrap().max_ns, 10 * MS);
         assert_eq!((figures.missed_count, pace.turn().missed_count), (2, 0));
@@ -216,8 +216,8 @@ mod tests {
     #[test]
     fn a_late_message_fills_its_gap_and_a_restart_is_none() {
         let mut pace = Pace::default();
-        for place in [(1, 0), (1, 2), (1, 1), (2, 0)] {
-            take(&mut pace, 0, place);
+        for (epoch, sequence) in [(1, 0), (1, 2), (1, 1), (2, 0)] {
+            take(&mut pace, 0, epoch, sequence);
         }
         let total = pace.total();
         assert_eq!((total.missed_count, total.reordered_count), (0, 1));

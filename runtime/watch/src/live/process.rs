@@ -1,8 +1,7 @@
 //! What the kernel says of a running process: processor time, processors it may use, how it is
 //! scheduled. It reads `/proc` and changes nothing.
 
-use std::collections::BTreeSet;
-use std::fs;
+use std::{collections::BTreeSet, fs};
 
 /// One look at a process.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]

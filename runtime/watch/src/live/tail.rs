@@ -20,10 +20,16 @@ pub(crate) struct ChannelTail {
     ingress: Option<Vec<IngressRecord>>,
     follow_up: Option<Vec<FollowUpRecord>>,
     taken: Option<Vec<TakenRecord>>,
-    /// The newest publication on the clock of the producer's host.
-    newest_published_ns: Option<i64>,
-    /// The newest stamp of a process of this host.
-    newest_here_ns: Option<i64>,
+    newest: Newest,
+}
+
+/// The newest stamps among the records.
+#[derive(Debug, Default)]
+struct Newest {
+    /// Publication, on the clock of the producer's host.
+    published_ns: Option<i64>,
+    /// Of a process of this host.
+    here_ns: Option<i64>,
 }
 
 /// What every record of a message says.
@@ -68,23 +74,10 @@ impl ChannelTail {
     /// Adds what came, if it is of a kind that accounts are made of.
     pub(crate) fn add(&mut self, batch: &Batch<'_>) {
         match batch.header.kind {
-            RecordKind::Published => {
-                let new = batch.records::<PublishedRecord>();
-                let seen = extend(&mut self.published, new);
-                self.see(seen);
-            }
-            RecordKind::Egress => {
-                let seen = extend(&mut self.egress, batch.records::<EgressRecord>());
-                self.see(seen);
-            }
-            RecordKind::Ingress => {
-                let seen = extend(&mut self.ingress, batch.records::<IngressRecord>());
-                self.see(seen);
-            }
-            RecordKind::Taken => {
-                let seen = extend(&mut self.taken, batch.records::<TakenRecord>());
-                self.see(seen);
-            }
+            RecordKind::Published => extend(&mut self.published, batch.records(), &mut self.newest),
+            RecordKind::Egress => extend(&mut self.egress, batch.records(), &mut self.newest),
+            RecordKind::Ingress => extend(&mut self.ingress, batch.records(), &mut self.newest),
+            RecordKind::Taken => extend(&mut self.taken, batch.records(), &mut self.newest),
             RecordKind::FollowUp => {
                 let kept = self.follow_up.get_or_insert_default();
                 kept.extend(batch.records::<FollowUpRecord>());
@@ -105,21 +98,17 @@ impl ChannelTail {
         }
     }
 
-    fn see(&mut self, (published_ns, here_ns): (Option<i64>, Option<i64>)) {
-        self.newest_published_ns = self.newest_published_ns.max(published_ns);
-        self.newest_here_ns = self.newest_here_ns.max(here_ns);
-    }
-
     /// Forgets messages published more than `span_ns` before the newest one, and all of them when
     /// nothing came here within `span_ns` before `now_ns`.
     pub(crate) fn trim(&mut self, span_ns: i64, now_ns: i64) {
         let is_silent = self
-            .newest_here_ns
+            .newest
+            .here_ns
             .is_none_or(|at| now_ns.saturating_sub(at) > span_ns);
         let oldest_ns = if is_silent {
             i64::MAX
         } else {
-            let newest_ns = self.newest_published_ns.unwrap_or(i64::MIN);
+            let newest_ns = self.newest.published_ns.unwrap_or(i64::MIN);
             newest_ns.saturating_sub(span_ns)
         };
         keep(&mut self.published, oldest_ns);
@@ -151,7 +140,7 @@ impl ChannelTail {
 
     /// True when no record of the channel is at hand.
     pub(crate) fn is_empty(&self) -> bool {
-        self.newest_here_ns.is_none()
+        self.newest.here_ns.is_none()
     }
 
     /// The account of the messages published within `span_ns`, which ends `settling_ns` before the
@@ -159,10 +148,11 @@ impl ChannelTail {
     /// in it.
     pub(crate) fn account(
         &self,
-        (span_ns, settling_ns): (i64, i64),
+        span_ns: i64,
+        settling_ns: i64,
         context: &AccountContext<'_>,
     ) -> ChannelAccount {
-        let newest_ns = self.newest_published_ns.unwrap_or(i64::MIN);
+        let newest_ns = self.newest.published_ns.unwrap_or(i64::MIN);
         let until_ns = newest_ns.saturating_sub(settling_ns);
         let window = until_ns.saturating_sub(span_ns)..=until_ns;
         let chosen = Self {
@@ -216,19 +206,19 @@ impl ChannelTail {
     }
 }
 
-/// Appends `new`; gives the newest publication and the newest stamp of this host among it.
+/// Appends `new` and notes the newest stamps among it.
 fn extend<R: OfMessage>(
     kept: &mut Option<Vec<R>>,
     new: impl Iterator<Item = R>,
-) -> (Option<i64>, Option<i64>) {
+    newest: &mut Newest,
+) {
     let kept = kept.get_or_insert_default();
-    let first = kept.len();
-    kept.extend(new);
-    let newest = |of: fn(&R) -> i64| {
-        let each = kept[first..].iter().map(of);
-        each.filter(|ns| *ns != UNAVAILABLE).max()
-    };
-    (newest(R::published_ns), newest(R::here_ns))
+    let known = |ns: i64| Some(ns).filter(|ns| *ns != UNAVAILABLE);
+    for record in new {
+        newest.published_ns = newest.published_ns.max(known(record.published_ns()));
+        newest.here_ns = newest.here_ns.max(known(record.here_ns()));
+        kept.push(record);
+    }
 }
 
 fn keep<R: OfMessage>(records: &mut Option<Vec<R>>, oldest_ns: i64) {
@@ -298,26 +288,21 @@ mod tests {
             }
         }
         let mut tail = ChannelTail::default();
-        let seen = extend(&mut tail.published, published.into_iter());
-        tail.see(seen);
-        let seen = extend(&mut tail.taken, taken.into_iter());
-        tail.see(seen);
+        extend(&mut tail.published, published.into_iter(), &mut tail.newest);
+        extend(&mut tail.taken, taken.into_iter(), &mut tail.newest);
         tail
     }
 
     fn account_of(tail: &ChannelTail) -> ChannelAccount {
-        tail.account(
-            (i64::MAX, 0),
-            &AccountContext::new(ChannelPath::SharedMemory),
-        )
+        tail.account(i64::MAX, 0, &AccountContext::new(ChannelPath::SharedMemory))
     }
 
     #[test]
     fn what_was_before_the_window_is_neither_published_nor_lost() {
         let mut tail = tail();
         let context = AccountContext::new(ChannelPath::SharedMemory);
-        assert_eq!(tail.account((20 * MS, 0), &context).published_count, 21);
-        let settled = tail.account((20 * MS, 40 * MS), &context);
+        assert_eq!(tail.account(20 * MS, 0, &context).published_count, 21);
+        let settled = tail.account(20 * MS, 40 * MS, &context);
         assert_eq!(settled.published_count, 10, "100 to 109 had settled");
         tail.trim(20 * MS, 1_150 * MS);
         let account = account_of(&tail);
@@ -333,13 +318,12 @@ mod tests {
     fn what_left_and_never_came_is_lost_only_where_its_arrival_would_be_on_record() {
         let mut tail = ChannelTail::default();
         let each = tail_of_sent();
-        let seen = extend(&mut tail.egress, each.into_iter());
-        tail.see(seen);
+        extend(&mut tail.egress, each.into_iter(), &mut tail.newest);
         let path = ChannelPath::Gateway {
             alignment: Some(Alignment::SAME_CLOCK),
         };
         let context = AccountContext::new(path);
-        let fates = |tail: &ChannelTail| tail.account((i64::MAX, 0), &context).fates;
+        let fates = |tail: &ChannelTail| tail.account(i64::MAX, 0, &context).fates;
         let unknown = MessageFate::UnknownPeerRecordsUnavailable;
         assert_eq!(fates(&tail).of(unknown), 20);
         tail.expect(RecordKind::Ingress);

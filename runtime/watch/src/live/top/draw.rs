@@ -8,7 +8,7 @@ use ratatui::style::{Color, Modifier, Style};
 
 use super::view::{ChannelRow, ProcessRow, Quantiles, View};
 use hil_platform::text::shortened;
-use hil_report::terminal::{JOINT, duration, percent};
+use hil_report::terminal::{JOINT, duration, percent, unsigned_duration};
 
 /// Longest bar of the run's progress, columns.
 const BAR_COLUMNS: usize = 30;
@@ -213,7 +213,7 @@ fn processes(view: &View, lines: &mut Vec<Line>) {
         lines,
     );
     for one in &view.processes {
-        let cpu = one.cpu_ratio.map(percent_of_one);
+        let cpu = one.cpu_ratio.map(|ratio| format!("{:.1}%", 100.0 * ratio));
         let text = format!(
             "{:name_columns$} {:>7} {:>6} {:>8} {:>9} {:>8} {:>8}  {}",
             shortened(&one.name, name_columns),
@@ -393,16 +393,12 @@ fn rate(rate_hz: f64) -> String {
 }
 
 fn bound(bound_ns: u64) -> String {
-    let text = duration(i64::try_from(bound_ns).unwrap_or(i64::MAX));
+    let text = unsigned_duration(bound_ns);
     if bound_ns == 0 {
         text
     } else {
         format!("±{text}")
     }
-}
-
-fn percent_of_one(ratio: f64) -> String {
-    format!("{:.1}%", 100.0 * ratio)
 }
 
 /// A column per window, as high as its figure against the highest one shown; a blank where there

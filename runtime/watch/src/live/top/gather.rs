@@ -1,9 +1,7 @@
 //! A [`View`] of a run, from what its processes recorded in the last window, from what its
 //! supervisor says of them and from what the kernel does.
 
-use std::collections::BTreeMap;
-use std::io;
-use std::time::Duration;
+use std::{collections::BTreeMap, io, time::Duration};
 
 use hil_account::{ChannelAccount, MessageFate};
 use hil_clock::ClockMap;
@@ -17,22 +15,36 @@ use super::view::{
     ChannelRow, ClockRow, ElsewhereRow, LinkRow, LinkState, ProcessRow, Quantiles, RunState,
     RunView, SegmentRow, View,
 };
-use crate::live::observer::Observer;
-use crate::live::pace::Pace;
-use crate::live::process;
+use crate::{live::observer::Observer, live::pace::Pace, live::process};
 use hil_platform::clock::MonotonicClock;
-use hil_rundir::status;
-use hil_rundir::status::{Phase, ProcessStatus, RunStatus};
+use hil_rundir::status::{self, Phase, ProcessStatus, RunStatus};
 use hil_topology::{Channel, Direction, Link, Topology};
 
 /// The supervisor tells of its processes twice a second; what is older than this is said to be old.
 const STATUS_AGE_MAX: Duration = Duration::from_secs(2);
 
+/// The processor time of a process at one look.
+#[derive(Debug, Clone, Copy)]
+struct ProcessorTime {
+    used_ns: u64,
+    /// When it was looked at.
+    at_ns: i64,
+}
+
+impl ProcessorTime {
+    /// Processor time over time since an earlier look; `None` when that is of another process.
+    fn ratio_since(self, before: Self) -> Option<f64> {
+        let passed_ns = self.at_ns.saturating_sub(before.at_ns);
+        let used_ns = self.used_ns.checked_sub(before.used_ns)?;
+        (passed_ns > 0).then(|| used_ns as f64 / passed_ns as f64)
+    }
+}
+
 /// What a look remembers for the next one.
 #[derive(Debug, Default)]
 pub(crate) struct Gatherer {
-    /// Processor time and the instant of the last look, by process id.
-    cpu: BTreeMap<u32, (u64, i64)>,
+    /// By process id.
+    cpu: BTreeMap<u32, ProcessorTime>,
     /// 99th percentiles of the delay, by channel.
     history: BTreeMap<String, Vec<Option<i64>>>,
     /// What the supervisor told last; it removes its file a moment before the run is over.
@@ -87,12 +99,16 @@ impl Gatherer {
         let mut cpu = BTreeMap::new();
         let rows = processes.unwrap_or_default().iter().map(|one| {
             let look = one.pid.map(process::look).unwrap_or_default();
-            let now_ns = MonotonicClock::now().as_ns();
-            let before = one.pid.and_then(|pid| self.cpu.get(&pid).copied());
-            if let (Some(pid), Some(cpu_ns)) = (one.pid, look.cpu_ns) {
-                cpu.insert(pid, (cpu_ns, now_ns));
-            }
-            process_row(one, look, (before, now_ns))
+            let at_ns = MonotonicClock::now().as_ns();
+            let now = look.cpu_ns.map(|used_ns| ProcessorTime { used_ns, at_ns });
+            let before = one.pid.and_then(|pid| self.cpu.get(&pid));
+            cpu.extend(one.pid.zip(now));
+            let both = now.zip(before);
+            process_row(
+                one,
+                look,
+                both.and_then(|(now, before)| now.ratio_since(*before)),
+            )
         });
         let rows = rows.collect();
         self.cpu = cpu;
@@ -190,16 +206,8 @@ fn run_view(observer: &Observer, status: Option<&RunStatus>, window: Duration) -
 fn process_row(
     status: &ProcessStatus,
     look: process::ProcessLook,
-    (before, now_ns): (Option<(u64, i64)>, i64),
+    cpu_ratio: Option<f64>,
 ) -> ProcessRow {
-    let cpu_ratio = look
-        .cpu_ns
-        .zip(before)
-        .and_then(|(cpu_ns, (cpu_before_ns, at_ns))| {
-            let passed_ns = now_ns.saturating_sub(at_ns);
-            let used_ns = cpu_ns.checked_sub(cpu_before_ns)?;
-            (passed_ns > 0).then(|| used_ns as f64 / passed_ns as f64)
-        });
     ProcessRow {
         name: status.name.clone(),
         host: status.host.clone(),
@@ -327,7 +335,7 @@ fn link_row(
         via: link.via.word().to_owned(),
         state,
         condition: link.emulation().map(|emulation| {
-            let words = |way, spec| condition_words(observer, (topology, link), (way, spec));
+            let words = |way, spec| condition_words(observer, topology, link, way, spec);
             let there = words(Way::Forward, &emulation.forward);
             let back = words(Way::Backward, &emulation.backward);
             if there == back {
@@ -343,8 +351,10 @@ fn link_row(
 /// What one direction of an emulated link does at present.
 fn condition_words(
     observer: &Observer,
-    (topology, link): (&Topology, &Link),
-    (way, spec): (Way, &LinkSpec),
+    topology: &Topology,
+    link: &Link,
+    way: Way,
+    spec: &LinkSpec,
 ) -> String {
     let ordered = observer.link_condition(&link.name, way);
     if ordered != LinkCondition::Topology {

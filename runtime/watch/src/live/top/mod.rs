@@ -46,7 +46,8 @@ pub fn run(
     args: &TopArgs,
     columns: usize,
     registry: &Registry,
-    (signals, console): (&Signals, &mut Console),
+    signals: &Signals,
+    console: &mut Console,
 ) -> Result<TopEnd, TopError> {
     let mut observer = Observer::open(args.run.as_deref(), registry)?;
     let names: Vec<String> = observer
@@ -63,7 +64,7 @@ pub fn run(
     // What processes used is a difference of two looks.
     gatherer.look(&observer, args.window);
     if !args.json && !args.once && io::stdout().is_terminal() {
-        return screen::run((observer, gatherer), args.window, signals).map_err(TopError::Terminal);
+        return screen::run(observer, gatherer, args.window, signals).map_err(TopError::Terminal);
     }
     loop {
         let is_whole = observer.poll_for(args.window, signals);

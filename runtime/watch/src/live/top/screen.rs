@@ -7,16 +7,15 @@ use std::time::{Duration, Instant as WallInstant};
 use ratatui::DefaultTerminal;
 use ratatui::crossterm::event::{self, Event, KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
 
-use super::TopEnd;
 use super::draw::{Detail, Frame, draw};
-use super::gather::Gatherer;
-use super::view::View;
+use super::{TopEnd, gather::Gatherer, view::View};
 use crate::live::observer::{Observer, POLL_PERIOD};
 use hil_platform::signals::Signals;
 
 /// Shows the run until the user leaves.
 pub(super) fn run(
-    (observer, gatherer): (Observer, Gatherer),
+    observer: Observer,
+    gatherer: Gatherer,
     window: Duration,
     signals: &Signals,
 ) -> io::Result<TopEnd> {

@@ -1,9 +1,7 @@
 //! What `top` shows: plain figures of one look, ready to be drawn or printed as JSON. What is not
 //! known is `None`. Nothing here gathers or draws.
 
-use std::collections::BTreeMap;
-use std::fmt;
-use std::path::PathBuf;
+use std::{collections::BTreeMap, fmt, path::PathBuf};
 
 use serde::Serialize;
 
