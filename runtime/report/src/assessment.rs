@@ -4,12 +4,9 @@
 use hil_account::{ChannelAccount, ClosingFigures, Coverage, MessageFate};
 use serde::{Deserialize, Serialize};
 
-use super::face::FaceSummary;
-use super::face_warnings;
-use super::summary::{
-    ChannelSummary, Fact, LinkKind, NO_ROOM, Outcome, ProcessSummary, RunSummary,
-};
+use super::summary::{ChannelSummary, LinkKind, NO_ROOM, Outcome, ProcessSummary, RunSummary};
 use super::terminal::{JOINT, percent};
+use super::{face::FaceSummary, face_warnings};
 use hil_platform::text::grouped;
 use hil_platform::words::counted;
 
@@ -93,7 +90,13 @@ impl Assessment {
         warnings.extend(summary.faces.iter().flat_map(face_warnings::face_warnings));
         warnings.extend(summary.processes.iter().flat_map(process_warnings));
         warnings.extend(summary.channels.iter().flat_map(channel_warnings));
-        warnings.extend(summary.realtime.refused.iter().map(refused_warning));
+        warnings.extend(
+            summary
+                .realtime
+                .refused
+                .iter()
+                .map(|one| format!("{}: {}", one.value, one.label)),
+        );
         let network = verdict(summary, overruns);
         // The joint is for pages; in JSON it would only surprise.
         for warning in &mut warnings {
@@ -202,10 +205,6 @@ fn emulation_warning(channel: &ChannelSummary) -> Option<String> {
         ms(figures.scheduling_error.p99_ns),
         ms(figures.error_max_ns),
     ))
-}
-
-fn refused_warning(refused: &Fact) -> String {
-    format!("{}: {}", refused.value, refused.label)
 }
 
 fn overrun(process: &ProcessSummary) -> Option<Overrun> {

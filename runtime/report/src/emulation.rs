@@ -77,9 +77,9 @@ mod tests {
 
     use super::*;
     use crate::assessment::{Assessment, NetworkVerdict};
-    use crate::sample_events::{recorded_channel, summary, ticking};
     use crate::summary::{ChannelSummary, LinkKind, RunSummary};
     use crate::terminal::{Style, render};
+    use crate::tests::sample_events::{recorded_channel, summary, ticking};
 
     /// Delays of 10 to 20 ms in turn, each given back `late_ns` late.
     fn records(late_ns: impl Fn(i64) -> i64) -> Vec<IngressRecord> {

@@ -3,9 +3,8 @@
 
 use core::fmt::Write;
 
-use super::link_change::LinkChange;
 use super::score_event::{ExplainedEvent, ScoreEvents};
-use super::terminal::JOINT;
+use super::{link_change::LinkChange, terminal::JOINT};
 
 /// The text of the file for the run called `name`.
 pub(crate) fn text(name: &str, all: &ScoreEvents, changes: &[LinkChange]) -> String {

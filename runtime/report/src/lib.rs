@@ -27,10 +27,4 @@ pub mod trace;
 pub mod trace_counts;
 
 #[cfg(test)]
-pub(crate) mod sample;
-#[cfg(test)]
-mod sample_events;
-#[cfg(test)]
-mod sample_network;
-#[cfg(test)]
-mod sample_records;
+mod tests;

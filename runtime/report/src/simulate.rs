@@ -2,35 +2,32 @@
 //! links. It starts no process and opens no socket.
 
 mod events;
-mod network;
 mod watched;
 
-use std::collections::BTreeMap;
-use std::fs;
-use std::io;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::{collections::BTreeMap, fs, io, time::Duration};
 
+use hil_account::network::{Moment, NetworkContext};
 use hil_account::{
-    ChannelAccount, Closing, EndToEnd, FateCounts, Gaps, MessageFate, StampCoverage,
+    ChannelAccount, ChannelPath, Closing, EndToEnd, FateCounts, Gaps, MessageFate, StampCoverage,
 };
-use hil_core::link_model::LinkModel;
-use hil_core::link_model::ReplayTally;
+use hil_core::case_study::ErrorSeries;
+use hil_core::link_model::{LinkModel, ReplayTally};
 use hil_core::plot::PlotSeries;
 use hil_core::run_log::RunLog;
 use hil_core::simulation::{Carrier, ChannelCounts, Simulation, SimulationError, SimulationResult};
-use hil_core::time::Instant;
+use hil_core::time::{Instant, duration_ns};
 use hil_stats::histogram::Distribution;
 
-use crate::analysis::figures::shell_words;
-use crate::analysis::outages::OutageStory;
-use crate::event_log;
+use crate::analysis::network::{AxisClocks, ChannelPassages, NetworkBuilder, RobotSeries};
+use crate::{analysis::figures::shell_words, analysis::outages::OutageStory};
+
 use crate::summary::{
     ChannelSummary, CountByName, DirectionSummary, Fact, LinkKind, Outcome, RecordedFigures,
     RunFacts, RunSummary, ScoreMetric,
 };
-use crate::terminal;
-use crate::terminal::{Style, percent};
+use crate::terminal::{self, Style, percent};
+use crate::{event_log, network::NetworkReport, score_event::ScoreEvents};
 use hil_rundir::launch::Side;
 use hil_rundir::pipe::CounterGroup;
 use hil_rundir::run_folder::RunFolder;
@@ -129,7 +126,7 @@ pub fn simulate(
     summary.score = ScoreMetric::all_of(&score);
     summary.score_events = events::explained(&score, entry.channels, &outages, &result.log);
     let watches = links.into_iter().map(|(name, link)| (name, link.watch));
-    let (network, network_series) = network::of_simulation(
+    let (network, network_series) = network(
         topology,
         watches.collect(),
         &result.log,
@@ -144,6 +141,45 @@ pub fn simulate(
         log: result.log,
         network_series: network_series.unwrap_or_default(),
     })
+}
+
+/// The report and the series of every channel that a link model carried; `None` when none did.
+fn network(
+    topology: &Topology,
+    watches: Vec<(String, Watch)>,
+    log: &RunLog,
+    errors: Vec<ErrorSeries>,
+    events: &mut ScoreEvents,
+) -> Option<(NetworkReport, Vec<PlotSeries>)> {
+    let seed = topology.run().seed;
+    let length_ns = duration_ns(topology.run().duration);
+    let mut builder = NetworkBuilder::default();
+    for (name, watch) in watches {
+        let crossing = topology.crossings().find(|one| one.channel.name == name)?;
+        let (passages, duplicated_count) = watch.passages();
+        let passages = passages.into_iter().collect();
+        let payload = log.raw(&name).first();
+        builder.add(ChannelPassages {
+            channel: &name,
+            hosts: [&crossing.from_host.name, &crossing.to_host.name],
+            passages: &passages,
+            other_events: Vec::new(),
+            duration_ns: length_ns,
+            // Virtual time begins with the run, for all hosts alike.
+            place: &|at: Moment| Some(at.ns),
+            context: NetworkContext {
+                path: ChannelPath::SharedMemory,
+                run_ns: Some((0, length_ns)),
+                payload_bytes: payload.map(|message| message.payload.len() as u64),
+                duplicated_count: Some(duplicated_count),
+                round_trips_ns: &[],
+                seed,
+            },
+        });
+    }
+    let errors = errors.into_iter();
+    let errors = errors.map(|one| RobotSeries::of(one, |at| Some(at.seconds_since(Instant::ZERO))));
+    builder.finish(events, errors.collect(), seed, AxisClocks::ONE)
 }
 
 fn run_facts(topology: &Topology, file: &Path) -> RunFacts {

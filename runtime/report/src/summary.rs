@@ -6,23 +6,19 @@
 //! not know. Units are part of the names.
 
 use core::fmt;
-use std::collections::BTreeMap;
-use std::io;
 use std::path::{Path, PathBuf};
+use std::{collections::BTreeMap, io};
 
 use hil_account::{ChannelAccount, MessageFate, OutageFigures};
 use hil_core::case_study::{Metric, Score};
 use hil_core::link_model::ReplayCounts;
 use serde::{Deserialize, Serialize};
 
-use super::assessment::Assessment;
-use super::clock_summary::ClockSection;
-use super::emulation::EmulationFigures;
-use super::face::FaceSummary;
-use super::link_change::LinkChange;
-use super::network::NetworkReport;
-use super::radio::RadioReport;
-use super::score_event::ScoreEvents;
+use super::{
+    assessment::Assessment, clock_summary::ClockSection, emulation::EmulationFigures,
+    face::FaceSummary, link_change::LinkChange, network::NetworkReport, radio::RadioReport,
+    score_event::ScoreEvents,
+};
 use crate::card_figures::HardwareStamps;
 use hil_platform::host_facts::HostFacts;
 use hil_platform::text::grouped;

@@ -8,7 +8,7 @@ use hil_platform::console::Console;
 use hil_platform::progress::Progress;
 use hil_report::analysis;
 use hil_report::page;
-use hil_report::page::material::Material;
+use hil_report::page::read::Material;
 use hil_report::page::{Format, read, write};
 use hil_report::summary::{RunSummary, SummaryError};
 use hil_report::terminal;

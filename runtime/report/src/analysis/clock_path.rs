@@ -4,8 +4,7 @@
 use hil_clock::{ClockFigures, ClockMap, ClockSettings, Exchange, Localised, Requester};
 use hil_core::time::{Instant, RemoteInstant};
 
-use super::clocks;
-use super::records::RunRecords;
+use super::{clocks, records::RunRecords};
 use crate::clock_summary::{ClockPathEnd, ClockPathSummary, ClockRung, HostPairClock};
 use hil_rundir::run_result::RunResult;
 use hil_topology::{ClockPath, Host, clock_process_name};

@@ -7,8 +7,7 @@ use hil_account::ChannelPath;
 use hil_clock::{ClockFigures, ClockMap, ClockSettings, Exchange, Requester};
 use hil_core::time::{Alignment, Instant, RemoteInstant};
 
-use super::clock_path;
-use super::records::RunRecords;
+use super::{clock_path, records::RunRecords};
 use crate::clock_summary::{ClockRung, ClockSection, DisciplinedOffset, HostPairClock};
 use hil_platform::clock_discipline::{self, HostDiscipline};
 use hil_topology::{Channel, Topology};

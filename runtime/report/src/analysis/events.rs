@@ -7,13 +7,10 @@ use hil_account::{Happening, MessageFate, MessageStory, Side, stories};
 use hil_core::case_study::{ChannelSpec, MessageRef, Score, ScoreEvent};
 use hil_core::time::{Instant, RemoteInstant};
 
-use super::axis::RunAxis;
-use super::outages::OutageStory;
-use super::records::RunRecords;
-use crate::network::within;
+use super::{axis::RunAxis, outages::OutageStory, records::RunRecords};
 use crate::score_event::{EventOutage, ExplainedEvent, ExplainedMessage, ScoreEvents};
 use crate::summary::{ChannelSummary, CounterGroup, LinkKind};
-use crate::terminal::duration_s;
+use crate::{network::within, terminal::duration_s};
 use hil_topology::{Channel, Topology};
 
 /// The events of `score` with the fates of their messages and the outages before them.

@@ -1,9 +1,7 @@
 //! From what the faces of a run recorded and reported to their part of the summary.
 
 use super::records::RunRecords;
-use crate::face::FaceSummary;
-use crate::face_figures::figures;
-use crate::summary::Fact;
+use crate::{face::FaceSummary, face_figures::figures, summary::Fact};
 use hil_arm::egm::messages::Side;
 use hil_rundir::pipe::FaceReport;
 use hil_rundir::run_result::RunResult;

@@ -1,14 +1,12 @@
 //! The parts of a summary: from what the supervisor and the processes said to what a report shows.
 //! It draws up no account itself.
 
-use std::collections::BTreeMap;
-use std::path::Path;
+use std::{collections::BTreeMap, path::Path};
 
 use hil_account::account;
 use hil_core::record::IngressRecord;
 
-use super::axis::RunAxis;
-use super::records::RunRecords;
+use super::{axis::RunAxis, records::RunRecords};
 use crate::emulation::EmulationFigures;
 use crate::summary::{
     Absence, ChannelSummary, CounterGroup, DirectionSummary, Fact, LinkKind, Outcome,

@@ -1,12 +1,9 @@
 //! What drawing up the account of a run costs in memory, and that it does not grow with the run as its
 //! records do: runs of two lengths are concluded, each in a process of its own, and their peaks compared.
 
-use std::collections::BTreeMap;
-use std::env;
 use std::fs::{self, File};
 use std::io::{BufWriter, Write};
-use std::path::Path;
-use std::process::Command;
+use std::{collections::BTreeMap, env, path::Path, process::Command};
 
 use bytemuck::Pod;
 use hil_account::MessageFate;

@@ -3,7 +3,6 @@
 
 mod axis;
 mod cards;
-mod channel_files;
 mod clock_path;
 mod clocks;
 mod events;
@@ -13,18 +12,15 @@ mod interruptions;
 pub(crate) mod link_changes;
 #[cfg(test)]
 mod memory_tests;
-pub(crate) mod message_records;
 pub(crate) mod network;
 pub(crate) mod outages;
 mod radio;
 pub(crate) mod records;
 mod robot_series;
 mod score_clock;
-mod stalls;
 
-use std::fs;
-use std::io;
 use std::path::{Path, PathBuf};
+use std::{fs, io};
 
 use hil_account::MessageFate;
 use hil_core::case_study::Score;
@@ -36,10 +32,9 @@ use figures::{channel_summary, process_summary, realtime_facts, run_event, run_f
 use outages::OutageStory;
 use records::RunRecords;
 
-use crate::event_log;
 use crate::summary::{Fact, RunSummary, ScoreMetric, SummaryError};
 use crate::terminal::{self, Style};
-use crate::trace::capture;
+use crate::{event_log, trace::capture};
 use hil_rundir::manifest::{Manifest, ManifestTopologyError};
 use hil_rundir::run_folder::RunFolder;
 use hil_rundir::run_result::{RunResult, RunResultError};

@@ -17,11 +17,9 @@ use hil_core::record::IngressRecord;
 use hil_core::time::Instant;
 use hil_stats::correlation::{self, LagWindow};
 
-use super::axis::RunAxis;
-use super::clocks::HostClocks;
-use super::records::RunRecords;
 pub(crate) use super::robot_series::RobotSeries;
 use super::robot_series::{index_of, without_holes};
+use super::{axis::RunAxis, clocks::HostClocks, records::RunRecords};
 use crate::network::{
     ChannelNetwork, Correlation, CorrelationTests, FOREGOING_S, ForegoingEvent, ForegoingNetwork,
     NetworkQuantity, NetworkReport, TestedPair, TimedEvent, Timeline, TimelineRow, TimelineSubject,

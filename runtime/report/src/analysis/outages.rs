@@ -6,8 +6,7 @@ use std::collections::BTreeMap;
 use hil_account::{Happening, Outage, OutageFigures, Side, Standing, foregoing, outages};
 use hil_core::time::Instant;
 
-use super::axis::RunAxis;
-use super::records::RunRecords;
+use super::{axis::RunAxis, records::RunRecords};
 use crate::score_event::EventOutage;
 use crate::terminal::{duration_s, seconds};
 use hil_platform::words::counted;

@@ -1,12 +1,9 @@
 //! The record files of a finished run, joined by channel, and the account drawn up from them. What
 //! the account means for a reader is decided elsewhere.
 
-use std::cell::RefCell;
-use std::collections::BTreeMap;
-use std::fs;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
-use std::time::Duration;
+use std::{cell::RefCell, fs, sync::Arc, time::Duration};
 
 use bytemuck::Pod;
 use hil_account::card_clock::{CardClockRecord, CardTimeline};
@@ -14,21 +11,20 @@ use hil_account::{
     AccountContext, ChannelPath, ChannelRecords, FLIGHT_TIME_MAX, Interruption, ORDER_TOLERANCE_NS,
     RunSpan,
 };
-use hil_core::record::RoundTripRecord;
-use hil_core::run_log::RunLog;
+use hil_core::record::{
+    EgressRecord, IngressRecord, PublishedRecord, RoundTripRecord, TakenRecord,
+};
+use hil_core::run_log::{Logged, RunLog};
 use hil_link::condition::LinkConditionRecord;
 
-use super::AnalysisError;
-use super::channel_files::{ChannelFiles, Signs, widen};
-use super::clocks::HostClocks;
-use super::message_records::missing_count;
-use super::{interruptions, link_changes, stalls};
+use super::{AnalysisError, clocks::HostClocks};
+use super::{interruptions, link_changes};
 use crate::summary::RecordedFigures;
 use hil_rundir::radio_record::RadioRecord;
 use hil_rundir::record::stored::{
     ReadFaults, StoredFile, StoredRecords, file_bytes, sort_by_start,
 };
-use hil_rundir::record::{RecordFileError, RecordKind};
+use hil_rundir::record::{RecordFile, RecordFileError, RecordKind};
 use hil_rundir::run_result::RunResult;
 use hil_topology::emulation::EmulationLaunch;
 use hil_topology::{Channel, Topology};
@@ -291,7 +287,7 @@ impl<'a> RunRecords<'a> {
             return known.clone();
         }
         let mut found = interruptions::noted(self, channel);
-        found.extend(stalls::at_end(self, channel));
+        found.extend(interruptions::at_end(self, channel));
         let mut interruptions = self.interruptions.borrow_mut();
         interruptions.insert(channel.name.clone(), found.clone());
         found
@@ -300,7 +296,7 @@ impl<'a> RunRecords<'a> {
 
 /// Hands every record file of `folder` with a `wanted` name to `take`, and before each the share of
 /// their bytes that lies before it to `reach`; gives what could not be read.
-pub(super) fn each_file(
+fn each_file(
     folder: &Path,
     wanted: &dyn Fn(&str) -> bool,
     reach: &dyn Fn(f64),
@@ -334,4 +330,115 @@ pub(super) fn each_file(
         }
     }
     Ok(problems)
+}
+
+/// All records of one channel.
+#[derive(Debug, Default)]
+pub(super) struct ChannelFiles {
+    pub(super) published: Option<StoredRecords>,
+    pub(super) egress: Option<StoredRecords>,
+    pub(super) ingress: Option<StoredRecords>,
+    pub(super) follow_up: Option<StoredRecords>,
+    pub(super) taken: Option<StoredRecords>,
+    pub(super) round_trips: BTreeMap<(u32, u64), RoundTripRecord>,
+    pub(super) face_sent: Option<StoredRecords>,
+    pub(super) face_received: Option<StoredRecords>,
+    pub(super) message: Option<StoredRecords>,
+    pub(super) signs: Signs,
+}
+
+/// The last signs of life that a channel's records give, and the ends of what its gateways noted of the
+/// clocks: asked for by other channels, too, so read once.
+#[derive(Debug, Default)]
+#[allow(clippy::struct_field_names, reason = "the unit, as everywhere")]
+pub(super) struct Signs {
+    pub(super) published_ns: Option<i64>,
+    pub(super) sent_ns: Option<i64>,
+    pub(super) received_ns: Option<i64>,
+    pub(super) taken_ns: Option<i64>,
+    pub(super) sender_realtime_ns: Option<(i64, i64)>,
+    pub(super) receiver_realtime_ns: Option<(i64, i64)>,
+}
+
+impl Signs {
+    fn of(files: &ChannelFiles) -> Self {
+        let mut signs = Self::default();
+        for record in all::<PublishedRecord>(files.published.as_ref()) {
+            signs.published_ns = signs.published_ns.max(Some(record.published_ns));
+        }
+        for record in all::<EgressRecord>(files.egress.as_ref()) {
+            signs.sent_ns = signs.sent_ns.max(Some(record.taken_ns));
+            widen(&mut signs.sender_realtime_ns, record.realtime_offset_ns);
+        }
+        for record in all::<IngressRecord>(files.ingress.as_ref()) {
+            signs.received_ns = signs.received_ns.max(Some(record.received_ns));
+            widen(&mut signs.receiver_realtime_ns, record.realtime_offset_ns);
+        }
+        for record in all::<TakenRecord>(files.taken.as_ref()) {
+            signs.taken_ns = signs.taken_ns.max(Some(record.taken_ns));
+        }
+        signs
+    }
+}
+
+/// Lets `ends` take in `ns`.
+fn widen(ends: &mut Option<(i64, i64)>, ns: i64) {
+    let (lowest, highest) = ends.unwrap_or((ns, ns));
+    *ends = Some((lowest.min(ns), highest.max(ns)));
+}
+
+/// The records of files that may not be there.
+pub(super) fn all<R: Pod>(files: Option<&StoredRecords>) -> impl Iterator<Item = R> + '_ {
+    files.into_iter().flat_map(StoredRecords::records)
+}
+
+/// The messages of a run, without the rest of its records.
+#[derive(Debug, Default)]
+pub(crate) struct MessageRecords {
+    /// The messages.
+    pub(crate) log: RunLog,
+    /// Channels whose messages someone recorded, be it none.
+    pub(crate) files: BTreeSet<String>,
+    /// What could not be read.
+    pub(crate) problems: Vec<String>,
+}
+
+impl MessageRecords {
+    /// Reads them from a records folder; `reach` hears the share that is read.
+    ///
+    /// # Errors
+    /// When the folder cannot be read.
+    pub(crate) fn read(folder: &Path, reach: &dyn Fn(f64)) -> Result<Self, AnalysisError> {
+        let mut records = Self::default();
+        let wanted = |name: &str| name.contains(".message.");
+        let problems = each_file(folder, &wanted, reach, &mut |path| {
+            let file = RecordFile::read(path)?;
+            if file.header.kind != RecordKind::Message {
+                return Ok(());
+            }
+            let channel = &file.header.channel;
+            records.files.insert(channel.clone());
+            file.append_messages(&mut records.log);
+            if file.truncated_bytes > 0 {
+                let problem = format!("{channel}: a record file ends in half a message");
+                records.problems.push(problem);
+            }
+            Ok(())
+        })?;
+        records.problems.extend(problems);
+        Ok(records)
+    }
+}
+
+/// Sequence numbers below the highest of each start of a producer that are not among its
+/// recorded messages.
+pub(crate) fn missing_count(messages: Logged<'_>) -> u64 {
+    let mut next_of_epoch: BTreeMap<u32, u64> = BTreeMap::new();
+    for message in messages {
+        let next = next_of_epoch.entry(message.envelope.epoch).or_default();
+        *next = (*next).max(message.envelope.sequence.saturating_add(1));
+    }
+    let given = next_of_epoch.values();
+    let given_count = given.fold(0_u64, |sum, count| sum.saturating_add(*count));
+    given_count.saturating_sub(messages.len() as u64)
 }

@@ -4,8 +4,7 @@
 use hil_core::run_log::{BroughtStamp, RunLog};
 use hil_core::time::RemoteInstant;
 
-use super::clocks::HostClocks;
-use super::records::RunRecords;
+use super::{clocks::HostClocks, records::RunRecords};
 use hil_topology::Topology;
 use hil_topology::registry::MadeCase;
 

@@ -8,7 +8,7 @@ use hil_stats::statistics::{CONFIDENCE, IntervalNs, wilson};
 
 use super::data::{Channel, Figure, Table};
 use super::figures::waterfall::Bar;
-use super::words::{UNAVAILABLE, count, ns_s};
+use super::words::{UNAVAILABLE, count, ns_s, number};
 use crate::summary::LinkKind;
 use crate::terminal::{JOINT, duration, percent, unsigned_duration};
 use hil_platform::text::grouped;
@@ -97,7 +97,7 @@ fn loss_ratio(network: Option<&NetworkFigures>) -> Figure {
                 .by(&format!(
                     "95 %, Wilson on {} independent messages' worth of {}, as losses come in \
                      bursts; as if independent {} to {}",
-                    grouped_f(loss.effective_count),
+                    number(loss.effective_count.max(0.0).round()),
                     grouped(loss.of_count),
                     percent(independent.low),
                     percent(independent.high)
@@ -105,15 +105,6 @@ fn loss_ratio(network: Option<&NetworkFigures>) -> Figure {
         }
         Measured::Unavailable { reason } => unavailable(reason),
     }
-}
-
-#[allow(
-    clippy::cast_possible_truncation,
-    clippy::cast_sign_loss,
-    reason = "a number of messages, not below zero"
-)]
-fn grouped_f(value: f64) -> String {
-    grouped(value.max(0.0).round() as u64)
 }
 
 /// Late, duplicated, reordered: counts, each with its share of what arrived.

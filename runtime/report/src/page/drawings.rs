@@ -1,11 +1,9 @@
 //! Which figures a run and its channels get, with the words below them.
 
 use super::channel::{Sources, bar};
-use super::data::Drawing;
-use super::figures::bursts::loss_bursts;
 use super::figures::cdf::{Curve, delay_cdf};
-use super::figures::histogram::delay_histogram;
 use super::figures::waterfall::{Bar, waterfall};
+use super::{data::Drawing, figures::bursts::loss_bursts, figures::histogram::delay_histogram};
 use hil_account::ChannelAccount;
 use hil_platform::text::grouped;
 

@@ -9,7 +9,6 @@ pub(crate) mod data;
 mod drawings;
 mod events;
 mod figures;
-pub mod material;
 mod paper;
 pub mod read;
 mod run;
@@ -19,17 +18,15 @@ mod template;
 #[cfg(test)]
 mod tests;
 mod timeline;
-mod unfinished;
 mod words;
 pub mod write;
 
-use std::collections::BTreeSet;
-use std::path::Path;
+use std::{collections::BTreeSet, path::Path};
 
 use clap::ValueEnum;
 
 use self::data::{Drawing, Page, Run, RunKind, SCHEMA_VERSION, Table};
-use self::material::Material;
+use self::read::Material;
 use super::terminal::JOINT;
 use hil_platform::text::grouped;
 

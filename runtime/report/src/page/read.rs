@@ -1,18 +1,52 @@
 //! Reads a run's folder for a page. What cannot be read is said, and the rest is read all the same.
 
-use std::fs;
-use std::io;
-use std::path::Path;
+use std::{fs, io, path::Path};
 
 use serde::Deserialize;
 use serde_json::Value;
 
-use super::material::{Found, Manifest, Material};
 use super::series::{self, Series};
 use crate::summary::RunSummary;
 use hil_platform::host_facts::HostFacts;
 use hil_rundir::run_folder::RunFolder;
 use hil_rundir::series::list;
+
+/// One folder.
+#[derive(Debug, Clone)]
+pub struct Material {
+    /// The folder's own name.
+    pub folder: String,
+    /// What was found there.
+    pub(crate) found: Found,
+    /// What there is to plot.
+    pub(crate) series: Vec<Series>,
+    /// `report.txt`.
+    pub(crate) printed: Option<String>,
+    /// What could not be read, in words.
+    pub problems: Vec<String>,
+}
+
+/// What kind of folder it is.
+#[derive(Debug, Clone)]
+pub(crate) enum Found {
+    /// Of a run that ended, or of one in virtual time.
+    Ended(Box<RunSummary>),
+    /// Of a run without a summary.
+    Unfinished(Manifest),
+}
+
+/// What `manifest.json` says of a run that has nothing else to say.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Manifest {
+    pub(crate) name: String,
+    pub(crate) case: String,
+    pub(crate) created: String,
+    pub(crate) seed: Option<u64>,
+    pub(crate) command_line: Vec<String>,
+    pub(crate) host_facts: HostFacts,
+    /// Files of records that there are, and what they hold in all, bytes.
+    pub(crate) records: (u64, u64),
+}
 
 /// Largest series that is read, bytes: an hour of two arms is a tenth of it.
 const SERIES_BYTES_MAX: u64 = 1 << 30;

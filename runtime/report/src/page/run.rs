@@ -3,18 +3,13 @@
 
 use super::channel::{self, Sources};
 use super::data::{Channel, FactGroup, Figure, Run, RunKind, Table, Verdict};
-use super::drawings;
 use super::events::{correlation, network_events, score_events};
-use super::material::{Found, Material};
-use super::paper;
-use super::timeline;
-use super::unfinished::unfinished;
+use super::read::{Found, Manifest, Material};
 use super::words::{UNAVAILABLE, count};
-use crate::assessment::Assessment;
-use crate::clock_summary::ClockSection;
-use crate::score_event::ScoreEvents;
+use super::{drawings, paper, timeline};
 use crate::summary::{ChannelSummary, Fact, LinkKind, RunSummary, ScoreMetric, host_words};
 use crate::terminal::{self, duration, seconds, unsigned_duration};
+use crate::{assessment::Assessment, clock_summary::ClockSection, score_event::ScoreEvents};
 use hil_platform::text::grouped;
 use hil_platform::words::counted;
 
@@ -78,6 +73,55 @@ pub(super) fn of(material: &Material, index: usize, steps: usize) -> Run {
     run.headline = headline(&run);
     run.printed.clone_from(&material.printed);
     run
+}
+
+/// A run without a summary.
+fn unfinished(key: &str, manifest: &Manifest, folder: &str) -> Run {
+    let (files, bytes) = manifest.records;
+    let seed = manifest
+        .seed
+        .map_or_else(|| UNAVAILABLE.to_owned(), |seed| seed.to_string());
+    Run {
+        key: key.to_owned(),
+        name: manifest.name.clone(),
+        case: manifest.case.clone(),
+        kind: RunKind::Unfinished,
+        outcome: Verdict {
+            tone: "bad",
+            word: "unfinished".to_owned(),
+            text: "this run never began or was killed outright, so it left no summary".to_owned(),
+        },
+        network_verdict: Verdict {
+            tone: "caution",
+            word: "no verdict".to_owned(),
+            text: "no verdict: there are no figures".to_owned(),
+        },
+        missing: vec![
+            "Score, channels, delays, losses and events: unavailable without summary.json."
+                .to_owned(),
+            format!(
+                "{} files of records with {} bytes are whole up to the moment it ended.",
+                grouped(files),
+                grouped(bytes)
+            ),
+        ],
+        facts: vec![
+            FactGroup {
+                title: "Run".to_owned(),
+                facts: vec![
+                    Fact::new("begun", &manifest.created),
+                    Fact::new("seed", seed),
+                    Fact::new("folder", folder),
+                ],
+            },
+            FactGroup {
+                title: "Host".to_owned(),
+                facts: host_words(&manifest.host_facts),
+            },
+        ],
+        repeat_command: Some(manifest.command_line.join(" ")).filter(|line| !line.is_empty()),
+        ..Run::default()
+    }
 }
 
 fn live(key: &str, summary: &RunSummary) -> Run {

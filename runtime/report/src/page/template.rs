@@ -6,8 +6,7 @@ use serde_json::json;
 
 use super::data::Page;
 use super::svg::{STYLE, escaped};
-use crate::alike::joined_labels;
-use crate::terminal::JOINT;
+use crate::{alike::joined_labels, terminal::JOINT};
 
 /// Why a template gave no text.
 #[derive(Debug, thiserror::Error)]

@@ -2,13 +2,12 @@
 
 use std::collections::BTreeMap;
 
-use super::material::{Found, Manifest, Material};
+use super::read::{Found, Manifest, Material};
 use super::series::{Series, parse};
 use super::{Format, PAGE_BYTES_MAX, figure_files, page_of, render};
-use crate::network::TimelineSubject;
-use crate::sample::{awkward, empty, full};
-use crate::summary::RunSummary;
 use crate::terminal::{JOINT, Style};
+use crate::tests::sample::{awkward, empty, full};
+use crate::{network::TimelineSubject, summary::RunSummary};
 
 const HOSTILE: &str = "</script><script>alert(1)</script>\"'><img src=x onerror=alert(1)>&amp;]]>";
 

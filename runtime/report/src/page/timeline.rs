@@ -5,14 +5,12 @@ use core::ops::Range;
 
 use hil_core::case_study::Severity;
 
-use super::data::Drawing;
-use super::drawings::name_of;
 use super::figures::time::{Mark, MarkClass, over_time};
 use super::series::{Plot, PlotPanel, Series, Thinned, thinned};
-use crate::link_change::LinkChange;
+use super::{data::Drawing, drawings::name_of};
 use crate::network::{NetworkQuantity, NetworkReport, TimelineRow, TimelineSubject};
 use crate::score_event::{ExplainedEvent, ScoreEvents};
-use crate::terminal::duration_s;
+use crate::{link_change::LinkChange, terminal::duration_s};
 
 /// Lines of one panel; a series with more columns gets more panels.
 const LINES_MAX: usize = 7;
@@ -121,28 +119,18 @@ fn run_caption(report: &NetworkReport, robot_s: f64, width_s: f64, is_cut: bool)
 }
 
 fn moment(event: &ExplainedEvent) -> Option<Mark> {
-    Some(Mark {
-        from_s: event.at_s?,
-        until_s: None,
-        class: match event.severity {
-            Severity::Notice => MarkClass::Notice,
-            Severity::Hazard => MarkClass::Hazard,
-            Severity::Incident => MarkClass::Incident,
-        },
-        channel: String::new(),
-        words: event.what.clone(),
-    })
+    let class = match event.severity {
+        Severity::Notice => MarkClass::Notice,
+        Severity::Hazard => MarkClass::Hazard,
+        Severity::Incident => MarkClass::Incident,
+    };
+    Some(Mark::moment(event.at_s?, class, event.what.clone()))
 }
 
 /// Refused changes changed nothing.
 fn changed_at(change: &LinkChange) -> Option<Mark> {
-    Some(Mark {
-        from_s: change.at_s.filter(|_| change.is_in_force())?,
-        until_s: None,
-        class: MarkClass::Change,
-        channel: String::new(),
-        words: change.what(),
-    })
+    let at_s = change.at_s.filter(|_| change.is_in_force())?;
+    Some(Mark::moment(at_s, MarkClass::Change, change.what()))
 }
 
 fn of_row(name: &str, row: &TimelineRow) -> Thinned {

@@ -16,12 +16,13 @@ pub(super) fn value(value: f64, unit: &str) -> String {
     }
 }
 
+/// A pure number; whole ones in groups of digits.
 #[allow(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,
     reason = "whole and between 0 and 1e15"
 )]
-fn number(value: f64) -> String {
+pub(super) fn number(value: f64) -> String {
     let is_count = value.fract().abs() < f64::EPSILON && (0.0..1e15).contains(&value);
     if is_count {
         grouped(value as u64)

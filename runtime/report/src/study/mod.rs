@@ -5,11 +5,8 @@
 mod pool;
 mod render;
 
-use std::fs;
-use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
-use std::thread;
-use std::time::Duration;
+use std::{fs, num::NonZeroUsize, thread, time::Duration};
 
 use hil_core::study::{Batch, StudyReport};
 

@@ -27,8 +27,8 @@ mod tests {
 
     use super::*;
     use crate::link_change::ChangedTo;
-    use crate::sample::full;
     use crate::terminal::{Style, render};
+    use crate::tests::sample::full;
 
     #[test]
     fn a_report_names_every_change_or_how_many_more_there_were() {

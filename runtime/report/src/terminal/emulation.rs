@@ -6,8 +6,7 @@ use hil_stats::histogram::LatencySummary;
 
 use super::canvas::{Canvas, Tone};
 use super::units::duration;
-use crate::emulation::EmulationFigures;
-use crate::trace_counts::replay_words;
+use crate::{emulation::EmulationFigures, trace_counts::replay_words};
 use hil_platform::text::grouped;
 
 /// Columns of a label.

@@ -1,8 +1,7 @@
 //! The network of a run: a table of all channels, then the figures of each with their intervals;
 //! and what preceded what. Figures are not computed here.
 
-use core::cmp::Ordering;
-use core::fmt::Write;
+use core::{cmp::Ordering, fmt::Write};
 
 use hil_account::network::{
     DelayFigures, DelayQuantile, Figure, InterarrivalJitter, LossFigures, NetworkFigures,

@@ -2,9 +2,7 @@
 //! `hil_trace`'s, the page is `report::terminal`'s.
 
 use core::fmt::Write as _;
-use std::collections::BTreeSet;
-use std::fs;
-use std::path::Path;
+use std::{collections::BTreeSet, fs, path::Path};
 
 use hil_core::plot::PlotSeries;
 use hil_trace::figures::TraceFigures;

@@ -5,8 +5,7 @@ use hil_stats::histogram::DurationBin;
 
 use super::{Frame, HALF_WIDTH};
 use crate::page::axis::{Axis, Unit};
-use crate::page::svg::Svg;
-use crate::terminal::duration;
+use crate::{page::svg::Svg, terminal::duration};
 use hil_platform::text::grouped;
 
 /// The figure; `None` without a bin above zero.

@@ -22,6 +22,19 @@ pub(in crate::page) struct Mark {
     pub(in crate::page) words: String,
 }
 
+impl Mark {
+    /// Something of no channel that happened at `at_s`.
+    pub(in crate::page) const fn moment(at_s: f64, class: MarkClass, words: String) -> Self {
+        Self {
+            from_s: at_s,
+            until_s: None,
+            class,
+            channel: String::new(),
+            words,
+        }
+    }
+}
+
 /// What a mark of a figure over time stands for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(in crate::page) enum MarkClass {
@@ -312,13 +325,7 @@ mod tests {
 
     #[test]
     fn gaps_stay_gaps_and_texts_stay_texts() {
-        let mark = Mark {
-            from_s: 5.0,
-            until_s: None,
-            class: MarkClass::Incident,
-            channel: String::new(),
-            words: String::new(),
-        };
+        let mark = Mark::moment(5.0, MarkClass::Incident, String::new());
         let values = vec![Some(0.1), None, Some(0.2), Some(0.3)];
         let svg = over_time("a", "t", &plot(values), &[], &[mark]);
         let path = svg.split("<path").nth(1).unwrap();

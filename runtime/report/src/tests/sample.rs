@@ -1,5 +1,5 @@
 //! A summary of a run that never was, and the rendered reports that are checked in. To renew
-//! them after a deliberate change: `HIL_BLESS=1 cargo test -p hil-runtime report`, then read the
+//! them after a deliberate change: `HIL_BLESS=1 cargo test -p hil-report`, then read the
 //! difference.
 
 use std::collections::BTreeMap;
@@ -8,19 +8,17 @@ use hil_account::{AccountContext, ChannelAccount, ChannelPath, ChannelRecords, C
 use hil_arm::egm::messages::Side as ArmSide;
 use hil_core::time::Alignment;
 
-use super::assessment::{Assessment, NetworkVerdict};
-use super::face::{Answers, FaceSummary};
 use super::sample_events::{few_events, many_events, recorded_channel};
-use super::sample_network::network;
-use super::sample_records::Files;
-use super::summary::{
+use super::{sample_network::network, sample_records::Files};
+use crate::assessment::{Assessment, NetworkVerdict};
+use crate::face::{Answers, FaceSummary};
+use crate::summary::{
     Absence, ChannelSummary, CountByName, CounterGroup, DirectionSummary, Fact, LinkKind, Outcome,
     ProcessSummary, RadioChange, RealtimeFacts, RunEvent, RunEventKind, RunFacts, RunSummary,
     ScoreMetric, SummaryError,
 };
-use super::terminal::{Style, render};
-use hil_platform::host_facts;
-use hil_platform::host_facts::{HostFact, HostFacts};
+use crate::terminal::{Style, render};
+use hil_platform::host_facts::{self, HostFact, HostFacts};
 use hil_rundir::event::{EventKind, ProcessKind};
 use hil_rundir::launch::Side;
 use hil_topology::FaceKind;
@@ -135,7 +133,7 @@ fn channels() -> Vec<ChannelSummary> {
 }
 
 /// A whole report.
-pub(super) fn full() -> RunSummary {
+pub(crate) fn full() -> RunSummary {
     let mut killed = process("robot gateway", ProcessKind::Gateway, None);
     killed.restart_count = 1;
     killed.cpu_time_s = None;
@@ -198,7 +196,7 @@ pub(super) fn full() -> RunSummary {
 }
 
 /// Names longer than any column, hostile characters, an overrun host, processes without figures.
-pub(super) fn awkward() -> RunSummary {
+pub(crate) fn awkward() -> RunSummary {
     let long = "an-exceedingly-long-name-that-someone-will-surely-choose-one-day".repeat(2);
     let mut summary = full();
     summary.run.name.clone_from(&long);
@@ -227,7 +225,7 @@ pub(super) fn awkward() -> RunSummary {
 }
 
 /// Nothing ran, nothing is known.
-pub(super) fn empty() -> RunSummary {
+pub(crate) fn empty() -> RunSummary {
     let mut run = run_facts();
     run.outcome = Outcome::Stopped;
     run.exit_reason = "stopped by a person while waiting for host robot".to_owned();
@@ -259,7 +257,7 @@ pub(super) fn empty() -> RunSummary {
 
 fn check_golden(actual: &str, file: &str, expected: &str) {
     if std::env::var_os("HIL_BLESS").is_some() {
-        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/src/report/testdata");
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/src/testdata");
         std::fs::write(format!("{folder}/{file}"), actual).unwrap();
         return;
     }
@@ -276,7 +274,11 @@ fn check_golden(actual: &str, file: &str, expected: &str) {
 #[test]
 fn a_full_report_reads_as_checked_in() {
     let text = render(&full(), 100, Style::Plain);
-    check_golden(&text, "full_100.txt", include_str!("testdata/full_100.txt"));
+    check_golden(
+        &text,
+        "full_100.txt",
+        include_str!("../testdata/full_100.txt"),
+    );
 }
 
 #[test]
@@ -285,14 +287,18 @@ fn a_report_of_awkward_names_keeps_its_columns() {
     check_golden(
         &text,
         "awkward_80.txt",
-        include_str!("testdata/awkward_80.txt"),
+        include_str!("../testdata/awkward_80.txt"),
     );
 }
 
 #[test]
 fn a_report_of_nothing_says_so() {
     let text = render(&empty(), 80, Style::Plain);
-    check_golden(&text, "empty_80.txt", include_str!("testdata/empty_80.txt"));
+    check_golden(
+        &text,
+        "empty_80.txt",
+        include_str!("../testdata/empty_80.txt"),
+    );
 }
 
 #[test]

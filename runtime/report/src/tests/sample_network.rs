@@ -9,9 +9,9 @@ use hil_core::case_study::ErrorSeries;
 use hil_core::random::RandomStream;
 use hil_core::time::{Alignment, Instant};
 
-use super::network::{Correlation, NetworkQuantity, NetworkReport};
-use super::score_event::ScoreEvents;
 use crate::analysis::network::{AxisClocks, ChannelPassages, NetworkBuilder, RobotSeries};
+use crate::network::{Correlation, NetworkQuantity, NetworkReport};
+use crate::score_event::ScoreEvents;
 
 const MS: i64 = 1_000_000;
 const RUN_NS: i64 = 20_000 * MS;
@@ -75,7 +75,7 @@ fn error() -> RobotSeries {
 
 /// The network of `names`, the second of which is between clocks that are not aligned; puts beside
 /// `events` what came before them.
-pub(super) fn network(names: [&str; 2], events: &mut ScoreEvents) -> NetworkReport {
+pub(crate) fn network(names: [&str; 2], events: &mut ScoreEvents) -> NetworkReport {
     let mut builder = NetworkBuilder::default();
     for (index, name) in names.into_iter().enumerate() {
         let down = NetworkEvent {

@@ -6,12 +6,12 @@ use std::collections::BTreeMap;
 use hil_account::{MessageFate, Standing};
 use hil_core::case_study::Severity;
 
-use super::assessment::{Assessment, NetworkVerdict};
-use super::score_event::{EventOutage, ExplainedEvent, ExplainedMessage, ScoreEvents};
-use super::summary::{
+use crate::assessment::{Assessment, NetworkVerdict};
+use crate::score_event::{EventOutage, ExplainedEvent, ExplainedMessage, ScoreEvents};
+use crate::summary::{
     ChannelSummary, Fact, LinkKind, Outcome, ProcessSummary, RecordedFigures, RunFacts, RunSummary,
 };
-use super::terminal::{Style, render};
+use crate::terminal::{Style, render};
 use hil_rundir::event::ProcessKind;
 
 fn message(sequence: u64, fate: Option<MessageFate>, words: &str) -> ExplainedMessage {
@@ -46,7 +46,7 @@ fn event(
 }
 
 /// A collision with its causes, and a message that came late.
-pub(super) fn few_events() -> ScoreEvents {
+pub(crate) fn few_events() -> ScoreEvents {
     let lost = message(
         900,
         Some(MessageFate::LostOnWire),
@@ -91,7 +91,7 @@ pub(super) fn few_events() -> ScoreEvents {
 }
 
 /// More than fit, on clocks that do not compare; the last one is the gravest.
-pub(super) fn many_events(long: &str) -> ScoreEvents {
+pub(crate) fn many_events(long: &str) -> ScoreEvents {
     let mut events: Vec<ExplainedEvent> = (0..20_u8)
         .map(|index| event(f64::from(index), Severity::Notice, "braked", Vec::new()))
         .collect();
@@ -111,7 +111,7 @@ pub(super) fn many_events(long: &str) -> ScoreEvents {
 }
 
 /// A channel that only the record heard.
-pub(super) fn recorded_channel() -> ChannelSummary {
+pub(crate) fn recorded_channel() -> ChannelSummary {
     ChannelSummary {
         name: "fleet/truth".to_owned(),
         from: "robots".to_owned(),
@@ -131,7 +131,7 @@ pub(super) fn recorded_channel() -> ChannelSummary {
     }
 }
 
-pub(super) fn summary(channel: ChannelSummary) -> RunSummary {
+pub(crate) fn summary(channel: ChannelSummary) -> RunSummary {
     let mut summary = RunSummary::new(RunFacts {
         name: "fleet".to_owned(),
         case: "fleet".to_owned(),
@@ -196,7 +196,7 @@ fn one_emulated_link_among_real_ones_makes_no_network_result() {
     assert_eq!(Assessment::of(&run).network, NetworkVerdict::NetworkResult);
 }
 
-pub(super) fn ticking() -> ProcessSummary {
+pub(crate) fn ticking() -> ProcessSummary {
     ProcessSummary {
         name: "robots".to_owned(),
         host: "robot-pc".to_owned(),

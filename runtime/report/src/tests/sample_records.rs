@@ -22,7 +22,7 @@ pub(super) struct Files {
 
 impl Files {
     /// All of them.
-    pub(super) fn sample() -> Self {
+    pub(crate) fn sample() -> Self {
         let mut files = Self::default();
         let mut stream = RandomStream::new(1, "report sample");
         for sequence in 0..5_000_u64 {
@@ -101,12 +101,12 @@ impl Files {
     }
 
     /// The account of a channel between gateways, one of which was killed.
-    pub(super) fn account(&self, alignment: Option<Alignment>) -> ChannelAccount {
+    pub(crate) fn account(&self, alignment: Option<Alignment>) -> ChannelAccount {
         self.consult(alignment, account)
     }
 
     /// The outages of the same channel on one clock.
-    pub(super) fn outages(&self) -> OutageFigures {
+    pub(crate) fn outages(&self) -> OutageFigures {
         let found = self.consult(Some(Alignment::SAME_CLOCK), outages);
         let end = Instant::from_ns(5_000 * PERIOD_NS);
         OutageFigures::of(&found, Some(end))
@@ -145,7 +145,7 @@ impl Files {
     }
 
     /// The account of a direct channel with the same messages.
-    pub(super) fn direct(&self) -> ChannelAccount {
+    pub(crate) fn direct(&self) -> ChannelAccount {
         let records = ChannelRecords {
             published: Some(&self.published),
             taken: Some(&self.taken),
