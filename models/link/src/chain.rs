@@ -16,8 +16,8 @@ use hil_core::random::RandomStream;
 use hil_core::time::Instant;
 
 /// The link.
-#[derive(Debug, Clone)]
-pub struct LinkChain {
+#[derive(Debug)]
+pub(crate) struct LinkChain {
     outages: OutageLink,
     wifi: Option<Box<WifiLink>>,
     loss: LossProcess,

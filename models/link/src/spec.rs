@@ -83,6 +83,18 @@ pub struct LinkPlace<'a> {
     pub way: Way,
 }
 
+impl<'a> LinkPlace<'a> {
+    /// Of a channel alone on its link.
+    pub const fn alone(seed: u64, channel: &'a str) -> Self {
+        Self {
+            seed,
+            link: channel,
+            channel,
+            way: Way::Forward,
+        }
+    }
+}
+
 impl LinkSpec {
     /// The paper's static model: a fixed delay and independent losses.
     pub fn fixed(delay: Duration, loss_ratio: f64) -> Self {
@@ -143,7 +155,7 @@ impl LinkSpec {
         if let Some(wifi) = &self.wifi {
             parts.insert(0, wifi.describe());
             if wifi.outages.is_active() {
-                parts.insert(1, describe_outages(&wifi.outages));
+                parts.insert(1, wifi.outages.describe());
             }
         }
         if !self.delay.is_fixed() {
@@ -168,26 +180,8 @@ impl LinkSpec {
             parts.push(format!("a ratio of {ratio} twice, {} ms apart", ms(lag)));
         }
         if self.outages.is_active() {
-            parts.push(describe_outages(&self.outages));
+            parts.push(self.outages.describe());
         }
         parts.join(", ")
     }
-}
-
-fn describe_outages(outages: &Outages) -> String {
-    let Outages {
-        mean_s,
-        per_hour,
-        buffered,
-    } = outages;
-    let what = if *buffered {
-        "which hold everything until they end"
-    } else {
-        "which lose everything"
-    };
-    let mean_ms = mean_s * 1e3;
-    format!(
-        "{per_hour} outages per hour of {mean_ms} ms on average, {what}, on all channels of the \
-         link both ways, counted from the start of the run"
-    )
 }

@@ -136,6 +136,27 @@ mod tests {
     }
 
     #[test]
+    fn the_normal_distribution_has_the_values_of_the_tables() {
+        // Abramowitz and Stegun, table 26.1.
+        for (z, expected) in [
+            (0.0, 0.5),
+            (0.5, 0.691_462_461_274_013),
+            (1.0, 0.841_344_746_068_543),
+            (1.96, 0.975_002_104_851_780),
+            (3.0, 0.998_650_101_968_370),
+        ] {
+            assert!((normal_distribution(z) - expected).abs() < 1e-13, "{z}");
+            assert!(
+                (normal_distribution(-z) - (1.0 - expected)).abs() < 1e-13,
+                "{z}"
+            );
+        }
+        assert!(normal_distribution(7.9) > 1.0 - 1e-13);
+        assert!(normal_distribution(f64::INFINITY) > 0.999);
+        assert!(normal_distribution(f64::NEG_INFINITY) < 1e-15);
+    }
+
+    #[test]
     fn normal_quantiles_match_the_tables() {
         close(normal_quantile(0.975), 1.959_963_984_540_054);
         close(normal_quantile(0.995), 2.575_829_303_548_901);

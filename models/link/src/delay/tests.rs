@@ -19,6 +19,40 @@ const fn us(count: u64) -> Duration {
     Duration::from_micros(count)
 }
 
+const fn normal_law(mean: Duration, deviation: Duration) -> Normal {
+    Normal {
+        mean,
+        deviation,
+        ..Normal::TEMPLATE
+    }
+}
+
+const fn log_normal_law(min: Duration, median: Duration, sigma: f64) -> LogNormal {
+    LogNormal {
+        min,
+        median,
+        sigma,
+        ..LogNormal::TEMPLATE
+    }
+}
+
+const fn exponential_law(min: Duration, mean_excess: Duration) -> Exponential {
+    Exponential {
+        min,
+        mean_excess,
+        ..Exponential::TEMPLATE
+    }
+}
+
+const fn pareto_law(min: Duration, scale: Duration, shape: f64) -> Pareto {
+    Pareto {
+        min,
+        scale,
+        shape,
+        ..Pareto::TEMPLATE
+    }
+}
+
 /// A million draws in seconds, ascending.
 fn draws(law: &DelayLaw, seed: u64) -> Vec<f64> {
     let sampler = DelaySampler::new(law).unwrap();
@@ -54,27 +88,27 @@ fn laws() -> Vec<DelayLaw> {
             min: ms(10),
             max: ms(60),
         }),
-        DelayLaw::Normal(Normal::new(ms(50), ms(10))),
-        DelayLaw::Normal(Normal::new(ms(5), ms(10))),
+        DelayLaw::Normal(normal_law(ms(50), ms(10))),
+        DelayLaw::Normal(normal_law(ms(5), ms(10))),
         DelayLaw::Normal(Normal {
             mean: ms(20),
             deviation: ms(10),
             max: ms(25),
         }),
-        DelayLaw::LogNormal(LogNormal::new(ms(2), ms(4), 0.6)),
+        DelayLaw::LogNormal(log_normal_law(ms(2), ms(4), 0.6)),
         DelayLaw::LogNormal(LogNormal {
             max: ms(10),
-            ..LogNormal::new(ms(2), ms(4), 1.5)
+            ..log_normal_law(ms(2), ms(4), 1.5)
         }),
-        DelayLaw::Exponential(Exponential::new(ms(1), ms(3))),
+        DelayLaw::Exponential(exponential_law(ms(1), ms(3))),
         DelayLaw::Exponential(Exponential {
             max: ms(5),
-            ..Exponential::new(ms(1), ms(3))
+            ..exponential_law(ms(1), ms(3))
         }),
-        DelayLaw::Pareto(Pareto::new(ms(2), ms(2), 3.5)),
+        DelayLaw::Pareto(pareto_law(ms(2), ms(2), 3.5)),
         DelayLaw::Pareto(Pareto {
             max: ms(500),
-            ..Pareto::new(Duration::ZERO, us(800), 1.2)
+            ..pareto_law(Duration::ZERO, us(800), 1.2)
         }),
         DelayLaw::Histogram(Histogram {
             edges: vec![ms(1), ms(2), ms(3), ms(10), ms(40)],
@@ -131,12 +165,12 @@ fn deviations_are_those_of_the_closed_forms() {
             50e-3 / 12_f64.sqrt(),
         ),
         // Cut at five deviations, which takes nothing.
-        (DelayLaw::Normal(Normal::new(ms(50), ms(10))), 10e-3),
+        (DelayLaw::Normal(normal_law(ms(50), ms(10))), 10e-3),
         (
-            DelayLaw::LogNormal(LogNormal::new(ms(2), ms(4), 0.6)),
+            DelayLaw::LogNormal(log_normal_law(ms(2), ms(4), 0.6)),
             log_normal_s,
         ),
-        (DelayLaw::Exponential(Exponential::new(ms(1), ms(3))), 3e-3),
+        (DelayLaw::Exponential(exponential_law(ms(1), ms(3))), 3e-3),
     ];
     for (law, promised_s) in cases {
         let drawn = draws(&law, 7);
@@ -154,7 +188,7 @@ fn deviations_are_those_of_the_closed_forms() {
 
 #[test]
 fn the_normal_law_says_what_its_cut_does_to_the_mean() {
-    let mean_of = |mean, deviation| DelayLaw::Normal(Normal::new(mean, deviation)).mean_s();
+    let mean_of = |mean, deviation| DelayLaw::Normal(normal_law(mean, deviation)).mean_s();
     // As the file's head says, and the half-normal: deviation sqrt(2 / pi).
     assert!((mean_of(ms(20), ms(10)) / 20e-3 - 1.0276).abs() < 1e-4);
     assert!((mean_of(ms(30), ms(10)) / 30e-3 - 1.001_479).abs() < 1e-6);
@@ -183,8 +217,8 @@ fn numbers_outside_their_range_are_refused_by_name() {
             weights: weights.to_vec(),
         })
     };
-    let log_normal = |sigma| DelayLaw::LogNormal(LogNormal::new(ms(1), ms(1), sigma));
-    let pareto = |shape| DelayLaw::Pareto(Pareto::new(ms(1), ms(1), shape));
+    let log_normal = |sigma| DelayLaw::LogNormal(log_normal_law(ms(1), ms(1), sigma));
+    let pareto = |shape| DelayLaw::Pareto(pareto_law(ms(1), ms(1), shape));
     let cases = [
         (DelayLaw::fixed(ms(10_001)), "delay"),
         (
@@ -195,13 +229,13 @@ fn numbers_outside_their_range_are_refused_by_name() {
             "max",
         ),
         (
-            DelayLaw::Normal(Normal::new(ms(1), Duration::ZERO)),
+            DelayLaw::Normal(normal_law(ms(1), Duration::ZERO)),
             "deviation",
         ),
         (
             DelayLaw::Normal(Normal {
                 max: ms(40),
-                ..Normal::new(ms(50), ms(10))
+                ..normal_law(ms(50), ms(10))
             }),
             "max",
         ),
@@ -212,7 +246,7 @@ fn numbers_outside_their_range_are_refused_by_name() {
         (
             DelayLaw::Exponential(Exponential {
                 max: ms(2),
-                ..Exponential::new(ms(3), ms(1))
+                ..exponential_law(ms(3), ms(1))
             }),
             "max",
         ),
@@ -226,5 +260,32 @@ fn numbers_outside_their_range_are_refused_by_name() {
     for (law, key) in cases {
         assert_eq!(law.check().unwrap_err().key, key, "{law:?}");
         assert!(DelaySampler::new(&law).is_err());
+    }
+}
+
+#[test]
+fn each_law_stands_in_the_table_of_the_documentation_with_all_its_keys() {
+    let page = include_str!("../../../../docs/link-models.md");
+    for name in DelayLaw::NAMES {
+        let mut law = DelayLaw::named(name).unwrap();
+        assert_eq!(law.name(), *name);
+        let row = page
+            .lines()
+            .find(|line| line.starts_with(&format!("| `{name}` |")));
+        let row = row.unwrap_or_else(|| panic!("{name} has no row"));
+        for field in law.options().fields() {
+            // The limit of a law without an end of its own is told once for all.
+            let is_told = row.contains(&format!("`{}`", field.key));
+            assert!(
+                is_told || field.key == "max",
+                "{name}: {} in {row}",
+                field.key
+            );
+            let key = field.key;
+            assert!(
+                field.is_required || field.check().is_ok(),
+                "{name}: default of {key}"
+            );
+        }
     }
 }
