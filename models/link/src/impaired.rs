@@ -8,9 +8,7 @@ use core::time::Duration;
 use crate::options::{options, words};
 use crate::outages::OutageLink;
 use hil_core::case_study::ParameterError;
-use hil_core::message::Envelope;
 use hil_core::random::RandomStream;
-use hil_core::simulation::Carrier;
 use hil_core::time::Instant;
 
 words! {
@@ -149,18 +147,6 @@ impl ImpairedLink {
         }
         let (is_met, share) = (self.random.chance(ratio), self.random.uniform());
         is_met.then_some(share * up_to_ms)
-    }
-}
-
-impl Carrier for ImpairedLink {
-    fn offer(
-        &mut self,
-        now: Instant,
-        envelope: &Envelope,
-        payload: &[u8],
-        deliver: &mut dyn FnMut(Instant, Envelope, &[u8]),
-    ) {
-        Self::offer(self, now, &mut |at| deliver(at, *envelope, payload));
     }
 }
 

@@ -28,6 +28,7 @@ use serde::{Deserialize, Serialize};
 use super::chain::LinkChain;
 use super::delay::DelayLaw;
 use super::loss::LossLaw;
+use super::options::Options;
 use super::outages::Outages;
 use super::rate::RateLimit;
 use super::reordering::{Duplication, Reordering};
@@ -110,22 +111,30 @@ impl LinkSpec {
     /// # Errors
     /// The first key outside its range.
     pub fn check(&self) -> Result<(), ParameterError> {
-        self.outages.check()?;
+        let mut spec = self.clone();
+        spec.outages.check()?;
         if let Some(wifi) = &self.wifi {
             wifi.check()?;
         }
-        self.loss.check()?;
-        if let Some(rate) = &self.rate {
-            rate.check()?;
+        spec.loss.check()?;
+        spec.delay.check()?;
+        let mut tables = spec.tables().into_iter();
+        tables.try_for_each(|(_, part)| part.check_all())
+    }
+
+    /// The parts that are tables of their own in files, by key, where they are there.
+    pub fn tables(&mut self) -> Vec<(&'static str, &mut dyn Options)> {
+        let mut tables: Vec<(&'static str, &mut dyn Options)> = Vec::new();
+        if let Some(rate) = &mut self.rate {
+            tables.push(("rate", rate));
         }
-        self.delay.check()?;
-        if let Some(reordering) = &self.reordering {
-            reordering.check()?;
+        if let Some(reordering) = &mut self.reordering {
+            tables.push(("reordering", reordering));
         }
-        if let Some(duplication) = &self.duplication {
-            duplication.check()?;
+        if let Some(duplication) = &mut self.duplication {
+            tables.push(("duplication", duplication));
         }
-        Ok(())
+        tables
     }
 
     /// The model of the channel at `place`, on a clock that reads zero when the run starts: the

@@ -222,23 +222,8 @@ pub(super) fn resolved_spec(mut spec: LinkSpec) -> Table {
             put(&mut table, "loss", loss);
         }
     }
-    let rate = spec.rate.as_mut().map(|part| part as &mut dyn Options);
-    let reordering = spec
-        .reordering
-        .as_mut()
-        .map(|part| part as &mut dyn Options);
-    let duplication = spec
-        .duplication
-        .as_mut()
-        .map(|part| part as &mut dyn Options);
-    for (key, part) in [
-        ("rate", rate),
-        ("reordering", reordering),
-        ("duplication", duplication),
-    ] {
-        if let Some(part) = part {
-            put(&mut table, key, resolved_part(part));
-        }
+    for (key, part) in spec.tables() {
+        put(&mut table, key, resolved_part(part));
     }
     table
 }

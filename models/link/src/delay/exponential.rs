@@ -91,3 +91,30 @@ impl Fitted for Uncut {
         format!("min {min}, mean {mean} on top")
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::delay::DelayLaw;
+    use crate::delay::tests::{check_law, ms};
+
+    #[test]
+    fn draws_have_the_distribution_mean_and_quantiles_that_it_states() {
+        check_law(
+            &DelayLaw::Exponential(Exponential {
+                min: ms(1),
+                mean_excess: ms(3),
+                ..Exponential::TEMPLATE
+            }),
+            6,
+        );
+        check_law(
+            &DelayLaw::Exponential(Exponential {
+                min: ms(1),
+                mean_excess: ms(3),
+                max: ms(5),
+            }),
+            7,
+        );
+    }
+}

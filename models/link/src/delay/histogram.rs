@@ -120,3 +120,21 @@ impl Density for Bins {
         self.edges[bin] + share * (self.edges[bin + 1] - self.edges[bin])
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::delay::DelayLaw;
+    use crate::delay::tests::{check_law, ms};
+
+    #[test]
+    fn draws_have_the_distribution_mean_and_quantiles_that_it_states() {
+        check_law(
+            &DelayLaw::Histogram(Histogram {
+                edges: vec![ms(1), ms(2), ms(3), ms(10), ms(40)],
+                weights: vec![70.0, 20.0, 0.0, 10.0],
+            }),
+            10,
+        );
+    }
+}

@@ -120,3 +120,32 @@ impl Fitted for Uncut {
         format!("min {min}, median {median} on top, sigma {:.4}", self.sigma)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::delay::DelayLaw;
+    use crate::delay::tests::{check_law, ms};
+
+    #[test]
+    fn draws_have_the_distribution_mean_and_quantiles_that_it_states() {
+        check_law(
+            &DelayLaw::LogNormal(LogNormal {
+                min: ms(2),
+                median: ms(4),
+                sigma: 0.6,
+                ..LogNormal::TEMPLATE
+            }),
+            4,
+        );
+        check_law(
+            &DelayLaw::LogNormal(LogNormal {
+                min: ms(2),
+                median: ms(4),
+                sigma: 1.5,
+                max: ms(10),
+            }),
+            5,
+        );
+    }
+}

@@ -105,3 +105,38 @@ impl Fitted for Uncut {
         format!("mean {mean}, deviation {deviation}")
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::delay::DelayLaw;
+    use crate::delay::tests::{check_law, ms};
+
+    #[test]
+    fn draws_have_the_distribution_mean_and_quantiles_that_it_states() {
+        check_law(
+            &DelayLaw::Normal(Normal {
+                mean: ms(50),
+                deviation: ms(10),
+                ..Normal::TEMPLATE
+            }),
+            1,
+        );
+        check_law(
+            &DelayLaw::Normal(Normal {
+                mean: ms(5),
+                deviation: ms(10),
+                ..Normal::TEMPLATE
+            }),
+            2,
+        );
+        check_law(
+            &DelayLaw::Normal(Normal {
+                mean: ms(20),
+                deviation: ms(10),
+                max: ms(25),
+            }),
+            3,
+        );
+    }
+}

@@ -133,3 +133,32 @@ impl Fitted for Uncut {
         format!("min {min}, scale {scale}, shape {:.4}", self.shape)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::delay::DelayLaw;
+    use crate::delay::tests::{check_law, ms};
+
+    #[test]
+    fn draws_have_the_distribution_mean_and_quantiles_that_it_states() {
+        check_law(
+            &DelayLaw::Pareto(Pareto {
+                min: ms(2),
+                scale: ms(2),
+                shape: 3.5,
+                ..Pareto::TEMPLATE
+            }),
+            8,
+        );
+        check_law(
+            &DelayLaw::Pareto(Pareto {
+                min: ms(0),
+                scale: Duration::from_micros(800),
+                shape: 1.2,
+                max: ms(500),
+            }),
+            9,
+        );
+    }
+}

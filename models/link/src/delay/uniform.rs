@@ -97,3 +97,21 @@ impl Fitted for Range {
         format!("{} to {}", ms_fitted(self.min), ms_fitted(self.max))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::delay::DelayLaw;
+    use crate::delay::tests::{check_law, ms};
+
+    #[test]
+    fn draws_have_the_distribution_mean_and_quantiles_that_it_states() {
+        check_law(
+            &DelayLaw::Uniform(Uniform {
+                min: ms(10),
+                max: ms(60),
+            }),
+            0,
+        );
+    }
+}

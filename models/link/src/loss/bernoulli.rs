@@ -24,13 +24,23 @@ impl Law for Bernoulli {
         format!("loss ratio {}", self.ratio)
     }
 
-    fn start(&self, _own: &mut RandomStream, _shared: RandomStream) -> Box<dyn Losses> {
-        Box::new(*self)
+    fn start(&self, own: RandomStream, _shared: RandomStream) -> Box<dyn Losses> {
+        Box::new(Independent {
+            ratio: self.ratio,
+            random: own,
+        })
     }
 }
 
-impl Losses for Bernoulli {
-    fn is_lost(&mut self, _now: Instant, random: &mut RandomStream) -> bool {
-        random.chance(self.ratio)
+/// The law at work.
+#[derive(Debug)]
+struct Independent {
+    ratio: f64,
+    random: RandomStream,
+}
+
+impl Losses for Independent {
+    fn is_lost(&mut self, _now: Instant) -> bool {
+        self.random.chance(self.ratio)
     }
 }

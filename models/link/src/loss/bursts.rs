@@ -60,11 +60,12 @@ impl Law for Bursts {
     }
 
     /// The states from time zero on, as `shared` has them.
-    fn start(&self, _own: &mut RandomStream, mut shared: RandomStream) -> Box<dyn Losses> {
+    fn start(&self, own: RandomStream, mut shared: RandomStream) -> Box<dyn Losses> {
         let is_bad = shared.chance(self.bad_ratio());
         let mut states = States {
             law: *self,
-            random: shared,
+            shared,
+            own,
             is_bad,
             until: Instant::ZERO,
         };
@@ -77,7 +78,8 @@ impl Law for Bursts {
 #[derive(Debug)]
 struct States {
     law: Bursts,
-    random: RandomStream,
+    shared: RandomStream,
+    own: RandomStream,
     is_bad: bool,
     until: Instant,
 }
@@ -90,17 +92,17 @@ impl States {
         } else {
             self.law.good_mean
         };
-        Duration::from_secs_f64(-mean.as_secs_f64() * (1.0 - self.random.uniform()).ln())
+        Duration::from_secs_f64(-mean.as_secs_f64() * (1.0 - self.shared.uniform()).ln())
     }
 }
 
 impl Losses for States {
-    fn is_lost(&mut self, now: Instant, random: &mut RandomStream) -> bool {
+    fn is_lost(&mut self, now: Instant) -> bool {
         while now >= self.until && self.until < END_OF_TIME {
             self.is_bad = !self.is_bad;
             self.until = self.until + self.stay();
         }
-        random.chance(if self.is_bad {
+        self.own.chance(if self.is_bad {
             self.law.bad_loss_ratio
         } else {
             self.law.good_loss_ratio

@@ -54,10 +54,11 @@ impl Law for GilbertElliott {
         )
     }
 
-    fn start(&self, own: &mut RandomStream, _shared: RandomStream) -> Box<dyn Losses> {
+    fn start(&self, mut own: RandomStream, _shared: RandomStream) -> Box<dyn Losses> {
         Box::new(Chain {
             law: *self,
             is_bad: own.chance(self.bad_ratio()),
+            random: own,
         })
     }
 }
@@ -67,19 +68,20 @@ impl Law for GilbertElliott {
 struct Chain {
     law: GilbertElliott,
     is_bad: bool,
+    random: RandomStream,
 }
 
 impl Losses for Chain {
     /// Always takes two numbers of the stream.
-    fn is_lost(&mut self, _now: Instant, random: &mut RandomStream) -> bool {
+    fn is_lost(&mut self, _now: Instant) -> bool {
         let law = &self.law;
         let (loss_ratio, step) = if self.is_bad {
             (law.bad_loss_ratio, law.to_good)
         } else {
             (law.good_loss_ratio, law.to_bad)
         };
-        let is_lost = random.chance(loss_ratio);
-        self.is_bad ^= random.chance(step);
+        let is_lost = self.random.chance(loss_ratio);
+        self.is_bad ^= self.random.chance(step);
         is_lost
     }
 }

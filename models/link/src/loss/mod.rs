@@ -40,16 +40,16 @@ trait Law: Options {
     /// The law in words.
     fn text(&self) -> String;
 
-    /// The law at work on one channel; `own` is the channel's stream, `shared` one that all channels
-    /// of the link have alike.
-    fn start(&self, own: &mut RandomStream, shared: RandomStream) -> Box<dyn Losses>;
+    /// The law at work; see [`LossLaw::start`].
+    fn start(&self, own: RandomStream, shared: RandomStream) -> Box<dyn Losses>;
 }
 
-/// A loss law at work.
-trait Losses: Debug + Send {
-    /// Decides the fate of the next message, at `now`, with the same count of numbers of the
-    /// channel's stream for each.
-    fn is_lost(&mut self, now: Instant, random: &mut RandomStream) -> bool;
+/// A loss law at work on one channel.
+pub(super) trait Losses: Debug + Send {
+    /// Decides the fate of the next message, at `now`; calls come in non-decreasing `now`. The
+    /// channel's stream advances for every message, so the fate of the n-th depends on the seed, on n
+    /// and on the time alone.
+    fn is_lost(&mut self, now: Instant) -> bool;
 }
 
 impl LossLaw {
@@ -61,6 +61,20 @@ impl LossLaw {
     /// Share of the messages lost in the long run.
     pub fn loss_ratio(&self) -> f64 {
         self.law().loss_ratio()
+    }
+
+    /// The law at work on one channel; `own` is the channel's stream, `shared` one that all channels
+    /// of the link have alike.
+    ///
+    /// # Errors
+    /// The first key outside its range.
+    pub(super) fn start(
+        &self,
+        own: RandomStream,
+        shared: RandomStream,
+    ) -> Result<Box<dyn Losses>, ParameterError> {
+        self.check()?;
+        Ok(self.law().start(own, shared))
     }
 }
 
@@ -75,37 +89,5 @@ impl Default for LossLaw {
 impl fmt::Display for LossLaw {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         formatter.write_str(&self.law().text())
-    }
-}
-
-/// A checked law at work on one channel.
-#[derive(Debug)]
-pub(super) struct LossProcess {
-    losses: Box<dyn Losses>,
-    random: RandomStream,
-}
-
-impl LossProcess {
-    /// `own` is the channel's stream, `shared` one that all channels of the link have alike.
-    ///
-    /// # Errors
-    /// The first key of `law` outside its range.
-    pub(super) fn new(
-        law: LossLaw,
-        mut own: RandomStream,
-        shared: RandomStream,
-    ) -> Result<Self, ParameterError> {
-        law.check()?;
-        Ok(Self {
-            losses: law.law().start(&mut own, shared),
-            random: own,
-        })
-    }
-
-    /// Decides the fate of the next message, at `now`; calls come in non-decreasing `now`. The
-    /// stream advances for every message, so the fate of the n-th depends on the seed, on n and on
-    /// the time alone.
-    pub(super) fn is_lost(&mut self, now: Instant) -> bool {
-        self.losses.is_lost(now, &mut self.random)
     }
 }

@@ -7,9 +7,9 @@ use super::*;
 const COUNT: usize = 2_000_000;
 const ERRORS_MAX: f64 = 5.0;
 
-fn process(law: LossLaw, seed: u64, channel: &str) -> LossProcess {
+fn process(law: LossLaw, seed: u64, channel: &str) -> Box<dyn Losses> {
     let shared = RandomStream::new(seed, "bursts of the link");
-    LossProcess::new(law, RandomStream::new(seed, channel), shared).unwrap()
+    law.start(RandomStream::new(seed, channel), shared).unwrap()
 }
 
 /// The fates of messages one period apart.

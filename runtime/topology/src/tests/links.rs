@@ -3,6 +3,7 @@
 
 use hil_link::delay::{Exponential, Histogram, LogNormal, Normal, Pareto, Uniform};
 use hil_link::loss::{Bursts, GilbertElliott};
+use hil_link::options::Slot;
 use hil_link::rate::RateLimit;
 use hil_link::reordering::{Duplication, Reordering};
 
@@ -87,6 +88,32 @@ fn every_delay_law_can_be_written_and_is_written_back() {
         if !law.is_fixed() {
             let text = format!("[links.hop.delay]\nreorders = true\n{text}");
             assert!(specs(&text).0.reorders);
+        }
+    }
+}
+
+#[test]
+fn every_delay_law_of_the_list_is_read_with_its_required_keys_and_written_back() {
+    for name in DelayLaw::NAMES {
+        let mut law = DelayLaw::named(name).unwrap();
+        let mut text = format!("[links.hop.delay]\nlaw = \"{name}\"\n");
+        let mut has_list = false;
+        for field in law.options().fields() {
+            let value = match field.slot {
+                _ if !field.is_required => continue,
+                Slot::Duration(..) => "\"3 ms\"".to_owned(),
+                Slot::Number(_, range) => {
+                    format!("{:?}", 1.5_f64.clamp(*range.start(), *range.end()))
+                }
+                _ => {
+                    has_list = true;
+                    continue;
+                }
+            };
+            text.push_str(&format!("{} = {value}\n", field.key));
+        }
+        if !has_list {
+            assert_eq!(specs(&text).0.delay.name(), *name);
         }
     }
 }
