@@ -6,7 +6,6 @@ use hil_trace::TraceRecord;
 use prost::Message as _;
 
 use crate::encode::Encoder;
-use crate::facts::Words;
 use crate::net::{LinkDecision, MessageLatency};
 use crate::schema::{self, Schema};
 use crate::sink::{Sink, Topic};
@@ -40,6 +39,8 @@ pub(crate) struct Wanted<'a> {
 pub(crate) struct ChannelTopics {
     /// The channel.
     pub(crate) name: String,
+    /// Host of its producer; empty when the manifest does not tell.
+    pub(crate) host: String,
     /// Its message, where the manifest names it.
     pub(crate) message: Option<String>,
     /// Its messages.
@@ -74,11 +75,12 @@ impl ChannelTopics {
         let message = described.map_or("", |one| &one.message);
         let size = described.map_or(String::new(), |one| one.size_bytes.to_string());
         let host = described.and_then(|one| one.from_host.as_deref());
+        let host = host.unwrap_or_default();
         let metadata = [
             ("channel", name),
             ("message", message),
             ("size_bytes", &size),
-            ("clock_host", host.unwrap_or_default()),
+            ("clock_host", host),
         ];
         let own = Topic::new(own, schema, &metadata);
         let base = topic_of(name);
@@ -91,6 +93,7 @@ impl ChannelTopics {
         });
         Self {
             name: name.to_owned(),
+            host: host.to_owned(),
             message: described.map(|one| one.message.clone()),
             own,
             encoder,
@@ -179,19 +182,5 @@ impl ChannelTopics {
     /// Why its messages are kept as bytes, if there are any that are.
     pub(crate) fn untyped(&self) -> Option<&str> {
         self.untyped.as_deref().filter(|_| self.own.is_declared())
-    }
-
-    /// Of each channel its message, and whether it is typed.
-    pub(crate) fn words<'a>(channels: impl Iterator<Item = &'a Self>) -> Words {
-        let describe = |channel: &Self| {
-            let message = channel.message.as_deref().unwrap_or("unknown message");
-            let how = match channel.untyped() {
-                _ if !channel.own.is_declared() => "no message was recorded".to_owned(),
-                None => "typed".to_owned(),
-                Some(why) => format!("kept as bytes: {why}"),
-            };
-            (channel.name.clone(), format!("{message}; {how}"))
-        };
-        channels.map(describe).collect()
     }
 }

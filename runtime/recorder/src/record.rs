@@ -243,7 +243,6 @@ impl LiveRecording {
             let polled = self.poll()?;
             let now = Instant::now();
             if polled != Poll::Busy {
-                self.topics.draw(&mut self.files)?;
                 self.topics.settle(now, &mut self.files)?;
             }
             // What was there before the recorder is not to wait for its first period.
@@ -261,7 +260,7 @@ impl LiveRecording {
             }
             let since_told = now.duration_since(told);
             if since_told >= PROGRESS_PERIOD {
-                let count = self.topics.counts.message_count;
+                let count = self.topics.topics.counts.message_count;
                 let rate_hz = (count - told_count) as f64 / since_told.as_secs_f64();
                 (told, told_count) = (now, count);
                 if let Some(signal) = look(&self.progress(rate_hz)) {
@@ -303,14 +302,6 @@ impl LiveRecording {
         failed.map_or(Ok(polled), Err)
     }
 
-    /// A run may be over before the ground of its fleet was made.
-    fn await_scene(&mut self) {
-        let since = Instant::now();
-        while !self.topics.is_scene_ready() && since.elapsed() < GROUND_WITHIN {
-            thread::sleep(GROUND_PAUSE);
-        }
-    }
-
     /// What was published before the signal is to be in the file; what the last poll came to.
     fn catch_up(&mut self) -> Result<Poll, WriteError> {
         thread::sleep(RINGS_EMPTY_WITHIN);
@@ -331,9 +322,16 @@ impl LiveRecording {
     }
 
     fn finish(mut self, signal: Option<&'static str>) -> Result<Recorded, RecordError> {
-        self.await_scene();
-        for problem in self.topics.finish_scene(&mut self.files)? {
-            self.problems.note(&problem);
+        // A run may be over before the ground of its fleet was made.
+        let since = Instant::now();
+        while !self.topics.is_scene_ready() && since.elapsed() < GROUND_WITHIN {
+            thread::sleep(GROUND_PAUSE);
+        }
+        if let Some(scene) = &mut self.topics.topics.scene {
+            scene.finish(&mut self.files)?;
+            for problem in scene.problems() {
+                self.problems.note(&problem);
+            }
         }
         let mut run = Run::without_records(self.feed.run().run_folder());
         if self.has_summary {
@@ -341,12 +339,7 @@ impl LiveRecording {
             if let Err(error) = run.read_traces() {
                 run.gaps.leave_out(error.to_string());
             }
-            let section = run.summary.as_ref().and_then(|one| one.clocks.as_ref());
-            let has_one_clock = section.map(|section| section.has_one_clock);
-            let clocks = &mut self.topics.clocks;
-            let mut time_ns = |host: &str, at_ns| clocks.time_ns(host, at_ns);
-            let events = facts::event_times(&run, has_one_clock, &mut time_ns);
-            self.topics.conclude(&run, &events, &mut self.files)?;
+            self.topics.conclude(&run, &mut self.files)?;
         }
         let how = match signal {
             Some(signal) => format!("the recorder was ended by {signal}, the run went on"),
@@ -360,7 +353,7 @@ impl LiveRecording {
         }
         self.files.open().describe("hil.end", end)?;
         facts::attach(self.files.open(), &run.folder)?;
-        let counts = self.topics.counts;
+        let counts = self.topics.topics.counts;
         let missed = self.topics.missed(&self.feed, self.is_silent);
         let mut words = self.problems.words.clone();
         if self.has_summary {
@@ -396,12 +389,12 @@ impl LiveRecording {
         file.describe("hil.clocks", self.told_clocks.clone())?;
         file.describe("hil.run", words)?;
         facts::describe_manifest(file, self.feed.manifest())?;
-        facts::attach_robot(file, self.topics.messages())
+        facts::attach_robot(file, self.topics.topics.messages())
     }
 
     /// What was recorded so far, at the end of each file.
     fn describe_recording(&mut self, how: &str) -> Result<(), WriteError> {
-        let counts = self.topics.counts;
+        let counts = self.topics.topics.counts;
         let numbers = [
             ("file_number", self.files.number() as u64),
             ("message_count", counts.message_count),
@@ -411,7 +404,7 @@ impl LiveRecording {
             ("unordered_latency_count", self.topics.unordered_count()),
             ("problem_count", self.problems.count),
         ];
-        let names = &self.topics.names;
+        let names = &self.topics.topics.names;
         let mut words = facts::recording_words(&numbers, &self.problems.words, names);
         words.insert("mode".to_owned(), "live".to_owned());
         words.insert("ended".to_owned(), how.to_owned());
@@ -422,7 +415,7 @@ impl LiveRecording {
             words.insert(format!("before {channel}"), count.to_string());
         }
         let clocks = self.topics.clocks.words();
-        let channels = self.topics.channel_words();
+        let channels = self.topics.topics.channel_words();
         let file = self.files.open();
         // Offsets of other clocks come with the last records.
         if clocks != self.told_clocks {

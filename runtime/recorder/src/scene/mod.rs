@@ -9,7 +9,8 @@ mod fleet;
 mod shapes;
 #[cfg(test)]
 mod tests;
-pub(crate) mod waiting;
+
+use std::collections::BTreeMap;
 
 use foxglove::messages::{
     FrameTransforms, SceneEntity, SceneEntityDeletion, SceneUpdate, Timestamp,
@@ -21,6 +22,7 @@ use hil_fleet::messages::{Mission, State, Truth};
 use prost::Message as _;
 use serde_json::Value;
 
+use crate::newest::Newest;
 use crate::sink::{Sink, Topic};
 use crate::topics::{Names, timestamp, well_known};
 use crate::view::arms::ArmsView;
@@ -39,6 +41,13 @@ const GROUND_PERIOD_NS: u64 = 10_000_000_000;
 /// Nothing is drawn of a silence longer than this: one damaged time must not make a million pictures.
 const SILENCE_NS: u64 = 2_000_000_000;
 
+/// Whatever was published so long before the newest message has come, when nothing more waits.
+const BEHIND_NS: i64 = 150_000_000;
+/// Messages that wait at most. A recorder that begins late has a long past to read; the oldest go on
+/// then before their time, and the picture of that moment may lack one of them. The same when a
+/// ground takes long to make; that is said.
+const WAITING_MAX: usize = 50_000;
+
 /// A message that says something of the scene.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Heard<'a> {
@@ -54,11 +63,6 @@ pub(crate) struct Heard<'a> {
     pub(crate) published_ns: i64,
 }
 
-/// True when messages of this name say anything of a scene.
-pub(crate) fn concerns(message: &str) -> bool {
-    is_of_fleet(message) || is_of_arms(message)
-}
-
 fn is_of_fleet(message: &str) -> bool {
     [State::NAME, Mission::NAME, Truth::NAME].contains(&message)
 }
@@ -66,6 +70,15 @@ fn is_of_fleet(message: &str) -> bool {
 /// True when messages of this name are about arms.
 pub(crate) fn is_of_arms(message: &str) -> bool {
     [EgmCommand::NAME, EgmFeedback::NAME].contains(&message)
+}
+
+/// A message that waits for those before it.
+#[derive(Debug)]
+struct Waiting {
+    channel: String,
+    message: String,
+    payload: Vec<u8>,
+    published_ns: i64,
 }
 
 /// The scene's topics, and what they show.
@@ -85,6 +98,14 @@ pub(crate) struct Scene {
     ground_due_ns: u64,
     picture_count: u64,
     ground_count: u64,
+    /// Messages of a run that goes come channel by channel, the scene wants them in order of time: they
+    /// wait until what could come before them has come, and until there is a ground to draw them on. By
+    /// time, then by arrival.
+    waiting: BTreeMap<(u64, u64), Waiting>,
+    arrived_count: u64,
+    newest: Newest,
+    /// Messages that went on before the ground was known.
+    groundless_count: u64,
 }
 
 impl Scene {
@@ -114,6 +135,10 @@ impl Scene {
             ground_due_ns: 0,
             picture_count: 0,
             ground_count: 0,
+            waiting: BTreeMap::new(),
+            arrived_count: 0,
+            newest: Newest::default(),
+            groundless_count: 0,
         }
     }
 
@@ -128,9 +153,28 @@ impl Scene {
         self.map.is_some() || fleet.problem.is_some()
     }
 
-    /// Why a fleet has no ground.
-    pub(crate) fn problem(&self) -> Option<&str> {
-        self.fleet.as_ref()?.problem.as_deref()
+    /// True while the ground is being made that messages wait for.
+    pub(crate) fn awaits_ground(&mut self) -> bool {
+        self.arrived_count > 0 && !self.is_ready()
+    }
+
+    /// What the scene lacks, once it is finished.
+    pub(crate) fn problems(&mut self) -> Vec<String> {
+        let fleet = self.fleet.as_ref();
+        let problem = fleet.and_then(|fleet| fleet.problem.clone());
+        let mut problems: Vec<String> = problem.into_iter().collect();
+        if self.groundless_count > 0 {
+            problems.push(format!(
+                "the scene of the first {} messages was drawn before the fleet's ways were planned: \
+                 it lacks sections and ways ahead",
+                self.groundless_count
+            ));
+        }
+        if self.awaits_ground() {
+            let why = "the fleet's ways were not planned in time";
+            problems.push(format!("/scene/ground is missing: {why}"));
+        }
+        problems
     }
 
     /// Lets `sink` hear now of the topics that messages of these names lead to.
@@ -192,11 +236,77 @@ impl Scene {
         Ok(())
     }
 
-    /// Draws what the last messages said.
+    /// Takes a message in whatever order.
+    ///
+    /// # Errors
+    /// When the sink cannot take a picture.
+    pub(crate) fn hold<S: Sink>(
+        &mut self,
+        heard: &Heard<'_>,
+        sink: &mut S,
+    ) -> Result<(), S::Error> {
+        if !is_of_fleet(heard.message) && !is_of_arms(heard.message) {
+            return Ok(());
+        }
+        let waiting = Waiting {
+            channel: heard.channel.to_owned(),
+            message: heard.message.to_owned(),
+            payload: heard.payload.to_vec(),
+            published_ns: heard.published_ns,
+        };
+        let key = (heard.at_ns, self.arrived_count);
+        self.waiting.insert(key, waiting);
+        self.arrived_count += 1;
+        self.newest.take(signed(heard.at_ns));
+        let excess_count = self.waiting.len().saturating_sub(WAITING_MAX);
+        self.take_until(u64::MAX, excess_count, sink)
+    }
+
+    /// Nothing more has come for now: takes what waits and is old enough.
+    ///
+    /// # Errors
+    /// When the sink cannot take a picture.
+    pub(crate) fn settle<S: Sink>(&mut self, sink: &mut S) -> Result<(), S::Error> {
+        if self.awaits_ground() {
+            return Ok(());
+        }
+        let newest_ns = self.newest.get().unwrap_or_default();
+        let until_ns = newest_ns.saturating_sub(BEHIND_NS).max(0);
+        self.take_until(until_ns.cast_unsigned(), usize::MAX, sink)
+    }
+
+    /// Takes at most so many of the messages that wait, those until `until_ns`.
+    fn take_until<S: Sink>(
+        &mut self,
+        until_ns: u64,
+        count_max: usize,
+        sink: &mut S,
+    ) -> Result<(), S::Error> {
+        for _ in 0..count_max {
+            let first = self.waiting.first_entry();
+            let Some(first) = first.filter(|first| first.key().0 <= until_ns) else {
+                break;
+            };
+            let ((at_ns, _), one) = first.remove_entry();
+            let heard = Heard {
+                channel: &one.channel,
+                message: &one.message,
+                payload: &one.payload,
+                at_ns,
+                published_ns: one.published_ns,
+            };
+            self.groundless_count += u64::from(!self.is_ready());
+            self.take(&heard, sink)?;
+        }
+        Ok(())
+    }
+
+    /// Takes everything that waits, and draws what the last messages said.
     ///
     /// # Errors
     /// When the sink cannot take the picture.
     pub(crate) fn finish<S: Sink>(&mut self, sink: &mut S) -> Result<(), S::Error> {
+        self.take_until(u64::MAX, usize::MAX, sink)?;
         if self.origin_ns.is_none() {
             return Ok(());
         }
