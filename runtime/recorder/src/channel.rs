@@ -5,21 +5,21 @@ use hil_rundir::manifest::ChannelDescription;
 use hil_trace::TraceRecord;
 use prost::Message as _;
 
-use crate::encode::Encoder;
+use crate::codec::Codec;
 use crate::net::{LinkDecision, MessageLatency};
-use crate::schema::{self, Schema};
+use crate::schema::Schema;
 use crate::sink::{Sink, Topic};
 use crate::topics::{Names, View, topic_of};
 use crate::writer::Stamp;
 
 /// How the messages of a channel are written field by field, with their schema; or why they cannot
 /// be.
-pub(crate) type Typed = Result<(Encoder, Schema), String>;
+pub(crate) type Typed = Result<(Codec, Schema), String>;
 
 /// By what the manifest says of a channel.
 pub(crate) fn typed(described: Option<&ChannelDescription>) -> Typed {
     let one = described.ok_or("the manifest does not tell of this channel")?;
-    Encoder::typed(&one.message, &one.fields, one.size_bytes)
+    Codec::typed(&one.message, &one.fields, one.size_bytes)
         .map_err(|fault| format!("{}: {fault}", one.message))
 }
 
@@ -45,7 +45,7 @@ pub(crate) struct ChannelTopics {
     pub(crate) message: Option<String>,
     /// Its messages.
     pub(crate) own: Topic,
-    encoder: Encoder,
+    codec: Codec,
     untyped: Option<String>,
     views: Vec<(View, Topic)>,
     /// The stamps of each message.
@@ -68,9 +68,9 @@ impl ChannelTopics {
     fn of(wanted: Wanted<'_>, own: String, names: &mut Names) -> Self {
         let (name, described) = (wanted.name, wanted.described);
         let mut untyped = None;
-        let (encoder, schema) = wanted.typed.unwrap_or_else(|why| {
+        let (codec, schema) = wanted.typed.unwrap_or_else(|why| {
             untyped = Some(why);
-            (Encoder::Opaque, schema::opaque())
+            Codec::opaque(0)
         });
         let message = described.map_or("", |one| &one.message);
         let size = described.map_or(String::new(), |one| one.size_bytes.to_string());
@@ -96,7 +96,7 @@ impl ChannelTopics {
             host: host.to_owned(),
             message: described.map(|one| one.message.clone()),
             own,
-            encoder,
+            codec,
             untyped,
             views: views.collect(),
             latency: derived(format!("/net{base}/latency"), MessageLatency::schema()),
@@ -129,7 +129,7 @@ impl ChannelTopics {
     ) -> Result<bool, S::Error> {
         if self.own.is_wanted(sink) {
             self.buffer.clear();
-            if !self.encoder.encode(payload, &mut self.buffer) {
+            if !self.codec.encode(payload, &mut self.buffer) {
                 return Ok(false);
             }
             self.own.write(sink, at, &self.buffer)?;

@@ -7,43 +7,38 @@ use std::process::ExitCode;
 use clap::{CommandFactory as _, Parser};
 use hil_platform::console::Console;
 use hil_platform::progress::Progress;
-use hil_platform::signals::{EXIT_INTERRUPTED, Signals};
+use hil_platform::signals::Signals;
 use hil_platform::words::counted_plainly;
 use hil_topology::documents;
 
-use crate::cli::{Cli, Command, PlayOptions, ServeOptions};
-use crate::convert::{ConvertError, convert};
+use crate::cli::{Cli, Command, PlayOptions, RecordOptions};
+use crate::convert::convert;
 use crate::ending::Ending;
-use crate::play::{PlayEnd, PlayError, SourceError, TargetError, play};
-use crate::record::{Progress as RecordProgress, RecordError, Request, Which, record};
-use crate::recover::{RecoverError, loss_words, recover};
-use crate::scan::ScanError;
-use crate::serve::{ServeError, serve};
-use crate::writer::{WriteError, check_target, partial};
-
-/// Exit codes, as `--help` lists them; those of `hil-runtime`.
-mod exit {
-    pub(super) const DONE: u8 = 0;
-    pub(super) const FAILED: u8 = 1;
-    pub(super) const USAGE: u8 = 2;
-    pub(super) const INTERNAL: u8 = 70;
-}
+use crate::failure::{Exit, Failure};
+use crate::play::{PlayEnd, play};
+use crate::record::{Progress as RecordProgress, record};
+use crate::recover::{loss_words, recover};
+use crate::serve::serve;
+use crate::writer::{check_target, partial};
 
 /// Does what the command line of this process says, and tells the exit code.
 pub fn run() -> ExitCode {
     let cli = Cli::parse();
     let mut console = Console::new(cli.quiet);
-    let signals = match Signals::install() {
-        Ok(signals) => signals,
+    let exit = match Signals::install() {
+        Ok(signals) => work(cli.command, &signals, &mut console).unwrap_or_else(|failure| {
+            console.error(&failure.words);
+            failure.exit
+        }),
         Err(error) => {
             console.error(&format!("cannot handle signals: {error}"));
-            return ExitCode::from(exit::INTERNAL);
+            Exit::Internal
         }
     };
-    ExitCode::from(work(cli.command, &signals, &mut console))
+    ExitCode::from(exit as u8)
 }
 
-fn work(command: Command, signals: &Signals, console: &mut Console) -> u8 {
+fn work(command: Command, signals: &Signals, console: &mut Console) -> Result<Exit, Failure> {
     match command {
         Command::Convert {
             run,
@@ -51,83 +46,25 @@ fn work(command: Command, signals: &Signals, console: &mut Console) -> u8 {
             force,
             no_scene,
         } => {
-            if let Err(error) = check_target(&output, &run, force) {
-                console.error(&error.to_string());
-                return exit::USAGE;
-            }
+            check_target(&output, &run, force).map_err(Failure::usage)?;
             convert_run(&run, &output, !no_scene, signals, console)
         }
-        Command::Record {
-            run,
-            output,
-            wait,
-            below,
-            from_now,
-            split_size,
-            flush,
-            force,
-            no_scene,
-        } => {
-            let request = Request {
-                run: Which::Named(run),
-                output,
-                waits: wait,
-                below,
-                from_now,
-                split_bytes: split_size,
-                flush,
-                force,
-                has_scene: !no_scene,
-            };
-            record_run(&request, signals, console)
-        }
+        Command::Record(options) => record_run(&options, signals, console),
         Command::Recover {
             broken,
             output,
             force,
         } => {
-            if let Err(error) = check_target(&output, &broken, force) {
-                console.error(&error.to_string());
-                return exit::USAGE;
-            }
+            check_target(&output, &broken, force).map_err(Failure::usage)?;
             recover_file(&broken, &output, signals, console)
         }
-        Command::Documents { folder } => write_documents(&folder, console),
-        Command::Serve(options) => serve_run(&options, signals, console),
+        Command::Documents { folder } => match documents::write(Cli::command(), &folder) {
+            Ok(_) => Ok(Exit::Done),
+            Err(error) => Err(Failure::failed(format!("{}: {error}", folder.display()))),
+        },
+        Command::Serve(options) => serve(&options, signals, console),
         Command::Play(options) => play_file(&options, signals, console),
     }
-}
-
-fn write_documents(folder: &Path, console: &mut Console) -> u8 {
-    match documents::write(Cli::command(), folder) {
-        Ok(_) => exit::DONE,
-        Err(error) => {
-            console.error(&format!("{}: {error}", folder.display()));
-            exit::FAILED
-        }
-    }
-}
-
-fn serve_run(options: &ServeOptions, signals: &Signals, console: &mut Console) -> u8 {
-    match serve(options, signals, console) {
-        Ok(code) => u8::try_from(code).unwrap_or(exit::FAILED),
-        Err(error) => {
-            console.error(&error.to_string());
-            match error {
-                ServeError::Run(_)
-                | ServeError::Select(_)
-                | ServeError::Over { .. }
-                | ServeError::Record(WriteError::Exists { .. } | WriteError::Unfinished { .. }) => {
-                    exit::USAGE
-                }
-                _ => exit::FAILED,
-            }
-        }
-    }
-}
-
-fn interrupted() -> u8 {
-    u8::try_from(EXIT_INTERRUPTED).unwrap_or(exit::FAILED)
 }
 
 fn convert_run(
@@ -136,7 +73,7 @@ fn convert_run(
     has_scene: bool,
     signals: &Signals,
     console: &mut Console,
-) -> u8 {
+) -> Result<Exit, Failure> {
     let progress = Progress::begin();
     // Much of the work is done in one piece, of a large run for seconds.
     let ending = Ending::watch(signals, partial(output));
@@ -145,57 +82,33 @@ fn convert_run(
         signals.received()
     });
     drop(ending);
-    match converted {
-        Ok(converted) => {
-            for words in &converted.words {
-                console.warn(words);
-            }
-            console.result(&format!(
-                "{}: {} of the run, {} in all on {}\n",
-                output.display(),
-                counted_plainly(converted.message_count, "message"),
-                converted.written_count,
-                counted_plainly(converted.topic_count as u64, "topic")
-            ));
-            if converted.has_gaps {
-                console.error("the run's folder has gaps, see above; the file says so too");
-                return exit::FAILED;
-            }
-            exit::DONE
-        }
-        Err(error) => {
-            console.error(&error.to_string());
-            match error {
-                ConvertError::Run(_) => exit::USAGE,
-                ConvertError::Write(_) => exit::FAILED,
-                ConvertError::Interrupted(_) => interrupted(),
-            }
-        }
+    let converted = converted?;
+    for words in &converted.words {
+        console.warn(words);
     }
+    console.result(&format!(
+        "{}: {} of the run, {} in all on {}\n",
+        output.display(),
+        counted_plainly(converted.message_count, "message"),
+        converted.written_count,
+        counted_plainly(converted.topic_count as u64, "topic")
+    ));
+    if converted.has_gaps {
+        let words = "the run's folder has gaps, see above; the file says so too";
+        return Err(Failure::failed(words));
+    }
+    Ok(Exit::Done)
 }
 
-fn record_run(request: &Request, signals: &Signals, console: &mut Console) -> u8 {
-    let recorded = record(request, &mut |progress| {
+fn record_run(
+    options: &RecordOptions,
+    signals: &Signals,
+    console: &mut Console,
+) -> Result<Exit, Failure> {
+    let recorded = record(options, &mut |progress| {
         console.progress(&progress_words(progress));
         signals.received()
-    });
-    let recorded = match recorded {
-        Ok(recorded) => recorded,
-        Err(error) => {
-            console.error(&error.to_string());
-            return match error {
-                RecordError::Select(_)
-                | RecordError::NotYet(_)
-                | RecordError::Write(WriteError::Exists { .. } | WriteError::Unfinished { .. }) => {
-                    exit::USAGE
-                }
-                RecordError::Interrupted(_) => interrupted(),
-                RecordError::Feed(_) | RecordError::Gone { .. } | RecordError::Write(_) => {
-                    exit::FAILED
-                }
-            };
-        }
-    };
+    })?;
     for words in &recorded.words {
         console.warn(words);
     }
@@ -203,27 +116,22 @@ fn record_run(request: &Request, signals: &Signals, console: &mut Console) -> u8
         let count = counted_plainly(*count, "message");
         console.warn(&format!("{channel}: missed {count}"));
     }
-    let files: Vec<String> = recorded
-        .paths
-        .iter()
-        .map(|path| path.display().to_string())
-        .collect();
     console.result(&format!(
         "{}: {} of the run, {} in all on {}; missed {}\n",
-        files.join(", "),
+        recorded.files(),
         counted_plainly(recorded.message_count, "message"),
         recorded.written_count,
         counted_plainly(recorded.topic_count as u64, "topic"),
         recorded.missed.values().sum::<u64>()
     ));
     if recorded.signal.is_some() {
-        return interrupted();
+        return Ok(Exit::Interrupted);
     }
     if recorded.has_gaps {
-        console.error("something of the run is not in the file, see above; the file says so too");
-        return exit::FAILED;
+        let words = "something of the run is not in the file, see above; the file says so too";
+        return Err(Failure::failed(words));
     }
-    exit::DONE
+    Ok(Exit::Done)
 }
 
 fn progress_words(progress: &RecordProgress<'_>) -> String {
@@ -243,25 +151,19 @@ fn progress_words(progress: &RecordProgress<'_>) -> String {
     )
 }
 
-fn recover_file(broken: &Path, output: &Path, signals: &Signals, console: &mut Console) -> u8 {
+fn recover_file(
+    broken: &Path,
+    output: &Path,
+    signals: &Signals,
+    console: &mut Console,
+) -> Result<Exit, Failure> {
     let progress = Progress::begin();
     let size_bytes = fs::metadata(broken).map_or(0, |file| file.len());
     let recovered = recover(broken, output, &mut |offset| {
         let share = (size_bytes > 0).then(|| offset as f64 / size_bytes as f64);
         progress.show(console, share, &format!("{} MiB read", offset >> 20));
         signals.received()
-    });
-    let recovered = match recovered {
-        Ok(recovered) => recovered,
-        Err(error) => {
-            console.error(&error.to_string());
-            return match error {
-                RecoverError::Scan(ScanError::Foreign { .. }) => exit::USAGE,
-                RecoverError::Interrupted(_) => interrupted(),
-                _ => exit::FAILED,
-            };
-        }
-    };
+    })?;
     for loss in &recovered.end.losses {
         console.warn(&format!("lost: {}", loss_words(loss)));
     }
@@ -280,27 +182,19 @@ fn recover_file(broken: &Path, output: &Path, signals: &Signals, console: &mut C
         counted_plainly(recovered.message_count, "message"),
         recovered.span_s()
     ));
-    exit::DONE
+    Ok(Exit::Done)
 }
 
-fn play_file(options: &PlayOptions, signals: &Signals, console: &mut Console) -> u8 {
-    match play(options, signals, console) {
-        Ok(PlayEnd::Done) => exit::DONE,
-        Ok(PlayEnd::Interrupted(signal)) => {
+fn play_file(
+    options: &PlayOptions,
+    signals: &Signals,
+    console: &mut Console,
+) -> Result<Exit, Failure> {
+    Ok(match play(options, signals, console)? {
+        PlayEnd::Done => Exit::Done,
+        PlayEnd::Interrupted(signal) => {
             console.say(&format!("ended by {signal}"));
-            interrupted()
+            Exit::Interrupted
         }
-        Err(error) => {
-            console.error(&error.to_string());
-            match error {
-                PlayError::Source(SourceError::Message { .. })
-                | PlayError::Target(TargetError::Domain(_) | TargetError::Channel(_)) => {
-                    exit::FAILED
-                }
-                PlayError::NoneChosen { .. } | PlayError::Source(_) | PlayError::Target(_) => {
-                    exit::USAGE
-                }
-            }
-        }
-    }
+    })
 }

@@ -12,28 +12,15 @@ use hil_rundir::record::{RecordFile, RecordKind};
 use crate::channel::{Typed, Wanted, typed};
 use crate::clocks::Clocks;
 use crate::facts;
+use crate::failure::Failure;
 use crate::net::{self, MessageLatency};
-use crate::run::{Run, RunError};
+use crate::run::Run;
 use crate::run_topics::{Plan, RunTopics, What};
 use crate::scene::Scene;
 use crate::writer::{Recording, WriteError};
 
 /// How often it looks whether something that takes its time is done.
 const PAUSE: Duration = Duration::from_millis(20);
-
-/// How a conversion went wrong.
-#[derive(Debug, thiserror::Error)]
-pub(crate) enum ConvertError {
-    /// Nothing to convert.
-    #[error(transparent)]
-    Run(#[from] RunError),
-    /// Nowhere to put it.
-    #[error(transparent)]
-    Write(#[from] WriteError),
-    /// A signal came.
-    #[error("ended by {0}; no file was written")]
-    Interrupted(&'static str),
-}
 
 /// What a conversion came to.
 #[derive(Debug)]
@@ -60,14 +47,14 @@ pub(crate) fn convert(
     to: &Path,
     has_scene: bool,
     look: &mut dyn FnMut(Option<f64>, &str) -> Option<&'static str>,
-) -> Result<Converted, ConvertError> {
+) -> Result<Converted, Failure> {
     let mut stopped = None;
     let mut run = Run::read(from, &mut |share, path| {
         stopped = look(Some(share), &format!("reading {path}"));
         stopped.is_none()
     })?;
     if let Some(signal) = stopped {
-        return Err(ConvertError::Interrupted(signal));
+        return Err(interrupted(signal));
     }
     run.count_missing();
     let clocks = Clocks::of(&run);
@@ -83,7 +70,7 @@ pub(crate) fn convert(
     // Something may still be made that the pictures need.
     while !topics.scene.as_mut().is_none_or(Scene::is_ready) {
         if let Some(signal) = look(None, "making the fleet's ground") {
-            return Err(ConvertError::Interrupted(signal));
+            return Err(interrupted(signal));
         }
         thread::sleep(PAUSE);
     }
@@ -93,7 +80,7 @@ pub(crate) fn convert(
             let all = plan.items.len();
             let share = count as f64 / all.max(1) as f64;
             if let Some(signal) = look(Some(share), &format!("writing {count} of {all}")) {
-                return Err(ConvertError::Interrupted(signal));
+                return Err(interrupted(signal));
             }
         }
         topics.write(&run, &latencies, *item, &mut recording)?;
@@ -123,6 +110,10 @@ pub(crate) fn convert(
         has_gaps: run.gaps.is_any(),
         words,
     })
+}
+
+fn interrupted(signal: &str) -> Failure {
+    Failure::interrupted(format!("ended by {signal}; no file was written"))
 }
 
 /// Declares every topic that there is something for; the joined stamps of each channel.

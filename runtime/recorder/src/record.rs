@@ -3,17 +3,17 @@
 //! [`crate::split`].
 
 use std::collections::BTreeMap;
-use std::io;
 use std::path::PathBuf;
 use std::thread;
 use std::time::{Duration, Instant};
 
 use hil_rundir::live_run::LiveRun;
-use hil_rundir::select::select;
-use hil_rundir::select::{SelectError, select_below};
-use hil_watch::{Event, Feed, FeedError, Poll};
+use hil_rundir::select::{SelectError, select, select_below};
+use hil_watch::{Event, Feed, Poll};
 
+use crate::cli::RecordOptions;
 use crate::facts::{self, Words};
+use crate::failure::Failure;
 use crate::live::LiveTopics;
 use crate::pace::Pace;
 use crate::run::Run;
@@ -38,67 +38,6 @@ const GROUND_PAUSE: Duration = Duration::from_millis(20);
 /// Problems that the file tells in words; further ones are counted.
 const PROBLEMS_MAX: usize = 1000;
 
-/// How a recording went wrong.
-#[derive(Debug, thiserror::Error)]
-pub(crate) enum RecordError {
-    /// No run, or several.
-    #[error(transparent)]
-    Select(#[from] SelectError),
-    /// None that fits, and nobody asked to wait for one.
-    #[error("{0}; --wait waits for one to begin")]
-    NotYet(SelectError),
-    /// The run cannot be watched.
-    #[error(transparent)]
-    Feed(#[from] FeedError),
-    /// The run that was chosen is not there any more.
-    #[error("the run in {folder} does not go any more: {why}", folder = .folder.display())]
-    Gone {
-        /// Its folder.
-        folder: PathBuf,
-        /// What the system said.
-        why: io::Error,
-    },
-    /// Nowhere to put it.
-    #[error(transparent)]
-    Write(#[from] WriteError),
-    /// A signal came before a run did.
-    #[error("ended by {0}; no run had begun and no file was written")]
-    Interrupted(&'static str),
-}
-
-/// The run that is meant.
-#[derive(Debug, Clone)]
-pub(crate) enum Which {
-    /// By a word of the user's; the only one if left out.
-    Named(Option<String>),
-    /// The one in this folder.
-    In(PathBuf),
-}
-
-/// What is asked for.
-#[derive(Debug, Clone)]
-#[allow(clippy::struct_excessive_bools, reason = "options of a command line")]
-pub(crate) struct Request {
-    /// Which run.
-    pub(crate) run: Which,
-    /// File to write, or folder to write it into.
-    pub(crate) output: PathBuf,
-    /// Wait for a run to begin.
-    pub(crate) waits: bool,
-    /// Know only runs whose folders lie below this one.
-    pub(crate) below: Option<PathBuf>,
-    /// Leave out what is recorded already.
-    pub(crate) from_now: bool,
-    /// Begin another file when one is larger than this, bytes.
-    pub(crate) split_bytes: Option<u64>,
-    /// What a kill may lose at most.
-    pub(crate) flush: Duration,
-    /// Replace files that exist.
-    pub(crate) force: bool,
-    /// Draw the scene.
-    pub(crate) has_scene: bool,
-}
-
 /// What a recording came to.
 #[derive(Debug)]
 pub(crate) struct Recorded {
@@ -118,6 +57,14 @@ pub(crate) struct Recorded {
     pub(crate) has_gaps: bool,
     /// The signal that ended the recording before its run.
     pub(crate) signal: Option<&'static str>,
+}
+
+impl Recorded {
+    /// The files, in one line.
+    pub(crate) fn files(&self) -> String {
+        let paths = self.paths.iter().map(|path| path.display().to_string());
+        paths.collect::<Vec<_>>().join(", ")
+    }
 }
 
 /// How far a recording is.
@@ -143,46 +90,47 @@ pub(crate) type Look<'a> = &'a mut dyn FnMut(&Progress<'_>) -> Option<&'static s
 /// # Errors
 /// When there is no run to record or no file can be written; what was written is beside its place
 /// then.
-pub(crate) fn record(request: &Request, look: Look<'_>) -> Result<Recorded, RecordError> {
-    prepare(&request.output, request.split_bytes, request.force)?;
-    let run = find(request, look)?;
-    let target = target(&request.output, &run.name);
-    let mut feed = Feed::open(run)?;
-    if request.from_now {
+pub(crate) fn record(options: &RecordOptions, look: Look<'_>) -> Result<Recorded, Failure> {
+    let (split_bytes, force) = (options.split_size, options.force);
+    prepare(&options.output, split_bytes, force)?;
+    let run = find(options, look)?;
+    let target = target(&options.output, &run.name);
+    let mut feed = Feed::open(run).map_err(Failure::failed)?;
+    if options.from_now {
         feed.skip_to_now();
     }
-    let files = Files::begin(&target, request.split_bytes, request.force)?;
-    let topics = LiveTopics::of(&feed, request.has_scene);
+    let files = Files::begin(&target, split_bytes, force)?;
+    let topics = LiveTopics::of(&feed, !options.no_scene);
     let mut recording = LiveRecording::begin(feed, topics, files)?;
-    let signal = recording.run(request.flush, look)?;
+    let signal = recording.run(options.flush, look)?;
     recording.finish(signal)
 }
 
-fn find(request: &Request, look: Look<'_>) -> Result<LiveRun, RecordError> {
-    let wanted = match &request.run {
-        Which::Named(wanted) => wanted.as_deref(),
-        Which::In(folder) => {
-            return LiveRun::read(folder).map_err(|why| RecordError::Gone {
-                folder: folder.clone(),
-                why,
-            });
-        }
-    };
+fn find(options: &RecordOptions, look: Look<'_>) -> Result<LiveRun, Failure> {
+    if let Some(folder) = &options.folder {
+        return LiveRun::read(folder).map_err(|why| {
+            let folder = folder.display();
+            Failure::failed(format!("the run in {folder} does not go any more: {why}"))
+        });
+    }
+    let wanted = options.run.as_deref();
     loop {
-        let selected = match &request.below {
+        let selected = match &options.below {
             Some(below) => select_below(below, wanted),
             None => select(wanted),
         };
         match selected {
             Ok(run) => return Ok(run),
-            Err(SelectError::NoneRuns | SelectError::NoSuch { .. }) if request.waits => {}
+            Err(SelectError::NoneRuns | SelectError::NoSuch { .. }) if options.wait => {}
             Err(error @ (SelectError::NoneRuns | SelectError::NoSuch { .. })) => {
-                return Err(RecordError::NotYet(error));
+                let cure = "--wait waits for one to begin";
+                return Err(Failure::usage(format!("{error}; {cure}")));
             }
-            Err(error) => return Err(error.into()),
+            Err(error) => return Err(Failure::usage(error)),
         }
         if let Some(signal) = look(&Progress::default()) {
-            return Err(RecordError::Interrupted(signal));
+            let words = format!("ended by {signal}; no run had begun and no file was written");
+            return Err(Failure::interrupted(words));
         }
         thread::sleep(WAIT_PAUSE);
     }
@@ -321,7 +269,7 @@ impl LiveRecording {
         Ok(())
     }
 
-    fn finish(mut self, signal: Option<&'static str>) -> Result<Recorded, RecordError> {
+    fn finish(mut self, signal: Option<&'static str>) -> Result<Recorded, Failure> {
         // A run may be over before the ground of its fleet was made.
         let since = Instant::now();
         while !self.topics.is_scene_ready() && since.elapsed() < GROUND_WITHIN {

@@ -15,6 +15,7 @@ use mcap::{Attachment, Compression, McapError, WriteOptions, Writer};
 use nix::unistd::{AccessFlags, access};
 
 use crate::disk::QueuedFile;
+use crate::failure::Failure;
 use crate::schema::Schema;
 use crate::sink::Sink;
 
@@ -72,6 +73,15 @@ pub(crate) enum WriteError {
         /// Why.
         source: McapError,
     },
+}
+
+impl From<WriteError> for Failure {
+    fn from(error: WriteError) -> Self {
+        match error {
+            WriteError::Exists { .. } | WriteError::Unfinished { .. } => Self::usage(error),
+            _ => Self::failed(error),
+        }
+    }
 }
 
 /// When a message was, nanoseconds, and its number.

@@ -13,8 +13,9 @@ use hil_watch::Record;
 
 use super::source::{Progress, Source, Warning};
 use crate::clocks::Clocks;
+use crate::failure::Failure;
 use crate::net::{self, Noted};
-use crate::run::{Run, RunError};
+use crate::run::Run;
 use crate::view::facts::RunFacts;
 use crate::view::{Body, LiveRecord};
 
@@ -62,7 +63,7 @@ impl Playback {
         speed: f64,
         repeats: bool,
         goes_on: &mut dyn FnMut(f64, &str) -> bool,
-    ) -> Result<(Self, RunFacts), RunError> {
+    ) -> Result<(Self, RunFacts), Failure> {
         let run = Run::read(path, goes_on)?;
         let clocks = Clocks::of(&run);
         let (name, manifest) = (run.folder.name(), run.manifest.as_ref());

@@ -10,7 +10,9 @@ use std::time::Duration;
 use hil_platform::console::Console;
 use hil_platform::words::counted_plainly;
 
-use crate::record::{RecordError, Recorded, Request, Which, record};
+use crate::cli::RecordOptions;
+use crate::failure::Failure;
+use crate::record::{Recorded, record};
 use crate::split::another;
 
 /// What a kill may lose at most.
@@ -32,7 +34,7 @@ pub(super) struct Recording {
     pub(super) path: PathBuf,
     /// No file came of it.
     pub(super) has_failed: bool,
-    thread: Option<JoinHandle<Result<Recorded, RecordError>>>,
+    thread: Option<JoinHandle<Result<Recorded, Failure>>>,
     stop: Arc<AtomicBool>,
 }
 
@@ -41,21 +43,22 @@ impl Recording {
     /// bear one.
     pub(super) fn begin(folder: &Path, target: &Target, number: usize) -> Self {
         let path = another(&target.path, number);
-        let request = Request {
-            run: Which::In(folder.to_owned()),
+        let options = RecordOptions {
+            run: None,
+            folder: Some(folder.to_owned()),
             output: path.clone(),
-            waits: false,
+            wait: false,
             below: None,
             from_now: false,
-            split_bytes: None,
+            split_size: None,
             flush: FLUSH,
             force: false,
-            has_scene: target.has_scene,
+            no_scene: !target.has_scene,
         };
         let stop = Arc::new(AtomicBool::new(false));
         let is_stopped = Arc::clone(&stop);
         let thread = thread::spawn(move || {
-            record(&request, &mut |_| {
+            record(&options, &mut |_| {
                 is_stopped.load(Ordering::Relaxed).then_some("the server")
             })
         });
@@ -96,10 +99,9 @@ impl Recording {
                 for words in &recorded.words {
                     console.warn(words);
                 }
-                let files = recorded.paths.iter().map(|path| path.display().to_string());
                 console.say(&format!(
                     "{}: {} of the run; missed {}",
-                    files.collect::<Vec<_>>().join(", "),
+                    recorded.files(),
                     counted_plainly(recorded.message_count, "message"),
                     recorded.missed.values().sum::<u64>()
                 ));
