@@ -26,15 +26,13 @@ use crate::newest::Newest;
 use crate::sink::{Sink, Topic};
 use crate::topics::{Names, timestamp, well_known};
 use crate::view::arms::ArmsView;
-use crate::view::fleet::FleetView;
+use crate::view::fleet::{FleetView, MANY_ROBOTS};
 use crate::writer::Stamp;
 
 /// Between two pictures, of the run's time: 20 Hz.
 const PERIOD_NS: u64 = 50_000_000;
 /// The same for fleets of many robots.
 const LARGE_PERIOD_NS: u64 = 200_000_000;
-/// Robots from which on a fleet counts as large.
-const MANY_ROBOTS: usize = 64;
 /// Between two pictures of the ground: whoever opens one of several files, or the middle of a
 /// stream, has it within this time.
 const GROUND_PERIOD_NS: u64 = 10_000_000_000;

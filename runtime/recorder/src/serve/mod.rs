@@ -34,6 +34,7 @@ use tokio::runtime::Runtime;
 use crate::cli::ServeOptions;
 use crate::failure::{Exit, Failure};
 use crate::split::prepare;
+use crate::view::state::RunState;
 use access::{Access, NO_ORIGIN, Refusal};
 use engine::{Engine, Showing, Shown};
 use front::{Door, Front, GONE_AFTER};
@@ -149,8 +150,12 @@ fn first(
         for words in playback.words() {
             console.warn(words);
         }
-        let source = Box::new(playback);
-        return Ok(Some(Shown::new(facts, source, Some(options.speed), None)));
+        return Ok(Some(Shown {
+            state: RunState::new(facts),
+            source: Box::new(playback),
+            playback_speed: Some(options.speed),
+            links: None,
+        }));
     }
     match select(wanted) {
         Ok(run) => Ok(Some(watch(run)?)),
@@ -174,9 +179,12 @@ fn has_not_begun(folder: &Path) -> bool {
 fn watch(run: LiveRun) -> Result<Shown, Failure> {
     let folder = run.folder.clone();
     let (running, facts) = Running::open(run).map_err(Failure::failed)?;
-    let topology = running.topology().clone();
-    let links = Some((folder, topology));
-    Ok(Shown::new(facts, Box::new(running), None, links))
+    Ok(Shown {
+        state: RunState::new(facts),
+        links: Some((folder, running.topology().clone())),
+        source: Box::new(running),
+        playback_speed: None,
+    })
 }
 
 /// Shows a run that has begun, where none is shown or the one shown gives way to it. `said` is what

@@ -8,7 +8,7 @@ use hil_watch::Record;
 use serde_json::{Value, json};
 
 use super::facts::ChannelFacts;
-use super::join::{Joined, LINK_SEGMENTS, LOCAL_SEGMENTS, Way};
+use super::join::{Joined, Way};
 use super::window::{Recent, Samples, WINDOW_NS};
 use super::{Body, LiveRecord, seconds};
 use crate::net::{MessageId, MessageLatency, Noted};
@@ -80,16 +80,13 @@ impl Account {
     /// The account of `channel`; `has_one_clock` says that stamps of both ends compare.
     pub(crate) fn new(channel: &ChannelFacts, has_one_clock: bool) -> Self {
         let has_link = channel.link.is_some();
-        let count = if has_link {
-            LINK_SEGMENTS.len()
-        } else {
-            LOCAL_SEGMENTS.len()
+        let way = Way {
+            has_link,
+            has_one_clock,
         };
         Self {
-            way: Way {
-                has_link,
-                has_one_clock,
-            },
+            segments: way.segments().iter().map(|_| Samples::default()).collect(),
+            way,
             is_by_message: channel.is_by_message,
             under_way: BTreeMap::new(),
             lost: BTreeMap::new(),
@@ -99,7 +96,6 @@ impl Account {
             counts: Counts::default(),
             rate: Recent::default(),
             window_lost: Recent::default(),
-            segments: (0..count).map(|_| Samples::default()).collect(),
             whole: Samples::default(),
             left_ns: None,
             arrived_ns: None,
@@ -155,10 +151,9 @@ impl Account {
             self.counts.lost = self.counts.lost.saturating_sub(1);
             self.untold.retain(|(number, _)| *number != sequence);
         }
-        let newest = self.newest.insert(epoch, sequence).unwrap_or(sequence);
-        if newest > sequence {
-            self.newest.insert(epoch, newest);
-        }
+        let known = self.newest.entry(epoch).or_insert(sequence);
+        let newest = *known;
+        *known = newest.max(sequence);
         // Where nobody here saw them leave, the numbers passed over are all that tells of them.
         if self.counts.sent.is_none() {
             let from = newest.saturating_add(1).max(sequence.saturating_sub(1000));
@@ -189,15 +184,9 @@ impl Account {
     /// Decides about messages that have been under way for long enough.
     pub(crate) fn settle(&mut self, now_ns: i64) {
         let due_ns = now_ns - LOST_AFTER_NS;
-        let old = self.under_way.iter();
-        let old: Vec<MessageId> = old
-            .filter(|(_, joined)| joined.first_ns <= due_ns)
-            .map(|(key, _)| *key)
-            .collect();
-        for key in old {
-            let Some(joined) = self.under_way.remove(&key) else {
-                continue;
-            };
+        let is_old = |_: &MessageId, joined: &mut Joined| joined.first_ns <= due_ns;
+        let old: Vec<_> = self.under_way.extract_if(.., is_old).collect();
+        for (key, joined) in old {
             if self.is_lost(key, &joined) {
                 self.counts.lost += 1;
                 self.window_lost.add(now_ns, 1);
@@ -237,55 +226,35 @@ impl Account {
         origin_ns: Option<i64>,
     ) -> Option<Value> {
         let mut lost = core::mem::take(&mut self.untold);
+        if lost.is_empty() {
+            return None;
+        }
         lost.sort_unstable();
         let first_ns = lost.iter().filter_map(|(_, published)| *published).min();
-        let sequences: Vec<u64> = lost
-            .iter()
-            .map(|(number, _)| *number)
-            .take(LISTED_MAX)
-            .collect();
-        (!lost.is_empty()).then(|| {
-            json!({
-                "at_s": at_s, "channel": name, "sequences": sequences, "count": lost.len(),
-                "first_at_s": first_ns
-                    .zip(origin_ns)
-                    .map(|(ns, origin_ns)| seconds(ns.saturating_sub(origin_ns))),
-            })
-        })
+        let ends = first_ns.zip(origin_ns);
+        let first_at_s = ends.map(|(ns, origin_ns)| seconds(ns.saturating_sub(origin_ns)));
+        let sequences = lost.iter().map(|(number, _)| *number).take(LISTED_MAX);
+        Some(json!({
+            "at_s": at_s, "channel": name, "sequences": sequences.collect::<Vec<_>>(),
+            "count": lost.len(), "first_at_s": first_at_s,
+        }))
     }
 
     /// The channel's entry in `/live/channels`.
     pub(crate) fn figures(&mut self, name: &str, now_ns: i64) -> Value {
-        let names: &[&str] = if self.way.has_link {
-            &LINK_SEGMENTS
-        } else {
-            &LOCAL_SEGMENTS
-        };
-        let segments: Vec<Value> = names
-            .iter()
-            .zip(&mut self.segments)
-            .map(|(name, samples)| {
-                let mut figures = samples.figures(now_ns);
-                figures["name"] = json!(name);
-                figures
-            })
+        let named = self.way.segments().iter().zip(&mut self.segments);
+        let segments: Vec<Value> = named
+            .map(|(name, samples)| samples.figures(name, now_ns))
             .collect();
-        let one_way = self.whole.is_available.then(|| {
-            let mut figures = self.whole.figures(now_ns);
-            figures["name"] = json!("published-taken");
-            figures
-        });
+        let one_way = self.whole.is_available;
+        let one_way = one_way.then(|| self.whole.figures("published-taken", now_ns));
         let can_tell = self.way.has_link && self.counts.received.is_some();
         let window_lost = self.window_lost.count(now_ns);
-        let silent_ns = self
-            .arrived_ns
-            .filter(|_| self.way.has_link)
-            .map(|ns| now_ns - ns);
+        let arrived_ns = self.arrived_ns.filter(|_| self.way.has_link);
         let counts = &self.counts;
         // What no process here has to do with has no rate here.
-        let is_seen = [counts.published(), counts.received, counts.taken]
-            .iter()
-            .any(Option::is_some);
+        let seen = [counts.published(), counts.received, counts.taken];
+        let is_seen = seen.iter().any(Option::is_some);
         let rate_hz = self.rate.count(now_ns) as f64 * 1e9 / WINDOW_NS as f64;
         let rate_hz = is_seen.then_some(rate_hz);
         json!({
@@ -300,7 +269,7 @@ impl Account {
             "one_way": one_way,
             "clock_bound_us": self.way.has_one_clock.then_some(0.0),
             "link_state": self.link_state(now_ns),
-            "silent_s": silent_ns.map(|ns| seconds(ns.max(0))),
+            "silent_s": arrived_ns.map(|ns| seconds((now_ns - ns).max(0))),
         })
     }
 

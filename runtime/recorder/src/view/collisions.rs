@@ -29,7 +29,8 @@ pub(crate) struct Collisions {
     next: Option<Instant>,
     known_count: usize,
     overlapping: BTreeSet<(u32, u32, u32)>,
-    listed: VecDeque<Value>,
+    /// The last of them.
+    pub(crate) listed: VecDeque<Value>,
     count: u64,
     /// Collisions are those of the robots' true motion.
     pub(crate) has_truth: bool,
@@ -58,30 +59,32 @@ impl Collisions {
         let Some(referee) = &mut self.referee else {
             return;
         };
-        let first = self
-            .waiting
-            .front()
-            .map(|truth| Instant::from_ns(truth.at_ns));
-        let Some(begin) = self.next.or(first) else {
+        let first = self.waiting.front();
+        let first = first.map(|truth| Instant::from_ns(truth.at_ns));
+        let Some(mut at) = self.next.or(first) else {
             return;
         };
-        self.next = Some(scan(referee, &mut self.waiting, begin, now_ns));
-        let incidents = referee.incidents();
-        let listed: Vec<Value> = incidents[self.known_count..]
-            .iter()
-            .map(|one| {
-                json!({
-                    "at_s": seconds(one.at.as_ns() - origin_ns),
-                    "fleet": one.fleet_id, "robots": one.robots,
-                    "x_m": rounded(one.position_m[0]), "y_m": rounded(one.position_m[1]),
-                    "basis": "truth", "kind": one.kind,
-                })
-            })
-            .collect();
-        self.known_count = incidents.len();
-        for one in listed {
-            self.list(one);
+        while at.as_ns() + BEHIND_NS <= now_ns {
+            let before = |truth: &mut Truth| truth.at_ns <= at.as_ns();
+            while let Some(truth) = self.waiting.pop_front_if(before) {
+                referee.on_truth(&truth);
+            }
+            referee.scan(at);
+            at = at + SCAN_PERIOD;
         }
+        self.next = Some(at);
+        let incidents = referee.incidents();
+        let news = incidents[self.known_count..].iter().map(|one| {
+            json!({
+                "at_s": seconds(one.at.as_ns() - origin_ns),
+                "fleet": one.fleet_id, "robots": one.robots,
+                "x_m": rounded(one.position_m[0]), "y_m": rounded(one.position_m[1]),
+                "basis": "truth", "kind": one.kind,
+            })
+        });
+        let news: Vec<Value> = news.collect();
+        self.known_count = incidents.len();
+        news.into_iter().for_each(|one| self.list(one));
     }
 
     /// Looks at reported poses instead: `robots` of one fleet, with the footprint of all.
@@ -123,32 +126,8 @@ impl Collisions {
         self.listed.push_back(one);
     }
 
-    /// The last of them, and how many there were; a count that lacks something is not known.
-    pub(crate) fn listed(&self) -> (Vec<Value>, Option<u64>) {
-        let count = (self.forgotten_count == 0).then_some(self.count);
-        (self.listed.iter().cloned().collect(), count)
+    /// How many there were; a count that lacks something is not known.
+    pub(crate) fn count(&self) -> Option<u64> {
+        (self.forgotten_count == 0).then_some(self.count)
     }
-}
-
-/// Gives the referee all records up to each look, from `begin` on; the time of the next look.
-fn scan(
-    referee: &mut Referee,
-    waiting: &mut VecDeque<Truth>,
-    begin: Instant,
-    now_ns: i64,
-) -> Instant {
-    let mut at = begin;
-    while at.as_ns() + BEHIND_NS <= now_ns {
-        while waiting
-            .front()
-            .is_some_and(|truth| truth.at_ns <= at.as_ns())
-        {
-            if let Some(truth) = waiting.pop_front() {
-                referee.on_truth(&truth);
-            }
-        }
-        referee.scan(at);
-        at = at + SCAN_PERIOD;
-    }
-    at
 }

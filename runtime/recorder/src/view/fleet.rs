@@ -1,20 +1,24 @@
 //! The fleet as its messages tell of it: where each robot last was, how far it may go, who waits.
 
 use std::collections::BTreeMap;
+use std::sync::mpsc::{Receiver, TryRecvError};
 
 use hil_core::message::Message;
 use hil_fleet::geometry::{Footprint, Pose};
 use hil_fleet::messages::{Mission, NO_AUTHORITY, Phase, State, TO_GOAL, Truth};
 use hil_fleet::path::{Path, PathId};
 use hil_fleet::scenario::Scene;
+use hil_fleet::world::World;
 use serde_json::{Value, json};
 
 use super::collisions::Collisions;
-use super::ground::{Ground, Made, Making, points};
+use super::ground::{self, Ground, points};
 use super::sections::{Areas, OnPath, of_pair};
 use super::{rounded, seconds};
 use crate::topics::read;
 
+/// Robots from which on a fleet's picture is drawn more seldom.
+pub(crate) const MANY_ROBOTS: usize = 64;
 /// A state older than this is shown as stale.
 const STALE_NS: i64 = 1_000_000_000;
 /// Points of a way ahead.
@@ -39,7 +43,7 @@ pub(crate) struct FleetView {
     robots: BTreeMap<Id, Robot>,
     collisions: Collisions,
     vehicle: Option<Footprint>,
-    making: Option<Making>,
+    making: Option<Receiver<Result<Box<Ground>, String>>>,
     ground: Option<Box<Ground>>,
     areas: Option<Areas>,
     /// From the robots' monotonic clock to the axis.
@@ -63,10 +67,9 @@ impl Robot {
     }
 
     fn path_of(&self, mission: u32) -> Option<PathId> {
-        let known = self.missions.iter().find(|(known, _)| *known == mission);
-        known
-            .filter(|_| mission != 0)
-            .map(|(_, path)| PathId(*path))
+        let mut known = self.missions.iter().filter(|_| mission != 0);
+        let (_, path) = known.find(|(known, _)| *known == mission)?;
+        Some(PathId(*path))
     }
 }
 
@@ -79,7 +82,7 @@ impl FleetView {
             robots: BTreeMap::new(),
             collisions: Collisions::default(),
             vehicle,
-            making: Some(Making::begin(parameters.clone())),
+            making: Some(ground::make(parameters.clone())),
             ground: None,
             areas: None,
             offset_ns: 0,
@@ -139,10 +142,13 @@ impl FleetView {
 
     /// Looks whether the ground has been made; the map, the first time.
     pub(crate) fn new_map(&mut self) -> Option<Value> {
-        match self.making.as_ref()?.look() {
-            Made::NotYet => return None,
-            Made::Not(why) => self.problem = Some(format!("no map of the fleet: {why}")),
-            Made::Ground(ground) => {
+        match self.making.as_ref()?.try_recv() {
+            Err(TryRecvError::Empty) => return None,
+            Err(TryRecvError::Disconnected) => {
+                self.problem = Some("no map of the fleet: making the map failed".to_owned());
+            }
+            Ok(Err(why)) => self.problem = Some(format!("no map of the fleet: {why}")),
+            Ok(Ok(ground)) => {
                 self.collisions.begin(&ground);
                 self.areas = Some(Areas::new(ground.scene.world.vehicle.footprint));
                 self.ground = Some(ground);
@@ -171,21 +177,20 @@ impl FleetView {
             .look(now_ns - offset_ns, origin_ns - offset_ns);
         self.look_at_states(now_ns, at_s);
         let scene = self.ground.as_ref().map(|ground| &ground.scene);
-        let robots: Vec<Value> = self
-            .robots
-            .iter()
+        let robots = self.robots.iter();
+        let robots: Vec<Value> = robots
             .filter_map(|(id, robot)| picture_of(*id, robot, scene, now_ns))
             .collect();
         let sections = self.sections();
-        let (collisions, count) = self.collisions.listed();
-        let basis = if self.collisions.has_truth {
+        let collisions = &self.collisions;
+        let basis = if collisions.has_truth {
             "truth"
         } else {
             "states"
         };
         json!({
-            "at_s": at_s, "robots": robots, "sections": sections,
-            "collisions": collisions, "collision_count": count, "basis": basis,
+            "at_s": at_s, "robots": robots, "sections": sections, "basis": basis,
+            "collisions": collisions.listed, "collision_count": collisions.count(),
         })
     }
 
@@ -203,10 +208,9 @@ impl FleetView {
             }
         }
         for (fleet, robots) in fleets {
-            let known = robots.len() <= PAIRED_MAX;
-            if known {
-                self.collisions
-                    .look_at_states(fleet, &robots, &vehicle, at_s);
+            if robots.len() <= PAIRED_MAX {
+                let collisions = &mut self.collisions;
+                collisions.look_at_states(fleet, &robots, &vehicle, at_s);
             }
         }
     }
@@ -240,15 +244,12 @@ impl FleetView {
     }
 }
 
-fn on_path(id: u32, robot: &Robot, world: &hil_fleet::world::World) -> Option<OnPath> {
+fn on_path(id: u32, robot: &Robot, world: &World) -> Option<OnPath> {
     let (state, _) = robot.state?;
-    let is_under_way = matches!(
-        Phase::of(state.phase),
-        Some(Phase::Driving | Phase::AtPoint)
-    );
-    let path = robot
-        .path_of(state.header.mission_id)
-        .filter(|_| is_under_way)?;
+    let (Phase::Driving | Phase::AtPoint) = Phase::of(state.phase)? else {
+        return None;
+    };
+    let path = robot.path_of(state.header.mission_id)?;
     let index = usize::try_from(state.path_index).ok()?;
     let granted = granted(&state, world.paths.get(path)?).unwrap_or(index);
     Some(OnPath {
@@ -264,9 +265,7 @@ fn granted(state: &State, path: &Path) -> Option<usize> {
     match state.authority_index {
         TO_GOAL => Some(path.last_index()),
         NO_AUTHORITY => None,
-        index => usize::try_from(index)
-            .ok()
-            .map(|index| index.min(path.last_index())),
+        index => Some(usize::try_from(index).ok()?.min(path.last_index())),
     }
 }
 
@@ -292,14 +291,13 @@ fn picture_of(id: Id, robot: &Robot, scene: Option<&Scene>, now_ns: i64) -> Opti
         "path": null, "goal": null, "path_index": null, "granted_index": null,
         "last_index": null, "granted_m": null, "ahead": [], "granted": [],
     });
-    let id = robot.path_of(mission);
-    let path = id.and_then(|id| scene?.world.paths.get(id));
-    if let (Some(id), Some(path)) = (id, path) {
-        let here = usize::try_from(state.path_index)
-            .unwrap_or(0)
-            .min(path.last_index());
+    if let (Some(id), Some(scene)) = (robot.path_of(mission), scene)
+        && let Some(path) = scene.world.paths.get(id)
+    {
+        let here = usize::try_from(state.path_index).unwrap_or(0);
+        let here = here.min(path.last_index());
         let granted = granted(&state, path);
-        let route = scene.and_then(|scene| scene.world.routes.iter().find(|one| one.path == id));
+        let route = scene.world.routes.iter().find(|one| one.path == id);
         picture["path"] = json!(id.0);
         picture["goal"] = json!(route.map(|route| route.to));
         picture["path_index"] = json!(here);

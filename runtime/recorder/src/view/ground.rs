@@ -1,11 +1,13 @@
 //! The ground of a fleet, made from the run's parameters as its own processes make it: map, paths,
 //! vehicle. Planning the paths takes seconds, so it is done beside everything else.
 
-use std::sync::mpsc::{Receiver, TryRecvError, channel};
+use std::error::Error;
+use std::sync::mpsc::{Receiver, channel};
 use std::thread;
 
+use hil_core::case_study::ParameterError;
 use hil_fleet::FleetParameters;
-use hil_fleet::geometry::{Bounds, Footprint, Pose};
+use hil_fleet::geometry::{Bounds, Footprint};
 use hil_fleet::path::{Path, PathId};
 use hil_fleet::scenario::Scene;
 use serde_json::{Value, json};
@@ -29,79 +31,36 @@ pub(crate) struct Ground {
     pub(crate) map: Value,
 }
 
-/// A ground that is being made.
-#[derive(Debug)]
-pub(crate) struct Making {
-    result: Receiver<Result<Box<Ground>, String>>,
+/// Begins to make the ground of the fleet with these `[case.parameters]`; it comes, or why not.
+pub(crate) fn make(parameters: Value) -> Receiver<Result<Box<Ground>, String>> {
+    let (give, result) = channel();
+    thread::spawn(move || {
+        let made = || -> Result<Box<Ground>, Box<dyn Error>> {
+            let parameters: FleetParameters = serde_json::from_value(parameters)?;
+            let scene = parameters.world.build()?;
+            Ok(Box::new(Ground {
+                map: map(&parameters, &scene)?,
+                scene,
+                parameters,
+            }))
+        };
+        // Nobody may be there any more to take it.
+        let _is_wanted = give.send(made().map_err(|error| error.to_string())).is_ok();
+    });
+    result
 }
 
-/// What became of it.
-pub(crate) enum Made {
-    /// Not yet.
-    NotYet,
-    /// Here.
-    Ground(Box<Ground>),
-    /// It cannot be made, and why.
-    Not(String),
-}
-
-impl Making {
-    /// Begins to make the ground of the fleet with these `[case.parameters]`.
-    pub(crate) fn begin(parameters: Value) -> Self {
-        let (give, result) = channel();
-        thread::spawn(move || {
-            // Nobody may be there any more to take it.
-            let _is_wanted = give.send(make(parameters)).is_ok();
-        });
-        Self { result }
-    }
-
-    /// Looks whether it is done.
-    pub(crate) fn look(&self) -> Made {
-        match self.result.try_recv() {
-            Ok(Ok(ground)) => Made::Ground(ground),
-            Ok(Err(why)) => Made::Not(why),
-            Err(TryRecvError::Empty) => Made::NotYet,
-            Err(TryRecvError::Disconnected) => Made::Not("making the map failed".to_owned()),
-        }
-    }
-}
-
-fn make(parameters: Value) -> Result<Box<Ground>, String> {
-    let parameters: FleetParameters =
-        serde_json::from_value(parameters).map_err(|error| error.to_string())?;
-    let scene = parameters
-        .world
-        .build()
-        .map_err(|error| error.to_string())?;
-    let map = map(&parameters, &scene).map_err(|error| error.to_string())?;
-    Ok(Box::new(Ground {
-        scene,
-        parameters,
-        map,
-    }))
-}
-
-fn map(
-    parameters: &FleetParameters,
-    scene: &Scene,
-) -> Result<Value, hil_core::case_study::ParameterError> {
+fn map(parameters: &FleetParameters, scene: &Scene) -> Result<Value, ParameterError> {
     let known = parameters.world.map()?;
     let world = &scene.world;
     let vehicle = &world.vehicle.footprint;
-    let bounds = known
-        .as_ref()
-        .map_or_else(|| around(scene), |map| map.bounds);
+    let bounds = known.as_ref().map(|map| map.bounds);
     let bays = world.bays.iter().enumerate();
     let bays: Vec<_> = bays
         .map(|(id, bay)| {
-            let Pose {
-                x_m,
-                y_m,
-                heading_rad,
-            } = bay.pose;
-            json!({ "id": id, "x_m": rounded(x_m), "y_m": rounded(y_m),
-                    "heading_rad": rounded(heading_rad) })
+            let pose = bay.pose;
+            json!({ "id": id, "x_m": rounded(pose.x_m), "y_m": rounded(pose.y_m),
+                    "heading_rad": rounded(pose.heading_rad) })
         })
         .collect();
     let forward = world.routes.iter().filter(|route| route.path.0 % 2 == 0);
@@ -117,7 +76,7 @@ fn map(
     Ok(json!({
         "case": "fleet",
         "scenario": scenario,
-        "bounds": bounds,
+        "bounds": bounds.unwrap_or_else(|| around(scene)),
         "obstacles": known.map_or_else(Vec::new, |map| map.obstacles),
         "bays": bays,
         "footprint": { "length_m": vehicle.length_m, "width_m": vehicle.width_m },

@@ -7,7 +7,7 @@ use hil_watch::Record;
 use crate::net::{MessageId, MessageLatency};
 
 /// The segments of a channel over a link, in order.
-pub(crate) const LINK_SEGMENTS: [&str; 7] = [
+const LINK_SEGMENTS: [&str; 7] = [
     "published-taken by gateway",
     "taken by gateway-handed",
     "handed-TX stamp",
@@ -18,7 +18,7 @@ pub(crate) const LINK_SEGMENTS: [&str; 7] = [
 ];
 
 /// The only segment of a channel that stays in shared memory.
-pub(crate) const LOCAL_SEGMENTS: [&str; 1] = ["published-taken"];
+const LOCAL_SEGMENTS: [&str; 1] = ["published-taken"];
 
 /// What decides which lengths a channel's stamps give.
 #[derive(Debug, Clone, Copy)]
@@ -27,6 +27,17 @@ pub(crate) struct Way {
     pub(crate) has_link: bool,
     /// Stamps of both ends compare.
     pub(crate) has_one_clock: bool,
+}
+
+impl Way {
+    /// The names of its segments.
+    pub(crate) const fn segments(self) -> &'static [&'static str] {
+        if self.has_link {
+            &LINK_SEGMENTS
+        } else {
+            &LOCAL_SEGMENTS
+        }
+    }
 }
 
 /// One message on its way.
@@ -78,7 +89,7 @@ impl Joined {
     }
 
     /// Hears of each segment whose two ends are known now and were not before: its place among
-    /// [`LINK_SEGMENTS`] or [`LOCAL_SEGMENTS`], `None` for the whole way, and its length.
+    /// [`Way::segments`], `None` for the whole way, and its length.
     pub(crate) fn news(&mut self, way: Way, hear: &mut dyn FnMut(Option<usize>, i64)) {
         let one = &self.stamps;
         let mut counted = self.counted;

@@ -66,8 +66,8 @@ impl Samples {
         self.values.push_back((at_ns, value_ns));
     }
 
-    /// `p50_us`, `p99_us`, `max_us`, `count` and `is_available` of the window before `now_ns`.
-    pub(crate) fn figures(&mut self, now_ns: i64) -> Value {
+    /// `p50_us`, `p99_us`, `max_us`, `count` and `is_available` of the window before `now_ns`, as `name`.
+    pub(crate) fn figures(&mut self, name: &str, now_ns: i64) -> Value {
         let oldest_ns = now_ns - WINDOW_NS;
         while self.values.front().is_some_and(|(at, _)| *at <= oldest_ns) {
             self.values.pop_front();
@@ -77,6 +77,7 @@ impl Samples {
         let of =
             |figure: fn(&LatencySummary) -> i64| summary.as_ref().map(figure).map(microseconds);
         json!({
+            "name": name,
             "p50_us": of(|one| one.p50_ns), "p99_us": of(|one| one.p99_ns),
             "max_us": of(|one| one.max_ns),
             "count": values.len(), "is_available": self.is_available,
@@ -108,18 +109,18 @@ mod tests {
     #[test]
     fn percentiles_are_those_of_the_window() {
         let mut samples = Samples::default();
-        assert_eq!(samples.figures(0)["is_available"], false);
-        assert_eq!(samples.figures(0)["p50_us"], Value::Null);
+        assert_eq!(samples.figures("x", 0)["is_available"], false);
+        assert_eq!(samples.figures("x", 0)["p50_us"], Value::Null);
         samples.add(0, 900_000);
         for index in 1..=100 {
             samples.add(WINDOW_NS + index, index * 1000);
         }
-        let figures = samples.figures(WINDOW_NS + 200);
+        let figures = samples.figures("x", WINDOW_NS + 200);
         assert_eq!(figures["count"], 100);
         assert_eq!(figures["p50_us"], 50.0);
         assert_eq!(figures["p99_us"], 99.0);
         assert_eq!(figures["max_us"], 100.0);
-        let later = samples.figures(3 * WINDOW_NS);
+        let later = samples.figures("x", 3 * WINDOW_NS);
         assert_eq!(
             (&later["count"], &later["max_us"]),
             (&json!(0), &Value::Null)
