@@ -3,6 +3,7 @@
 use std::fs;
 use std::path::Path;
 use std::process::ExitCode;
+use std::time::Duration;
 
 use clap::{CommandFactory as _, Parser};
 use hil_platform::console::Console;
@@ -13,13 +14,15 @@ use hil_topology::documents;
 
 use crate::cli::{Cli, Command, PlayOptions, RecordOptions};
 use crate::convert::convert;
-use crate::ending::Ending;
 use crate::failure::{Exit, Failure};
 use crate::play::{PlayEnd, play};
 use crate::record::{Progress as RecordProgress, record};
 use crate::recover::{loss_words, recover};
 use crate::serve::serve;
 use crate::writer::{check_target, partial};
+
+/// How long a conversion may take to end by itself after a signal.
+const END_WITHIN: Duration = Duration::from_millis(400);
 
 /// Does what the command line of this process says, and tells the exit code.
 pub fn run() -> ExitCode {
@@ -76,7 +79,17 @@ fn convert_run(
 ) -> Result<Exit, Failure> {
     let progress = Progress::begin();
     // Much of the work is done in one piece, of a large run for seconds.
-    let ending = Ending::watch(signals, partial(output));
+    let unfinished = partial(output);
+    let ending = signals.end_program_after(END_WITHIN, move |signal| {
+        let removed = fs::remove_file(&unfinished);
+        match removed.err().filter(|_| unfinished.exists()) {
+            Some(error) => {
+                let path = unfinished.display();
+                format!("ended by {signal}; what was written so far is in {path}: {error}")
+            }
+            None => format!("ended by {signal}; no file was written"),
+        }
+    });
     let converted = convert(run, output, has_scene, &mut |share, words| {
         progress.show(console, share, words);
         signals.received()

@@ -20,7 +20,6 @@ mod conditions;
 mod convert;
 pub mod decoders;
 mod disk;
-mod ending;
 mod facts;
 mod failure;
 mod joining;

@@ -6,7 +6,6 @@ use std::time::Instant;
 
 use hil_core::message::Envelope;
 use hil_core::record::UNAVAILABLE;
-use hil_rundir::live_run::Source;
 use hil_watch::{Event, Feed, Origin, Record, Seen, WatchedChannel};
 
 use crate::channel::{Wanted, typed};
@@ -273,13 +272,7 @@ impl LiveChannel {
             written: Seen::default(),
             due: Seen::default(),
             outstanding_count: 0,
-            is_from_memory: matches!(
-                channel.source,
-                Some(Source::SharedMemory {
-                    is_forwarded: false,
-                    ..
-                })
-            ),
+            is_from_memory: channel.is_unrecorded(),
         }
     }
 

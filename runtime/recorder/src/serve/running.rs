@@ -7,11 +7,9 @@ use std::time::Duration;
 
 use hil_platform::clock::MonotonicClock;
 use hil_report::summary::RunSummary;
-use hil_rundir::live_run;
 use hil_rundir::live_run::LiveRun;
-use hil_rundir::status;
-use hil_rundir::status::Overruns;
-use hil_watch::{Event, Feed, FeedError, Origin, Poll};
+use hil_rundir::status::{self, Overruns};
+use hil_watch::{Event, Feed, FeedError, Origin, Poll, WatchedChannel};
 
 use super::engine::REST;
 use super::playback::how_ended;
@@ -61,15 +59,7 @@ impl Running {
         for channel in &mut facts.channels {
             channel.offsets_ns = [offset_ns; 2];
             let watched = feed.channel(&channel.name);
-            let source = watched.and_then(|watched| watched.source.as_ref());
-            // A foreign program keeps no records of what it publishes.
-            channel.is_by_message |= matches!(
-                source,
-                Some(live_run::Source::SharedMemory {
-                    is_forwarded: false,
-                    ..
-                })
-            );
+            channel.is_by_message |= watched.is_some_and(WatchedChannel::is_unrecorded);
         }
         let is_here = |host: &String| facts.hosts_here.contains(host);
         facts.has_one_clock = facts.hosts.iter().all(is_here) || feed.has_one_clock() == Some(true);

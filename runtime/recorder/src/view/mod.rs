@@ -11,11 +11,8 @@ mod collisions;
 pub(crate) mod facts;
 pub(crate) mod fleet;
 mod ground;
-mod join;
-mod polygon;
 mod sections;
 pub(crate) mod state;
-mod window;
 
 use hil_watch::Record;
 
