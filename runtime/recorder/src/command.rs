@@ -16,7 +16,7 @@ use crate::cli::{Cli, Command, PlayOptions, RecordOptions};
 use crate::convert::convert;
 use crate::failure::{Exit, Failure};
 use crate::play::{PlayEnd, play};
-use crate::record::{Progress as RecordProgress, record};
+use crate::record::{Progress as RecordProgress, Recorded, record};
 use crate::recover::{loss_words, recover};
 use crate::serve::serve;
 use crate::writer::{check_target, partial};
@@ -95,22 +95,35 @@ fn convert_run(
         signals.received()
     });
     drop(ending);
-    let converted = converted?;
-    for words in &converted.words {
+    let gaps = "the run's folder has gaps, see above; the file says so too";
+    tell(&converted?, "", gaps, console)
+}
+
+/// Says what was written, with `missed` behind it, and what of the run is not in it.
+fn tell(
+    recorded: &Recorded,
+    missed: &str,
+    gaps: &str,
+    console: &mut Console,
+) -> Result<Exit, Failure> {
+    for words in &recorded.words {
         console.warn(words);
     }
-    console.result(&format!(
-        "{}: {} of the run, {} in all on {}\n",
-        output.display(),
-        counted_plainly(converted.message_count, "message"),
-        converted.written_count,
-        counted_plainly(converted.topic_count as u64, "topic")
-    ));
-    if converted.has_gaps {
-        let words = "the run's folder has gaps, see above; the file says so too";
-        return Err(Failure::failed(words));
+    for (channel, count) in &recorded.missed {
+        let count = counted_plainly(*count, "message");
+        console.warn(&format!("{channel}: missed {count}"));
     }
-    Ok(Exit::Done)
+    console.result(&format!(
+        "{}, {} in all on {}{missed}\n",
+        recorded.files(),
+        recorded.written_count,
+        counted_plainly(recorded.topic_count as u64, "topic")
+    ));
+    match recorded.signal {
+        Some(_) => Ok(Exit::Interrupted),
+        None if recorded.has_gaps => Err(Failure::failed(gaps)),
+        None => Ok(Exit::Done),
+    }
 }
 
 fn record_run(
@@ -122,29 +135,9 @@ fn record_run(
         console.progress(&progress_words(progress));
         signals.received()
     })?;
-    for words in &recorded.words {
-        console.warn(words);
-    }
-    for (channel, count) in &recorded.missed {
-        let count = counted_plainly(*count, "message");
-        console.warn(&format!("{channel}: missed {count}"));
-    }
-    console.result(&format!(
-        "{}: {} of the run, {} in all on {}; missed {}\n",
-        recorded.files(),
-        counted_plainly(recorded.message_count, "message"),
-        recorded.written_count,
-        counted_plainly(recorded.topic_count as u64, "topic"),
-        recorded.missed.values().sum::<u64>()
-    ));
-    if recorded.signal.is_some() {
-        return Ok(Exit::Interrupted);
-    }
-    if recorded.has_gaps {
-        let words = "something of the run is not in the file, see above; the file says so too";
-        return Err(Failure::failed(words));
-    }
-    Ok(Exit::Done)
+    let missed = format!("; missed {}", recorded.missed.values().sum::<u64>());
+    let gaps = "something of the run is not in the file, see above; the file says so too";
+    tell(&recorded, &missed, gaps, console)
 }
 
 fn progress_words(progress: &RecordProgress<'_>) -> String {

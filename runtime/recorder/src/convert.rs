@@ -1,6 +1,7 @@
 //! A finished run's folder as one recording. Everything is put on one axis of time, the instants of
 //! publication; what each topic looks like is decided in the modules it calls.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::thread;
 use std::time::Duration;
@@ -9,33 +10,18 @@ use hil_core::message::Envelope;
 use hil_link::condition::LinkConditionRecord;
 use hil_rundir::record::{RecordFile, RecordKind};
 
-use crate::channel::{Typed, Wanted, typed};
 use crate::clocks::Clocks;
 use crate::facts;
 use crate::failure::Failure;
 use crate::net::{self, MessageLatency};
+use crate::record::Recorded;
 use crate::run::Run;
-use crate::run_topics::{Plan, RunTopics, What};
+use crate::run_topics::{Plan, RunTopics, Wanted, What};
 use crate::scene::Scene;
 use crate::writer::{Recording, WriteError};
 
 /// How often it looks whether something that takes its time is done.
 const PAUSE: Duration = Duration::from_millis(20);
-
-/// What a conversion came to.
-#[derive(Debug)]
-pub(crate) struct Converted {
-    /// Messages in the file, of all topics.
-    pub(crate) written_count: u64,
-    /// Messages of the run's own channels among them.
-    pub(crate) message_count: u64,
-    /// Topics.
-    pub(crate) topic_count: usize,
-    /// What of the run is not in it.
-    pub(crate) has_gaps: bool,
-    /// The same in words, and what else a reader must know.
-    pub(crate) words: Vec<String>,
-}
 
 /// Converts the run at `from` to the file `to`, with its scene if that is wanted; `look` hears how
 /// far it is, in words, and gives the signal that came.
@@ -47,7 +33,7 @@ pub(crate) fn convert(
     to: &Path,
     has_scene: bool,
     look: &mut dyn FnMut(Option<f64>, &str) -> Option<&'static str>,
-) -> Result<Converted, Failure> {
+) -> Result<Recorded, Failure> {
     let mut stopped = None;
     let mut run = Run::read(from, &mut |share, path| {
         stopped = look(Some(share), &format!("reading {path}"));
@@ -63,7 +49,12 @@ pub(crate) fn convert(
     let wanted = recorded.iter().map(|name| Wanted {
         name,
         described: run.described(name),
-        typed: typed_as_recorded(&run, name),
+        recorded_bytes: run
+            .files
+            .iter()
+            .filter(|file| is_of(file, name, RecordKind::Message))
+            .map(|file| (file.header.record_bytes as usize).saturating_sub(size_of::<Envelope>()))
+            .collect(),
     });
     let mut topics = RunTopics::new(wanted.collect(), run.topology(), has_scene);
     let latencies = declare(&run, &clocks, &mut topics, &mut recording)?;
@@ -103,12 +94,15 @@ pub(crate) fn convert(
         let why = channel.untyped()?;
         Some(format!("{}: kept as bytes: {why}", channel.name))
     }));
-    Ok(Converted {
+    Ok(Recorded {
+        paths: vec![to.to_owned()],
         topic_count: recording.topic_count(),
         written_count: recording.finish()?,
         message_count: topics.counts.message_count,
-        has_gaps: run.gaps.is_any(),
+        missed: BTreeMap::new(),
         words,
+        has_gaps: run.gaps.is_any(),
+        signal: None,
     })
 }
 
@@ -205,28 +199,6 @@ fn plan(run: &Run, clocks: &Clocks, topics: &RunTopics, latencies: &[Vec<Message
     });
     plan.items.sort_unstable();
     plan
-}
-
-/// How the messages of a channel are written, if their size in the record files is that of the
-/// manifest.
-fn typed_as_recorded(run: &Run, channel: &str) -> Typed {
-    let described = run.described(channel);
-    if let Some(one) = described {
-        let mut files = run.files.iter();
-        let expected = one.size_bytes.saturating_add(size_of::<Envelope>());
-        let other = files.find(|file| {
-            is_of(file, channel, RecordKind::Message)
-                && file.header.record_bytes as usize != expected
-        });
-        if let Some(other) = other {
-            let (message, size) = (&one.message, one.size_bytes);
-            let found = (other.header.record_bytes as usize).saturating_sub(size_of::<Envelope>());
-            return Err(format!(
-                "{message} has {size} bytes by the manifest, and {found} by its record file"
-            ));
-        }
-    }
-    typed(described)
 }
 
 fn is_of(file: &RecordFile, channel: &str, kind: RecordKind) -> bool {

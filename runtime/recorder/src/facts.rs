@@ -1,14 +1,12 @@
 //! What a recording says of its run beside the messages: what ran, on what, by which clocks, and what
 //! is missing. Names and keys are in `docs/recordings.md`; all values are text.
 
-use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fs;
 
 use hil_arm::yumi::description::Urdf;
 use hil_rundir::manifest::Manifest;
 use hil_rundir::run_folder::RunFolder;
-use mcap::Attachment;
 use serde_json::Value;
 
 use crate::clocks::{self, Clocks};
@@ -168,13 +166,8 @@ pub(crate) fn attach_robot<'a>(
     if !messages.into_iter().any(is_of_arms) {
         return Ok(());
     }
-    recording.attach(&Attachment {
-        log_time: 0,
-        create_time: 0,
-        name: "yumi.urdf".to_owned(),
-        media_type: "application/xml".to_owned(),
-        data: Cow::Owned(Urdf.to_string().into_bytes()),
-    })
+    let urdf = Urdf.to_string().into_bytes();
+    recording.attach_file("yumi.urdf", "application/xml", urdf)
 }
 
 /// Report and figures as they are: whoever has only this file has them too.
@@ -191,13 +184,7 @@ pub(crate) fn attach(recording: &mut Recording, folder: &RunFolder) -> Result<()
         // A killed run lacks some of them, which the metadata say.
         let Ok(data) = fs::read(&path) else { continue };
         let name = path.file_name().unwrap_or_default().to_string_lossy();
-        recording.attach(&Attachment {
-            log_time: 0,
-            create_time: 0,
-            name: name.into_owned(),
-            media_type: media_type.to_owned(),
-            data: Cow::Owned(data),
-        })?;
+        recording.attach_file(&name, media_type, data)?;
     }
     Ok(())
 }

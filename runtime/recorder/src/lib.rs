@@ -2,7 +2,7 @@
 //! program of its own so that the real-time binary carries none of what this needs.
 //!
 //! Read in this order: `run` and `clocks`, what there is and when it was; `schema` and
-//! `codec`, what a message looks like; `topics`, `net`, `channel` and `run_topics`, what is made of it;
+//! `codec`, what a message looks like; `topics`, `net` and `run_topics`, what is made of it;
 //! `writer`, the file; `convert`, all of them together. While a run goes, `live` makes the same topics of
 //! its events for any `sink`, and `record` puts them into files; `pace` keeps it out of the run's
 //! way. `scan` reads files as far as their `lengths` hold, for `recover`; `play` feeds what `codec`
@@ -11,7 +11,6 @@
 //! The program is [`run()`]; nothing else is for other crates but [`decoders`], for tests.
 #![forbid(unsafe_code)]
 
-mod channel;
 mod cli;
 mod clocks;
 mod codec;

@@ -8,12 +8,11 @@ use hil_core::message::Envelope;
 use hil_core::record::UNAVAILABLE;
 use hil_watch::{Event, Feed, Origin, Record, Seen, WatchedChannel};
 
-use crate::channel::{Wanted, typed};
 use crate::clocks::LiveClocks;
 use crate::joining::Joining;
 use crate::net::MessageLatency;
 use crate::run::Run;
-use crate::run_topics::{Drawn, Plan, RunTopics};
+use crate::run_topics::{Drawn, Plan, RunTopics, Wanted};
 use crate::sink::Sink;
 
 /// What is known of one channel while its run goes.
@@ -46,13 +45,10 @@ impl LiveTopics {
     /// Names the topics of a run; they appear with their first message. Without a scene, what it takes
     /// to draw one is not worked out.
     pub(crate) fn of(feed: &Feed, has_scene: bool) -> Self {
-        let wanted = feed.channels().map(|channel| {
-            let described = Some(&channel.description);
-            Wanted {
-                name: &channel.description.name,
-                described,
-                typed: typed(described),
-            }
+        let wanted = feed.channels().map(|channel| Wanted {
+            name: &channel.description.name,
+            described: Some(&channel.description),
+            recorded_bytes: Vec::new(),
         });
         let names = feed.channels().map(|one| one.description.name.clone());
         Self {

@@ -7,6 +7,7 @@ use std::path::PathBuf;
 use std::thread;
 use std::time::{Duration, Instant};
 
+use hil_platform::words::counted_plainly;
 use hil_rundir::live_run::LiveRun;
 use hil_rundir::select::{SelectError, select, select_below};
 use hil_watch::{Event, Feed, Poll};
@@ -38,7 +39,7 @@ const GROUND_PAUSE: Duration = Duration::from_millis(20);
 /// Problems that the file tells in words; further ones are counted.
 const PROBLEMS_MAX: usize = 1000;
 
-/// What a recording came to.
+/// What a recording, of a run that goes or of a folder, came to.
 #[derive(Debug)]
 pub(crate) struct Recorded {
     /// The files, in order.
@@ -60,10 +61,12 @@ pub(crate) struct Recorded {
 }
 
 impl Recorded {
-    /// The files, in one line.
+    /// The files, and what is in them.
     pub(crate) fn files(&self) -> String {
         let paths = self.paths.iter().map(|path| path.display().to_string());
-        paths.collect::<Vec<_>>().join(", ")
+        let paths = paths.collect::<Vec<_>>().join(", ");
+        let messages = counted_plainly(self.message_count, "message");
+        format!("{paths}: {messages} of the run")
     }
 }
 
@@ -100,8 +103,8 @@ pub(crate) fn record(options: &RecordOptions, look: Look<'_>) -> Result<Recorded
         feed.skip_to_now();
     }
     let files = Files::begin(&target, split_bytes, force)?;
-    let topics = LiveTopics::of(&feed, !options.no_scene);
-    let mut recording = LiveRecording::begin(feed, topics, files)?;
+    let live = LiveTopics::of(&feed, !options.no_scene);
+    let mut recording = LiveRecording::begin(feed, live, files)?;
     let signal = recording.run(options.flush, look)?;
     recording.finish(signal)
 }
@@ -154,7 +157,7 @@ impl Problems {
 
 struct LiveRecording {
     feed: Feed,
-    topics: LiveTopics,
+    live: LiveTopics,
     files: Files,
     /// All records of the run have come.
     is_silent: bool,
@@ -165,9 +168,9 @@ struct LiveRecording {
 }
 
 impl LiveRecording {
-    fn begin(feed: Feed, topics: LiveTopics, files: Files) -> Result<Self, WriteError> {
+    fn begin(feed: Feed, live: LiveTopics, files: Files) -> Result<Self, WriteError> {
         let mut recording = Self {
-            topics,
+            live,
             feed,
             files,
             is_silent: false,
@@ -191,7 +194,7 @@ impl LiveRecording {
             let polled = self.poll()?;
             let now = Instant::now();
             if polled != Poll::Busy {
-                self.topics.settle(now, &mut self.files)?;
+                self.live.settle(now, &mut self.files)?;
             }
             // What was there before the recorder is not to wait for its first period.
             let is_abreast = polled == Poll::Idle && !has_caught_up;
@@ -208,7 +211,7 @@ impl LiveRecording {
             }
             let since_told = now.duration_since(told);
             if since_told >= PROGRESS_PERIOD {
-                let count = self.topics.topics.counts.message_count;
+                let count = self.live.topics.counts.message_count;
                 let rate_hz = (count - told_count) as f64 / since_told.as_secs_f64();
                 (told, told_count) = (now, count);
                 if let Some(signal) = look(&self.progress(rate_hz)) {
@@ -223,7 +226,7 @@ impl LiveRecording {
     }
 
     fn progress(&self, rate_hz: f64) -> Progress<'_> {
-        let missed = self.topics.missed(&self.feed, false);
+        let missed = self.live.missed(&self.feed, false);
         Progress {
             run: &self.feed.run().name,
             rate_hz,
@@ -234,7 +237,7 @@ impl LiveRecording {
     }
 
     fn poll(&mut self) -> Result<Poll, WriteError> {
-        self.topics.clocks.learn(self.feed.has_one_clock());
+        self.live.clocks.learn(self.feed.has_one_clock());
         let mut failed = None;
         let polled = self.feed.poll(&mut |event| {
             match &event {
@@ -244,7 +247,7 @@ impl LiveRecording {
                 Event::Message { .. } | Event::Record { .. } => {}
             }
             if failed.is_none() {
-                failed = self.topics.take(&event, &mut self.files).err();
+                failed = self.live.take(&event, &mut self.files).err();
             }
         });
         failed.map_or(Ok(polled), Err)
@@ -257,7 +260,7 @@ impl LiveRecording {
         while polled == Poll::Busy {
             polled = self.poll()?;
         }
-        self.topics.flush_joins(&mut self.files)?;
+        self.live.flush_joins(&mut self.files)?;
         Ok(polled)
     }
 
@@ -272,10 +275,10 @@ impl LiveRecording {
     fn finish(mut self, signal: Option<&'static str>) -> Result<Recorded, Failure> {
         // A run may be over before the ground of its fleet was made.
         let since = Instant::now();
-        while !self.topics.is_scene_ready() && since.elapsed() < GROUND_WITHIN {
+        while !self.live.is_scene_ready() && since.elapsed() < GROUND_WITHIN {
             thread::sleep(GROUND_PAUSE);
         }
-        if let Some(scene) = &mut self.topics.topics.scene {
+        if let Some(scene) = &mut self.live.topics.scene {
             scene.finish(&mut self.files)?;
             for problem in scene.problems() {
                 self.problems.note(&problem);
@@ -287,7 +290,7 @@ impl LiveRecording {
             if let Err(error) = run.read_traces() {
                 run.gaps.leave_out(error.to_string());
             }
-            self.topics.conclude(&run, &mut self.files)?;
+            self.live.conclude(&run, &mut self.files)?;
         }
         let how = match signal {
             Some(signal) => format!("the recorder was ended by {signal}, the run went on"),
@@ -301,8 +304,8 @@ impl LiveRecording {
         }
         self.files.open().describe("hil.end", end)?;
         facts::attach(self.files.open(), &run.folder)?;
-        let counts = self.topics.topics.counts;
-        let missed = self.topics.missed(&self.feed, self.is_silent);
+        let counts = self.live.topics.counts;
+        let missed = self.live.missed(&self.feed, self.is_silent);
         let mut words = self.problems.words.clone();
         if self.has_summary {
             words.extend(run.gaps.words.iter().cloned());
@@ -332,38 +335,38 @@ impl LiveRecording {
             "exit_reason".to_owned(),
             "recorded while it went".to_owned(),
         );
-        self.told_clocks = self.topics.clocks.words();
+        self.told_clocks = self.live.clocks.words();
         let file = self.files.open();
         file.describe("hil.clocks", self.told_clocks.clone())?;
         file.describe("hil.run", words)?;
         facts::describe_manifest(file, self.feed.manifest())?;
-        facts::attach_robot(file, self.topics.topics.messages())
+        facts::attach_robot(file, self.live.topics.messages())
     }
 
     /// What was recorded so far, at the end of each file.
     fn describe_recording(&mut self, how: &str) -> Result<(), WriteError> {
-        let counts = self.topics.topics.counts;
+        let counts = self.live.topics.counts;
         let numbers = [
             ("file_number", self.files.number() as u64),
             ("message_count", counts.message_count),
             ("misfit_message_count", counts.misfit_count),
             ("timeless_record_count", counts.timeless_count),
-            ("late_record_count", self.topics.late_count()),
-            ("unordered_latency_count", self.topics.unordered_count()),
+            ("late_record_count", self.live.late_count()),
+            ("unordered_latency_count", self.live.unordered_count()),
             ("problem_count", self.problems.count),
         ];
-        let names = &self.topics.topics.names;
+        let names = &self.live.topics.names;
         let mut words = facts::recording_words(&numbers, &self.problems.words, names);
         words.insert("mode".to_owned(), "live".to_owned());
         words.insert("ended".to_owned(), how.to_owned());
-        for (channel, count) in self.topics.missed(&self.feed, self.is_silent) {
+        for (channel, count) in self.live.missed(&self.feed, self.is_silent) {
             words.insert(format!("missed {channel}"), count.to_string());
         }
-        for (channel, count) in self.topics.earlier(&self.feed) {
+        for (channel, count) in self.live.earlier(&self.feed) {
             words.insert(format!("before {channel}"), count.to_string());
         }
-        let clocks = self.topics.clocks.words();
-        let channels = self.topics.topics.channel_words();
+        let clocks = self.live.clocks.words();
+        let channels = self.live.topics.channel_words();
         let file = self.files.open();
         // Offsets of other clocks come with the last records.
         if clocks != self.told_clocks {

@@ -14,8 +14,9 @@ use hil_rundir::record::RecordKind;
 use hil_rundir::record::file::RecordHeader;
 use serde_json::json;
 
-use crate::convert::{Converted, convert};
+use crate::convert::convert;
 use crate::failure::{Exit, Failure};
+use crate::record::Recorded;
 use crate::recover::{Recovered, recover};
 use crate::scan::scan;
 
@@ -76,7 +77,7 @@ impl Folder {
         fs::write(self.at("run/manifest.json"), manifest.to_string()).unwrap();
     }
 
-    fn convert(&self) -> Result<Converted, Failure> {
+    fn convert(&self) -> Result<Recorded, Failure> {
         convert(&self.at("run"), &self.at("run.mcap"), true, &mut |_, _| {
             None
         })

@@ -4,18 +4,13 @@
 //! one as far as the same messages reached it in time: not those that only another host has, and not
 //! those before it began.
 
-mod arms;
-mod fleet;
-mod shapes;
+mod draw;
 #[cfg(test)]
 mod tests;
 
 use std::collections::BTreeMap;
 
-use foxglove::messages::{
-    FrameTransforms, SceneEntity, SceneEntityDeletion, SceneUpdate, Timestamp,
-    scene_entity_deletion,
-};
+use foxglove::messages::{FrameTransforms, SceneUpdate};
 use hil_arm::egm::messages::{EgmCommand, EgmFeedback};
 use hil_core::message::Message;
 use hil_fleet::messages::{Mission, State, Truth};
@@ -84,14 +79,11 @@ struct Waiting {
 pub(crate) struct Scene {
     fleet: Option<FleetView>,
     arms: ArmsView,
-    /// `/live/map`, once it is known.
-    map: Option<Value>,
     moving: Topic,
     ground: Topic,
     frames: Topic,
     /// The first message's time.
     origin_ns: Option<u64>,
-    newest_ns: u64,
     next_ns: u64,
     ground_due_ns: u64,
     picture_count: u64,
@@ -123,12 +115,10 @@ impl Scene {
         Self {
             fleet: is_fleet.then(|| FleetView::new(parameters)),
             arms: ArmsView::new(),
-            map: None,
             moving,
             ground,
             frames: Topic::new(frames, well_known::<FrameTransforms>(), &[]),
             origin_ns: None,
-            newest_ns: 0,
             next_ns: 0,
             ground_due_ns: 0,
             picture_count: 0,
@@ -145,10 +135,8 @@ impl Scene {
         let Some(fleet) = &mut self.fleet else {
             return true;
         };
-        if self.map.is_none() {
-            self.map = fleet.new_map();
-        }
-        self.map.is_some() || fleet.problem.is_some()
+        fleet.new_map();
+        fleet.map().is_some() || fleet.problem.is_some()
     }
 
     /// True while the ground is being made that messages wait for.
@@ -220,7 +208,6 @@ impl Scene {
             self.ground_due_ns = heard.at_ns;
         }
         self.draw_until(heard.at_ns, sink)?;
-        self.newest_ns = self.newest_ns.max(heard.at_ns);
         let at_ns = signed(heard.at_ns);
         if is_fleets {
             if let Some(fleet) = &mut self.fleet {
@@ -341,25 +328,25 @@ impl Scene {
                 && let Some(size) = fleet.vehicle_size_m()
             {
                 let picture = fleet.picture(now_ns, origin_ns);
-                let update = fleet::moving(&picture, size, time);
+                let update = draw::moving(&picture, size, time);
                 self.moving.write(sink, stamp, &update.encode_to_vec())?;
                 self.picture_count += 1;
             }
         } else if self.arms.is_known() {
             let picture = self.arms.picture(now_ns, origin_ns);
-            let update = arms::shapes(&picture, time);
+            let update = draw::arms(&picture, time);
             self.moving.write(sink, stamp, &update.encode_to_vec())?;
-            let frames = arms::transforms(&picture, time);
+            let frames = draw::transforms(&picture, time);
             self.frames.write(sink, stamp, &frames.encode_to_vec())?;
             self.picture_count += 1;
         }
         if at_ns >= self.ground_due_ns
-            && let Some(map) = &self.map
+            && let Some(map) = self.fleet.as_ref().and_then(FleetView::map)
         {
             self.ground_due_ns = at_ns.saturating_add(GROUND_PERIOD_NS);
             let stamp = Stamp::new(at_ns, self.ground_count);
             self.ground_count += 1;
-            let update = fleet::ground(map, time);
+            let update = draw::ground(map, time);
             self.ground.write(sink, stamp, &update.encode_to_vec())?;
         }
         Ok(())
@@ -368,17 +355,4 @@ impl Scene {
 
 fn signed(at_ns: u64) -> i64 {
     i64::try_from(at_ns).unwrap_or(i64::MAX)
-}
-
-/// A whole picture: it takes the place of all that the topic showed before, so that any one message
-/// of a file is enough to see the scene.
-fn entire(entities: Vec<SceneEntity>, at: Timestamp) -> SceneUpdate {
-    SceneUpdate {
-        deletions: vec![SceneEntityDeletion {
-            timestamp: Some(at),
-            r#type: scene_entity_deletion::Type::All.into(),
-            id: String::new(),
-        }],
-        entities,
-    }
 }

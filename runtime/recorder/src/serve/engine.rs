@@ -9,9 +9,10 @@ use hil_platform::console::Console;
 use serde_json::{Value, json};
 
 use super::parameters::Links;
-use super::recording::{Recording, Target};
+use super::recording::Recording;
 use super::source::{Progress, Source, Warning};
 use super::viewers::Viewers;
+use crate::cli::RecordOptions;
 use crate::view::Body;
 use crate::view::fleet::{FleetView, MANY_ROBOTS};
 use crate::view::state::RunState;
@@ -77,7 +78,7 @@ pub(crate) struct Engine {
     /// Parameters as they were told last.
     told: Vec<Parameter>,
     /// Where what is shown is recorded, and the recording.
-    target: Option<Target>,
+    target: Option<RecordOptions>,
     recording: Option<Recording>,
     /// Recordings that were begun.
     recorded_count: usize,
@@ -88,7 +89,7 @@ pub(crate) struct Engine {
 
 impl Engine {
     /// Nothing is shown yet.
-    pub(crate) fn new(viewers: Viewers, links: Links, target: Option<Target>) -> Self {
+    pub(crate) fn new(viewers: Viewers, links: Links, target: Option<RecordOptions>) -> Self {
         Self {
             shown: None,
             viewers,
@@ -104,7 +105,6 @@ impl Engine {
 
     /// From now on shows this run.
     pub(crate) fn show(&mut self, shown: Shown, console: &mut Console) {
-        self.viewers.forget();
         let words = self.viewers.offer(&shown.state.facts);
         for words in words.unwrap_or_else(|error| vec![error.to_string()]) {
             console.warn(&words);
@@ -158,7 +158,7 @@ impl Engine {
         let Some(shown) = &mut self.shown else {
             let now_ns = realtime_ns();
             if is_due(&mut due.run, RUN_PERIOD) {
-                let run = waiting(viewers.count());
+                let run = waiting(viewers.server.client_count());
                 viewers.live("/live/run", now_ns, run);
             }
             viewers.welcome(now_ns);
@@ -197,7 +197,7 @@ impl Engine {
             }
         }
         if let Some(map) = state.fleet.as_mut().and_then(FleetView::new_map) {
-            viewers.live("/live/map", now_ns, map);
+            viewers.live("/live/map", now_ns, json!(map));
         }
         // After the end the last picture stays, the one with what came in the last look.
         if !is_over {
@@ -207,7 +207,7 @@ impl Engine {
             if let Some(recording) = &mut self.recording {
                 recording.look(console);
             }
-            let mut run = words(shown, &self.links, viewers.count(), now_ns);
+            let mut run = words(shown, &self.links, viewers.server.client_count(), now_ns);
             let file = self.recording.as_ref().map(|recording| &recording.path);
             run["recorder"]["file"] = json!(file);
             viewers.live("/live/run", now_ns, run);
@@ -233,10 +233,12 @@ fn pictures(state: &mut RunState, viewers: &mut Viewers, due: &mut Due, now_ns: 
         && let Some(origin_ns) = state.origin_ns
     {
         if let Some(fleet) = &mut state.fleet {
-            viewers.live("/live/fleet", now_ns, fleet.picture(now_ns, origin_ns));
+            let picture = json!(fleet.picture(now_ns, origin_ns));
+            viewers.live("/live/fleet", now_ns, picture);
         }
         if state.arms.is_known() {
-            viewers.live("/live/arms", now_ns, state.arms.picture(now_ns, origin_ns));
+            let picture = json!(state.arms.picture(now_ns, origin_ns));
+            viewers.live("/live/arms", now_ns, picture);
         }
     }
     if is_due(&mut due.channels, CHANNELS_PERIOD) {

@@ -8,9 +8,7 @@ mod front;
 mod head;
 mod page;
 mod parameters;
-mod playback;
 mod recording;
-mod running;
 mod source;
 mod viewers;
 
@@ -31,7 +29,7 @@ use hil_rundir::run_folder::RunFolder;
 use hil_rundir::select::{SelectError, select};
 use tokio::runtime::Runtime;
 
-use crate::cli::ServeOptions;
+use crate::cli::{RecordOptions, ServeOptions};
 use crate::failure::{Exit, Failure};
 use crate::split::prepare;
 use crate::view::state::RunState;
@@ -39,11 +37,11 @@ use access::{Access, NO_ORIGIN, Refusal};
 use engine::{Engine, Showing, Shown};
 use front::{Door, Front, GONE_AFTER};
 use parameters::Links;
-use playback::Playback;
-use recording::Target;
-use running::Running;
+use source::{Playback, Running};
 use viewers::Viewers;
 
+/// What a kill may lose at most of a recording.
+const FLUSH: Duration = Duration::from_secs(1);
 /// Between two looks for a run that begins.
 const WAIT_PERIOD: Duration = Duration::from_millis(300);
 
@@ -76,9 +74,17 @@ pub(crate) fn serve(
         .map_err(|error| Failure::failed(format!("cannot begin: {error}")))?;
     let access = Arc::new(admitted(options));
     let (viewers, front) = open(options, &runtime, &links, &access, console)?;
-    let target = options.record.clone().map(|path| Target {
-        path,
-        has_scene: !options.no_scene,
+    let target = options.record.clone().map(|output| RecordOptions {
+        run: None,
+        output,
+        wait: false,
+        below: None,
+        from_now: false,
+        split_size: None,
+        flush: FLUSH,
+        force: false,
+        no_scene: options.no_scene,
+        folder: None,
     });
     let mut engine = Engine::new(viewers, links, target);
     match shown {

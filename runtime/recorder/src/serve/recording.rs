@@ -5,27 +5,13 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
-use std::time::Duration;
 
 use hil_platform::console::Console;
-use hil_platform::words::counted_plainly;
 
 use crate::cli::RecordOptions;
 use crate::failure::Failure;
 use crate::record::{Recorded, record};
 use crate::split::another;
-
-/// What a kill may lose at most.
-const FLUSH: Duration = Duration::from_secs(1);
-
-/// Where what is shown is recorded, and how.
-#[derive(Debug, Clone)]
-pub(super) struct Target {
-    /// The file, or the folder that files are written into.
-    pub(super) path: PathBuf,
-    /// Draw the scene.
-    pub(super) has_scene: bool,
-}
 
 /// A run that is being recorded.
 #[derive(Debug)]
@@ -39,21 +25,14 @@ pub(super) struct Recording {
 }
 
 impl Recording {
-    /// Records the run in `folder`, the `number`th that this server records, from its first message on. Its name would not do: two runs may
-    /// bear one.
-    pub(super) fn begin(folder: &Path, target: &Target, number: usize) -> Self {
-        let path = another(&target.path, number);
+    /// Records the run in `folder`, the `number`th that this server records, from its first message on,
+    /// to `target`. Its name would not do: two runs may bear one.
+    pub(super) fn begin(folder: &Path, target: &RecordOptions, number: usize) -> Self {
+        let path = another(&target.output, number);
         let options = RecordOptions {
-            run: None,
             folder: Some(folder.to_owned()),
             output: path.clone(),
-            wait: false,
-            below: None,
-            from_now: false,
-            split_size: None,
-            flush: FLUSH,
-            force: false,
-            no_scene: !target.has_scene,
+            ..target.clone()
         };
         let stop = Arc::new(AtomicBool::new(false));
         let is_stopped = Arc::clone(&stop);
@@ -100,9 +79,8 @@ impl Recording {
                     console.warn(words);
                 }
                 console.say(&format!(
-                    "{}: {} of the run; missed {}",
+                    "{}; missed {}",
                     recorded.files(),
-                    counted_plainly(recorded.message_count, "message"),
                     recorded.missed.values().sum::<u64>()
                 ));
             }

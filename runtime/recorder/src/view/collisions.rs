@@ -7,6 +7,7 @@ use hil_core::time::Instant;
 use hil_fleet::geometry::{Footprint, Pose};
 use hil_fleet::messages::Truth;
 use hil_fleet::referee::{Referee, SCAN_PERIOD};
+use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::ground::Ground;
@@ -19,6 +20,19 @@ const WAITING_MAX: usize = 200_000;
 /// Collisions listed.
 const LISTED_MAX: usize = 100;
 
+/// A collision.
+#[derive(Debug, Clone, Serialize)]
+pub(crate) struct Collision {
+    pub(crate) at_s: f64,
+    pub(crate) fleet: u32,
+    pub(crate) robots: [u32; 2],
+    pub(crate) x_m: f64,
+    pub(crate) y_m: f64,
+    /// `truth` or `states`.
+    pub(crate) basis: &'static str,
+    pub(crate) kind: Value,
+}
+
 /// Finds collisions.
 #[derive(Debug, Default)]
 pub(crate) struct Collisions {
@@ -30,7 +44,7 @@ pub(crate) struct Collisions {
     known_count: usize,
     overlapping: BTreeSet<(u32, u32, u32)>,
     /// The last of them.
-    pub(crate) listed: VecDeque<Value>,
+    pub(crate) listed: VecDeque<Collision>,
     count: u64,
     /// Collisions are those of the robots' true motion.
     pub(crate) has_truth: bool,
@@ -74,15 +88,16 @@ impl Collisions {
         }
         self.next = Some(at);
         let incidents = referee.incidents();
-        let news = incidents[self.known_count..].iter().map(|one| {
-            json!({
-                "at_s": seconds(one.at.as_ns() - origin_ns),
-                "fleet": one.fleet_id, "robots": one.robots,
-                "x_m": rounded(one.position_m[0]), "y_m": rounded(one.position_m[1]),
-                "basis": "truth", "kind": one.kind,
-            })
+        let news = incidents[self.known_count..].iter().map(|one| Collision {
+            at_s: seconds(one.at.as_ns() - origin_ns),
+            fleet: one.fleet_id,
+            robots: one.robots,
+            x_m: rounded(one.position_m[0]),
+            y_m: rounded(one.position_m[1]),
+            basis: "truth",
+            kind: json!(one.kind),
         });
-        let news: Vec<Value> = news.collect();
+        let news: Vec<Collision> = news.collect();
         self.known_count = incidents.len();
         news.into_iter().for_each(|one| self.list(one));
     }
@@ -107,18 +122,21 @@ impl Collisions {
                 if !is_overlap {
                     self.overlapping.remove(&key);
                 } else if self.overlapping.insert(key) {
-                    self.list(json!({
-                        "at_s": at_s, "fleet": fleet, "robots": [one, other],
-                        "x_m": rounded(0.5 * (pose.x_m + there.x_m)),
-                        "y_m": rounded(0.5 * (pose.y_m + there.y_m)),
-                        "basis": "states", "kind": "overlap",
-                    }));
+                    self.list(Collision {
+                        at_s,
+                        fleet,
+                        robots: [*one, *other],
+                        x_m: rounded(0.5 * (pose.x_m + there.x_m)),
+                        y_m: rounded(0.5 * (pose.y_m + there.y_m)),
+                        basis: "states",
+                        kind: json!("overlap"),
+                    });
                 }
             }
         }
     }
 
-    fn list(&mut self, one: Value) {
+    fn list(&mut self, one: Collision) {
         self.count += 1;
         if self.listed.len() == LISTED_MAX {
             self.listed.pop_front();

@@ -63,12 +63,6 @@ impl ChannelFacts {
     pub(crate) fn message(&self) -> Option<&str> {
         self.described.as_ref().map(|one| one.message.as_str())
     }
-
-    /// False where the manifest says that nobody takes its messages: they are recorded only.
-    pub(crate) fn is_taken(&self) -> bool {
-        let described = self.described.as_ref();
-        described.is_none_or(|one| one.to_host.is_some())
-    }
 }
 
 /// A link.

@@ -1,6 +1,6 @@
 //! The fleet as its messages tell of it: where each robot last was, how far it may go, who waits.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::sync::mpsc::{Receiver, TryRecvError};
 
 use hil_core::message::Message;
@@ -9,11 +9,12 @@ use hil_fleet::messages::{Mission, NO_AUTHORITY, Phase, State, TO_GOAL, Truth};
 use hil_fleet::path::{Path, PathId};
 use hil_fleet::scenario::Scene;
 use hil_fleet::world::World;
-use serde_json::{Value, json};
+use serde::Serialize;
+use serde_json::Value;
 
-use super::collisions::Collisions;
-use super::ground::{self, Ground, points};
-use super::sections::{Areas, OnPath, of_pair};
+use super::collisions::{Collision, Collisions};
+use super::ground::{self, Ground, MapPicture, points};
+use super::sections::{Areas, OnPath, Point, SectionPicture, of_pair};
 use super::{rounded, seconds};
 use crate::topics::read;
 
@@ -29,6 +30,42 @@ const PAIRED_MAX: usize = 64;
 const SECTIONS_MAX: usize = 400;
 /// Robots shown at all: a damaged record must not fill the memory.
 const ROBOTS_MAX: usize = 64 * 448;
+
+/// `/live/fleet`.
+#[derive(Debug, Serialize)]
+pub(crate) struct FleetPicture {
+    pub(crate) at_s: f64,
+    pub(crate) robots: Vec<RobotPicture>,
+    /// `None` where the ground is not known, or a fleet is too large to look at its pairs.
+    pub(crate) sections: Option<Vec<SectionPicture>>,
+    pub(crate) collisions: VecDeque<Collision>,
+    collision_count: Option<u64>,
+    basis: &'static str,
+}
+
+/// A robot of it.
+#[derive(Debug, Serialize)]
+pub(crate) struct RobotPicture {
+    pub(crate) fleet: u32,
+    pub(crate) id: u32,
+    pub(crate) x_m: f64,
+    pub(crate) y_m: f64,
+    pub(crate) heading_rad: f64,
+    speed_mps: f64,
+    pub(crate) age_s: f64,
+    pub(crate) is_stale: bool,
+    pub(crate) phase: &'static str,
+    pub(crate) is_waiting: bool,
+    mission: Option<u32>,
+    path: Option<u32>,
+    goal: Option<usize>,
+    path_index: Option<usize>,
+    granted_index: Option<usize>,
+    last_index: Option<usize>,
+    granted_m: Option<f64>,
+    pub(crate) ahead: Vec<Point>,
+    pub(crate) granted: Vec<Point>,
+}
 
 /// Which robot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -141,7 +178,7 @@ impl FleetView {
     }
 
     /// Looks whether the ground has been made; the map, the first time.
-    pub(crate) fn new_map(&mut self) -> Option<Value> {
+    pub(crate) fn new_map(&mut self) -> Option<&MapPicture> {
         match self.making.as_ref()?.try_recv() {
             Err(TryRecvError::Empty) => return None,
             Err(TryRecvError::Disconnected) => {
@@ -155,7 +192,12 @@ impl FleetView {
             }
         }
         self.making = None;
-        self.ground.as_ref().map(|ground| ground.map.clone())
+        self.map()
+    }
+
+    /// `/live/map`, once it is known.
+    pub(crate) fn map(&self) -> Option<&MapPicture> {
+        self.ground.as_ref().map(|ground| &ground.map)
     }
 
     /// Length and width of a vehicle, metres.
@@ -170,7 +212,7 @@ impl FleetView {
     }
 
     /// `/live/fleet` at `now_ns`; `origin_ns` is the run's beginning, both on the axis.
-    pub(crate) fn picture(&mut self, now_ns: i64, origin_ns: i64) -> Value {
+    pub(crate) fn picture(&mut self, now_ns: i64, origin_ns: i64) -> FleetPicture {
         let at_s = seconds(now_ns - origin_ns);
         let offset_ns = self.offset_ns;
         self.collisions
@@ -178,7 +220,7 @@ impl FleetView {
         self.look_at_states(now_ns, at_s);
         let scene = self.ground.as_ref().map(|ground| &ground.scene);
         let robots = self.robots.iter();
-        let robots: Vec<Value> = robots
+        let robots = robots
             .filter_map(|(id, robot)| picture_of(*id, robot, scene, now_ns))
             .collect();
         let sections = self.sections();
@@ -188,10 +230,14 @@ impl FleetView {
         } else {
             "states"
         };
-        json!({
-            "at_s": at_s, "robots": robots, "sections": sections, "basis": basis,
-            "collisions": collisions.listed, "collision_count": collisions.count(),
-        })
+        FleetPicture {
+            at_s,
+            robots,
+            sections,
+            collisions: collisions.listed.clone(),
+            collision_count: collisions.count(),
+            basis,
+        }
     }
 
     fn look_at_states(&mut self, now_ns: i64, at_s: f64) {
@@ -215,8 +261,7 @@ impl FleetView {
         }
     }
 
-    /// `None` where the ground is not known, or a fleet is too large to look at its pairs.
-    fn sections(&mut self) -> Option<Vec<Value>> {
+    fn sections(&mut self) -> Option<Vec<SectionPicture>> {
         let world = &self.ground.as_ref()?.scene.world;
         let areas = self.areas.as_mut()?;
         let mut fleets: BTreeMap<u32, Vec<OnPath>> = BTreeMap::new();
@@ -269,7 +314,7 @@ fn granted(state: &State, path: &Path) -> Option<usize> {
     }
 }
 
-fn picture_of(id: Id, robot: &Robot, scene: Option<&Scene>, now_ns: i64) -> Option<Value> {
+fn picture_of(id: Id, robot: &Robot, scene: Option<&Scene>, now_ns: i64) -> Option<RobotPicture> {
     let (state, at_ns) = robot.state?;
     let phase = Phase::of(state.phase)?;
     let word = match phase {
@@ -280,38 +325,47 @@ fn picture_of(id: Id, robot: &Robot, scene: Option<&Scene>, now_ns: i64) -> Opti
     };
     let is_standing = state.speed_mps.abs() < 1e-3;
     let mission = state.header.mission_id;
-    let mut picture = json!({
-        "fleet": id.fleet, "id": id.robot,
-        "x_m": rounded(state.x_m), "y_m": rounded(state.y_m),
-        "heading_rad": rounded(state.heading_rad), "speed_mps": rounded(state.speed_mps.into()),
-        "age_s": seconds((now_ns - at_ns).max(0)), "is_stale": now_ns - at_ns > STALE_NS,
-        "phase": word,
-        "is_waiting": phase == Phase::AtPoint || (phase == Phase::Driving && is_standing),
-        "mission": (mission != 0).then_some(mission),
-        "path": null, "goal": null, "path_index": null, "granted_index": null,
-        "last_index": null, "granted_m": null, "ahead": [], "granted": [],
-    });
+    let mut picture = RobotPicture {
+        fleet: id.fleet,
+        id: id.robot,
+        x_m: rounded(state.x_m),
+        y_m: rounded(state.y_m),
+        heading_rad: rounded(state.heading_rad),
+        speed_mps: rounded(state.speed_mps.into()),
+        age_s: seconds((now_ns - at_ns).max(0)),
+        is_stale: now_ns - at_ns > STALE_NS,
+        phase: word,
+        is_waiting: phase == Phase::AtPoint || (phase == Phase::Driving && is_standing),
+        mission: (mission != 0).then_some(mission),
+        path: None,
+        goal: None,
+        path_index: None,
+        granted_index: None,
+        last_index: None,
+        granted_m: None,
+        ahead: Vec::new(),
+        granted: Vec::new(),
+    };
     if let (Some(id), Some(scene)) = (robot.path_of(mission), scene)
         && let Some(path) = scene.world.paths.get(id)
     {
-        let here = usize::try_from(state.path_index).unwrap_or(0);
-        let here = here.min(path.last_index());
+        let last = path.last_index();
+        let here = usize::try_from(state.path_index).unwrap_or(0).min(last);
         let granted = granted(&state, path);
-        let route = scene.world.routes.iter().find(|one| one.path == id);
-        picture["path"] = json!(id.0);
-        picture["goal"] = json!(route.map(|route| route.to));
-        picture["path_index"] = json!(here);
-        picture["last_index"] = json!(path.last_index());
-        picture["granted_index"] = json!(granted);
+        let mut routes = scene.world.routes.iter();
+        picture.path = Some(id.0);
+        picture.goal = routes.find(|one| one.path == id).map(|route| route.to);
+        picture.path_index = Some(here);
+        picture.last_index = Some(last);
+        picture.granted_index = granted;
         if matches!(phase, Phase::Driving | Phase::AtPoint) {
-            let ahead = points(path, here, path.last_index(), AHEAD_MAX);
-            picture["ahead"] = json!(ahead);
+            picture.ahead = points(path, here, last, AHEAD_MAX);
         }
         if let Some(granted) = granted {
             let way_m = path.way_to_m(granted) - state.travelled_m;
-            picture["granted_m"] = json!(rounded(way_m.max(0.0)));
+            picture.granted_m = Some(rounded(way_m.max(0.0)));
             if granted > here {
-                picture["granted"] = json!(points(path, here, granted, AHEAD_MAX));
+                picture.granted = points(path, here, granted, AHEAD_MAX);
             }
         }
     }

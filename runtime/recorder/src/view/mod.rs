@@ -7,11 +7,11 @@
 
 mod account;
 pub(crate) mod arms;
-mod collisions;
+pub(crate) mod collisions;
 pub(crate) mod facts;
 pub(crate) mod fleet;
-mod ground;
-mod sections;
+pub(crate) mod ground;
+pub(crate) mod sections;
 pub(crate) mod state;
 
 use hil_watch::Record;

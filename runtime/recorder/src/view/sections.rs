@@ -3,11 +3,11 @@
 
 use std::collections::BTreeMap;
 
-use hil_fleet::geometry::{Footprint, Pose};
+use hil_fleet::geometry::Footprint;
 use hil_fleet::path::{Path, PathId};
 use hil_fleet::section::Side;
 use hil_fleet::world::World;
-use serde_json::{Value, json};
+use serde::Serialize;
 
 use super::rounded;
 
@@ -70,21 +70,24 @@ impl Areas {
     }
 }
 
-/// Corners of the vehicle at poses of the path's part, its ends among them.
-fn covered(path: &Path, from: usize, to: usize, vehicle: &Footprint) -> Vec<Point> {
+/// Some poses of the path's part, its ends among them.
+fn part(path: &Path, from: usize, to: usize) -> Vec<usize> {
     let to = to.min(path.last_index());
     let step = to.saturating_sub(from).div_ceil(POSES_MAX).max(1);
-    let poses = path.poses();
-    let part = (from..to).step_by(step).chain([to]);
-    let at = |pose: &Pose| vehicle.at(pose).corners();
-    part.flat_map(|index| at(&poses[index])).collect()
+    (from..to).step_by(step).chain([to]).collect()
+}
+
+/// Corners of the vehicle along the path's part.
+fn covered(path: &Path, from: usize, to: usize, vehicle: &Footprint) -> Vec<Point> {
+    let part = part(path, from, to).into_iter();
+    part.flat_map(|index| vehicle.at(&path.poses()[index]).corners())
+        .collect()
 }
 
 /// The strip that a vehicle covers along the path's part.
 fn strip(path: &Path, from: usize, to: usize, vehicle: &Footprint) -> Vec<Point> {
-    let to = to.min(path.last_index());
-    let step = to.saturating_sub(from).div_ceil(POSES_MAX).max(1);
-    let part = (from..to).step_by(step).chain([to]);
+    let indices = part(path, from, to);
+    let last = indices.last().copied();
     let beside = |index: usize, side: f64| {
         let pose = &path.poses()[index];
         let (sine, cosine) = pose.heading_rad.sin_cos();
@@ -92,20 +95,15 @@ fn strip(path: &Path, from: usize, to: usize, vehicle: &Footprint) -> Vec<Point>
         // A vehicle at an end of the part reaches beyond it by half its length.
         let along_m = match index {
             index if index == from => -0.5 * vehicle.length_m,
-            index if index == to => 0.5 * vehicle.length_m,
+            index if Some(index) == last => 0.5 * vehicle.length_m,
             _ => 0.0,
         };
         // Backwards, the way goes against the heading.
-        let along_m = if is_backwards(path) {
-            -along_m
-        } else {
-            along_m
-        };
+        let along_m = along_m * if is_backwards(path) { -1.0 } else { 1.0 };
         let x_m = pose.x_m + along_m * cosine - across_m * sine;
         let y_m = pose.y_m + along_m * sine + across_m * cosine;
         [rounded(x_m), rounded(y_m)]
     };
-    let indices: Vec<usize> = part.collect();
     let left = indices.iter().map(|index| beside(*index, 1.0));
     let right = indices.iter().rev().map(|index| beside(*index, -1.0));
     left.chain(right).collect()
@@ -192,6 +190,18 @@ pub(crate) struct OnPath {
     pub(crate) granted: usize,
 }
 
+/// A section of two robots.
+#[derive(Debug, PartialEq, Serialize)]
+pub(crate) struct SectionPicture {
+    pub(crate) id: String,
+    pub(crate) fleet: u32,
+    pub(crate) robots: [u32; 2],
+    pub(crate) may_pass: Vec<u32>,
+    pub(crate) inside: Vec<u32>,
+    pub(crate) is_contested: bool,
+    pub(crate) polygon: Vec<Point>,
+}
+
 /// The sections that two robots of `fleet` still have before them or are in, as `/live/fleet`
 /// lists them.
 pub(crate) fn of_pair(
@@ -200,7 +210,7 @@ pub(crate) fn of_pair(
     fleet: u32,
     one: &OnPath,
     other: &OnPath,
-) -> Vec<Value> {
+) -> Vec<SectionPicture> {
     let mut list = Vec::new();
     let sections = world.sections.between(one.path, other.path);
     for (index, section) in sections.iter().enumerate() {
@@ -221,15 +231,15 @@ pub(crate) fn of_pair(
         let other_way = (other.index, other.granted);
         let meeting = section.first_conflict(Side::First, one.index, other_way);
         let is_contested = meeting.is_some_and(|pose| pose <= one.granted);
-        list.push(json!({
-            "id": format!("{fleet}:{}-{}:{index}", one.robot, other.robot),
-            "fleet": fleet,
-            "robots": [one.robot, other.robot],
-            "may_pass": may_pass,
-            "inside": inside,
-            "is_contested": is_contested,
-            "polygon": areas.of(world, one.path, other.path, index),
-        }));
+        list.push(SectionPicture {
+            id: format!("{fleet}:{}-{}:{index}", one.robot, other.robot),
+            fleet,
+            robots: [one.robot, other.robot],
+            may_pass,
+            inside,
+            is_contested,
+            polygon: areas.of(world, one.path, other.path, index).to_vec(),
+        });
     }
     list
 }
@@ -238,6 +248,7 @@ pub(crate) fn of_pair(
 mod tests {
     use super::*;
     use hil_fleet::scenario::{Scenario, Scene, WorldParameters};
+    use serde_json::{Value, json};
 
     fn crossing() -> Scene {
         let parameters = WorldParameters {
@@ -259,7 +270,8 @@ mod tests {
 
     fn listed(scene: &Scene, one: &OnPath, other: &OnPath) -> Vec<Value> {
         let mut areas = Areas::new(scene.world.vehicle.footprint);
-        of_pair(&scene.world, &mut areas, 0, one, other)
+        let list = of_pair(&scene.world, &mut areas, 0, one, other);
+        list.iter().map(|section| json!(section)).collect()
     }
 
     #[test]
