@@ -4,7 +4,6 @@
 use core::fmt;
 use core::fmt::Write as _;
 
-use serde::ser::{SerializeMap, SerializeSeq};
 use serde::{Serialize, Serializer};
 
 use super::{LayoutFault, check, checked_element_bytes};
@@ -38,19 +37,9 @@ impl Serialize for Value {
             Self::Single(value) if value.is_finite() => serializer.serialize_f32(*value),
             Self::Double(value) if value.is_finite() => serializer.serialize_f64(*value),
             Self::Single(_) | Self::Double(_) => serializer.serialize_str(&self.to_string()),
-            Self::List(values) => {
-                let mut list = serializer.serialize_seq(Some(values.len()))?;
-                for value in values {
-                    list.serialize_element(value)?;
-                }
-                list.end()
-            }
+            Self::List(values) => serializer.collect_seq(values),
             Self::Record(fields) => {
-                let mut map = serializer.serialize_map(Some(fields.len()))?;
-                for (name, value) in fields {
-                    map.serialize_entry(name, value)?;
-                }
-                map.end()
+                serializer.collect_map(fields.iter().map(|(name, value)| (name, value)))
             }
         }
     }
