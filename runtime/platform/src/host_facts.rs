@@ -11,16 +11,15 @@ use nix::sys::utsname::uname;
 use serde::{Deserialize, Serialize};
 
 pub use self::fake::FakeHost;
-pub use self::files::HostFiles;
-pub use self::files::{CAP_IPC_LOCK, CAP_SYS_NICE, format_cpu_list};
+pub use self::files::{CAP_IPC_LOCK, CAP_SYS_NICE, HostFiles, format_cpu_list};
 pub use self::kernel::{
     KernelOptions, PreemptionMode, RealtimeThrottle, boot_parameter, clocksource, has_fair_server,
     kernel_release, preemption, virtual_machine,
 };
 pub use self::processors::{
-    CPU_FOLDER, governors, isolated_or_online, load_average, online_cpus, refuse_absent,
+    CPU_FOLDER, IsolatedCpus, ProcessorTicks, governors, isolated_or_online, load_average,
+    online_cpus, refuse_absent,
 };
-pub use self::processors::{IsolatedCpus, ProcessorTicks};
 
 /// Something the host was asked: an answer, or why there is none.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]

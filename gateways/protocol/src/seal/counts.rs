@@ -48,7 +48,7 @@ pub struct SealCounts {
     pub agreement_count: u64,
     /// Times a key gave way to the next generation, both ways together.
     pub rotation_count: u64,
-    refused: SealRefusalCounts,
+    pub(super) refused: SealRefusalCounts,
 }
 
 impl SealCounts {
