@@ -1,19 +1,17 @@
 //! Every way a datagram can be refused, and a counter for each. A bad datagram is a count, never
 //! an error of the loop that received it.
 
-/// Declares every cause for which one part of the protocol refuses, and a counter for each.
+use core::fmt;
+
 macro_rules! refusals {
-    (
-        $(#[$meta:meta])* enum $refusal:ident, counted in $counts:ident:
-        $($(#[doc = $doc:literal])+ $variant:ident => $name:literal, $message:literal;)+
-    ) => {
-        $(#[$meta])*
+    ($($(#[doc = $doc:literal])+ $variant:ident => $name:literal, $message:literal;)+) => {
+        /// Why a datagram was refused.
         #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, thiserror::Error)]
-        pub enum $refusal {
+        pub enum Refusal {
             $($(#[doc = $doc])+ #[error($message)] $variant,)+
         }
 
-        impl $refusal {
+        impl Refusal {
             /// All of them, in the order of checking where there is one.
             pub const ALL: &'static [Self] = &[$(Self::$variant),+];
 
@@ -22,50 +20,10 @@ macro_rules! refusals {
                 match self { $(Self::$variant => $name,)+ }
             }
         }
-
-        #[doc = concat!("One counter per [`", stringify!($refusal), "`].")]
-        #[derive(Clone, Copy, PartialEq, Eq, Default)]
-        pub struct $counts {
-            counts: [u64; $refusal::ALL.len()],
-        }
-
-        impl $counts {
-            /// Counts one datagram.
-            pub fn count(&mut self, refusal: $refusal) {
-                self.counts[refusal as usize] += 1;
-            }
-
-            /// How often `refusal` happened.
-            pub const fn get(&self, refusal: $refusal) -> u64 {
-                self.counts[refusal as usize]
-            }
-
-            /// Every counter with its name, zeros included, always in the same order.
-            pub fn iter(&self) -> impl Iterator<Item = (&'static str, u64)> + use<> {
-                let names = $refusal::ALL.iter().map(|refusal| refusal.name());
-                names.zip(self.counts)
-            }
-
-            /// Datagrams refused for any reason.
-            pub fn total(&self) -> u64 {
-                self.counts.iter().sum()
-            }
-        }
-
-        impl ::core::fmt::Debug for $counts {
-            fn fmt(&self, f: &mut ::core::fmt::Formatter<'_>) -> ::core::fmt::Result {
-                let happened = self.iter().filter(|(_, count)| *count > 0);
-                f.debug_map().entries(happened).finish()
-            }
-        }
     };
 }
 
-pub(crate) use refusals;
-
 refusals! {
-    /// Why a datagram was refused.
-    enum Refusal, counted in RefusalCounts:
     /// Shorter than the fixed header.
     TooShort => "shorter than the header", "datagram is shorter than the 72-byte header";
     /// Not a datagram of this protocol.
@@ -115,6 +73,51 @@ refusals! {
     DuplicateFragment => "duplicate fragment", "fragment arrived before";
     /// A reply to nothing that was asked, or a second reply.
     Unsolicited => "unsolicited", "reply answers no open request";
+}
+
+/// One counter per [`Refusal`].
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub struct RefusalCounts {
+    counts: [u64; Refusal::ALL.len()],
+}
+
+impl RefusalCounts {
+    /// Counts one datagram.
+    pub fn count(&mut self, refusal: Refusal) {
+        self.counts[refusal as usize] += 1;
+    }
+
+    /// How often `refusal` happened.
+    pub const fn get(&self, refusal: Refusal) -> u64 {
+        self.counts[refusal as usize]
+    }
+
+    /// Every counter with its name, zeros included, always in the same order.
+    pub fn iter(&self) -> impl Iterator<Item = (&'static str, u64)> + '_ {
+        Refusal::ALL
+            .iter()
+            .map(|&refusal| (refusal.name(), self.get(refusal)))
+    }
+
+    /// Datagrams refused for any reason.
+    pub fn total(&self) -> u64 {
+        self.counts.iter().sum()
+    }
+}
+
+impl Default for RefusalCounts {
+    fn default() -> Self {
+        Self {
+            counts: [0; Refusal::ALL.len()],
+        }
+    }
+}
+
+impl fmt::Debug for RefusalCounts {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let happened = self.iter().filter(|(_, count)| *count > 0);
+        f.debug_map().entries(happened).finish()
+    }
 }
 
 #[cfg(test)]

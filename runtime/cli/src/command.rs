@@ -5,7 +5,6 @@ mod doctor_work;
 mod live_work;
 mod report_work;
 
-use core::fmt::Display;
 use std::collections::BTreeMap;
 use std::env;
 use std::fs;
@@ -14,30 +13,40 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::{CommandFactory as _, Parser};
+use hil_core::case_study::ParameterError;
 use hil_core::layout::Field;
 use hil_teleoperation::swing::swing_bvh;
 
 use crate::arguments::{Cli, Command, RunArgs};
 use crate::cases;
+use hil_engine::face;
+use hil_engine::gateway;
 use hil_engine::process::{component, own_program};
+use hil_engine::security::cli::KeyCommand;
 use hil_engine::security::{KeyFileError, PreSharedKey};
-use hil_engine::supervisor::{self, PeerError, RunError, RunOptions};
-use hil_engine::{face, gateway};
+use hil_engine::supervisor;
+use hil_engine::supervisor::{PeerError, RunError, RunOptions};
 use hil_nic::card_clock::guard;
 use hil_platform::console::Console;
 use hil_platform::progress::Progress;
 use hil_platform::signals::{EXIT_INTERRUPTED, Signals};
-use hil_report::analysis::{self, AnalysisError, Concluded};
-use hil_report::terminal::{self, Style};
-use hil_report::{compare, trace};
+use hil_probe;
+use hil_report::analysis;
+use hil_report::analysis::{AnalysisError, Concluded};
+use hil_report::compare;
+use hil_report::compare::cli::CompareArgs;
+use hil_report::terminal;
+use hil_report::terminal::Style;
+use hil_report::trace;
 use hil_rundir::run_result::{Outcome, RunResult};
+use hil_topology;
+use hil_topology::documents;
 use hil_topology::emulation_room::check_emulation;
 use hil_topology::registry::Registry;
-use hil_topology::{
-    HOST_VARIABLE, HostChoice, MachineIdentity, Topology, TopologyErrors, documents, trace_source,
-    which_host,
-};
+use hil_topology::trace_source;
+use hil_topology::{HOST_VARIABLE, HostChoice, MachineIdentity, Topology, which_host};
 use hil_watch::link;
+use hil_watch::link::cli::LinkCommand;
 
 /// Exit codes, as `--help` lists them (after `sysexits.h`, which systemd knows).
 mod exit {
@@ -51,65 +60,27 @@ mod exit {
     pub(crate) const HOST_UNFIT: u8 = 78;
 }
 
-/// Why a command comes to nothing.
-#[derive(Debug)]
-struct Refusal {
-    code: u8,
-    /// `None` when it was printed already.
-    text: Option<String>,
-}
-
-impl Refusal {
-    fn new(code: u8, text: impl Display) -> Self {
-        let text = Some(text.to_string());
-        Self { code, text }
-    }
-}
-
-fn usage(text: impl Display) -> Refusal {
-    Refusal::new(exit::USAGE, text)
-}
-
-fn failed(text: impl Display) -> Refusal {
-    Refusal::new(exit::FAILED, text)
-}
-
 /// Does what the command line says.
 pub(crate) fn run(registry: &Registry) -> ExitCode {
     let cli = Cli::parse();
-    let is_batch_quiet = match &cli.command {
-        Some(Command::Tables { batch, .. }) => batch.quiet,
-        Some(Command::Calibrate(args)) => args.batch.quiet,
-        _ => false,
-    };
-    let mut console = Console::new(cli.run.quiet || is_batch_quiet);
-    let done = match cli.command {
+    let mut console = Console::new(cli.run.quiet);
+    let code = match cli.command {
         None => run_topology(&cli.run, registry, &mut console),
         Some(command) => run_command(command, registry, &mut console),
     };
-    let code = done.unwrap_or_else(|refusal| {
-        if let Some(text) = &refusal.text {
-            console.error(text);
-        }
-        refusal.code
-    });
     ExitCode::from(code)
 }
 
-fn run_command(
-    command: Command,
-    registry: &Registry,
-    console: &mut Console,
-) -> Result<u8, Refusal> {
+fn run_command(command: Command, registry: &Registry, console: &mut Console) -> u8 {
     match command {
-        Command::Component { launch } => code_of(component::run(&launch, registry)),
+        Command::Component { launch } => code_of(component::run(&launch, registry), console),
         Command::Become {
             supervisor,
             program,
-        } => code_of(own_program::become_program(supervisor, &program)),
-        Command::CardGuard(args) => code_of(guard::run(&args)),
-        Command::Face { launch } => code_of(face::process::run(&launch)),
-        Command::Gateway { launch } => code_of(gateway::process::run(&launch)),
+        } => code_of(own_program::become_program(supervisor, &program), console),
+        Command::CardGuard(args) => code_of(guard::run(&args), console),
+        Command::Face { launch } => code_of(face::process::run(&launch), console),
+        Command::Gateway { launch } => code_of(gateway::process::run(&launch), console),
         Command::Simulate {
             topology,
             overrides,
@@ -123,105 +94,146 @@ fn run_command(
         } => {
             overrides
                 .extend(sections.map(|count| format!("case.parameters.tables.sections={count}")));
-            case_work::tables(&topology, &overrides, &batch, registry, console)
+            case_work::tables(&topology, &overrides, &batch, registry)
         }
-        Command::Calibrate(args) => case_work::calibrate(args, registry, console),
+        Command::Calibrate(args) => case_work::calibrate(args, registry),
         Command::Replay(args) => case_work::replay(&args.run, args.json, registry, console),
         Command::Report(args) => report_work::report(&args, registry, console),
-        Command::Compare(args) => Ok(match compare::work::work(&args, console) {
-            compare::work::End::Passed => exit::RAN,
-            compare::work::End::Failed => exit::FAILED,
-            compare::work::End::Refused => exit::USAGE,
-        }),
-        Command::Trace { command } => Ok(match trace::work::work(command, columns(), console) {
+        Command::Compare(args) => compare(&args, console),
+        Command::Trace { command } => match trace::work::work(command, columns(), console) {
             trace::work::End::Done => exit::RAN,
             trace::work::End::Failed => exit::FAILED,
             trace::work::End::Refused => exit::USAGE,
-        }),
-        Command::Link { command } => Ok(match link::work::work(&command, console) {
-            link::work::End::Done => exit::RAN,
-            link::work::End::Failed => exit::FAILED,
-            link::work::End::Refused => exit::USAGE,
-        }),
+        },
+        Command::Link { command } => change_link(&command, console),
         Command::Doctor(args) => doctor_work::doctor(&args, registry, console),
         Command::Channel(args) => live_work::channel(args, registry, console),
         Command::Top(args) => live_work::top(&args, registry, console),
-        Command::Probe(args) => Ok(hil_probe::run(&args, console)),
-        Command::Documents { folder } => code_of(
-            documents::write(Cli::command(), &folder)
-                .and_then(|_paths| documents::write_schema(&hil_topology::schema(), &folder))
-                .and_then(|_path| documents::write_robot(&folder))
-                .map(drop),
-        ),
-        Command::Sweep => {
-            supervisor::sweep();
-            Ok(exit::RAN)
-        }
-        Command::Key { command } => {
-            console.result(&command.work().map_err(usage)?);
-            Ok(exit::RAN)
-        }
+        Command::Probe(args) => hil_probe::run(&args, console),
+        Command::Documents { folder } => write_documents(&folder, console),
+        Command::Sweep => sweep(),
+        Command::Key { command } => key(&command, console),
         Command::Cases => {
             console.result(&cases::list(registry));
-            Ok(exit::RAN)
+            exit::RAN
         }
         Command::Motion {
             output,
             period,
             amplitude,
             rate,
-        } => {
-            let text = swing_bvh(period, amplitude, rate).map_err(usage)?;
-            let Some(path) = output else {
-                console.result(&text);
-                return Ok(exit::RAN);
-            };
-            let shown = path.display();
-            fs::write(&path, text).map_err(|error| failed(format!("{shown}: {error}")))?;
-            console.say(&format!("wrote {shown}"));
-            Ok(exit::RAN)
+        } => write_motion(
+            output.as_deref(),
+            swing_bvh(period, amplitude, rate),
+            console,
+        ),
+    }
+}
+
+fn write_documents(folder: &Path, console: &mut Console) -> u8 {
+    let written = documents::write(Cli::command(), folder)
+        .and_then(|_paths| documents::write_schema(&hil_topology::schema(), folder))
+        .and_then(|_path| documents::write_robot(folder));
+    code_of(written.map(drop), console)
+}
+
+fn sweep() -> u8 {
+    supervisor::sweep();
+    exit::RAN
+}
+
+fn compare(args: &CompareArgs, console: &mut Console) -> u8 {
+    match compare::work::work(args, console) {
+        compare::work::End::Passed => exit::RAN,
+        compare::work::End::Failed => exit::FAILED,
+        compare::work::End::Refused => exit::USAGE,
+    }
+}
+
+fn key(command: &KeyCommand, console: &mut Console) -> u8 {
+    match command.work() {
+        Ok(text) => {
+            console.result(&text);
+            exit::RAN
+        }
+        Err(error) => {
+            console.error(&error.to_string());
+            exit::USAGE
         }
     }
 }
 
-fn code_of<E: Display>(outcome: Result<(), E>) -> Result<u8, Refusal> {
-    outcome.map(|()| exit::RAN).map_err(failed)
+fn change_link(command: &LinkCommand, console: &mut Console) -> u8 {
+    match link::work::work(command, console) {
+        link::work::End::Done => exit::RAN,
+        link::work::End::Failed => exit::FAILED,
+        link::work::End::Refused => exit::USAGE,
+    }
 }
 
-/// Takes over the signals that end programs.
-fn signals() -> Result<Signals, Refusal> {
-    Signals::install()
-        .map_err(|error| Refusal::new(exit::INTERNAL, format!("cannot handle signals: {error}")))
+fn code_of<E: core::fmt::Display>(outcome: Result<(), E>, console: &mut Console) -> u8 {
+    match outcome {
+        Ok(()) => exit::RAN,
+        Err(error) => {
+            console.error(&error.to_string());
+            exit::FAILED
+        }
+    }
 }
 
-/// The topology that was read, or its faults on the console.
-fn loaded(
-    topology: Result<Topology, TopologyErrors>,
-    console: &mut Console,
-) -> Result<Topology, Refusal> {
-    topology.map_err(|errors| {
-        console.faults(&errors.render(io::stderr().is_terminal()));
-        let code = exit::USAGE;
-        Refusal { code, text: None }
+/// Takes over the signals that end programs, or says why it cannot.
+fn signals(console: &mut Console) -> Result<Signals, u8> {
+    Signals::install().map_err(|error| {
+        console.error(&format!("cannot handle signals: {error}"));
+        exit::INTERNAL
     })
 }
 
-fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> Result<u8, Refusal> {
-    let path = args.topology.as_ref().ok_or_else(|| {
-        usage("no topology given; try --topology deploy/topologies/local.toml or --help")
-    })?;
-    let topology = hil_topology::load(path, &args.overrides, registry.known());
-    let topology = loaded(topology, console)?;
-    trace_source::check(&topology).map_err(usage)?;
+fn load(
+    path: &Path,
+    overrides: &[String],
+    registry: &Registry,
+    console: &mut Console,
+) -> Option<Topology> {
+    match hil_topology::load(path, overrides, registry.known()) {
+        Ok(topology) => Some(topology),
+        Err(errors) => {
+            console.faults(&errors.render(io::stderr().is_terminal()));
+            None
+        }
+    }
+}
+
+fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> u8 {
+    let Some(path) = &args.topology else {
+        console.error("no topology given; try --topology deploy/topologies/local.toml or --help");
+        return exit::USAGE;
+    };
+    let Some(topology) = load(path, &args.overrides, registry, console) else {
+        return exit::USAGE;
+    };
+    if let Err(error) = trace_source::check(&topology) {
+        console.error(&error.to_string());
+        return exit::USAGE;
+    }
     // A file is checked anywhere, also where none of its hosts is.
     if args.check && args.host.is_none() {
         return show_check(path, &topology, None, console);
     }
-    let hosts = hosts_here(&topology, args.host.as_deref()).map_err(usage)?;
+    let hosts = match hosts_here(&topology, args.host.as_deref()) {
+        Ok(hosts) => hosts,
+        Err(text) => {
+            console.error(&text);
+            return exit::USAGE;
+        }
+    };
     if args.check {
         return show_check(path, &topology, Some(&hosts), console);
     }
-    let signals = signals()?;
+    let signals = match signals(console) {
+        Ok(signals) => signals,
+        Err(code) => return code,
+    };
     let options = RunOptions {
         hosts,
         domain_root: args.domain_root.clone(),
@@ -230,38 +242,45 @@ fn run_topology(args: &RunArgs, registry: &Registry, console: &mut Console) -> R
         layouts: layouts(&topology, registry),
     };
     console.serve();
-    let result = supervisor::run(&topology, &options, &signals, console)
-        .map_err(|error| Refusal::new(exit_code_of_error(&error), error))?;
-    let code = match exit_code(&result.outcome) {
-        exit::RAN if result.has_gaps() => exit::FAILED,
-        code => code,
-    };
-    let origin = (path.as_path(), options.command_line.as_slice());
-    let concluded = Progress::begin().during(console, "drawing up the account", |_| {
-        let written = result.write().map_err(AnalysisError::from);
-        let analysed = written.and_then(|()| analysis::analyse(&result.folder, registry));
-        // What the folder cannot give back, because its disk is full, is still in memory.
-        analysed.or_else(|error| {
-            let concluded = analysis::conclude(&topology, &result, registry, origin)?;
-            Ok::<_, AnalysisError>(Concluded {
-                unwritten: concluded.unwritten.or(Some(error)),
-                ..concluded
-            })
-        })
-    });
-    let Concluded { summary, unwritten } = concluded.map_err(|error| {
-        let text = format!("the run is over but its report failed: {error}");
-        Refusal::new(exit::INTERNAL, text)
-    })?;
-    console.result(&terminal::render(&summary, columns(), Style::Coloured));
-    if code != exit::RAN {
-        console.error(&complaint(&result));
-    }
-    match unwritten {
-        None => Ok(code),
-        Some(error) => {
-            let text = format!("{error}; the report is only what is printed here");
-            Err(Refusal::new(code.max(exit::FAILED), text))
+    match supervisor::run(&topology, &options, &signals, console) {
+        Ok(result) => {
+            let is_incomplete = result.has_gaps();
+            let code = match exit_code(&result.outcome) {
+                exit::RAN if is_incomplete => exit::FAILED,
+                code => code,
+            };
+            let origin = (path.as_path(), options.command_line.as_slice());
+            let concluded = Progress::begin().during(console, "drawing up the account", |_| {
+                let written = result.write().map_err(AnalysisError::from);
+                let analysed = written.and_then(|()| analysis::analyse(&result.folder, registry));
+                // What the folder cannot give back, because its disk is full, is still in memory.
+                analysed.or_else(|error| {
+                    let concluded = analysis::conclude(&topology, &result, registry, origin)?;
+                    Ok::<_, AnalysisError>(Concluded {
+                        unwritten: concluded.unwritten.or(Some(error)),
+                        ..concluded
+                    })
+                })
+            });
+            match concluded {
+                Ok(Concluded { summary, unwritten }) => {
+                    console.result(&terminal::render(&summary, columns(), Style::Coloured));
+                    if code != exit::RAN {
+                        console.error(&complaint(&result));
+                    }
+                    let Some(error) = unwritten else { return code };
+                    console.error(&format!("{error}; the report is only what is printed here"));
+                    code.max(exit::FAILED)
+                }
+                Err(error) => {
+                    console.error(&format!("the run is over but its report failed: {error}"));
+                    exit::INTERNAL
+                }
+            }
+        }
+        Err(error) => {
+            console.error(&error.to_string());
+            exit_code_of_error(&error)
         }
     }
 }
@@ -296,16 +315,18 @@ fn show_check(
     topology: &Topology,
     hosts: Option<&[String]>,
     console: &mut Console,
-) -> Result<u8, Refusal> {
-    let path = path.display();
-    check_emulation(topology).map_err(|error| {
-        usage(format!(
-            "{path}: the file is valid and can be simulated, but no gateway can keep its emulated \
-             link: {error}"
-        ))
-    })?;
+) -> u8 {
+    if let Err(error) = check_emulation(topology) {
+        console.error(&format!(
+            "{}: the file is valid and can be simulated, but no gateway can keep its emulated \
+             link: {error}",
+            path.display()
+        ));
+        return exit::USAGE;
+    }
     if let Some(text) = topology.unsaid_security() {
-        return Err(usage(format!("{path}: {text}")));
+        console.error(&format!("{}: {text}", path.display()));
+        return exit::USAGE;
     }
     // As comments, so that what is printed is a topology as a whole.
     let clock_paths = topology.clock_paths().map(|clock| {
@@ -313,20 +334,25 @@ fn show_check(
         let words = clock.describe();
         format!("\n# {words}, UDP ports {asking} and {answering}\n")
     });
-    let key = hosts
-        .map_or(Ok(None), |hosts| key_here(topology, hosts))
-        .map_err(|error| Refusal::new(exit::FORBIDDEN, error))?;
+    let key = match hosts.map_or(Ok(None), |hosts| key_here(topology, hosts)) {
+        Ok(key) => key,
+        Err(error) => {
+            console.error(&error.to_string());
+            return exit::FORBIDDEN;
+        }
+    };
     let key = key.map(|(file, key)| {
         let (file, fingerprint) = (file.display(), key.fingerprint());
         format!("\n# {file}: the key {fingerprint}, which the other hosts must have as well\n")
     });
     console.result(&format!(
-        "# {path}: the file is valid; it comes to\n\n{}{}{}",
+        "# {}: the file is valid; it comes to\n\n{}{}{}",
+        path.display(),
         topology.to_toml(),
         clock_paths.collect::<Vec<_>>().concat(),
         key.unwrap_or_default()
     ));
-    Ok(exit::RAN)
+    exit::RAN
 }
 
 /// Why a run does not end with exit code 0, for those who do not read its report.
@@ -414,4 +440,32 @@ fn columns() -> usize {
 fn columns_or(otherwise: usize) -> usize {
     let said = env::var("COLUMNS").ok();
     said.and_then(|text| text.parse().ok()).unwrap_or(otherwise)
+}
+
+fn write_motion(
+    output: Option<&Path>,
+    text: Result<String, ParameterError>,
+    console: &mut Console,
+) -> u8 {
+    let text = match text {
+        Ok(text) => text,
+        Err(error) => {
+            console.error(&error.to_string());
+            return exit::USAGE;
+        }
+    };
+    let Some(path) = output else {
+        console.result(&text);
+        return exit::RAN;
+    };
+    match fs::write(path, text) {
+        Ok(()) => {
+            console.say(&format!("wrote {}", path.display()));
+            exit::RAN
+        }
+        Err(error) => {
+            console.error(&format!("{}: {error}", path.display()));
+            exit::FAILED
+        }
+    }
 }

@@ -4,7 +4,8 @@ use std::fs;
 use std::io::IsTerminal;
 use std::path::Path;
 
-use super::{Refusal, exit, hosts_here, interrupted, loaded, signals, usage};
+use super::{exit, hosts_here, interrupted, load, signals};
+use hil_doctor;
 use hil_doctor::cli::DoctorArgs;
 use hil_doctor::latency::{LatencyReport, LatencyRequest, Watch, measure};
 use hil_doctor::{DoctorReport, DoctorRequest, Plan, Severity};
@@ -15,14 +16,22 @@ use hil_platform::signals::Signals;
 use hil_topology::registry::Registry;
 
 /// `doctor`.
-pub(super) fn doctor(
-    args: &DoctorArgs,
-    registry: &Registry,
-    console: &mut Console,
-) -> Result<u8, Refusal> {
-    let request = request(args, registry, console)?;
-    let latency = latency_request(args, &request).map_err(usage)?;
-    let signals = signals()?;
+pub(super) fn doctor(args: &DoctorArgs, registry: &Registry, console: &mut Console) -> u8 {
+    let request = match request(args, registry, console) {
+        Ok(request) => request,
+        Err(code) => return code,
+    };
+    let latency = match latency_request(args, &request) {
+        Ok(latency) => latency,
+        Err(text) => {
+            console.error(&text);
+            return exit::USAGE;
+        }
+    };
+    let signals = match signals(console) {
+        Ok(signals) => signals,
+        Err(code) => return code,
+    };
     let watch = signals.end_program_unless_over(
         "the doctor describes a host whole or not at all; a card it was trying is put back",
     );
@@ -49,13 +58,13 @@ pub(super) fn doctor(
         report.to_text(true)
     };
     console.result(&text);
-    Ok(if is_interrupted {
+    if is_interrupted {
         interrupted()
     } else if args.strict && report.worst_severity() >= Severity::Warning {
         exit::HOST_UNFIT
     } else {
         exit::RAN
-    })
+    }
 }
 
 /// What a topology, and another host's report, have the doctor look at beside the host itself.
@@ -63,15 +72,21 @@ fn request(
     args: &DoctorArgs,
     registry: &Registry,
     console: &mut Console,
-) -> Result<DoctorRequest, Refusal> {
+) -> Result<DoctorRequest, u8> {
     let mut request = DoctorRequest::default();
     if let Some(path) = &args.other {
-        request.other = Some(other_report(path).map_err(usage)?);
+        let other = other_report(path).map_err(|text| {
+            console.error(&text);
+            exit::USAGE
+        })?;
+        request.other = Some(other);
     }
     if let Some(path) = &args.topology {
-        let topology = hil_topology::load(path, &args.overrides, registry.known());
-        let topology = loaded(topology, console)?;
-        let here = hosts_here(&topology, args.host.as_deref()).map_err(usage)?;
+        let topology = load(path, &args.overrides, registry, console).ok_or(exit::USAGE)?;
+        let here = hosts_here(&topology, args.host.as_deref()).map_err(|text| {
+            console.error(&text);
+            exit::USAGE
+        })?;
         request.plan = Some(Plan::of(&topology, &here));
     }
     Ok(request)

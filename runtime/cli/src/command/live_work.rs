@@ -1,23 +1,31 @@
 //! The commands that look at a run while it goes: `channel` and `top`.
 
-use super::{Refusal, columns_or, exit, interrupted, signals};
+use super::{columns_or, exit, interrupted, signals};
 use hil_platform::console::Console;
 use hil_topology::registry::Registry;
-use hil_watch::live::channel::{self, End};
+use hil_watch::live::channel;
+use hil_watch::live::channel::End;
 use hil_watch::live::cli::{ChannelArgs, TopArgs};
-use hil_watch::live::top::{self, TopEnd, TopError};
+use hil_watch::live::top;
+use hil_watch::live::top::{TopEnd, TopError};
 
 /// `channel`.
-pub(super) fn channel(
-    args: ChannelArgs,
-    registry: &Registry,
-    console: &mut Console,
-) -> Result<u8, Refusal> {
-    match channel::run(args, registry, &signals()?, console) {
-        Ok(End::Done) => Ok(exit::RAN),
-        Ok(End::Interrupted) => Ok(interrupted()),
-        Err(error) if error.is_usage() => Err(Refusal::new(exit::USAGE, error)),
-        Err(error) => Err(Refusal::new(exit::FAILED, error)),
+pub(super) fn channel(args: ChannelArgs, registry: &Registry, console: &mut Console) -> u8 {
+    let signals = match signals(console) {
+        Ok(signals) => signals,
+        Err(code) => return code,
+    };
+    match channel::run(args, registry, &signals, console) {
+        Ok(End::Done) => exit::RAN,
+        Ok(End::Interrupted) => interrupted(),
+        Err(error) => {
+            console.error(&error.to_string());
+            if error.is_usage() {
+                exit::USAGE
+            } else {
+                exit::FAILED
+            }
+        }
     }
 }
 
@@ -25,22 +33,26 @@ pub(super) fn channel(
 const PLAIN_COLUMNS: usize = 132;
 
 /// `top`.
-pub(super) fn top(
-    args: &TopArgs,
-    registry: &Registry,
-    console: &mut Console,
-) -> Result<u8, Refusal> {
-    let context = (&signals()?, console);
-    match top::run(args, columns_or(PLAIN_COLUMNS), registry, context) {
-        Ok(TopEnd::Done) => Ok(exit::RAN),
-        Ok(TopEnd::Interrupted) => Ok(interrupted()),
+pub(super) fn top(args: &TopArgs, registry: &Registry, console: &mut Console) -> u8 {
+    let signals = match signals(console) {
+        Ok(signals) => signals,
+        Err(code) => return code,
+    };
+    match top::run(
+        args,
+        columns_or(PLAIN_COLUMNS),
+        registry,
+        (&signals, console),
+    ) {
+        Ok(TopEnd::Done) => exit::RAN,
+        Ok(TopEnd::Interrupted) => interrupted(),
         Err(error) => {
-            let code = match error {
+            console.error(&error.to_string());
+            match error {
                 TopError::Observe(_) => exit::USAGE,
                 TopError::Terminal(_) => exit::FAILED,
                 TopError::Json(_) => exit::INTERNAL,
-            };
-            Err(Refusal::new(code, error))
+            }
         }
     }
 }
