@@ -1,10 +1,20 @@
 //! Messages of guided motion as they lie in shared memory. Layout only; SI units and radians; joints
 //! in chain order, see [`crate::yumi`]. The maker's own datagrams are in [`crate::egm::wire`].
 
-use bytemuck::{CheckedBitPattern, Pod, Zeroable};
+mod motion;
+mod numbers;
+
+pub use motion::{
+    EgmStartParameters, MotionArrival, MotionKind, MotionOutcome, MotionRefusal, MotionRequest,
+    MotionResponse,
+};
+
+use bytemuck::{Pod, Zeroable};
 use serde::{Deserialize, Serialize};
 
 use crate::yumi::{Joints, Pose};
+use hil_core::layout::Field;
+use hil_core::message::Message;
 
 /// One of the robot's two arms, each a motion task of its own.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -20,19 +30,20 @@ impl Side {
     /// Both, in the order of every list.
     pub const BOTH: [Self; 2] = [Self::Right, Self::Left];
 
-    /// The side with this number, see [`Side::index`].
-    pub fn from_index(index: u32) -> Option<Self> {
-        Self::BOTH.into_iter().find(|side| side.number() == index)
-    }
-
     /// 0 for right, 1 for left: its number in messages.
     pub const fn index(self) -> usize {
-        self as usize
+        match self {
+            Self::Right => 0,
+            Self::Left => 1,
+        }
     }
 
     /// As [`Side::index`], as messages carry it.
     pub const fn number(self) -> u32 {
-        self as u32
+        match self {
+            Self::Right => 0,
+            Self::Left => 1,
+        }
     }
 
     /// `right` or `left`.
@@ -44,27 +55,25 @@ impl Side {
     }
 }
 
-hil_core::message! {
-    /// To the robot: where one arm shall be.
-    #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-    #[repr(C)]
-    pub struct EgmCommand = "hil.EgmCommand.v1" {
-        /// The human frame this command answers; a foreign client's counts its datagrams instead.
-        pub frame_index: u64,
-        /// Time of that frame on the motion's own time axis; of a foreign client, zero.
-        pub source_time_ns: i64,
-        /// [`EgmFeedback::cycle_index`] of the newest feedback the sender had seen; meaningless
-        /// without [`EgmCommand::ANSWERS`].
-        pub answered_cycle: u64,
-        /// Desired joint positions.
-        pub position_rad: Joints,
-        /// Desired joint speeds; meaningless without [`EgmCommand::HAS_SPEED`].
-        pub speed_rad_per_s: Joints,
-        /// Sender's number of this message; foreign clients do not always count by one.
-        pub seqno: u32,
-        /// Bits below; all others are zero.
-        pub flags: u32,
-    }
+/// To the robot: where one arm shall be.
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct EgmCommand {
+    /// The human frame this command answers; a foreign client's counts its datagrams instead.
+    pub frame_index: u64,
+    /// Time of that frame on the motion's own time axis; of a foreign client, zero.
+    pub source_time_ns: i64,
+    /// [`EgmFeedback::cycle_index`] of the newest feedback the sender had seen; meaningless
+    /// without [`EgmCommand::ANSWERS`].
+    pub answered_cycle: u64,
+    /// Desired joint positions.
+    pub position_rad: Joints,
+    /// Desired joint speeds; meaningless without [`EgmCommand::HAS_SPEED`].
+    pub speed_rad_per_s: Joints,
+    /// Sender's number of this message; foreign clients do not always count by one.
+    pub seqno: u32,
+    /// Bits below; all others are zero.
+    pub flags: u32,
 }
 
 impl EgmCommand {
@@ -82,42 +91,55 @@ impl EgmCommand {
     pub const PARKED: u32 = 1 << 5;
 }
 
+hil_core::layout!(EgmCommand {
+    frame_index,
+    source_time_ns,
+    answered_cycle,
+    position_rad,
+    speed_rad_per_s,
+    seqno,
+    flags
+});
+
+impl Message for EgmCommand {
+    const NAME: &'static str = "hil.EgmCommand.v1";
+    const FIELDS: &'static [Field] = Self::LAYOUT;
+}
+
 const _: () = assert!(size_of::<EgmCommand>() == 144);
 
-hil_core::message! {
-    /// From the robot, every cycle: where one arm is.
-    #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-    #[repr(C)]
-    pub struct EgmFeedback = "hil.EgmFeedback.v1" {
-        /// Controller cycle, counted from the robot's start; a skipped cycle leaves a gap.
-        pub cycle_index: u64,
-        /// [`EgmCommand::frame_index`] of the reference in use; meaningless without
-        /// [`EgmFeedback::HAS_REFERENCE`].
-        pub reference_frame_index: u64,
-        /// Time since the reference in use arrived at the robot, queueing included; without
-        /// [`EgmFeedback::HAS_REFERENCE`], since its session began to be set up or to run.
-        pub reference_age_ns: i64,
-        /// Joint positions as measured.
-        pub measured_rad: Joints,
-        /// Joint positions as the controller plans them, ahead of the measured by its own delay.
-        pub planned_rad: Joints,
-        /// Tool centre point (the flange frame `tool0`) in the robot's body frame: x forward, y to
-        /// the robot's left, z up.
-        pub tool: Pose,
-        /// The controller's clock in milliseconds, wrapping; the protocol's `tm`.
-        pub clock_ms: u32,
-        /// Counts the cycles since guided motion last began to run, from 0; the protocol's `seqno`.
-        /// A skipped cycle leaves a gap.
-        pub seqno: u32,
-        /// Counts the sessions (activations) since the robot's start, from 1; 0 before the first.
-        pub session: u32,
-        /// [`SessionState`] as a number.
-        pub state: u32,
-        /// Commands waiting after this cycle took its own.
-        pub queue_count: u32,
-        /// Bits below; all others are zero.
-        pub flags: u32,
-    }
+/// From the robot, every cycle: where one arm is.
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct EgmFeedback {
+    /// Controller cycle, counted from the robot's start; a skipped cycle leaves a gap.
+    pub cycle_index: u64,
+    /// [`EgmCommand::frame_index`] of the reference in use; meaningless without
+    /// [`EgmFeedback::HAS_REFERENCE`].
+    pub reference_frame_index: u64,
+    /// Time since the reference in use arrived at the robot, queueing included; without
+    /// [`EgmFeedback::HAS_REFERENCE`], since its session began to be set up or to run.
+    pub reference_age_ns: i64,
+    /// Joint positions as measured.
+    pub measured_rad: Joints,
+    /// Joint positions as the controller plans them, ahead of the measured by its own delay.
+    pub planned_rad: Joints,
+    /// Tool centre point (the flange frame `tool0`) in the robot's body frame: x forward, y to
+    /// the robot's left, z up.
+    pub tool: Pose,
+    /// The controller's clock in milliseconds, wrapping; the protocol's `tm`.
+    pub clock_ms: u32,
+    /// Counts the cycles since guided motion last began to run, from 0; the protocol's `seqno`. A
+    /// skipped cycle leaves a gap.
+    pub seqno: u32,
+    /// Counts the sessions (activations) since the robot's start, from 1; 0 before the first.
+    pub session: u32,
+    /// [`SessionState`] as a number.
+    pub state: u32,
+    /// Commands waiting after this cycle took its own.
+    pub queue_count: u32,
+    /// Bits below; all others are zero.
+    pub flags: u32,
 }
 
 impl EgmFeedback {
@@ -147,10 +169,30 @@ impl EgmFeedback {
     }
 }
 
+hil_core::layout!(EgmFeedback {
+    cycle_index,
+    reference_frame_index,
+    reference_age_ns,
+    measured_rad,
+    planned_rad,
+    tool,
+    clock_ms,
+    seqno,
+    session,
+    state,
+    queue_count,
+    flags
+});
+
+impl Message for EgmFeedback {
+    const NAME: &'static str = "hil.EgmFeedback.v1";
+    const FIELDS: &'static [Field] = Self::LAYOUT;
+}
+
 const _: () = assert!(size_of::<EgmFeedback>() == 216);
 
 /// What an arm's motion task is doing.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, CheckedBitPattern)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 #[repr(u32)]
 pub enum SessionState {
     /// No session, none coming by itself: a request must start one.
@@ -168,6 +210,20 @@ pub enum SessionState {
 }
 
 impl SessionState {
+    const ALL: [Self; 6] = [
+        Self::Idle,
+        Self::Moving,
+        Self::Waiting,
+        Self::Activating,
+        Self::Running,
+        Self::Stopping,
+    ];
+
+    /// The state with this number.
+    pub fn from_number(number: u32) -> Option<Self> {
+        Self::ALL.into_iter().find(|state| *state as u32 == number)
+    }
+
     /// One word for a log line.
     pub const fn word(self) -> &'static str {
         match self {
@@ -181,37 +237,52 @@ impl SessionState {
     }
 }
 
-hil_core::message! {
-    /// To the record: something happened to an arm's session. What `value`, `limit` and `count`
-    /// mean, `kind` says.
-    #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-    #[repr(C)]
-    pub struct EgmEvent = "hil.EgmEvent.v1" {
-        /// Grid time of the cycle in which it happened, the robot's clock.
-        pub at_ns: i64,
-        /// That cycle.
-        pub cycle_index: u64,
-        /// What was seen, in the unit of the kind.
-        pub value: f64,
-        /// What it was held against, in the same unit.
-        pub limit: f64,
-        /// A count that belongs to it.
-        pub count: u64,
-        /// [`EgmEventKind`] as a number.
-        pub kind: u32,
-        /// [`Side::index`].
-        pub side: u32,
-        /// The session it belongs to.
-        pub session: u32,
-        /// [`EndCause`] or refusal as a number, where the kind has one.
-        pub cause: u32,
-    }
+/// To the record: something happened to an arm's session. What `value`, `limit` and `count` mean,
+/// `kind` says.
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct EgmEvent {
+    /// Grid time of the cycle in which it happened, the robot's clock.
+    pub at_ns: i64,
+    /// That cycle.
+    pub cycle_index: u64,
+    /// What was seen, in the unit of the kind.
+    pub value: f64,
+    /// What it was held against, in the same unit.
+    pub limit: f64,
+    /// A count that belongs to it.
+    pub count: u64,
+    /// [`EgmEventKind`] as a number.
+    pub kind: u32,
+    /// [`Side::index`].
+    pub side: u32,
+    /// The session it belongs to.
+    pub session: u32,
+    /// [`EndCause`] or refusal as a number, where the kind has one.
+    pub cause: u32,
+}
+
+hil_core::layout!(EgmEvent {
+    at_ns,
+    cycle_index,
+    value,
+    limit,
+    count,
+    kind,
+    side,
+    session,
+    cause
+});
+
+impl Message for EgmEvent {
+    const NAME: &'static str = "hil.EgmEvent.v1";
+    const FIELDS: &'static [Field] = Self::LAYOUT;
 }
 
 const _: () = assert!(size_of::<EgmEvent>() == 56);
 
 /// What an [`EgmEvent`] tells.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, CheckedBitPattern)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 #[repr(u32)]
 pub enum EgmEventKind {
     /// The controller's first cycle: the origin of its grid.
@@ -245,7 +316,7 @@ pub enum EgmEventKind {
 }
 
 /// Why a session ended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, CheckedBitPattern)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 #[repr(u32)]
 pub enum EndCause {
     /// No command that was not refused came for `CommTimeout`; unit: s.
@@ -260,7 +331,7 @@ pub enum EndCause {
 }
 
 /// Why a command never reached the servo.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, CheckedBitPattern)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 #[repr(u32)]
 pub enum CommandRefusal {
     /// A position or speed is not a number or infinite.
@@ -271,248 +342,31 @@ pub enum CommandRefusal {
     NoSession = 3,
 }
 
-hil_core::message! {
-    /// To the record: a command as it arrived at the controller, before anything was made of it.
-    /// With [`MotionArrival`] and [`EgmEventKind::Started`] it is all that a replay needs.
-    #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-    #[repr(C)]
-    pub struct EgmArrival = "hil.EgmArrival.v1" {
-        /// When, on the robot's clock.
-        pub at_ns: i64,
-        /// [`Side::index`].
-        pub side: u32,
-        /// Zero.
-        pub reserved: u32,
-        /// The command.
-        pub command: EgmCommand,
-    }
+/// To the record: a command as it arrived at the controller, before anything was made of it. With
+/// [`MotionArrival`] and [`EgmEventKind::Started`] it is all that a replay needs.
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct EgmArrival {
+    /// When, on the robot's clock.
+    pub at_ns: i64,
+    /// [`Side::index`].
+    pub side: u32,
+    /// Zero.
+    pub reserved: u32,
+    /// The command.
+    pub command: EgmCommand,
+}
+
+hil_core::layout!(EgmArrival {
+    at_ns,
+    side,
+    reserved,
+    command
+});
+
+impl Message for EgmArrival {
+    const NAME: &'static str = "hil.EgmArrival.v1";
+    const FIELDS: &'static [Field] = Self::LAYOUT;
 }
 
 const _: () = assert!(size_of::<EgmArrival>() == 160);
-
-hil_core::message! {
-    /// To the motion server: do something that guided motion is not, or start and stop that.
-    #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-    #[repr(C)]
-    pub struct MotionRequest = "hil.MotionRequest.v1" {
-        /// The sender's number; the responses carry it.
-        pub request_id: u64,
-        /// [`MotionKind`] as a number.
-        pub kind: u32,
-        /// Bit 0: right arm, bit 1: left arm; several at once are done together.
-        pub arms: u32,
-        /// Target of a joint motion, right then left.
-        pub joints_rad: [Joints; 2],
-        /// Target of a linear motion in the body frame, right then left.
-        pub poses: [Pose; 2],
-        /// Speed of a motion: share of the joints' own limits (joint motion, home), or m/s of the
-        /// tool (linear); 0 takes the controller's default.
-        pub speed: f64,
-        /// Parameters of [`MotionKind::EgmStart`].
-        pub egm: EgmStartParameters,
-    }
-}
-
-impl MotionRequest {
-    /// Bit of `side` in [`MotionRequest::arms`].
-    pub const fn bit(side: Side) -> u32 {
-        1 << side.index()
-    }
-}
-
-const _: () = assert!(size_of::<MotionRequest>() == 312);
-
-hil_core::message! {
-    /// What a session shall differ in from the controller's own settings; NaN keeps the setting.
-    #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-    #[repr(C)]
-    pub struct EgmStartParameters {
-        /// `CommTimeout`, s.
-        pub comm_timeout_s: f64,
-        /// `CondTime`, s.
-        pub condition_time_s: f64,
-        /// `MaxSpeedDeviation`, rad/s.
-        pub max_speed_deviation_rad_per_s: f64,
-        /// `MaxPosDeviation`, rad.
-        pub max_position_deviation_rad: f64,
-        /// `RampInTime`, s.
-        pub ramp_in_s: f64,
-        /// `PosCorrGain`, 0..=1.
-        pub position_correction_ratio: f64,
-        /// Proportional position gain, 1/s.
-        pub position_gain_per_s: f64,
-        /// Low-pass corner, Hz; 0 switches it off.
-        pub low_pass_hz: f64,
-    }
-}
-
-impl EgmStartParameters {
-    /// Keeps every setting.
-    pub const KEEP: Self = Self {
-        comm_timeout_s: f64::NAN,
-        condition_time_s: f64::NAN,
-        max_speed_deviation_rad_per_s: f64::NAN,
-        max_position_deviation_rad: f64::NAN,
-        ramp_in_s: f64::NAN,
-        position_correction_ratio: f64::NAN,
-        position_gain_per_s: f64::NAN,
-        low_pass_hz: f64::NAN,
-    };
-}
-
-/// What a request asks for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, CheckedBitPattern)]
-#[repr(u32)]
-pub enum MotionKind {
-    /// Only the state.
-    GetState = 0,
-    /// A joint motion (`MoveAbsJ`).
-    MoveJoints = 1,
-    /// A straight line of the tool (`MoveL`) of at most 5000 cycles, i.e. 20 s at 4 ms.
-    MoveLinear = 2,
-    /// Start guided motion.
-    EgmStart = 3,
-    /// Stop guided motion.
-    EgmStop = 4,
-    /// A joint motion to the home posture.
-    Home = 5,
-}
-
-hil_core::message! {
-    /// From the motion server: at once when a request is taken or refused, and once more when what
-    /// it began has ended.
-    #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-    #[repr(C)]
-    pub struct MotionResponse = "hil.MotionResponse.v1" {
-        /// [`MotionRequest::request_id`].
-        pub request_id: u64,
-        /// [`MotionRequest::kind`].
-        pub kind: u32,
-        /// [`MotionOutcome`] as a number.
-        pub outcome: u32,
-        /// [`MotionRefusal`] as a number when refused, otherwise 0.
-        pub refusal: u32,
-        /// [`Side::index`] of the arm at fault when refused.
-        pub refused_side: u32,
-        /// [`SessionState`] of right and left arm.
-        pub states: [u32; 2],
-        /// Measured joints of right and left arm.
-        pub measured_rad: [Joints; 2],
-    }
-}
-
-const _: () = assert!(size_of::<MotionResponse>() == 144);
-
-/// How a request stands.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, CheckedBitPattern)]
-#[repr(u32)]
-pub enum MotionOutcome {
-    /// Taken; a motion or activation is under way.
-    Accepted = 1,
-    /// What was asked is reached.
-    Done = 2,
-    /// Not taken; see [`MotionResponse::refusal`].
-    Refused = 3,
-    /// Taken, but something else ended it.
-    Interrupted = 4,
-}
-
-/// Why a request was not taken.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, CheckedBitPattern)]
-#[repr(u32)]
-pub enum MotionRefusal {
-    /// No such kind.
-    UnknownKind = 1,
-    /// No arm, or one that does not exist.
-    NoArm = 2,
-    /// A number is not finite or outside its range, or a linear motion is so slow that it would
-    /// last more than 5000 cycles.
-    BadNumber = 3,
-    /// The target is outside a joint's limits.
-    OutsideLimits = 4,
-    /// No joint position puts the tool there, or none on the straight line to it.
-    Unreachable = 5,
-    /// Another motion is under way.
-    Busy = 6,
-    /// Guided motion runs, and the request needs it not to.
-    GuidedMotionRuns = 7,
-}
-
-hil_core::message! {
-    /// To the record: a request as it arrived at the motion server.
-    #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-    #[repr(C)]
-    pub struct MotionArrival = "hil.MotionArrival.v1" {
-        /// When, on the robot's clock.
-        pub at_ns: i64,
-        /// The request.
-        pub request: MotionRequest,
-    }
-}
-
-const _: () = assert!(size_of::<MotionArrival>() == 320);
-
-// The numbers of the enumerations, read back. Writing needs nothing: `as u32`.
-macro_rules! read_back {
-    ($($kind:ident: $what:literal;)+) => {$(
-        impl $kind {
-            #[doc = concat!("The ", $what, " with this number.")]
-            pub fn from_number(number: u32) -> Option<Self> {
-                bytemuck::checked::try_cast(number).ok()
-            }
-        }
-    )+};
-}
-
-read_back! {
-    EgmEventKind: "kind of event";
-    EndCause: "cause";
-    CommandRefusal: "refusal";
-    MotionKind: "kind of request";
-    MotionOutcome: "outcome";
-    MotionRefusal: "refusal";
-    SessionState: "state";
-}
-
-impl MotionKind {
-    /// A few words for a log line.
-    pub const fn word(self) -> &'static str {
-        match self {
-            Self::GetState => "state",
-            Self::MoveJoints => "joint motion",
-            Self::MoveLinear => "linear motion",
-            Self::EgmStart => "start of guided motion",
-            Self::EgmStop => "stop of guided motion",
-            Self::Home => "motion to the home posture",
-        }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// Numbers `from..to` must read back as themselves, those around as nothing.
-    fn check<T>(from: u32, to: u32, read: fn(u32) -> Option<T>, number: fn(T) -> u32) {
-        for candidate in 0..50 {
-            let known = (from..to).contains(&candidate).then_some(candidate);
-            assert_eq!(read(candidate).map(number), known);
-        }
-        assert!(read(u32::MAX).is_none());
-    }
-
-    #[test]
-    fn every_number_reads_back_as_the_one_written() {
-        check(0, 12, EgmEventKind::from_number, |kind| kind as u32);
-        check(1, 5, EndCause::from_number, |cause| cause as u32);
-        check(1, 4, CommandRefusal::from_number, |refusal| refusal as u32);
-        check(0, 6, MotionKind::from_number, |kind| kind as u32);
-        check(1, 5, MotionOutcome::from_number, |outcome| outcome as u32);
-        check(1, 8, MotionRefusal::from_number, |refusal| refusal as u32);
-        check(0, 6, SessionState::from_number, |state| state as u32);
-        check(0, 2, Side::from_index, |side| match side {
-            Side::Right => 0,
-            Side::Left => 1,
-        });
-    }
-}

@@ -7,9 +7,9 @@
 //! command acts from the cycle after the one that took it, and `control_delay_cycles` later in
 //! the measured joints (ABB: a new position starts to act after about 20 ms).
 //!
-//! Read `law` (the control law), `inbox` (from arrival to reference), `session` (what starts
-//! and ends, and what is checked while it runs), [`motion`] (moves without a client) and `describe`
-//! (events in words).
+//! Read `law` (the control law), `inbox` (from arrival to reference), `session` (what starts and
+//! ends), `watch` (what is checked while it runs), [`motion`] (moves without a client) and
+//! `describe` (events in words).
 //!
 //! Everything about a command is decided at its grid point, not when it is handed over: a driver
 //! that comes late and hands over the arrivals of many cycles before going through these cycles
@@ -21,15 +21,15 @@ mod law;
 pub mod motion;
 mod ring;
 mod session;
+mod watch;
 
 #[cfg(test)]
 mod tests;
 
 use crate::egm::controller::inbox::Inbox;
 use crate::egm::controller::law::{Delay, Law, Plan, Reference};
-use crate::egm::controller::session::{
-    HoldWatch, Limits, OwnMotion, Phase, Request, Session, ThrottleWatch,
-};
+use crate::egm::controller::session::{OwnMotion, Phase, Request, Session};
+use crate::egm::controller::watch::{HoldWatch, Limits, ThrottleWatch};
 use crate::egm::messages::{
     CommandRefusal, EgmCommand, EgmEvent, EgmEventKind, EgmFeedback, EgmStartParameters,
     MotionKind, MotionRefusal, SessionState, Side,
@@ -41,7 +41,7 @@ use hil_core::time::Instant;
 
 pub use crate::egm::controller::inbox::{CommandCounters, LIMIT_TOLERANCE_RAD};
 pub(crate) use crate::egm::controller::law::DELAY_CYCLES_MAX;
-pub use crate::egm::controller::session::HOLD_AFTER_NS;
+pub use crate::egm::controller::watch::HOLD_AFTER_NS;
 
 /// One arm's controller.
 #[derive(Debug, Clone)]

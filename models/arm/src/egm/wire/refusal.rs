@@ -97,49 +97,98 @@ impl From<WireError> for Refusal {
     }
 }
 
-macro_rules! causes {
-    ($($cause:ident => $label:literal,)+) => {
-        /// A [`Refusal`] without its numbers: what is counted.
-        #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-        #[serde(rename_all = "snake_case")]
-        pub enum Cause {
-            $(#[doc = concat!("[`Refusal::", stringify!($cause), "`].")] $cause,)+
-        }
-
-        impl Cause {
-            /// Every cause, in the order of the counts.
-            pub const ALL: &'static [Self] = &[$(Self::$cause),+];
-
-            /// A few words for a report.
-            pub const fn label(self) -> &'static str {
-                match self { $(Self::$cause => $label,)+ }
-            }
-        }
-
-        impl Refusal {
-            /// Its cause.
-            pub const fn cause(&self) -> Cause {
-                match self { $(Self::$cause { .. } => Cause::$cause,)+ }
-            }
-        }
-    };
+/// A [`Refusal`] without its numbers: what is counted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+#[repr(usize)]
+pub enum Cause {
+    /// [`Refusal::TooLong`].
+    TooLong,
+    /// [`Refusal::NotProtobuf`].
+    NotProtobuf,
+    /// [`Refusal::MissingHeader`].
+    MissingHeader,
+    /// [`Refusal::WrongMessageType`].
+    WrongMessageType,
+    /// [`Refusal::MissingJoints`].
+    MissingJoints,
+    /// [`Refusal::WrongArity`].
+    WrongArity,
+    /// [`Refusal::NotFinite`].
+    NotFinite,
+    /// [`Refusal::OutsideLimits`].
+    OutsideLimits,
+    /// [`Refusal::TooFast`].
+    TooFast,
+    /// [`Refusal::NoSession`].
+    NoSession,
+    /// [`Refusal::Overtaken`].
+    Overtaken,
 }
 
-causes! {
-    TooLong => "too long",
-    NotProtobuf => "not protobuf",
-    MissingHeader => "missing header",
-    WrongMessageType => "wrong message type",
-    MissingJoints => "no joints",
-    WrongArity => "wrong number of joints",
-    NotFinite => "not a finite number",
-    OutsideLimits => "outside joint limits",
-    TooFast => "too fast",
-    NoSession => "no session",
-    Overtaken => "overtaken",
+impl Cause {
+    /// Number of causes.
+    pub const COUNT: usize = 11;
+
+    /// Every cause, in the order of the counts.
+    pub const ALL: [Self; Self::COUNT] = [
+        Self::TooLong,
+        Self::NotProtobuf,
+        Self::MissingHeader,
+        Self::WrongMessageType,
+        Self::MissingJoints,
+        Self::WrongArity,
+        Self::NotFinite,
+        Self::OutsideLimits,
+        Self::TooFast,
+        Self::NoSession,
+        Self::Overtaken,
+    ];
+
+    /// A few words for a report.
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::TooLong => "too long",
+            Self::NotProtobuf => "not protobuf",
+            Self::MissingHeader => "missing header",
+            Self::WrongMessageType => "wrong message type",
+            Self::MissingJoints => "no joints",
+            Self::WrongArity => "wrong number of joints",
+            Self::NotFinite => "not a finite number",
+            Self::OutsideLimits => "outside joint limits",
+            Self::TooFast => "too fast",
+            Self::NoSession => "no session",
+            Self::Overtaken => "overtaken",
+        }
+    }
 }
+
+const _: () = {
+    let mut index = 0;
+    while index < Cause::COUNT {
+        assert!(Cause::ALL[index] as usize == index);
+        index += 1;
+    }
+};
 
 impl Refusal {
+    /// Its cause.
+    pub const fn cause(&self) -> Cause {
+        match self {
+            Self::TooLong { .. } => Cause::TooLong,
+            Self::NotProtobuf => Cause::NotProtobuf,
+            Self::MissingHeader => Cause::MissingHeader,
+            Self::WrongMessageType { .. } => Cause::WrongMessageType,
+            Self::MissingJoints => Cause::MissingJoints,
+            Self::WrongArity { .. } => Cause::WrongArity,
+            Self::NotFinite { .. } => Cause::NotFinite,
+            Self::OutsideLimits { .. } => Cause::OutsideLimits,
+            Self::TooFast { .. } => Cause::TooFast,
+            Self::NoSession => Cause::NoSession,
+            Self::Overtaken { .. } => Cause::Overtaken,
+        }
+    }
+
     /// A few words for a report.
     pub const fn label(&self) -> &'static str {
         self.cause().label()
@@ -150,7 +199,7 @@ impl Refusal {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct DatagramCounts {
     accepted_count: u64,
-    refused_counts: [u64; Cause::ALL.len()],
+    refused_counts: [u64; Cause::COUNT],
 }
 
 impl DatagramCounts {
@@ -188,7 +237,7 @@ impl DatagramCounts {
 
     /// Cause and count of each cause that occurred.
     pub fn causes(&self) -> impl Iterator<Item = (Cause, u64)> + '_ {
-        let counted = Cause::ALL.iter().copied().zip(self.refused_counts);
+        let counted = Cause::ALL.into_iter().zip(self.refused_counts);
         counted.filter(|(_, count)| *count > 0)
     }
 }
