@@ -90,36 +90,31 @@ impl Sampler {
 }
 
 fn describe(tally: &Tally, interface: &str, hears_events: bool) -> String {
-    let mut text = format!("{} of {}", tally.sample_count, interface);
+    let mut parts = vec![format!("{} of {interface}", tally.sample_count)];
     if !hears_events {
-        text.push_str("; events of the association unavailable");
+        parts.push("events of the association unavailable".to_owned());
     } else if tally.event_count > 0 {
-        let words = format!("; {} events of the association", tally.event_count);
-        text.push_str(&words);
+        parts.push(format!("{} events of the association", tally.event_count));
     }
     if tally.overrun_count > 0 {
-        let words = format!(
-            "; the kernel threw events away {} times: roams may be missing",
+        parts.push(format!(
+            "the kernel threw events away {} times: roams may be missing",
             tally.overrun_count
-        );
-        text.push_str(&words);
+        ));
     }
     if let Some(error) = &tally.event_failure {
-        let words = format!("; events of the association broke off: {error}");
-        text.push_str(&words);
+        parts.push(format!("events of the association broke off: {error}"));
     }
     if tally.left_out_count > 0 {
-        let more = format!(
-            "; {} stations beyond {STATION_COUNT_MAX} left out",
-            tally.left_out_count
-        );
-        text.push_str(&more);
+        let count = tally.left_out_count;
+        parts.push(format!(
+            "{count} stations beyond {STATION_COUNT_MAX} left out"
+        ));
     }
     if let Some(error) = &tally.newest_failure {
-        let words = format!("; {} failed: {error}", tally.failed_count);
-        text.push_str(&words);
+        parts.push(format!("{} failed: {error}", tally.failed_count));
     }
-    text
+    parts.join("; ")
 }
 
 fn look(socket: &mut RadioSocket, sink: &mut RecordSink, tally: &mut Tally) {

@@ -105,14 +105,7 @@ impl HostDiscipline {
             self.basis = format!("ntpd: {}; not synchronised", variables.reference);
             return;
         };
-        if variables.is_local() {
-            self.basis.push_str(LOCAL_CLOCK);
-        } else if self.is_kernel_synchronised {
-            self.reference = Some(format!("ntp {}", variables.reference));
-            self.bound_ns = Some(bound_ns);
-        } else {
-            self.basis.push_str(NOT_KEPT);
-        }
+        self.follow(&variables.reference, bound_ns);
     }
 
     fn believe_chrony(&mut self, tracking: &ChronyTracking) {
@@ -124,15 +117,22 @@ impl HostDiscipline {
             tracking.root_delay_s,
             tracking.root_dispersion_s
         );
-        if !tracking.is_synchronised() {
+        if tracking.is_synchronised() {
+            self.follow(&tracking.reference, tracking.bound_ns());
+        } else {
             self.basis.push_str("; not synchronised");
-        } else if is_local_reference(&tracking.reference) {
+        }
+    }
+
+    /// Takes the bound of a synchronised NTP daemon, unless its clock is nobody's.
+    fn follow(&mut self, reference: &str, bound_ns: u64) {
+        if is_local_reference(reference) {
             self.basis.push_str(LOCAL_CLOCK);
         } else if !self.is_kernel_synchronised {
             self.basis.push_str(NOT_KEPT);
         } else {
-            self.reference = Some(format!("ntp {}", tracking.reference));
-            self.bound_ns = Some(tracking.bound_ns());
+            self.reference = Some(format!("ntp {reference}"));
+            self.bound_ns = Some(bound_ns);
         }
     }
 

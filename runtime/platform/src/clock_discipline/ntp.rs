@@ -76,11 +76,6 @@ impl NtpVariables {
         self.leap != 3 && (1..16).contains(&self.stratum)
     }
 
-    /// True while its source is the local clock itself, which is the reference of nobody else.
-    pub fn is_local(&self) -> bool {
-        is_local_reference(&self.reference)
-    }
-
     /// Largest error of the system clock against the reference, nanoseconds; `None` when not
     /// synchronised. Root distance (RFC 5905, appendix A.5.5.2), the offset it has yet to correct,
     /// and what the clock may have strayed since the last update.
